@@ -1,14 +1,15 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-# SciPy's stubs say little of sparse matrices.
-"""What a machine can do, in three figures that travel with its rows: without them times of two machines say nothing.
+# # SciPy's stubs are incomplete for sparse matrices.
+"""Calibrate a machine by three figures, which make the times of different machines comparable.
 
-    machine_bandwidth   bytes a second that are read and written where an array larger than a cache is copied
-    machine_flops       additions and multiplications a second of a product of two matrices, 2 n^3 (BLAS, float64)
-    machine_step        seconds of a fixed step: ten iterations of local-global for a sheet of 32 x 32 vertices
+    machine_bandwidth   bytes read and written per second when copying an array larger than a cache
+    machine_flops       additions and multiplications per second in a product of two matrices, 2 n^3 (BLAS, float64)
+    machine_step        seconds of a fixed step: ten local-global iterations on a sheet of 32 x 32 vertices
 
-by one thread, in its own CPU time, the best of a few tries; NumPy and SciPy do it, so there is nothing to compile.
-They are kept in the user's cache, for a day on one computer with the same libraries, unless other programs had so much
-of the processor meanwhile that they say more of those: the next process then asks again.
+One thread is measured in its own CPU time; the best of five repetitions counts. NumPy and SciPy do the work, so nothing
+is compiled. The figures are cached for a day in the user's cache, per computer and library versions. They are not
+cached if other programs used so much of the processor that the thread had less than 95 % of the wall time; the next
+process then measures again.
 """
 
 from __future__ import annotations
@@ -27,21 +28,25 @@ from harness.base.files import CannotWrite, replacing, users_cache
 from harness.base.machine_lock import alone
 
 NAMES: tuple[str, ...] = ("machine_bandwidth", "machine_flops", "machine_step")
-"""The columns."""
+"""Names of the columns."""
 
 _DAY = 86_400.0
 _TRIES = 5
 _OWN = 0.95
-"""Of the wall's time, how much CPU time a thread has at least that is left alone."""
+"""Smallest ratio of a thread's CPU time to wall time at which the measurement counts as undisturbed."""
 _BYTES, _MATRIX, _SHEET, _ITERATIONS = 2**26, 512, 32, 10
 
 
 _KNOWN: dict[str, float] = {}
-"""What this process has found."""
+"""Figures that this process has measured or loaded."""
 
 
 def of_this_machine(tick: Tick) -> dict[str, float]:
-    """The columns; none where there is no memory for it. tick: is told while this waits for the machine."""
+    """Return the calibration columns; empty if memory is insufficient.
+
+    Args:
+        tick: called while this waits for the timing lock.
+    """
     if not _KNOWN:
         with suppress(MemoryError):  # within a run's limit
             _KNOWN.update(_found(users_cache("machine") / f"{machine.node()}.json", tick))
@@ -69,21 +74,24 @@ def _found(path: Path, tick: Tick) -> dict[str, float]:
 
 
 def bandwidth() -> float:
-    """Bytes a second, those read and those written."""
+    """Measure the bandwidth of an array copy, read plus written [B/s]."""
     source = np.ones(_BYTES // 8)
     target = np.zeros_like(source)
     return 2 * _BYTES / _least(lambda: np.copyto(target, source))
 
 
 def flops() -> float:
-    """Operations a second."""
+    """Measure the speed of a matrix product [FLOP/s]."""
     a = np.random.default_rng(0).normal(size=(_MATRIX, _MATRIX))
     out = np.empty_like(a)
     return 2.0 * _MATRIX**3 / _least(lambda: np.matmul(a, a, out=out))
 
 
 def step() -> float:
-    """CPU seconds: d_e = r_e (A p)_e / |(A p)_e|, then Q p = A' K d + y, for a sheet that hangs at a side."""
+    """Measure the CPU seconds of a fixed local-global step, for a sheet that hangs by one side.
+
+    d_e = r_e (A p)_e / |(A p)_e|, then Q p = A' K d + y.
+    """
     from scipy.sparse import csr_array, identity
     from scipy.sparse.linalg import splu
 
@@ -117,7 +125,7 @@ def step() -> float:
 
 
 def _least(work: Callable[[], object]) -> float:
-    """CPU seconds of the quickest of some tries, after one that warms up."""
+    """Return the smallest CPU time of several repetitions after a warm-up [s]."""
     work()
     took = list[float]()
     for _ in range(_TRIES):

@@ -1,4 +1,4 @@
-"""What a command does itself, and does in a process of its own where it runs code of others."""
+"""Call a function in this process, or in a separate process where it runs user code."""
 
 from __future__ import annotations
 
@@ -17,8 +17,17 @@ def apart(
     say: Callable[[str], None] = lambda said: None,
     limits: Limits | None = None,
 ) -> Any:
-    """What a piece of work returns; done here where there is no code of others, `own`. It pickles; say: told what it
-    ticks. Raises what it raises, and RunFailed where its process is lost."""
+    """Return the result of a function, called in a separate process if user code is involved.
+
+    Args:
+        function: work to do; picklable; called with a function that reports progress.
+        user_code: plug-ins that the function runs; if empty, it is called in this process.
+        print_message: called with each progress message.
+        limits: limits of the process; none if left out.
+
+    Raises:
+        RunFailed: the process was lost. Errors of the function are raised unchanged.
+    """
     if not own:
         return piece(say)
     from harness.base.asides import is_step

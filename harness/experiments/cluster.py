@@ -1,13 +1,12 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 # pyright: reportMissingTypeArgument=false, reportUnknownParameterType=false
-# Dask tells no types.
-"""Runs on many machines, by Dask: each is a task, done in a process of its own on whichever worker is free.
+# # Dask has no type annotations.
+"""Execute runs on many machines with Dask: each run is a task in a separate process of a free worker.
 
-A worker does one run after the other; workers of one machine wait for each other while one is timed
-(`harness.base.machine_lock`). A run that crashes ends its process and not Dask's worker, so no number of bad runs uses
-up the workers. What a run leaves comes back with its outcome, but where the worker sees the client's folder. A worker
-that is lost costs its run at hand, which is done again elsewhere; one that cannot write, or has other code, gets no
-more.
+A worker executes one run at a time. Workers of one machine wait for each other while one is timed
+(`harness.base.machine_lock`). A run that crashes ends its process and not Dask's worker, so failed runs do not use up
+the workers. The files of a run return with its outcome, except where the worker shares the client's folder. If a worker
+is lost, its current run is repeated on another. A worker that cannot write or has other source code gets no more runs.
 """
 
 from __future__ import annotations
@@ -44,22 +43,22 @@ from harness.experiments.scheduler import PATIENCE, QUEUED, SILENCE, reach, sche
 from solvers.plugins import Plugin, load
 
 CLOCKS = 60.0
-"""Seconds by which a worker's clock may differ from the client's before that is said."""
+"""Difference between the clocks of a worker and the client above which a message is printed [s]."""
 
 _TRIES = 4
-"""How often a run is handed out whose worker is lost."""
+"""Largest number of attempts for a run whose worker is lost."""
 
 _GONE = "the scheduler is gone; what was done is kept, and the same command does the rest"
 
 _ASK, _LOOK = 1.0, 0.05
-"""Seconds between two questions which workers there are, and between two looks at tasks when none has ended."""
+"""Seconds between two queries of the workers; seconds between two queries of the tasks if none has finished."""
 
 _AHEAD = 4
-"""Tasks that wait at the scheduler for each thread of the workers: more would be kept there for nothing."""
+"""Tasks queued at the scheduler per worker thread; more would use its memory without benefit."""
 
 
 class WorkerFacts(NamedTuple):
-    """What a worker says of itself: its machine, its versions, its clock."""
+    """Machine, versions and clock of a worker."""
 
     machine: str
     node: str
@@ -70,13 +69,20 @@ class WorkerFacts(NamedTuple):
 
     @classmethod
     def this(cls) -> WorkerFacts:
-        """Of this process."""
+        """Return the information about this process."""
         python = ".".join(map(str, sys.version_info[:2]))
         return cls(machine.describe().id, machine.node(), machine.code_hash(), python, version("distributed"), time())
 
 
 class Done(NamedTuple):
-    """What became of a run on a worker: in words, and what it left, by name; or why this worker is of no use."""
+    """Outcome of a run on a worker.
+
+    Attributes:
+        worker_address: address of the worker.
+        message: outcome as text.
+        files: content of the files that the run wrote, by name.
+        worker_error: why this worker cannot execute runs; empty if it can.
+    """
 
     worker: str
     told: str = ""
@@ -85,7 +91,7 @@ class Done(NamedTuple):
 
 
 class Cluster(NamedTuple):
-    """A client of workers that can do the runs, and the ids of their machines."""
+    """Client of the workers, and the ids of their machines."""
 
     client: Client
     machines: Sequence[str]
@@ -93,14 +99,22 @@ class Cluster(NamedTuple):
     def do_all(
         self, folder: Path, display: Display, units: Sequence[RunUnit], another: Callable[[RunUnit], str]
     ) -> None:
-        """See `do_on`."""
+        """Execute units on the workers (`execute_on_cluster`)."""
         do_on(self.client, units, folder, display, another)
 
 
 @contextmanager
 def cluster(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> Generator[Cluster]:
-    """The workers of the scheduler at an address, so many on this machine (`local:4`), or those that a file asks of a
-    batch system. Raises InputError where there is none, or none that can do the runs."""
+    """Connect to the workers of a scheduler, and yield the cluster.
+
+    Args:
+        scheduler_address: an address, a number of workers on this machine (`local:4`), or a file for a batch system.
+        runs: runs to execute, whose plug-ins the workers must have.
+        print_message: prints a remark.
+
+    Raises:
+        InputError: there is no scheduler, or no worker that can execute the runs.
+    """
     with scheduler(on) as address:
         try:
             if isinstance(address, str):
@@ -109,7 +123,7 @@ def cluster(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> Gen
         except (OSError, ValueError) as error:
             why = f"no scheduler answers within {PATIENCE:g} s ({' '.join(str(error).split())[:200]})"
             raise InputError(Mistake(f"{on}: {why}; start one with `dask scheduler`", key="--on")) from None
-        # Its log would put tracebacks beside what the user is told of a scheduler that is gone.
+        # Dask's log would print tracebacks in addition to the message about a lost scheduler.
         with silence_logging_cmgr(SILENCE), client, client.as_current():
             for waits in range(0 if address is on else QUEUED, -1, -1):
                 try:
@@ -124,8 +138,16 @@ def cluster(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> Gen
 
 
 def machines(client: Client, runs: Sequence[RunSpec], say: Callable[[str], None]) -> list[str]:
-    """The ids of the workers' machines. Raises InputError for workers of other versions, or without the code that a run
-    names; says which clocks differ."""
+    """Check all workers and return the ids of their machines; print which clocks differ.
+
+    Args:
+        client: Dask client.
+        runs: runs whose plug-ins are required.
+        print_message: prints a remark.
+
+    Raises:
+        InputError: a worker has other versions, or lacks a plug-in.
+    """
     here = WorkerFacts.this()
     before = time()
     plugins = list({plugin for run in runs for plugin in run.own()})
@@ -157,7 +179,7 @@ def machines(client: Client, runs: Sequence[RunSpec], say: Callable[[str], None]
 
 
 def _about(plugins: Sequence[Plugin]) -> tuple[WorkerFacts, dict[str, str]]:
-    """On a worker: what it is, and which plug-ins it has not, and why."""
+    """On a worker: return its description, and the reason for each plug-in that cannot be imported."""
     missing = dict[str, str]()
     if plugins:
         _allow_children()
@@ -182,7 +204,10 @@ def _missing(plugins: Sequence[Plugin], tick: Tick) -> dict[str, str]:
 
 
 def _allow_children() -> None:
-    """Dask's nannies make their workers daemons, which may have no children; these end with their parent."""
+    """Allow child processes: Dask's nannies start workers as daemons, which may have none.
+
+    The children end with their parent.
+    """
     multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
 
 
@@ -193,8 +218,20 @@ def do_on(
     display: Display,
     another: Callable[[RunUnit], str] = lambda unit: "",
 ) -> None:
-    """Do the runs of units on a client's workers; their files come to `folder`. another: see `core.do_together`. Raises
-    InputError, CannotWrite, RunFailed where the scheduler is gone."""
+    """Execute units on the workers of a client; their files are written to `folder`.
+
+    Args:
+        client: Dask client.
+        units: runs to execute.
+        folder: folder of the sweep.
+        display: shows progress.
+        skip_reason: returns why another command has a unit, or an empty string (`execute_unclaimed`).
+
+    Raises:
+        InputError: the input is invalid.
+        CannotWrite: no worker can write any more.
+        RunFailed: the connection to the scheduler is lost.
+    """
     token = folder / "rows" / f".{uuid4().hex}.partial"  # who sees it shares the folder; it goes as such files do
     left, tries, excluded = list(enumerate(units))[::-1], dict[int, int](), set[str]()
     threads, asked = dict[str, int](), 0.0
@@ -239,7 +276,7 @@ def do_on(
 
 
 def _answers(client: Client, ended: Sequence[Future]) -> dict[Future, Done]:
-    """What tasks returned, fetched together; those that failed are missing, and all where one is lost meanwhile."""
+    """Fetch the outcomes of finished tasks together, without failed ones; empty if a worker was lost meanwhile."""
     finished = [task for task in ended if task.status == "finished"]
     try:
         found: Any = client.gather(finished)
@@ -260,7 +297,10 @@ def _ended(
     *,
     last: bool,
 ) -> bool:
-    """Keep what a task left; whether its run is to be done again. answer: if known already; last: no more."""
+    """Store the files of a finished task, and return whether to repeat its run.
+
+    `outcome` is the result if it has been fetched already; `is_last_attempt` excludes another attempt.
+    """
     if task.status in ("cancelled", "lost"):
         raise RunFailed(_GONE)
     run = display.run(unit.title, 1, unit.effort)
@@ -282,7 +322,7 @@ def _ended(
 
 
 def _threads(client: Client) -> dict[str, int]:
-    """How many tasks each worker does at a time. Raises RunFailed."""
+    """Return the number of threads of each worker. Raises RunFailed."""
     try:
         found: Any = client.nthreads()
     except OSError:
@@ -291,11 +331,11 @@ def _threads(client: Client) -> dict[str, int]:
 
 
 _PROCESSES: list[Workers] = []
-"""Of this worker, those that wait for their next run."""
+"""Idle processes of this worker, which wait for their next run."""
 
 
 def _do(unit: RunUnit, folder: Path, token: str, code: str, tables: Sequence[Mapping[str, str]]) -> Done:
-    """On a worker: one run, in a process of its own."""
+    """On a worker: execute one run in a separate process."""
     me = distributed.get_worker().address
     if machine.code_hash() != code:
         return Done(me, useless=f"has other code, {machine.code_hash()} and not {code}")

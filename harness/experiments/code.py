@@ -1,4 +1,4 @@
-"""By which code a run is done: the digest of all sources that it depends on, wherever they lie."""
+"""Fingerprint of the source code of a run: the digest of all source files that it depends on."""
 
 from __future__ import annotations
 
@@ -11,24 +11,26 @@ from solvers.plugins import Plugin, source_of
 from solvers.registry import EVERY, load
 
 Part = Path | type | Plugin
-"""The file of a solver; the class of a mesh or an effect, which is there already; somebody's own code."""
+"""Source file of a solver; imported class of a mesh or an effect; plug-in of the user."""
 
 TO_ERROR = "harness.experiments.asked.kept:keep_to_error"
-"""What does a run that keeps to an error; other runs depend on none of it."""
+"""Import target that executes error-controlled runs; other runs do not depend on it."""
 
 _RUN = Path(__file__).with_name("run.py")
-"""What does a run, whatever its parts."""
+"""Module that executes every run."""
 
 
 def solver_class(run: RunSpec) -> Any:
-    """The class of a run's solver; its module is imported."""
+    """Import and return the class of a run's solver."""
     return load(EVERY[run.solver.name])
 
 
 def parts(run: RunSpec) -> frozenset[Part]:
-    """What a run is put together from by name: the solver's file, the classes of the mesh and the effects, the files of
-    a judge's reference and of what guesses, and what keeps to an error. Neither solvers nor somebody's own code are
-    imported."""
+    """Return the source parts of a run, without importing solvers or user code.
+
+    These are the file of the solver, the classes of the mesh and the effects, the files of the reference solver for
+    verification and of the solver for initial guesses, and the module of error-controlled runs.
+    """
     named = {"mesh": run.scene.mesh, **{f"effects[{i}]": effect for i, effect in enumerate(run.scene.effects)}}
     shipped = [type(part) for place, part in named.items() if place not in run.scene.own]
     solver = [] if isinstance(run.solver.name, Plugin) else [run.solver.name]
@@ -39,17 +41,17 @@ def parts(run: RunSpec) -> frozenset[Part]:
 
 
 def code(parts: frozenset[Part]) -> str:
-    """12 hexadecimal digits of SHA-256 over all sources that a run of these parts depends on."""
+    """Return 12 hexadecimal digits of SHA-256 over all source files of these parts."""
     return sources.digest([_RUN, *(file for part in parts for file in files(part))])[:12]
 
 
 def _file_of(name: str) -> Path:
-    """The file of a shipped solver; what its class inherits is imported there."""
+    """Return the file of a solver of this package; it imports the base classes."""
     return Path(source_of(EVERY[name].partition(":")[0]) or _RUN)
 
 
 def files(part: Part) -> frozenset[Path]:
-    """The files that a part is written in."""
+    """Return the source files of a part."""
     if isinstance(part, Path):
         return frozenset([part])
     if isinstance(part, Plugin):

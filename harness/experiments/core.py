@@ -1,8 +1,8 @@
-"""What experiments have in common: units of work, of which those that are missing are done, each in a worker.
+"""Execute the missing units of an experiment, each in a worker process.
 
-A unit is a file of rows, written when all of it is done. A unit that crashes, hangs or swells costs its worker and is a
-row all the same. While one is timed the others wait; what is not timed is done side by side. A disk that is full ends
-the experiment, and so do the user's mistakes.
+A unit is a file of rows, written once the whole unit has finished. A unit that crashes, hangs or exceeds its memory
+costs its worker, and still yields a row. While one unit is timed the others wait; untimed work runs in parallel. A full
+disk ends the experiment, and so do errors of the user.
 """
 
 from __future__ import annotations
@@ -27,38 +27,43 @@ from solvers.registry import SOLVERS
 TABLES = (SOLVERS, EFFECTS, MESHES)
 
 MOST, GIB_EACH = 8, 2.0
-"""At most so many workers: they take turns at being timed. And the memory [GiB] that there is to be for each."""
+"""Largest number of workers, which are timed one at a time; memory required for each worker [GiB]."""
 
 
 class Unit(Protocol):
-    """What is measured at once, and stands in one file. It pickles."""
+    """Unit of work that is measured as a whole and stored in one file; picklable."""
 
     @property
     def title(self) -> str:
-        """The unit in words."""
+        """Title of the unit, for messages."""
         ...
 
     @property
     def ticks(self) -> int:
-        """So many steps it tells of."""
+        """Number of steps that the unit reports as progress."""
         ...
 
     @property
     def effort(self) -> Effort:
-        """What it takes, for the time left."""
+        """Estimated cost, from which the remaining time is predicted."""
         ...
 
     @property
     def limits(self) -> Limits:
-        """What it may take."""
+        """Limits of time and memory."""
         ...
 
     def do(self, tick: Tick) -> str:
-        """Measure, write the rows, and say in words what became of it. Raises InputError, CannotWrite."""
+        """Measure, write the rows and return the outcome as text.
+
+        Raises:
+            InputError: the input is invalid.
+            CannotWrite: the rows cannot be written.
+        """
         ...
 
     def lost(self, lost: Lost) -> str:
-        """Write the rows of one that gave no answer, and say so."""
+        """Write the rows of a unit whose worker was lost, and return the outcome as text."""
         ...
 
 
@@ -67,30 +72,33 @@ U = TypeVar("U", bound=Unit)
 
 @runtime_checkable
 class Sharing(Protocol):
-    """What units have that say themselves when they are timed (`harness.base.machine_lock`); others are as a whole."""
+    """Unit that acquires the timing lock itself (`harness.base.machine_lock`).
+
+    Any other unit is timed as a whole.
+    """
 
     @property
     def group(self) -> Hashable:
-        """Units of one group share what is found once, and are left to one worker where that can be."""
+        """Key of units that share cached results; one worker runs a group where possible."""
         ...
 
 
 @runtime_checkable
 class Foreign(Protocol):
-    """What units have that run code of others; a unit that runs none of it is done in another process."""
+    """Unit that runs user code; a unit without user code runs in another process."""
 
     @property
     def own(self) -> frozenset[Hashable]:
-        """What tells that code from other code."""
+        """Identity of the user code."""
         ...
 
 
 class Filed(Unit, Protocol):
-    """A unit that several commands may be about to do."""
+    """Unit that several commands may be about to execute."""
 
     @property
     def place(self) -> Path:
-        """The file of its rows."""
+        """File of the unit's rows."""
         ...
 
 
@@ -103,10 +111,17 @@ def do_together(
     do: Callable[[Sequence[F], Callable[[F], str]], None],
     say: Callable[[str], None],
 ) -> None:
-    """Do those of some units that no other command does; what one leaves undone is done here in the end.
+    """Execute the units that no other command executes.
 
-    do: does units, asking of each, when its turn comes, why it is another's, empty where it is ours; say: prints a
-    remark.
+    Units that another command leaves unfinished are executed at the end.
+
+    Args:
+        todo: units to execute.
+        claims: ownership of the row files in the results folder.
+        execute_batch: executes units; calls its second argument for each unit, immediately before it starts. That
+            function
+            returns why another command has the unit, or an empty string.
+        print_message: prints a remark.
     """
     remarks = Remarks(say)
     while todo:
@@ -132,10 +147,20 @@ def do_all(
     at_once: int = 1,
     another: Callable[[U], str] = lambda unit: "",
 ) -> None:
-    """Do units; isolated: in workers, so many at once, else in this process, one after the other and without limits.
+    """Execute units, in worker processes or in this process.
 
-    another: see `do_together`. Nothing else of ours is done on the machine while a unit is timed. Raises InputError,
-    CannotWrite.
+    The machine runs no other work of this command while a unit is timed.
+
+    Args:
+        todo: units to execute.
+        display: shows progress.
+        isolated: whether to use worker processes; otherwise units run here, one after the other and without limits.
+        num_workers: number of units that run concurrently.
+        skip_reason: returns why another command has a unit, or an empty string (`execute_unclaimed`).
+
+    Raises:
+        InputError: the input is invalid.
+        CannotWrite: the rows cannot be written.
     """
     display.begin([unit.effort for unit in todo], at_once)
     runs: dict[int, Run] = {}
@@ -165,23 +190,23 @@ def do_all(
 
 
 def workers_at_once() -> int:
-    """As many as there are cores, less what the memory has no room for."""
+    """Return the number of workers: the number of cores, limited by the available memory."""
     return max(1, min(machine.describe().cores, MOST, int(machine.describe().memory_gib / GIB_EACH)))
 
 
 def watched(unit: Unit, tick: Tick) -> str:
-    """What became of a unit; whoever is told of its steps is told what is compiled too."""
+    """Execute a unit and return its outcome; compilation is reported through `tick` too."""
     with compiling_told(tick), nullcontext() if isinstance(unit, Sharing) else alone(tick):
         return unit.do(tick)
 
 
 def require_threads(numbers: set[int]) -> None:
-    """Refuse, before anything starts, what this machine cannot do. Raises InputError."""
+    """Raise InputError for thread numbers that this machine does not support."""
     for number in numbers:
         machine.require_threads(number)
 
 
 def ready(tables: Sequence[Mapping[str, str]]) -> None:
-    """In a worker: know all names that are known here, those included that were added since."""
+    """Add the registered names of the parent process to a worker's tables."""
     for table, known in zip(TABLES, tables, strict=True):
         table.update(known)

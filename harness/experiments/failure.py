@@ -1,4 +1,4 @@
-"""What ends a measurement early, as the status and the reason of its row."""
+"""Convert the error that ended a measurement to the status and the reason of its row."""
 
 from __future__ import annotations
 
@@ -21,8 +21,17 @@ _STATUS: dict[type[BaseException], str] = {Unsupported: "unsupported", Diverged:
 
 
 def failure(error: BaseException, own: Collection[Path] = ()) -> dict[str, Any]:
-    """The row of a run that ended with an error, less what all its rows share; with the frame, where a step failed;
-    own: the solver's files, whose lines are blamed first. Raises CannotWrite if that is the error."""
+    """Return the row of a run that ended with an error, without the common columns.
+
+    The row has the frame number if a step failed.
+
+    Args:
+        error: the error that ended the run.
+        solver_files: source files of the solver; the reported error location is in these where possible.
+
+    Raises:
+        CannotWrite: if this is the error.
+    """
     if isinstance(error, CannotWrite):  # that is no outcome: a row of it would keep the run from being done again
         raise error
     if isinstance(error, StepFailed) and error.__cause__:
@@ -31,7 +40,13 @@ def failure(error: BaseException, own: Collection[Path] = ()) -> dict[str, Any]:
 
 
 def grown(run: RunSpec, growth: Growth, by_frame: Mapping[int, Mapping[str, Any]]) -> dict[str, str]:
-    """The columns `status` and `reason` of a run that was done and whose energy has grown without a source."""
+    """Return `status` and `reason` of a finished run whose energy has grown without a source.
+
+    Args:
+        run: specification of the run.
+        growth: the energy growth and its first frame.
+        by_frame: columns of the rows, by frame.
+    """
     times = f"{growth.times:,.0f}" if growth.times >= 10.0 else f"{growth.times:.1f}"
     said = f"energy has grown {times} times without a source, from frame {growth.first} on: "
     step = by_frame[growth.first]
@@ -45,7 +60,7 @@ def grown(run: RunSpec, growth: Growth, by_frame: Mapping[int, Mapping[str, Any]
 
 
 def _reason(error: BaseException, own: Collection[Path]) -> str:
-    """An error of ours speaks for itself; of any other the row also says what it was and where it came from."""
+    """Return the text of an error of springbench; for any other, also its type and location."""
     if isinstance(error, (Unsupported, NotPositiveDefinite, WrongAnswer, Blocked, Diverged, RunFailed, InputError)):
         return str(error)
     return f"{said(error)} ({where(error, set(map(str, own)))})"

@@ -1,4 +1,4 @@
-"""Which rows of a folder were made by other code than today's, told from the config that the folder belongs to."""
+"""Find stale results: rows of a folder that other source code produced, according to the folder's config."""
 
 from __future__ import annotations
 
@@ -16,14 +16,20 @@ from harness.experiments.plan import NEEDED, of_other_code
 
 
 def older_runs(folder: Path, table: pa.Table) -> Collection[str]:
-    """The ids of those runs in a table of the folder's rows. None where nobody can tell: the config is gone, or it
-    says something else today. Imports nothing that the config names."""
+    """Return the ids of stale runs in a table of the folder's rows.
+
+    The result is empty where the config is missing or has changed. Plug-ins of the config are not imported.
+
+    Args:
+        folder: folder of a sweep.
+        table: rows of that folder.
+    """
     runs = _runs(folder)
     return of_other_code(runs, table) & set(map(str, table["run_id"].unique().to_pylist()))
 
 
 def older_of(folder: Path) -> Collection[str]:
-    """The same of all rows of a sweep's folder."""
+    """Return the ids of all stale runs in the folder of a sweep."""
     table = rows.read(shelf.units(folder / "rows"), needed=NEEDED, left_out=lambda mistake: None)
     return older_runs(folder, table)
 

@@ -1,7 +1,7 @@
-"""What is there of a sweep and what is missing, told from the files of its runs; it simulates and draws nothing.
+"""Plan a sweep: find its complete and missing runs from their files, without simulating or drawing.
 
-A run is complete when its rows, its recording and its picture are in place. Rows are written after the recording,
-and a picture is drawn from the recording alone, so what a kill leaves undone is told from the files.
+A run is complete when its rows, its recording and its picture exist. Rows are written after the recording, and a
+picture is drawn from the recording alone. The files therefore show what an interrupted command has left undone.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 NEEDED = ("run_id", "scene", "size", "solver", "status", "code")
-"""Columns without which a row tells nothing of a run."""
+"""Columns that are required to identify a run and its status."""
 
 _TOLD = ("status", "code", "time_limit", "memory_limit")
-"""Columns that tell how a run stands."""
+"""Columns that determine the completion status."""
 
 _LIMITED = ("failed", "time-limit", "killed")
-"""How a run may end for its limits."""
+"""Statuses of runs that ended because of their limits."""
 
 
 @dataclass(frozen=True, slots=True)
 class Files:
-    """Where a run leaves its files."""
+    """Paths of a run's files."""
 
     rows: Path
     recording: Path
@@ -41,7 +41,13 @@ class Files:
 
     @classmethod
     def of(cls, run: RunSpec, folder: Path, on: str | None = None) -> Files:
-        """The files of a run in the folder of its sweep, done on the machine of an id, this one if left out."""
+        """Return the paths of a run in the folder of its sweep.
+
+        Args:
+            run: the run.
+            folder: folder of the sweep.
+            machine_id: machine that executes the run; this machine if None.
+        """
         label = run.label(on or machine.describe().id)
         return cls(
             folder / "rows" / f"{label}.parquet",
@@ -50,13 +56,13 @@ class Files:
         )
 
     def absolute(self) -> Files:
-        """The same files, whatever the working folder becomes."""
+        """Return the files as absolute paths, which a change of the working folder does not affect."""
         return Files(self.rows.absolute(), self.recording.absolute(), self.picture.absolute())
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedRun:
-    """A run of a sweep, its files, and what is there of it (`harness.experiments.resume.Planned`)."""
+    """Run of a sweep, its files and its status (`harness.experiments.completion_status.PlannedUnit`)."""
 
     run: RunSpec
     files: Files
@@ -64,12 +70,18 @@ class PlannedRun:
 
     @property
     def title(self) -> str:
-        """The run in words."""
+        """Title of the run, for messages."""
         return self.run.title
 
 
 def plan(runs: Iterable[RunSpec], folder: Path, machines: Sequence[str | None] = (None,)) -> list[PlannedRun]:
-    """Each run with its files and what is there already; machines: the ids of those on which it may have been done."""
+    """Return each run with its files and its completion status.
+
+    Args:
+        runs: the runs of the sweep.
+        folder: folder of the sweep.
+        machine_ids: machines that may have executed the runs; None is this machine.
+    """
     code_of = _codes()
     planned: list[PlannedRun] = []
     here = machine.describe().id
@@ -103,7 +115,7 @@ def _heads(paths: Sequence[Path]) -> dict[Path, dict[str, Any] | str]:
 
 
 def _unfit(recording: Path) -> str:
-    """What keeps a recording from being one, without reading all of it; nothing does where there is none."""
+    """Return why a recording is damaged, without reading all of it; empty if it is intact or missing."""
     if not recording.exists():
         return ""
     whole = recording.is_file() and whole_messages(recording)[0]
@@ -111,13 +123,13 @@ def _unfit(recording: Path) -> str:
 
 
 def _codes() -> Callable[[RunSpec], str]:
-    """The digest of the code of runs, which is found once for all that are put together from the same parts."""
+    """Return a function that computes source fingerprints, cached by the parts of a run."""
     of_parts = cache(code)
     return lambda run: of_parts(parts(run))
 
 
 def of_other_code(runs: Iterable[RunSpec], table: pa.Table) -> set[str]:
-    """The ids of those runs whose rows in the table were made by other code than today's."""
+    """Return the ids of the runs whose rows in the table come from other source code."""
     code_of = _codes()
     here, made = machine.describe().id, dict(zip(*(table[c].to_pylist() for c in ("run_id", "code")), strict=True))
     return {name for run in runs if made.get(name := run.run_id(here)) != code_of(run)}

@@ -1,4 +1,4 @@
-"""Columns that rows of all experiments share: what was asked, and where, when and by which code it was measured."""
+"""Columns common to the rows of all experiments: specification, machine, time and source code of a measurement."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from harness.config.sweep import RunSpec, SolverSpec
 
 
 def common(run: RunSpec) -> dict[str, Any]:
-    """The columns that are the same in all rows of a run."""
+    """Return the columns that are equal in all rows of a run."""
     limits = {"time_limit": run.time_limit, "memory_limit": run.memory_limit, "timing": run.timing}
     return (
         {"run_id": run.run_id(machine.describe().id), "sweep": run.sweep} | asked(run) | limits | provenance(run.solver)
@@ -20,7 +20,7 @@ def common(run: RunSpec) -> dict[str, Any]:
 
 
 def asked(run: RunSpec) -> dict[str, Any]:
-    """The columns that tell what a run was asked to do."""
+    """Return the columns that state the specification of a run."""
     return {
         "scene": run.scene_name,
         "size": run.size,
@@ -35,13 +35,16 @@ def asked(run: RunSpec) -> dict[str, Any]:
 
 
 def tolerance(stated: float | str | None) -> float | None:
-    """As the column has it: 0 for `auto`."""
+    """Return the tolerance as the column stores it: 0 for `auto`."""
     return 0.0 if isinstance(stated, str) else stated
 
 
 def provenance(solver: SolverSpec | None = None) -> dict[str, Any]:
-    """The columns that tell where, when and by which code something was measured; solver: of whose package the version
-    is told, if it is an interface to one."""
+    """Return the columns for the machine, the time and the source code of a measurement.
+
+    Args:
+        solver: solver whose package versions are included, where it is an interface to a package.
+    """
     here = machine.describe()
     return {
         "machine": here.id,

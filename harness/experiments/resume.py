@@ -1,4 +1,4 @@
-"""What is there of an experiment and what is to be done: the same rules, and the same remarks, for all of them."""
+"""Determine which units of an experiment exist and which are to be executed, with common rules and messages."""
 
 from __future__ import annotations
 
@@ -14,12 +14,17 @@ if TYPE_CHECKING:
 DONE, MISSING = "done", "missing"
 
 _NAMED = 8
-"""So many units are named where more are meant."""
+"""Largest number of units that a message lists by name."""
 
 
 class Standing(NamedTuple):
-    """What is there of a unit. state: done, missing, or the status of one that failed; older: whether its rows were
-    made by other code than today's; damage: what is wrong with its files, for which it is missing."""
+    """Completion status of a unit.
+
+    Attributes:
+        status: completed, missing, or the status of a failed unit.
+        is_stale: whether the rows come from other source code.
+        damage_reason: what is wrong with the files; a damaged unit counts as missing.
+    """
 
     state: str
     older: bool = False
@@ -27,16 +32,16 @@ class Standing(NamedTuple):
 
 
 class Planned(Protocol):
-    """A unit, or what it will be made of, and how it stands."""
+    """Unit, or the specification of one, with its completion status."""
 
     @property
     def title(self) -> str:
-        """The unit in words."""
+        """Title of the unit, for messages."""
         ...
 
     @property
     def standing(self) -> Standing:
-        """What is there of it."""
+        """Completion status of the unit."""
         ...
 
 
@@ -46,8 +51,17 @@ P = TypeVar("P", bound=Planned)
 def standings(
     asked: Mapping[Path, Callable[[Mapping[str, Any]], bool]], columns: Sequence[str], schema: pa.Schema
 ) -> dict[Path, Standing]:
-    """How units stand, by the path of their rows. asked: whether these columns of a unit's first row, and `code`, are
-    of what is asked for now. Raises InputError for a packed file that is damaged."""
+    """Return the completion status of units, by the path of their rows.
+
+    Args:
+        matches_request: for each path, a predicate on the columns of the unit's first row; whether they match the
+            request.
+        columns: columns that the predicates need; `code` is added.
+        schema: schema of the rows.
+
+    Raises:
+        InputError: a packed file is damaged.
+    """
     from harness.base import rows  # brings pyarrow along, for which those who only ask what there is need not wait
 
     heads, today = rows.heads(asked, [*columns, "code"], schema), machine.code_hash()
@@ -66,9 +80,16 @@ def standings(
 def wanted(
     planned: Sequence[P], what: str, say: Callable[[str], None], *, again: bool = False, changed: bool = False
 ) -> list[P]:
-    """Those that are to be done: the missing ones, all with `again`, with `changed` also those made by other code.
+    """Return the units to execute, and print a summary of the others.
 
-    what: the units in a word, plural; say: prints a remark.
+    Missing units are always included, and all units with `rerun`.
+
+    Args:
+        planned: all units of the experiment.
+        unit_noun: plural noun for the units, for messages.
+        print_message: prints a remark.
+        rerun: whether to include all units.
+        rerun_stale: whether to include units whose rows come from other source code.
     """
 
     def to_do(p: Planned) -> bool:

@@ -1,7 +1,8 @@
-"""The composition root: turns the names of one run into objects, runs its passes, and leaves its files.
+"""Execute one run: build its objects from their names, run all passes and write the files.
 
-The timed passes come first and record nothing. Recording, energies and pictures come from a second pass, whose
-final positions must equal the timed ones to the last bit. The rows are written last: where they are, all is.
+The timed passes come first and record nothing. Recording, energies and pictures come from an instrumentation pass. Its
+final positions must be bitwise identical to the timed ones. The rows are written last: where they exist, the run is
+complete.
 """
 
 from __future__ import annotations
@@ -54,11 +55,18 @@ from solvers.registry import SOLVERS, load, minimises
 def execute(
     run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = None, at_once: int = 1
 ) -> list[dict[str, Any]]:
-    """Do one run and write its files; a failure is a row with a status and a reason.
+    """Execute one run, write its files and return its rows; a failure is a row with status and reason.
 
-    tick: told the name of the pass after each step; positions: where to store the positions after every step
-    (frames, n, 3) [m], float64; at_once: how many runs may be timed at once. Returns the rows. Raises InputError, and
-    CannotWrite without rows.
+    Args:
+        run: specification of the run.
+        files: paths of its files.
+        tick: called with the name of the pass after each step.
+        positions: where to store the positions after every step, (frames, n, 3) [m], float64; None for not at all.
+        num_concurrent_runs: number of runs that may be timed concurrently.
+
+    Raises:
+        InputError: the input is invalid, and the run has no user code.
+        CannotWrite: the files cannot be written; there are then no rows.
     """
     shared: dict[str, Any] = {"at_once": at_once, **of_this_machine(tick)}
     threads = machine.threads(run.threads)
@@ -88,7 +96,7 @@ def execute(
 
 
 def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None, turn: Turn) -> list[dict[str, Any]]:
-    """Its rows; the turn looks at what was found when they are there."""
+    """Run all passes and return the rows; the timing session is checked for disturbances at the end."""
     if run.accuracy is not None:
         return _to_error(run, run.accuracy, files, tick, positions, turn)
     with turn.ready():
@@ -113,7 +121,7 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None, turn
 
 
 def _modulus_exponent(run: RunSpec, scene: Scene) -> int | None:
-    """How the material of the scene's springs depends on the mesh; None without springs or with several rules."""
+    """Return how the spring stiffness scales with mesh size; None without springs or with several rules."""
     rules = {effect.rule for effect in run.scene.effects if isinstance(effect, Springs)}
     found = {modulus_exponent(rule, scene.mesh.dimension) for rule in rules}
     return found.pop() if len(found) == 1 else None
@@ -138,7 +146,7 @@ def _measured(scene: Scene, solver: Solver, settings: Settings, tick: Tick) -> t
 def _to_error(
     run: RunSpec, error: float, files: Files, tick: Tick, positions: Path | None, turn: Turn
 ) -> list[dict[str, Any]]:
-    """The rows of a run whose solver keeps to an error of its end: integrator and steps are chosen first."""
+    """Return the rows of an error-controlled run, whose integrator and step size are chosen first."""
     with _timed(run, tick) as how:
         found = load(TO_ERROR)(run, error, tick)
     told, seen, last = found.rows(), found.positions, dict[str, Any]()
@@ -162,7 +170,7 @@ def _to_error(
 
 @contextmanager
 def _timed(run: RunSpec, tick: Tick) -> Generator[dict[str, Any]]:
-    """How the run is timed, as columns: alone on the machine, beside others, or on cores of its own."""
+    """Hold the timing lock that the run specifies (exclusive, shared, own cores), and yield its columns."""
     if run.timing != "shared":
         with (alone if run.timing == "exclusive" else beside)(tick):
             yield {}
@@ -180,7 +188,7 @@ def _second_pass(
     tick: Tick,
     positions: Path | None,
 ) -> dict[int, dict[str, Any]]:
-    """Simulate again with everything that is looked at: energies, convergence, recording, positions."""
+    """Repeat the simulation and observe energies, convergence, positions and the recording."""
     stored = np.empty((run.frames, len(scene.mesh.rest), 3)) if positions else None
     samples = FrameSamples(run.frames)
     with ExitStack() as cleanup:
@@ -221,8 +229,10 @@ def _second_pass(
 
 
 def _earliest(run: RunSpec, failed: dict[str, Any], own: Collection[Path]) -> dict[str, Any]:
-    """The row of a run that failed; where it diverged, that of the first frame in which it had. Timed passes see only
-    positions that are not finite, which may come later."""
+    """Return the row of a failed run; after divergence, that of the first diverged frame.
+
+    Timed passes detect only positions that are not finite, which may occur later.
+    """
     if failed["status"] != "diverged" or "frame" not in failed:
         return failed
     settings = replace(_settings(run), frames=failed["frame"] - 1)
@@ -246,7 +256,7 @@ def _earliest(run: RunSpec, failed: dict[str, Any], own: Collection[Path]) -> di
 
 
 def _record_until(run: RunSpec, files: Files, failed: dict[str, Any]) -> None:
-    """Record the frames before the one that failed, marked as what they are; nothing where they fail too."""
+    """Record the frames before the failed one and mark the recording; records nothing if they fail too."""
     facts = {"status": failed["status"], "reason": failed["reason"], "failed_frame": failed["frame"]}
     settings = replace(_settings(run), frames=failed["frame"] - 1)
     with ExitStack() as cleanup, suppress(Exception):  # what went wrong is told already
@@ -261,7 +271,7 @@ def _record_until(run: RunSpec, files: Files, failed: dict[str, Any]) -> None:
 
 
 def _own_files(run: RunSpec) -> frozenset[Path]:
-    """The files of the solver, whose lines are blamed first."""
+    """Return the source files of the solver, in which an error is located first."""
     try:
         return sources.of_class(solver_class(run))
     except Exception:  # it is somebody's own, and cannot be imported; that is the error
@@ -278,7 +288,7 @@ def _solver(run: RunSpec) -> Solver:
 
 @dataclass(frozen=True, slots=True)
 class _Motion:
-    """A run's scene and what else determines its motion; two of one key are the same."""
+    """Cache key: a run's scene and the other settings that determine its motion."""
 
     key: tuple[str | int, ...]
     run: RunSpec = field(compare=False)
@@ -293,7 +303,10 @@ def _judge(run: RunSpec, scene: Scene) -> Judge | None:
 
 @lru_cache(maxsize=1)
 def _reference(motion: _Motion) -> NDArray[np.float64] | None:
-    """The reference motion of a scene, whose runs come one after the other; None where Newton's method fails."""
+    """Return the reference motion of a scene; None where Newton's method fails.
+
+    One entry is cached, for the runs of a scene are consecutive.
+    """
     run = motion.run
     scene = build(run.scene, run.size, run.integrator)
     try:
@@ -303,7 +316,10 @@ def _reference(motion: _Motion) -> NDArray[np.float64] | None:
 
 
 def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any], *ends: Positions) -> RerunRecorder:
-    """facts: how the run ended, among the recording's properties; ends: positions by which its colours are scaled."""
+    """Open the recording of a run.
+
+    `outcome` is how the run ended, stored among the recording's properties. `final_positions` set the colour scale.
+    """
     files.recording.parent.mkdir(parents=True, exist_ok=True)
     here = machine.describe()
     properties = {
@@ -341,6 +357,6 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any]
 
 
 def save_positions(path: Path, positions: np.ndarray) -> None:
-    """Store positions (frames, n, 3) [m] under a partial name and rename. Raises CannotWrite."""
+    """Store positions (frames, n, 3) [m] in a partial file and rename it. Raises CannotWrite."""
     with replacing(path) as partial:
         np.savez_compressed(partial, positions=positions)

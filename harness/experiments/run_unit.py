@@ -1,4 +1,4 @@
-"""A run of a sweep as a unit of work, done here or on another machine's worker."""
+"""A run of a sweep as a unit of work, executed on this machine or by a remote worker."""
 
 from __future__ import annotations
 
@@ -20,8 +20,14 @@ from harness.experiments.provenance import common
 
 @dataclass(frozen=True, slots=True)
 class RunUnit:
-    """A run as a unit of a sweep (`harness.experiments.core.Unit`). positions: where to store those of its steps;
-    at_once: so many may be timed at once."""
+    """Run of a sweep as a unit (`harness.experiments.experiment_units.ExperimentUnit`).
+
+    Attributes:
+        run: specification of the run.
+        files: paths of its files.
+        positions_path: where to store the positions of all steps; None for not at all.
+        num_concurrent_runs: number of runs that may be timed concurrently.
+    """
 
     run: RunSpec
     files: Files
@@ -30,42 +36,42 @@ class RunUnit:
 
     @property
     def title(self) -> str:
-        """The run in words."""
+        """Title of the run, for messages."""
         return self.run.title
 
     @property
     def place(self) -> Path:
-        """See Filed."""
+        """File of the run's rows."""
         return self.files.rows
 
     @property
     def ticks(self) -> int:
-        """The steps of all passes."""
+        """Number of steps of all passes."""
         return self.run.frames * self.run.passes
 
     @property
     def effort(self) -> Effort:
-        """See Unit."""
+        """Estimated cost: vertices times steps times iterations."""
         return Effort(self.run.solver.name, (self.run.size or 32) ** 2 * self.ticks * self.run.iterations)
 
     @property
     def limits(self) -> Limits:
-        """What the sweep says; what the run writes is beside its rows."""
+        """Limits that the sweep sets; the log file lies in a folder next to that of the rows."""
         log = self.files.rows.parents[1] / "logs" / f"{self.files.rows.stem}.txt"
         return Limits(self.run.time_limit, self.run.memory_limit, log)
 
     @property
     def own(self) -> frozenset[Hashable]:
-        """The code of others that it runs."""
+        """Identity of the user code that the run executes."""
         return frozenset(tuple(plugin.identity()) for plugin in self.run.own())
 
     @property
     def group(self) -> Hashable:
-        """Runs that are judged by one reference."""
+        """Key of runs that are verified by one reference solution."""
         return (self.run.scene.digest, self.run.size, self.run.integrator) if self.run.judge else None
 
     def do(self, tick: Tick) -> str:
-        """See Unit."""
+        """Execute the run and return its outcome as text."""
         from harness.experiments.run import execute  # brings along all that simulates and records
 
         files = self.files.absolute()  # code of others may change the folder
@@ -73,12 +79,12 @@ class RunUnit:
         return _outcome(execute(self.run, files, tick, positions=positions, at_once=self.at_once))
 
     def lost(self, lost: Lost) -> str:
-        """See Unit."""
+        """Write the row of a run whose worker was lost, and return the outcome as text."""
         return _outcome(_abandoned(self.run, self.files, lost.status, str(lost)))
 
 
 def _abandoned(run: RunSpec, files: Files, status: str, reason: str) -> list[dict[str, Any]]:
-    """The rows of a run whose process gave no answer, written; what it left half written is removed."""
+    """Write and return the row of a lost run, and remove its partial files."""
     for earlier in (files.recording, files.picture):
         earlier.unlink(missing_ok=True)
         for half in half_written(earlier):

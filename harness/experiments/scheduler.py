@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# Dask and ruamel.yaml tell no types.
-"""Where a scheduler of Dask is: at an address, on this machine, or started by a batch system that a file describes."""
+# # Dask and ruamel.yaml have no type annotations.
+"""Provide a Dask scheduler: at an address, on this machine, or on a batch system that a file describes."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from harness.base.errors import InputError, Mistake
 from harness.base.interrupts import blocked
 
 PATIENCE = 10.0
-"""Seconds in which a scheduler has to answer, and to have a worker."""
+"""Time in which a scheduler must respond and have a worker [s]."""
 
 QUEUED = 60
-"""So many times PATIENCE the first job of a batch system may be queued."""
+"""Number of periods of CONNECT_TIMEOUT that the first job of a batch system may wait in the queue."""
 
 SILENCE = logging.CRITICAL
-"""What Dask says of workers that end is not for the user, who is told what became of runs."""
+"""Log level: Dask's messages about ended workers are suppressed, for the outcome of each run is reported."""
 
 
 @contextmanager
 def scheduler(on: str) -> Generator[Any]:
-    """An address as it stands, or the cluster that is started for as long. Raises InputError.
+    """Yield the given address, or a cluster that runs as long as the context. Raises InputError.
 
-    A cluster on this machine takes TLS connections alone, by a certificate that its processes hold in memory: whoever
-    connects to a scheduler has it run any code, and all users of the machine reach the loopback. Its HTTP servers ask
-    for no certificate, and serve no pages.
+    A local cluster accepts TLS connections only, with a certificate that its processes store in memory. Any client of a
+    scheduler can execute code, and the loopback interface is open to all users of the machine. The HTTP servers have no
+    authentication and therefore serve no pages.
     """
     kind, _, many = on.partition(":")
     if kind == "local":
@@ -64,7 +64,10 @@ def scheduler(on: str) -> Generator[Any]:
 
 
 def reach(address: str) -> None:
-    """Raise OSError or ValueError where nobody listens at an address: Dask's client would go on trying."""
+    """Raise OSError or ValueError if no server listens at an address.
+
+    Dask's client would retry without end.
+    """
     place = urlsplit(address)
     if not place.hostname or not place.port:
         raise ValueError("an address is like tcp://host:8786")
@@ -72,7 +75,10 @@ def reach(address: str) -> None:
 
 
 def _batch(path: Path) -> Any:
-    """The cluster that a file describes: `kind`, a class of dask-jobqueue less its Cluster, `jobs`, and its options."""
+    """Start the cluster that a file describes.
+
+    `kind` is a class name of dask-jobqueue without "Cluster", `jobs` the number of jobs; the rest are its options.
+    """
     try:
         options = dict(YAML(typ="safe").load(path.read_text()) or {})
         kind, jobs = str(options.pop("kind")), int(options.pop("jobs"))

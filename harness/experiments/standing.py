@@ -1,6 +1,6 @@
-"""How a run that was done stands: by what a second opinion says of its steps, where the run is judged.
+"""Verification status of a finished run: the result of the independent reference implementation.
 
-The opinion is about a scene and not about a solver, so it is asked once for all that are run on it.
+The result depends on the scene and not on the solver. It is therefore computed once for all runs of a scene.
 """
 
 from __future__ import annotations
@@ -18,14 +18,17 @@ SINGLE = "single opinion: the integrator comes from outside, and its formula is 
 
 @dataclass(frozen=True, slots=True)
 class _Formulas:
-    """A run's scene, and what else determines how its steps are stated; two of one key are the same."""
+    """Cache key: a run's scene and the other settings that determine the formulas of its steps."""
 
     key: tuple[str | int, ...]
     run: RunSpec = field(compare=False)
 
 
 def standing(run: RunSpec) -> dict[str, str]:
-    """The columns `status`, `second_opinion` and `reason` of a run that was done and judged, as far as it has them."""
+    """Return the columns `status`, `second_opinion` and `reason` of a finished run that is verified.
+
+    Columns that do not apply are left out.
+    """
     if isinstance(run.integrator, Plugin):
         return {"status": "ok", "second_opinion": SINGLE}
     said = opinion(_Formulas((run.scene.digest, run.size, run.integrator), run))
@@ -36,6 +39,6 @@ def standing(run: RunSpec) -> dict[str, str]:
 
 @lru_cache(maxsize=32)
 def opinion(formulas: _Formulas) -> str:
-    """The second opinion of a run's scene, at its size and with its integrator."""
+    """Return the verification result for a run's scene, at its size and with its integrator."""
     run = formulas.run
     return second_opinion(run.scene, build(run.scene, run.size, run.integrator), run.integrator)

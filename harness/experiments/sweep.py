@@ -1,4 +1,4 @@
-"""Sweeps: does the runs that are missing, and only those, then draws what compares them."""
+"""Execute the missing runs of a sweep, then draw the pictures that compare them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
 
 _FEW = 100
-"""Up to so many runs the start of what draws counts, and their rows are not too long to hand over."""
+"""Largest number of runs for which the start-up time of the drawing code matters and the rows are small enough to send.
+"""
 
 
 def _away(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> AbstractContextManager[Cluster]:
@@ -54,13 +55,25 @@ def run_sweep(
     on: str | None = None,
     meanwhile: Callable[[], object] = int,
 ) -> pa.Table:
-    """Do what is missing of a sweep, all of it with `again` or `positions`, with `changed` also what was done by other
-    code than today's, and return all its rows.
+    """Execute the missing runs of a sweep, draw its pictures and return all rows.
 
-    say: prints a remark; positions: where to store the positions of the sweep's only run; isolated: whether runs are
-    done in processes that may die, within their limits, or in this one; at_once: in how many, by the cores if left out;
-    on: where else to do them (`harness.experiments.cluster`); meanwhile: done while another process draws. Raises
-    InputError, RunFailed where that process is lost.
+    Args:
+        name: name of the sweep.
+        runs: its runs.
+        folder: its folder in the results.
+        display: shows progress.
+        print_message: prints a remark.
+        rerun: whether to repeat all runs; `positions` implies it.
+        rerun_stale: whether to repeat runs whose rows come from other source code.
+        positions: where to store the positions of the sweep's only run.
+        isolated: whether runs are executed in worker processes with limits, or in this process.
+        num_workers: number of worker processes; chosen by cores and memory if left out.
+        scheduler_address: where else to execute the runs (`harness.experiments.dask_cluster`).
+        background_call: called while another process draws.
+
+    Raises:
+        InputError: the options contradict each other, or the input is invalid.
+        RunFailed: the drawing process was lost.
     """
     if on and (positions or not isolated):
         raise InputError("--positions and --here are of this machine; leave --on out")
@@ -115,14 +128,14 @@ def run_sweep(
 
 
 def _ready_to_draw() -> None:
-    """In the process that draws a sweep of few runs: load what does while the runs are done, in a second or two."""
+    """In the process that draws a small sweep: load the drawing code during the runs, in 1 to 2 s."""
     from harness.report.sweep import get_ready
 
     get_ready()
 
 
 def failures(table: pa.Table) -> list[str]:
-    """Scene, size, solver, status and reason of the runs that failed."""
+    """Return a line for each failed run: scene, size, solver, status and reason."""
     ended = table.select(["scene", "size", "solver", "status", "reason"]).to_pylist()
     failed = [row for row in ended if row["status"] != "ok"]
     lines = [f"{r['scene']} {r['size']} {r['solver']}: {r['status']}: {r['reason']}" for r in failed]

@@ -1,1 +1,1 @@
-"""Any error that is asked for: ways to keep to it, their choice, and what is told of it."""
+"""Error control: methods that meet a requested error, the choice among them, and its verification."""

@@ -1,4 +1,4 @@
-"""`springbench run SCENE --error 1e-3`: the scene simulated to an error, its row, its recording and its picture."""
+"""Run `springbench run SCENE --error 1e-3`: simulate a scene to an error, and write row and recording."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from solvers.problem import Positions
 
 Say = Callable[[str], None]
 _SHARED = ("sweep", "scene", "size", "vertices", "threads", "horizon", "asked")
-"""Columns that the rows of peers have too."""
+"""Columns that the rows of third-party integrators share."""
 
 
 def run_to_error(
@@ -49,12 +49,26 @@ def run_to_error(
     again: bool = False,
     others: Mapping[str, Any] | None = None,
 ) -> bool:
-    """Simulate the scene in a file to a relative error at a horizon [s], and say what it took.
+    """Simulate the scene in a file to a relative error, and print the cost.
 
-    sizes: of the mesh, one at most; check: whether the reference grades it; peers: whether theirs are timed as well;
-    positions: where to store those of the frames; again: whether all ways are tried, also those that rows measured
-    before tell to be dear; others: options that were given besides, which are refused. Returns whether what was checked
-    holds. Raises InputError, RunFailed.
+    Args:
+        config: file of the scene.
+        error: relative error at t_end.
+        results: folder of results.
+        print_message: prints a remark.
+        t_end: simulated time [s]; that of the scene if None.
+        sizes: mesh sizes, at most one.
+        verify: whether to compare with the reference solution.
+        compare_third_party: whether to time third-party integrators too.
+        positions: where to store the positions of the frames; None for not at all.
+        rerun: whether to try all methods, even those that were expensive according to stored rows.
+        rejected_options: other options on the command line, which are not supported here.
+
+    Returns: whether the verification passes; True without verification.
+
+    Raises:
+        InputError: an option is invalid.
+        RunFailed: no method reaches the error.
     """
     _require(error, horizon, {**(others or {}), "second --size": sizes[1:]})
     scene = load_scene(config)
@@ -105,7 +119,7 @@ def _done(
 
 
 def _searched(asked: Asked, error: float, seen: Growth, before: Sequence[Row], say: Say) -> Answer:
-    """The cheapest way, among those first that were not dear to an error about as large. Raises RunFailed."""
+    """Search the cheapest method, first among those that were cheap for a similar error. Raises RunFailed."""
     nearest, pairs = promising(before, error)
     if not pairs:
         return search(asked, error, seen, say)
@@ -119,7 +133,7 @@ def _searched(asked: Asked, error: float, seen: Growth, before: Sequence[Row], s
 
 
 def _checked(asked: Asked, error: float, p: Positions, results: Path, say: Say) -> float | None:
-    """The error of the end p (n, 3) [m] by the reference, told; None where that cannot grade it."""
+    """Print and return the error of positions p (n, 3) [m] against the reference; None if there is none."""
     try:
         trajectory = references(results).trajectory(asked.scene, asked.size, [asked.horizon], error=error)
     except RunFailed as failed:
@@ -131,7 +145,7 @@ def _checked(asked: Asked, error: float, p: Positions, results: Path, say: Say) 
 
 
 def _require(error: float, horizon: float | None, others: Mapping[str, Any]) -> None:
-    """Raise InputError for what cannot be asked."""
+    """Raise InputError for invalid options."""
     mistakes = [
         Mistake("with --error, solver and steps are chosen; leave it out", key=f"--{name.replace('_', '-')}")
         for name, value in others.items()
@@ -174,7 +188,7 @@ def _row(name: str, asked: Asked, error: float, answer: Answer) -> dict[str, Any
 
 
 def _beside(row: dict[str, Any], asked: Asked, error: float, answer: Answer, say: Say) -> list[dict[str, Any]]:
-    """The peers' rows, each of which is told with its time beside ours."""
+    """Build the rows of third-party integrators, and print the time of each relative to the search result."""
     shared = {name: row[name] for name in _SHARED} | provenance()
     found = list[dict[str, Any]]()
     say("beside it, on the same machine in the same process, to the same error:")
@@ -191,7 +205,7 @@ def _beside(row: dict[str, Any], asked: Asked, error: float, answer: Answer, say
 
 
 def _record(path: Path, name: str, asked: Asked, answer: Answer) -> Path:
-    """The recording of the motion at its frames, and of what was asked."""
+    """Write the recording of the motion at its frames, with the requested error among its properties."""
     scene, best, here = asked.bound(asked.frame, "own"), answer.best, machine.describe()
     properties = {"scene": name, "size": asked.size, "solver": best.way.solver, "integrator": best.way.integrator}
     info = RecordingInfo(

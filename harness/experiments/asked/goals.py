@@ -1,8 +1,8 @@
-"""Time for the same error, side by side: the cheapest way that is known now, and what it is held against.
+"""Measure performance targets: the time of the cheapest method for an error, against a baseline.
 
-Both take turns in one process on one core, told by processor time, preparing included: its least of some rounds. A goal
-that is `graded` has errors by the reference; the way's own may be twice the one asked at the most, and smaller than a
-third of it only where longer steps would be unstable.
+Both are timed in one process on one core, interleaved. The smallest CPU time of several rounds counts, including
+preparation. If a target is `graded`, its errors are computed from the reference solution. The method's error may then
+be at most twice the requested one. It may be below a third of it only where longer steps would be unstable.
 """
 
 from __future__ import annotations
@@ -21,16 +21,30 @@ from harness.reference.store import Store
 from solvers.problem import NotPositiveDefinite, Unsupported
 
 ROUNDS, MOST_ROUNDS, LONG = 3, 15, 0.5
-"""Rounds at the least, and at the most, where the way's own are over sooner than after so many processor seconds."""
+"""Smallest and largest number of rounds; rounds above the minimum end at this total CPU time of the method [s]."""
 MOST = 2.0
-"""Times the error asked, what one may be."""
+"""Largest accepted ratio of the error to the requested one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Met:
-    """A goal as it was found: way and other in words, their errors and processor seconds; error: of the way by the
-    reference, None where it does not grade; note: why it is far more exact than was asked; bound: whether the other
-    would take longer than its seconds; reason: why there is nothing."""
+    """Measured result of a performance target.
+
+    Attributes:
+        target: the performance target.
+        size: size of the mesh.
+        vertices: number of vertices.
+        method: name of the cheapest method.
+        error_estimated: its estimated error.
+        seconds: its CPU time [s].
+        baseline: name of the baseline.
+        baseline_error: error of the baseline.
+        baseline_seconds: CPU time of the baseline [s].
+        is_lower_bound: whether the baseline would take longer than baseline_seconds.
+        error: error of the method against the reference solution; None where the target is not graded.
+        note: why the method is much more accurate than requested; empty otherwise.
+        reason: why there is no result; empty if there is one.
+    """
 
     asked: OneGoal
     size: int
@@ -48,24 +62,30 @@ class Met:
 
     @property
     def ratio(self) -> float:
-        """Of its processor time to the other's, at the most."""
+        """CPU time of the method divided by that of the baseline; an upper bound if `is_lower_bound`."""
         return self.seconds / self.other_seconds
 
     @property
     def as_asked(self) -> bool:
-        """Whether the error, where the reference grades it, is about the one asked."""
+        """Whether the error against the reference solution, if known, is close to the requested one."""
         if self.error is None:
             return True
         return self.error <= MOST * self.asked.error and (self.error >= WIDE * self.asked.error or bool(self.note))
 
     @property
     def holds(self) -> bool:
-        """Whether no more than the part that was wanted is needed, for the error asked."""
+        """Whether the error is as requested and the time ratio at most the target ratio."""
         return not self.reason and self.as_asked and self.ratio <= self.asked.goal.wanted
 
 
 def met(goals: Goals, store: Store, say: Callable[[str], None]) -> Iterator[Met]:
-    """Each goal in turn; what cannot be measured is told by its reason. store: of references."""
+    """Measure the targets one after the other; a failure is reported as `reason`.
+
+    Args:
+        targets: the performance targets.
+        reference_store: store of the reference solutions.
+        print_message: prints a remark.
+    """
     for one in goals.goals:
         say(f"{one.scene} {one.size or ''} to {one.error:g} after {one.goal.horizon:g} s:")
         asked = None
@@ -93,7 +113,7 @@ def _met(one: OneGoal, asked: Asked, store: Store, say: Callable[[str], None]) -
 
 
 def _in_turns(best: Found, other: Held) -> tuple[float, float]:
-    """The least processor seconds of both."""
+    """Return the smallest CPU seconds of the method and of the baseline, timed interleaved."""
     ours, its = list[float](), [other.seconds]
     while len(ours) < ROUNDS or (sum(ours) < LONG and len(ours) < MOST_ROUNDS):
         ours.append(_timed(best.again))

@@ -1,4 +1,4 @@
-"""`springbench goals`: time for the same error, beside what was there before."""
+"""Command `springbench goals`: compare the time to an error with a baseline."""
 
 from __future__ import annotations
 
@@ -68,6 +68,6 @@ def goals(
 
 
 def _part(ratio: float, *, at_most: bool = False) -> str:
-    """Of a cost, in words."""
+    """Format a ratio of costs."""
     told = f"1/{1 / ratio:.3g}" if ratio < 1.0 else f"{ratio:.3g}"
     return f"at most {told}" if at_most else told

@@ -1,9 +1,9 @@
-"""What can be had where no error can be promised: how far a motion still moves when its steps are halved.
+"""Estimate the time-stepping error by halving the step (step doubling), where error control is not possible.
 
     |p_h(T) - p_(h/2)(T)| / |p_(h/2)(T) - p(0)|,    Frobenius norms over the free vertices
 
-by implicit Euler with converged steps, of order 1 as all methods are where contact begins and ends: the error that is
-left is about as large.
+with implicit Euler and converged steps. Its order is 1, as that of all methods is where contact starts and ends.
+Therefore the remaining error is about as large as this change.
 """
 
 from __future__ import annotations
@@ -25,8 +25,12 @@ _SOLVED = StopRule(50, 1e-6)
 
 @dataclass(frozen=True, slots=True)
 class Halved:
-    """The last step that was halved [s], and how far the end moved by that, relative to the motion; None for neither
-    within the time allowed."""
+    """Step-doubling estimate.
+
+    Attributes:
+        time_step: last step size that was halved [s].
+        relative_change: change of the end positions by that, relative to the displacement; None if time ran out first.
+    """
 
     step: float
     moved: float | None
@@ -38,9 +42,14 @@ class Halved:
 
 
 def halved(bound: Callable[[float, str], Scene], horizon: float, frames: int, *, seconds: float) -> Halved:
-    """Halve the steps of a motion, frames of which make the horizon [s], for about so many wall seconds.
+    """Halve the step size repeatedly, within a budget of wall time, and return the last change.
 
-    bound: the scene with steps of a length [s] and an integrator by name."""
+    Args:
+        build_scene: returns the scene for a time step [s] and an integrator by name.
+        t_end: simulated time [s].
+        frames: number of steps to start with.
+        time_budget: wall time [s].
+    """
     _end(bound(horizon / frames, "implicit-euler"), 1, inf)  # compiles
     began, before, found = perf_counter(), None, Halved(horizon / frames, None)
     while True:
@@ -56,7 +65,7 @@ def halved(bound: Callable[[float, str], Scene], horizon: float, frames: int, *,
 
 
 def _end(scene: Scene, frames: int, until: float) -> Positions | None:
-    """Where the motion ends; None where the clock passed a time."""
+    """Return the positions at the end of the motion; None after the deadline."""
     for step in simulate(scene, prepare(scene, Newton()), _SOLVED, first_guess="current", frames=frames):
         if perf_counter() > until:
             return None

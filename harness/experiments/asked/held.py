@@ -1,7 +1,8 @@
-"""What goals are held against: a peer, or the cheapest steps of one length that keep to an error, known in hindsight.
+"""Baselines of performance targets: a third-party integrator, or the cheapest fixed step size for the same error.
 
-Steps are shortened by the square root of two until their end errs by no more than was asked, for each integrator,
-solver and tolerance. Where none of them gets there within `LONGEST`, what they cost at the least is told.
+Step sizes are divided by sqrt(2) until the error at the end is at most the requested one, for each integrator, solver
+and tolerance. The best combination is thus known in hindsight. Where none reaches the error within
+`MAX_SIMULATION_SECONDS`, the baseline is a lower bound of the cost.
 """
 
 from __future__ import annotations
@@ -25,20 +26,27 @@ from solvers.problem import NotPositiveDefinite, Positions, Solver, Unsupported
 from solvers.registry import EVERY, about, load
 
 LONGEST = 20.0
-"""Processor seconds that one simulation may take."""
+"""CPU time limit of one simulation [s]."""
 _SHORTENED = 40
-"""Times that steps are shortened by the square root of two, a million times in all: before that time is over."""
+"""Largest number of divisions of the step size by sqrt(2), by a factor of 10^6 in total; the time limit comes first."""
 _PATIENCE = 1.5
-"""Times the cheapest so far, what another may take."""
+"""Time limit of a combination as a multiple of the cheapest time so far."""
 
 Error = Callable[[Positions], float]
-"""The relative error of the end (n, 3) [m] of a motion."""
+"""Function that returns the relative error of end positions (n, 3) [m]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """What a goal is held against: its name, its error, its processor seconds; bound: whether it does not keep to the
-    error, and would take longer; again: does it once more, and returns the seconds."""
+    """Baseline of a performance target.
+
+    Attributes:
+        name: name of the baseline.
+        error: its relative error.
+        seconds: its CPU time [s].
+        is_lower_bound: whether it misses the error, so that reaching it would take longer.
+        rerun_timed: repeats the simulation and returns its CPU seconds; None where that is not possible.
+    """
 
     name: str
     error: float
@@ -49,7 +57,7 @@ class Held:
 
 @dataclass(frozen=True, slots=True)
 class _Fixed:
-    """Steps of one length."""
+    """Simulation with a fixed step size."""
 
     integrator: str
     solver: str
@@ -62,7 +70,18 @@ class _Fixed:
 
 
 def held(one: OneGoal, asked: Asked, answer: Answer, error: Error, say: Callable[[str], None]) -> Held:
-    """What a goal names, done. Raises RunFailed where nothing of it can be done."""
+    """Measure the baseline of a performance target.
+
+    Args:
+        performance_target: the target.
+        error_target: the scene and its end time.
+        search_result: result of the method search.
+        error: returns the error of end positions.
+        print_message: prints a remark.
+
+    Raises:
+        RunFailed: no baseline can be measured.
+    """
     return _peer(one, asked, answer) if one.goal.peer else _steps(one, asked, error, say)
 
 
@@ -74,7 +93,7 @@ def _peer(one: OneGoal, asked: Asked, answer: Answer) -> Held:
 
 
 def _steps(one: OneGoal, asked: Asked, error: Error, say: Callable[[str], None]) -> Held:
-    """The cheapest of steps of one length that keep to the error, or the least that all cost more than."""
+    """Return the cheapest fixed step size that meets the error, or the smallest lower bound of the cost."""
     best, again, bounds = Held("", inf, inf), None, list[Held]()
     for integrator, solver, tolerance in _choices(one.goal):
         limit = min(LONGEST, _PATIENCE * best.seconds)
@@ -108,8 +127,10 @@ def _steps(one: OneGoal, asked: Asked, error: Error, say: Callable[[str], None])
 
 
 def _choices(goal: Goal) -> list[tuple[str, str, float | None]]:
-    """Integrators, solvers and tolerances that go together: solvers with steps of their own come first, once, as `own`;
-    they are the quickest to try."""
+    """Return the combinations of integrators, solvers and tolerances.
+
+    Solvers with their own integrator come first, since they are the quickest to run; they are listed once, as `own`.
+    """
     alone = {name: about(load(EVERY[name]), name).own_steps for name in goal.solver}
     every = goal.integrator or ()
     own = [("own", solver, None) for solver in goal.solver if alone[solver] and "own" in every]
@@ -119,14 +140,14 @@ def _choices(goal: Goal) -> list[tuple[str, str, float | None]]:
 
 
 def _bound(fixed: _Fixed, found: Held, nearest: Held | None) -> Held:
-    """Of steps that were still too long when their time was over."""
+    """Build the lower bound from steps that were still too long at the time limit."""
     reached = f"; {nearest.name} err by {nearest.error:.2g}" if nearest else ""
     name = f"{fixed}, given up after {found.seconds:.3g} s{reached}"
     return Held(name, nearest.error if nearest else inf, found.seconds, bound=True)
 
 
 def _run(asked: Asked, error: Error, fixed: _Fixed, limit: float) -> Held:
-    """A simulation, which ends early beyond a limit [s]."""
+    """Simulate with a fixed step size; the simulation ends early beyond a time limit [s]."""
     scene = asked.bound(asked.horizon / fixed.frames, fixed.integrator)
     made: Solver = load(EVERY[fixed.solver])()
     guess = asked.scene.guess(fixed.integrator)

@@ -1,4 +1,4 @@
-"""A run of a sweep that keeps to an error of its end (`accuracy`): its solver is the one stated, the rest is chosen."""
+"""Error-controlled run of a sweep (`accuracy`): the solver is given; integrator and step size are chosen."""
 
 from __future__ import annotations
 
@@ -22,7 +22,15 @@ from solvers.problem import Positions
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kept:
-    """scene: bound with the frame as its step; answer: how the error is kept; rounds: the same motion, timed again."""
+    """Result of an error-controlled run.
+
+    Attributes:
+        scene: the scene, built with the frame as its time step.
+        search_result: method, setting and error estimate.
+        error_requested: requested relative error.
+        timed_trajectories: the same motion, timed again in each round.
+        messages: remarks, stored in the rows.
+    """
 
     scene: Scene
     answer: Answer
@@ -32,16 +40,16 @@ class Kept:
 
     @property
     def positions(self) -> Positions:
-        """At the start and after each frame, (frames + 1, n, 3) [m]."""
+        """Positions at the start and after each frame, (frames + 1, n, 3) [m]."""
         return self.rounds[0].positions
 
     @property
     def ms_per_step(self) -> float:
-        """The run's ms a step, each frame being a step."""
+        """Time per step [ms], where each frame counts as one step."""
         return ms_per_step([seconds for path in self.rounds for seconds in path.frames])
 
     def rows(self) -> list[dict[str, Any]]:
-        """A row for each frame of each round."""
+        """Build a row for each frame of each round."""
         best, scene = self.answer.best, self.scene
         shared = {
             "phase": "step",
@@ -71,8 +79,17 @@ class Kept:
 
 
 def keep_to_error(run: RunSpec, error: float, tick: Tick) -> Kept:
-    """The cheapest way of the run's solver, done as often as the run has rounds. Raises RunFailed, Unsupported and what
-    the solver raises; RunFailed where a round ends elsewhere, to the last bit."""
+    """Find the cheapest method of the run's solver, and repeat it for all rounds of the run.
+
+    Args:
+        run: specification of the run.
+        error: relative error at the end of the run.
+        tick: called with the name of the phase as the run progresses.
+
+    Raises:
+        RunFailed: no setting reaches the error, or a round ends at positions that are not bitwise identical.
+        Unsupported: the solver does not support error control. Errors of the solver are raised unchanged.
+    """
     pairs = tried_by(run.solver)
     asked = Asked.of(run.scene, run.size, run.frames * run.scene.time_step)
     said = list[str]()

@@ -1,7 +1,7 @@
-"""What rows measured before say of a scene: which ways to an error are worth trying again.
+"""Read the trials of earlier searches on a scene, to select the methods that are worth running again.
 
-A row of the kind `way` tells what a way `promised` when an error was asked for, the processor seconds that it would
-take to it. For an error that is not far from that one, ways that promised several times the least are left out.
+A row of the kind `way` states in the column `promised` the CPU seconds predicted for the requested error. For a similar
+error, methods whose predicted cost was several times the smallest are left out.
 """
 
 from __future__ import annotations
@@ -20,18 +20,20 @@ from harness.experiments.asked.ways import Asked, tried
 Row = dict[str, Any]
 
 _FAR = 10.0
-"""Times an error, or a part of it: what was promised for others says little."""
+"""Largest ratio of two errors for which a stored prediction is used; for others it has little value."""
 _DEAR = 2.0
-"""Times the least promise, what a way that is tried again may have promised: promises are no better than that."""
+"""Largest ratio to the smallest predicted cost of a method that is run again; predictions are no more accurate than
+that.
+"""
 
 
 def problem(asked: Asked) -> str:
-    """What is simulated, its frames included, in a word."""
+    """Return an identifier of the simulated problem, including its frames."""
     return f"{asked.scene.stepped(1.0).digest[:12]}-{asked.size}-{asked.horizon:.9g}-{asked.frames}"
 
 
 def known(folder: Path, asked: Asked) -> list[Row]:
-    """The rows of ways to errors of this motion, which this code left on this machine in a folder of rows."""
+    """Return the rows of trials of this motion, from the same source code and machine, in a folder of rows."""
     here = {"problem": problem(asked), "machine": machine.describe().id, "code": machine.code_hash()}
     units = [unit for unit in shelf.units(folder) if "-asked-" in unit.name]
     found = rows.read(units, SCHEMA).to_pylist() if units else []
@@ -39,8 +41,14 @@ def known(folder: Path, asked: Asked) -> list[Row]:
 
 
 def promising(found: Sequence[Row], error: float) -> tuple[float, list[tuple[str, SolverSpec]]]:
-    """The error that was asked for nearest to this one, and the integrators and solvers that were not dear to it; none
-    where nothing near was asked for."""
+    """Return the stored requested error nearest to `error`, and the methods that were cheap at it.
+
+    Args:
+        stored_trials: rows of earlier trials.
+        error: relative error to reach.
+
+    Returns: the nearest error, and integrators with solvers; none where no stored error is similar.
+    """
     nearest = min((row["asked"] for row in found), key=lambda asked: abs(log(asked / error)), default=0.0)
     if not error / _FAR <= nearest <= error * _FAR:
         return nearest, []
@@ -51,7 +59,13 @@ def promising(found: Sequence[Row], error: float) -> tuple[float, list[tuple[str
 
 
 def way_rows(answer: Answer, found: Iterable[Row], error: float) -> list[Row]:
-    """Rows of the ways that were tried, by their first settings, and those found of the same error that were not."""
+    """Build the rows of the first trials of a search, and add stored trials of the same error.
+
+    Args:
+        search_result: result of the search.
+        stored_trials: rows of earlier trials; methods that were run again are left out.
+        error: requested error.
+    """
     made = [
         {
             "kind": "way",

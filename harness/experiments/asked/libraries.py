@@ -1,6 +1,6 @@
-"""Integrators of other libraries, each at a tolerance: SciPy's, and CVODE of SUNDIALS where it is installed.
+"""Third-party integrators with error control: those of SciPy, and CVODE of SUNDIALS if it is installed.
 
-Radau, BDF and CVODE's BDF know which entries of the Jacobian are zero; CVODE's Adams solves by GMRES without it.
+Radau, BDF and CVODE's BDF use the sparsity of the Jacobian; CVODE's Adams method uses matrix-free GMRES.
 """
 
 from __future__ import annotations
@@ -21,12 +21,20 @@ from harness.scenes.bind import Scene
 from solvers.problem import Start, is_lagged
 
 _STEPS = 10**8
-"""CVODE may take: the clock ends it."""
+"""Largest number of steps of CVODE; in practice the time limit ends it first."""
 
 
 class InitialValueProblem(NamedTuple):
-    """What is integrated: the field F of y' = F(t, y), the scene that it is of, up to a time [s]; the relative
-    tolerance of y, and the absolute one [m, m/s]."""
+    """Initial value problem y' = F(t, y), y = (positions, velocities).
+
+    Attributes:
+        vector_field: the function F.
+        initial_state: y at time 0.
+        scene: scene that the equations belong to.
+        t_end: end time [s].
+        rtol: relative tolerance of y.
+        atol: absolute tolerance of y [m, m/s].
+    """
 
     field: Callable[[float, State], State]
     start: State
@@ -38,9 +46,15 @@ class InitialValueProblem(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Library:
-    """An integrator of somebody else's. order: about that of its error; end: where a motion ends, which raises
-    RunFailed; compiled: whether forces are; module: what it needs, and extra: what installs that, empty for what is
-    always there."""
+    """Integrator of another library.
+
+    Attributes:
+        order: approximate order of its error.
+        integrate_to_end: returns the state at t_end; raises RunFailed.
+        uses_compiled_forces: whether the forces are compiled.
+        module: module that it needs; empty if it is always installed.
+        pip_extra: extra that installs the module.
+    """
 
     order: int
     end: Callable[[InitialValueProblem], State]
@@ -50,7 +64,7 @@ class Library:
 
     @property
     def missing(self) -> str:
-        """Which command installs it, if it is not there."""
+        """How to install the module if it is missing; empty otherwise."""
         if not self.module or find_spec(self.module):
             return ""
         return f"is not installed; `.venv/bin/pip install -e '.[{self.extra}]'` in the checkout installs it"
@@ -99,11 +113,11 @@ LIBRARIES = {
     "cvode-adams": Library(5, _cvode("Adams"), **_SUNDIALS),
     "cvode-bdf": Library(3, _cvode("BDF"), **_SUNDIALS),
 }
-"""By the names of their rows."""
+"""Third-party integrators by the names of their rows."""
 
 
 def pattern(scene: Scene) -> csr_array:
-    """Which entries of F's Jacobian may differ from zero, (6 f, 6 f): 1 where they may."""
+    """Return the sparsity pattern of F's Jacobian, (6 f, 6 f): 1 where an entry may differ from zero."""
     system, p = scene.system, scene.mesh.rest
     begun = Start(p, np.zeros_like(p), 0.0, p, system.rate, 0.0)
     n = 3 * system.vertices

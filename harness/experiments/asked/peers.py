@@ -1,7 +1,8 @@
-"""What others offer for the same question: other libraries' integrators on the equations of motion, at the error asked.
+"""Compare with third-party integrators on the equations of motion, at the same error.
 
-Forces are compiled, as ours are; once, as whoever calls SciPy first would have them, in NumPy. A peer's tolerance is
-moved until its error, told by the same closer motion as ours, is the one asked.
+Forces are compiled, as for the methods of this package. One SciPy integrator runs with NumPy forces too, which is
+typical of a first implementation. The tolerance of each integrator is changed until its error matches the target. The
+errors are estimated from the same reference trial.
 """
 
 from __future__ import annotations
@@ -20,15 +21,23 @@ from harness.scenes.bind import Scene
 from harness.simulation.controlled import TooSlow
 
 MOST = 5.0
-"""Seconds of processor time that a peer may take for one motion."""
+"""CPU time limit of an integrator for one motion [s]."""
 _TRIES, _NEAR = 5, 0.2
-"""Tolerances tried for a peer, and the part of the error asked that is near enough to it."""
+"""Largest number of tolerances per integrator; fraction of the target error that ends the adjustment."""
 
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """A peer's name, its estimated relative error, its wall seconds, how many times as much processor time it took as
-    the answer, preparing included; and why there is nothing to tell."""
+    """Result of a third-party integrator.
+
+    Attributes:
+        name: name of the integrator.
+        error_estimated: estimated relative error.
+        wall_seconds: wall time [s].
+        cpu_time_ratio: CPU time divided by that of the search result, both including preparation.
+        reason: why there is no result; empty if there is one.
+        cpu_seconds: CPU time [s].
+    """
 
     name: str
     estimated: float
@@ -36,12 +45,21 @@ class Peer:
     ratio: float
     reason: str = ""
     processor: float = inf
-    """Seconds of processor time."""
+    """CPU time [s]."""
 
 
 def peers(asked: Asked, error: float, answer: Answer, names: Iterable[str] = LIBRARIES) -> Iterator[Peer]:
-    """These one after the other; what one cannot do is told by its reason. Raises Unintegrable where the scene has no
-    equations of motion."""
+    """Measure third-party integrators one after the other; a failure is reported as `reason`.
+
+    Args:
+        error_target: the scene and its end time.
+        error: relative error to reach.
+        search_result: result to compare with.
+        names: integrators in THIRD_PARTY_INTEGRATORS.
+
+    Raises:
+        Unintegrable: the scene has no equations of motion.
+    """
     scene = asked.bound(asked.frame, "newmark")
     fields = {compiled: Field(scene, compiled=compiled) for compiled in (True, False)}
     fields[True].witness()  # compiles
@@ -53,7 +71,7 @@ def peers(asked: Asked, error: float, answer: Answer, names: Iterable[str] = LIB
 
 @dataclass(frozen=True, eq=False)
 class _Beside:
-    """ours: processor seconds of the answer."""
+    """Comparison of one search result; `own_cpu_seconds` is the CPU time of its best trial."""
 
     asked: Asked
     error: float
@@ -63,7 +81,10 @@ class _Beside:
     ours: float
 
     def peer(self, name: str) -> Peer:
-        """The first tolerance that keeps to the error and is not far more exact, or the cheapest of those tried."""
+        """Measure one integrator: adjust its tolerance until its error is below the target, but not far below.
+
+        Where no tolerance does both, the cheapest one that meets the error counts.
+        """
         order, tolerance = LIBRARIES[name].order, 0.2 * self.answer.tolerance
         if missing := LIBRARIES[name].missing:
             return Peer(name, inf, inf, inf, missing)
@@ -81,7 +102,7 @@ class _Beside:
         return found
 
     def _tried(self, name: str, tolerance: float) -> Peer:
-        """With one tolerance [m]."""
+        """Integrate at one tolerance [m]."""
         library, free, size = LIBRARIES[name], self.scene.system.free, self.scene.mesh.size or 1.0
         field = self.fields[library.compiled]
         began, cpu = perf_counter(), thread_time()
@@ -101,7 +122,7 @@ class _Beside:
 
 
 def _limited(field: Field, until: float) -> Callable[[float, State], State]:
-    """The field, which raises TooSlow from a time of the processor's clock on."""
+    """Return the vector field with a check that raises TooSlow after a deadline [s of CPU time]."""
 
     def rate(t: float, y: State) -> State:
         if thread_time() > until:

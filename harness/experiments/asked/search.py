@@ -1,10 +1,10 @@
-"""The cheapest way to an error: all ways are run, the best one's setting is moved until its error is the one asked.
+"""Find the cheapest method for an error: run all methods, then tune the setting of the best one.
 
-    estimate = |p(T) - q(T)| / |q(T) - p(0)|,    q the same motion to a much smaller error
+    estimate = |p(T) - q(T)| / |q(T) - p(0)|,    q: reference trial of a much smaller error
 
-in Frobenius norms over the vertices that are not pinned, as errors are told everywhere. How the cost of a way grows
-with its error is known from its order: a step is in proportion to error^(1/order). The order is measured where two
-settings were tried, for a scene may lower it. Ways are compared by processor seconds, preparing included.
+in Frobenius norms over the free vertices. The cost of a method depends on its error through its order: the step size is
+proportional to error^(1/order). The order is measured where two settings were run, for a scene may reduce it. Methods
+are compared by CPU seconds, including preparation.
 """
 
 from __future__ import annotations
@@ -26,34 +26,47 @@ from harness.simulation.controlled import Path, Stuck, TooSlow
 from solvers.problem import Positions
 
 AIM = 0.65
-"""Of the error asked, what a setting is chosen for: estimates scatter."""
+"""Fraction of the target error at which a setting aims, because estimates scatter."""
 _AIM_EVEN = 0.85
-"""Where steps have one length, and the error falls by their order."""
+"""The same fraction for fixed step sizes, whose error follows their order."""
 WIDE = 1 / 3
-"""An error below this part of the one asked was bought for too much, if a cheaper way is stable; DOUBT times as much,
-where it is estimated."""
+"""Smallest fraction of the target error that is accepted if a cheaper setting is stable.
+
+Estimated errors are compared with ESTIMATE_SAFETY times this fraction.
+"""
 CLOSER = 1 / 50
-"""Of a step's error, that of the motion that errors are estimated by."""
+"""Local error of the reference trial, as a fraction of that of the trial."""
 DOUBT = 1.25
-"""What an estimate is multiplied by: the closer motion errs too, by a tenth of it, and by a sixth where stability rules
-the steps and its own are hardly shorter."""
+"""Safety factor on error estimates, because the reference trial has an error too.
+
+That error is a tenth of the estimate. It is a sixth where stability limits the step size, so that the reference trial
+has hardly shorter steps.
+"""
 _FINER = 10.0
-"""Times as exact, by the order and the number of steps, at which a motion counts as closer."""
+"""Factor of accuracy, by order and number of steps, above which a trial may serve as reference."""
 _MOVES, _STALLS, _CLOSINGS = 6, 2, 3
 _SHORT = 0.05
-"""Processor seconds below which a way is run twice, and the lesser time counts."""
+"""CPU time below which a trial is run twice, and the smaller time counts [s]."""
 _AT_FIRST, _PATIENCE = 1.0, 4.0
-"""Processor seconds that a way may take, so many times as many if none ends within them, or as the cheapest takes."""
+"""First time limit of a method [s of CPU time]; factor on the limit if no method finishes, and on the cheapest time."""
 _DEAR = 2.0
-"""Times what the next way promises, what one may take before that one is tried instead."""
+"""Factor on the predicted cost of the next method, above which that method is tried first."""
 _LEAST_ORDER = 0.5
-"""No order is measured below it: a way whose error falls more slowly is given up."""
+"""Lower bound of measured orders; a method whose error decreases more slowly is given up."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """A way, its setting (`Follower`), the path that it gave, its estimated relative error, and the order by which the
-    error falls with the step: the way's own, or less where two settings showed it."""
+    """Run of a method at one setting.
+
+    Attributes:
+        method: the method.
+        setting: setting of its stepper.
+        trajectory: the computed motion.
+        error_estimated: estimated relative error.
+        order: order at which the error decreases with the step size: that of the method, or less if two settings show
+            it.
+    """
 
     way: Way
     setting: float
@@ -63,12 +76,12 @@ class Found:
 
     @property
     def tolerance(self) -> float | None:
-        """Of the error of a step [m]; None where steps have one length."""
+        """Tolerance on the local error [m]; None for fixed step sizes."""
         return None if self.way.follower.even else self.setting
 
     @property
     def columns(self) -> dict[str, Any]:
-        """What rows of any table say of it."""
+        """Columns of this trial, common to several tables."""
         return {
             "integrator": self.way.integrator,
             "estimated": self.estimated,
@@ -79,15 +92,22 @@ class Found:
         }
 
     def again(self) -> Path:
-        """The same once more."""
+        """Run the method again at the same setting."""
         return self.way.follower.follow(self.setting)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """best: what keeps to the error; tried: the ways at their first settings, which the tolerance [m] gave, and the
-    processor seconds that each promised, the cheapest first; closer: by which errors were estimated; seconds: wall time
-    of all that was done besides; note: why it is far more exact than was asked."""
+    """Result of a search.
+
+    Attributes:
+        best_trial: cheapest trial that meets the error.
+        trials: first trials of all methods with the CPU seconds predicted for the target error, cheapest first.
+        step_atol: tolerance of the first trials [m].
+        reference_trial: trial from which errors are estimated.
+        search_seconds: wall time of everything except the best trial.
+        note: why the best trial is much more accurate than requested; empty otherwise.
+    """
 
     best: Found
     tried: tuple[tuple[Found, float], ...]
@@ -97,15 +117,26 @@ class Answer:
     note: str
 
     def error(self, p: Positions, free: NDArray[np.int64]) -> float:
-        """Of the end p (n, 3) [m] of another motion by the closer one, relative to its way, over the free vertices."""
+        """Return the error of end positions p (n, 3) [m] against the reference trial.
+
+        The error is relative to the displacement and taken over the free vertices.
+        """
         q = self.closer.path.positions
         away, moved = (float(np.linalg.norm((x - q[-1])[free])) for x in (p, q[0]))
         return away / moved
 
 
 def foresee(asked: Asked, error: float, say: Callable[[str], None]) -> Growth:
-    """How far ahead the motion can be known, told before anything else. Raises Unpredictable where the error cannot be
-    had at the horizon, with the one that can, and where nothing moves."""
+    """Compute how far ahead the motion is predictable, and print the smallest error that can be reached.
+
+    Args:
+        error_target: the scene and its end time.
+        max_error: relative error to reach.
+        print_message: prints a remark.
+
+    Raises:
+        Unpredictable: the error cannot be reached at t_end (the message states one that can), or nothing moves.
+    """
     seen = growth(asked.scene, asked.size, asked.horizon)
     seen.require(error)
     say(
@@ -122,8 +153,18 @@ def search(
     say: Callable[[str], None],
     pairs: Sequence[tuple[str, SolverSpec]] = (),
 ) -> Answer:
-    """The cheapest way that keeps to a relative error at the horizon; pairs: see `ways`. Raises RunFailed where none
-    does."""
+    """Find the cheapest method whose relative error at t_end is at most `max_error`.
+
+    Args:
+        error_target: the scene and its end time.
+        max_error: relative error to reach.
+        growth: growth of perturbations (`compute_predictability_horizon`).
+        print_message: prints a remark.
+        candidates: integrators and solvers to try; the default candidates if empty.
+
+    Raises:
+        RunFailed: no method reaches the error.
+    """
     return _Search(asked, error, seen, say).answer(pairs)
 
 
@@ -152,14 +193,14 @@ class _Search:
 
     @staticmethod
     def _run(way: Way, setting: float, limit: float = inf) -> Found:
-        """With a second run where the first is too short to be timed."""
+        """Run a method at a setting; twice where the first run is too short to be timed."""
         paths = [way.follower.follow(setting, limit=limit)]
         if paths[0].processor < _SHORT:
             paths.append(way.follower.follow(setting, limit=limit))
         return Found(way, setting, min(paths, key=lambda path: path.processor), inf, way.follower.order)
 
     def _race(self, ways: list[Way], tolerance: float) -> list[Found]:
-        """Those that end, none of which takes much longer than the fastest."""
+        """Run all methods and return the trials that finish within a multiple of the fastest time."""
         found, stuck, limit = list[Found](), list[Stuck](), _AT_FIRST
         while ways and not found:
             late = list[tuple[Way, float]]()
@@ -179,8 +220,10 @@ class _Search:
         return found
 
     def _closer(self, raced: list[Found]) -> Found:
-        """The same motion with a much smaller error, by what is the cheapest there and keeps to an error, if any does:
-        by so much smaller a one that it can tell the error asked."""
+        """Run the reference trial: a motion whose error is much smaller than the target error.
+
+        The method that is predicted to be the cheapest at that accuracy computes it; adaptive methods are preferred.
+        """
         best = min(raced, key=lambda one: (one.way.follower.even, self._cost(one, CLOSER)))
         follower, found = best.way.follower, best
         order = self._order(best) if follower.even else float(follower.order)
@@ -195,7 +238,7 @@ class _Search:
         return found
 
     def _order(self, one: Found) -> float:
-        """Of steps of one length, by what halving them twice changes (Richardson)."""
+        """Estimate the order of fixed step sizes by doubling the step twice (Richardson)."""
         two, four = (self._run(one.way, parts * one.setting).path.positions[-1] for parts in (2.0, 4.0))
         first, second = self._apart(one.path.positions[-1], two), self._apart(two, four)
         fell = log(first / second, 2.0) if 0.0 < first < inf and 0.0 < second < inf else inf
@@ -203,7 +246,7 @@ class _Search:
 
     @staticmethod
     def _cost(one: Found, part: float) -> float:
-        """Processor seconds with a part of the error of a step: it prepares once."""
+        """Predict the CPU seconds at a fraction of the local error; preparation counts once."""
         stepping = min(one.path.seconds, one.path.processor)
         return one.path.processor - stepping + stepping * part ** (-1.0 / one.order)
 
@@ -215,7 +258,7 @@ class _Search:
         return replace(one, estimated=estimated if estimated < inf else inf)
 
     def _measured(self, one: Found, closer: Found) -> Found:
-        """One with its estimated error; where steps of one length err too much, half of them, with their order."""
+        """Estimate the error of a trial, and its order where fixed steps are not accurate enough."""
         one = self._graded(one, closer)
         if not one.way.follower.even or one.estimated <= self._error:
             return one
@@ -228,18 +271,22 @@ class _Search:
         return float(np.linalg.norm((p - q)[self._free]))
 
     def _promise(self, one: Found) -> float:
-        """The processor seconds that a way would take to the error asked; where it is more exact than that, those that
-        it took, for explicit steps may be as long as is stable already."""
+        """Predict the CPU seconds of a trial's method at the target error.
+
+        The measured time counts where the trial is more accurate, since explicit steps may have reached the stability
+        limit.
+        """
         return self._cost(one, min(1.0, self._aim(one) / one.estimated)) if one.estimated < inf else inf
 
     def _aim(self, one: Found) -> float:
-        """The error that a setting is chosen for."""
+        """Return the error for which a setting is chosen."""
         return (_AIM_EVEN if one.way.follower.even else AIM) * self._error
 
     def _reached(self, graded: list[Found], closer: Found) -> tuple[Found, str]:
-        """The first way that gives the error asked, at its setting for that, and why it is far more exact, if it is.
+        """Return the first trial that reaches the error, and a note if it is much more accurate.
 
-        A way that takes much longer than the next one promises is tried again after all others."""
+        A method that exceeds the predicted time of the next one by far is tried again after all others.
+        """
         nearest, times = list[Found](), _DEAR
         while graded:
             late = list[Found]()
@@ -259,8 +306,10 @@ class _Search:
         raise self._nothing(min(nearest, key=lambda one: one.estimated))
 
     def _moved(self, one: Found, closer: Found, limit: float) -> tuple[Found, str]:
-        """The way at the setting that gives the error asked, or the nearest to it, and why it is far more exact, if it
-        is. Raises TooSlow beyond a limit of processor seconds."""
+        """Tune the setting of a method towards the target error, and return the nearest trial.
+
+        The second result says why the trial is much more accurate. Raises TooSlow beyond a limit of CPU seconds.
+        """
         best, above = None if one.estimated > self._error else one, None
         nearest, stalled = one, 0
         for _ in range(_MOVES):
@@ -290,7 +339,7 @@ class _Search:
         return best, _STABLE if best.estimated < DOUBT * WIDE * self._error else ""
 
     def _next(self, one: Found, best: Found | None, above: Found | None) -> float:
-        """The setting to try after one that errs too much or too little: between both where they are known."""
+        """Return the next setting to try; between two settings where they bracket the error."""
         if best and above:
             return sqrt(best.setting * above.setting)
         aim = self._aim(one)
@@ -307,7 +356,7 @@ class _Search:
 
 
 def _of_order(before: Found, after: Found) -> Found:
-    """After, with the order by which errors fell from one to the other, at most that of the way."""
+    """Return the second trial with the observed order, at most that of its method."""
     shorter = log(after.path.accepted / before.path.accepted)
     if not (0.0 < before.estimated < inf and 0.0 < after.estimated < inf and abs(shorter) > 0.1):
         return after

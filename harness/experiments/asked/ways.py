@@ -1,4 +1,4 @@
-"""Ways to follow a motion to an error: solvers with steps of their own, and integrators with solvers of their steps."""
+"""Methods for error-controlled runs: adaptive solvers, and integrators combined with solvers of their steps."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from solvers.problem import NotPositiveDefinite, Unsupported
 from solvers.registry import EVERY, SOLVERS, about, load, minimises
 
 _ONCE = 1e-2
-"""Of the mesh's size: the tolerance of what only compiles."""
+"""Tolerance of the warm-up run, which only compiles, as a fraction of the mesh size."""
 _SPENT = 30.0
-"""Seconds on what can be had instead of a promise."""
+"""Wall time for the step-doubling estimate where error control is not possible [s]."""
 _CONTACT = (
     "contact begins and ends within steps, where every method here has order 1: no error can be promised; run it with "
     "steps of one length (--integrator, --time-step), and halve them until the motion stays as it is"
@@ -32,7 +32,14 @@ _CONTACT = (
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A scene of one size, up to a horizon [s] that is so many frames. Pins are exact, as in the reference."""
+    """Scene of one size, up to an end time, split into frames; Dirichlet conditions are exact, as in the reference.
+
+    Attributes:
+        scene: the scene.
+        size: size of the mesh.
+        t_end: simulated time [s].
+        num_frames: number of frames of equal length up to t_end.
+    """
 
     scene: SceneSpec
     size: int
@@ -43,9 +50,18 @@ class Asked:
     def of(
         cls, scene: SceneSpec, size: int | None, horizon: float | None, say: Callable[[str], None] | None = None
     ) -> Asked:
-        """Of the scene's own size and length where none are given; frames are about as long as its time step.
+        """Return the target for a scene; a frame is about as long as the scene's time step.
 
-        Raises InputError, and RunFailed for contact."""
+        Args:
+            scene: the scene.
+            size: size of the mesh; the scene's default if None.
+            t_end: simulated time [s]; that of the scene if None.
+            print_message: prints a remark.
+
+        Raises:
+            InputError: the size or the time step does not fit the scene.
+            RunFailed: the scene has contact.
+        """
         scene.require_even_steps()
         horizon = horizon or scene.frames * scene.time_step
         size = size or scene.default_size or 0
@@ -61,18 +77,18 @@ class Asked:
         return asked
 
     def bound(self, time_step: float, integrator: str) -> Scene:
-        """The scene with steps of a length [s] and an integrator by name."""
+        """Build the scene with a time step [s] and an integrator by name."""
         return bind(self.scene.stepped(time_step), self.size, integrator, warns=False)
 
     @property
     def frame(self) -> float:
-        """The length of a frame [s]."""
+        """Length of a frame [s]."""
         return self.horizon / self.frames
 
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """An integrator and a solver by name, and how they follow the motion."""
+    """Integrator and solver by name, and the stepper that combines them."""
 
     integrator: str
     solver: str
@@ -83,14 +99,19 @@ class Way:
 
 
 def in_words(integrator: str, solver: str) -> str:
-    """What a way is called, by the names of both."""
+    """Return the name of a method for messages, from the names of its integrator and its solver."""
     return solver if integrator == "own" else f"{integrator} with {solver}"
 
 
 def tried() -> list[tuple[str, SolverSpec]]:
-    """Integrators and solvers by name: those with steps of their own, and those that minimise what the integrator
-    with an error states that has the highest order, and the highest of its stages; and, with steps of one length, what
-    the one states that has the highest order of those of one unknown that begin anew each step."""
+    """Return the integrators (by name) and solvers that a search tries by default.
+
+    Solvers with their own adaptive integrator come first. The others are solvers that minimise the step's objective.
+    They
+    are combined with the embedded Runge-Kutta integrator of the highest order, and among equals of the highest stage
+    order.
+    They are also combined with the one-step integrator of fixed step size that has the highest order.
+    """
     pairs = {name: one for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded}
     best = max(pairs, key=lambda name: (pairs[name].order, pairs[name].starts))
     told = {name: about(load(target), name) for name, target in SOLVERS.items()}
@@ -102,7 +123,11 @@ def tried() -> list[tuple[str, SolverSpec]]:
 
 
 def tried_by(solver: SolverSpec) -> list[tuple[str, SolverSpec]]:
-    """What one solver can do of that, with all integrators that tell an error. Raises Unsupported for nothing."""
+    """Return all methods of one solver: its own integrator, or all embedded Runge-Kutta integrators.
+
+    Raises:
+        Unsupported: the solver has no error estimate and does not minimise the steps of an integrator.
+    """
     one = about(load(EVERY[solver.name]), solver.name)
     if one.own_steps:
         return [("own", solver)]
@@ -112,8 +137,16 @@ def tried_by(solver: SolverSpec) -> list[tuple[str, SolverSpec]]:
 
 
 def ways(asked: Asked, say: Callable[[str], None], pairs: Sequence[tuple[str, SolverSpec]] = ()) -> list[Way]:
-    """Those that know the scene, warmed up: what they compile counts against nobody; others are told, with the reason.
-    pairs: of integrators and solvers, all that are tried if left out. Raises RunFailed for none."""
+    """Return the methods that support the scene, warmed up so that timings exclude compilation.
+
+    Args:
+        error_target: the scene and its end time.
+        print_message: prints the methods that do not support the scene, with the reason.
+        candidates: integrators and solvers; `list_candidate_methods` if empty.
+
+    Raises:
+        RunFailed: no method supports the scene.
+    """
     found, reasons = list[Way](), list[str]()
     for integrator, solver in pairs or tried():
         way = Way(integrator, solver.name, _follower(asked, integrator, solver))
