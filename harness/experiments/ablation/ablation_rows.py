@@ -1,12 +1,13 @@
-"""The rows of `springbench ablate`: one Parquet file for a scene, under `results/<scene>/ablation/`.
+"""Rows of `springbench ablate`: one Parquet file per scene, under `results/<scene>/ablation/`.
 
-One table holds all kinds of rows, which `kind` tells apart:
+One table contains all kinds of rows; the column `kind` distinguishes them:
 
-    whole        the scene with all that it lists
-    without      the scene without some of its effects: what they cost, and what leaving them out changes
-    error        how far the whole scene is from a better answer: of its solver, or of its time step
-    suggestion   an effect that the scene does not list and its motion calls for, with the evidence
-    price        an effect beside springs, gravity, drag and pins alone, or all of them: what an iteration takes more
+    whole        the scene with all effects that it lists
+    without      the scene without some of its effects: their cost, and the change of the motion without them
+    error        the distance of the full scene from a more accurate solution: of its solver, or of its time step
+    suggestion   an effect that the scene does not list although its motion indicates it, with the evidence
+    price        the per-iteration overhead of one effect, or all, over a scene with springs, gravity, drag and pins
+    only
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What ablations and prices have in common: one run of a scene becomes a file of rows under `<folder>/ablation`."""
+"""Common base of ablation and overhead units: one run of a scene yields a file of rows under `<folder>/ablation`."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class OfEffects(ABC):
-    """What a scene's effects come to in a run (`harness.experiments.core.Unit`)."""
+    """Unit that measures a scene's effects in a run (`harness.experiments.experiment_units.ExperimentUnit`)."""
 
     run: RunSpec
     folder: Path
 
     @property
     def path(self) -> Path:
-        """The file of rows."""
+        """File of the unit's rows."""
         return self.folder / "ablation" / f"{self.run.label(machine.describe().id)}{self.suffix()}.parquet"
 
     @property
     def standing(self) -> Standing:
-        """Whether its rows are there."""
+        """Completion status: completed if the rows exist."""
         return standings({self.path: lambda row: True}, (), SCHEMA)[self.path]
 
     @property
     def effort(self) -> Effort:
-        """See Unit."""
+        """Estimated cost, which is unknown."""
         return ANY_EFFORT
 
     @property
     def limits(self) -> Limits:
-        """Those of a run."""
+        """Limits of the run."""
         return Limits(self.run.time_limit, self.run.memory_limit)
 
     def do(self, tick: Tick) -> str:
-        """See Unit."""
+        """Measure, write the rows and return the outcome as text."""
         try:
             found = self.measured(tick)
         except InputError:
@@ -58,20 +58,20 @@ class OfEffects(ABC):
         return self._written(found)
 
     def lost(self, lost: Lost) -> str:
-        """See Unit."""
+        """Write the rows of a lost unit, and return the outcome as text."""
         return self._written(self.unanswered(lost.status, str(lost)))
 
     @abstractmethod
     def suffix(self) -> str:
-        """What tells its file from others of the same run."""
+        """Return the suffix that distinguishes its file from others of the same run."""
 
     @abstractmethod
     def measured(self, tick: Tick) -> list[Row]:
-        """The rows. Raises what the solver raises."""
+        """Measure and return the rows. Errors of the solver are raised unchanged."""
 
     @abstractmethod
     def unanswered(self, status: str, reason: str) -> list[Row]:
-        """The rows where there is no answer."""
+        """Build the rows for a unit without a result."""
 
     def _written(self, found: list[Row]) -> str:
         self.path.parent.mkdir(parents=True, exist_ok=True)

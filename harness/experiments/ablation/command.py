@@ -1,4 +1,4 @@
-"""The command `springbench ablate`."""
+"""Command `springbench ablate`."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ from harness.base.commands import Again, Changed, InThisProcess, Results
 from harness.base.console import err, narrow, out, say
 
 SOLVER, TOLERANCE = "hybrid", 1e-4
-"""It takes all effects, and converges: what an effect changes is not to drown in the solver's own error."""
+"""Default solver, which supports all effects, and its tolerance.
+
+It converges far enough that the solver's own error does not hide the change from an effect.
+"""
 
 PRICED = 1e-6
-"""The tolerance of --all-solvers, if the command line does not say: iterations far from the minimum and near to it."""
+"""Default tolerance of --all-solvers: it includes iterations far from the minimum and close to it."""
 
 ROUNDS = 5
-"""How often each step is timed, if the command line does not say."""
+"""Default number of times that each step is timed."""
 
 
 def ablate(
@@ -34,7 +37,7 @@ def ablate(
     changed: Changed = False,
     here: InThisProcess = False,
 ) -> None:
-    """Leave out each effect of a scene: what it costs, what it changes, and which effects the motion calls for."""
+    """Leave out each effect of a scene: measure its cost and its influence, and suggest missing effects."""
     from harness.base.claim import claimed
     from harness.base.progress import display
     from harness.config.load import load_any
@@ -75,7 +78,7 @@ def _prices(
     changed: bool,
     here: bool,
 ) -> None:
-    """`--all-solvers`."""
+    """Run `--all-solvers`."""
     from harness.base.claim import claimed
     from harness.base.errors import InputError
     from harness.base.progress import display

@@ -1,4 +1,4 @@
-"""How far two motions of one mesh lie apart, in mean rest lengths."""
+"""Difference of two motions of one mesh, in mean rest lengths."""
 
 from __future__ import annotations
 
@@ -13,7 +13,13 @@ States = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def difference(scene: Scene, a: States, b: States) -> dict[str, float]:
-    """The columns `largest`, `rms`, `energy`, `centre` of two motions; the scene is the whole one."""
+    """Return the columns `largest`, `rms`, `energy` and `centre` for two motions.
+
+    Args:
+        scene: the full scene.
+        a: first motion, whose largest energy is the unit of the energy difference.
+        b: second motion.
+    """
     (p, _), (q, _) = a, b
     unit, mass = rest_length(scene), scene.system.mass
     away = np.linalg.norm(p - q, axis=2)
@@ -29,13 +35,15 @@ def difference(scene: Scene, a: States, b: States) -> dict[str, float]:
 
 
 def rest_length(scene: Scene) -> float:
-    """The mean rest length of the scene's springs [m]; the mesh's spacing where it has none."""
+    """Return the mean rest length of the scene's springs; the mesh spacing without springs [m]."""
     lengths = scene.springs.rest_length
     return float(lengths.mean()) if lengths.any() else scene.mesh.spacing
 
 
 def _energy(scene: Scene, p: NDArray[np.float64], v: NDArray[np.float64]) -> float:
-    """Kinetic energy and that of the whole scene's springs [J], of those that can have any: the same yardstick for all
-    motions."""
+    """Return the kinetic energy plus the energy of the full scene's springs [J].
+
+    The same energies are evaluated for all motions.
+    """
     elastic = sum(energy.value(p) for energy in scene.system.energies if isinstance(energy, Springs))
     return 0.5 * float(scene.system.mass @ np.einsum("ij,ij->i", v, v)) + elastic

@@ -1,4 +1,4 @@
-"""Prices as units: those of all of a scene's effects by one solver."""
+"""Units that measure the per-iteration overhead of all effects of a scene with one solver."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from solvers.registry import EVERY, load
 
 @dataclass(frozen=True, slots=True)
 class Prices(OfEffects):
-    """The prices of a scene's effects by a run's solver."""
+    """Unit that measures the per-iteration overheads of a scene's effects with a run's solver."""
 
     @property
     def title(self) -> str:
-        """See Unit."""
+        """Title of the unit, for messages."""
         return f"{self.run.title}: the price of each effect"
 
     @property
     def ticks(self) -> int:
-        """One an effect."""
+        """Number of measured effects."""
         return len(priced(self.run.scene))
 
     def suffix(self) -> str:
-        """See OfEffects."""
+        """Return the suffix of the file of overheads."""
         return "-prices"
 
     def measured(self, tick: Tick) -> list[Row]:
-        """See OfEffects."""
+        """Measure the overhead of each effect and return the rows."""
         run = self.run
         solver: Solver = load(EVERY[run.solver.name])(**run.solver.parameters)
         stop, told = stop_rule(run.iterations, run.tolerance), list[Row]()
@@ -53,7 +53,7 @@ class Prices(OfEffects):
         return self._shared(told)
 
     def unanswered(self, status: str, reason: str) -> list[Row]:
-        """See OfEffects: none of the effects has a price."""
+        """Build the rows of a unit without a result: no effect has an overhead."""
         return self._shared([{"name": effect, "status": status, "reason": reason} for effect in priced(self.run.scene)])
 
     def _shared(self, told: list[Row]) -> list[Row]:
@@ -81,9 +81,21 @@ def price_all(
     changed: bool = False,
     isolated: bool = True,
 ) -> list[Path]:
-    """Price a scene's effects by each of a sweep's solvers, where that is not done; returns the files of rows.
+    """Measure the overheads of a scene's effects for each solver of a sweep, where they are missing.
 
-    isolated: see `harness.experiments.core.do_all`. Raises InputError for what the user can mend.
+    Args:
+        sweep: one scene with several solvers.
+        folder: folder of the results.
+        display: shows progress.
+        print_message: prints a remark.
+        rerun: whether to repeat all units.
+        rerun_stale: whether to repeat units measured by other source code.
+        isolated: see `harness.experiments.experiment_units.execute_units`.
+
+    Returns: the files of rows.
+
+    Raises:
+        InputError: the scene has no effect to measure, or no fixed time step.
     """
     units = [Prices(run, folder) for run in sweep.runs()]
     scene = units[0].run.scene

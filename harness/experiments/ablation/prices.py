@@ -1,16 +1,16 @@
-"""What an iteration takes with an effect, over one without: each effect by each solver.
+"""Measure the per-iteration overhead of each effect with each solver.
 
-    price = median over rounds of (CPU time an iteration of plain + effect) / (the same of plain)
+    price = median over rounds of (CPU time per iteration with the effect) / (CPU time per iteration without it)
 
-The plain scene has the effects that say that they are `plain`. Both scenes go step by step in turns, each to
-the tolerance that is asked for, so that a drift of the machine meets both alike. Rounds end once the price is known to
-CLOSE, or after as many as are allowed. A round that has taken ENOUGH ends with the next step that counts, and then
-LEAST rounds will do; where a single step takes that long, fewer iterations a step are done. So the slowest solvers take
-minutes as well.
+The baseline scene has only the effects that are declared `plain`. Both scenes are simulated interleaved, step by step,
+to the requested tolerance, so that a drift of the machine affects both alike. Rounds end once the interval of the ratio
+is narrower than MAX_INTERVAL_WIDTH, or at the largest number of rounds. A round that has taken MAX_ROUND_SECONDS ends
+with the next counted step, and then MIN_ROUNDS rounds suffice. Where a single step takes that long, the number of
+iterations per step is reduced. So the slowest solvers take minutes as well.
 
-No iteration reads the effect's own numbers sooner than a dot product does, nor multiplies and adds them up sooner than
-a product of matrices does: the longer one is the bound beside each price. Of an element that couples k vertices 12 k
-flops count, those of A p and of A'f for three coordinates, and none of what happens in between.
+No iteration can read the effect's own numbers faster than a dot product, nor multiply and add them faster than a matrix
+product. The slower of the two is the lower bound of each ratio. An element that couples k vertices counts as 12 k
+flops, those of A p and of A'f for three coordinates; other operations are not counted.
 """
 
 from __future__ import annotations
@@ -34,26 +34,34 @@ from solvers.energies.springs import Springs
 from solvers.problem import NotPositiveDefinite, Prepared, ProjectiveEnergy, Solver, Unsupported
 
 ALL = "all"
-"""The name of all effects together."""
+"""Name of all effects together."""
 CLOSE, LEAST = 0.03, 3
-"""Of a price, the width of its interval at which rounds end; and rounds that an interval needs."""
+"""Relative width of the interval at which rounds end; number of rounds that an interval needs."""
 WARM = 2
-"""Steps before those that count."""
+"""Number of steps before those that count."""
 ENOUGH = 2.0
-"""Seconds of CPU time, of both scenes' steps, after which a round has no more steps but one that counts."""
+"""CPU time of both scenes' steps after which a round has only one more counted step [s]."""
 _READS = 20
 _SIDE = 256
-"""Of matrices whose product tells how many flops a second there are at the most."""
+"""Size of the matrices whose product determines the peak number of flops per second."""
 
 
 Ready = tuple[Scene, Prepared]
-"""A scene, and what a solver prepared for it."""
+"""Scene, and the solver prepared for it."""
 
 
 class Price(NamedTuple):
-    """Of an effect: the ratio, and seconds of CPU time an iteration with the effect; bound: the least
-    ratio that the effect's own bytes and flops allow; iterations: the limit of a step; refused: why there is none of
-    these, in words."""
+    """Per-iteration overhead of an effect.
+
+    Attributes:
+        effect_kind: kind of the effect.
+        ratio_interval: CPU time per iteration with the effect, divided by that without, with its interval.
+        seconds: CPU time per iteration with the effect [s].
+        min_ratio: lower bound of the ratio, from the effect's own bytes and flops.
+        num_rounds: number of rounds.
+        max_iterations: iteration limit of a step.
+        unsupported_reason: why there is no measurement; empty if there is one.
+    """
 
     effect: str
     price: Interval = Interval(np.nan, np.nan, np.nan)
@@ -66,7 +74,10 @@ class Price(NamedTuple):
 
 @dataclass(eq=False)
 class _Run:
-    """A scene on its way by one solver: seconds of the steps that count, and their iterations; spent: of all [s]."""
+    """Running simulation of a scene by one solver.
+
+    `seconds` and `iterations` are those of the counted steps, `total_seconds` those of all steps [s].
+    """
 
     steps: Iterator[Step]
     seconds: float = 0.0
@@ -74,7 +85,7 @@ class _Run:
     spent: float = 0.0
 
     def step(self, *, counts: bool) -> None:
-        """One step more."""
+        """Compute the next step; it is included in `seconds` and `iterations` if `is_counted`."""
         began = thread_time()
         done = next(self.steps)
         took = thread_time() - began
@@ -85,12 +96,12 @@ class _Run:
 
     @property
     def each(self) -> float:
-        """Seconds an iteration."""
+        """CPU time per iteration [s]."""
         return self.seconds / max(1, self.iterations)
 
 
 def priced(scene: SceneSpec) -> list[str]:
-    """The kinds of effects that have a price, and all of them together; raises InputError where there is none."""
+    """Return the kinds of effects to measure, then ALL_EFFECTS. Raises InputError if there are none."""
     kinds = list(dict.fromkeys(effect.kind for effect in scene.effects if not _plain(effect)))
     if not kinds:
         listed = ", ".join(dict.fromkeys(effect.kind for effect in scene.effects))
@@ -99,7 +110,7 @@ def priced(scene: SceneSpec) -> list[str]:
 
 
 def only(scene: SceneSpec, *kinds: str) -> SceneSpec:
-    """The scene with these effects alone, and the plain ones; with all of them where they are ALL."""
+    """Return the scene with these effects and the baseline effects only; ALL_EFFECTS selects all."""
     if ALL in kinds:
         return scene
     kept = [i for i, e in enumerate(scene.effects) if e.kind in kinds or _plain(e)]
@@ -107,12 +118,21 @@ def only(scene: SceneSpec, *kinds: str) -> SceneSpec:
 
 
 def _plain(effect: Effect) -> bool:
-    """Whether it says that it has no price."""
+    """Return whether an effect is declared part of the baseline."""
     return bool(getattr(effect, "plain", False))
 
 
 def prices(scene: SceneSpec, size: int, solver: Solver, stop: Stop, *, frames: int, rounds: int) -> Iterator[Price]:
-    """The price of each effect by a solver; one that it refuses has none. frames: that count in a round."""
+    """Measure the overhead of each effect with one solver; unsupported effects yield a reason.
+
+    Args:
+        scene: the scene.
+        size: mesh size.
+        solver: the solver.
+        stop_rule: stop rule of a step.
+        frames: number of counted steps in a round.
+        max_rounds: largest number of rounds.
+    """
     plain = None
     for effect in priced(scene):
         try:
@@ -125,13 +145,28 @@ def prices(scene: SceneSpec, size: int, solver: Solver, stop: Stop, *, frames: i
 
 
 def ready(scene: SceneSpec, size: int, solver: Solver, *effects: str) -> Ready:
-    """The scene with these effects and the plain ones; raises InputError, NotPositiveDefinite and Unsupported."""
+    """Build the scene with these effects and the baseline effects, and prepare the solver.
+
+    Raises:
+        InputError: the scene cannot be built.
+        NotPositiveDefinite: the system matrix is not positive definite.
+        Unsupported: the solver does not support an effect.
+    """
     made = build(only(scene, *effects), size)
     return made, prepare(made, solver)
 
 
 def price(effect: str, one: Ready, plain: Ready, stop: Stop, *, frames: int, rounds: int) -> Price:
-    """The price of an effect, from scenes with and without it. frames: that count in a round."""
+    """Measure the overhead of an effect from scenes with and without it.
+
+    Args:
+        effect: kind of the effect.
+        with_effect: scene with the effect.
+        baseline: scene without it.
+        stop_rule: stop rule of a step.
+        frames: number of counted steps in a round.
+        max_rounds: largest number of rounds.
+    """
     pairs: list[tuple[float, float]] = []
     found = Interval(np.nan, np.nan, np.nan)
     while len(pairs) < rounds:
@@ -153,7 +188,10 @@ def price(effect: str, one: Ready, plain: Ready, stop: Stop, *, frames: int, rou
 
 
 def _affordable(plain: Ready, stop: Stop) -> Stop:
-    """The rule; where a step takes longer than ENOUGH, with as many iterations as take a quarter of it."""
+    """Return the stop rule, with fewer iterations if a step takes longer than MAX_ROUND_SECONDS.
+
+    The reduced number of iterations takes a quarter of that time.
+    """
     run = _Run(iter(simulate(*plain, stop, first_guess="current", frames=WARM)))
     for k in range(WARM):  # what the first compiles does not count
         run.step(counts=k == WARM - 1)
@@ -161,7 +199,7 @@ def _affordable(plain: Ready, stop: Stop) -> Stop:
 
 
 def _least(scene: Scene) -> float:
-    """The least time [s] that the arithmetic of all energies that are not springs takes, once each."""
+    """Return the smallest time [s] for the arithmetic of all energies other than springs, once each."""
     n = scene.system.vertices
     work = [_work(energy, n) for energy in scene.system.energies if not isinstance(energy, Springs)]
     size, flops = sum(one.bytes for one in work), sum(one.flops for one in work)
@@ -172,7 +210,7 @@ def _least(scene: Scene) -> float:
 
 
 def _fastest(work: Callable[[], object]) -> float:
-    """The least of some times [s] that it takes."""
+    """Return the smallest of several wall times of a function [s]."""
     best = np.inf
     for _ in range(_READS):
         began = perf_counter()
@@ -182,14 +220,14 @@ def _fastest(work: Callable[[], object]) -> float:
 
 
 class _Work(NamedTuple):
-    """What an energy reads of its own, and the flops of what is linear in it."""
+    """Bytes that an energy reads of its own data, and flops that are linear in them."""
 
     bytes: int = 0
     flops: int = 0
 
 
 def _work(energy: Any, n: int) -> _Work:
-    """Of its elements, or of its entries of Q; none of what is known in steps alone."""
+    """Count the work of an energy's elements, or of its entries of Q; data known only in steps is not counted."""
     if hasattr(energy, "elements"):
         return _Work(sum(x.nbytes for x in energy.elements), 12 * energy.elements.vertices.size)
     if isinstance(energy, ProjectiveEnergy):

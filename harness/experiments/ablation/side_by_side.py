@@ -1,12 +1,12 @@
-"""What each scene costs and does: all of them take turns, step by step, in one process.
+"""Measure the cost and the motion of scene variants, interleaved step by step in one process.
 
 In each round every scene is simulated from its start, one step of each after the other, so that a drift of the machine
-meets them all alike. Times are CPU times of the one thread that computes, which other programs hardly move. The cost
-of an effect is a difference of times of the same frame in the same round:
+affects all alike. Times are CPU times of the one computing thread, on which other programs have little influence. The
+cost of an effect is a difference of times of the same frame in the same round:
 
-    cost = mean over frames of the median over rounds of (whole - without)
+    cost = mean over frames of the median over rounds of (full scene - scene without the effect)
 
-`harness.base.statistics` gives its 95 % interval.
+`harness.base.statistics` computes its 95 % interval.
 """
 
 from __future__ import annotations
@@ -33,8 +33,18 @@ Array = NDArray[np.float64]
 
 @dataclass(eq=False)
 class Contender:
-    """A variant on its way. seconds: (rounds, frames); positions: (frames, n, 3) [m]; velocities likewise [m/s];
-    failure: why there is no answer, empty where there is one."""
+    """Running simulation of a variant.
+
+    Attributes:
+        variant: the scene variant.
+        scene: the scene; None if it could not be built.
+        prepared: the prepared solver; None if preparation failed.
+        memory_bytes: memory of the scene and the prepared solver.
+        failure_reason: why there is no result; empty if there is one.
+        seconds: CPU time of the steps, (rounds, frames) [s].
+        positions: (frames, n, 3) [m].
+        velocities: (frames, n, 3) [m/s].
+    """
 
     variant: Variant
     scene: Scene | None = None
@@ -54,9 +64,19 @@ def turns(
     settings: Settings,
     tick: Tick,
 ) -> list[Contender]:
-    """Every variant simulated `rounds` times, after a pass that warms up and keeps the motion.
+    """Simulate every variant `rounds` times, interleaved, after a warm-up pass that stores the motion.
 
-    Raises InputError and Unsupported for the first variant, the whole scene; the others say so themselves.
+    Args:
+        variants: the full scene, then the others.
+        size: mesh size.
+        integrator: name of the integrator.
+        solver: the solver.
+        settings: settings of the simulations.
+        tick: called after each motion and each round.
+
+    Raises:
+        InputError: the full scene is invalid; other variants store the reason.
+        Unsupported: the solver does not support the full scene; other variants store the reason.
     """
     _prepared(variants[0], size, integrator, solver)  # what is compiled and imported is not the scene's memory
     found = [_prepared(variant, size, integrator, solver) for variant in variants]
@@ -64,7 +84,7 @@ def turns(
         _keep_motion(turn, settings)
         tick("motion")
     for round in range(settings.rounds):
-        # The order turns from round to round: who comes first after a pause finds its caches cold.
+        # The order rotates from round to round: the first one after a pause has cold caches.
         alive = [turn for turn in found if not turn.failure]
         alive = alive[round % len(alive) :] + alive[: round % len(alive)]
         for turn in alive:
@@ -80,12 +100,12 @@ def turns(
 
 
 def cost(whole: Contender, without: Contender) -> Interval:
-    """What a step of the whole scene takes more of CPU time [s]."""
+    """Return the CPU time per step that the full scene takes in addition [s]."""
     return added(np.array(whole.seconds) - np.array(without.seconds))
 
 
 def seconds(turn: Contender) -> float:
-    """CPU time of a step [s], the mean over the frames of the median over the rounds."""
+    """Return the CPU time per step: mean over the frames of the median over the rounds [s]."""
     return float(np.median(np.array(turn.seconds), axis=0).mean())
 
 
@@ -106,7 +126,7 @@ def _prepared(variant: Variant, size: int, integrator: str, solver: Solver) -> C
 
 
 def _keep_motion(turn: Contender, settings: Settings) -> None:
-    """Simulate once, and keep positions and velocities."""
+    """Simulate once, and store positions and velocities."""
     if turn.failure:
         return
     try:
@@ -126,7 +146,14 @@ def _steps(turn: Contender, settings: Settings) -> Iterator[Step]:
 
 
 def motion(scene: Scene, solver: Solver, settings: Settings, *, every: int = 1) -> tuple[Array, Array]:
-    """Positions and velocities (frames, n, 3) of every so many-th step; raises what the solver and its steps raise."""
+    """Simulate, and return positions and velocities (frames, n, 3) of every `stride`-th step.
+
+    Args:
+        scene: the scene.
+        solver: the solver.
+        settings: settings, whose number of frames is that of the result.
+        stride: number of steps per frame of the result.
+    """
     run = replace(settings, frames=settings.frames * every)
     kept = [s.state.now for s in steps(scene, prepare(scene, solver), run) if s.index % every == 0]
     return np.array([now.positions for now in kept]), np.array([now.velocity for now in kept])

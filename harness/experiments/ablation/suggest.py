@@ -1,6 +1,6 @@
-"""Effects that a scene does not list and its motion calls for, each with the evidence.
+"""Suggest effects that a scene does not list although its motion indicates them, each with the evidence.
 
-An effect's class says itself by what evidence a motion calls for it (`harness.scenes.effects.base.Effect`).
+The class of an effect defines the evidence for it (`harness.scenes.effects.effect_interface.Effect`).
 """
 
 from __future__ import annotations
@@ -19,14 +19,21 @@ from solvers.registry import load
 
 
 class Suggestion(NamedTuple):
-    """An effect by name, and why."""
+    """Kind of the suggested effect, and the evidence for it."""
 
     effect: str
     evidence: str
 
 
 def seen(scene: Scene, kinds: Collection[str], positions: NDArray[np.float64], velocities: NDArray[np.float64]) -> Seen:
-    """A scene with effects of these kinds and its motion, positions [m] and velocities [m/s] (frames, n, 3)."""
+    """Collect the evidence from a scene and its motion.
+
+    Args:
+        scene: the scene.
+        effect_kinds: kinds of its effects.
+        positions: (frames, n, 3) [m].
+        velocities: (frames, n, 3) [m/s].
+    """
     return Seen(
         mesh=scene.mesh,
         springs=scene.springs,
@@ -42,7 +49,12 @@ def seen(scene: Scene, kinds: Collection[str], positions: NDArray[np.float64], v
 
 
 def suggestions(found: Seen, kinds: Collection[str]) -> list[Suggestion]:
-    """What the motion calls for, less the `kinds` that the scene lists; in a fixed order."""
+    """Return the effects that the evidence indicates and the scene does not list, in a fixed order.
+
+    Args:
+        evidence: evidence from the motion.
+        effect_kinds: kinds of the effects that the scene lists.
+    """
     absent = [kind for kind in EFFECTS if kind not in kinds and hasattr(_class(kind), "called_for")]
     told = (Suggestion(kind, _class(kind).called_for(found)) for kind in absent)
     return [suggestion for suggestion in told if suggestion.evidence]

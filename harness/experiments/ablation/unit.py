@@ -1,4 +1,4 @@
-"""An ablation as a unit: the whole scene, without each effect, and with better answers."""
+"""Ablation unit: the full scene, the scene without each effect, and two more accurate solutions."""
 
 from __future__ import annotations
 
@@ -27,41 +27,43 @@ from solvers.problem import Solver, StopRule
 from solvers.registry import EVERY, SOLVERS, load
 
 _BETTER_ANSWERS = ("solver", "time-step")
-"""In what the better answers are better."""
+"""What is improved in each of the more accurate solutions."""
 
 BETTER = "newton"
-"""Whose answer tells how far the scene's own solver is from the minimum."""
+"""Solver whose solution determines the distance of the scene's own solver from the minimum."""
 CONVERGED = StopRule(200, 1e-8)
-"""Far below any difference that an effect makes."""
+"""Its tolerance is far below any difference that an effect makes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ablation(OfEffects):
-    """A run of a scene, the whole and without its effects, taking turns in one process. pairs: whether each pair of
-    effects is left out too."""
+    """Run of a scene, in full and without its effects, timed interleaved in one process.
+
+    `with_pairs` selects variants without each pair of effects, too.
+    """
 
     pairs: bool
 
     @property
     def title(self) -> str:
-        """See Unit."""
+        """Title of the unit, for messages."""
         return f"{self.run.title}: without each effect"
 
     @property
     def ticks(self) -> int:
-        """A motion of each variant, the timed rounds, two better answers."""
+        """Number of variants, timed rounds and more accurate solutions."""
         return len(variants(self.run.scene, pairs=self.pairs)) + self.run.rounds + len(_BETTER_ANSWERS)
 
     def suffix(self) -> str:
-        """See OfEffects."""
+        """Return the suffix of the file: `-pairs` with pairs of effects."""
         return "-pairs" if self.pairs else ""
 
     def measured(self, tick: Tick) -> list[Row]:
-        """See OfEffects."""
+        """Measure all variants and return the rows."""
         return _measured(self.run, self.pairs, tick)
 
     def unanswered(self, status: str, reason: str) -> list[Row]:
-        """See OfEffects: without the whole scene there is nothing to compare."""
+        """Build the row of a failed unit: without the full scene no comparison is possible."""
         why = {"kind": "whole", "name": "", "status": status, "reason": reason}
         return [asked(self.run) | provenance() | why]
 
@@ -77,10 +79,24 @@ def run_ablation(
     changed: bool = False,
     isolated: bool = True,
 ) -> Path:
-    """Ablate the one run of a scene's sweep, whose rounds are those of the timing, where that is not done; returns the
-    file of rows. Where the whole scene has no answer, that is its one row.
+    """Execute the ablation of the only run of a scene's sweep, if it is missing.
 
-    isolated: see `harness.experiments.core.do_all`. Raises InputError for what the user can mend.
+    The rounds of the run are those of the timing. Where the full scene has no solution, the file has one row.
+
+    Args:
+        sweep: sweep with one run.
+        folder: folder of the results.
+        display: shows progress.
+        print_message: prints a remark.
+        with_pairs: whether to leave out each pair of effects, too.
+        rerun: whether to repeat the ablation.
+        rerun_stale: whether to repeat it if it was measured by other source code.
+        isolated: see `harness.experiments.experiment_units.execute_units`.
+
+    Returns: the file of rows.
+
+    Raises:
+        InputError: the scene or an option is invalid.
     """
     (run,) = sweep.runs()
     run.scene.require_even_steps()
@@ -92,7 +108,7 @@ def run_ablation(
 
 
 def _measured(run: RunSpec, pairs: bool, tick: Tick) -> list[Row]:
-    """The rows. Raises Unsupported and what else the whole scene's solver raises."""
+    """Measure all variants and build the rows. Errors for the full scene are raised unchanged."""
     settings = Settings(stop_rule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
     solver: Solver = load(EVERY[run.solver.name])(**run.solver.parameters)
     with machine.pinned_threads(machine.threads(run.threads).number):
@@ -133,7 +149,7 @@ def _built(turn: Contender) -> Row:
 
 
 def _errors(run: RunSpec, whole: Contender, settings: Settings, tick: Tick) -> list[Row]:
-    """How far the whole scene is from the minima of its steps, and those from the minima of half the time step."""
+    """Measure the distance of the full scene from the minima of its steps, and of those from half the time step."""
     assert whole.scene is not None
     settings = replace(settings, stop=CONVERGED)
     found: list[Row] = []
@@ -156,7 +172,7 @@ def _errors(run: RunSpec, whole: Contender, settings: Settings, tick: Tick) -> l
 
 
 def _shared(run: RunSpec, scene: Scene, told: list[Row]) -> list[Row]:
-    """The rows with the columns that are the same in all of them."""
+    """Add the columns that all rows share."""
     shared = asked(run) | {
         "vertices": len(scene.mesh.rest),
         "springs": len(scene.springs.edges),

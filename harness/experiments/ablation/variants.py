@@ -1,4 +1,4 @@
-"""The variants of a scene that are compared: the whole one, and without each effect or each pair of them."""
+"""Scene variants to compare: the full scene, and the scene without each effect or each pair of effects."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from harness.scenes.spec import SceneSpec
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Variant:
-    """A scene without the effects `left_out`, by name; none are left out of the whole scene."""
+    """Scene without the effects `omitted_effects`, by name; the full scene omits none."""
 
     left_out: tuple[str, ...]
     scene: SceneSpec
 
     @property
     def name(self) -> str:
-        """The effects left out, joined by +."""
+        """The omitted effects, joined by +."""
         return "+".join(self.left_out)
 
 
 def variants(scene: SceneSpec, *, pairs: bool) -> list[Variant]:
-    """The whole scene, then without each of its effects in their order; with `pairs` also without each two."""
+    """Build the full scene, then one variant without each effect in order; `with_pairs` adds pairs."""
     names = effect_names(scene)
     chosen: list[tuple[int, ...]] = [(), *((i,) for i in range(len(names)))]
     if pairs:
@@ -32,7 +32,7 @@ def variants(scene: SceneSpec, *, pairs: bool) -> list[Variant]:
 
 
 def effect_names(scene: SceneSpec) -> list[str]:
-    """Each effect's kind; where a scene lists two of a kind, with their places in the list."""
+    """Return each effect's kind; with its index in the list where a scene lists two of a kind."""
     count = Counter(effect.kind for effect in scene.effects)
     return [e.kind if count[e.kind] == 1 else f"{e.kind}[{i}]" for i, e in enumerate(scene.effects)]
 

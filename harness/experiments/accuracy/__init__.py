@@ -1,1 +1,1 @@
-"""What accuracy costs in time: convergence curves on frozen steps, and the work of whole trajectories."""
+"""Accuracy against time: convergence curves on step snapshots, and work-precision of whole simulations."""

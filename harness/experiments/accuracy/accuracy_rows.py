@@ -1,19 +1,19 @@
-"""The rows of `springbench accuracy`: one Parquet file for each unit of work, under `results/<name>/accuracy/`.
+"""Rows of `springbench accuracy`: one Parquet file for each unit of work, under `results/<name>/accuracy/`.
 
-One table holds all kinds of rows, which `kind` tells apart:
+One table contains all kinds of rows; the column `kind` distinguishes them:
 
-    problem   a frozen step: what it is, its energy at the current positions and at Liu's inertial target
-    minimum   a minimum of it that is known; branch 0 is the lowest
-    prepare   the time in which a solver prepares for it
-    curve     an iterate of a solver on it: energy, errors, stationarity, and when it came
-    work      a simulation of the horizon: its error, the wall time that it took, and the CPU time of its best round
-    asked     a simulation to an error that was asked for (`springbench run SCENE --error`)
-    way       one of the ways that were tried for it, by its first setting
-    peer      the same by another library's integrator (`--peers`), whose name is `solver`
-    goal      the processor time of the cheapest way to an error, beside another's (`springbench goals`)
+    problem   a step snapshot: its properties, and its energy at the current positions and at Liu's inertial target
+    minimum   a known minimum of it; branch 0 is the lowest
+    prepare   the time that a solver needs to prepare for it
+    curve     an iterate of a solver on it: energy, errors, stationarity, and its time
+    work      a simulation up to the horizon: its error, its wall time, and the CPU time of its best round
+    asked     a simulation to a requested error (`springbench run SCENE --error`)
+    way       a method that was tried for it, at its first setting
+    peer      a simulation to the same error by a third-party integrator (`--peers`), whose name is `solver`
+    goal      the CPU time of the cheapest method for an error, compared with a baseline (`springbench goals`)
 
-Rows hold energies and errors of positions, never gaps: whoever reads them computes gaps from `g`, `g0` and the
-lowest `g` of the minima, so that a better minimum needs no new measurement.
+Rows contain energies and errors of positions, never gaps. Gaps are computed on reading from `g`, `g0` and the lowest
+`g` of the minima, so that a better minimum needs no new measurement.
 """
 
 from __future__ import annotations

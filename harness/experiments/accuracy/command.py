@@ -1,4 +1,4 @@
-"""`springbench recommend`."""
+"""Command `springbench recommend`."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
-"""How a solver converges on one frozen step: errors and wall times of the same iterates, in passes of their own.
+"""Measure the convergence of a solver on one step snapshot: errors and wall times of the same iterates.
 
-The first pass keeps the iterates that are to be graded. It also looks at a clock, which ends it at the time limit and
-does no more. Each timed pass then takes as many iterates as the first, with a stamp after each and nothing else in
-between, and must end at the same positions to the last bit.
+Errors and times come from separate passes. The first pass stores the iterates to score, and ends at the time limit.
+Each timed pass then computes as many iterates as the first. It records a time stamp after each and does nothing else in
+between. It must end at bitwise identical positions.
 
-A curve ends where it has converged (a stationarity of 1e-10, or an energy within 1e-9 of the gap at the current
-positions), where the iterates do not change any more, and at its limits. A saddle is stationary too, and is told by its
-curvature: a solver may yet leave it, and one that stays there has not converged.
+A curve ends on convergence: at a stationarity of 1e-10, or at an energy gap of 1e-9 of that at the current positions.
+It also ends where the iterates do not change any more, and at its limits. A saddle is stationary too; its negative
+curvature identifies it. A solver may still leave a saddle, and one that remains there has not converged.
 """
 
 from __future__ import annotations
@@ -30,31 +30,35 @@ from solvers.problem import Positions, Prepared, StepProblem
 
 STATIONARY, GAP = 1e-10, 1e-9
 AT_REST = 1e-8
-"""Stationarity at which iterates that do not change any more count as converged: round-off holds them there."""
+"""Stationarity at which iterates that do not change any more count as converged: round-off prevents progress."""
 
 STILL = 5
-"""Iterates in a row that do not differ before a solver counts as standing still: one that refuses its own step may
-go another way in the next."""
+"""Number of equal consecutive iterates after which a solver counts as stalled.
+
+A solver that rejects its own step may use another direction in the next iteration.
+"""
 
 PROGRESS = 1e-3
-"""The share of its gap by which a solver has to come nearer in the second half of its iterations."""
+"""Relative decrease of the gap that is required in the second half of the iterations."""
 
 EXPLODED = 1e6
-"""A gap of so many times that at the current positions is a divergence, finite as it may be."""
+"""Ratio of the gap to that at the current positions above which the solve diverges, even if it is finite."""
 
 WARM_UP = 2
-"""Iterates whose time does not count against the limit: they compile."""
+"""Iterates whose time does not count against the limit, because they compile."""
 
 SHORT = 0.1
-"""Seconds of a solve below which one more comes before the timed ones: grading has filled the caches, and the first
-iterate of a small mesh would take three times as long."""
+"""Duration below which an untimed solve precedes the timed ones [s].
+
+Scoring has filled the caches, and the first iterate of a small mesh would take three times as long.
+"""
 
 _EACH = 50
 _MANTISSAS = (1.0, 1.2, 1.5, 1.8, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 8.5)
 
 
 def kept(iteration: int) -> bool:
-    """Whether an iterate is graded: each of the first 50, and then 12 a decade."""
+    """Return whether an iterate is scored: each of the first 50, then 12 per decade."""
     if iteration <= _EACH:
         return True
     decade = 10 ** (len(str(iteration)) - 1)
@@ -63,8 +67,18 @@ def kept(iteration: int) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GradedCurve:
-    """The graded iterates: numbers (k,), 0 is the first guess; positions (k, n, 3) [m]; g (k,) [J]; stationarity (k,);
-    status and reason of the curve as a whole; seconds (k, rounds) since the solve began; interrupted: in any round."""
+    """Scored iterates of a solve.
+
+    Attributes:
+        iterate_indices: (k,); 0 is the initial guess.
+        positions: (k, n, 3) [m].
+        g: objective (k,) [J].
+        stationarity: (k,).
+        status: status of the curve as a whole.
+        reason: reason of the status.
+        seconds: time since the start of the solve, (k, rounds) [s].
+        preempted: whether any round was preempted.
+    """
 
     numbers: list[int]
     positions: list[Positions]
@@ -86,10 +100,19 @@ def measure(
     time_limit: float,
     rounds: int,
 ) -> GradedCurve:
-    """The curve of a solve from the problem's first guess.
+    """Measure the convergence curve of a solve from the problem's initial guess.
 
-    lowest: energy [J] of the lowest minimum known; time_limit: seconds of the solver's own.
-    Raises RunFailed where a timed pass ends at other positions, or another clock saw other seconds go by.
+    Args:
+        prepared: the prepared solver.
+        problem: the problem of the step.
+        evaluator: reference evaluator that scores iterates.
+        lowest_energy: energy of the lowest known minimum [J]; None without one.
+        max_iterations: iteration limit.
+        time_limit: limit on the solver's own time [s].
+        num_rounds: number of timed passes.
+
+    Raises:
+        RunFailed: a timed pass ends at other positions, or another clock disagrees.
     """
     grading = _Grading(oracle, problem, lowest, iterations, time_limit)
     p, spent, number, still = problem.first_guess.copy(), 0.0, 0, 0
@@ -115,7 +138,7 @@ def measure(
 
 
 class _Grading:
-    """The iterates graded so far, and what ends the curve."""
+    """Scored iterates of a running solve, and the conditions that end the curve."""
 
     def __init__(
         self, oracle: Oracle, problem: StepProblem, lowest: float | None, iterations: int, time_limit: float
@@ -138,7 +161,7 @@ class _Grading:
         self.positions.append(p.copy())
 
     def judge(self, fixed: bool, spent: float) -> None:
-        """Set status and reason where the last iterate that was added ends the curve."""
+        """Set status and reason where the last added iterate ends the curve."""
         number, stationarity = self.numbers[-1], self.stationarity[-1]
         gap = (self.g[-1] - self._lowest) / self._scale
         at = f"after {number} iterations, at a stationarity of {stationarity:.1e}"
@@ -160,12 +183,12 @@ class _Grading:
             self.reason = f"the limit of iterations was reached {at}"
 
     def _saddle(self) -> Curvature | None:
-        """The curvature at the last iterate, where it is negative beyond round-off."""
+        """Return the curvature at the last iterate if it is negative beyond round-off, else None."""
         found = curvature(self._problem, self.positions[-1])
         return found if found.falls else None
 
     def _progress(self) -> bool:
-        """Whether the second half of the iterations came nearer; energy tells it, or a smaller stationarity."""
+        """Return whether energy gap or stationarity decreased in the second half of the iterations."""
         half = np.searchsorted(self.numbers, self.numbers[-1] / 2, side="right")
         gaps, stationarity = np.array(self.g) - self._lowest, np.array(self.stationarity)
         return any(np.min(s[half:]) < (1 - PROGRESS) * np.min(s[:half]) for s in (gaps, stationarity))
@@ -175,7 +198,8 @@ class _Grading:
 def _timed(
     prepared: Prepared, problem: StepProblem, count: int, expected: Positions
 ) -> tuple[NDArray[np.float64], bool]:
-    """Wall seconds (count + 1,) from the start to the first guess (0), and to each iterate; whether interrupted."""
+    """Return the wall seconds (num_iterates + 1,) until each iterate, 0 for the initial guess, and whether preempted.
+    """
     stamps, watch = np.zeros(count + 1), Watch(numba.get_num_threads())
     p, copied = problem.first_guess, None
     gc.disable()  # a collection in the middle would be counted as the solver's

@@ -1,4 +1,4 @@
-"""What ends a measurement early, as the status and the reason of its rows."""
+"""Convert the error that ended a measurement to the status and the reason of its rows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from harness.reference.trajectory import Unpredictable
 
 
 class OverTime(Exception):
-    """A simulation reached its time limit; the message says how far it came."""
+    """Simulation that reached its time limit; the message states its last frame."""
 
 
 _STATUS: dict[type[Exception], str] = {
@@ -25,7 +25,7 @@ _STATUS: dict[type[Exception], str] = {
 
 
 def lost(error: Exception) -> dict[str, Any]:
-    """Status and reason of what ended with an error."""
+    """Return the status and the reason of a measurement that ended with an error."""
     told = failure(error)
     reason = str(error) if type(error) in _STATUS else told["reason"]
     return {"status": _STATUS.get(type(error), told["status"]), "reason": reason}

@@ -1,8 +1,8 @@
-"""The cheapest way to simulate a scene up to an error: looked up among what was measured, or measured first.
+"""Find the cheapest method to simulate a scene up to an error, from stored rows or new measurements.
 
-An error is that of a whole simulation up to a horizon (`harness.experiments.accuracy.work`), and a cost the wall
-seconds of a simulated second. The answer is the cheapest of those that were measured and keep to the error; one more
-simulation checks it.
+An error is that of a whole simulation up to a horizon (`harness.experiments.accuracy.work_precision`). A cost is the
+wall time per simulated second. The result is the cheapest measured method that meets the error; one more simulation
+checks it.
 """
 
 from __future__ import annotations
@@ -41,24 +41,28 @@ from solvers.about import LOCAL_GLOBAL
 from solvers.registry import EVERY, SOLVERS, about, load, minimises
 
 REFINEMENTS = (0.5, 1, 2, 4, 8)
-"""Steps in the horizon, relative to those of the scene's own time step."""
+"""Numbers of steps up to the horizon, relative to those at the scene's own time step."""
 
 HORIZON = 1.0
-"""Seconds after which the error counts, if nothing else is said."""
+"""Default simulated time at which the error counts [s]."""
 BUDGET = 60.0
-"""Wall seconds that measurements may take together, if nothing else is said."""
+"""Default limit for the wall time of all measurements together [s]."""
 _SAID = 2.0
-"""Seconds between two remarks on the reference."""
+"""Interval between two messages about the reference [s]."""
 _SAME, _APART = 1e-6, 1.3
-"""How far two errors of one simulation may differ, by compilers alone; and how many times as long it may take."""
+"""Relative difference of two errors of one simulation that compilers may cause; accepted ratio of its two times."""
 
 TRIED = ["implicit-euler", "bdf2", "midpoint", "sdirk-4"]
-"""Integrators: one of each order and kind."""
+"""Integrators to try: one of each order and kind."""
 
 
 def candidates() -> list[dict[str, Any]]:
-    """What is measured where nothing was: of each family's first, steps solved to a tolerance, and steps of 50
-    iterations or substeps; and all methods that take steps of their own to keep to an error."""
+    """Return the grid that is measured where no rows exist.
+
+    The first solver of each family runs with steps solved to a tolerance, or with 50 iterations or substeps. All
+    adaptive
+    solvers with their own integrator are included.
+    """
     made = {name: load(target) for name, target in SOLVERS.items()}
     told = {name: about(solver, name) for name, solver in made.items()}
     own = [name for name, of in told.items() if of.own_steps and of.to_error]
@@ -74,8 +78,16 @@ def candidates() -> list[dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class Recommended:
-    """A way to simulate the scene, its relative error, its wall seconds per simulated second, what kind of truth it
-    errs from, what the solver chose by itself, and the study that measured it."""
+    """Method that was measured on the scene.
+
+    Attributes:
+        work_spec: the simulation.
+        error: relative error.
+        seconds_per_simulated_second: wall time per simulated second.
+        reference_kind: kind of the reference solution for the error.
+        solver_description: what the solver selected automatically.
+        sweep: name of the study that measured it.
+    """
 
     spec: WorkSpec
     error: float
@@ -93,7 +105,7 @@ class Recommended:
         return f"{u.case.integrator}, time step {u.case.scene.time_step:.6g} s, {stop}, solver {u.solver.name}"
 
     def command(self, scene: Path) -> str:
-        """The command line that simulates a scene in a file this way; "" where a solver's parameters need a sweep."""
+        """Return the command line for this method; empty where the solver's parameters need a sweep."""
         u, made = self.spec, load(EVERY[self.spec.solver.name])
         if made(**u.solver.parameters) != made():
             return ""
@@ -107,7 +119,13 @@ class Recommended:
 
 @dataclass(frozen=True, slots=True)
 class Recommendation:
-    """ways: all that were measured, the cheapest first; best: of those within the error; checked: that once more."""
+    """Result of a recommendation.
+
+    Attributes:
+        measured_methods: all measured methods, cheapest first.
+        best_method: cheapest of those that meet the error.
+        checked_method: a repeated measurement of it.
+    """
 
     ways: tuple[Recommended, ...]
     best: Recommended
@@ -115,7 +133,7 @@ class Recommendation:
 
     @property
     def verdict(self) -> str:
-        """Whether what was predicted is what the check measured, in words."""
+        """Comparison of the predicted with the repeated measurement, as text."""
         before, now = self.best, self.checked
         if not math.isclose(now.error, before.error, rel_tol=_SAME):
             return (
@@ -143,12 +161,24 @@ def recommend(
     say: Callable[[str], None],
     budget: float = BUDGET,
 ) -> Recommendation:
-    """The cheapest way to a relative `error` after `horizon` seconds of the scene in a file.
+    """Return the cheapest method for a relative error at `t_end` seconds of the scene in a file.
 
-    size: of the mesh, the scene's default if left out; horizon: `HORIZON` if left out, or the longest at which the
-    error can be measured, where that is shorter; time_limit: seconds that a simulation may take; results: the folder
-    that holds a folder for each config; budget: wall seconds that all measurements may take together. Raises
-    InputError; RunFailed where nothing keeps to the error.
+    Args:
+        path: file of the scene.
+        max_error: relative error to reach.
+        size: mesh size; the scene's default if None.
+        t_end: simulated time [s]. If None, DEFAULT_T_END, or the longest time at which the error can be measured, if
+            that
+            is shorter.
+        time_limit: wall-time limit of a simulation [s].
+        results: folder that contains a folder for each config.
+        display: shows progress.
+        print_message: prints a remark.
+        budget: limit for the wall time of all measurements together [s].
+
+    Raises:
+        InputError: an option is invalid.
+        RunFailed: no method meets the error.
     """
     asked_for = {"--error": error, "--horizon": horizon, "--time-limit": time_limit, "--budget": budget}
     for key, value in asked_for.items():
@@ -180,7 +210,7 @@ def recommend(
 
 
 def _longest(path: Path, scene: SceneSpec, size: int, error: float, store: Store, say: Callable[[str], None]) -> float:
-    """The horizon [s] where none is given. Raises InputError, Unpredictable."""
+    """Return the default end time [s]. Raises InputError, Unpredictable."""
     if mistakes := misfits(scene, [size]):
         raise InputError(mistakes)
     if touches(bind(scene, size).system):
@@ -201,7 +231,7 @@ def _longest(path: Path, scene: SceneSpec, size: int, error: float, store: Store
 def _referenced(
     scene: SceneSpec, size: int, error: float, horizon: float, store: Store, say: Callable[[str], None]
 ) -> None:
-    """Make the reference, or say at once why there is none. Raises RunFailed."""
+    """Compute the reference, or report without delay why there is none. Raises RunFailed."""
     if touches(bind(scene, size).system):
         say(told_once(scene.path.stem))
     say(f"the reference first, the motion up to {horizon:g} s, which is made once")
@@ -225,7 +255,7 @@ def _measured(
     say: Callable[[str], None],
     budget: float,
 ) -> Omitted:
-    """Measure what may be the cheapest way to the error, where it is not known yet. Raises InputError, CannotWrite."""
+    """Measure the methods that may be the cheapest and have no rows. Raises InputError, CannotWrite."""
     known: dict[str, dict[str, Any]] = {
         way.spec.label(): {"status": "ok", "error": way.error, "seconds_per_simulated": way.cost} for way in ways
     }
@@ -244,7 +274,7 @@ def _measured(
 
 
 def _grid(path: Path, scene: SceneSpec, size: int, horizon: float, time_limit: float) -> Accuracy:
-    """What is measured where nothing was."""
+    """Build the study that is measured where no rows exist."""
     steps = max(1, round(horizon / scene.time_step))
     time_steps = [horizon / round(steps * factor) for factor in REFINEMENTS if round(steps * factor)]
     shared = {"horizon": horizon, "time_step": time_steps, "time_limit": time_limit} | ({"size": size} if size else {})
@@ -260,15 +290,17 @@ def _grid(path: Path, scene: SceneSpec, size: int, horizon: float, time_limit: f
 
 
 def _of_option(mistake: Mistake) -> Mistake:
-    """A mistake in a study as one in the option that its key came from."""
+    """Convert a mistake in a study to one in the option that its key came from."""
     return Mistake(mistake.problem, key="--" + mistake.key.rpartition(".")[2].replace("_", "-"))
 
 
 def _known(
     name: str, scene: SceneSpec, size: int, horizon: float, results: Path
 ) -> tuple[list[Recommended], list[dict[str, Any]]]:
-    """What was measured of this scene on this machine: the ways that have an error, the cheapest first, and the rows
-    of those that have none."""
+    """Read the rows of this scene on this machine.
+
+    Returns the methods that have an error, cheapest first, and the rows of those that have none.
+    """
     here, ways, without = machine.describe().id, list[Recommended](), list[dict[str, Any]]()
     units = (unit for folder in shelf.folders(results, "accuracy", "*/") for unit in shelf.units(folder))
     for path in sorted(unit for unit in units if unit.name.startswith(f"{name}-{size}-work-")):
@@ -284,7 +316,7 @@ def _known(
 
 
 def _spec(row: dict[str, Any], name: str, scene: SceneSpec) -> WorkSpec:
-    """What a row was measured of, if the scene is still the same."""
+    """Build the specification that a row was measured with, assuming an unchanged scene."""
     case = Case(name, scene.stepped(row["time_step"]), row["size"], row["integrator"])
     solver = SolverSpec(row["solver"], json.loads(row["parameters"]))
     how = How(row["threads"], rounds=1, time_limit=float("inf"))
@@ -292,7 +324,7 @@ def _spec(row: dict[str, Any], name: str, scene: SceneSpec) -> WorkSpec:
 
 
 def _check(best: Recommended, store: Store) -> Recommended:
-    """The same once more."""
+    """Repeat the measurement of a method."""
     row = work_rows(best.spec, trajectory_of(best.spec, store), lambda: None)[0]
     if row["status"] != "ok":
         raise RunFailed(f"the check of {best} ended otherwise than before: {row['status']}: {row['reason']}")
@@ -313,7 +345,7 @@ def _recommended(spec: WorkSpec, row: dict[str, Any]) -> Recommended:
 def _nothing(
     ways: list[Recommended], without: list[dict[str, Any]], error: float, horizon: float, omitted: Omitted | None
 ) -> str:
-    """Why there is no answer, and what to do."""
+    """Explain why no method meets the error, and suggest what to change."""
     if omitted and not omitted.complete:
         return (
             f"nothing that was measured keeps to an error of {error:g} over {horizon:g} s, and settings remain "

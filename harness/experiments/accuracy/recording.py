@@ -1,4 +1,4 @@
-"""A solve as a recording: the mesh at each graded iterate, and how far the solve is from its minimum."""
+"""Record a solve: the mesh at each scored iterate, and the distance of the solve from its minimum."""
 
 from __future__ import annotations
 
@@ -20,28 +20,40 @@ from harness.scenes.bind import Scene
 
 
 class FrozenStep(Protocol):
-    """A frozen step: when it was, and what is known of its minima."""
+    """Step snapshot with its known minima."""
 
     @property
     def moment(self) -> str:
-        """In words."""
+        """Name of the snapshot."""
         ...
 
     @property
     def frozen(self) -> Frozen:
-        """The problem."""
+        """The problem of the step."""
         ...
 
     @property
     def reference(self) -> KnownMinima:
-        """The minima."""
+        """The known minima of the step."""
         ...
 
 
 def record(
     spec: CurveSpec, graded: FrozenStep, scene: Scene, first_guess: str, curve: GradedCurve, folder: Path
 ) -> Path:
-    """Write the recording of a curve under `folder`/recordings and return its path. Raises RunFailed."""
+    """Write the recording of a curve under `folder`/recordings and return its path.
+
+    Args:
+        spec: the curves of the solver.
+        step: the step snapshot.
+        scene: the scene.
+        initial_guess: name of the initial guess.
+        curve: the scored iterates.
+        folder: folder of the results.
+
+    Raises:
+        RunFailed: the recording is incomplete.
+    """
     path = folder / "recordings" / f"{spec.label()}-{first_guess}.rrd"
     problem, here = graded.frozen.problem, machine.describe()
     finite = [p for p in curve.positions if np.isfinite(p).all()]

@@ -1,4 +1,4 @@
-"""The rows of frozen steps: what a step is, its minima, and the curves of a solver on it."""
+"""Rows of step snapshots: the step, its minima, and the curves of a solver on it."""
 
 from __future__ import annotations
 
@@ -30,15 +30,22 @@ from solvers.registry import EVERY, load
 Row = dict[str, Any]
 
 CONVERGED = 1e-2
-"""Stationarity below which a solver counts as having reached the basin where its last iterate lies."""
+"""Stationarity below which a solver counts as having reached the basin of its last iterate."""
 
 CLOSE = 1e-3
-"""Of the mean rest length: who ends so close to a minimum that is known, all over, has reached that one."""
+"""Largest distance of a vertex from a known minimum at which the minimum counts as reached, in mean rest lengths."""
 
 
 @dataclass(frozen=True, eq=False)
 class GradedStep:
-    """A frozen step of a case, and what grades it. moment: as rows tell it; store: of the truth."""
+    """Step snapshot of a case, with the objects that score iterates on it.
+
+    Attributes:
+        case: scene, size and integrator.
+        snapshot_name: name of the snapshot, as in the rows.
+        step_snapshot: the problem of the step.
+        reference_store: store of the reference solutions.
+    """
 
     case: Case
     moment: str
@@ -47,7 +54,13 @@ class GradedStep:
 
     @classmethod
     def find(cls, case: Case, moment: str | int, store: Store) -> GradedStep:
-        """The step at a moment; finds its minima. Raises InputError, RunFailed."""
+        """Load a step snapshot and find its minima. Raises InputError, RunFailed.
+
+        Args:
+            case: scene, size and integrator.
+            snapshot_name: name of the snapshot, or number of the frame.
+            reference_store: store of the reference solutions.
+        """
         scene, size, integrator = case.scene, case.size, case.integrator
         if isinstance(moment, int):
             frozen = store.frames(scene, size, [moment], integrator)[moment]
@@ -62,22 +75,22 @@ class GradedStep:
 
     @cached_property
     def oracle(self) -> Oracle:
-        """What grades iterates."""
+        """Reference evaluator that scores iterates."""
         return Oracle(self.frozen.problem.system)
 
     @property
     def reference(self) -> KnownMinima:
-        """The minima known by now."""
+        """The minima that are known at the time of the call."""
         return self.store.reference(self.frozen)
 
     @cached_property
     def mean_rest_length(self) -> float:
-        """Of the springs [m]; nan without any."""
+        """Mean rest length of the springs [m]; nan without springs."""
         lengths = self.scene.springs.rest_length
         return float(lengths.mean()) if len(lengths) else float("nan")
 
     def common(self) -> Row:
-        """The columns of the step that all rows share which tell of it."""
+        """Build the columns of the step that all its rows share."""
         return {
             "vertices": self.frozen.problem.system.vertices,
             "springs": len(self.scene.springs.edges),
@@ -88,7 +101,7 @@ class GradedStep:
         }
 
     def rows(self) -> list[Row]:
-        """The step's own row, and those of its minima; where no minimum is certified the first is `uncertified`."""
+        """Build the rows of the step and of its minima; the first is `uncertified` without a certified minimum."""
         case, problem, reference = self.case, self.frozen.problem, self.reference
         common = self.common() | provenance()
         common |= {"scene": case.scene_name, "size": case.size, "integrator": case.integrator}
@@ -118,7 +131,7 @@ class GradedStep:
         }
 
     def reached(self, p: Positions, stationarity: float) -> Minimum | None:
-        """The minimum in whose basin p (n, 3) [m] lies, if p is near enough to tell."""
+        """Return the minimum whose basin contains p (n, 3) [m]; None if p has not converged enough."""
         if not stationarity <= CONVERGED:
             return None
         for known in self.reference.minima:
@@ -129,9 +142,15 @@ class GradedStep:
 
 
 def curve_rows(spec: CurveSpec, graded: GradedStep, folder: Path, tick: Callable[[], None]) -> list[Row]:
-    """The rows of one solver on one step: its preparation, and a curve from each first guess.
+    """Measure one solver on one step: its preparation, and a curve from each initial guess.
 
-    folder: of the config's results; tick: called after each curve. What a solver raises is a row.
+    An error of the solver becomes a row.
+
+    Args:
+        spec: the curves of the solver.
+        step: the step snapshot.
+        results_folder: folder of the config's results.
+        tick: called after each curve.
     """
     solver: Solver = load(EVERY[spec.solver.name])(**spec.solver.parameters)
     shared = graded.common()
@@ -208,5 +227,5 @@ def _points(curve: GradedCurve, system: System, minimum: Minimum | None) -> list
 
 
 def _number(value: float) -> float | None:
-    """A measured value; null where an iterate has none, as it overflows."""
+    """Return the value, or None if it is not finite because an iterate overflows."""
     return value if math.isfinite(value) else None

@@ -1,6 +1,6 @@
-"""Does what is missing of an accuracy config: the frozen steps first, then the curves on them, and simulations.
+"""Execute the missing units of an accuracy config: step snapshots first, then curves on them, and simulations.
 
-A unit that the config asks for in another way by now, or of another frozen step, is done again.
+A unit is executed again if the config now requests it with other settings, or of another step snapshot.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from harness.reference.self_converged import told_once, touches
 
 @dataclass(frozen=True, slots=True)
 class _Planned:
-    """See `harness.experiments.resume.Planned`."""
+    """Unit and its completion status (`harness.experiments.completion_status.PlannedUnit`)."""
 
     unit: CurveUnit | WorkUnit
     standing: Standing
@@ -47,13 +47,22 @@ def run_accuracy(
     changed: bool = False,
     isolated: bool = True,
 ) -> list[Path]:
-    """Do what is missing (all of it with `again`, with `changed` also what other code measured) and return the files
-    of all units and their frozen steps.
+    """Execute the missing units and return the files of all units and their step snapshots.
 
-    What an earlier state of the config asked for is left where it is, and not among these.
+    Files of units that only an earlier version of the config requested stay in place, and are not returned.
 
-    folder: of the config's results, beside which the truth is kept for all configs; say: prints a remark; isolated: see
-    `harness.experiments.core.do_all`. Raises InputError, CannotWrite.
+    Args:
+        accuracy: the accuracy config.
+        folder: folder of its results; the reference solutions for all configs are stored next to it.
+        display: shows progress.
+        print_message: prints a remark.
+        rerun: whether to repeat all units.
+        rerun_stale: whether to repeat units measured by other source code.
+        isolated: see `harness.experiments.experiment_units.execute_units`.
+
+    Raises:
+        InputError: the input is invalid.
+        CannotWrite: the rows cannot be written.
     """
     home = Home(accuracy.name, folder)
     for name, case in {spec.case.scene_name: spec.case for spec in reversed(accuracy.work)}.items():
@@ -72,9 +81,16 @@ def run_accuracy(
 
 @contextmanager
 def measuring(work: Sequence[WorkSpec], folder: Path, display: Display) -> Generator[Callable[[WorkSpec], Row]]:
-    """A function that measures one simulation of these at a time, in a worker, and returns its row.
+    """Yield a function that measures one of these simulations in a worker and returns its row.
 
-    folder: of the results, as in `run_accuracy`. Raises InputError, CannotWrite.
+    Args:
+        work: the simulations that may be measured.
+        folder: folder of the results, as in `run_accuracy_study`.
+        display: shows progress.
+
+    Raises:
+        InputError: the input is invalid.
+        CannotWrite: the rows cannot be written.
     """
     home = Home(folder.name, folder)
     require_threads({spec.how.threads for spec in work})
@@ -92,7 +108,7 @@ def measuring(work: Sequence[WorkSpec], folder: Path, display: Display) -> Gener
         return rows.read([home.rows(spec.label())], SCHEMA).to_pylist()[0]
 
     with holding.alone(folder):
-        # No run that ends is of this kind, so no time left is estimated: most of these are omitted in the end.
+        # No run ends with this kind, so no remaining time is estimated: most of these are omitted in the end.
         display.begin([Effort("omitted")] * len(work))
         try:
             yield measure
@@ -102,7 +118,7 @@ def measuring(work: Sequence[WorkSpec], folder: Path, display: Display) -> Gener
 
 
 def failures(files: Sequence[Path]) -> list[str]:
-    """Scene, size, moment, solver and reason of what failed; other statuses are results."""
+    """Return a line for each failed unit: scene, size, snapshot, solver and reason; other statuses are results."""
     found = [rows.read([path], SCHEMA).to_pylist()[0] for path in files]
     return [
         f"{r['scene']} {r['size']} {r['moment'] or r['integrator']} {r['solver']}: {r['reason']}"
@@ -116,7 +132,7 @@ def _labels(spec: CurveSpec | WorkSpec) -> list[str]:
 
 
 def _steps(curves: Sequence[CurveSpec], home: Home) -> list[StepsUnit]:
-    """One for each case."""
+    """Return one unit for each case."""
     moments: dict[str, CurveSpec] = {}
     for spec in curves:
         moments.setdefault(spec.problem_label(), spec)
@@ -131,7 +147,7 @@ def _case(spec: CurveSpec) -> str:
 
 
 def _curves(curves: Sequence[CurveSpec], home: Home) -> Iterator[CurveUnit]:
-    """The curves of each step, once where two moments of a case are one step."""
+    """Yield the units for the curves of each step, once where two snapshots of a case are one step."""
     paths = dict.fromkeys(home.rows(spec.problem_label()) for spec in curves)
     steps = rows.heads(paths, ("problem", "moment", "frame", "status", "reason"), SCHEMA)
     moments: dict[tuple[str, str], str] = {}
@@ -148,7 +164,7 @@ def _work(work: Sequence[WorkSpec], home: Home) -> Iterator[WorkUnit]:
 
 
 def _planned(units: Sequence[CurveUnit | WorkUnit], home: Home) -> list[_Planned]:
-    """Units, and whether their rows are as they are asked for, and of the step that there is now."""
+    """Return the units and whether their rows match the request and the current step snapshot."""
     here = machine.describe().id
 
     def as_asked(unit: CurveUnit | WorkUnit, row: Mapping[str, Any]) -> bool:

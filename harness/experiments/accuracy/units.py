@@ -1,6 +1,7 @@
-"""Frozen steps, curves and simulations as units of an accuracy config (`harness.experiments.core.Unit`).
+"""Step snapshots, curves and simulations as units of an accuracy config.
 
-Each leaves a Parquet file under `<folder>/accuracy`, written when all of it is measured.
+Each is a `harness.experiments.experiment_units.ExperimentUnit`. It writes a Parquet file under `<folder>/accuracy` once
+the whole unit is measured.
 """
 
 from __future__ import annotations
@@ -28,39 +29,39 @@ from harness.reference.trajectory import Trajectory
 Row = dict[str, Any]
 
 PATIENCE = 3600.0
-"""Wall seconds that a unit may take beside what its solver may: compiling, grading, finding minima."""
+"""Wall time in addition to the solver's limit, for compiling, scoring and finding minima [s]."""
 SHARE = 4.0
-"""How many times as much wall time as its solver is allowed a pass may take: iterates are graded meanwhile."""
+"""Wall time of a pass as a multiple of the solver's time limit, since iterates are scored meanwhile."""
 
 
 @dataclass(frozen=True, slots=True)
 class Home:
-    """The results of a config of this name; the truth is kept beside them, for all configs."""
+    """Results of the config of this name; reference solutions are stored next to them, for all configs."""
 
     name: str
     folder: Path
 
     @property
     def store(self) -> Store:
-        """The truth."""
+        """Store of the reference solutions."""
         return references(self.folder.parent)
 
     def rows(self, label: str) -> Path:
-        """A file of rows."""
+        """Return the path of a file of rows."""
         return self.folder / "accuracy" / f"{label}.parquet"
 
 
 def references(results: Path) -> Store:
-    """The truth of all configs whose results are in one folder."""
+    """Open the store of reference solutions for all configs in one folder of results."""
     return Store(results / ".references")
 
 
 @dataclass(frozen=True, slots=True)
 class StepsUnit:
-    """Finds the frozen steps of a case and their minima: one for each of these specs, which differ in the moment.
+    """Unit that finds the step snapshots of a case and their minima, one per spec; specs differ in the snapshot.
 
-    A moment whose step could not be found has one row, without a problem; one whose step is that of another moment has
-    none, so that the step is measured once.
+    A snapshot that could not be found has one row, without a problem. A snapshot that equals another one has no row, so
+    that the step is measured once.
     """
 
     specs: tuple[CurveSpec, ...]
@@ -69,21 +70,21 @@ class StepsUnit:
 
     @property
     def title(self) -> str:
-        """See Unit."""
+        """Title of the unit, for messages."""
         return f"{self.specs[0].case.title} {self.specs[0].case.integrator}: steps to freeze"
 
     @property
     def ticks(self) -> int:
-        """The moments."""
+        """Number of snapshots."""
         return len(self.specs)
 
     @property
     def limits(self) -> Limits:
-        """See Unit."""
+        """Wall-time limit, proportional to the number of snapshots."""
         return Limits(PATIENCE * len(self.specs))
 
     def do(self, tick: Tick) -> str:
-        """See Unit."""
+        """Find the snapshots, write their rows and return the outcome as text."""
         told: list[str] = []
         known: set[str] = set()
         for spec in self.specs:
@@ -105,7 +106,7 @@ class StepsUnit:
         return "; ".join(told) or "ok"
 
     def lost(self, lost: Lost) -> str:
-        """See Unit."""
+        """Write a row for each snapshot of a lost unit, and return the outcome as text."""
         why = {"status": lost.status, "reason": str(lost)}
         for spec in self.specs:
             _write_step(self.home.rows(spec.problem_label()), self.home, [_unfound(spec, why)])
@@ -113,7 +114,7 @@ class StepsUnit:
 
 
 def _unfound(spec: CurveSpec, why: Row) -> Row:
-    """The row of a step that could not be found."""
+    """Build the row of a snapshot that could not be found."""
     return why | {"kind": "problem", "moment": moment_name(spec.moment)} | _of_case(spec.case) | provenance()
 
 
@@ -123,7 +124,7 @@ def _write_step(path: Path, home: Home, found: Sequence[Row]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class CurveUnit:
-    """The curves of one solver on one step. step: the first row of the step's file."""
+    """Unit that measures the curves of one solver on one step; `snapshot_row` is the first row of the step's file."""
 
     spec: CurveSpec
     home: Home
@@ -132,26 +133,26 @@ class CurveUnit:
 
     @property
     def title(self) -> str:
-        """See Unit."""
+        """Title of the unit, for messages."""
         return f"{self.spec.case.title} {self.step['moment']} {self.spec.solver.name}"
 
     @property
     def ticks(self) -> int:
-        """The curves."""
+        """Number of curves."""
         return len(self.spec.first_guesses)
 
     @property
     def limits(self) -> Limits:
-        """See Unit."""
+        """Wall-time limit for all rounds of all curves."""
         how = self.spec.how
         return Limits(PATIENCE + SHARE * how.time_limit * (how.rounds + 2) * self.ticks)
 
     def do(self, tick: Tick) -> str:
-        """See Unit."""
+        """Measure the curves, write their rows and return the outcome as text."""
         return _written(self.home, self.spec, self._measured(tick))
 
     def lost(self, lost: Lost) -> str:
-        """See Unit."""
+        """Write the rows of a lost unit, and return the outcome as text."""
         return _written(self.home, self.spec, self._without({"status": lost.status, "reason": str(lost)}))
 
     def _measured(self, tick: Tick) -> list[Row]:
@@ -164,7 +165,7 @@ class CurveUnit:
         except Exception as error:
             return self._without(ended(error))
         found = curve_rows(self.spec, graded, self.home.folder, lambda: tick(graded.moment))
-        # The curves may have found more minima; the step is told of them before its curves are there.
+        # The curves may have found more minima; the rows of the step are updated before those of its curves exist.
         _write_step(self.home.rows(self.spec.problem_label()), self.home, graded.rows())
         return found
 
@@ -175,7 +176,7 @@ class CurveUnit:
 
 @dataclass(frozen=True, slots=True)
 class WorkUnit:
-    """One simulation of a scene up to a horizon."""
+    """Unit that measures one simulation of a scene up to a horizon."""
 
     spec: WorkSpec
     home: Home
@@ -183,34 +184,34 @@ class WorkUnit:
 
     @property
     def title(self) -> str:
-        """See Unit."""
+        """Title of the unit, for messages."""
         case = self.spec.case
         return f"{case.title} {case.integrator} dt {case.scene.time_step:.3g} {self.spec.solver.name}"
 
     @property
     def ticks(self) -> int:
-        """The rounds."""
+        """Number of rounds."""
         return self.spec.how.rounds
 
     @property
     def limits(self) -> Limits:
-        """See Unit."""
+        """Wall-time limit for all rounds."""
         return Limits(PATIENCE + SHARE * self.spec.how.time_limit * (self.spec.how.rounds + 1))
 
     def do(self, tick: Tick) -> str:
-        """See Unit."""
+        """Measure the simulation, write its row and return the outcome as text."""
         trajectory = _trajectory(_Asked.of_motion(self.spec, self.home))
         return _written(self.home, self.spec, work_rows(self.spec, trajectory, lambda: tick("rounds")))
 
     def lost(self, lost: Lost) -> str:
-        """See Unit."""
+        """Write the row of a lost unit, and return the outcome as text."""
         spec = self.spec
         row: Row = {"kind": "work", "status": lost.status, "reason": str(lost), "horizon": spec.horizon}
         return _written(self.home, spec, [row | options(spec)])
 
 
 def _written(home: Home, spec: CurveSpec | WorkSpec, found: Sequence[Row]) -> str:
-    """Write what was measured, and say in words what became of it."""
+    """Write measured rows with the common columns, and return the outcome as text."""
     shared = {
         "unit": spec.unit_id(machine.describe().id),
         "sweep": home.name,
@@ -237,7 +238,7 @@ def _of_case(case: Case) -> Row:
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    """What units that come one after the other ask for alike; two of one key are the same."""
+    """Cache key of a reference request, which is equal for consecutive units."""
 
     key: tuple[Any, ...]
     spec: Any = field(compare=False)
@@ -249,7 +250,7 @@ class _Asked:
 
     @classmethod
     def of_motion(cls, spec: WorkSpec, home: Home) -> _Asked:
-        """The trajectory is the same for every time step."""
+        """Build the key of a trajectory, which is equal for all time steps."""
         return cls((spec.case.scene.stepped(1.0).digest, spec.case.size, spec.horizon, home.folder), spec, home.store)
 
 
@@ -264,9 +265,13 @@ def _trajectory(asked: _Asked) -> Trajectory | Exception:
 
 
 def trajectory_of(spec: WorkSpec, store: Store) -> Trajectory | Exception:
-    """The reference up to a simulation's horizon, or why there is none; which errors it can tell, each row asks.
+    """Return the reference trajectory up to a simulation's horizon, or the error that prevents it.
 
-    Raises InputError.
+    Each row checks which errors the reference can resolve. Raises InputError.
+
+    Args:
+        spec: the simulation.
+        reference_store: store of the reference solutions.
     """
     try:
         return store.trajectory(spec.case.scene, spec.case.size, [spec.horizon], error=1.0)

@@ -1,9 +1,9 @@
-"""The work of whole trajectories: how far a simulation ends from the reference, and the wall time that it took.
+"""Work-precision of whole simulations: the error against the reference at the horizon, and the wall time.
 
     error = |p(T) - reference(T)| / |reference(T) - p(0)|        Frobenius norms over the vertices that are not pinned
 
-The error is that of time stepping and solver together, which is what a user gets. Pins are exact here, as they are in
-the reference. Where the error is smaller than the reference's own, nothing can be said: the row is `uncertified`.
+The error combines time stepping and solver, which is what a user gets. Pins are exact here, as they are in the
+reference. Where the error is smaller than the reference's own error, the row is `uncertified`.
 """
 
 from __future__ import annotations
@@ -32,13 +32,16 @@ from solvers.registry import EVERY, load
 Row = dict[str, Any]
 
 WARM_UP = 2
-"""Steps done before the clock counts: they compile, and touch memory for the first time."""
+"""Steps before the clock starts: they compile, and access memory for the first time."""
 
 
 def work_rows(spec: WorkSpec, trajectory: Trajectory | Exception, tick: Callable[[], None]) -> list[Row]:
-    """The row of one simulation; what it raises is told there.
+    """Measure one simulation and build its row; an error becomes status and reason.
 
-    trajectory: the reference up to the horizon, or why there is none; tick: called after each round.
+    Args:
+        spec: the simulation.
+        trajectory: reference up to the horizon, or the error that prevents it.
+        tick: called after each round.
     """
     shared: Row = {"kind": "work", "status": "ok", **options(spec), "horizon": spec.horizon}
     try:
@@ -51,7 +54,7 @@ def work_rows(spec: WorkSpec, trajectory: Trajectory | Exception, tick: Callable
 
 
 def options(spec: WorkSpec) -> Row:
-    """The columns of a simulation's options."""
+    """Build the columns of a simulation's options."""
     return {**spec.options, "tolerance": tolerance(spec.options["tolerance"])}
 
 
@@ -85,10 +88,9 @@ def _simulated(spec: WorkSpec, trajectory: Trajectory, tick: Callable[[], None])
 def _run(
     spec: WorkSpec, scene: Scene, prepared: Prepared, frames: int, *, limit: float | None = None
 ) -> tuple[Positions, int, Row]:
-    """The last positions (n, 3) [m], the iterations of all steps, and what their clocks say, as columns;
-    limit: of seconds, the spec's if left out.
+    """Simulate under a clock; return the last positions (n, 3) [m], the number of iterations and timing columns.
 
-    Raises RunFailed where another clock saw other seconds go by.
+    `time_limit` is in seconds; that of the spec if left out. Raises RunFailed where another clock disagrees.
     """
     seconds, iterations, p, watch = 0.0, 0, scene.mesh.rest, Watch(spec.how.threads)
     clock = Clock(watch)

@@ -1,1 +1,1 @@
-"""The speed report: solvers, a yardstick in C++ and the machine's own limits, taking turns in one process."""
+"""Speed report: solvers, a C++ baseline and roofline microbenchmarks, timed interleaved in one process."""

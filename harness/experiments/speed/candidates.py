@@ -1,5 +1,6 @@
-"""What takes turns: a solver, the yardstick in C++, the machine itself. Each is prepared once and then timed again
-and again.
+"""Candidates of the round robin: a solver, the C++ baseline, and the machine itself.
+
+Each is prepared once and then timed repeatedly.
 """
 
 from __future__ import annotations
@@ -25,12 +26,14 @@ from solvers.problem import Positions, Prepared, StepProblem, StopRule
 from solvers.registry import EVERY, load
 
 LEAST = 0.02
-"""Seconds that a phase is repeated for in each turn: a clock's overhead is nothing then, and a first call that finds
-the caches cold is one of many."""
+"""Time for which a phase is repeated in each round [s].
+
+The overhead of a clock is then negligible, and a first call with cold caches is one of many.
+"""
 
 
 class Reading(NamedTuple):
-    """One phase in one turn: its seconds a call, and other columns of its row."""
+    """Timing of one phase in one round: seconds per call, and other columns of its row."""
 
     phase: str
     seconds: float
@@ -38,13 +41,13 @@ class Reading(NamedTuple):
 
 
 class Candidate(Protocol):
-    """Anything that is timed. `columns` are those of all its rows."""
+    """Subject of a measurement; `columns` are common to all its rows."""
 
     run: RunSpec
     columns: dict[str, Any]
 
     def prepare(self) -> float | None:
-        """Get ready, or do again what that takes; its seconds, None where there is nothing to do again."""
+        """Prepare, or repeat the preparation; returns its seconds, None if there is nothing to repeat."""
         ...
 
     def turn(self) -> list[Reading]:
@@ -52,15 +55,15 @@ class Candidate(Protocol):
         ...
 
     def close(self) -> Positions | None:
-        """Let go of everything; the positions after the last step (n, 3) [m], None where there are none."""
+        """Release all resources; returns the positions after the last step (n, 3) [m], None if there are none."""
         ...
 
 
 class SolverCandidate:
-    """A solver of the registry, asked for the same step each time.
+    """Solver of the registry, which computes the same step each time.
 
-    Candidates that differ in their threads alone are timed on one factor, in `prepared`: large ones would not fit
-    into memory side by side.
+    Candidates that differ only in their number of threads are timed on one factor, in `prepared`, because several large
+    factors would not fit into memory.
     """
 
     def __init__(
@@ -76,7 +79,7 @@ class SolverCandidate:
 
     @measured_again
     def prepare(self) -> float:
-        """See Candidate. Raises Unsupported, NotPositiveDefinite, MemoryError."""
+        """Prepare the solver and return the wall seconds. Raises Unsupported, NotPositiveDefinite, MemoryError."""
         watch = Watch(numba.get_num_threads())
         with watch:
             began = perf_counter()
@@ -94,7 +97,7 @@ class SolverCandidate:
         return seconds
 
     def turn(self) -> list[Reading]:
-        """See Candidate."""
+        """Time a step and the phases of an iteration."""
         prepared = self._prepared
         assert prepared is not None
         readings = [reading("step", self._step, self._columns("iteration", self.run.iterations))]
@@ -103,7 +106,7 @@ class SolverCandidate:
         return readings
 
     def close(self) -> Positions | None:
-        """See Candidate."""
+        """Release the solver; returns the positions of its last step."""
         self._prepared = None
         return self._positions
 
@@ -126,7 +129,7 @@ class SolverCandidate:
 
 
 class YardstickCandidate:
-    """The C++ program, asked for the same step."""
+    """C++ baseline program, which computes the same step."""
 
     def __init__(
         self, run: RunSpec, scene: Scene, problem: StepProblem, program: Callable[[], Path], tunables: str
@@ -137,7 +140,7 @@ class YardstickCandidate:
         self._running: Yardstick | None = None
 
     def prepare(self) -> float | None:
-        """See Candidate. Raises Unsupported, RunFailed."""
+        """Start the program, once, and return the seconds of its preparation. Raises Unsupported, RunFailed."""
         if self._running:
             return None
         folder = Path(self._folder.name)
@@ -145,7 +148,7 @@ class YardstickCandidate:
         return self._running.prepare_seconds
 
     def turn(self) -> list[Reading]:
-        """See Candidate."""
+        """Time a step, its local steps and its global steps."""
         running, iterations = self._running, self.run.iterations
         assert running is not None
         once = running.step(iterations)
@@ -159,7 +162,7 @@ class YardstickCandidate:
         ]
 
     def close(self) -> Positions | None:
-        """See Candidate."""
+        """End the program and remove its files; returns the positions of its last step."""
         try:
             return self._running.close() if self._running else None
         finally:
@@ -169,18 +172,18 @@ class YardstickCandidate:
 
 
 class MachineCandidate:
-    """The machine's own limits with a number of threads."""
+    """Roofline microbenchmarks of the machine for a number of threads."""
 
     def __init__(self, run: RunSpec) -> None:
         self.run, self.columns = run, {}
 
     def prepare(self) -> None:
-        """See Candidate: compiles, which is not timed."""
+        """Compile the kernels, which is not timed."""
         for probe in limits.probes(limits.WORKING_SETS[:1]):
             probe.call()
 
     def turn(self) -> list[Reading]:
-        """See Candidate."""
+        """Time every kernel once."""
         return [
             reading(
                 probe.name,
@@ -192,18 +195,18 @@ class MachineCandidate:
         ]
 
     def close(self) -> None:
-        """See Candidate."""
+        """Do nothing: no resources to release."""
 
 
 class Repeated:
-    """The seconds that some calls take, by their number; interrupted: whether any of them were."""
+    """Timed repetition of a call; `preempted` states whether any repetition was preempted."""
 
     def __init__(self, call: Callable[[], object]) -> None:
         self._call, self.interrupted = call, False
 
     @measured_again
     def __call__(self, number: int) -> float:
-        """Wall seconds of so many calls. Raises ClocksDisagree."""
+        """Return the wall seconds of a number of calls. Raises ClocksDisagree."""
         watch = Watch(numba.get_num_threads())
         with watch:
             began = perf_counter()
@@ -215,13 +218,20 @@ class Repeated:
 
 
 def reading(phase: str, call: Callable[[], object], columns: dict[str, Any], least: float = LEAST) -> Reading:
-    """A phase's seconds a call. Raises RunFailed where another clock saw other ones."""
+    """Time a phase and return the seconds per call. Raises RunFailed where another clock disagrees.
+
+    Args:
+        phase: name of the phase.
+        call: what to time.
+        columns: further columns of its row.
+        min_seconds: time for which to repeat the call [s].
+    """
     seconds = Repeated(call)
     return Reading(phase, average(seconds, least), columns | {"interrupted": seconds.interrupted})
 
 
 def average(seconds: Callable[[int], float], least: float = LEAST) -> float:
-    """Seconds a call: of one that takes longer than `least`, else of as many as take that long, after a first one."""
+    """Return the seconds per call, over one call or enough calls to last `min_seconds` after a first one."""
     once = seconds(1)
     number = _repeats(once, least)
     return seconds(number) / number if number > 1 else once

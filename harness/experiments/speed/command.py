@@ -1,4 +1,4 @@
-"""`springbench speed`."""
+"""Command `springbench speed`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def speed(
     changed: Changed = False,
     here: InThisProcess = False,
 ) -> None:
-    """Time a sweep's solvers in turns, beside a yardstick in C++ and the machine's own limits."""
+    """Time a sweep's solvers interleaved, with a C++ baseline and roofline microbenchmarks."""
     from harness.base.claim import claimed
     from harness.base.progress import display
     from harness.config.load import load_sweep, require_stated

@@ -1,7 +1,7 @@
-"""The speed report: the runs of a sweep, side by side with the yardstick and the machine's limits, size by size.
+"""Speed report: the runs of a sweep, compared with the C++ baseline and the roofline of the machine, size by size.
 
-An ordinary sweep says what runs; here all runs of a size are one unit, and are timed in turns in one process, each from
-the same first step of its scene.
+An ordinary sweep specifies the runs. All runs of a size are one unit here. They are timed interleaved in one process,
+each from the same first step of its scene.
 """
 
 from __future__ import annotations
@@ -35,19 +35,23 @@ from harness.simulation.step import problem, start
 from solvers.problem import Prepared
 
 TEMPORARIES = {"default": "", "cheap": yardstick.CHEAP_TEMPORARIES}
-"""How the yardstick's memory is set up: as it comes, or so that temporaries cost least."""
+"""Memory settings of the C++ baseline: the defaults, or those that make temporaries cheapest."""
 
 
 PATIENCE = 3600.0
-"""Wall seconds that a size may take beside four times the budget of each candidate: compiling, preparing, checking."""
+"""Wall time of a size in addition to four times the budget of each candidate, for compiling, preparing, checking [s].
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """The runs of one scene and size, and what is timed beside them (`harness.experiments.core.Unit`).
+    """Runs of one scene and size with their baselines (`harness.experiments.experiment_units.ExperimentUnit`).
 
-    folder: of the results; smaller: the name and the file of rows of each candidate of a smaller size, the
-    smallest first; budget: seconds that a candidate may take, as its smaller sizes predict.
+    Attributes:
+        candidate_runs: the runs, and those of the baselines.
+        folder: folder of the results.
+        smaller_rows: name and file of rows of each candidate of a smaller size, smallest first.
+        budget: time limit of a candidate, as predicted from its smaller sizes [s].
     """
 
     members: tuple[RunSpec, ...]
@@ -57,46 +61,46 @@ class Comparison:
 
     @property
     def files(self) -> list[Path]:
-        """The rows of each candidate."""
+        """Files of the rows of each candidate."""
         return [Files.of(run, self.folder).rows for run in self.members]
 
     @property
     def title(self) -> str:
-        """See Unit."""
+        """Title of the unit, for messages."""
         first = self.members[0]
         return f"{first.scene_name} {first.size}: {len(self.members)} candidates take turns"
 
     @property
     def ticks(self) -> int:
-        """Rounds of preparing and of turns."""
+        """Number of rounds of preparation and of timing."""
         return PREPARES + max(run.rounds for run in self.members)
 
     @property
     def effort(self) -> Effort:
-        """See Unit: by vertices."""
+        """Estimated cost, proportional to the number of vertices."""
         return Effort(amount=float(self.members[0].size or 32) ** 2)
 
     @property
     def limits(self) -> Limits:
-        """See Unit."""
+        """Wall-time limit, from the budget of all candidates."""
         return Limits(PATIENCE + 4.0 * self.budget * len(self.members))
 
     @property
     def standing(self) -> Standing:
-        """Whether the rows of all candidates are there."""
+        """Completion status: completed if the rows of all candidates exist."""
         found = list(standings(dict.fromkeys(self.files, lambda row: True), (), SCHEMA).values())
         missing = next((one for one in found if one.state == MISSING), None)
         return missing or found[0]._replace(older=any(one.older for one in found))
 
     def do(self, tick: Tick) -> str:
-        """See Unit."""
+        """Time all candidates, write their rows and return the outcome as text."""
         past: dict[str, list[Past]] = {}
         for candidate, path in self.smaller:
             past.setdefault(candidate, []).extend(_past(rows.read([path]).to_pylist()))
         return self._written(_measured(self.members, self.folder, past, self.budget, tick))
 
     def lost(self, lost: Lost) -> str:
-        """See Unit."""
+        """Write a row for each candidate of a lost unit, and return the outcome as text."""
         why = {"phase": "run", "status": lost.status, "reason": str(lost)}
         return self._written([[common(run) | why] for run in self.members])
 
@@ -118,11 +122,20 @@ def run_speed(
     budget: float = 210.0,
     isolated: bool = True,
 ) -> pa.Table:
-    """Do the sizes of a sweep that are missing (all with `again`, with `changed` also those measured by other code) and
-    return all rows.
+    """Execute the missing sizes of a sweep and return all rows.
 
-    budget: seconds that a candidate may take at a size, as its smaller sizes predict; say: prints a remark; isolated:
-    see `harness.experiments.core.do_all`. Raises InputError.
+    Args:
+        sweep: the sweep.
+        folder: folder of the results.
+        display: shows progress.
+        print_message: prints a remark.
+        rerun: whether to repeat all sizes.
+        rerun_stale: whether to repeat sizes measured by other source code.
+        budget: time limit of a candidate at a size, as predicted from its smaller sizes [s].
+        isolated: see `harness.experiments.experiment_units.execute_units`.
+
+    Raises:
+        InputError: an option is invalid.
     """
     runs = [run.but(threads=machine.threads(run.threads).number) for run in sweep.runs()]
     require_threads({machine.threads(run.threads).number for run in runs})
@@ -138,7 +151,7 @@ def run_speed(
 
 
 def _groups(runs: Sequence[RunSpec]) -> list[list[RunSpec]]:
-    """The runs of each scene and size, smaller sizes first."""
+    """Group the runs by scene and size, smaller sizes first."""
     groups: dict[tuple[str, int], list[RunSpec]] = {}
     for run in sorted(runs, key=lambda run: run.size):
         groups.setdefault((run.scene_name, run.size), []).append(run)
@@ -146,7 +159,7 @@ def _groups(runs: Sequence[RunSpec]) -> list[list[RunSpec]]:
 
 
 def _beside(group: Sequence[RunSpec]) -> list[RunSpec]:
-    """What is timed beside the runs of a size: the yardstick on one thread, the machine on as many as they use."""
+    """Build the baseline runs of a size: the C++ baseline on one thread, the machine on as many as the runs use."""
     first = group[0]
     eigen = [first.but(threads=1, solver=SolverSpec(YARDSTICK, {"temporaries": setting})) for setting in TEMPORARIES]
     threads = sorted({run.threads for run in group})
@@ -156,7 +169,7 @@ def _beside(group: Sequence[RunSpec]) -> list[RunSpec]:
 def _measured(
     runs: Sequence[RunSpec], folder: Path, past: dict[str, list[Past]], budget: float, tick: Tick
 ) -> list[list[dict[str, Any]]]:
-    """The rows of each run of one scene and size."""
+    """Measure all runs of one scene and size, and return the rows of each."""
     scene = build(runs[0].scene, runs[0].size)
     stated = problem(scene, start(scene), runs[0].first_guess)
     program = partial(yardstick.build, folder / "build")
@@ -175,7 +188,7 @@ def _measured(
 
 
 def _past(found: Sequence[dict[str, Any]]) -> list[Past]:
-    """What the rows of a run tell about larger sizes; nothing where it failed or has no steps."""
+    """Return the timing that predicts larger sizes from a run's rows; empty if it failed or has no steps."""
     prepare = [row["seconds"] for row in found if row["phase"] == "prepare"]
     iteration = [row["seconds"] / row["iterations"] for row in found if row["phase"] == "step"]
     if not (prepare and iteration):

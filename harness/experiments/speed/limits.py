@@ -1,13 +1,13 @@
 # pyright: reportMissingTypeStubs=false
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-# Numba and llvmlite, which generate the code, have no types.
-"""What the machine can do at best, measured: bytes a second by working set (after STREAM, McCalpin 1995), and flops.
+# Numba and llvmlite, which generate the code, have no type annotations.
+"""Roofline microbenchmarks: bandwidth by working set (after STREAM, McCalpin 1995), and peak flops.
 
-    read     s += a_i                    8 bytes an entry
-    triad    a_i = b_i + 3 c_i           24 bytes an entry, as STREAM counts them
-    fma      a = a x + y in registers    2 flops a lane
+    read     s += a_i                    8 bytes per entry
+    triad    a_i = b_i + 3 c_i           24 bytes per entry, as STREAM counts them
+    fma      a = a x + y in registers    2 flops per lane
 
-The same kernels with one thread and with several: each thread has its own part of a working set.
+The same kernels run with one thread and with several; each thread has its own part of a working set.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from solvers.compiling import kept
 
 WORKING_SETS = tuple(int(2.0**k) for k in np.arange(14, 29.5, 0.5))
-"""Bytes in all threads together: from 16 KiB, in the first cache, to 512 MiB, in memory."""
+"""Bytes of all threads together: from 16 KiB, in the first-level cache, to 512 MiB, in memory."""
 
 _CALL_BYTES = 1 << 27
 _CHAINS, _VECTOR_BYTES = 12, 64
@@ -37,8 +37,15 @@ _FAST = {"contract", "reassoc", "nsz"}
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """One kernel, ready to be timed: its name, the bytes that it goes through again and again, what one call moves
-    [bytes] and computes [flops]."""
+    """Kernel that is ready to be timed.
+
+    Attributes:
+        name: name of the kernel.
+        working_set_bytes: size of the data that it traverses repeatedly [B].
+        bytes_moved: bytes that one call moves [B].
+        flops: operations that one call computes.
+        call: runs the kernel.
+    """
 
     name: str
     working_set: int
@@ -48,12 +55,12 @@ class Probe:
 
 
 def probes(sets: tuple[int, ...] = WORKING_SETS) -> Iterator[Probe]:
-    """All kernels, for the number of threads that Numba uses now."""
+    """Build all kernels for Numba's current number of threads."""
     threads = numba.get_num_threads()
     room = np.ones(max(sets) // 8)
     for size in sets:
         a = room[: size // 8]
-        # Short sets are gone through many times in a call, or starting the threads would be what is measured.
+        # Short sets are traversed many times in a call; otherwise the start of the threads would dominate.
         repeats = max(1, _CALL_BYTES // size)
         yield Probe("read", size, 8 * len(a) * repeats, len(a) * repeats, lambda a=a, r=repeats: _read(a, threads, r))
         b, c, d = np.split(a[: len(a) // 3 * 3], 3)
@@ -110,7 +117,7 @@ def _fused(start: NDArray[Any], threads: int) -> float:
 
 
 def _multiply_adds(typingctx: Any, start: Any, repeats: Any) -> tuple[Any, Callable[..., Any]]:
-    """The sum of some vectors after `repeats` multiply-adds of each with start[0] and itself, all in registers."""
+    """Sum some vectors after `repeats` multiply-adds of each with start[0] and itself, all in registers."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         array, count = signature.args[0], args[1]

@@ -1,7 +1,8 @@
-"""Whether a factor of less precision leads elsewhere: from where a step has converged, not along the way there.
+"""Measure whether a factor of lower precision changes the solution, starting from a converged step.
 
-Local-global iterations take tens of thousands of steps to the minimum of a stiff scene, so Newton's method finds it,
-and then a candidate and one of float64 iterate from there. They part by what the precision does to a converged step.
+Local-global iterations take tens of thousands of steps to the minimum of a stiff scene. Newton's method therefore finds
+it. Then a candidate and a float64 solver iterate from the minimum. Their difference is the effect of the precision on a
+converged step.
 """
 
 from __future__ import annotations
@@ -19,23 +20,23 @@ from solvers.problem import Positions, Prepared, StepProblem, StopRule, Unsuppor
 _FROM_MINIMUM = StopRule(50)
 _TO_MINIMUM = StopRule(200, 1e-12)
 _LARGEST = 10_000
-"""Vertices up to which a minimum is looked for: a second for 64 a side, half a minute for 128."""
+"""Largest number of vertices for which a minimum is computed: 1 s for 64 a side, 30 s for 128."""
 
 
 class Rest(NamedTuple):
-    """A step problem that begins at its minimum, and the positions (n, 3) [m] where float64 ends from there."""
+    """Step problem that starts at its minimum, and the positions (n, 3) [m] where float64 ends from there."""
 
     problem: StepProblem
     positions: Positions
 
 
 def precision(run: RunSpec) -> str:
-    """The precision of a run's factor."""
+    """Return the precision of a run's factor."""
     return run.solver.parameters.get("precision", "float64")
 
 
 def rest_of(problem: StepProblem) -> Rest | None:
-    """Where a step problem converges; None for a large one, or one that Newton's method does not take."""
+    """Find the minimum of a step problem; None for a large one, or one that Newton's method does not support."""
     if problem.system.vertices > _LARGEST:
         return None
     try:
@@ -47,6 +48,6 @@ def rest_of(problem: StepProblem) -> Rest | None:
 
 
 def apart(rest: Rest, prepared: Prepared) -> float:
-    """How far from float64's a prepared solver's positions end, in the scene's size."""
+    """Return the largest distance of a prepared solver's positions from float64's, relative to the scene's size."""
     found = prepared.solve(rest.problem, _FROM_MINIMUM).positions
     return float(np.abs(found - rest.positions).max()) / float(np.ptp(rest.positions, axis=0).max())

@@ -1,8 +1,8 @@
-"""Candidates of one mesh size take turns, A B C A B C ..., so that whatever slows the machine slows all of them.
+"""Time candidates of one mesh size in round-robin order, A B C A B C ..., so that disturbances affect all alike.
 
-First each is prepared (round 0, cold), then prepared again, then timed in as many rounds as the sweep says. Their final
-positions are compared before any time is believed. A candidate that would take too long, as its own smaller sizes
-predict, is left out with a row that says so.
+Each candidate is first prepared (round 0, cold), then prepared again, then timed in the sweep's number of rounds. Final
+positions are compared, and only candidates that agree keep their times. A candidate that would take too long, as
+predicted from its smaller sizes, is skipped with a row that states so.
 """
 
 from __future__ import annotations
@@ -26,20 +26,23 @@ from harness.simulation.measure import digest
 from solvers.problem import Positions
 
 PREPARES = 3
-"""How often each is prepared, the first time included."""
+"""Number of preparations of each candidate, including the first."""
 
 LONG = 3.0
-"""Seconds of a preparation that is not repeated: that of a large mesh, which nothing is cold for any more."""
+"""Duration above which a preparation is not repeated [s]: for a large mesh, cold caches do not matter any more."""
 
 AGREEMENT = {"float64": 1e-9, "float32": 1e-5, "float16": 1e-2}
-"""How far final positions may lie apart, in the scene's size: round-off of 50 iterations, that of float64 in 1e10 : 1
-stiffnesses; below float64 the iterates differ by the precision of the factor until they converge."""
+"""Largest difference of final positions, relative to the scene's size, by precision.
+
+float64: round-off of 50 iterations, with stiffness ratios of 1e10 : 1. Below float64 the iterates differ by the
+precision of the factor until they converge.
+"""
 
 Row = dict[str, Any]
 
 
 class Past(NamedTuple):
-    """What a candidate took at a smaller size: seconds to prepare, warm, and an iteration."""
+    """Timing of a candidate at a smaller size: warm preparation [s], and one iteration [s]."""
 
     vertices: int
     prepare: float
@@ -53,10 +56,14 @@ def measure(
     budget: float,
     tick: Tick = lambda phase: None,
 ) -> list[list[Row]]:
-    """The rows of each candidate.
+    """Measure the candidates in turn and return the rows of each.
 
-    counts: columns that all share; past: by `name` of a run, smaller sizes first; budget: seconds a candidate; tick:
-    told of each round.
+    Args:
+        candidates: what to time.
+        counts: columns that all rows share.
+        past_timings: timings at smaller sizes in ascending order, by `format_candidate_name` of a run.
+        budget: time limit of a candidate [s].
+        tick: called after each round with the phase.
     """
     rows: dict[Candidate, list[Row]] = {}
     alive: list[Candidate] = []
@@ -91,12 +98,18 @@ def measure(
 
 
 def name(run: RunSpec) -> str:
-    """What stays the same of a run over the mesh sizes."""
+    """Return the name of a run that is common to all mesh sizes."""
     return f"{run.scene_name} {run.solver.name} {sorted(run.solver.parameters.items())} {run.threads}"
 
 
 def predicted(past: Sequence[Past], vertices: int, run: RunSpec) -> float:
-    """The seconds that a run will take, by a power law through the last two smaller sizes; 0 without any."""
+    """Predict the seconds of a run by a power law through the last two smaller sizes; 0 without any.
+
+    Args:
+        past_timings: timings at other sizes, in ascending order.
+        vertices: number of vertices of the run.
+        run: the run.
+    """
     known = [p for p in past if p.vertices < vertices]
     if not known:
         return 0.0
@@ -114,7 +127,7 @@ def predicted(past: Sequence[Past], vertices: int, run: RunSpec) -> float:
 
 @contextmanager
 def _guarded(candidate: Candidate, rows: list[Row], alive: list[Candidate]) -> Generator[None]:
-    """With the candidate's threads; what it raises is its only row, and it is out."""
+    """Run a block with the candidate's threads; an error becomes its only row and excludes the candidate."""
     try:
         with machine.pinned_threads(machine.threads(candidate.run.threads).number):
             yield
@@ -131,7 +144,7 @@ def _row(reading: Reading, round: int) -> Row:
 
 
 def _compare(rows: dict[Candidate, list[Row]], alive: list[Candidate]) -> None:
-    """Close all; whose positions differ from those of the first is out, and digests go to the rows of steps."""
+    """Close all candidates, exclude those whose positions differ from the first, and store digests."""
     reference: Positions | None = None
     for candidate in list(alive):
         with _guarded(candidate, rows[candidate], alive):
@@ -149,6 +162,6 @@ def _compare(rows: dict[Candidate, list[Row]], alive: list[Candidate]) -> None:
 
 
 def _closed(candidate: Candidate) -> None:
-    """Close one that may have been closed, or that cannot answer any more."""
+    """Close a candidate that may be closed already, or does not respond any more."""
     with suppress(RunFailed, OSError):
         candidate.close()

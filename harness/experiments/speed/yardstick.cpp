@@ -1,9 +1,9 @@
-// The yardstick: one step of the local-global iterations of `eigen.hpp`, timed again and again.
+// C++ baseline: one step of the local-global iterations of `eigen.hpp`, timed repeatedly.
 //
-// The scene comes from the file named first (see `harness.experiments.speed.yardstick`).
-// It answers with the seconds of its preparation. Each line of the input is a number of iterations: a step from the
-// first guess, answered by seconds of wall time: of the step, of its local steps, of its global steps. The end of
-// the input writes the last positions, row by row, to the file named second.
+// Input: the scene, from the file named first (see `harness.experiments.roofline.cpp_baseline`); then, on the standard
+// input, a number of iterations per line. Output: the seconds of the preparation; then, for each line, the wall seconds
+// of a step from the initial guess, of its local steps and of its global steps. At the end of the input the last
+// positions are written, row by row, to the file named second.
 
 #include "eigen.hpp"
 
@@ -23,7 +23,7 @@ static std::vector<T> read(std::size_t count) {
     return values;
 }
 
-// Points lie in the file as x, y, z of one vertex after the other.
+// Points are stored as x, y, z of one vertex after the other.
 static MatrixXd points(std::size_t count) {
     const std::vector<double> values = read<double>(3 * count);
     using Rows = Eigen::Matrix<double, Eigen::Dynamic, 3, Eigen::RowMajor>;

@@ -1,7 +1,7 @@
-"""The yardstick in C++, `yardstick.cpp`: compiled where a compiler and Eigen are, and asked for one step at a time.
+"""C++ baseline, `cpp_baseline.cpp`: compiled where a compiler and Eigen exist, and called for one step at a time.
 
-The scene goes to it in a file: int64 n, m, q; float64 dt; int64 edges (m, 2), pinned (q,); float64 stiffness, rest
-length (m,), mass (n,), pin weight (q,), target, force, first guess (n, 3), pin targets (q, 3).
+The scene is passed in a file: int64 n, m, q; float64 dt; int64 edges (m, 2), pinned (q,); float64 stiffness, rest
+length (m,), mass (n,), pin weight (q,), target, force, initial guess (n, 3), pin targets (q, 3).
 """
 
 from __future__ import annotations
@@ -24,21 +24,33 @@ CHEAP_TEMPORARIES = ":".join(
     f"glibc.malloc.{setting}"
     for setting in ("hugetlb=1", "mmap_threshold=1073741824", "trim_threshold=4294967296", "top_pad=67108864")
 )
-"""Settings of the GNU C library that make temporaries cheap: transparent huge pages, and freed memory is kept."""
+"""Settings of the GNU C library for cheap temporaries: transparent huge pages, and freed memory is not returned."""
 
 MALFORMED = {2: "wanted a scene and a file for positions", 3: "the scene's file is too short", 4: "Q has no factor"}
 
 
 def build(folder: Path) -> Path:
-    """The compiled yardstick in `folder`, made anew when its source has changed. Raises Unsupported: why not."""
+    """Compile the baseline in `folder`; again if its source has changed. Raises Unsupported with the reason."""
     return compile_cpp(SOURCE, folder, NEEDS)
 
 
 class Yardstick:
-    """The running program, with one step problem of springs."""
+    """Running baseline program with one step problem of springs."""
 
     def __init__(self, program: Path, problem: StepProblem, springs: Springs, folder: Path, tunables: str) -> None:
-        """Start it and factorise; folder: for its files; tunables: of the C library. Raises Unsupported, RunFailed."""
+        """Start the program and factorise.
+
+        Args:
+            program: the compiled program.
+            problem: the step problem.
+            springs: the springs of the scene.
+            folder: folder for the files of the program.
+            tunables: settings of the C library.
+
+        Raises:
+            Unsupported: a pin is not a penalty.
+            RunFailed: the program ended.
+        """
         if problem.system.pins.exact.any():
             raise Unsupported("the yardstick knows pins by penalty only")
         scene, self._positions = folder / "scene.bin", folder / "positions.bin"
@@ -55,9 +67,9 @@ class Yardstick:
         scene.unlink()
 
     def step(self, iterations: int) -> list[float]:
-        """Do one step of so many iterations from the first guess.
+        """Compute one step with a number of iterations, from the initial guess.
 
-        Its wall seconds: in all, in the local steps, in the global steps. Raises RunFailed.
+        Returns: wall seconds of the whole step, of its local steps, and of its global steps. Raises RunFailed.
         """
         assert self._process.stdin is not None
         try:
@@ -68,7 +80,7 @@ class Yardstick:
         return self._answer()
 
     def close(self) -> Positions:
-        """End the program; the positions (n, 3) [m] of its last step. Raises RunFailed."""
+        """End the program and return the positions (n, 3) [m] of its last step. Raises RunFailed."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         if self._process.wait():
@@ -78,7 +90,7 @@ class Yardstick:
         return p
 
     def kill(self) -> None:
-        """End the program, whatever it is doing."""
+        """Kill the program in any state."""
         self._process.kill()
         self._process.wait()
 
@@ -96,7 +108,7 @@ class Yardstick:
 
 
 def write(path: Path, problem: StepProblem, springs: Springs) -> None:
-    """Write a step problem of springs in the form that the program reads."""
+    """Write a step problem of springs in the format of the program."""
     system = problem.system
     parts = [
         np.array([system.vertices, len(springs.edges), len(system.pins.vertices)], np.int64),
