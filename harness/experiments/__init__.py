@@ -1,1 +1,1 @@
-"""What is run and kept: sweeps, accuracy, speed, ablation, galleries."""
+"""Experiments and their stored results: sweeps, accuracy, speed, ablation, galleries."""

@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-# # SciPy's stubs are incomplete for sparse matrices.
+# SciPy's stubs are incomplete for sparse matrices.
 """Calibrate a machine by three figures, which make the times of different machines comparable.
 
     machine_bandwidth   bytes read and written per second when copying an array larger than a cache

@@ -1,12 +1,13 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 # pyright: reportMissingTypeArgument=false, reportUnknownParameterType=false
-# # Dask has no type annotations.
+# Dask has no type annotations.
 """Execute runs on many machines with Dask: each run is a task in a separate process of a free worker.
 
 A worker executes one run at a time. Workers of one machine wait for each other while one is timed
-(`harness.base.machine_lock`). A run that crashes ends its process and not Dask's worker, so failed runs do not use up
-the workers. The files of a run return with its outcome, except where the worker shares the client's folder. If a worker
-is lost, its current run is repeated on another. A worker that cannot write or has other source code gets no more runs.
+(`harness.execution.timing_lock`). A run that crashes ends its process and not Dask's worker, so failed runs do not use
+up the workers. The files of a run return with its outcome, except where the worker shares the client's folder. If a
+worker is lost, its current run is repeated on another. A worker that cannot write or has other source code gets no more
+runs.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ U = TypeVar("U", bound=Unit)
 
 @runtime_checkable
 class Sharing(Protocol):
-    """Unit that acquires the timing lock itself (`harness.base.machine_lock`).
+    """Unit that acquires the timing lock itself (`harness.execution.timing_lock`).
 
     Any other unit is timed as a whole.
     """

@@ -1,4 +1,4 @@
-"""`springbench gallery`: scenes simulated and drawn side by side on one sheet, as they are at their last frame."""
+"""Command `springbench gallery`: simulate scenes and draw their last frames side by side on one sheet."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def gallery(
 
 
 def _strains(tiles: list[Any]) -> list[str]:
-    """What colours mean, where they mean the same in all tiles."""
+    """Return the legend of the strain colours if all tiles share one range."""
     ranges = {tile.replay.strain_range for tile in tiles}
     return [f"strain: blue −{100 * ranges.pop():g} % or more, orange as much stretched"] if len(ranges) == 1 else []
 
 
 def _tile(path: Path) -> Any:
-    """A scene's tile."""
+    """Simulate a scene and build its tile."""
     import numpy as np
 
     from harness.base import machine

@@ -1,4 +1,4 @@
-"""`springbench list`: the runs of a config and states, or the names of solvers, integrators, effects and meshes."""
+"""Command `springbench list`: the runs of a config with status, or solvers, integrators, effects and meshes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from harness.config.sweep import RunSpec
 
 _ALWAYS = ("iterations", "frames", "threads")
-"""Options with a column of their own, whether runs differ in them or not."""
+"""Options that always have a column, even if all runs agree in them."""
 
 
 def list_command(
@@ -30,7 +30,7 @@ def list_command(
     ] = None,
     results: Results = Path("results"),
 ) -> None:
-    """Check a config and show its runs with their states; without a config, list solvers, effects and meshes."""
+    """Check a config and list its runs with their status; without a config, list all solvers, effects and meshes."""
     if config is None:
         _print_names()
     else:
@@ -58,10 +58,10 @@ def _print_runs(config: Path, results: Path) -> None:
 
 
 def settings(runs: Sequence[RunSpec]) -> dict[str, list[str]]:
-    """Return the options and solver parameters that tell runs of one scene, size and solver apart.
+    """Return the options and solver parameters that distinguish runs of one scene, size and solver.
 
     Args:
-        runs: of one sweep.
+        runs: runs of one sweep.
 
     Returns: a value for each run by column; empty for a parameter that the run's solver does not have.
     """
@@ -111,7 +111,7 @@ def _print_names() -> None:
 
 
 def _summary(target: Any) -> str:
-    """The first sentence on a class, read from its source because importing a solver compiles kernels."""
+    """Read the first sentence on a class from its source, because importing a solver compiles kernels."""
     if not isinstance(target, str):
         from solvers.integrators import OWN
 
@@ -123,7 +123,7 @@ def _summary(target: Any) -> str:
     tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
     classes = (node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
     said = next((ast.get_docstring(node) or "" for node in classes), "")
-    # A docstring that starts with the parameters leaves it to the module's to say what the class is.
+    # A class docstring that starts with its parameters leaves the description to the module docstring.
     return _first_sentence(ast.get_docstring(tree) or "" if said[:1].islower() else said)
 
 

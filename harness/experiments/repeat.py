@@ -1,4 +1,4 @@
-"""`springbench repeat`: a point of an accuracy config by an outside engine alone, by a script without us."""
+"""Command `springbench repeat`: export a point of an accuracy config as a script for an external engine alone."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def repeat(
     point: Annotated[str, typer.Argument(help="A point's name, or its last letters; all are listed if left out.")] = "",
     output: Annotated[Path, typer.Option("-o", "--output", help="The folder for the script and its data.")] = Path(),
 ) -> None:
-    """Print a script that repeats one simulation by an outside engine's own interface, and write what it reads."""
+    """Export a script that repeats one simulation with an external engine's own interface, with its data."""
     from harness.config.accuracy_load import load_accuracy
     from solvers.registry import EVERY, load
 
@@ -53,7 +53,7 @@ def _line(spec: WorkSpec) -> tuple[str, ...]:
 
 
 def _written(name: str, spec: WorkSpec, folder: Path) -> dict[str, str]:
-    """The script's files, written beside the data that they read, by their names."""
+    """Write the script's files next to their data, and return their texts by name."""
     import numpy as np
 
     from harness.base import machine
@@ -86,7 +86,7 @@ def _written(name: str, spec: WorkSpec, folder: Path) -> dict[str, str]:
 
 
 def _between(scene: Scene) -> list[str]:
-    """What an engine is told anew before each frame."""
+    """List the quantities that springbench changes in the engine before each frame."""
     there = (
         ("velocities that drag has slowed (with the integrator own it is a force of the engine's)", scene.filters),
         ("forces that change", scene.forces),

@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# # Dask and ruamel.yaml have no type annotations.
+# Dask and ruamel.yaml have no type annotations.
 """Provide a Dask scheduler: at an address, on this machine, or on a batch system that a file describes."""
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def _batch(path: Path) -> Any:
         kind, jobs = str(options.pop("kind")), int(options.pop("jobs"))
     except (OSError, TypeError, ValueError, KeyError) as error:
         wanted = (
-            "wanted a mapping with `kind` (SLURM, PBS, ...), `jobs` and the options of that cluster of dask-jobqueue"
+            "expected a mapping with `kind` (SLURM, PBS, ...), `jobs` and the options of that dask-jobqueue cluster"
         )
         raise InputError(Mistake(f"cannot be read ({error}); {wanted}", path)) from None
     try:

@@ -1,4 +1,4 @@
-"""`springbench show`: a scene as it starts, with what its effects choose and what else can be chosen."""
+"""Command `springbench show`: preview a scene at its start, with the vertices that its effects select."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def show(
         Path | None, typer.Option("-o", "--output", help="The picture to write (.png); SCENE.png here if left out.")
     ] = None,
 ) -> None:
-    """Draw a scene at its start, and say which vertices its effects choose and what else its mesh has to choose by."""
+    """Draw a scene at its start, and list the vertices that its effects select and the selectors of its mesh."""
     path = output or Path(f"{scene.stem}.png")
     if path.suffix != ".png" or not path.parent.is_dir() or path.is_dir():
         raise InputError(f"--output: came {path}; wanted a file that ends in .png, in a folder that exists")
@@ -37,7 +37,7 @@ def show(
 
 
 def _shown(run: RunSpec, path: Path, tick: Tick) -> list[str]:
-    """Draw the scene of a run at its start; what is said of it."""
+    """Draw the scene of a run at its start, and return the messages about it."""
     import numpy as np
 
     from harness.base import machine
@@ -96,7 +96,7 @@ def _shown(run: RunSpec, path: Path, tick: Tick) -> list[str]:
 
 
 def _notes(mesh: Any) -> list[tuple[str, str]]:
-    """What a mesh has to choose by: parts, boundary loops with their lengths, holes, numbers of its file."""
+    """List the selectors of a mesh: parts, boundary loops with lengths, holes, numbers of its file."""
     from harness.scenes.mesh.boundary import loops
 
     rims = loops(mesh)

@@ -30,14 +30,14 @@ COLUMNS = (
         "status",
         _TEXT,
         "",
-        "ok, impossible (the scene has no answer without them), unknown (an error); of whole and price as in runs",
+        "ok, impossible (no solution without the effects), unknown (an error); of whole and price as in runs",
     ),
     Column("reason", _TEXT, "", "why the status is not ok; of a suggestion the evidence"),
     Column(
         "seconds",
         _REAL,
         "s",
-        "CPU time of a step, the mean over frames of the median over rounds; of a price, of an iteration",
+        "CPU time per step, the mean over frames of the median over rounds; of a price, per iteration",
     ),
     Column("cost", _REAL, "s", "what the effects cost a step: the same of the differences from the whole scene"),
     Column("cost_low", _REAL, "s", "lower end of its 95 % interval"),
@@ -49,8 +49,8 @@ COLUMNS = (
         "price_bound",
         _REAL,
         "",
-        "the least that it can be: the effect's own numbers are read once, by a dot product, or multiplied once, at "
-        "the rate of a product of matrices, whichever takes longer",
+        "lower bound: the effect's own numbers are read once, by a dot product, or multiplied once, at the "
+        "rate of a matrix product, whichever takes longer",
     ),
     Column("bytes", _INT, "B", "memory of the bound scene and the prepared solver, as Python's allocators see it"),
     *as_in_runs("nnz_system"),

@@ -6,7 +6,7 @@ cost of an effect is a difference of times of the same frame in the same round:
 
     cost = mean over frames of the median over rounds of (full scene - scene without the effect)
 
-`harness.base.statistics` computes its 95 % interval.
+`harness.results.bootstrap_statistics` computes its 95 % interval.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Best-first search for the cheapest setting of a study that meets an error, with the settings that it omits.
+"""Best-first search for the cheapest setting of a study that meets an error.
 
 A method is a solver with an integrator; its settings are time steps and tolerances. Shorter steps and smaller
 tolerances are taken to cost more, so that a method's last cost bounds those that follow, and the method with the least
-bound is measured next. Omitted are
+bound is measured next. The search omits
 
     smaller tolerances at a time step    once one meets the error, or smaller ones no longer change it
     the rest of a method                 once it costs more than SLOWER times the best that meets the error
@@ -23,20 +23,26 @@ from typing import Any
 from harness.config.accuracy import WorkSpec
 
 SLOWER = 1.5
-"""Times the cost of the best: above it a method is given up. Shorter steps may take fewer iterations each."""
+"""Multiple of the best cost above which a method is given up; shorter steps may need fewer iterations each."""
 
 LEAST_LIMIT = 0.2
-"""Seconds that any simulation may take, however fast the best is: an interruption must not cost a candidate."""
+"""Smallest time limit of a simulation [s], so that a short interruption does not exclude a candidate."""
 
 UNCHANGED = 0.1
-"""Of the error in excess: a smaller change from one tolerance to the next is none that further ones can make up for."""
+"""Relative change of the excess error between two tolerances, below which smaller tolerances are omitted."""
 
 OVER_BUDGET = "the budget was used up"
 
 
 @dataclass(frozen=True, slots=True)
 class Omitted:
-    """How many settings were measured or known, how many there are, and the omitted ones by their reasons."""
+    """Summary of a search.
+
+    Attributes:
+        measured: number of settings that were measured or known.
+        settings: number of all settings.
+        reasons: number of omitted settings by reason.
+    """
 
     measured: int
     settings: int
@@ -44,7 +50,7 @@ class Omitted:
 
     @property
     def complete(self) -> bool:
-        """Whether the search ended before its budget did."""
+        """Whether the search ended within its budget."""
         return OVER_BUDGET not in self.reasons
 
     def __str__(self) -> str:
@@ -54,8 +60,14 @@ class Omitted:
 
 @dataclass(slots=True)
 class _Method:
-    """grid: settings by time step, the longest first, and in each by tolerance, the largest first; errors: at the
-    present time step; loosest: the cost of its largest tolerance; bound: on the costs that follow."""
+    """Settings of a method that remain to be measured.
+
+    Attributes:
+        grid: settings by time step, the longest first, and in each by tolerance, the largest first.
+        errors: errors at the current time step.
+        loosest: cost of the largest tolerance at the current time step.
+        bound: lower bound of the costs that follow.
+    """
 
     grid: list[list[WorkSpec]]
     errors: list[float] = field(default_factory=list[float])
@@ -67,13 +79,13 @@ class _Method:
         return sum(map(len, self.grid))
 
     def next_step(self) -> int:
-        """Go on to the next time step; how many tolerances this leaves out."""
+        """Proceed to the next time step, and return the number of omitted tolerances."""
         left = len(self.grid.pop(0))
         self.errors, self.bound = [], max(self.bound, self.loosest)
         return left
 
     def drop(self) -> int:
-        """Give the method up; how many settings this leaves out."""
+        """Give up the method, and return the number of omitted settings."""
         left = self.left
         self.grid = []
         return left
@@ -86,14 +98,14 @@ def search(
     measure: Callable[[WorkSpec], Mapping[str, Any]],
     budget: float,
 ) -> Omitted:
-    """Measure settings until none that is left can be the cheapest that meets an error.
+    """Measure settings until no remaining one can be the cheapest that meets an error.
 
     Args:
         work: the settings.
-        error: relative.
-        best: wall seconds per simulated second of the best known, infinite without one.
-        measure: returns a setting's row; its time limit is what it may still take.
-        budget: wall seconds; no simulation starts after them.
+        error: relative error to meet.
+        best: wall seconds per simulated second of the best known setting, infinite without one.
+        measure: measures a setting within the time limit of its specification, and returns the row.
+        budget: wall time after which no simulation starts [s].
     """
     methods = _methods(work)
     settings, measured, reasons, end = sum(one.left for one in methods), 0, Counter[str](), monotonic() + budget
@@ -142,18 +154,18 @@ def _slow(error: float) -> str:
 
 
 def _outcome(row: Mapping[str, Any]) -> tuple[float, float]:
-    """Error and cost, infinite where there are none."""
+    """Return the error and the cost of a row, infinite if there are none."""
     return (row["error"], row["seconds_per_simulated"]) if row["status"] == "ok" else (inf, inf)
 
 
 def _limited(spec: WorkSpec, best: float) -> WorkSpec:
-    """With no more time than a simulation may take that is not slower."""
+    """Return the specification with a time limit of SLOWER times the best cost."""
     limit = max(LEAST_LIMIT, SLOWER * best * spec.horizon)
     return replace(spec, how=replace(spec.how, time_limit=min(spec.how.time_limit, limit)))
 
 
 def _methods(work: Iterable[WorkSpec]) -> list[_Method]:
-    """Settings by all but time step and tolerance."""
+    """Group the settings by everything except time step and tolerance."""
     by_method: dict[str, list[WorkSpec]] = {}
     for spec in work:
         others = {name: value for name, value in spec.options.items() if name != "tolerance"}

@@ -198,8 +198,7 @@ class _Grading:
 def _timed(
     prepared: Prepared, problem: StepProblem, count: int, expected: Positions
 ) -> tuple[NDArray[np.float64], bool]:
-    """Return the wall seconds (num_iterates + 1,) until each iterate, 0 for the initial guess, and whether preempted.
-    """
+    """Return the wall seconds (num_iterates + 1,) until each iterate from 0, and whether the pass was preempted."""
     stamps, watch = np.zeros(count + 1), Watch(numba.get_num_threads())
     p, copied = problem.first_guess, None
     gc.disable()  # a collection in the middle would be counted as the solver's

@@ -138,13 +138,13 @@ class Recommendation:
         if not math.isclose(now.error, before.error, rel_tol=_SAME):
             return (
                 f"not as predicted: the error is {now.error:.3g}, not {before.error:.3g}; what was measured before is "
-                "not this simulation, so remove it and ask again"
+                "not this simulation, so remove it and repeat the command"
             )
         ratio = now.cost / before.cost
         if not 1.0 / _APART <= ratio <= _APART:
             return (
                 f"the error is as predicted, the time {ratio:.2g} times that: other programs ran beside one of the "
-                "two, so ask again on an idle machine before you rely on the time"
+                "two, so repeat the command on an idle machine before you rely on the time"
             )
         return f"as predicted: the same error, {ratio:.2g} times the time"
 

@@ -1,1 +1,1 @@
-"""What is done with results that are there: packing, merging, publishing and verifying them."""
+"""Operations on existing results: compaction, merging, publication and verification."""

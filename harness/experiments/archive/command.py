@@ -1,4 +1,4 @@
-"""The commands of `springbench` on results that are there."""
+"""Commands of `springbench` on existing results: compact, merge, publish, verify."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def compact(
     results: Folder,
     days: Annotated[float, typer.Option(help="Pack what was written so many days ago or more; 0 is all.")] = 0.0,
 ) -> None:
-    """Pack the rows of many runs into one file. All commands see the same rows before and after."""
+    """Pack the rows of many runs into one file. All commands read the same rows before and after."""
     from harness.experiments.archive.compact import compact as pack
 
     if not 0.0 <= days < 1e6:
@@ -31,7 +31,7 @@ def merge(
     sources: Annotated[list[Path], typer.Argument(help="Folders of results, or those of sweeps.")],
     into: Annotated[Path, typer.Option("-o", "--into", help="The folder that has all of them afterwards.")],
 ) -> None:
-    """Bring results together. Exit code 1: runs of one machine and one code ended at other positions."""
+    """Merge folders of results. Exit code 1: runs of one machine and source code ended at different positions."""
     from harness.experiments.archive.merge import merge as bring_together
 
     found = bring_together(sources, into, say)
@@ -50,7 +50,7 @@ def publish(
     output: Annotated[Path, typer.Option("-o", "--output", help="The archive to write (.zip).")],
     license: Annotated[str, typer.Option(help="What others may do with it: a name or a URL.")] = "",
 ) -> None:
-    """Put results, what made them and their checksums into one file, for others to cite and to verify."""
+    """Write results, their configs and checksums to one archive, for others to cite and to verify."""
     from harness.experiments.archive.publish import publish as put_together
 
     count = put_together(results, output, say, license=license)
@@ -64,8 +64,10 @@ def verify(
         bool, typer.Option("--own-code", help="Do also runs that need code from the archive: read it first.")
     ] = False,
 ) -> None:
-    """Check an archive's sums, and do a random tenth of its runs again. Exit code 1: something does not hold; 3: it
-    cannot be told."""
+    """Verify the checksums of an archive, and repeat a random tenth of its runs.
+
+    Exit code 1: a claim fails; 3: a claim is inconclusive.
+    """
     from secrets import randbelow
     from tempfile import TemporaryDirectory
 

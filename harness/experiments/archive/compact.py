@@ -1,11 +1,12 @@
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
-# pyarrow's stubs say little of columns, and of files that Parquet is read from.
-"""Packs the rows of many units into one file beside their folder; whoever reads rows sees the same before and after.
+# pyarrow's stubs are incomplete for columns, and for file objects that Parquet is read from.
+"""Pack the rows of many units into one file next to their folder; readers get the same rows before and after.
 
-The packed file is written anew under a partial name, with what was packed before; it is compared with the originals,
-which another reader reads for that, file by file, and takes its place by a rename; then the units' own files go. A
-unit's own file goes before its packed rows (`harness.base.shelf`): so a kill leaves, at any moment, all rows where they
-are seen once, and the next start does the rest.
+The packed file is written under a partial name, including the rows that were packed before. It is compared with the
+originals, which an independent reader reads file by file, and renamed. Then the units' own files are removed. Readers
+prefer a unit's own file to its packed rows (`harness.results.row_store`). An interruption therefore leaves, at any
+moment,
+all rows visible exactly once, and the next call completes the work.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ from harness.base.errors import InputError, Mistake
 from harness.base.files import replacing
 
 TABLES = ("rows", "accuracy", "ablation")
-"""The folders of rows in a folder of results."""
+"""Folders of rows in a folder of results."""
 
 _BATCH = 2_000
-"""So many units are in memory at once."""
+"""Number of units that are in memory at a time."""
 _DAY = 86_400.0
 _ANY = pa.schema([])
 _NAME = pa.field(shelf.FILE, pa.string())
@@ -35,10 +36,15 @@ _STARTED = pa.schema([columns.SCHEMA.field("started")])
 
 
 def compact(results: Path, say: Callable[[str], None], *, days: float = 0.0) -> int:
-    """Pack the units of all folders of rows in a folder of results, those that were written so many days ago or more.
+    """Pack the units of all folders of rows that have a minimum age, and return their number.
 
-    Returns how many units were packed; say: is told of each folder. Raises InputError where there are no rows, where a
-    sweep is being run, or where rows do not fit together.
+    Args:
+        results: folder of results, or of one sweep.
+        print_message: called with a remark on each folder.
+        min_age_days: smallest age of a unit's file [days].
+
+    Raises:
+        InputError: there are no rows, a sweep is running, or the schemas of rows do not match.
     """
     folders = [folder for table in TABLES for folder in shelf.folders(results, table)]
     if not folders:
@@ -84,7 +90,7 @@ def _compact(folder: Path, before: float, say: Callable[[str], None]) -> int:
 
 
 def _is_text(name: str) -> bool:
-    """Whether a name is UTF-8, which those of packed units have to be."""
+    """Return whether a name is valid UTF-8, which the names of packed units must be."""
     try:
         name.encode()
     except UnicodeEncodeError:
@@ -93,8 +99,11 @@ def _is_text(name: str) -> bool:
 
 
 def fitting_schema(units: Sequence[Path], schema: pa.Schema = _ANY) -> pa.Schema:
-    """The schema of all units, those columns first that they have to have if at all. Raises InputError that names a
-    file whose columns are of other types."""
+    """Return the common schema of all units; columns of `schema` come first.
+
+    Raises:
+        InputError: a file has columns of other types; the message names it.
+    """
     found, _ = shelf.parts(units)
     for part in found:
         try:
@@ -110,7 +119,7 @@ def _batches(units: Sequence[Path]) -> Iterator[Sequence[Path]]:
 
 
 def _compare(written: BinaryIO, units: Sequence[Path], schema: pa.Schema) -> None:
-    """Compare what was written with the originals. Raises InputError where rows differ: nothing is removed then."""
+    """Compare the packed rows with the originals. Raises InputError if they differ; nothing is removed then."""
     with pq.ParquetFile(written) as file:
         for group, batch in enumerate(_batches(units)):
             if not rows.same(file.read_row_group(group), rows.read_each(batch, schema, named=True)):
@@ -119,7 +128,7 @@ def _compare(written: BinaryIO, units: Sequence[Path], schema: pa.Schema) -> Non
 
 
 def _sync(folder: Path) -> None:
-    """See that a rename is on the disk before what it replaces goes."""
+    """Flush a folder to the disk, so that a rename is durable before the replaced files are removed."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)

@@ -1,11 +1,11 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-# pyarrow's stubs say little of columns, and of files that Parquet is read from.
-"""Results of several folders in one: rows are told apart by their content, so that nothing is lost and nothing doubled.
+# pyarrow's stubs are incomplete for columns, and for file objects that Parquet is read from.
+"""Merge results of several folders; units are identified by content, so that none is lost or duplicated.
 
-A run on two machines has two ids, so both keep their rows. Where the rows of one unit differ, since it was done twice,
-the newer keep its name and the others are named by their content, `<unit>~<digest>`. Rows are copied file by file, by
-pyarrow, and what was written is compared with the original before it takes the place of anything. Runs that should
-have ended at the same positions and did not are reported.
+A run on two machines has two ids, so both keep their rows. Where a unit was measured twice with different rows, the
+newer rows keep its name. The others are named by their content, `<unit>~<digest>`. Rows are copied file by file with
+pyarrow, and compared with the original before they replace a file. Runs that should have ended at the same positions
+and did not are reported.
 """
 
 from __future__ import annotations
@@ -37,9 +37,16 @@ _STARTED = pa.schema([columns.SCHEMA.field("started")])
 
 @dataclass(frozen=True, slots=True)
 class Merged:
-    """What a merge did: units written and those that were there; conflicts: in words, runs of one machine and one code
-    that end at other positions; others: the same between machines or codes, which may differ in the last bits;
-    machines: which there are in all, and what may be compared across them."""
+    """Result of a merge.
+
+    Attributes:
+        num_written: units written.
+        num_existing: units that existed already.
+        conflicts: descriptions of runs with the same machine and source code that end at different positions.
+        cross_machine_differences: descriptions of such runs across machines or source codes, whose last bits may
+            differ.
+        machine_summary: all machines, and what may be compared across them.
+    """
 
     written: int
     known: int
@@ -49,7 +56,7 @@ class Merged:
 
 
 def sweeps(results: Path) -> list[Path]:
-    """The folders in a folder of results that hold rows; itself, where that does. Raises InputError for none."""
+    """Return the folders that contain rows, or `results` itself if it does. Raises InputError for none."""
     found = {folder.parent for table in TABLES for folder in shelf.folders(results, table)}
     found = {folder for folder in found if not any(part.startswith(".") for part in folder.relative_to(results).parts)}
     if not found:
@@ -58,11 +65,18 @@ def sweeps(results: Path) -> list[Path]:
 
 
 def merge(sources: Sequence[Path], into: Path, say: Callable[[str], None]) -> Merged:
-    """Bring the rows of folders together, with the recordings and pictures of their runs, in a folder that may have
-    some already. A merge that was stopped is gone on with by the same command.
+    """Merge the rows of folders, with the recordings and pictures of their runs, into one folder.
 
-    Raises InputError where a folder has no rows, where one lies in another, or is of a sweep and another of several,
-    and for damaged rows and such that do not fit together.
+    The target may contain results already. The same command resumes an interrupted merge.
+
+    Args:
+        sources: folders of results, or of sweeps.
+        target: folder for the merged results.
+        print_message: prints a remark.
+
+    Raises:
+        InputError: a folder has no rows, one contains another, sweeps and folders of several sweeps are mixed, rows are
+            damaged, or their schemas do not match.
     """
     for source in sources:
         if into.resolve().is_relative_to(source.resolve()) or source.resolve().is_relative_to(into.resolve()):
@@ -93,7 +107,7 @@ def merge(sources: Sequence[Path], into: Path, say: Callable[[str], None]) -> Me
 
 
 def _table(folders: Sequence[Path], home: Path) -> tuple[int, int]:
-    """Bring one table's units together: how many were written, and how many were there."""
+    """Merge the units of one table; return the numbers of written and of existing units."""
     by_name: dict[str, list[Path]] = defaultdict(list)
     for folder in (home, *folders):
         for unit in shelf.units(folder):
@@ -132,7 +146,7 @@ def _started(head: dict[str, object] | str) -> str:
 
 
 def _tables(units: Sequence[Path], batch: int = 1_000) -> Iterator[tuple[Path, pa.Table]]:
-    """The rows of each unit; packed ones are read many at once."""
+    """Yield the rows of each unit; packed ones are read in batches."""
     for start in range(0, len(units), batch):
         chosen = units[start : start + batch]
         packed = [unit for unit in chosen if not unit.exists()]
@@ -147,13 +161,13 @@ def _tables(units: Sequence[Path], batch: int = 1_000) -> Iterator[tuple[Path, p
 
 
 def content(table: pa.Table) -> str:
-    """8 hexadecimal digits of SHA-256 over rows, wherever they are stored; empty columns are none."""
+    """Return 8 hexadecimal digits of SHA-256 over rows, independent of storage; empty columns are ignored."""
     full = [name for name in table.column_names if table[name].null_count < len(table)]
     return hashlib.sha256(repr(table.select(sorted(full)).to_pylist()).encode()).hexdigest()[:8]
 
 
 def _put(table: pa.Table, unit: Path, target: Path) -> None:
-    """Write a unit's rows, after its recordings and its picture: where rows are, all is."""
+    """Write a unit's rows, after its recordings and its picture: rows mark a complete unit."""
     source, home = unit.parent.parent, target.parent.parent
     for part in ("recordings", "pictures"):
         for path in sorted((source / part).glob(f"{escape(unit.stem)}[.-]*")):
@@ -178,15 +192,17 @@ def _copy(path: Path, target: Path) -> None:
 
 
 def _claim(source: Path, home: Path) -> None:
-    """The merged folder belongs to the config of its sources, where that is still there."""
+    """Assign the merged folder to the config of its sources, if that still exists."""
     config = config_of(source)
     if config and not (home / CLAIM).exists():
         claimed(home, config)
 
 
 def _conflicts(folders: Sequence[Path]) -> tuple[list[str], list[str], list[str]]:
-    """Runs that were asked the same and ended a step at other positions: of one machine and code, and of several; and
-    the machines that there are."""
+    """Find runs with equal specifications whose steps ended at different positions.
+
+    Returns those of one machine and source code, those across several, and the machines.
+    """
     units = [unit for folder in folders for unit in shelf.units(folder)]
     try:
         return _differing(units)
@@ -195,7 +211,7 @@ def _conflicts(folders: Sequence[Path]) -> tuple[list[str], list[str], list[str]
 
 
 def _differing(units: Sequence[Path], read: pa.Table | None = None) -> tuple[list[str], list[str], list[str]]:
-    """See `_conflicts`. read: the rows of the units; else DuckDB reads them. Raises Unfit."""
+    """Query the conflicts; DuckDB reads the units unless `table` has their rows. Raises SchemaMismatch."""
     asked = ", ".join(f'"{name}"' for name in ASKED)
     with union.connected() as connection:
         if read is None:

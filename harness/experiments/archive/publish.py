@@ -1,14 +1,13 @@
-"""Puts results into one file that others can cite, read and check: `springbench verify` does runs of it again.
+"""Publish results as one archive that others can cite, read and check; `springbench verify` repeats some of its runs.
 
     results/<sweep>/       rows, recordings, pictures, pages
     configs/<sweep>/       the config, and the scenes, meshes and code that it names
-    environment/           the machine, and the installed packages as `pip install -r` takes them
+    environment/           the machine, and the installed packages in the format of `pip install -r`
     CITATION.cff, ro-crate-metadata.json, SHA256SUMS
 
-Only files that lie in the folder of results, or in a config's folder, go in: all others to which a link or a config
-leads are refused by name. The archive unpacks to a folder of results: `springbench list`, `query` and `gate` work on it
-as on any other. The metadata are those of RO-Crate 1.1 (https://w3id.org/ro/crate/1.1), the checksums are for
-`sha256sum -c`.
+Only files in the folder of results, or in a config's folder, are included. Any other file to which a link or a config
+points is an error that names it. The archive unpacks to a folder of results on which `springbench list`, `query` and
+`gate` work. The metadata follow RO-Crate 1.1 (https://w3id.org/ro/crate/1.1); the checksums are for `sha256sum -c`.
 """
 
 from __future__ import annotations
@@ -45,16 +44,23 @@ _PACKAGE = Path(__file__).resolve().parents[2]
 _KINDS = {".parquet": "application/vnd.apache.parquet", ".rrd": "application/octet-stream", ".yaml": "application/yaml"}
 _BUFFER = 2**20
 _ODD = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
-"""Characters that neither archives nor checksums hold in the names of files."""
+"""Characters that archives or checksum files do not support in file names."""
 
 Content = Path | bytes
 
 
 def publish(results: Path, archive: Path, say: Callable[[str], None], *, license: str = "") -> int:
-    """Write an archive (.zip) of a folder of results, or of one sweep's; how many files it holds.
+    """Write an archive (.zip) of a folder of results or of one sweep, and return its number of files.
 
-    license: what others may do with it, a name or a URL. Damaged rows are refused, and files outside of the folders.
-    Raises InputError, CannotWrite.
+    Args:
+        results: folder of results, or of one sweep.
+        archive: archive to write.
+        print_message: prints a remark.
+        license_text: license of the results, a name or a URL.
+
+    Raises:
+        InputError: rows are damaged, or files lie outside of the folders.
+        CannotWrite: the archive cannot be written.
     """
     if archive.suffix.lower() != ".zip" or archive.is_dir():
         raise InputError(Mistake("wanted the name of a file that ends in .zip", archive, key="--output"))
@@ -92,7 +98,7 @@ def publish(results: Path, archive: Path, say: Callable[[str], None], *, license
 
 
 def _shown(folder: Path) -> Iterator[Path]:
-    """The files of a sweep's results that are meant to be read."""
+    """Yield the files of a sweep's results that are intended for readers."""
     for path in sorted(folder.rglob("*")):
         place = path.relative_to(folder)
         hidden = any(part.startswith(".") for part in place.parts)
@@ -101,7 +107,7 @@ def _shown(folder: Path) -> Iterator[Path]:
 
 
 def _unfit(path: Path, folder: Path) -> str:
-    """Why a file is not published, empty where it is: it has to lie in a folder, all links resolved."""
+    """Return why a file is excluded; empty if it lies in the folder after resolving all links."""
     place = path.resolve()
     if not place.is_relative_to(folder.resolve()):
         leads = f"leads to {place}, which lies" if path.is_symlink() else "lies"
@@ -110,7 +116,7 @@ def _unfit(path: Path, folder: Path) -> str:
 
 
 def _is_config(path: Path) -> bool:
-    """Whether a file is a config of any kind: results from elsewhere may name any file as theirs."""
+    """Return whether a file is a config of any kind; results from elsewhere may name any file as theirs."""
     if path.suffix.lower() == ".json":
         with suppress(InputError):
             return bool(read_scene_json(path))
@@ -120,11 +126,11 @@ def _is_config(path: Path) -> bool:
 
 
 _KEYS = {"scenes", "mesh", "curves", "work", "goals"}
-"""Of each kind of config, a key that it has to have."""
+"""A required key of each kind of config."""
 
 
 def _needed(config: Path) -> list[Path]:
-    """A config and the files that it names. None of its code is run."""
+    """Return a config and the files that it names, without running its code."""
     files = {config}
     with suppress(InputError):  # a config of another kind, or one that was changed; it goes along all the same
         sweep = load_any(config, opens=False)
@@ -194,7 +200,7 @@ def _chunks(data: Content) -> Iterator[bytes]:
 
 
 def _crate(sums: Mapping[str, str], sizes: Mapping[str, int], title: str, license: str) -> dict[str, Any]:
-    """The metadata: what this is, the files, and the program that made them."""
+    """Build the metadata: the data set, its files, and the program that made them."""
     files = [
         {
             "@id": name,

@@ -1,11 +1,12 @@
-"""Whether an archive is what was published, and whether its numbers come out again.
+"""Verify that an archive is unchanged, and that its numbers are reproducible.
 
 All checksums are compared, and the names and options of all runs with those of their configs. Then a random tenth of
-the runs is done here, each beside another solver's run on the same scene and size. Positions after every step, and all
-columns but UNREPEATED, must be equal to the bit; a step's time must be that which was published within SECONDS, and the
-ratio of the two solvers' times, step by step (`harness.base.statistics.changed`), within RATIO on the machine type that
-it was published from, within ELSEWHERE on others. Where another machine, other libraries or other code ran, what
-differs refutes nothing: it cannot be told. Nor can it of a run for which no config asks.
+the runs is repeated here, each with another solver's run on the same scene and size. Positions after every step, and
+all columns except IRREPRODUCIBLE_COLUMNS, must be bitwise identical. A step's time must match the published one within
+a factor of MAX_SECONDS_RATIO. The ratio of the two solvers' times is compared step by step
+(`harness.results.bootstrap_statistics.estimate_slowdown`). It must match within MAX_RATIO_SAME_MACHINE on the published
+machine type, within MAX_RATIO_OTHER_MACHINE on others. With another machine, other libraries or other source code, a
+difference is inconclusive. So is a run that no config requests.
 """
 
 from __future__ import annotations
@@ -44,8 +45,11 @@ from harness.experiments.provenance import asked
 from harness.experiments.run_unit import RunUnit
 
 RATIO, ELSEWHERE, SECONDS = 1.25, 2.0, 3.0
-"""Minima of two runs of the same code lie up to 4 % apart on an idle machine, ratios far more on busy ones; another
-processor has other vectors and caches. Times themselves change with all else that the machine does."""
+"""Accepted ratios of times.
+
+Minima of two runs of the same code differ by up to 4 % on an idle machine, ratios far more on busy ones. Another
+processor has other vector units and caches. Times themselves depend on the entire load of the machine.
+"""
 
 UNREPEATED = frozenset(
     (
@@ -57,19 +61,22 @@ UNREPEATED = frozenset(
         *("time_limit", "memory_limit", "timing", "at_once", "pinned"),
     )
 )
-"""Columns that no repeat confirms: times, the state and the kind of the machine, the sweep's name, the recording, which
-is not made again, and how the run was limited and timed."""
+"""Columns that a repeated run cannot confirm.
+
+These are times, state and type of the machine, the sweep's name, how the run was limited and timed, and the recording,
+which is not repeated.
+"""
 
 _MOST_FILES, _MOST_SUMS, _MOST_TIMES = 200_000, 2**26, 200
-"""Files of an archive, bytes of its checksums, and how many times as large as itself it may unpack to."""
+"""Largest number of files in an archive, of bytes of its checksums, and ratio of unpacked to packed size."""
 _MOST_LOADED = 200
-"""Configs are read with at most so many different options."""
+"""Largest number of different option sets with which configs are read."""
 
 Row = dict[str, Any]
 
 
 class Holds(Enum):
-    """Of something that was published: it is so here, it is not, or this cannot be told."""
+    """Verdict on a published claim: it holds, it does not hold, or the check is inconclusive."""
 
     YES = "holds"
     NO = "does not hold"
@@ -78,7 +85,7 @@ class Holds(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """Something that was published, and whether it holds, in words."""
+    """Published claim with its verdict and an explanation."""
 
     what: str
     holds: Holds
@@ -90,30 +97,30 @@ class Claim:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Published:
-    """A run of an archive: its rows, and how to do it again."""
+    """Run of an archive: its rows, and the specification to repeat it."""
 
     rows: list[Row]
     run: RunSpec
 
     @property
     def title(self) -> str:
-        """The run in words."""
+        """Title of the run, for messages."""
         return self.run.title
 
     @property
     def group(self) -> tuple[str, str, int]:
-        """The runs whose times are compared: of one sweep, scene and size."""
+        """Key of runs whose times are compared: sweep, scene and size."""
         return self.run.sweep, self.run.scene_name, self.run.size
 
     @property
     def steps(self) -> list[Row]:
-        """The rows of its steps."""
+        """Rows of the run's steps."""
         return [row for row in self.rows if row["phase"] == "step"]
 
 
 @contextmanager
 def unpacked(archive: Path) -> Generator[Path]:
-    """A folder with what an archive holds, for a while. Raises InputError for what is none, or is too large."""
+    """Unpack an archive to a temporary folder. Raises InputError for a damaged or oversized archive."""
     wanted = "wanted an archive that `springbench publish` wrote (.zip)"
     if not archive.is_file():  # a device or a pipe would be read for ever
         raise InputError(Mistake(f"is {'no plain file' if archive.exists() else 'not there'}; {wanted}", archive))
@@ -129,11 +136,17 @@ def unpacked(archive: Path) -> Generator[Path]:
 
 
 _DAMAGE = (zipfile.BadZipFile, RuntimeError, NotImplementedError, ValueError, EOFError, zlib.error, struct.error)
-"""What zipfile raises on archives that are damaged or made up."""
+"""Errors that zipfile raises for damaged or forged archives."""
 
 
 def _excess(files: Sequence[zipfile.ZipInfo], size: int, free: int) -> str:
-    """Why files of an archive of this size are not unpacked, empty where they are."""
+    """Return why an archive is not unpacked; empty if it is.
+
+    Args:
+        files: entries of the archive.
+        size: size of the archive [B].
+        free: free space on the disk [B].
+    """
     unpacked = sum(info.file_size for info in files)
     if len(files) > _MOST_FILES:
         return f"holds {len(files):,} files, and at most {_MOST_FILES:,} are unpacked"
@@ -147,7 +160,10 @@ def _excess(files: Sequence[zipfile.ZipInfo], size: int, free: int) -> str:
 
 
 def checksums(folder: Path) -> list[Claim]:
-    """What is not as it was published; empty where all is. Raises InputError where there are no checksums."""
+    """Return a failed claim for each file that differs from the published one.
+
+    The result is empty if all match. Raises InputError if there are no checksums.
+    """
     sums = folder / SUMS
     if not sums.is_file() or sums.stat().st_size > _MOST_SUMS:
         raise InputError(Mistake(f"holds no {SUMS}; wanted an archive that `springbench publish` wrote", folder))
@@ -167,10 +183,14 @@ def _digest(path: Path) -> str:
 
 
 def published(folder: Path, say: Callable[[str], None], *, own_code: bool) -> tuple[list[Published], list[Claim]]:
-    """The runs in a folder of results that can be done again, by the configs beside them; and what does not hold, or
-    cannot be told, of the names of runs.
+    """Load the runs of an archive that can be repeated, according to its configs.
 
-    own_code: whether those that need code from the archive are among them.
+    Args:
+        folder: the unpacked archive.
+        print_message: prints a remark.
+        with_user_code: whether to include runs that need code from the archive.
+
+    Returns: the runs, and failed or inconclusive claims on the names of runs.
     """
     runs: list[Published] = []
     claims: list[Claim] = []
@@ -199,18 +219,21 @@ def published(folder: Path, say: Callable[[str], None], *, own_code: bool) -> tu
 
 
 _REPEATED = ("ok", "unsupported", "diverged", "disputed")
-"""How a run ends by what its config says alone."""
+"""Statuses that depend on the config of a run only."""
 
 
 def _rows(sweep: Path) -> list[Row]:
-    """The rows of a sweep. Raises InputError for what takes too much."""
+    """Return the rows of a sweep. Raises InputError if they need too much memory."""
     units = shelf.units(sweep / "rows")
     with rows.memory_for(units):
         return rows.read(units, needed=("run_id", "status")).to_pylist()
 
 
 def _spec(config: Path, of_run: Sequence[Row], *, own_code: bool) -> RunSpec | None:
-    """The run that left these rows, by its id, which tells its content; None where the config asks for none such."""
+    """Find the specification that produced these rows, by the run id, which is a hash of its content.
+
+    None where the config requests no such run.
+    """
     steps = [row for row in of_run if row["phase"] == "step"]
     first = (steps or of_run)[0]
     names = {"iterations": "max_iterations"} | {n: n for n in ("tolerance", "integrator", "time_step", "first_guess")}
@@ -234,8 +257,10 @@ def _largest(steps: Sequence[Row], name: str) -> int:
 
 
 def _runs(config: Path, given: str, opens: bool) -> list[RunSpec]:
-    """The runs of a config with options, as JSON; none where it refuses them. opens: whether code that it names is
-    run."""
+    """Load the runs of a config with options, given as JSON; none if they are invalid.
+
+    `imports_code` states whether code that the config names is imported.
+    """
     key = config, given, opens
     if key not in _LOADED:
         if len(_LOADED) >= _MOST_LOADED:
@@ -251,7 +276,7 @@ _LOADED: dict[tuple[Path, str, bool], list[RunSpec]] = {}
 
 
 def _names(one: Published) -> Claim | None:
-    """What of the names and options in a run's rows is not what its config says."""
+    """Return a failed claim if names or options in a run's rows differ from its config."""
     left_out = {"threads", *stated(one.run.solver.name)}  # of the machine, and of the code
     if one.run.accuracy is not None:
         left_out |= {"integrator", "time_step", "tolerance", "max_iterations", "first_guess"}  # are chosen
@@ -261,7 +286,13 @@ def _names(one: Published) -> Claim | None:
 
 
 def chosen(runs: Sequence[Published], seed: int, part: float = 0.1) -> list[Published]:
-    """A random part of the runs, one at least, and beside each alone another solver's on its scene and size."""
+    """Select a random fraction of the runs, at least one, and a second solver for each where possible.
+
+    Args:
+        runs: runs of the archive.
+        seed: seed of the selection.
+        fraction: fraction of the runs.
+    """
     chance = random.Random(seed)
     taken = chance.sample(list(runs), max(1, math.ceil(part * len(runs)))) if runs else []
     for one in list(taken):
@@ -272,7 +303,7 @@ def chosen(runs: Sequence[Published], seed: int, part: float = 0.1) -> list[Publ
 
 
 def again(runs: Sequence[Published], folder: Path, display: Display) -> list[list[Row]]:
-    """Do runs again, in this folder: the rows of each. Raises InputError."""
+    """Repeat runs in a folder, and return the rows of each. Raises InputError."""
     for part in ("rows", "recordings", "pictures"):
         (folder / part).mkdir(parents=True, exist_ok=True)
     bare = [one.run.but(record=False, pictures=False) for one in runs]
@@ -282,7 +313,12 @@ def again(runs: Sequence[Published], folder: Path, display: Display) -> list[lis
 
 
 def compare(runs: Sequence[Published], new: Sequence[list[Row]]) -> list[Claim]:
-    """What holds of runs that were done again. new: the rows that each left here."""
+    """Verify repeated runs, and return the claims.
+
+    Args:
+        runs: published runs.
+        rerun_rows: rows of the repetition of each.
+    """
     claims: list[Claim] = []
     for one, here in zip(runs, new, strict=True):
         claims += _repeated(one, here)
@@ -296,7 +332,7 @@ def compare(runs: Sequence[Published], new: Sequence[list[Row]]) -> list[Claim]:
 
 
 def _repeated(old: Published, new: list[Row]) -> list[Claim]:
-    """What holds of a run that was done again: its end, its positions, its other columns and its times."""
+    """Verify the end, the positions, the other columns and the times of a repeated run."""
     ended, here = ({(row["status"], row["reason"]) for row in found} for found in (old.rows, new))
     if {status for status, _ in here} != {status for status, _ in ended}:
         status, reason = next(iter(here - ended), next(iter(here)))
@@ -318,7 +354,7 @@ def _positions(old: Published, new: list[Row]) -> Claim:
 
 
 def _columns(old: Published, new: list[Row]) -> Claim:
-    """Whether all columns that a repeat determines have the published values; an empty one claims nothing."""
+    """Verify the columns that a repetition determines; an empty published column claims nothing."""
     what = f"{old.title}, other columns"
     of_place = {_place(row): row for row in new}
     if lost := [_place(row) for row in old.rows if _place(row) not in of_place]:
@@ -341,7 +377,7 @@ def _place(row: Row) -> tuple[Any, ...]:
 
 
 def _differing(pairs: Sequence[tuple[Row, Row]], names: Iterable[str]) -> dict[str, tuple[Row, Any, Any]]:
-    """Columns of published rows that state another value than rows here: the first such row, and both values."""
+    """Return the columns whose published values differ: the first such row, and both values."""
     wrong: dict[str, tuple[Row, Any, Any]] = {}
     for row, here in pairs:
         for name in names:
@@ -358,14 +394,14 @@ def _listed(wrong: Mapping[str, tuple[Row, Any, Any]]) -> str:
 
 
 def _refuted(what: str, why: str, old: Published, new: list[Row]) -> Claim:
-    """That something differs, which refutes it only where the same code ran on such a machine."""
+    """Build the claim for a difference: a failure only with the same source code on such a machine."""
     if elsewhere := _elsewhere(old.rows[0], new[0]):
         return Claim(what, Holds.UNKNOWN, f"{why}; {elsewhere}")
     return Claim(what, Holds.NO, why)
 
 
 def _seconds_hold(old: Published, new: list[Row]) -> list[Claim]:
-    """Whether a step takes as long as was published; nothing where it was on another machine, and may be."""
+    """Verify the time of a step; no claim where another machine may explain the difference."""
     what = f"{old.title}, time of a step"
     was, now = _seconds(old.rows), _seconds(new)
     if was.keys() != now.keys():
@@ -383,17 +419,17 @@ def _seconds_hold(old: Published, new: list[Row]) -> list[Claim]:
 
 
 _OTHER_MACHINE = 20.0
-"""So many times as fast as this machine another one may be without a question."""
+"""Ratio of speeds that is plausible between two machines."""
 
 
 def _interrupted(found: Sequence[Row]) -> float:
-    """The share of steps that were interrupted."""
+    """Compute the fraction of steps that were preempted."""
     steps = [row for row in found if row["phase"] == "step"]
     return sum(bool(row["interrupted"]) for row in steps) / len(steps)
 
 
 def _elsewhere(old: Row, new: Row) -> str:
-    """What else was another, in words."""
+    """Describe the differences of machine, libraries, source code and threads."""
     differ = [f"{told}" for name, told in _WHERE.items() if old[name] != new[name]]
     return f"other {' and '.join(differ)}" if differ else ""
 
@@ -421,18 +457,18 @@ def _ratio(old: tuple[Published, Published], new: tuple[list[Row], list[Row]]) -
 
 
 def _seconds(run: Sequence[Row]) -> dict[int, float]:
-    """Of the steps of a run, by frame, those that have a time."""
+    """Read the times of a run's steps by frame, where there are any [s]."""
     timed = [row for row in run if row["phase"] == "step" and row["frame"] is not None and row["seconds"] is not None]
     return statistics.least((row["frame"], row["seconds"]) for row in timed if 0.0 < row["seconds"] < math.inf)
 
 
 def _ratios(ours: Mapping[int, float], theirs: Mapping[int, float]) -> dict[int, float]:
-    """How many times as long as theirs each frame's step takes."""
+    """Compute the ratio of the two times of each frame."""
     return {frame: taken / theirs[frame] for frame, taken in ours.items() if frame in theirs}
 
 
 def possible(runs: Sequence[Published], say: Callable[[str], None]) -> list[Published]:
-    """Those that this machine has cores for."""
+    """Return the runs for which this machine has enough cores."""
     usable = machine.describe().cores
     found = [one for one in runs if machine.threads(one.run.threads).number <= usable]
     if left := len(runs) - len(found):

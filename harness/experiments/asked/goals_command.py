@@ -16,7 +16,7 @@ def goals(
     config: Annotated[Path, typer.Argument(help="Goals (YAML).")],
     results: Results = Path("results"),
 ) -> None:
-    """Hold the cheapest way to an error against a peer, or against the best steps of one length."""
+    """Measure performance targets: the cheapest method for an error, against a baseline."""
     from rich.table import Table
 
     from harness.base import machine, rows

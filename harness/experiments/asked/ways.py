@@ -25,8 +25,8 @@ _ONCE = 1e-2
 _SPENT = 30.0
 """Wall time for the step-doubling estimate where error control is not possible [s]."""
 _CONTACT = (
-    "contact begins and ends within steps, where every method here has order 1: no error can be promised; run it with "
-    "steps of one length (--integrator, --time-step), and halve them until the motion stays as it is"
+    "contact begins and ends within steps, where every method has order 1, so errors cannot be controlled; use a fixed "
+    "step size (--integrator, --time-step), and halve it until the motion does not change"
 )
 
 
