@@ -88,7 +88,9 @@ def flops() -> float:
 
 
 def step() -> float:
-    """Measure the CPU seconds of a fixed local-global step, for a sheet that hangs by one side.
+    """Measure the CPU seconds of a fixed local-global step.
+
+    The sheet hangs by one side.
 
     d_e = r_e (A p)_e / |(A p)_e|, then Q p = A' K d + y.
     """

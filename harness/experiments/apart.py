@@ -1,4 +1,4 @@
-"""Call a function in this process, or in a separate process where it runs user code."""
+"""Call a function, in a separate process where it runs user code."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def apart(
     say: Callable[[str], None] = lambda said: None,
     limits: Limits | None = None,
 ) -> Any:
-    """Return the result of a function, called in a separate process if user code is involved.
+    """Return the result of a function, isolated if user code is involved.
 
     Args:
         function: work to do; picklable; called with a function that reports progress.

@@ -1,7 +1,9 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 # pyright: reportMissingTypeArgument=false, reportUnknownParameterType=false
 # Dask has no type annotations.
-"""Execute runs on many machines with Dask: each run is a task in a separate process of a free worker.
+"""Execute runs on many machines with Dask.
+
+Each run is a task in a separate process of a free worker.
 
 A worker executes one run at a time. Workers of one machine wait for each other while one is timed
 (`harness.execution.timing_lock`). A run that crashes ends its process and not Dask's worker, so failed runs do not use
@@ -180,7 +182,7 @@ def machines(client: Client, runs: Sequence[RunSpec], say: Callable[[str], None]
 
 
 def _about(plugins: Sequence[Plugin]) -> tuple[WorkerFacts, dict[str, str]]:
-    """On a worker: return its description, and the reason for each plug-in that cannot be imported."""
+    """On a worker: return its description, and why plug-ins cannot be imported."""
     missing = dict[str, str]()
     if plugins:
         _allow_children()
@@ -277,7 +279,10 @@ def do_on(
 
 
 def _answers(client: Client, ended: Sequence[Future]) -> dict[Future, Done]:
-    """Fetch the outcomes of finished tasks together, without failed ones; empty if a worker was lost meanwhile."""
+    """Fetch the outcomes of finished tasks together.
+
+    Failed tasks are left out; the result is empty if a worker was lost meanwhile.
+    """
     finished = [task for task in ended if task.status == "finished"]
     try:
         found: Any = client.gather(finished)

@@ -1,4 +1,4 @@
-"""Fingerprint of the source code of a run: the digest of all source files that it depends on."""
+"""Fingerprint of a run's source code: the digest of all files it depends on."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ class Unit(Protocol):
         ...
 
     def lost(self, lost: Lost) -> str:
-        """Write the rows of a unit whose worker was lost, and return the outcome as text."""
+        """Write the rows of a lost unit, and return the outcome as text."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""Convert the error that ended a measurement to the status and the reason of its row."""
+"""Convert the error that ended a measurement to status and reason."""
 
 from __future__ import annotations
 
@@ -60,7 +60,10 @@ def grown(run: RunSpec, growth: Growth, by_frame: Mapping[int, Mapping[str, Any]
 
 
 def _reason(error: BaseException, own: Collection[Path]) -> str:
-    """Return the text of an error of springbench; for any other, also its type and location."""
+    """Return the text of an error of springbench.
+
+    For any other error the text includes type and location.
+    """
     if isinstance(error, (Unsupported, NotPositiveDefinite, WrongAnswer, Blocked, Diverged, RunFailed, InputError)):
         return str(error)
     return f"{said(error)} ({where(error, set(map(str, own)))})"

@@ -28,7 +28,7 @@ def figure(
         Path | None, typer.Option("-o", "--output", help="The folder; RESULTS/figures if left out.")
     ] = None,
 ) -> None:
-    """Draw a figure for print at its width, with its data as CSV and a script that redraws it."""
+    """Draw a figure for print, with its data as CSV and a script."""
     from harness.report.figures.asked import asked
     from harness.report.figures.kinds import kind as find
 

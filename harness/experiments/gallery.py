@@ -1,4 +1,4 @@
-"""Command `springbench gallery`: simulate scenes and draw their last frames side by side on one sheet."""
+"""Command `springbench gallery`: simulate scenes and draw their last frames on one sheet."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def gallery(
     scenes: Annotated[list[Path], typer.Argument(help="Scenes (YAML), in the order of the sheet.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="The picture to write (.png).")] = Path("scenes.png"),
 ) -> None:
-    """Draw a sheet of scenes, each simulated at its default size up to its last frame."""
+    """Draw a sheet of scenes, each at its default size and last frame."""
     from harness.report.contact_sheet import draw_sheet
 
     if output.suffix != ".png" or not output.parent.is_dir() or output.is_dir():

@@ -1,4 +1,4 @@
-"""Command `springbench list`: the runs of a config with status, or solvers, integrators, effects and meshes."""
+"""Command `springbench list`: runs with status, or all solvers, integrators, effects and meshes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ def list_command(
     ] = None,
     results: Results = Path("results"),
 ) -> None:
-    """Check a config and list its runs with their status; without a config, list all solvers, effects and meshes."""
+    """Check a config and list its runs with their status.
+
+    Without a config, list all solvers, effects and meshes.
+    """
     if config is None:
         _print_names()
     else:
@@ -111,7 +114,10 @@ def _print_names() -> None:
 
 
 def _summary(target: Any) -> str:
-    """Read the first sentence on a class from its source, because importing a solver compiles kernels."""
+    """Read the first sentence on a class from its source.
+
+    Importing a solver would compile kernels.
+    """
     if not isinstance(target, str):
         from solvers.integrators import OWN
 

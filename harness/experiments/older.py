@@ -1,4 +1,7 @@
-"""Find stale results: rows of a folder that other source code produced, according to the folder's config."""
+"""Find stale results: rows of a folder that other source code produced.
+
+The folder's config determines the current source code.
+"""
 
 from __future__ import annotations
 

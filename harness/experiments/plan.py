@@ -1,4 +1,6 @@
-"""Plan a sweep: find its complete and missing runs from their files, without simulating or drawing.
+"""Plan a sweep: find its complete and missing runs from their files.
+
+Nothing is simulated or drawn.
 
 A run is complete when its rows, its recording and its picture exist. Rows are written after the recording, and a
 picture is drawn from the recording alone. The files therefore show what an interrupted command has left undone.
@@ -56,7 +58,10 @@ class Files:
         )
 
     def absolute(self) -> Files:
-        """Return the files as absolute paths, which a change of the working folder does not affect."""
+        """Return the files as absolute paths.
+
+        A change of the working folder does not affect them.
+        """
         return Files(self.rows.absolute(), self.recording.absolute(), self.picture.absolute())
 
 
@@ -115,7 +120,10 @@ def _heads(paths: Sequence[Path]) -> dict[Path, dict[str, Any] | str]:
 
 
 def _unfit(recording: Path) -> str:
-    """Return why a recording is damaged, without reading all of it; empty if it is intact or missing."""
+    """Return why a recording is damaged, without reading all of it.
+
+    The result is empty if it is intact or missing.
+    """
     if not recording.exists():
         return ""
     whole = recording.is_file() and whole_messages(recording)[0]
@@ -129,7 +137,7 @@ def _codes() -> Callable[[RunSpec], str]:
 
 
 def of_other_code(runs: Iterable[RunSpec], table: pa.Table) -> set[str]:
-    """Return the ids of the runs whose rows in the table come from other source code."""
+    """Return the ids of the runs whose rows come from other source code."""
     code_of = _codes()
     here, made = machine.describe().id, dict(zip(*(table[c].to_pylist() for c in ("run_id", "code")), strict=True))
     return {name for run in runs if made.get(name := run.run_id(here)) != code_of(run)}

@@ -1,4 +1,7 @@
-"""Command `springbench repeat`: export a point of an accuracy config as a script for an external engine alone."""
+"""Command `springbench repeat`: export a simulation as a script for an external engine.
+
+The simulation is a point of an accuracy config.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ def repeat(
     point: Annotated[str, typer.Argument(help="A point's name, or its last letters; all are listed if left out.")] = "",
     output: Annotated[Path, typer.Option("-o", "--output", help="The folder for the script and its data.")] = Path(),
 ) -> None:
-    """Export a script that repeats one simulation with an external engine's own interface, with its data."""
+    """Export a script that repeats one simulation with an external engine alone."""
     from harness.config.accuracy_load import load_accuracy
     from solvers.registry import EVERY, load
 

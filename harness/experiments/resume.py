@@ -1,4 +1,4 @@
-"""Determine which units of an experiment exist and which are to be executed, with common rules and messages."""
+"""Determine which units of an experiment are missing, with common rules and messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Execute one run: build its objects from their names, run all passes and write the files.
+"""Execute one run: build its objects, run all passes, write the files.
 
 The timed passes come first and record nothing. Recording, energies and pictures come from an instrumentation pass. Its
 final positions must be bitwise identical to the timed ones. The rows are written last: where they exist, the run is
@@ -55,7 +55,9 @@ from solvers.registry import SOLVERS, load, minimises
 def execute(
     run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = None, at_once: int = 1
 ) -> list[dict[str, Any]]:
-    """Execute one run, write its files and return its rows; a failure is a row with status and reason.
+    """Execute one run, write its files and return its rows.
+
+    A failure is a row with status and reason.
 
     Args:
         run: specification of the run.
@@ -96,7 +98,10 @@ def execute(
 
 
 def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None, turn: Turn) -> list[dict[str, Any]]:
-    """Run all passes and return the rows; the timing session is checked for disturbances at the end."""
+    """Run all passes and return the rows.
+
+    The timing session is checked for disturbances at the end.
+    """
     if run.accuracy is not None:
         return _to_error(run, run.accuracy, files, tick, positions, turn)
     with turn.ready():
@@ -121,7 +126,10 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None, turn
 
 
 def _modulus_exponent(run: RunSpec, scene: Scene) -> int | None:
-    """Return how the spring stiffness scales with mesh size; None without springs or with several rules."""
+    """Return how the spring stiffness scales with mesh size.
+
+    The result is None without springs or with several rules.
+    """
     rules = {effect.rule for effect in run.scene.effects if isinstance(effect, Springs)}
     found = {modulus_exponent(rule, scene.mesh.dimension) for rule in rules}
     return found.pop() if len(found) == 1 else None
@@ -170,7 +178,7 @@ def _to_error(
 
 @contextmanager
 def _timed(run: RunSpec, tick: Tick) -> Generator[dict[str, Any]]:
-    """Hold the timing lock that the run specifies (exclusive, shared, own cores), and yield its columns."""
+    """Hold the run's timing lock (exclusive, shared, own cores), and yield its columns."""
     if run.timing != "shared":
         with (alone if run.timing == "exclusive" else beside)(tick):
             yield {}
@@ -256,7 +264,10 @@ def _earliest(run: RunSpec, failed: dict[str, Any], own: Collection[Path]) -> di
 
 
 def _record_until(run: RunSpec, files: Files, failed: dict[str, Any]) -> None:
-    """Record the frames before the failed one and mark the recording; records nothing if they fail too."""
+    """Record the frames before the failed one and mark the recording.
+
+    Nothing is recorded if they fail too.
+    """
     facts = {"status": failed["status"], "reason": failed["reason"], "failed_frame": failed["frame"]}
     settings = replace(_settings(run), frames=failed["frame"] - 1)
     with ExitStack() as cleanup, suppress(Exception):  # what went wrong is told already

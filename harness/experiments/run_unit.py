@@ -1,4 +1,4 @@
-"""A run of a sweep as a unit of work, executed on this machine or by a remote worker."""
+"""Run of a sweep as a unit of work, executed here or remotely."""
 
 from __future__ import annotations
 
@@ -56,7 +56,10 @@ class RunUnit:
 
     @property
     def limits(self) -> Limits:
-        """Limits that the sweep sets; the log file lies in a folder next to that of the rows."""
+        """Limits that the sweep sets.
+
+        The log file lies in a folder next to that of the rows.
+        """
         log = self.files.rows.parents[1] / "logs" / f"{self.files.rows.stem}.txt"
         return Limits(self.run.time_limit, self.run.memory_limit, log)
 
@@ -79,7 +82,7 @@ class RunUnit:
         return _outcome(execute(self.run, files, tick, positions=positions, at_once=self.at_once))
 
     def lost(self, lost: Lost) -> str:
-        """Write the row of a run whose worker was lost, and return the outcome as text."""
+        """Write the row of a lost run, and return the outcome as text."""
         return _outcome(_abandoned(self.run, self.files, lost.status, str(lost)))
 
 

@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # Dask and ruamel.yaml have no type annotations.
-"""Provide a Dask scheduler: at an address, on this machine, or on a batch system that a file describes."""
+"""Provide a Dask scheduler: remote, on this machine, or on a batch system.
+
+A file describes the batch system.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,9 @@ SILENCE = logging.CRITICAL
 
 @contextmanager
 def scheduler(on: str) -> Generator[Any]:
-    """Yield the given address, or a cluster that runs as long as the context. Raises InputError.
+    """Yield the given address, or a cluster that runs as long as the context.
+
+    Raises InputError.
 
     A local cluster accepts TLS connections only, with a certificate that its processes store in memory. Any client of a
     scheduler can execute code, and the loopback interface is open to all users of the machine. The HTTP servers have no

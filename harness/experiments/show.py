@@ -1,4 +1,4 @@
-"""Command `springbench show`: preview a scene at its start, with the vertices that its effects select."""
+"""Command `springbench show`: preview a scene with the vertices that its effects select."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def show(
         Path | None, typer.Option("-o", "--output", help="The picture to write (.png); SCENE.png here if left out.")
     ] = None,
 ) -> None:
-    """Draw a scene at its start, and list the vertices that its effects select and the selectors of its mesh."""
+    """Draw a scene at its start, and list selected vertices and possible selectors."""
     path = output or Path(f"{scene.stem}.png")
     if path.suffix != ".png" or not path.parent.is_dir() or path.is_dir():
         raise InputError(f"--output: came {path}; wanted a file that ends in .png, in a folder that exists")
@@ -96,7 +96,7 @@ def _shown(run: RunSpec, path: Path, tick: Tick) -> list[str]:
 
 
 def _notes(mesh: Any) -> list[tuple[str, str]]:
-    """List the selectors of a mesh: parts, boundary loops with lengths, holes, numbers of its file."""
+    """List a mesh's selectors: parts, boundary loops with lengths, holes, numbers of its file."""
     from harness.scenes.mesh.boundary import loops
 
     rims = loops(mesh)

@@ -18,7 +18,7 @@ SINGLE = "single opinion: the integrator comes from outside, and its formula is 
 
 @dataclass(frozen=True, slots=True)
 class _Formulas:
-    """Cache key: a run's scene and the other settings that determine the formulas of its steps."""
+    """Cache key: a run's scene and other settings that determine its formulas."""
 
     key: tuple[str | int, ...]
     run: RunSpec = field(compare=False)

@@ -128,7 +128,10 @@ def run_sweep(
 
 
 def _ready_to_draw() -> None:
-    """In the process that draws a small sweep: load the drawing code during the runs, in 1 to 2 s."""
+    """In the drawing process of a small sweep: load the drawing code.
+
+    This takes 1 to 2 s, during the runs.
+    """
     from harness.report.sweep import get_ready
 
     get_ready()

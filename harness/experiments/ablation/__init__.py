@@ -1,1 +1,4 @@
-"""Ablation (`springbench ablate`): what each effect of a scene costs and changes, and which effects it lacks."""
+"""Ablation (`springbench ablate`): the cost and the influence of each effect.
+
+It also suggests effects that a scene lacks.
+"""

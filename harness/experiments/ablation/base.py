@@ -1,4 +1,7 @@
-"""Common base of ablation and overhead units: one run of a scene yields a file of rows under `<folder>/ablation`."""
+"""Common base of ablation and overhead units.
+
+One run of a scene yields a file of rows under `<folder>/ablation`.
+"""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def ablate(
     changed: Changed = False,
     here: InThisProcess = False,
 ) -> None:
-    """Leave out each effect of a scene: measure its cost and its influence, and suggest missing effects."""
+    """Measure the cost and the influence of each effect, and suggest missing ones."""
     from harness.base.claim import claimed
     from harness.base.progress import display
     from harness.config.load import load_any

@@ -81,7 +81,7 @@ def price_all(
     changed: bool = False,
     isolated: bool = True,
 ) -> list[Path]:
-    """Measure the overheads of a scene's effects for each solver of a sweep, where they are missing.
+    """Measure the missing overheads of a scene's effects for each solver of a sweep.
 
     Args:
         sweep: one scene with several solvers.

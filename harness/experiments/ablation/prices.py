@@ -199,7 +199,10 @@ def _affordable(plain: Ready, stop: Stop) -> Stop:
 
 
 def _least(scene: Scene) -> float:
-    """Return the smallest time [s] for the arithmetic of all energies other than springs, once each."""
+    """Return the smallest time for the arithmetic of all non-spring energies [s].
+
+    Each energy is evaluated once.
+    """
     n = scene.system.vertices
     work = [_work(energy, n) for energy in scene.system.energies if not isinstance(energy, Springs)]
     size, flops = sum(one.bytes for one in work), sum(one.flops for one in work)
@@ -220,14 +223,17 @@ def _fastest(work: Callable[[], object]) -> float:
 
 
 class _Work(NamedTuple):
-    """Bytes that an energy reads of its own data, and flops that are linear in them."""
+    """Bytes that an energy reads, and flops that are linear in them."""
 
     bytes: int = 0
     flops: int = 0
 
 
 def _work(energy: Any, n: int) -> _Work:
-    """Count the work of an energy's elements, or of its entries of Q; data known only in steps is not counted."""
+    """Count the work of an energy's elements, or of its entries of Q.
+
+    Data known only in steps is not counted.
+    """
     if hasattr(energy, "elements"):
         return _Work(sum(x.nbytes for x in energy.elements), 12 * energy.elements.vertices.size)
     if isinstance(energy, ProjectiveEnergy):

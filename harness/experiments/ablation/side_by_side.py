@@ -1,4 +1,6 @@
-"""Measure the cost and the motion of scene variants, interleaved step by step in one process.
+"""Measure the cost and the motion of scene variants, interleaved step by step.
+
+All variants run in one process.
 
 In each round every scene is simulated from its start, one step of each after the other, so that a drift of the machine
 affects all alike. Times are CPU times of the one computing thread, on which other programs have little influence. The
@@ -105,7 +107,10 @@ def cost(whole: Contender, without: Contender) -> Interval:
 
 
 def seconds(turn: Contender) -> float:
-    """Return the CPU time per step: mean over the frames of the median over the rounds [s]."""
+    """Return the CPU time per step [s].
+
+    This is the mean over the frames of the median over the rounds.
+    """
     return float(np.median(np.array(turn.seconds), axis=0).mean())
 
 

@@ -1,4 +1,6 @@
-"""Suggest effects that a scene does not list although its motion indicates them, each with the evidence.
+"""Suggest effects that a scene does not list although its motion indicates them.
+
+Each comes with the evidence.
 
 The class of an effect defines the evidence for it (`harness.scenes.effects.effect_interface.Effect`).
 """
@@ -49,7 +51,7 @@ def seen(scene: Scene, kinds: Collection[str], positions: NDArray[np.float64], v
 
 
 def suggestions(found: Seen, kinds: Collection[str]) -> list[Suggestion]:
-    """Return the effects that the evidence indicates and the scene does not list, in a fixed order.
+    """Return the unlisted effects that the evidence indicates, in a fixed order.
 
     Args:
         evidence: evidence from the motion.

@@ -149,7 +149,10 @@ def _built(turn: Contender) -> Row:
 
 
 def _errors(run: RunSpec, whole: Contender, settings: Settings, tick: Tick) -> list[Row]:
-    """Measure the distance of the full scene from the minima of its steps, and of those from half the time step."""
+    """Measure the error of the full scene's solver, and that of its time step.
+
+    These are the distance from the minima of the steps, and the distance of those from half the time step.
+    """
     assert whole.scene is not None
     settings = replace(settings, stop=CONVERGED)
     found: list[Row] = []

@@ -1,4 +1,4 @@
-"""Scene variants to compare: the full scene, and the scene without each effect or each pair of effects."""
+"""Variants of a scene: the full one, and without each effect or pair."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ def variants(scene: SceneSpec, *, pairs: bool) -> list[Variant]:
 
 
 def effect_names(scene: SceneSpec) -> list[str]:
-    """Return each effect's kind; with its index in the list where a scene lists two of a kind."""
+    """Return the name of each effect.
+
+    It is the kind, with the index in the list where a scene lists two of a kind.
+    """
     count = Counter(effect.kind for effect in scene.effects)
     return [e.kind if count[e.kind] == 1 else f"{e.kind}[{i}]" for i, e in enumerate(scene.effects)]
 

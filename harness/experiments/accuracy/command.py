@@ -26,7 +26,7 @@ def recommend(
     budget: Annotated[float, typer.Option(help="Wall seconds that all simulations together may take.")] = 60.0,
     results: Results = Path("results"),
 ) -> None:
-    """Find the cheapest integrator, time step, tolerance and solver that keep to an error, and check them."""
+    """Find and check the cheapest integrator, time step, tolerance and solver for an error."""
     from rich.table import Table
 
     from harness.base.progress import display

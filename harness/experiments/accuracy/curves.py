@@ -1,4 +1,4 @@
-"""Measure the convergence of a solver on one step snapshot: errors and wall times of the same iterates.
+"""Measure the convergence of a solver on one step snapshot.
 
 Errors and times come from separate passes. The first pass stores the iterates to score, and ends at the time limit.
 Each timed pass then computes as many iterates as the first. It records a time stamp after each and does nothing else in
@@ -198,7 +198,10 @@ class _Grading:
 def _timed(
     prepared: Prepared, problem: StepProblem, count: int, expected: Positions
 ) -> tuple[NDArray[np.float64], bool]:
-    """Return the wall seconds (num_iterates + 1,) until each iterate from 0, and whether the pass was preempted."""
+    """Return the wall seconds until each iterate, and whether the pass was preempted.
+
+    The times (num_iterates + 1,) begin with 0 for the initial guess.
+    """
     stamps, watch = np.zeros(count + 1), Watch(numba.get_num_threads())
     p, copied = problem.first_guess, None
     gc.disable()  # a collection in the middle would be counted as the solver's

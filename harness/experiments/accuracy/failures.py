@@ -1,4 +1,4 @@
-"""Convert the error that ended a measurement to the status and the reason of its rows."""
+"""Convert the error that ended a measurement to status and reason."""
 
 from __future__ import annotations
 

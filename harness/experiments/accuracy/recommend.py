@@ -1,4 +1,6 @@
-"""Find the cheapest method to simulate a scene up to an error, from stored rows or new measurements.
+"""Find the cheapest method to simulate a scene up to an error.
+
+It is selected from stored rows or new measurements.
 
 An error is that of a whole simulation up to a horizon (`harness.experiments.accuracy.work_precision`). A cost is the
 wall time per simulated second. The result is the cheapest measured method that meets the error; one more simulation
@@ -161,7 +163,7 @@ def recommend(
     say: Callable[[str], None],
     budget: float = BUDGET,
 ) -> Recommendation:
-    """Return the cheapest method for a relative error at `t_end` seconds of the scene in a file.
+    """Return the cheapest method for a relative error at `t_end`.
 
     Args:
         path: file of the scene.
@@ -290,7 +292,7 @@ def _grid(path: Path, scene: SceneSpec, size: int, horizon: float, time_limit: f
 
 
 def _of_option(mistake: Mistake) -> Mistake:
-    """Convert a mistake in a study to one in the option that its key came from."""
+    """Convert a mistake in a study to one in a command-line option."""
     return Mistake(mistake.problem, key="--" + mistake.key.rpartition(".")[2].replace("_", "-"))
 
 

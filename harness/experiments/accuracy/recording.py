@@ -1,4 +1,4 @@
-"""Record a solve: the mesh at each scored iterate, and the distance of the solve from its minimum."""
+"""Record a solve: the mesh at each scored iterate, and the distance from the minimum."""
 
 from __future__ import annotations
 

@@ -20,7 +20,9 @@ def distances(system: System, p: Positions, other: Positions) -> tuple[float, fl
 
 
 def stiffness_ratio(system: System, stiffness: np.ndarray) -> float:
-    """Return k dt^2/m of the median stiffness (m,) [N/m] and the mean mass of free vertices.
+    """Return k dt^2/m of the median stiffness and the mean mass.
+
+    The stiffness (m,) is in N/m, and the mass is that of the free vertices.
 
     The result is nan without springs.
     """

@@ -1,4 +1,4 @@
-"""Rows of step snapshots: the step, its minima, and the curves of a solver on it."""
+"""Rows of step snapshots: the step, its minima, and a solver's curves."""
 
 from __future__ import annotations
 
@@ -101,7 +101,10 @@ class GradedStep:
         }
 
     def rows(self) -> list[Row]:
-        """Build the rows of the step and of its minima; the first is `uncertified` without a certified minimum."""
+        """Build the rows of the step and of its minima.
+
+        The first is `uncertified` without a certified minimum.
+        """
         case, problem, reference = self.case, self.frozen.problem, self.reference
         common = self.common() | provenance()
         common |= {"scene": case.scene_name, "size": case.size, "integrator": case.integrator}
@@ -131,7 +134,10 @@ class GradedStep:
         }
 
     def reached(self, p: Positions, stationarity: float) -> Minimum | None:
-        """Return the minimum whose basin contains p (n, 3) [m]; None if p has not converged enough."""
+        """Return the minimum whose basin contains p (n, 3) [m].
+
+        The result is None if p has not converged enough.
+        """
         if not stationarity <= CONVERGED:
             return None
         for known in self.reference.minima:

@@ -1,4 +1,6 @@
-"""Execute the missing units of an accuracy config: step snapshots first, then curves on them, and simulations.
+"""Execute the missing units of an accuracy config.
+
+Step snapshots come first, then curves on them, and simulations.
 
 A unit is executed again if the config now requests it with other settings, or of another step snapshot.
 """
@@ -81,7 +83,7 @@ def run_accuracy(
 
 @contextmanager
 def measuring(work: Sequence[WorkSpec], folder: Path, display: Display) -> Generator[Callable[[WorkSpec], Row]]:
-    """Yield a function that measures one of these simulations in a worker and returns its row.
+    """Yield a function that measures one simulation in a worker and returns its row.
 
     Args:
         work: the simulations that may be measured.
@@ -118,7 +120,10 @@ def measuring(work: Sequence[WorkSpec], folder: Path, display: Display) -> Gener
 
 
 def failures(files: Sequence[Path]) -> list[str]:
-    """Return a line for each failed unit: scene, size, snapshot, solver and reason; other statuses are results."""
+    """Return a line for each failed unit: scene, size, snapshot, solver and reason.
+
+    Other statuses are results.
+    """
     found = [rows.read([path], SCHEMA).to_pylist()[0] for path in files]
     return [
         f"{r['scene']} {r['size']} {r['moment'] or r['integrator']} {r['solver']}: {r['reason']}"
@@ -147,7 +152,10 @@ def _case(spec: CurveSpec) -> str:
 
 
 def _curves(curves: Sequence[CurveSpec], home: Home) -> Iterator[CurveUnit]:
-    """Yield the units for the curves of each step, once where two snapshots of a case are one step."""
+    """Yield the units for the curves of each step.
+
+    A step is used once where two snapshots of a case are one step.
+    """
     paths = dict.fromkeys(home.rows(spec.problem_label()) for spec in curves)
     steps = rows.heads(paths, ("problem", "moment", "frame", "status", "reason"), SCHEMA)
     moments: dict[tuple[str, str], str] = {}

@@ -36,7 +36,10 @@ SHARE = 4.0
 
 @dataclass(frozen=True, slots=True)
 class Home:
-    """Results of the config of this name; reference solutions are stored next to them, for all configs."""
+    """Results of the config of this name.
+
+    Reference solutions are stored next to them, for all configs.
+    """
 
     name: str
     folder: Path
@@ -58,7 +61,9 @@ def references(results: Path) -> Store:
 
 @dataclass(frozen=True, slots=True)
 class StepsUnit:
-    """Unit that finds the step snapshots of a case and their minima, one per spec; specs differ in the snapshot.
+    """Unit that finds the step snapshots of a case and their minima, one per spec.
+
+    Specs differ in the snapshot.
 
     A snapshot that could not be found has one row, without a problem. A snapshot that equals another one has no row, so
     that the step is measured once.
@@ -106,7 +111,7 @@ class StepsUnit:
         return "; ".join(told) or "ok"
 
     def lost(self, lost: Lost) -> str:
-        """Write a row for each snapshot of a lost unit, and return the outcome as text."""
+        """Write a row for each snapshot of a lost unit, and return a message."""
         why = {"status": lost.status, "reason": str(lost)}
         for spec in self.specs:
             _write_step(self.home.rows(spec.problem_label()), self.home, [_unfound(spec, why)])
@@ -124,7 +129,10 @@ def _write_step(path: Path, home: Home, found: Sequence[Row]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class CurveUnit:
-    """Unit that measures the curves of one solver on one step; `snapshot_row` is the first row of the step's file."""
+    """Unit that measures the curves of one solver on one step.
+
+    `snapshot_row` is the first row of the step's file.
+    """
 
     spec: CurveSpec
     home: Home

@@ -1,4 +1,4 @@
-"""Work-precision of whole simulations: the error against the reference at the horizon, and the wall time.
+"""Work-precision of whole simulations: error at the horizon and wall time.
 
     error = |p(T) - reference(T)| / |reference(T) - p(0)|        Frobenius norms over the vertices that are not pinned
 
@@ -88,7 +88,9 @@ def _simulated(spec: WorkSpec, trajectory: Trajectory, tick: Callable[[], None])
 def _run(
     spec: WorkSpec, scene: Scene, prepared: Prepared, frames: int, *, limit: float | None = None
 ) -> tuple[Positions, int, Row]:
-    """Simulate under a clock; return the last positions (n, 3) [m], the number of iterations and timing columns.
+    """Simulate under a clock.
+
+    Return the last positions (n, 3) [m], the number of iterations and timing columns.
 
     `time_limit` is in seconds; that of the spec if left out. Raises RunFailed where another clock disagrees.
     """

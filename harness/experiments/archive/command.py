@@ -19,7 +19,10 @@ def compact(
     results: Folder,
     days: Annotated[float, typer.Option(help="Pack what was written so many days ago or more; 0 is all.")] = 0.0,
 ) -> None:
-    """Pack the rows of many runs into one file. All commands read the same rows before and after."""
+    """Pack the rows of many runs into one file.
+
+    All commands read the same rows before and after.
+    """
     from harness.experiments.archive.compact import compact as pack
 
     if not 0.0 <= days < 1e6:
@@ -31,7 +34,10 @@ def merge(
     sources: Annotated[list[Path], typer.Argument(help="Folders of results, or those of sweeps.")],
     into: Annotated[Path, typer.Option("-o", "--into", help="The folder that has all of them afterwards.")],
 ) -> None:
-    """Merge folders of results. Exit code 1: runs of one machine and source code ended at different positions."""
+    """Merge folders of results.
+
+    Exit code 1: runs of one machine and source code ended at different positions.
+    """
     from harness.experiments.archive.merge import merge as bring_together
 
     found = bring_together(sources, into, say)
@@ -50,7 +56,10 @@ def publish(
     output: Annotated[Path, typer.Option("-o", "--output", help="The archive to write (.zip).")],
     license: Annotated[str, typer.Option(help="What others may do with it: a name or a URL.")] = "",
 ) -> None:
-    """Write results, their configs and checksums to one archive, for others to cite and to verify."""
+    """Write results, their configs and checksums to one archive.
+
+    Others can cite and verify it.
+    """
     from harness.experiments.archive.publish import publish as put_together
 
     count = put_together(results, output, say, license=license)

@@ -1,6 +1,8 @@
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # pyarrow's stubs are incomplete for columns, and for file objects that Parquet is read from.
-"""Pack the rows of many units into one file next to their folder; readers get the same rows before and after.
+"""Pack the rows of many units into one file next to their folder.
+
+Readers get the same rows before and after.
 
 The packed file is written under a partial name, including the rows that were packed before. It is compared with the
 originals, which an independent reader reads file by file, and renamed. Then the units' own files are removed. Readers
@@ -36,7 +38,7 @@ _STARTED = pa.schema([columns.SCHEMA.field("started")])
 
 
 def compact(results: Path, say: Callable[[str], None], *, days: float = 0.0) -> int:
-    """Pack the units of all folders of rows that have a minimum age, and return their number.
+    """Pack the old units of all folders of rows, and return their number.
 
     Args:
         results: folder of results, or of one sweep.
@@ -119,7 +121,10 @@ def _batches(units: Sequence[Path]) -> Iterator[Sequence[Path]]:
 
 
 def _compare(written: BinaryIO, units: Sequence[Path], schema: pa.Schema) -> None:
-    """Compare the packed rows with the originals. Raises InputError if they differ; nothing is removed then."""
+    """Compare the packed rows with the originals.
+
+    Raises InputError if they differ; nothing is removed then.
+    """
     with pq.ParquetFile(written) as file:
         for group, batch in enumerate(_batches(units)):
             if not rows.same(file.read_row_group(group), rows.read_each(batch, schema, named=True)):
@@ -128,7 +133,10 @@ def _compare(written: BinaryIO, units: Sequence[Path], schema: pa.Schema) -> Non
 
 
 def _sync(folder: Path) -> None:
-    """Flush a folder to the disk, so that a rename is durable before the replaced files are removed."""
+    """Flush a folder to the disk.
+
+    A rename is then durable before the replaced files are removed.
+    """
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)

@@ -1,6 +1,8 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 # pyarrow's stubs are incomplete for columns, and for file objects that Parquet is read from.
-"""Merge results of several folders; units are identified by content, so that none is lost or duplicated.
+"""Merge results of several folders.
+
+Units are identified by content, so that none is lost or duplicated.
 
 A run on two machines has two ids, so both keep their rows. Where a unit was measured twice with different rows, the
 newer rows keep its name. The others are named by their content, `<unit>~<digest>`. Rows are copied file by file with
@@ -56,7 +58,10 @@ class Merged:
 
 
 def sweeps(results: Path) -> list[Path]:
-    """Return the folders that contain rows, or `results` itself if it does. Raises InputError for none."""
+    """Return the folders that contain rows, or `results` itself if it does.
+
+    Raises InputError for none.
+    """
     found = {folder.parent for table in TABLES for folder in shelf.folders(results, table)}
     found = {folder for folder in found if not any(part.startswith(".") for part in folder.relative_to(results).parts)}
     if not found:
@@ -65,7 +70,7 @@ def sweeps(results: Path) -> list[Path]:
 
 
 def merge(sources: Sequence[Path], into: Path, say: Callable[[str], None]) -> Merged:
-    """Merge the rows of folders, with the recordings and pictures of their runs, into one folder.
+    """Merge the rows, recordings and pictures of several folders into one.
 
     The target may contain results already. The same command resumes an interrupted merge.
 

@@ -1,4 +1,6 @@
-"""Publish results as one archive that others can cite, read and check; `springbench verify` repeats some of its runs.
+"""Publish results as one archive that others can cite, read and check.
+
+`springbench verify` repeats some of its runs.
 
     results/<sweep>/       rows, recordings, pictures, pages
     configs/<sweep>/       the config, and the scenes, meshes and code that it names
@@ -50,7 +52,7 @@ Content = Path | bytes
 
 
 def publish(results: Path, archive: Path, say: Callable[[str], None], *, license: str = "") -> int:
-    """Write an archive (.zip) of a folder of results or of one sweep, and return its number of files.
+    """Write an archive (.zip) of results, and return its number of files.
 
     Args:
         results: folder of results, or of one sweep.
@@ -107,7 +109,10 @@ def _shown(folder: Path) -> Iterator[Path]:
 
 
 def _unfit(path: Path, folder: Path) -> str:
-    """Return why a file is excluded; empty if it lies in the folder after resolving all links."""
+    """Return why a file is excluded.
+
+    The result is empty if it lies in the folder after resolving all links.
+    """
     place = path.resolve()
     if not place.is_relative_to(folder.resolve()):
         leads = f"leads to {place}, which lies" if path.is_symlink() else "lies"
@@ -116,7 +121,10 @@ def _unfit(path: Path, folder: Path) -> str:
 
 
 def _is_config(path: Path) -> bool:
-    """Return whether a file is a config of any kind; results from elsewhere may name any file as theirs."""
+    """Return whether a file is a config of any kind.
+
+    Results from elsewhere may name any file as theirs.
+    """
     if path.suffix.lower() == ".json":
         with suppress(InputError):
             return bool(read_scene_json(path))

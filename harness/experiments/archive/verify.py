@@ -76,7 +76,7 @@ Row = dict[str, Any]
 
 
 class Holds(Enum):
-    """Verdict on a published claim: it holds, it does not hold, or the check is inconclusive."""
+    """Verdict on a published claim: pass, fail or inconclusive."""
 
     YES = "holds"
     NO = "does not hold"
@@ -230,9 +230,11 @@ def _rows(sweep: Path) -> list[Row]:
 
 
 def _spec(config: Path, of_run: Sequence[Row], *, own_code: bool) -> RunSpec | None:
-    """Find the specification that produced these rows, by the run id, which is a hash of its content.
+    """Find the run specification that produced these rows.
 
-    None where the config requests no such run.
+    The run id is a hash of its content.
+
+    The result is None where the config requests no such run.
     """
     steps = [row for row in of_run if row["phase"] == "step"]
     first = (steps or of_run)[0]
@@ -257,7 +259,9 @@ def _largest(steps: Sequence[Row], name: str) -> int:
 
 
 def _runs(config: Path, given: str, opens: bool) -> list[RunSpec]:
-    """Load the runs of a config with options, given as JSON; none if they are invalid.
+    """Load the runs of a config with options, given as JSON.
+
+    The result is empty if they are invalid.
 
     `imports_code` states whether code that the config names is imported.
     """
@@ -276,7 +280,7 @@ _LOADED: dict[tuple[Path, str, bool], list[RunSpec]] = {}
 
 
 def _names(one: Published) -> Claim | None:
-    """Return a failed claim if names or options in a run's rows differ from its config."""
+    """Return a failed claim if a run's names or options differ from its config."""
     left_out = {"threads", *stated(one.run.solver.name)}  # of the machine, and of the code
     if one.run.accuracy is not None:
         left_out |= {"integrator", "time_step", "tolerance", "max_iterations", "first_guess"}  # are chosen
@@ -286,7 +290,9 @@ def _names(one: Published) -> Claim | None:
 
 
 def chosen(runs: Sequence[Published], seed: int, part: float = 0.1) -> list[Published]:
-    """Select a random fraction of the runs, at least one, and a second solver for each where possible.
+    """Select a random fraction of the runs, at least one.
+
+    A second solver on the same scene and size is added to each where possible.
 
     Args:
         runs: runs of the archive.
@@ -394,7 +400,10 @@ def _listed(wrong: Mapping[str, tuple[Row, Any, Any]]) -> str:
 
 
 def _refuted(what: str, why: str, old: Published, new: list[Row]) -> Claim:
-    """Build the claim for a difference: a failure only with the same source code on such a machine."""
+    """Build the claim for a difference.
+
+    It is a failure only with the same source code on such a machine.
+    """
     if elsewhere := _elsewhere(old.rows[0], new[0]):
         return Claim(what, Holds.UNKNOWN, f"{why}; {elsewhere}")
     return Claim(what, Holds.NO, why)

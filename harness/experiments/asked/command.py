@@ -1,4 +1,7 @@
-"""Run `springbench run SCENE --error 1e-3`: simulate a scene to an error, and write row and recording."""
+"""Run `springbench run SCENE --error 1e-3`: simulate a scene to an error.
+
+It writes a row and a recording.
+"""
 
 from __future__ import annotations
 
@@ -119,7 +122,10 @@ def _done(
 
 
 def _searched(asked: Asked, error: float, seen: Growth, before: Sequence[Row], say: Say) -> Answer:
-    """Search the cheapest method, first among those that were cheap for a similar error. Raises RunFailed."""
+    """Search the cheapest method, first among those that were cheap for a similar error.
+
+    Raises RunFailed.
+    """
     nearest, pairs = promising(before, error)
     if not pairs:
         return search(asked, error, seen, say)
@@ -133,7 +139,10 @@ def _searched(asked: Asked, error: float, seen: Growth, before: Sequence[Row], s
 
 
 def _checked(asked: Asked, error: float, p: Positions, results: Path, say: Say) -> float | None:
-    """Print and return the error of positions p (n, 3) [m] against the reference; None if there is none."""
+    """Print and return the error of positions p (n, 3) [m] against the reference.
+
+    The result is None if there is none.
+    """
     try:
         trajectory = references(results).trajectory(asked.scene, asked.size, [asked.horizon], error=error)
     except RunFailed as failed:
@@ -188,7 +197,7 @@ def _row(name: str, asked: Asked, error: float, answer: Answer) -> dict[str, Any
 
 
 def _beside(row: dict[str, Any], asked: Asked, error: float, answer: Answer, say: Say) -> list[dict[str, Any]]:
-    """Build the rows of third-party integrators, and print the time of each relative to the search result."""
+    """Build the rows of third-party integrators, and print their relative times."""
     shared = {name: row[name] for name in _SHARED} | provenance()
     found = list[dict[str, Any]]()
     say("beside it, on the same machine in the same process, to the same error:")
@@ -205,7 +214,7 @@ def _beside(row: dict[str, Any], asked: Asked, error: float, answer: Answer, say
 
 
 def _record(path: Path, name: str, asked: Asked, answer: Answer) -> Path:
-    """Write the recording of the motion at its frames, with the requested error among its properties."""
+    """Write the recording of the motion, with the requested error as a property."""
     scene, best, here = asked.bound(asked.frame, "own"), answer.best, machine.describe()
     properties = {"scene": name, "size": asked.size, "solver": best.way.solver, "integrator": best.way.integrator}
     info = RecordingInfo(

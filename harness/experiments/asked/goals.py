@@ -62,7 +62,10 @@ class Met:
 
     @property
     def ratio(self) -> float:
-        """CPU time of the method divided by that of the baseline; an upper bound if `is_lower_bound`."""
+        """CPU time of the method divided by that of the baseline.
+
+        It is an upper bound if `is_lower_bound`.
+        """
         return self.seconds / self.other_seconds
 
     @property

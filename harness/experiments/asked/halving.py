@@ -1,4 +1,4 @@
-"""Estimate the time-stepping error by halving the step (step doubling), where error control is not possible.
+"""Estimate the time-stepping error by halving the step, where error control is impossible.
 
     |p_h(T) - p_(h/2)(T)| / |p_(h/2)(T) - p(0)|,    Frobenius norms over the free vertices
 
@@ -42,7 +42,7 @@ class Halved:
 
 
 def halved(bound: Callable[[float, str], Scene], horizon: float, frames: int, *, seconds: float) -> Halved:
-    """Halve the step size repeatedly, within a budget of wall time, and return the last change.
+    """Halve the step size within a time budget, and return the last change.
 
     Args:
         build_scene: returns the scene for a time step [s] and an integrator by name.

@@ -1,4 +1,6 @@
-"""Baselines of performance targets: a third-party integrator, or the cheapest fixed step size for the same error.
+"""Baselines of performance targets.
+
+A baseline is a third-party integrator, or the cheapest fixed step size for the same error.
 
 Step sizes are divided by sqrt(2) until the error at the end is at most the requested one, for each integrator, solver
 and tolerance. The best combination is thus known in hindsight. Where none reaches the error within
@@ -93,7 +95,10 @@ def _peer(one: OneGoal, asked: Asked, answer: Answer) -> Held:
 
 
 def _steps(one: OneGoal, asked: Asked, error: Error, say: Callable[[str], None]) -> Held:
-    """Return the cheapest fixed step size that meets the error, or the smallest lower bound of the cost."""
+    """Return the cheapest fixed step size for the error, or a lower bound.
+
+    The bound is the smallest of those on the cost.
+    """
     best, again, bounds = Held("", inf, inf), None, list[Held]()
     for integrator, solver, tolerance in _choices(one.goal):
         limit = min(LONGEST, _PATIENCE * best.seconds)

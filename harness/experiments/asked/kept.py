@@ -1,4 +1,7 @@
-"""Error-controlled run of a sweep (`accuracy`): the solver is given; integrator and step size are chosen."""
+"""Error-controlled run of a sweep (`accuracy`) with a given solver.
+
+Integrator and step size are chosen.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +82,9 @@ class Kept:
 
 
 def keep_to_error(run: RunSpec, error: float, tick: Tick) -> Kept:
-    """Find the cheapest method of the run's solver, and repeat it for all rounds of the run.
+    """Find the cheapest method of the run's solver, and repeat it.
+
+    It is repeated for all rounds of the run.
 
     Args:
         run: specification of the run.

@@ -1,4 +1,4 @@
-"""Read the trials of earlier searches on a scene, to select the methods that are worth running again.
+"""Read the trials of earlier searches, to select the methods worth running again.
 
 A row of the kind `way` states in the column `promised` the CPU seconds predicted for the requested error. For a similar
 error, methods whose predicted cost was several times the smallest are left out.
@@ -33,7 +33,10 @@ def problem(asked: Asked) -> str:
 
 
 def known(folder: Path, asked: Asked) -> list[Row]:
-    """Return the rows of trials of this motion, from the same source code and machine, in a folder of rows."""
+    """Return the stored trials of this motion in a folder of rows.
+
+    They are of the same source code and machine.
+    """
     here = {"problem": problem(asked), "machine": machine.describe().id, "code": machine.code_hash()}
     units = [unit for unit in shelf.units(folder) if "-asked-" in unit.name]
     found = rows.read(units, SCHEMA).to_pylist() if units else []
@@ -41,7 +44,7 @@ def known(folder: Path, asked: Asked) -> list[Row]:
 
 
 def promising(found: Sequence[Row], error: float) -> tuple[float, list[tuple[str, SolverSpec]]]:
-    """Return the stored requested error nearest to `error`, and the methods that were cheap at it.
+    """Return the stored error nearest to `error`, and the methods cheap at it.
 
     Args:
         stored_trials: rows of earlier trials.
@@ -59,7 +62,9 @@ def promising(found: Sequence[Row], error: float) -> tuple[float, list[tuple[str
 
 
 def way_rows(answer: Answer, found: Iterable[Row], error: float) -> list[Row]:
-    """Build the rows of the first trials of a search, and add stored trials of the same error.
+    """Build the rows of the trials of a search.
+
+    Stored trials of the same error are added.
 
     Args:
         search_result: result of the search.

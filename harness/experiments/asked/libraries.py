@@ -1,4 +1,6 @@
-"""Third-party integrators with error control: those of SciPy, and CVODE of SUNDIALS if it is installed.
+"""Third-party integrators with error control: those of SciPy and CVODE of SUNDIALS.
+
+CVODE is available if it is installed.
 
 Radau, BDF and CVODE's BDF use the sparsity of the Jacobian; CVODE's Adams method uses matrix-free GMRES.
 """
@@ -117,7 +119,10 @@ LIBRARIES = {
 
 
 def pattern(scene: Scene) -> csr_array:
-    """Return the sparsity pattern of F's Jacobian, (6 f, 6 f): 1 where an entry may differ from zero."""
+    """Return the sparsity pattern of F's Jacobian, (6 f, 6 f).
+
+    An entry is 1 where the Jacobian may differ from zero.
+    """
     system, p = scene.system, scene.mesh.rest
     begun = Start(p, np.zeros_like(p), 0.0, p, system.rate, 0.0)
     n = 3 * system.vertices

@@ -81,7 +81,9 @@ class _Beside:
     ours: float
 
     def peer(self, name: str) -> Peer:
-        """Measure one integrator: adjust its tolerance until its error is below the target, but not far below.
+        """Measure one integrator.
+
+        Its tolerance is adjusted until the error is below the target, but not far below.
 
         Where no tolerance does both, the cheapest one that meets the error counts.
         """
@@ -122,7 +124,10 @@ class _Beside:
 
 
 def _limited(field: Field, until: float) -> Callable[[float, State], State]:
-    """Return the vector field with a check that raises TooSlow after a deadline [s of CPU time]."""
+    """Return the vector field with a deadline on the CPU clock [s].
+
+    It raises TooSlow afterwards.
+    """
 
     def rate(t: float, y: State) -> State:
         if thread_time() > until:

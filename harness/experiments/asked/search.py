@@ -1,4 +1,6 @@
-"""Find the cheapest method for an error: run all methods, then tune the setting of the best one.
+"""Find the cheapest method for an error.
+
+All methods are run, then the setting of the best one is tuned.
 
     estimate = |p(T) - q(T)| / |q(T) - p(0)|,    q: reference trial of a much smaller error
 
@@ -127,7 +129,9 @@ class Answer:
 
 
 def foresee(asked: Asked, error: float, say: Callable[[str], None]) -> Growth:
-    """Compute how far ahead the motion is predictable, and print the smallest error that can be reached.
+    """Compute how far ahead the motion is predictable.
+
+    The smallest error that can be reached is printed.
 
     Args:
         error_target: the scene and its end time.
@@ -193,14 +197,20 @@ class _Search:
 
     @staticmethod
     def _run(way: Way, setting: float, limit: float = inf) -> Found:
-        """Run a method at a setting; twice where the first run is too short to be timed."""
+        """Run a method at a setting.
+
+        The method is run twice where the first run is too short to be timed.
+        """
         paths = [way.follower.follow(setting, limit=limit)]
         if paths[0].processor < _SHORT:
             paths.append(way.follower.follow(setting, limit=limit))
         return Found(way, setting, min(paths, key=lambda path: path.processor), inf, way.follower.order)
 
     def _race(self, ways: list[Way], tolerance: float) -> list[Found]:
-        """Run all methods and return the trials that finish within a multiple of the fastest time."""
+        """Run all methods and return the trials that are fast enough.
+
+        The time limit is a multiple of the fastest time.
+        """
         found, stuck, limit = list[Found](), list[Stuck](), _AT_FIRST
         while ways and not found:
             late = list[tuple[Way, float]]()
@@ -258,7 +268,10 @@ class _Search:
         return replace(one, estimated=estimated if estimated < inf else inf)
 
     def _measured(self, one: Found, closer: Found) -> Found:
-        """Estimate the error of a trial, and its order where fixed steps are not accurate enough."""
+        """Estimate the error of a trial, and its order where necessary.
+
+        The order is measured where fixed steps are not accurate enough.
+        """
         one = self._graded(one, closer)
         if not one.way.follower.even or one.estimated <= self._error:
             return one
@@ -283,7 +296,9 @@ class _Search:
         return (_AIM_EVEN if one.way.follower.even else AIM) * self._error
 
     def _reached(self, graded: list[Found], closer: Found) -> tuple[Found, str]:
-        """Return the first trial that reaches the error, and a note if it is much more accurate.
+        """Return the first trial that reaches the error, and a note.
+
+        The note states why the trial is much more accurate, if it is.
 
         A method that exceeds the predicted time of the next one by far is tried again after all others.
         """

@@ -32,7 +32,9 @@ _CONTACT = (
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """Scene of one size, up to an end time, split into frames; Dirichlet conditions are exact, as in the reference.
+    """Scene of one size up to an end time, split into frames.
+
+    Dirichlet conditions are exact, as in the reference.
 
     Attributes:
         scene: the scene.
@@ -50,7 +52,9 @@ class Asked:
     def of(
         cls, scene: SceneSpec, size: int | None, horizon: float | None, say: Callable[[str], None] | None = None
     ) -> Asked:
-        """Return the target for a scene; a frame is about as long as the scene's time step.
+        """Return the target for a scene.
+
+        A frame is about as long as the scene's time step.
 
         Args:
             scene: the scene.
@@ -99,7 +103,7 @@ class Way:
 
 
 def in_words(integrator: str, solver: str) -> str:
-    """Return the name of a method for messages, from the names of its integrator and its solver."""
+    """Return the name of a method for messages."""
     return solver if integrator == "own" else f"{integrator} with {solver}"
 
 

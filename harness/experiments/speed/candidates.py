@@ -33,7 +33,7 @@ The overhead of a clock is then negligible, and a first call with cold caches is
 
 
 class Reading(NamedTuple):
-    """Timing of one phase in one round: seconds per call, and other columns of its row."""
+    """Timing of one phase: seconds per call, and other columns of its row."""
 
     phase: str
     seconds: float
@@ -55,7 +55,10 @@ class Candidate(Protocol):
         ...
 
     def close(self) -> Positions | None:
-        """Release all resources; returns the positions after the last step (n, 3) [m], None if there are none."""
+        """Release all resources.
+
+        Returns the positions after the last step (n, 3) [m], None if there are none.
+        """
         ...
 
 
@@ -231,7 +234,10 @@ def reading(phase: str, call: Callable[[], object], columns: dict[str, Any], lea
 
 
 def average(seconds: Callable[[int], float], least: float = LEAST) -> float:
-    """Return the seconds per call, over one call or enough calls to last `min_seconds` after a first one."""
+    """Return the seconds per call.
+
+    This is one call, or the mean of enough calls to last `min_seconds` after a first one.
+    """
     once = seconds(1)
     number = _repeats(once, least)
     return seconds(number) / number if number > 1 else once

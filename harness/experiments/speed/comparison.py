@@ -1,4 +1,4 @@
-"""Speed report: the runs of a sweep, compared with the C++ baseline and the roofline of the machine, size by size.
+"""Speed report: a sweep's runs, the C++ baseline and the roofline, by size.
 
 An ordinary sweep specifies the runs. All runs of a size are one unit here. They are timed interleaved in one process,
 each from the same first step of its scene.
@@ -100,7 +100,7 @@ class Comparison:
         return self._written(_measured(self.members, self.folder, past, self.budget, tick))
 
     def lost(self, lost: Lost) -> str:
-        """Write a row for each candidate of a lost unit, and return the outcome as text."""
+        """Write a row for each candidate of a lost unit, and return a message."""
         why = {"phase": "run", "status": lost.status, "reason": str(lost)}
         return self._written([[common(run) | why] for run in self.members])
 
@@ -159,7 +159,10 @@ def _groups(runs: Sequence[RunSpec]) -> list[list[RunSpec]]:
 
 
 def _beside(group: Sequence[RunSpec]) -> list[RunSpec]:
-    """Build the baseline runs of a size: the C++ baseline on one thread, the machine on as many as the runs use."""
+    """Build the baseline runs of a size.
+
+    These are the C++ baseline on one thread, and the machine on as many threads as the runs use.
+    """
     first = group[0]
     eigen = [first.but(threads=1, solver=SolverSpec(YARDSTICK, {"temporaries": setting})) for setting in TEMPORARIES]
     threads = sorted({run.threads for run in group})
@@ -188,7 +191,10 @@ def _measured(
 
 
 def _past(found: Sequence[dict[str, Any]]) -> list[Past]:
-    """Return the timing that predicts larger sizes from a run's rows; empty if it failed or has no steps."""
+    """Return the timing that predicts larger sizes from a run's rows.
+
+    The result is empty if it failed or has no steps.
+    """
     prepare = [row["seconds"] for row in found if row["phase"] == "prepare"]
     iteration = [row["seconds"] / row["iterations"] for row in found if row["phase"] == "step"]
     if not (prepare and iteration):

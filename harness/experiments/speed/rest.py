@@ -24,7 +24,10 @@ _LARGEST = 10_000
 
 
 class Rest(NamedTuple):
-    """Step problem that starts at its minimum, and the positions (n, 3) [m] where float64 ends from there."""
+    """Step problem that starts at its minimum, and float64's final positions from there.
+
+    The positions are (n, 3) [m].
+    """
 
     problem: StepProblem
     positions: Positions
@@ -36,7 +39,10 @@ def precision(run: RunSpec) -> str:
 
 
 def rest_of(problem: StepProblem) -> Rest | None:
-    """Find the minimum of a step problem; None for a large one, or one that Newton's method does not support."""
+    """Find the minimum of a step problem.
+
+    The result is None for a large one, or one that Newton's method does not support.
+    """
     if problem.system.vertices > _LARGEST:
         return None
     try:
@@ -48,6 +54,9 @@ def rest_of(problem: StepProblem) -> Rest | None:
 
 
 def apart(rest: Rest, prepared: Prepared) -> float:
-    """Return the largest distance of a prepared solver's positions from float64's, relative to the scene's size."""
+    """Return the largest distance of a solver's positions from float64's.
+
+    It is relative to the scene's size.
+    """
     found = prepared.solve(rest.problem, _FROM_MINIMUM).positions
     return float(np.abs(found - rest.positions).max()) / float(np.ptp(rest.positions, axis=0).max())

@@ -1,4 +1,6 @@
-"""Time candidates of one mesh size in round-robin order, A B C A B C ..., so that disturbances affect all alike.
+"""Time candidates of one mesh size in round-robin order, A B C A B C.
+
+Disturbances thus affect all candidates alike.
 
 Each candidate is first prepared (round 0, cold), then prepared again, then timed in the sweep's number of rounds. Final
 positions are compared, and only candidates that agree keep their times. A candidate that would take too long, as
@@ -103,7 +105,9 @@ def name(run: RunSpec) -> str:
 
 
 def predicted(past: Sequence[Past], vertices: int, run: RunSpec) -> float:
-    """Predict the seconds of a run by a power law through the last two smaller sizes; 0 without any.
+    """Predict the seconds of a run from its smaller sizes; 0 without any.
+
+    A power law passes through the last two of them.
 
     Args:
         past_timings: timings at other sizes, in ascending order.
@@ -127,7 +131,10 @@ def predicted(past: Sequence[Past], vertices: int, run: RunSpec) -> float:
 
 @contextmanager
 def _guarded(candidate: Candidate, rows: list[Row], alive: list[Candidate]) -> Generator[None]:
-    """Run a block with the candidate's threads; an error becomes its only row and excludes the candidate."""
+    """Run a block with the candidate's threads.
+
+    An error becomes its only row and excludes the candidate.
+    """
     try:
         with machine.pinned_threads(machine.threads(candidate.run.threads).number):
             yield

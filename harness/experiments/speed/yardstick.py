@@ -1,4 +1,6 @@
-"""C++ baseline, `cpp_baseline.cpp`: compiled where a compiler and Eigen exist, and called for one step at a time.
+"""C++ baseline, `cpp_baseline.cpp`, called for one step at a time.
+
+It is compiled where a compiler and Eigen exist.
 
 The scene is passed in a file: int64 n, m, q; float64 dt; int64 edges (m, 2), pinned (q,); float64 stiffness, rest
 length (m,), mass (n,), pin weight (q,), target, force, initial guess (n, 3), pin targets (q, 3).
@@ -30,7 +32,10 @@ MALFORMED = {2: "wanted a scene and a file for positions", 3: "the scene's file 
 
 
 def build(folder: Path) -> Path:
-    """Compile the baseline in `folder`; again if its source has changed. Raises Unsupported with the reason."""
+    """Compile the baseline in `folder`; again if its source has changed.
+
+    Raises Unsupported with the reason.
+    """
     return compile_cpp(SOURCE, folder, NEEDS)
 
 
@@ -80,7 +85,10 @@ class Yardstick:
         return self._answer()
 
     def close(self) -> Positions:
-        """End the program and return the positions (n, 3) [m] of its last step. Raises RunFailed."""
+        """End the program and return the positions (n, 3) [m] of its last step.
+
+        Raises RunFailed.
+        """
         assert self._process.stdin is not None
         self._process.stdin.close()
         if self._process.wait():
