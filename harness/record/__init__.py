@@ -1,1 +1,1 @@
-"""Recordings: written in a run's second pass, read back without a viewer or a server."""
+"""Recordings, written in the instrumentation pass and read back without a viewer or a server."""

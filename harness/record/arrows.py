@@ -1,7 +1,8 @@
-"""Forces in a recording: arrows from where they act, hidden until somebody asks for them.
+"""Force arrows of a recording, drawn at the vertices and hidden until switched on.
 
-Entities: `/scene/forces/<name>`. An arrow's length is in proportion to its force, by one scale a recording: the longest
-of all that were seen. It is known at the end, so they wait for that, or until HELD frames wait.
+Entities: `/scene/forces/<name>`. An arrow's length is proportional to its force. Each force has one scale in a
+recording, set by its longest arrow in any frame. That arrow is only known at the end, so arrows are buffered until the
+recording is finished or until MAX_BUFFERED_FRAMES frames have accumulated.
 """
 
 from __future__ import annotations
@@ -15,20 +16,20 @@ from numpy.typing import NDArray
 from solvers.problem import Positions
 
 MOST = 200
-"""Of a force, at most."""
+"""Maximum number of arrows of one force in a frame."""
 COLOURS = {"external": 0xF0E442FF, "contact": 0x56B4E9FF}
-"""By the forces' names."""
+"""Arrow colour (0xRRGGBBAA) of each force."""
 HELD = 2000
-"""Frames that wait; later ones have the scale of these."""
+"""Number of buffered frames that set the scale; later frames use the same scale."""
 _LONGEST = 0.15
-"""The longest arrow, in the mesh's size."""
+"""Length of the longest arrow, as a fraction of the mesh size."""
 
 Points = NDArray[np.float32]
 Times = Callable[[NDArray[np.int64]], Iterable[rr.TimeColumn]]
 
 
 class Arrows:
-    """The forces on a mesh of a size [m], in an open recording."""
+    """Arrows of the forces on a mesh of a given size [m], in an open recording."""
 
     def __init__(self, stream: rr.RecordingStream, size: float) -> None:
         self._stream, self._size = stream, size
@@ -36,8 +37,14 @@ class Arrows:
         self._scale: dict[str, float] = {}  # metres a newton
 
     def at(self, frame: int, p: Points, forces: Mapping[str, Positions], times: Times) -> None:
-        """Keep the forces (n, 3) [N] of a frame at positions p (n, 3) [m]; of many vertices, those of some. times: the
-        index of frames by their numbers."""
+        """Buffer the force arrows of one frame.
+
+        Args:
+          frame: frame index.
+          p: positions (n, 3) [m].
+          forces: forces (n, 3) [N] by name; a subset of the vertices is drawn where more than MAX_ARROWS carry a force.
+          times: builds the time columns from frame indices.
+        """
         for name, force in forces.items():
             acting = np.flatnonzero(np.abs(force).max(axis=1, initial=0.0) > 0.0)
             acting = acting[:: -(-len(acting) // MOST) or 1]
@@ -48,7 +55,7 @@ class Arrows:
                 self._send(name, times)
 
     def close(self, times: Times) -> None:
-        """Send what waits."""
+        """Write all buffered arrows."""
         for name in [*self._held]:
             self._send(name, times)
 

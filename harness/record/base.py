@@ -1,4 +1,4 @@
-"""The interface between a run and its recordings, and between recordings and pictures."""
+"""Interface between a run and its recordings, and between recordings and pictures."""
 
 from __future__ import annotations
 
@@ -19,22 +19,29 @@ if TYPE_CHECKING:
 
 
 LAYOUT = 2
-"""Of entities and columns: recordings of another one are not read."""
+"""Version of the layout of entities and columns; recordings of another version are rejected."""
 
 
 SELF_CONTACT = "self_contact"
-"""The property of a recording that states whether an effect keeps the mesh from passing through itself."""
+"""Property of a recording that states whether an effect prevents self-intersection of the mesh."""
 
 SAMPLES = 8
-"""Frames before the last that are read back: a recording wrong in half of its frames passes once in 256 runs."""
+"""Number of sampled frames before the last: a recording wrong in half of its frames passes once in 256 runs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One simulated step, as recorded: frame 0 is the start, before any step.
+    """One simulated step, as recorded; frame 0 is the initial state.
 
-    index; time [s]; positions (n, 3) [m]; energies [J] by name; residual [J^(1/2)]; iterations; forces (n, 3) [N] by
-    name, to be seen as arrows; intersections: of the mesh with itself, None where nobody looked.
+    Attributes:
+      index: frame number.
+      time: simulated time [s].
+      positions: vertex positions (n, 3) [m].
+      energies: energies [J] by name.
+      residual: residual norm [J^(1/2)].
+      num_iterations: number of solver iterations of the step.
+      forces: forces (n, 3) [N] by name, drawn as arrows.
+      num_intersections: number of self-intersections of the mesh; None where they were not counted.
     """
 
     index: int
@@ -49,14 +56,20 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordingInfo:
-    """What does not change in a recording.
+    """Properties of a recording that are constant over its frames.
 
-    title: scene, size and solver in words; run_id; mesh; springs (m, 2) and their rest_lengths (m,) [m]: those of
-    the scene, which may be fewer than the mesh's; pinned: vertices (q,); time_step [s];
-    strain_range: the strain at the ends of the colour scale (0.1 is 10 %);
-    properties: everything else about the run and its machine, flat (scene, size, solver, iterations, cpu, ...);
-    iterates: whether the frames are iterates of one solve, by their numbers, instead of steps of a run;
-    obstacles: what is seen beside the mesh.
+    Attributes:
+      title: scene, size and solver in words.
+      run_id: identifier of the run.
+      mesh: mesh of the scene.
+      springs: vertex pairs (m, 2) of the scene's springs, which may be fewer than those of the mesh.
+      rest_lengths: rest lengths of the springs (m,) [m].
+      pinned_vertices: indices of the pinned vertices (q,).
+      time_step: step size [s].
+      strain_range: strain at the ends of the colour scale (0.1 is 10 %).
+      properties: flat metadata of the run and its machine (scene, size, solver, iterations, cpu, ...).
+      is_solve: whether the frames are the numbered iterates of one solve, instead of the steps of a run.
+      obstacles: obstacles drawn with the mesh.
     """
 
     title: str
@@ -73,7 +86,7 @@ class RecordingInfo:
 
 
 class Recorder(Protocol):
-    """Takes the frames of one run, in order, and ends with a complete file or none."""
+    """Writer of the frames of one run, in order, to one complete file or none."""
 
     def frame(self, frame: Frame) -> None:
         """Record one frame."""
@@ -84,17 +97,20 @@ class Recorder(Protocol):
         ...
 
     def close(self, milliseconds: Mapping[str, Sequence[float]]) -> Path:
-        """Write the milliseconds of each phase by frame (from the timed pass; index 0 is frame 1), finish
-        the file under its final name and return that."""
+        """Write the phase times, finish the file and return its final path.
+
+        Args:
+          milliseconds: wall time [ms] of each phase by frame, from the timed pass; index 0 is frame 1.
+        """
         ...
 
     def abandon(self) -> None:
-        """Stop without leaving a file under the final name."""
+        """Stop and leave no file under the final name."""
         ...
 
 
 class FrameSamples:
-    """Copies of the positions of some random frames of a run, and of its last one."""
+    """Copies of the positions of some random frames of a run and of its last frame."""
 
     def __init__(self, last: int) -> None:
         before = range(1, last)
@@ -102,18 +118,29 @@ class FrameSamples:
         self.positions: dict[int, Positions] = {}
 
     def add(self, frame: int, p: Positions) -> None:
-        """Copy the positions (n, 3) [m] after a step, if its frame is one of those."""
+        """Copy the positions (n, 3) [m] after a step if its frame is sampled."""
         if frame in self.frames:
             self.positions[frame] = p.copy()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay:
-    """A recording read back: what pictures are drawn from.
+    """Contents of a recording that has been read back, from which pictures are drawn.
 
-    frames: indices (k,); times (k,) [s]; positions (k, n, 3) float32 [m], relative to `origin`; triangles (f, 3);
-    springs (m, 2); rest_lengths (m,) [m]; pinned (q,); strain_range; scalars: entity name -> (frames, values);
-    properties and title as recorded; origin (3,) [m], zero unless the mesh is far from zero.
+    Attributes:
+      title: title as recorded.
+      run_id: identifier of the run.
+      frames: frame indices (k,).
+      times: simulated times (k,) [s].
+      positions: positions (k, n, 3) float32 [m], relative to `origin`.
+      triangles: vertex indices (f, 3).
+      springs: vertex pairs (m, 2).
+      rest_lengths: rest lengths of the springs (m,) [m].
+      pinned_vertices: indices of the pinned vertices (q,).
+      strain_range: strain at the ends of the colour scale.
+      scalars: (frames, values) by entity name.
+      properties: metadata as recorded.
+      origin: origin of the positions (3,) [m], zero unless the mesh is far from zero.
     """
 
     title: str
@@ -131,5 +158,5 @@ class Replay:
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     def absolute_positions(self, frame: int) -> Positions:
-        """Return the positions (n, 3) [m] of a recorded frame, counted from 0, with the origin added."""
+        """Return the positions (n, 3) [m] of the recorded frame with an index counted from 0, with the origin added."""
         return self.positions[frame] + self.origin

@@ -1,4 +1,4 @@
-"""What is seen when a recording is opened: the mesh and its colour scale beside plots by frame, and the run."""
+"""Viewer layout of a recording: the mesh and its colour scale, plots by frame, and the run's metadata."""
 
 from __future__ import annotations
 
@@ -15,38 +15,48 @@ from harness.record.camera import Extent
 
 BACKGROUND = (38, 40, 46)
 _LEGEND = 1.2
-"""The height of the room for a legend above a plot's data, in that of the data."""
+"""Height of the space for a legend above a plot's data, relative to the height of the data."""
 _LISTED = 1.6
-"""The height of a plot with a legend over that of one without: five names have their place at 800 pixels."""
+"""Height of a plot with a legend relative to one without: five names fit at 800 pixels."""
 
 Ends = Mapping[str, tuple[float, float]]
 
 _SHARES = (-1.0, 1.0)
-"""Where nothing is known of the values."""
+"""Value range where the values are unknown."""
 
 COLOURS = (0xE69F00FF, 0x56B4E9FF, 0x009E73FF, 0xCC79A7FF, 0xF0E442FF, 0xD55E00FF, 0x0072B2FF, 0x999999FF)
-"""Of the lines of a plot: the palette of Okabe and Ito, told apart by the colour-blind; clear on black first."""
+"""Colours of a plot's lines: the colour-blind safe palette of Okabe and Ito, those clearest on black first."""
 
 
 def spring_cadence(info: RecordingInfo) -> int:
-    """Springs are drawn in the frames that this number divides: in all where they are few, else so rarely that
-    they cost about 2.5 bytes a vertex and frame; vertices cost 15."""
+    """Return the interval in frames at which the springs are recorded.
+
+    It is 1 for at most 1024 springs. Otherwise it is chosen so that springs cost about 2.5 bytes per vertex and frame;
+    the vertices themselves cost 15.
+    """
     return 1 if len(info.springs) <= 1024 else 10 * math.ceil(len(info.springs) / len(info.mesh.rest))
 
 
 def application(info: RecordingInfo) -> str:
-    """The viewer keeps one layout for each application: one for each scene, so that its camera fits."""
+    """Return the application name of a scene, for which the viewer stores one layout, so that its camera fits."""
     return f"springbench {info.properties.get('scene', info.title)}"
 
 
 def scale_name(strain_range: float) -> str:
-    """The colour scale in words."""
+    """Return a description of the strain colour scale."""
     percent = f"{100 * strain_range:g} %"
     return f"Strain: blue = compressed {percent} or more, grey = at rest, orange = stretched {percent} or more"
 
 
 def scene_view(root: str, name: str, box: Extent, *, springs_visible: bool) -> rrb.Spatial3DView:
-    """The mesh under `root`/scene; its springs and the forces on it are there to be switched on."""
+    """Build the 3D view of the mesh under a root entity.
+
+    Args:
+      root: entity path above `/scene`.
+      name: title of the view.
+      extent: extent of the positions, from which the camera is computed.
+      springs_visible: whether springs are shown at first; forces are hidden at first.
+    """
     shown: dict[Any, rrb.EntityBehavior] = {f"{root}/scene/springs": rrb.EntityBehavior(visible=springs_visible)}
     shown[f"{root}/scene/forces"] = rrb.EntityBehavior(visible=False)
     return rrb.Spatial3DView(
@@ -62,9 +72,13 @@ def scene_view(root: str, name: str, box: Extent, *, springs_visible: bool) -> r
 def plot(
     name: str, contents: Sequence[str], *, last: int, ends: tuple[float, float] | None = None
 ) -> rrb.TimeSeriesView:
-    """Plot everything under the given paths, to the `last` frame.
+    """Build a plot of all scalars under the given paths.
 
-    ends: the smallest and the largest value; where they are given there is a legend, in room of its own above the data.
+    Args:
+      name: title of the plot.
+      contents: entity queries.
+      last: last frame shown.
+      value_range: smallest and largest value; if given, a legend is shown in a space of its own above the data.
     """
     corner = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=ends is not None)
     across = rrb.TimeRange(*(rrb.TimeRangeBoundary.absolute(seq=at) for at in (0, max(last, 1))))
@@ -78,7 +92,14 @@ def plot(
 
 
 def blueprint(info: RecordingInfo, box: Extent, last: int = 0, ends: Ends | None = None) -> rrb.Blueprint:
-    """The layout of one recording; last: its last frame; ends: the smallest and largest value of groups of scalars."""
+    """Build the viewer layout of one recording.
+
+    Args:
+      info: properties of the recording.
+      extent: extent of the positions, from which the camera is computed.
+      last: last frame.
+      value_ranges: smallest and largest value of groups of scalars, by entity.
+    """
     ends = ends or {}
     series = rrb.Vertical(
         plot(
@@ -101,7 +122,7 @@ def blueprint(info: RecordingInfo, box: Extent, last: int = 0, ends: Ends | None
     run = rrb.TextDocumentView(origin="/run", name="Run and machine")
     tabs = (_solve(last, ends),) if info.iterates else (series, convergence)
     return rrb.Blueprint(
-        # A grid: in a window that is higher than wide, such as a phone's, the viewer puts the plots below the mesh.
+        # In a grid, the viewer moves the plots below the mesh in windows higher than wide, such as a phone's.
         rrb.Grid(
             scene_view("", info.title, box, springs_visible=not len(info.mesh.triangles)),
             rrb.Tabs(*tabs, run, active_tab=0),
@@ -113,7 +134,7 @@ def blueprint(info: RecordingInfo, box: Extent, last: int = 0, ends: Ends | None
 
 
 def _solve(last: int, ends: Ends) -> rrb.Vertical:
-    """The plots of a solve, by the number of the iterate."""
+    """Build the plots of a solve by iteration number."""
     return rrb.Vertical(
         plot("log10 of gap and stationarity, relative", ["+ /solve/**"], last=last, ends=ends.get("/solve", _SHARES)),
         plot(
@@ -129,7 +150,7 @@ def _solve(last: int, ends: Ends) -> rrb.Vertical:
 
 
 def run_document(info: RecordingInfo) -> str:
-    """The run and its machine as Markdown."""
+    """Return the metadata of the run and its machine as Markdown."""
     mesh = info.mesh
     facts = {
         "vertices": len(mesh.rest),
@@ -152,7 +173,10 @@ def run_document(info: RecordingInfo) -> str:
 
 
 def panels(time_step: float, timeline: str = "frame") -> tuple[rrb.TimePanel, rrb.SelectionPanel, rrb.BlueprintPanel]:
-    """Time by frame or iteration, played from the first on in real time as far as a screen can show it, in a loop."""
+    """Build the panels, with a time panel that loops by frame or iteration.
+
+    Playback is in real time as far as a screen can show it (1 to 120 frames per second).
+    """
     fps = math.ceil(min(max(1 / time_step, 1.0), 120.0))
     time = rrb.TimePanel(state="collapsed", timeline=timeline, fps=fps, play_state="playing", loop_mode="all")
     return time, rrb.SelectionPanel(state="hidden"), rrb.BlueprintPanel(state="hidden")

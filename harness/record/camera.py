@@ -1,13 +1,12 @@
-"""Where the camera of a recording stands, and the scale of strain that it sees below the mesh.
+"""Camera placement of a recording, and the strain colour scale shown below the mesh.
 
-With x to the right, y up and z towards the camera, a point is seen from (cx, cy, D) where
+With x to the right, y up and z towards the camera, a point is visible from (cx, cy, D) where
+    |x - cx| <= a h (D - z),    -b h (D - z) <= y - cy <= h (D - z),    h = tan(55 degrees / 2).
 
-    |x - cx| <= a h (D - z),    -b h (D - z) <= y - cy <= h (D - z),    h = tan(55 degrees / 2),
-
-a the view's width over its height, and b < 1 for what stays free below. All are linear in cx, cy and D: of the points
-only four maxima count, and the nearest camera that sees all of them follows. Where that leaves room on two sides, h is
-replaced by smaller shares of it until it does not, so that the points stand in the middle. Of several directions the
-one is taken in which the mesh fills the view well, over all frames.
+Here a is the aspect ratio (width over height) of the view, and b < 1 leaves space below for the colour scale. All
+conditions are linear in cx, cy and D, so only four maxima over the points matter. They determine the nearest camera
+that sees all points. Where that leaves space on two sides, h is scaled down in steps until it no longer does, which
+centres the points. Among several directions, one in which the mesh fills the view well over all frames is selected.
 """
 
 from __future__ import annotations
@@ -24,44 +23,46 @@ from harness.record.framing import framed_vertices, outside_words
 from harness.record.shading import LEVELS, palette, percent
 
 _AROUND, _UP = 38.5, 20.8
-"""From where the camera looks, if nowhere else is better [degrees]: from the side, and a little from above; y is up."""
+"""Default azimuth and elevation of the camera [degrees]: from the side and slightly from above; y is up."""
 _OTHERS = [(around, up) for around in (40, 20, 60, 80, -20, -40, -60, -80) for up in (15, 30, 40)]
 _BETTER = 1.15
-"""How much more of its view the mesh must fill, over all frames, where the camera looks from elsewhere."""
+"""Factor by which another direction must improve the filled fraction, over all frames, to replace the default."""
 _AS_GOOD = 0.97
-"""Of the best: the first of these is taken."""
+"""Fraction of the best filled fraction that counts as equally good; the first such direction is selected."""
 
 _HALF_VIEW = math.tan(math.radians(55 / 2))
-"""The viewer's angle of view is 55 degrees, from bottom to top."""
+"""The viewer's vertical field of view is 55 degrees."""
 
 _BELOW = 0.72
-"""b: the rest of the lower half is the scale's."""
+"""b: the remainder of the lower half is reserved for the colour scale."""
 _SCALE_AT, _SCALE_HEIGHT, _SCALE_WIDTH = -0.84, 0.035, 0.62
-"""The scale's upper edge, its height, and half its width, in half views."""
+"""The colour scale's upper edge, its height and half its width, in half views."""
 
 _WORD = 0.085
-"""How far above its place the viewer is given a word that is to stand there."""
+"""Offset of a label above its intended position, which compensates for the viewer's placement, in half views."""
 
 _MARGIN = 1.04
 _SHARES = np.linspace(0.2, 1.0, 5)
 _NEAREST = 0.3
-"""How near the camera comes to the nearest point, in the diagonal of the box."""
+"""Minimum distance of the camera to the nearest point, as a fraction of the diagonal of the bounding box."""
 
 
 _SUPPORTS = 32
-"""Of more vertices than twice this only those count that are the outermost along so many axes: of a ball of them the
-others lie 2 % further out at most."""
+"""Number of axes along which extreme vertices are selected; of more than twice as many vertices only those are used.
+For vertices that fill a ball, the others lie at most 2 % further out."""
 
 
 _LEAST = 1e-3
-"""Of a view: what is seen as a line, or as a point, fills so much of it."""
+"""Minimum filled fraction of a view, assigned to a mesh seen as a line or as a point."""
 
 
 class Extent:
-    """The positions of some frames, and what of them a camera must see: see `harness.record.framing`.
+    """Positions of some frames, and the camera that frames them (see `harness.recording.camera_framing`).
 
-    aspect: of the view, its width over its height; first: what is seen first, the positions at rest if left out
-    or not finite.
+    Args:
+      rest: rest positions (n, 3) [m].
+      aspect: width of the view over its height.
+      initial_positions: positions shown first (n, 3) [m]; the rest positions if omitted or not finite.
     """
 
     def __init__(
@@ -77,7 +78,7 @@ class Extent:
         self._sight: _Sight | None = None
 
     def add(self, p: NDArray[np.floating]) -> None:
-        """See positions (n, 3) [m] too, unless they have blown up beyond showing."""
+        """Include positions (n, 3) [m], unless they have diverged too far to be shown."""
         p = p.astype(np.float64)
         if not np.isfinite(p).all():
             return
@@ -90,11 +91,11 @@ class Extent:
             self._sight = None
 
     def outside(self) -> list[str]:
-        """How many vertices the camera leaves out, in words; nothing where it frames all."""
+        """Return a description of how many vertices are not framed; empty where all are."""
         return outside_words(framed_vertices(self._start, self._moved))
 
     def _best(self) -> _Sight:
-        """Of the sights that fill the view well, over all frames."""
+        """Return the camera view that fills the view well over all frames."""
         if self._sight is None:
             near = framed_vertices(self._start, self._moved)
             seen = [p[near[which]] for which, p in self._seen if near[which].any()]
@@ -109,17 +110,19 @@ class Extent:
         return self._sight
 
     def eye(self) -> rrb.EyeControls3D:
-        """An orbiting eye that just sees all of it, and has room below."""
+        """Return an orbiting camera that just sees all framed points, with space below them."""
         sight = self._best()
         x, y, distance = sight.place
         eye, target = ((x, y, z) @ sight.axes for z in (distance, (sight.near + sight.far) / 2))
         return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=eye, look_target=target, eye_up=(0, 1, 0))
 
     def scale(self, strain_range: float, ends: tuple[float, float] = (0.0, 0.0)) -> tuple[rr.Mesh3D, rr.Points3D]:
-        """The strip of colours in the room below, facing the camera, and its numbers.
+        """Build the strip of colours below the mesh, facing the camera, and its numbers.
 
-        ends: the smallest and the largest strain of a spring; where the strip does not reach one it ends in a tip, with
-        that figure.
+        Args:
+          strain_range: strain at the ends of the colour scale.
+          strain_limits: smallest and largest strain of a spring. Where one is outside the scale, the strip ends in a
+            tip labelled with that strain.
         """
         sight = self._best()
         (x, y, distance), near = sight.place, sight.near
@@ -156,8 +159,12 @@ class Extent:
 class _Sight:
     """The points of some frames, seen from one direction.
 
-    axes: to the right, up and towards the camera; place: cx, cy and D; near, far: of the points towards the camera;
-    filled: the part of the view that a frame's points span, the geometric mean over the frames.
+    Attributes:
+      axes: unit vectors (3, 3) to the right, up and towards the camera.
+      place: cx, cy and D [m].
+      near: largest coordinate of the points towards the camera [m].
+      far: smallest coordinate of the points towards the camera [m].
+      filled: fraction of the view that the points of a frame span, as the geometric mean over the frames.
     """
 
     def __init__(
@@ -197,7 +204,8 @@ class _Sight:
 
 
 def _outermost(p: NDArray[np.float64], of: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Of these vertices those that are the last along some axis, spread over all directions; and where they are."""
+    """Return the vertices that are extreme along some axis, with axes spread over all directions, and their positions.
+    """
     if len(of) <= 2 * _SUPPORTS:
         return of, p[of]
     turn = np.arange(_SUPPORTS)
@@ -209,6 +217,6 @@ def _outermost(p: NDArray[np.float64], of: NDArray[np.intp]) -> tuple[NDArray[np
 
 
 def _middle(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:
-    """The middle of the first of these intervals that is one."""
+    """Return the midpoint of the first non-empty interval."""
     first = int(np.argmax(low <= high))
     return float(low[first] + high[first]) / 2

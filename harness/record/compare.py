@@ -1,7 +1,7 @@
-"""Recordings of one scene and size side by side in one file: a view for each solver, one plot for each quantity.
+"""Recordings of one scene and size side by side in one file, with shared plots.
 
-The chunks of each recording are copied as they are, under the name of its solver; where the scales of strain differ,
-all are coloured by the longest.
+Each solver has its own view, and each quantity one plot. The chunks of each recording are copied unchanged under the
+name of its solver. Where the strain scales differ, all recordings are coloured by the widest scale.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ _QUANTITIES = {
     "/iterations": "Iterations of a step",
 }
 _SHOWN = 3
-"""How many of them are seen at once; the others are behind a tab."""
+"""Number of quantities shown at once; the others are in another tab."""
 
 
 _ABREAST = 4
-"""Scenes in a row at most; so many are higher than wide."""
+"""Maximum number of scenes in a row; with this many, each view is higher than wide."""
 
 _STRAINED = ("/scene/mesh", "/scene/springs")
 _PAINTED = (
@@ -45,19 +45,26 @@ _PAINTED = (
     ("Points3D:positions", "Points3D:colors"),
     ("LineStrips3D:strips", "LineStrips3D:colors"),
 )
-"""Components that tell where something is, and the colours of its strain."""
+"""Components with positions, and those with the strain colours at these positions."""
 
 
 class Look(NamedTuple):
-    """How a run's lines are drawn: a colour such as `#0072b2`, which is lighter here where it is dark."""
+    """Line style of a run: a colour such as `#0072b2`, which is lightened here where it is dark."""
 
     color: str
 
 
 def side_by_side(out: Path, recordings: Mapping[str, Path], title: str, looks: Mapping[str, Look]) -> None:
-    """Write to `out` the recordings, by solver, side by side on one time line; looks: by the same names.
+    """Write several recordings side by side on one timeline to one file.
 
-    Raises InputError for a file that is not the recording of a run, RunFailed when `out` cannot be written.
+    Args:
+      out: path of the new file.
+      recordings: paths of the recordings by solver name.
+      title: title of the new recording.
+      styles: line styles by solver name.
+    Raises:
+      InputError: a file is not the recording of a run.
+      RunFailed: `out` cannot be written.
     """
     file = PartialFile(out, f"springbench side by side {title}", title, title)
     try:
@@ -83,7 +90,7 @@ def side_by_side(out: Path, recordings: Mapping[str, Path], title: str, looks: M
 
 
 class _Run:
-    """One recording: where it went and what its views need to know."""
+    """One source recording: its root entity and the data its views need."""
 
     def __init__(self, name: str, k: int, source: Source, strain_range: float) -> None:
         fixed = network(source)
@@ -91,7 +98,7 @@ class _Run:
         self._springs = fixed["springs"].reshape(-1, 2).astype(np.int64)
         self._rest_lengths = fixed["rest_lengths"].astype(float)
         self.ends = (0.0, 0.0)  # the smallest and the largest strain of a spring
-        # Entities take few characters unescaped; the number keeps names apart that differ in others.
+        # Entity paths allow few unescaped characters; the number separates names that differ only in the replaced ones.
         self.name, self.root = name, f"/{k + 1}-{re.sub(r'[^A-Za-z0-9_.]+', '-', name)}"
         self.time_step = float(fixed["time_step"][0])
         self.properties: dict[str, Any] = properties(source)[1]
@@ -102,7 +109,7 @@ class _Run:
         self.ranges: dict[str, tuple[float, float]] = {}  # the smallest and the largest of what is compared
 
     def seen_in(self, source: Source, box: Extent | None, aspect: float) -> Extent | None:
-        """The box, widened to the recording's positions; aspect: of its view."""
+        """Return the extent, widened to the recording's positions, for a view of the given aspect ratio."""
         for frame, _, p in positions(source):
             box = box or Extent(p, aspect)
             box.add(p)
@@ -112,11 +119,11 @@ class _Run:
         return box
 
     def _strains(self, p: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Of the springs and of the vertices."""
+        """Return the strains of the springs and of the vertices."""
         return strains(p.astype(float), self._springs, self._rest_lengths)
 
     def measure(self, chunk: Chunk) -> None:
-        """Widen the range of a compared quantity to the values of a piece of a recording."""
+        """Widen the range of a compared quantity to the values of a chunk."""
         if chunk.entity_path in _QUANTITIES:
             batch = chunk.to_record_batch()
             if "Scalars:scalars" in batch.schema.names:
@@ -126,7 +133,7 @@ class _Run:
                 self.ranges[chunk.entity_path] = float(known.min(initial=low)), float(known.max(initial=high))
 
     def coloured(self, chunk: Chunk) -> Chunk:
-        """A piece of a recording; what shows strain by the scale of all."""
+        """Return a chunk in which strain colours use the common scale."""
         batch = chunk.to_record_batch() if self._anew and chunk.entity_path in _STRAINED else None
         for places, painted in _PAINTED if batch else ():
             if batch and {places, painted} <= set(batch.schema.names):
@@ -135,7 +142,7 @@ class _Run:
         return chunk
 
     def _painted(self, places: NDArray[np.float32]) -> NDArray[np.uint32]:
-        """The colours of vertices, or of springs, whose two ends each were recorded."""
+        """Return the colours of vertices, or of springs, for which both end points were recorded."""
         p = places.reshape(-1, 3).astype(float)
         if len(p) == self._vertices:
             return colours(self._strains(p)[1], self.strain_range)
@@ -161,7 +168,7 @@ def _copy(file: PartialFile, run: _Run, source: Source, look: Look, box: Extent 
 
 
 def residuals(source: Source) -> dict[int, list[float]]:
-    """How the frames converged that were looked at: frame -> the residual [J^(1/2)] after each iteration."""
+    """Return the residuals [J^(1/2)] after each iteration of the frames with recorded convergence, by frame."""
     found: dict[int, list[float]] = {}
     for chunk in source.chunks(content="/convergence/residual", components=["Scalars:scalars"]):
         frames, _ = looked_at(source, "/convergence/residual")
@@ -172,7 +179,7 @@ def residuals(source: Source) -> dict[int, list[float]]:
 
 
 def on_dark(color: str) -> str:
-    """A colour such as `#0072b2`, mixed with white where it is dark, as on the page of results when that is dark."""
+    """Return a colour such as `#0072b2` mixed with white where it is dark, as on the dark results page."""
     parts = [int(color[k : k + 2], 16) for k in (1, 3, 5)]
     by = max(0.0, 0.5 - float(np.dot((0.2126, 0.7152, 0.0722), parts)) / 255)
     return "#" + "".join(f"{round(part + (255 - part) * by):02x}" for part in parts)
@@ -195,7 +202,7 @@ def _layout(runs: list[_Run], box: Extent | None) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Grid(*scenes, grid_columns=columns),
-            # Each behind a tab of its own over the whole width, so that no title is cut.
+            # Each group is in a tab of its own over the whole width, so that no title is truncated.
             rrb.Tabs(*_named({"By frame": plots[:_SHOWN], "Convergence": drawn, "More": plots[_SHOWN:]}), table),
             row_shares=[2, 1],
         ),
@@ -216,7 +223,7 @@ def _plot(runs: list[_Run], entity: str, name: str, last: int, *, legend: bool) 
 
 
 def _table(title: str, runs: list[_Run]) -> str:
-    """The runs' properties as Markdown, a column for each run."""
+    """Return the runs' properties as a Markdown table with one column per run."""
     keys = dict.fromkeys(key for run in runs for key in run.properties)
     rows = [[key, *(f"`{run.properties.get(key, '')}`" for run in runs)] for key in keys]
     head = [["", *(run.name for run in runs)], ["-"] * (len(runs) + 1)]

@@ -1,7 +1,7 @@
-"""Curves over iterations as a drawing, which is seen whatever timeline the viewer shows.
+"""Curves over iterations as a drawing that is visible on every timeline of the viewer.
 
-The viewer's own plots show nothing but the timeline that is active, which is that of the frames. The drawing has a
-logarithmic axis, whole decades and numbers; the words on a curve stand at its end, beside the data.
+The viewer's own plots show only the active timeline, which is that of the frames. The drawing has a logarithmic axis
+with whole decades and numbers. The label of a curve is at its end, next to the data.
 """
 
 from __future__ import annotations
@@ -18,24 +18,31 @@ from numpy.typing import NDArray
 _WIDTH, _HEIGHT = 150.0, 100.0
 _PALE, _RULE = 0xFFFFFFFF, 0x464950FF
 _LINE = 7.0
-"""The height of a word, by which those at the ends of curves are kept apart."""
+"""Height of a label, the minimum spacing of the labels at the ends of curves."""
 _LOWER = 4.5
-"""How far below its place the viewer writes a word."""
+"""Distance by which the viewer draws a label below its position."""
 
 _DEEPEST = 18
-"""Decades below the largest value that are drawn."""
+"""Maximum number of decades drawn below the largest value."""
 
 Colours = NDArray[np.uint32]
 Points = NDArray[np.float64]
 
 
 def colours(numbers: Iterable[int]) -> Colours:
-    """As an array, of 0xRRGGBBAA: Rerun takes three or four numbers in a list for the parts of one colour."""
+    """Return colours 0xRRGGBBAA as an array; Rerun reads a list of three or four numbers as one colour."""
     return np.array(list(numbers), np.uint32)
 
 
 def draw(stream: rr.RecordingStream, entity: str, curves: Mapping[str, Sequence[float]], colours: Colours) -> None:
-    """Log curves by name over the iterations 1, 2, ..., the logarithms of their values, as a drawing under `entity`."""
+    """Log curves over the iterations 1, 2, ... with a logarithmic axis, as a drawing.
+
+    Args:
+      stream: open recording.
+      entity: entity path under which the drawing is logged.
+      curves: values of each iteration by curve name; values that are not positive and finite are omitted.
+      colours: colours of the curves.
+    """
     found = {name: np.asarray(values, float) for name, values in curves.items()}
     known = np.concatenate([values[np.isfinite(values) & (values > 0)] for values in found.values()] or [np.empty(0)])
     if not len(known):
@@ -51,7 +58,7 @@ def draw(stream: rr.RecordingStream, entity: str, curves: Mapping[str, Sequence[
         y = _HEIGHT * (top - np.log10(values[fine])) / (top - bottom)
         strips.append(np.column_stack([x, y]))
         ends.append((float(x[-1]), float(y[-1])) if len(x) else (0.0, _HEIGHT))
-    # All lines are one entity and all words another: each entity costs some 3 kB.
+    # All lines share one entity and all labels another, since each entity costs about 3 kB.
     radii: Any = [rr.Radius.ui_points(0.5)] * len(rules) + [rr.Radius.ui_points(1.25)] * len(strips)
     lines = rr.LineStrips2D([*rules, *strips], colors=_painted(len(rules), _RULE, colours), radii=radii)
     stream.log(f"{entity}/lines", lines, static=True)
@@ -71,13 +78,13 @@ def _painted(count: int, colour: int, others: Colours) -> Colours:
 
 
 def view(origin: str, name: str) -> rrb.Spatial2DView:
-    """A view of the drawing."""
+    """Build a view of the drawing."""
     bounds = rrb.VisualBounds2D(x_range=(-18, _WIDTH + 32), y_range=(-8, _HEIGHT + 14))
     return rrb.Spatial2DView(origin=origin, name=name, background=(28, 30, 34), visual_bounds=bounds)
 
 
 def _axes(bottom: int, top: int, last: int) -> tuple[list[Points], Points, list[str]]:
-    """Rules, and the places of the words beside them."""
+    """Return the rules, and the positions and texts of their labels."""
     step = -(-(top - bottom) // 6)
     decades = np.arange(top, bottom - 1, -step)
     rows = _HEIGHT * (top - decades) / (top - bottom)
@@ -94,13 +101,13 @@ def _across(iterations: NDArray[np.int64], last: int) -> NDArray[np.float64]:
 
 
 def _round(last: int) -> int:
-    """About five steps of 1, 2 or 5 times a power of ten."""
+    """Return a tick step of 1, 2 or 5 times a power of ten, for about five ticks."""
     power = 10 ** math.floor(math.log10(max(1.0, last / 5)))
     return int(next(f * power for f in (1, 2, 5, 10) if f * power * 5 >= last))
 
 
 def _apart(wanted: list[float]) -> list[float]:
-    """Heights in the order of the wanted ones, a line apart at least, and none below the drawing."""
+    """Return label heights in the given order, at least one line apart and none below the drawing."""
     order, placed = sorted(range(len(wanted)), key=wanted.__getitem__), dict[int, float]()
     height = -math.inf
     for k in order:

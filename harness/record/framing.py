@@ -1,12 +1,13 @@
-"""Which vertices a camera frames: all, unless some have left the others far behind.
+"""Selection of the vertices that a camera frames: all, unless some are far from the others.
 
-A runaway vertex or a part that nothing holds would make a dot of everything else. With the distance of each vertex from
-the middle of those that moved least, at the start plus what it moved, the vertices are framed up to the first gap:
+A runaway vertex or an unsupported part would reduce the rest of the mesh to a dot. The radius of a vertex is its
+initial distance from the centre of the vertices that moved least, plus its displacement. Vertices are framed up to the
+first gap in the sorted radii:
 
     reach_i = |p_i(0) - centre| + max_t |p_i(t) - p_i(0)|,    framed: reach_i <= r_k for the least k of at least
-    SHARE n vertices with r_{k+1} > GAP max(r_k, half the diagonal of the start)
+    MIN_FRAMED_SHARE n vertices with r_{k+1} > GAP_FACTOR max(r_k, half the diagonal of the initial positions)
 
-A connected mesh has no such gap, nor has one that moves as a whole.
+A connected mesh has no such gap, and neither has one that moves as a whole.
 """
 
 from __future__ import annotations
@@ -17,17 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 GAP = 4.0
-"""The step in distance from which on vertices are left out: until then a quarter of the view shows the others."""
+"""Minimum ratio of radii at a gap: below it, the other vertices still fill a quarter of the view."""
 SHARE = 0.3
-"""Of the vertices, framed at least: one of three layers that is held, the others having fallen."""
+"""Minimum fraction of framed vertices: one of three layers that is supported while the others have fallen."""
 
 
 def framed_vertices(start: NDArray[np.floating], moved: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Return the vertices (n,) that a camera frames.
+    """Return a mask (n,) of the vertices that a camera frames.
 
     Args:
-      start: positions at the start (n, 3) [m], finite.
-      moved: largest distance from there in the frames to be seen (n,) [m].
+      start: initial positions (n, 3) [m], finite.
+      moved: largest displacement from `start` over the frames shown (n,) [m].
     """
     calm = moved <= np.median(moved)
     reach = np.linalg.norm(start - np.median(start[calm], axis=0), axis=1) + moved
@@ -40,7 +41,7 @@ def framed_vertices(start: NDArray[np.floating], moved: NDArray[np.floating]) ->
 
 
 def outside_words(framed: NDArray[np.bool_]) -> list[str]:
-    """Say how many vertices are not framed; nothing where all are."""
+    """Return a description of how many vertices are not framed; empty where all are."""
     count = int((~framed).sum())
     verb = "is" if count == 1 else "are"
     return [f"{count:,} of {len(framed):,} vertices {verb} outside"] if count else []

@@ -1,9 +1,9 @@
-"""The origin of stored positions, so that single precision resolves a mesh far from (0, 0, 0).
+"""Local origin of stored positions, so that single precision resolves a mesh far from (0, 0, 0).
 
     stored = float32(p - origin),  origin = cell round(centre / cell)
 
 `cell` is the smallest power of two of at least 8 diagonals of the mesh at rest, so the origin is zero for meshes near
-zero. Round-off is 2^-24 of the distance from the origin, not of that from zero.
+zero. The round-off is 2^-24 of the distance from the origin, not of the distance from zero.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from solvers.problem import Positions
 
 KEY = "origin"
-"""The property of a recording that states its origin [m], in JSON; absent where it is zero."""
+"""Property of a recording that states its origin [m] in JSON; absent where the origin is zero."""
 
 _LARGEST = 2.0**1000
-"""[m]: the origin of a larger mesh is zero, as cells would overflow."""
+"""Maximum cell size [m]: the origin of a larger mesh is zero, since cells would overflow."""
 
 CELLS = 8.0
-"""The smallest cell, in diagonals of the mesh."""
+"""Minimum cell size, in diagonals of the mesh."""
 
 
 def local_origin(rest: Positions) -> NDArray[np.float64]:
@@ -45,10 +45,10 @@ def store_relative(p: Positions, origin: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def origin_property(origin: NDArray[np.float64]) -> dict[str, str]:
-    """Return the property that states an origin; none where it is zero."""
+    """Return the property that states an origin; empty where the origin is zero."""
     return {KEY: json.dumps(origin.tolist())} if origin.any() else {}
 
 
 def read_origin(properties: Mapping[str, object]) -> NDArray[np.float64]:
-    """Return the origin that a recording's properties state."""
+    """Return the origin (3,) [m] stated by a recording's properties."""
     return np.array(json.loads(str(properties.get(KEY, "[0, 0, 0]"))), np.float64)

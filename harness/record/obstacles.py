@@ -1,6 +1,6 @@
-"""Obstacles in a recording: each shape once, and where its motion takes it in each frame.
+"""Obstacle shapes in a recording: each shape once, and its pose in each frame.
 
-Entities: `/scene/obstacles/<number>-<kind>`. A plane has no end; the part of it around the mesh is drawn.
+Entities: `/scene/obstacles/<number>-<kind>`. Planes are infinite; only the part around the mesh is drawn.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ if TYPE_CHECKING:  # a scene without obstacles imports none of them
 Array = NDArray[np.float64]
 
 KEY = "obstacles"
-"""The property of a recording that declares its obstacles, as scenes do, in JSON."""
+"""Property of a recording that declares its obstacles in JSON, in the format of scene files."""
 
 _COLOUR = (0x9C, 0x97, 0x8D)
 _AROUND = 2.0
-"""Half the side of what is drawn of a plane, in the mesh's size and distance."""
+"""Half the side of the drawn part of a plane, relative to the mesh size plus its distance from the plane."""
 
 
 def listed(effects: Iterable[Effect]) -> tuple[AnySurface, ...]:
-    """What a scene's effects keep its mesh out of: to be seen beside it."""
+    """Return the obstacles of a scene's effects, to be drawn with the mesh."""
     return tuple(one for effect in effects for one in getattr(effect, "obstacles", ()))
 
 
 def declared(obstacles: Sequence[AnySurface]) -> dict[str, str]:
-    """The property of a recording with these obstacles; none where there are none."""
+    """Return the property that declares these obstacles; empty where there are none."""
     return {KEY: f"[{', '.join(one.model_dump_json(exclude_none=True) for one in obstacles)}]"} if obstacles else {}
 
 
 class Obstacles:
-    """Obstacles beside a mesh at rest (n, 3) [m], in an open recording whose positions are relative to an origin."""
+    """Obstacles near a mesh with rest positions (n, 3) [m], in an open recording relative to an origin (3,) [m]."""
 
     def __init__(self, stream: rr.RecordingStream, obstacles: Sequence[AnySurface], rest: Array, origin: Array) -> None:
         self._stream, self._origin = stream, origin
@@ -55,7 +55,7 @@ class Obstacles:
                 self._moving.append((entity, one.motion))
 
     def at(self, time: float) -> None:
-        """Record where those that move are at a time [s], on the timelines as they are set."""
+        """Record the poses of moving obstacles at a time [s], on the current timelines."""
         for entity, motion in self._moving:
             base, *ends = motion.moved(self._origin + np.concatenate([np.zeros((1, 3)), np.eye(3)]), time)
             moved = rr.Transform3D(translation=base - self._origin, mat3x3=(np.array(ends) - base).T)
@@ -71,7 +71,8 @@ def _sphere(one: Sphere, rest: Array, origin: Array) -> rr.Ellipsoids3D:
 
 
 def _capsule(one: Capsule, rest: Array, origin: Array) -> rr.Capsules3D:
-    """Rerun's go along z from the origin; this one is turned there by the half way between z and its own direction."""
+    """Build a capsule; Rerun's extends along z, so it is rotated by 180 degrees about the bisector of z and its axis.
+    """
     first, last = np.array(one.ends)
     length = float(np.linalg.norm(last - first))
     half = (last - first) / length + [0.0, 0.0, 1.0]
@@ -92,7 +93,7 @@ def _box(one: Box, rest: Array, origin: Array) -> rr.Boxes3D:
 
 
 def _plane(one: Plane, rest: Array, origin: Array) -> rr.Mesh3D:
-    """Two triangles about the foot of the mesh's middle."""
+    """Build two triangles around the foot of the perpendicular from the mesh's centre."""
     foot, x, normal, z = one.model_copy(update={"motion": None}).obstacle().frame(0.0)
     middle = rest.mean(axis=0)
     height = float((middle - foot) @ normal)
@@ -105,7 +106,7 @@ def _plane(one: Plane, rest: Array, origin: Array) -> rr.Mesh3D:
 
 
 def _mesh(one: Solid, rest: Array, origin: Array) -> rr.Mesh3D:
-    """Every triangle with points of its own: edges stay sharp."""
+    """Build a mesh in which each triangle has its own vertices, so that edges stay sharp."""
     points, triangles = one.shape()
     return _faces(points - origin, triangles)
 

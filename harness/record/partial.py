@@ -1,10 +1,10 @@
-"""A Rerun file that has a partial name until it is complete: a kill never leaves half a file under the final name.
+"""A Rerun file under a temporary name until it is complete, so that a kill leaves no truncated file.
 
-The stream has no batching thread of its own, which would slow down what runs beside it and lose its last
-batch in a kill: what is logged reaches the disk with `flush`.
+The stream has no batching thread of its own, which would slow down concurrent work and lose its last batch in a kill.
+Logged data is written to disk by `flush_stream`.
 
-The library has no public call that ends a stream's threads once it is gone, that writes a layout without leaving
-threads, or that lets go of a stream whose writer has died. `tests/contracts/test_rerun_gaps.py` tells when it has.
+The library has no public call to end the threads of a destroyed stream, to write a layout without leaving threads
+running, or to release a stream whose writer has died. `tests/contracts/test_rerun_gaps.py` fails once it has one.
 """
 
 from __future__ import annotations
@@ -23,21 +23,22 @@ from harness.base.files import CannotWrite, cannot_write, partial_name
 from harness.record.sound import trust, whole_messages
 
 _PATIENCE = 30
-"""Seconds that a flush may take."""
+"""Timeout of a flush [s]."""
 
 _PAGE = 2**16
-"""Bytes that a disk that is full does not take any more."""
+"""Number of bytes in a test write, which fails if the disk is full."""
 
 _broken: list[rr.RecordingStream] = []
 """Streams whose writing thread has died."""
 _first = 0
-"""The process that opened the first stream here, or in one that this is a fork of, in which it does not survive."""
+"""Process that opened the first stream, here or before a fork; streams do not survive a fork."""
 
 
 class PartialFile:
-    """An open recording stream into a partial file beside `path`.
+    """An open recording stream into a partial file in the folder of the final file.
 
-    Raises CannotWrite, from any method, when the file cannot be written or, at the end, is not whole.
+    Raises:
+      CannotWrite: from any method, if the file cannot be written or is incomplete at the end.
     """
 
     def __init__(self, path: Path, application: str, recording_id: str, title: str) -> None:
@@ -64,17 +65,17 @@ class PartialFile:
         self.stream.send_recording_name(title)
 
     def flush(self) -> None:
-        """Wait until all that was logged is in the file."""
+        """Wait until all logged data is in the file."""
         try:
             self.stream.flush(timeout_sec=_PATIENCE)
         except Exception as error:
             raise self._failure(error) from error
 
     def lay_out(self, layout: rrb.Blueprint) -> None:
-        """Write how the file opens; the last one counts.
+        """Write the viewer layout; the last layout written takes effect.
 
-        As the library's `send_blueprint` does, but for the disconnection: without it two threads stay for ever, for
-        the stream and its storage hold each other.
+        Equals the library's `send_blueprint` plus a disconnection. Without it two threads never end, since the stream
+        and its storage refer to each other.
         """
         name = self.stream.get_application_id() or ""
         sketch = rr.RecordingStream._from_native(  # pyright: ignore[reportPrivateUsage]
@@ -87,7 +88,7 @@ class PartialFile:
         sketch.disconnect()
 
     def finish(self, layout: rrb.Blueprint) -> Path:
-        """Close the file, see that it is whole and give it its final name, which is returned."""
+        """Close the file, check that it is complete, rename it to its final name and return that path."""
         try:
             self.lay_out(layout)
             self.flush()
@@ -103,15 +104,15 @@ class PartialFile:
         return self._path
 
     def abandon(self) -> None:
-        """Stop and remove the partial file, where there still is one."""
+        """Stop and remove the partial file if it still exists."""
         if not self._broken:
             self.stream.disconnect()
         self._partial.unlink(missing_ok=True)
 
     def _failure(self, error: Exception) -> CannotWrite:
         if not self._broken:
-            # The library's writing thread has died (the disk is full), and whatever waits for it may wait for
-            # ever: disconnecting, the clean-up at exit, the stream's end. So none of them is to come.
+            # The library's writing thread has died (the disk is full). Disconnecting, the clean-up at exit and the
+            # stream's destructor may then wait forever for it, so all of them are disabled.
             self._broken = True
             _broken.append(self.stream)
             rr.unregister_shutdown()
@@ -119,7 +120,7 @@ class PartialFile:
         return cannot_write(self._path, self._cause() or error)
 
     def _cause(self) -> OSError | None:
-        """Why the library's writer died, which it does not tell: the file is in its state still, so one asks again."""
+        """Find why the library's writer died, by a test write to the file; the library does not report it."""
         try:
             with self._partial.open("ab") as file:
                 file.write(bytes(_PAGE))

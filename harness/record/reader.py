@@ -1,9 +1,10 @@
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
-# pyarrow's stubs do not know the columns of a schema.
-"""Recordings read back, without a viewer: what pictures are drawn from and `springbench inspect` prints.
+# pyarrow's stubs do not state the column types of a schema.
+"""Reader of recordings without a viewer, for pictures and for `springbench inspect`.
 
-A complete file is read through the index in its footer. A file without one (its run was killed) is scanned up to
-the last whole message. What this process has not written is tried in another one first (see `harness.record.sound`).
+A complete file is read through the index in its footer. A file without one (its run was killed) is scanned up to the
+last complete message. A file that this process has not written is first read in a separate process
+(see `harness.recording.recording_integrity`).
 """
 
 from __future__ import annotations
@@ -50,10 +51,19 @@ SCALARS = pa.schema(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Summary:
-    """What is in a recording without its positions.
+    """Contents of a recording without its positions.
 
-    complete: whether the run closed it; frames: indices of the recorded frames (k,); entities: the paths;
-    timelines: name -> (first, last); scalars: a table of the schema SCALARS.
+    Attributes:
+      path: path of the file.
+      is_complete: whether the run closed the file.
+      title: title as recorded.
+      run_id: identifier of the run.
+      application: application name.
+      properties: metadata as recorded.
+      frames: indices of the recorded frames (k,).
+      timelines: (first, last) by timeline name.
+      entities: entity paths.
+      scalars: table with schema SCALAR_SCHEMA.
     """
 
     path: Path
@@ -70,7 +80,7 @@ class Summary:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """An open recording: its chunks, as often as they are asked for."""
+    """An open recording, whose chunks can be iterated repeatedly."""
 
     path: Path
     store: LazyStore | RrdReader
@@ -79,14 +89,18 @@ class Source:
     run_id: str
 
     def chunks(self, *, content: str, components: Sequence[str] | None = None) -> Iterator[Chunk]:
-        """The chunks of the entities that `content` names, with these components only."""
+        """Iterate over the chunks of the entities that match `content`, with the given components only."""
         return iter(self.store.stream().filter(content=content, components=components))
 
 
 def read_replay(path: Path, frames: Collection[int] | None = None) -> Replay:
-    """The recording at `path`, with all frames or only the chosen ones (-1 is the last), in order.
+    """Read a recording with all frames or a selection of them, in order.
 
-    Raises InputError when the file is not the recording of a run or has not got a chosen frame.
+    Args:
+      path: path of the recording.
+      frames: indices of the frames, -1 for the last; all if omitted.
+    Raises:
+      InputError: the file is not the recording of a run or lacks a selected frame.
     """
     with open_recording(path) as source:
         springs = network(source)
@@ -119,9 +133,10 @@ def read_replay(path: Path, frames: Collection[int] | None = None) -> Replay:
 
 
 def summary(path: Path) -> Summary:
-    """What is in the recording at `path`, a run's or several side by side.
+    """Read the contents of a recording of one run or of several side by side, without positions.
 
-    Raises InputError when it is not a Rerun recording.
+    Raises:
+      InputError: the file is not a Rerun recording.
     """
     with open_recording(path) as source:
         entities: set[str] = set()
@@ -149,7 +164,7 @@ def summary(path: Path) -> Summary:
 
 
 def _try(path: Path) -> None:
-    """Read all of a recording in every way that there is; raises anything, or ends the process, where it is damaged."""
+    """Read all of a recording in every supported form; damage raises an exception or ends the process."""
     trust(path, noted=False)
     with open_recording(path) as source:
         for chunk in source.chunks(content="/**"):
@@ -161,9 +176,10 @@ def _try(path: Path) -> None:
 
 @contextmanager
 def open_recording(path: Path) -> Generator[Source]:
-    """The recording at `path`, for as long as the context lasts.
+    """Open the recording at `path` for the duration of the context.
 
-    Raises InputError when the file is not a Rerun recording, is damaged, or nothing of it can be read.
+    Raises:
+      InputError: the file is not a Rerun recording, is damaged, or contains no readable data.
     """
     if not path.is_file():
         raise InputError(Mistake("there is no such file; a Rerun recording (.rrd) was expected", file=path))
@@ -193,7 +209,7 @@ def open_recording(path: Path) -> Generator[Source]:
 
 
 def network(source: Source) -> dict[str, NDArray[Any]]:
-    """What does not change: springs (2m,), rest_lengths (m,), pinned (q,), strain_range (1,), time_step (1,)."""
+    """Return the constant arrays: springs (2m,), rest_lengths (m,), pinned (q,), strain_range (1,), time_step (1,)."""
     for chunk in source.chunks(content="/network"):
         batch = chunk.to_record_batch()
         names = [name for name in batch.schema.names if name != _ROW_ID]
@@ -211,7 +227,13 @@ def network(source: Source) -> dict[str, NDArray[Any]]:
 def positions(
     source: Source, wanted: Collection[int] | None = None
 ) -> Iterator[tuple[int, float, NDArray[np.float32]]]:
-    """Frame, time [s] and positions (n, 3), relative to the origin, of the wanted frames, as they come in the file."""
+    """Iterate over frame, time [s] and positions (n, 3) [m] of the selected frames, in file order.
+
+    Args:
+      source: open recording.
+      frames: indices of the frames; all if omitted.
+    Returns: tuples whose positions are relative to the origin.
+    """
     for chunk in source.chunks(content="/scene/mesh", components=_POSITIONS):
         batch = chunk.to_record_batch()
         (name,) = set(_POSITIONS) & set(batch.schema.names)
@@ -221,14 +243,14 @@ def positions(
 
 
 def triangles(source: Source) -> NDArray[np.int64]:
-    """The mesh's triangles, shape (f, 3)."""
+    """Return the mesh's triangles, shape (f, 3)."""
     for chunk in source.chunks(content="/scene/mesh", components=["Mesh3D:triangle_indices"]):
         return cell(chunk.to_record_batch(), "Mesh3D:triangle_indices").reshape(-1, 3).astype(np.int64)
     return np.empty((0, 3), np.int64)
 
 
 def properties(source: Source) -> tuple[str, dict[str, Any]]:
-    """The title and what was recorded about the run and its machine."""
+    """Return the title and the recorded metadata of the run and its machine."""
     title, facts = "", dict[str, Any]()
     for chunk in source.chunks(content="/__properties/**"):
         batch = chunk.to_record_batch()
@@ -275,7 +297,7 @@ def _scalars(source: Source) -> pa.Table:
 
 
 def looked_at(source: Source, entity: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The frames whose convergence was recorded, and when they were [s], in the order of the values."""
+    """Return the frames with recorded convergence and their times [s], in the order of the values."""
     for chunk in source.chunks(content=entity.rpartition("/")[0]):
         batch = chunk.to_record_batch()
         return cell(batch, "frames").astype(np.int64), cell(batch, "times").astype(float)
@@ -283,7 +305,7 @@ def looked_at(source: Source, entity: str) -> tuple[NDArray[np.int64], NDArray[n
 
 
 def _by_frame(table: pa.Table) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """The scalars that have one value a frame: entity -> (frames, values)."""
+    """Return the scalars that have one value per frame: entity -> (frames, values)."""
     entities, frames, values = (table[name].to_numpy() for name in ("entity", "frame", "value"))
     once = table["iteration"].is_null().to_numpy()
     entities, frames, values = entities[once], frames[once].astype(np.int64), values[once]
@@ -291,7 +313,7 @@ def _by_frame(table: pa.Table) -> dict[str, tuple[NDArray[np.int64], NDArray[np.
 
 
 def _chosen(path: Path, frame: int, known: NDArray[np.int64]) -> int:
-    """The frame's index, of the `known` ones; -1 is the last."""
+    """Return the index of a frame among the recorded ones; -1 is the last."""
     if frame == -1 and len(known):
         return int(known[-1])
     if frame in known:
