@@ -1,20 +1,26 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyarrow's stubs do not know the arrays that the library makes.
-"""A run as a Rerun recording: one file that opens with its own layout.
+# pyarrow's stubs do not type the arrays that the library creates.
+"""Recorder of a run as a Rerun file that opens with its own layout.
 
-Topology is written once, positions every FLUSH frames in one piece, scalars in bulk. The stream has no batching thread
-of its own, so a killed run leaves all but the last few frames. The file has a partial name until it is complete and its
-end has been found.
+Topology is written once, positions in batches of FLUSH_INTERVAL frames, scalars in bulk. The stream has no batching
+thread of its own, so the file of a killed run lacks only the last few frames. The file has a temporary name until it is
+complete and its end mark has been found.
 
-Positions are stored relative to an origin (`harness.record.local_origin`).
+Positions are stored relative to an origin (`harness.recording.local_origin`).
 
-Entities: `/scene/mesh` (positions, exact to float32), `/scene/pins`, `/scene/springs`, `/scene/obstacles/*`;
-`/scene/forces/*`, arrows that are hidden at first; `/scene/scale`, of strain; `/energy/*`, `/residual`, `/iterations`,
-`/strain/largest`, `/milliseconds/*` by `frame` and `time`, `/energy_change/*` as a share of its largest;
-`/convergence/residual` and `objective` by `iteration`, a value for each of the frames that
-`/convergence` names, and drawn in `/curves/*`; `/network` (springs, rest lengths, pins), `/run` (Markdown) and the
-recording's properties. Where frames are the iterates of a solve, everything is by `iteration`, and `/solve/*` tells
-how it converges.
+Entities:
+  `/scene/mesh`: positions, exact to float32; also `/scene/pins`, `/scene/springs`, `/scene/obstacles/*`.
+  `/scene/forces/*`: arrows, hidden at first.
+  `/scene/scale`: strain colour scale.
+  `/energy/*`, `/residual`, `/iterations`, `/strain/largest`, `/milliseconds/*`: scalars by `frame` and `time`.
+  `/energy_change/*`: change of each energy, relative to its largest change.
+  `/convergence/residual`, `/convergence/objective`: values by `iteration` for each frame listed in `/convergence`.
+  `/curves/*`: the convergence curves as drawings.
+  `/network`: springs, rest lengths, pins.
+  `/run`: metadata as Markdown, also stored as the recording's properties.
+
+In a recording of the iterates of one solve, everything is indexed by `iteration`, and `/solve/*` contains the
+convergence curves.
 """
 
 from __future__ import annotations
@@ -39,21 +45,25 @@ from harness.record.partial import PartialFile
 from harness.record.shading import PIN_COLOUR, Shading, widest
 
 FLUSH = 20
-"""Frames between flushes at most: what a kill may cost. A piece of an entity costs some 1.5 kB, and .5 kB of index."""
+"""Maximum number of frames between flushes, the most that a kill can lose. A chunk costs 1.5 kB, plus 0.5 kB of
+index."""
 _FULL = 100_000
-"""Vertices that wait for a flush at most, in all of its frames."""
+"""Maximum number of buffered vertices, summed over the buffered frames."""
 
 _DRAWN = ("/milliseconds/", "/strain/largest", "/residual/log10")
-"""The scalars that the layout draws: others need no look of their own."""
+"""Scalars that the layout plots; only these get a line style."""
 
 _STRIPS: Any = rr.components.LineStrip3DBatch([]).as_arrow_array().type
 
 
 class RerunRecorder:
-    """Records one run to `path`; implements `harness.record.base.Recorder`.
+    """Recorder of one run to a Rerun file; implements `harness.recording.recorder_interface.RunRecorder`.
 
-    All but opening the file waits for the first frame, so that it is done by the thread that the frames come from.
-    Raises RunFailed when the file cannot be written or, at the end, is not whole.
+    All work but opening the file is deferred to the first frame, so that it runs in the thread that delivers the
+    frames.
+
+    Raises:
+      RunFailed: the file cannot be written or is incomplete at the end.
     """
 
     def __init__(self, path: Path, info: RecordingInfo) -> None:
@@ -78,11 +88,11 @@ class RerunRecorder:
 
     @property
     def info(self) -> RecordingInfo:
-        """What does not change in the recording."""
+        """The properties of the recording that are constant over its frames."""
         return self._info
 
     def frame(self, frame: Frame) -> None:
-        """Record one frame; its arrays are only read."""
+        """Record one frame; its arrays are not modified."""
         p = store_relative(frame.positions, self._origin)
         if not self._frames:
             self._begin()
@@ -91,7 +101,7 @@ class RerunRecorder:
         self._stream.set_time("frame", sequence=frame.index)
         self._stream.set_time("time", duration=frame.time)
         self._clock[frame.index] = frame.time
-        # Of a run at 0, else that timeline would show no scene at all.
+        # The iterations timeline of a run needs the scene at 0, otherwise it would show no scene at all.
         self._stream.set_time("iteration", sequence=frame.index if self._info.iterates else 0)
         self._held.append((frame.index, p, self._shading.colours(of_vertex)))
         self._obstacles.at(frame.time)
@@ -119,7 +129,7 @@ class RerunRecorder:
         self._curves[frame] = residuals, objective
 
     def solve(self, numbers: Sequence[int], curves: Mapping[str, Sequence[float]]) -> None:
-        """Record log10 of curves by name over the iterates with these numbers; of a recording of iterates."""
+        """Record log10 of curves by name over numbered iterates, in a recording of one solve."""
         for name, values in curves.items():
             entity = f"/solve/{name.replace(' ', '_')}"
             self._style(entity, f"log10 of the {name}")
@@ -129,8 +139,12 @@ class RerunRecorder:
             self._stream.send_columns(entity, self._times(np.array(numbers)), columns)
 
     def close(self, milliseconds: Mapping[str, Sequence[float]], ended: Mapping[str, str] | None = None) -> Path:
-        """Write the milliseconds of each phase by frame, from frame 1, and properties that its end has changed; finish
-        the file and return its path."""
+        """Write the phase times and changed properties, finish the file and return its path.
+
+        Args:
+          milliseconds: wall time [ms] of each phase by frame, from frame 1.
+          final_properties: properties that changed at the end of the run.
+        """
         if not self._frames:
             self._begin()
         self._send_mesh()
@@ -148,7 +162,7 @@ class RerunRecorder:
         return self._file.finish(blueprint.blueprint(self._info, self._box, max(self._clock, default=0), self._ranges))
 
     def abandon(self) -> None:
-        """Stop, and remove the partial file; nothing happens after `close`."""
+        """Stop and remove the partial file; has no effect after `finish_recording`."""
         self._file.abandon()
 
     def _begin(self) -> None:
@@ -243,7 +257,7 @@ class RerunRecorder:
         curves.draw(self._stream, "/curves/objective", above, colours)
 
     def _send_changes(self) -> None:
-        """Each energy's change from the start as a share of its largest, so that none hides the others."""
+        """Write each energy's change from the start relative to its largest change, so that small ones stay visible."""
         for name, by_frame in self._energies.items():
             frames, values = np.array(list(by_frame)), np.array(list(by_frame.values()))
             change = values - values[0]
@@ -279,7 +293,7 @@ class RerunRecorder:
         return rr.TimeColumn("frame", sequence=frames), self._seconds(frames)
 
     def _at(self, frames: NDArray[np.int64]) -> Iterable[rr.TimeColumn]:
-        """The times of what is in the scene, which stands still on the timeline of the iterations of a run."""
+        """Build the time columns of scene entities; on the iterations timeline of a run the scene is static."""
         iterations = frames if self._info.iterates else np.zeros_like(frames)
         return (
             rr.TimeColumn("frame", sequence=frames),
@@ -300,7 +314,7 @@ class RerunRecorder:
 
 
 def _segments(ends: NDArray[np.float32]) -> Any:
-    """Line strips of two points each from (m, 2, 3); the library's own way takes a Python loop over them."""
+    """Build line strips of two points each from (m, 2, 3), without the library's Python loop over them."""
     points: Any = rr.components.Position3DBatch(ends.reshape(-1, 3)).as_arrow_array()
     offsets: Any = pa.array(np.arange(0, 2 * len(ends) + 1, 2, dtype=np.int32))
     return pa.ListArray.from_arrays(offsets, points, type=_STRIPS)

@@ -1,8 +1,8 @@
-"""How a recorded mesh looks: strain to colour, and vertex normals, fast enough for every frame.
+"""Strain colours and vertex normals of a recorded mesh, fast enough for every frame.
 
-The strain of a spring is length / rest length - 1. A vertex shows the incident strain of largest magnitude, with
-its sign, so that a single overstretched spring is seen. Normals are area-weighted. Both are rounded: the
-recording's compression then finds equal neighbours, and the rounding is too fine to be seen.
+The strain of a spring is length / rest length - 1. A vertex shows the incident strain of largest magnitude, with its
+sign, so that a single overstretched spring is visible. Normals are area-weighted. Both are rounded: the recording's
+compression then finds equal neighbours, and the rounding is too fine to be visible.
 """
 
 from __future__ import annotations
@@ -21,24 +21,25 @@ from solvers.problem import Positions
 Reals = NDArray[np.float64]
 
 STRAIN_COLOURS = ("#125490", "#64a2d6", "#d9d7d2", "#e5863b", "#943404")
-"""Strain at -range, -range/2, 0, range/2, range: blue compressed, grey at rest, orange stretched; safe for the
-colour-blind, and grey enough in the middle that light and shadow still show."""
+"""Colours at strains -range, -range/2, 0, range/2, range: blue compressed, grey at rest, orange stretched.
+
+They are colour-blind safe, and the middle is grey enough for light and shadow to remain visible."""
 
 PIN_COLOUR = "#c5299b"
-"""Of what is pinned, here and in pictures: on no scale of strain, clear on light and on dark."""
+"""Colour of pinned vertices in recordings and pictures: not on any strain scale, clear on light and on dark."""
 
 STRAIN_RANGE = 0.1
-"""The end of the scale where a run says nothing of its strains."""
+"""End of the scale where a run states no strain range."""
 LEAST_RANGE = 1e-3
 
 LEVELS = 65
 NORMAL_STEPS = 32
 NEUTRAL = (128, 128, 128, 255)
-"""The colour of a strain that is not a number."""
+"""Colour of a strain that is NaN."""
 
 
 def palette() -> NDArray[np.uint8]:
-    """The colours of the levels from most compressed to most stretched and, last, NEUTRAL: (LEVELS + 1, 4)."""
+    """Return the colours of the levels (NUM_LEVELS + 1, 4), most compressed first, with NEUTRAL_COLOUR last."""
     stops = np.array([[int(colour[k : k + 2], 16) for k in (1, 3, 5)] + [255] for colour in STRAIN_COLOURS])
     at = np.linspace(0, len(stops) - 1, LEVELS)
     channels: list[NDArray[np.float64]] = [np.interp(at, range(len(stops)), channel) for channel in stops.T]
@@ -49,14 +50,24 @@ def palette() -> NDArray[np.uint8]:
 def strain_range(
     positions: Iterable[Positions], springs: NDArray[np.int64], rest_lengths: NDArray[np.float64]
 ) -> float:
-    """The end of a scale that shows the strains at these positions, each (n, 3) [m]: see `scale_end`."""
+    """Return the end of a scale that shows the strains at the given positions.
+
+    Args:
+      positions: vertex positions, each (n, 3) [m].
+      springs: vertex pairs (m, 2).
+      rest_lengths: rest lengths (m,) [m].
+    Returns: the range of `round_scale_end` over all strains; DEFAULT_STRAIN_RANGE without springs.
+    """
     found = [strains(p, springs, rest_lengths)[1] for p in positions if len(rest_lengths)]
     return scale_end(np.concatenate(found)) if found else STRAIN_RANGE
 
 
 def scale_end(strain: NDArray[np.float64]) -> float:
-    """The end of a scale that shows these strains of vertices: the round number above what 99 % of them have, so that
-    a few at a pin do not leave all others grey; STRAIN_RANGE where none is finite."""
+    """Return the round number above 99 % of the vertex strains, as the end of their scale.
+
+    A few large strains at a pin thus do not leave all others grey. The result is DEFAULT_STRAIN_RANGE where none is
+    finite.
+    """
     known = np.abs(strain[np.isfinite(strain)])
     if not len(known):
         return STRAIN_RANGE
@@ -66,12 +77,12 @@ def scale_end(strain: NDArray[np.float64]) -> float:
 
 
 def percent(strain: float, digits: int = 3) -> str:
-    """A strain with its sign."""
+    """Format a strain with its sign as a percentage."""
     return f"{100 * strain:+.{digits}g} %".replace("-", "−")
 
 
 def colours(strain: NDArray[np.float64], end: float) -> NDArray[np.uint32]:
-    """The colour of each strain as 0xRRGGBBAA, shape (len(strain),), on the scale from -end to end."""
+    """Return the colour of each strain as 0xRRGGBBAA, shape (len(strain),), on the scale from -end to end."""
     with np.errstate(invalid="ignore"):
         level = np.rint((np.clip(strain / end, -1, 1) + 1) * (LEVELS - 1) / 2)
     return _packed()[np.where(np.isnan(level), LEVELS, level).astype(np.intp)]
@@ -83,7 +94,7 @@ def _packed() -> NDArray[np.uint32]:
 
 
 def widest(ends: tuple[float, float], strain: NDArray[np.float64]) -> tuple[float, float]:
-    """The smallest and the largest of these strains and of `ends`; what is not finite counts for nothing."""
+    """Return the smallest and the largest of `ends` and the finite strains."""
     known = strain[np.isfinite(strain)]
     return float(known.min(initial=ends[0])), float(known.max(initial=ends[1]))
 
@@ -96,18 +107,19 @@ class Shading:
         self._springs, self._rest_lengths = info.springs, info.rest_lengths
 
     def strains(self, p: Positions) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The strain of each spring (m,), and of each vertex (n,) the one of largest magnitude among its springs.
+        """Return the strains of springs (m,) and of vertices (n,).
 
-        Where a rest length is 0, or a vertex has no spring, it is 0.
+        The strain of a vertex is the one of largest magnitude among its springs. It is 0 where a rest length is 0 or a
+        vertex has no spring.
         """
         return strains(p, self._springs, self._rest_lengths)
 
     def colours(self, strain: NDArray[np.float64]) -> NDArray[np.uint32]:
-        """The colour of each strain as 0xRRGGBBAA, shape (len(strain),)."""
+        """Return the colour of each strain as 0xRRGGBBAA, shape (len(strain),)."""
         return colours(strain, self._range)
 
     def normals(self, p: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The unit normal of each vertex, rounded to 1/32, shape (n, 3); zero where there is none."""
+        """Return the unit normal of each vertex (n, 3), rounded to 1/32; zero where it is undefined."""
         normals = np.zeros(p.shape)  # areas of tiny or huge triangles leave the range of single precision
         _normals(p.astype(np.float64), self._triangles, normals)
         return normals.astype(np.float32)
@@ -116,14 +128,21 @@ class Shading:
 def strains(
     p: Positions, springs: NDArray[np.int64], rest_lengths: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """As `Shading` has it, of springs (m, 2) with rest_lengths (m,) [m] at p (n, 3) [m]."""
+    """Compute the strains of springs and of vertices.
+
+    Args:
+      p: positions (n, 3) [m].
+      springs: vertex pairs (m, 2).
+      rest_lengths: rest lengths (m,) [m].
+    Returns: strains of the springs (m,), and for each vertex (n,) the one of largest magnitude among its springs.
+    """
     of_spring, of_vertex = np.empty(len(rest_lengths)), np.zeros(len(p))
     _strains(p.copy(), springs, rest_lengths, of_spring, of_vertex)
     return of_spring, of_vertex
 
 
-# Positions come as writable copies: a read-only array is another type to Numba, and another compilation. Without the
-# interpreter's lock, so that the solver beside need not wait.
+# Positions are passed as writable copies: a read-only array is another type to Numba and causes another compilation.
+# The kernels release the interpreter lock, so that a concurrent solver need not wait.
 @kept(error_model="numpy", nogil=True)
 def _strains(
     p: Positions,

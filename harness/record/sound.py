@@ -1,12 +1,13 @@
-"""Whether a recording is whole, and whether it can be read.
+"""Integrity check of recordings: whether a file is complete and whether it can be read.
 
-A recording is a header of 12 bytes and messages, each a kind and a length of 8 bytes, then that many bytes of payload.
-The library aborts the process on some damaged files. So what this process has not written is first read in the child
-that `harness.base.child` keeps.
+A recording is a header of 12 bytes and a sequence of messages. Each message is a kind and a length of 8 bytes each,
+then that many bytes of payload. The library aborts the process on some damaged files. A file that this process has not
+written is therefore first read in the child process of `harness.execution.sandbox`.
 
-Which files can be read is noted beside the user's other caches, for all processes: reading a recording in every way
-takes far longer than what a report wants of it. The note is of a file as it is: by its inode, size and times, of which
-the last change is the system's and cannot be set. It is not kept with the results, which may come from anybody.
+Files that can be read are noted in the user's cache folder, for all processes, since reading a whole recording takes
+far longer than what a report needs from it. A note identifies the state of a file by its inode, size and times; the
+change time is set by the system and cannot be forged. Notes are not stored with the results, which may come from
+anybody.
 """
 
 from __future__ import annotations
@@ -28,20 +29,25 @@ _HEADER, _END = 12, 0
 
 _SECONDS, _BYTES_PER_SECOND = 10.0, 1e7
 _MEMORY, _MEMORY_PER_BYTE = 2**30, 8
-"""What a recording may take to read, for its bytes: it comes compressed."""
+"""Time [s] and memory [bytes] limits to read a recording, as functions of its size; it is compressed."""
 
 _NOTED = 2**21
-"""Bytes of notes from which on they begin anew."""
+"""Size [bytes] of the notes from which on they are discarded."""
 
 _sound: set[bytes] = set()
-"""The files that can be read, each in the state that it had then."""
+"""Hashes of the file states that have been read successfully."""
 
 _read: dict[Path, int] = {}
-"""How many bytes of notes were read."""
+"""Number of bytes of notes that have been read, by file."""
 
 
 def trust(path: Path, *, noted: bool = True) -> None:
-    """Note that a recording can be read as it is now, for this process alone or for others too."""
+    """Mark a recording in its present state as readable.
+
+    Args:
+      path: path of the recording.
+      shared: whether other processes see the mark too.
+    """
     _sound.add(state := _state(path))
     if noted:
         with suppress(OSError):  # then it is found out again
@@ -77,7 +83,7 @@ def _notes() -> Path:
 
 @cache
 def _library() -> str:
-    """The version that reads recordings: another may not."""
+    """Return the version of the library that reads recordings; another version may not read them."""
     return version("rerun-sdk")
 
 
@@ -88,7 +94,7 @@ def _state(path: Path) -> bytes:
 
 
 def whole_messages(path: Path) -> tuple[bool, int]:
-    """Whether the file has its end mark, and where its last whole message ends."""
+    """Return whether the file has its end mark, and the offset [bytes] of the end of its last complete message."""
     size, place = path.stat().st_size, _HEADER
     with path.open("rb") as file:
         while place + 16 <= size:
@@ -103,7 +109,14 @@ def whole_messages(path: Path) -> tuple[bool, int]:
 
 
 def require_sound(path: Path, read: Callable[[Path], None]) -> None:
-    """Raise InputError for a recording that `read`, a function of a module, cannot read in a child within limits."""
+    """Require that a recording can be read in a child process within limits.
+
+    Args:
+      path: path of the recording.
+      read_recording: function at module level that reads it.
+    Raises:
+      InputError: the recording cannot be read.
+    """
     if _trusted(path):
         return
     size = path.stat().st_size

@@ -1,10 +1,11 @@
-"""A recording read back from its file, before its run counts as done: its last frame and a few random ones.
+"""Check of a recording, read back from its file: the last frame and a few random frames.
 
-Positions are the run's, rounded to single precision relative to the recording's origin. What that rounds is bounded by
-the mesh's size, wherever the mesh is: an origin that does not resolve the mesh is an error.
+Recorded positions must be those of the run, rounded to single precision relative to the recording's origin. The
+rounding is bounded by the mesh size, wherever the mesh is: an origin that does not resolve the mesh is an error.
 
-Colours are made once more, plainly, from the positions of the run, so that neither another frame's positions
-nor another frame's colours pass. They may be one level of the scale off, for the rounding of a strain between two.
+Colours are recomputed by separate, simple code from the positions of the run, so that positions or colours of another
+frame are detected. They may differ by one level of the scale, since a strain between two levels may be rounded to
+either.
 """
 
 from __future__ import annotations
@@ -26,20 +27,26 @@ from harness.record.shading import LEVELS, palette
 from solvers.problem import Positions
 
 ROUNDING = 1e-9
-"""Strains that differ by less, one of them stretched and one compressed, may be taken in either order."""
+"""Relative difference of magnitude below which a stretched and a compressed strain count as equally large."""
 
 _UNIT = 2.0**-24
-"""Round-off of single precision, relative."""
+"""Relative round-off of single precision."""
 
 _PARTS = (("Mesh3D:vertex_positions", "Mesh3D:vertex_colors"), ("Points3D:positions", "Points3D:colors"))
 
 
 def require_frames(path: Path, info: RecordingInfo, times: Mapping[int, float], run: Mapping[int, Positions]) -> str:
-    """The SHA-256 of the positions in the recording's last frame, as its file has them (float32 bytes).
+    """Check some frames of a recording against the run.
 
-    times, run: time [s] and positions (n, 3) [m] of some frames of the run, the last of them the run's last.
-    Raises RunFailed unless the recording ends with that frame and has all of these frames with their times, positions
-    and colours; InputError where the file cannot be read.
+    Args:
+      path: path of the recording.
+      info: properties of the recording.
+      times: time [s] of each checked frame.
+      run: positions (n, 3) [m] of each checked frame; the last of them is the run's last frame.
+    Returns: SHA-256 of the positions in the recording's last frame, as stored (float32 bytes).
+    Raises:
+      RunFailed: the recording does not end with that frame, or times, positions or colours of a frame differ.
+      InputError: the file cannot be read.
     """
     last = max(run)
     origin, end, found = _read(path, run)
@@ -63,7 +70,7 @@ def require_frames(path: Path, info: RecordingInfo, times: Mapping[int, float], 
 
 
 class _Recorded(NamedTuple):
-    """Time [s], positions (n, 3) [m] relative to the origin, and colours (n,), as 0xRRGGBBAA, of a frame."""
+    """Time [s], positions (n, 3) [m] relative to the origin, and colours (n,) as 0xRRGGBBAA of a frame."""
 
     time: float
     positions: NDArray[np.float32]
@@ -71,7 +78,7 @@ class _Recorded(NamedTuple):
 
 
 def _read(path: Path, wanted: Collection[int]) -> tuple[NDArray[np.float64], int, dict[int, _Recorded]]:
-    """The origin, the number of the last frame (-1 for none), and those of the wanted frames that are recorded."""
+    """Read the origin, the number of the last frame (-1 for none), and the selected frames that are recorded."""
     end, found = -1, dict[int, _Recorded]()
     with open_recording(path) as source:
         origin = read_origin(properties(source)[1])
@@ -91,9 +98,9 @@ def _read(path: Path, wanted: Collection[int]) -> tuple[NDArray[np.float64], int
 def _beyond_rounding(
     recorded: NDArray[np.float32], origin: NDArray[np.float64], info: RecordingInfo, p: Positions
 ) -> float:
-    """The largest error [m] of what was recorded, if single precision relative to the mesh allows less; else 0.
+    """Return the largest error [m] in excess of single-precision rounding, or 0.
 
-    Allowed is the round-off of the distance from the middle of the mesh at rest, and of the largest cell of an origin.
+    Allowed is the round-off of the distance from the centre of the mesh at rest, and of the largest cell of an origin.
     """
     rest = info.mesh.rest
     with np.errstate(over="ignore", invalid="ignore"):
@@ -104,7 +111,7 @@ def _beyond_rounding(
 
 
 def _are_of(colours: NDArray[np.uint32], info: RecordingInfo, p: Positions) -> bool:
-    """Whether the vertices at p have the colours of the largest of their springs' strains."""
+    """Return whether the vertices at p have the colours of the largest of their springs' strains."""
     rest, high, low = info.rest_lengths, np.zeros(len(p)), np.zeros(len(p))
     with np.errstate(all="ignore"):
         length = np.linalg.norm(np.diff(p[info.springs], axis=1)[:, 0], axis=1)

@@ -1,1 +1,1 @@
-"""The truth that accuracy is graded against: frozen step problems, certified minima, trajectories of the ODE."""
+"""Reference solutions for accuracy measurements: step snapshots, certified minima, trajectories of the ODE."""

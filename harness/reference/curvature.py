@@ -1,14 +1,16 @@
-"""The curvature at a point: the Hessian's smallest eigenvalue, and what of it is not to be relied on.
+"""Smallest eigenvalue of the Hessian at a point, with a bound on its uncertainty.
 
     lambda = x' H x,   |x| = 1
     doubt  = 4 eps |x|' |H| |x|  +  4 max over roundings p' of p of |x' (H(p') - H(p)) x|  +  1.1 d
 
-The first part is what sums lose, over the places that x is at: a stiff part that does not move has no share in it. The
-second is what the rounding of the positions makes of the Hessian, a last bit up or down at each coordinate; the third,
-d, is by how much |x' H x| falls within Newton's next step across x, for the curvature in question is that of the
-stationary point nearby: in a valley all that a point beside its floor has is lost there.
-A stationary point is a minimum where lambda > doubt and a saddle where lambda < -doubt. In between it is flat: the
-minima may be a continuum, along a symmetry of the step, and no float64 number tells.
+The first term bounds the round-off of the sums. It is weighted by the components of x, so a stiff part that does not
+move contributes nothing. The second term is the effect on the Hessian of rounding the positions, by one unit in the
+last place up or down at each coordinate. The third term, d, is the decrease of |x' H x| within Newton's next step
+across x, since the curvature in question is that of the nearby stationary point: in a curved valley, a point away from
+the valley floor loses all of its curvature there.
+
+A stationary point is a minimum where lambda > doubt and a saddle where lambda < -doubt. In between it is degenerate:
+the minima may form a continuum, along a symmetry of the step, and float64 cannot distinguish these cases.
 """
 
 from __future__ import annotations
@@ -30,49 +32,59 @@ from solvers.problem import Positions, StepProblem
 from solvers.round_off import EPS
 
 LARGE = 30_000
-"""Unknowns from which on SuperLU would need gigabytes, and the blocks' own Cholesky factor takes its place; it guides
-the search alone, for the eigenvalue is a product with the Hessian."""
+"""Number of unknowns from which on SuperLU would need gigabytes, so that the block Cholesky factor replaces it. The
+factor only guides the search, since the eigenvalue is a product with the Hessian."""
 ROUNDINGS = 3
 SHORT = 1e-4
-"""Of the shape: steps that are longer tell of no stationary point nearby."""
+"""Step length relative to the mesh extent above which a step gives no information on a nearby stationary point."""
 SHIFTS = (0.0, *(10.0**k for k in range(-17, 2)))
-"""Of the Hessian's largest row: the first that makes it positive definite lies next to the smallest eigenvalue."""
+"""Shifts relative to the Hessian's largest row sum: the first that makes it positive definite is next to the smallest
+eigenvalue."""
 
 
 Solve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 class SplitHessian(NamedTuple):
-    """H = S + V V' [N/m] without the exactly pinned vertices. sparse: S (3 f, 3 f); columns: V (3 f, r), none where all
-    energies are sparse (see `solvers.core.coupled`)."""
+    """H = S + V V' [N/m] without the exactly pinned vertices.
+
+    Attributes:
+      sparse: S (3 f, 3 f).
+      columns: V (3 f, r), with r = 0 where all energies have sparse Hessians (see `solvers.model.rank_update`).
+    """
 
     sparse: csr_array
     columns: NDArray[np.float64]
 
     def times(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """H x, (3 f,)."""
+        """Return H x, (3 f,)."""
         return self.sparse @ x + self.columns @ (self.columns.T @ x)
 
     def bend(self, x: NDArray[np.float64]) -> float:
-        """x' H x."""
+        """Return x' H x."""
         along = self.columns.T @ x
         return float(x @ (self.sparse @ x) + along @ along)
 
     def sums(self, x: NDArray[np.float64]) -> float:
-        """|x|' |H| |x|, at most."""
+        """Return an upper bound of |x|' |H| |x|."""
         along = np.abs(self.columns).T @ np.abs(x)
         return float(np.abs(x) @ (abs(self.sparse) @ np.abs(x)) + along @ along)
 
     def toarray(self) -> NDArray[np.float64]:
-        """All entries."""
+        """Return all entries as a dense array."""
         return self.sparse.toarray() + self.columns @ self.columns.T
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curvature:
-    """smallest: the Hessian's smallest eigenvalue [N/m], infinite where nothing is free; doubt: what of it may be
-    round-off [N/m]; direction: its eigenvector (n, 3), zero at exactly pinned vertices; solve: the product with the
-    inverse of the Hessian (3 f,), shifted as little as makes it positive definite."""
+    """Smallest eigenvalue of the Hessian at a point.
+
+    Attributes:
+      min_eigenvalue: smallest eigenvalue [N/m], infinite where no vertex is free.
+      eigenvalue_uncertainty: bound on its uncertainty by round-off [N/m].
+      direction: its eigenvector (n, 3), zero at exactly pinned vertices.
+      solve: product with the inverse of the Hessian (3 f,), with the smallest shift that makes it positive definite.
+    """
 
     smallest: float
     doubt: float
@@ -91,12 +103,12 @@ class Curvature:
 
     @property
     def flat(self) -> bool:
-        """Whether there is a direction in which it may be zero, and none in which it is negative."""
+        """Whether the smallest eigenvalue is zero within its uncertainty."""
         return abs(self.smallest) <= self.doubt
 
 
 def curvature(problem: StepProblem, p: Positions) -> Curvature:
-    """The curvature at p (n, 3) [m], exactly pinned vertices on their targets."""
+    """Compute the curvature at p (n, 3) [m], where exactly pinned vertices are at their targets."""
     free, direction = problem.system.free, np.zeros_like(p)
     if not len(free):
         return Curvature(np.inf, 0.0, direction, np.copy)
@@ -118,7 +130,15 @@ def curvature(problem: StepProblem, p: Positions) -> Curvature:
 
 
 def across(problem: StepProblem, p: Positions, at: Curvature, *, most: float = SHORT) -> Positions:
-    """p less Newton's step across the softest direction, or less the first part of it, up to `most` of the shape."""
+    """Return p after Newton's step orthogonal to the softest direction.
+
+    Args:
+      problem: step problem.
+      p: positions (n, 3) [m].
+      at: curvature at p.
+      max_fraction: maximum length of the step relative to the mesh extent; longer steps are scaled down.
+    Returns: positions (n, 3) [m].
+    """
     free, q, x = problem.system.free, p.copy(), at.direction[problem.system.free].ravel()
     gradient = problem.gradient(p)[free].ravel()
     step = at.solve(gradient - (x @ gradient) * x)
@@ -129,7 +149,7 @@ def across(problem: StepProblem, p: Positions, at: Curvature, *, most: float = S
 
 
 def free_hessian(problem: StepProblem, p: Positions) -> SplitHessian:
-    """The objective's Hessian at p."""
+    """Assemble the objective's Hessian at p."""
     system = problem.system
     _, vertices, weight = system.penalty
     held = system.inertia + np.bincount(vertices, weight, minlength=system.vertices)
@@ -146,8 +166,10 @@ def free_hessian(problem: StepProblem, p: Positions) -> SplitHessian:
 
 
 def _softest(H: SplitHessian) -> tuple[NDArray[np.float64], Solve]:
-    """The eigenvector of the smallest eigenvalue of a symmetric matrix, of length 1, and the product with the inverse
-    of the matrix, shifted as little as makes it positive definite."""
+    """Compute the unit eigenvector of a symmetric matrix for its smallest eigenvalue, and a solver.
+
+    The solver is the product with the inverse of the matrix, with the smallest shift that makes it positive definite.
+    """
     size = H.sparse.indptr.size - 1
     rows = abs(H.sparse).sum(axis=1) + np.abs(H.columns) @ np.abs(H.columns).sum(axis=0)
     scale = float(rows.max())
@@ -170,10 +192,11 @@ def _softest(H: SplitHessian) -> tuple[NDArray[np.float64], Solve]:
 
 
 def definite(H: SplitHessian) -> Solve | None:
-    """The product with the inverse of a symmetric matrix of 3 x 3 blocks; None where it is not positive definite in
-    floating point: some pivot of its factor is not positive.
+    """Factorise a symmetric matrix of 3 x 3 blocks; return None where it is not positive definite.
 
-    Of S + V V' the number of negative eigenvalues is that of S less that of I + V'S^-1 V (Sylvester's law of inertia).
+    The result is the product with its inverse. Not positive definite means that in floating point some pivot of the
+    factor is not positive. For S + V V', the number of negative eigenvalues is that of S less that of I + V'S^-1 V
+    (Sylvester's law of inertia).
     """
     S, V = H
     if S.indptr.size > LARGE:

@@ -1,16 +1,16 @@
-"""Steps that keep lengths exactly, judged: their tensions by least squares, their Lagrangian by the oracle.
+"""Evaluation of steps with inextensible edges: least-squares tensions and the Lagrangian.
 
     minimise grad g . d + |d|_Q^2 / 2   such that   low <= l + n . A d <= high
 
-with lengths l and directions n at p, and the Q of the step's projective energies and of the penalties of exact lengths
-(`solvers.energies.augmented`). Its solution d is zero just where p is a stationary point, with the tensions t that its
-constraints have: of all tensions those that leave least of the gradient, in the norm of Q^-1, once the lengths are
-mended. Which limits hold is found as semismooth Newton's method does (Hintermueller, Ito and Kunisch 2002): where
-l + t/k is beyond them. Lengths that follow from others share their tension.
+Lengths l and directions n are those at p. Q is that of the step's projective energies and of the penalties of exact
+lengths (`solvers.model.energies.augmented_lagrangian`). The solution d is zero if and only if p is a stationary point. The
+tensions t are the multipliers of its constraints: of all tensions, those that minimise the remaining gradient in the
+norm of Q^-1 once the length errors are corrected. The active set is found by a semismooth Newton method (Hintermueller,
+Ito and Kunisch 2002): a limit is active where l + t/k is beyond it. Linearly dependent lengths share their tension.
 
-The step of the Lagrangian with these tensions keeps no lengths: the oracle, its round-off and the curvature that
-certifies a minimum are those of any other step. Penalties of a certificate are FIRM times larger: were the curvature
-negative along the constraints, no penalty would lift it.
+With these tensions, the step of the Lagrangian has no length constraints. Its stationarity, its round-off and the
+curvature that certifies a minimum are therefore evaluated as for any other step. The penalties of a certificate are
+PENALTY_FACTOR times larger: if the curvature were negative along the constraints, no penalty would make it positive.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from solvers.matrices import signed_incidence_matrix_sparse
 from solvers.problem import Positions, StepProblem, System
 
 GIVE, PASSES = 1e-10, 4
-"""What the constraints of a factor give, as a part of what the penalties do, and how often it is used in turn."""
+"""Compliance of the regularised constraints relative to the penalties, and the number of iterative refinements."""
 
 FIRM = 1e4
 CHANGES = 50
-"""How often what holds is looked at anew."""
+"""Maximum number of updates of the active set."""
 
 
 class Exact:
-    """The lengths that a system keeps, and its Lagrangians."""
+    """The exact lengths of a system, and its Lagrangians."""
 
     def __init__(self, system: System) -> None:
-        """Raises NotPositiveDefinite."""
+        """Assemble the augmented system; raises NotPositiveDefinite."""
         self._system, self.lengths = system, joined(system.lengths)
         self._penalties = penalties(system, self.lengths)
         self.augmented = self._with(np.zeros(len(self._penalties)), 1.0)
@@ -53,11 +53,17 @@ class Exact:
         return augmented(self._system, self.lengths, firm * self._penalties, tension)
 
     def lagrangian(self, problem: StepProblem, tension: NDArray[np.float64], firm: float = 1.0) -> StepProblem:
-        """The step with the Lagrangian of tensions (m,) [N] for its objective, and penalties `firm` times larger."""
+        """Return the step whose objective is the Lagrangian of given tensions.
+
+        Args:
+          problem: step problem.
+          tension: tensions (m,) [N].
+          penalty_factor: factor on the penalties.
+        """
         return replace(problem, system=self._with(tension, firm))
 
     def tensions(self, problem: StepProblem, p: Positions) -> NDArray[np.float64]:
-        """The tensions (m,) [N] at p (n, 3) [m], zero where an edge is within its limits."""
+        """Compute the tensions (m,) [N] at p (n, 3) [m], zero where an edge is within its limits."""
         x, k, rows = self.lengths, self._penalties, len(self._columns)
         length, n = directions(p[x.edges[:, 0]] - p[x.edges[:, 1]], x.rest_direction)
         J = _along(x, n, len(p))[:, self._columns]
@@ -76,20 +82,23 @@ class Exact:
         return tension
 
     def _held(self, length: NDArray[np.float64], tension: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Which limit holds each length: 1 the longest, -1 the shortest, 0 none."""
+        """Return the active limit of each length: 1 the longest, -1 the shortest, 0 none."""
         x, pulled = self.lengths, length + tension / self._penalties
         return np.where((pulled > x.high) | (x.low == x.high), 1, np.where(pulled < x.low, -1, 0))
 
 
 class Stationarity:
-    """How stationary points of a run's steps are: of its systems, for a first or every second step may have another."""
+    """Stationarity of the steps of a run, with one evaluator for each system.
+
+    Systems differ where the first step, or every second one, has another rate.
+    """
 
     def __init__(self) -> None:
         self._oracles: dict[float, Oracle] = {}
         self._exact: dict[float, Exact] = {}
 
     def __call__(self, problem: StepProblem, p: Positions) -> Reading:
-        """As `Oracle.stationarity` has it; where lengths are exact, that of the Lagrangian with the tensions at p."""
+        """Evaluate the stationarity at p; with exact lengths, that of the Lagrangian with the tensions at p."""
         exact = self.exact(problem.system)
         if exact is None:
             return self._oracle(problem.system).stationarity(problem, p)
@@ -97,14 +106,14 @@ class Stationarity:
         return self._oracle(exact.augmented).stationarity(stated, p, self.yardstick(problem))
 
     def yardstick(self, problem: StepProblem) -> float:
-        """As `Oracle.yardstick` has it, without tensions [J^(1/2)]."""
+        """Compute the initial residual [J^(1/2)], with zero tensions where lengths are exact."""
         exact = self.exact(problem.system)
         if exact is None:
             return self._oracle(problem.system).yardstick(problem)
         return self._oracle(exact.augmented).yardstick(exact.lagrangian(problem, np.zeros(len(exact.lengths.low))))
 
     def exact(self, system: System) -> Exact | None:
-        """The lengths that a system keeps, None where it keeps none."""
+        """Return the exact lengths of a system, None where it has none."""
         if system.lengths and system.rate not in self._exact:
             self._exact[system.rate] = Exact(system)
         return self._exact.get(system.rate)
@@ -116,7 +125,7 @@ class Stationarity:
 
 
 def _along(x: Lengths, n: Positions, vertices: int) -> csr_array:
-    """n_e . (p_i - p_j) of all edges as a matrix (m, 3 vertices)."""
+    """Build the matrix (m, 3 vertices) of n_e . (p_i - p_j) for all edges."""
     A, whole = signed_incidence_matrix_sparse(x.edges, vertices), csr_array((len(n), 3 * vertices))
     for c in range(3):
         whole = csr_array(whole + kron(diags_array(n[:, c]) @ A, np.eye(3)[c : c + 1]))
@@ -124,8 +133,11 @@ def _along(x: Lengths, n: Positions, vertices: int) -> csr_array:
 
 
 def _solved(Q: csr_array, J: csr_array, gives: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The solution of [Q J'; J 0] x = b, by a factor of a matrix that gives a little, until that tells no more: so
-    lengths that follow from others make nothing singular, and those that do not are mended all the same."""
+    """Solve [Q J'; J 0] x = b by iterative refinement with a factor of a slightly compliant matrix.
+
+    The compliance avoids a singular matrix where lengths are linearly dependent; refinement removes its effect on the
+    others.
+    """
     if not len(gives):
         return np.asarray(splu(Q.tocsc()).solve(right))
     K = block_array([[Q, J.T], [J, None]]).tocsc()

@@ -1,12 +1,12 @@
-"""Frozen step problems: single steps of a reference run, so that every solver answers the same question.
+"""Snapshots of single steps of a reference run, so that all solvers solve the same problem.
 
-The reference run takes converged steps (Newton's method), with pins exact whatever the scene says of them. Three of its
-moments are graded:
+The reference run takes converged steps (Newton's method), with all pins exact whatever the scene states. Accuracy is
+measured on three snapshots:
 
     early     a tenth of the run, and the second step at least, before which BDF2 has no history
-    middle    half of it
-    violent   the step that has farthest to go: the largest g(current positions) - g(minimum), which is about the
-              kinetic energy while things fly, and more where they are caught
+    middle    half of the run
+    violent   the step with the largest decrease g(current positions) - g(minimum), which is about the kinetic energy
+              in free motion, and more where the motion is stopped by springs or contact
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from solvers.problem import Pins, Positions, Solver, Start, StepProblem, StopRul
 
 MOMENTS = ("early", "middle", "violent")
 CONVERGED = StopRule(500, 1e-12)
-"""The reference run's steps: Newton's method takes the last digits in one iteration more."""
+"""Stop rule of the reference run: Newton's method reaches the last digits in one more iteration."""
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -37,9 +37,13 @@ Arrays = Mapping[str, NDArray[Any]]
 class Frozen:
     """One step of a reference run.
 
-    frame: the step, from 1; problem: exact pins, its first guess the current positions; after: the motion at the
-    step's end; digest: 12 hex digits of the problem's arrays, of the gradient at the current positions, which stands
-    for the energies, and of where it is from; acceleration: at the step's end, None where the integrator tells none.
+    Attributes:
+      frame: step number, from 1.
+      problem: step problem with exact pins, whose initial guess is the current positions.
+      end_motion: motion at the step's end.
+      digest: 12 hex digits of a hash of the problem's arrays, of the gradient at the current positions, which
+        represents the energies, and of the origin of the snapshot.
+      acceleration: acceleration at the step's end (n, 3) [m/s^2], None where the integrator provides none.
     """
 
     frame: int
@@ -50,17 +54,21 @@ class Frozen:
 
     @property
     def state(self) -> State:
-        """From which the reference run goes on."""
+        """The state from which the reference run continues."""
         begun = self.problem.start
         return State(self.after, Motion(begun.positions, begun.velocity), self.frame, self.acceleration)
 
     def stated(self, first_guess: str) -> StepProblem:
-        """The problem with a first guess by name (`harness.simulation.step.FIRST_GUESSES`)."""
+        """Return the problem with an initial guess by name (`harness.simulation.time_loop`)."""
         return guessed(self.problem, first_guess)
 
 
 def bind(spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, warns: bool = True) -> Scene:
-    """The scene with all of its pins exact; warns: see `build`. Raises InputError."""
+    """Build the scene with all of its pins exact.
+
+    Raises:
+      InputError: the scene cannot be built.
+    """
     scene = build(spec, size, integrator, warns=warns)
     vertices = scene.system.pins.vertices
     return replace(scene, system=replace(scene.system, pins=Pins(vertices, np.full(len(vertices), np.inf))))
@@ -69,11 +77,18 @@ def bind(spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, warn
 def reference_run(
     scene: Scene, solver: Solver, length: int, wanted: Collection[int] = (), state: State | None = None
 ) -> tuple[dict[int, Step], NDArray[np.float64]]:
-    """Converged steps up to `length`, from a state (the start if it is left out).
+    """Take converged steps up to a number of steps.
 
-    Returns the frames wanted, or the moments where none are, and the violence (length,) [J] of all steps, which is
-    what the objective falls by from the current positions, nan before the state. Raises RunFailed where a step does
-    not converge.
+    Args:
+      scene: scene with exact pins.
+      solver: solver of the steps.
+      num_steps: number of the last step.
+      frames: steps to return; the snapshot steps if empty.
+      initial_state: state from which to continue; the start of the scene if omitted.
+    Returns: the steps by frame, and for all steps (num_steps,) the decrease of the objective [J] from the current
+      positions to the solution, nan before the initial state.
+    Raises:
+      RunFailed: a step does not converge.
     """
     kept: dict[int, Step] = {}
     violence, keep = np.full(length, np.nan), set(wanted)
@@ -91,7 +106,12 @@ def reference_run(
 
 
 def moment_frames(violence: NDArray[np.float64], length: int) -> dict[str, int]:
-    """The frames of MOMENTS in a run of `length` steps, of whose first the violence (frames,) [J] is known."""
+    """Select the frames of SNAPSHOT_NAMES in a run.
+
+    Args:
+      violence: decrease of the objective [J] of the first steps (frames,).
+      num_steps: number of steps of the run.
+    """
     first = min(2, length)
     return {
         "early": max(first, -(-length // 10)),
@@ -106,7 +126,12 @@ _START = tuple(field.name for field in fields(Start) if field.name not in _MAYBE
 
 
 def freeze(step: Step, origin: str) -> tuple[Frozen, Arrays]:
-    """A step as a frozen problem, and as the arrays to be saved; origin: what it was taken from, in words."""
+    """Convert a step to a snapshot and to the arrays that are saved.
+
+    Args:
+      step: step of the reference run.
+      origin: description of the source of the step.
+    """
     problem, now = step.problem, step.state.now
     system, start = problem.system, problem.start
     arrays: dict[str, Any] = {name: getattr(problem, name) for name in _ARRAYS}
@@ -126,7 +151,7 @@ def freeze(step: Step, origin: str) -> tuple[Frozen, Arrays]:
 
 
 def thaw(arrays: Arrays, scene: Scene) -> Frozen | None:
-    """The frozen problem in saved arrays, bound to a scene; None where today's scene states another problem."""
+    """Restore a snapshot from saved arrays for a scene; None where the scene now states another problem."""
     if any(f"start_{name}" not in arrays for name in _START):
         return None
     system = replace(scene.system, factor=float(arrays["factor"]))
@@ -146,7 +171,7 @@ def thaw(arrays: Arrays, scene: Scene) -> Frozen | None:
 
 
 def agree(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool:
-    """Whether two arrays are the same but for the order of sums, which differs between processors."""
+    """Return whether two arrays are equal up to the order of summation, which differs between processors."""
     if found.shape != wanted.shape:
         return False
     return bool(np.abs(found - wanted).max(initial=0.0) <= 1e-9 * np.abs(wanted).max(initial=0.0))

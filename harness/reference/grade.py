@@ -1,13 +1,14 @@
-"""Grades some steps of a run by the oracle, whatever the run asks for: a residual that is claimed must be one.
+"""Audit of the residuals that a solver reports, on some steps of every run.
 
-    claimed >= |Q^-1 grad g(p)|_Q / SLACK,   p the answer, or the iterate before it, round-off apart
+    claimed >= |Q^-1 grad g(p)|_Q / RESIDUAL_SLACK,   p the solution or the iterate before it, apart from round-off
 
-Where lengths are exact, g is the Lagrangian with the tensions that leave least of its gradient at p
-(`harness.reference.exact`): by the tensions of a method itself it may vanish where lengths are wrong.
+Where lengths are exact, g is the Lagrangian with the tensions that minimise its gradient at p
+(`harness.reference.exact_lengths`). With the tensions of the method itself the gradient may vanish where lengths are
+wrong.
 
-It is done in the second pass, where no clock runs. Whoever does nothing and reports that nothing is left is found out.
-Of a method whose iterations end elsewhere than at the minimum of the step's objective (`minimises = False`, and no
-steps of its own) nothing is refused; what is left is measured all the same.
+The audit runs in the instrumentation pass, which is not timed. It detects a method that does nothing and reports a zero
+residual. A method whose iterations do not end at the minimum of the step's objective (`minimises = False`, and no
+substepping) is never rejected; its stationarity is measured all the same.
 """
 
 from __future__ import annotations
@@ -25,17 +26,17 @@ from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, 
 from solvers.registry import about, minimises, name_of
 
 SLACK = 10.0
-"""A residual may be measured with a factor of few digits, or with a preconditioner that is like Q."""
+"""Factor between reported and measured residual: a factor of few digits, or a preconditioner close to Q, is allowed."""
 
 _SAME = 1e-9
-"""Of the largest coordinate, what two sums of the same terms may differ by after many iterations."""
+"""Relative difference, in the largest coordinate, of two sums of the same terms after many iterations."""
 
 
 class Graded(Passing):
-    """A prepared solver whose answers in some frames are graded, as it gives them in turn."""
+    """A prepared solver whose solutions in some frames are audited in sequence."""
 
     def __init__(self, prepared: Prepared, solver: Solver, frames: Collection[int]) -> None:
-        """frames: counted from 1."""
+        """Wrap a prepared solver; `frames` are counted from 1."""
         super().__init__(prepared)
         self._claims = minimises(solver)
         own_steps = about(type(solver), name_of(solver)).own_steps
@@ -44,10 +45,10 @@ class Graded(Passing):
         self._name = type(solver).__name__
         self._stationarity = Stationarity()
         self.found: dict[int, dict[str, Any]] = {}
-        """By frame, the column `graded` of its row."""
+        """Column `graded` of the row of each audited frame."""
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """The solver's answer; raises RunFailed where it claims what is not so."""
+        """Return the solver's solution; raises RunFailed where its reported residual is wrong."""
         found = self._prepared.solve(problem, stop)
         if problem.start.time > self._begun:  # the first unknown of the next frame
             self._done, self._begun = self._done + 1, problem.start.time
@@ -80,7 +81,7 @@ class Graded(Passing):
         return {"graded": reached}
 
     def _before(self, problem: StepProblem, found: Solution) -> list[Positions]:
-        """The iterate before the answer, where the iterates lead to that."""
+        """Return the iterate before the solution, if the iterates lead to that solution."""
         if found.iterations < 1:
             return []
         p = before = problem.first_guess.copy()

@@ -1,12 +1,12 @@
-"""How fast a perturbation of the start grows: the estimate of the predictable horizon that all commands use.
+"""Growth of a perturbation of the start: the estimate of the predictability horizon for all commands.
 
-Every free coordinate of the start is perturbed by `PERTURBATION` of the mesh's size, to either side, and both motions
-are integrated by the same steps: by a symplectic composition of order 6 (Blanes and Moan 2002) where it supports the
-scene, else by Dormand and Prince's method of order 8. Where their difference has grown to `_LINEAR` times its start, it
-is rescaled to it (Benettin et al. 1980), so that it grows as an infinitesimal one does. Once 1e-12 of the size would
-have grown to the displacement itself, nothing is known of the motion any more.
+Every free coordinate of the start is perturbed by `START_PERTURBATION` of the mesh size, with random sign. Both motions
+are integrated with the same steps: by a symplectic composition of order 6 (Blanes and Moan 2002) where it supports the
+scene, otherwise by Dormand and Prince's method of order 8. Where the difference has grown to `_LINEAR_LIMIT` times its
+initial size, it is rescaled to that size (Benettin et al. 1980), so that it grows as an infinitesimal one does. Once a
+perturbation of 1e-12 of the size would have grown to the displacement itself, the motion is no longer predictable.
 
-The samples depend on the horizon alone, not on the scene's time step, so that every command finds the same.
+The samples depend on the end time alone, not on the scene's step size, so that every command obtains the same result.
 """
 
 from __future__ import annotations
@@ -32,28 +32,35 @@ from solvers.methods.explicit import BlanesMoan6
 from solvers.problem import StopRule, Unsupported
 
 PERTURBATION = 1e-9
-"""Of the size: a thousand times the round-off of a thousand steps."""
+"""Initial perturbation relative to the mesh size: a thousand times the round-off of a thousand steps."""
 LEAST = 1e-11
-"""No relative error is asked below it: the sum of a thousand steps' round-off comes near."""
+"""Minimum relative error that can be requested: the round-off of a thousand steps is close to it."""
 AT_REST = "nothing moves up to the horizon, and errors are relative to what does"
 _INTERVAL, _SAMPLES = 1 / 30, 30
-"""Seconds between two samples at most, and samples at least."""
+"""Maximum interval between two samples [s], and minimum number of samples."""
 _LINEAR = 1e3
-"""Times its start, from which a difference is rescaled: it is a millionth of the size then."""
+"""Growth factor from which on a difference is rescaled; it is then a millionth of the size."""
 _SURE = 0.5
-"""Of the growth allowed, that at a horizon that is recommended: its own samples lie elsewhere."""
+"""Fraction of the allowed growth at a recommended horizon, since the samples of that horizon differ."""
 _REFINE, _RTOL = 2, 1e-9
-"""Of the two methods: growth up to 1e-2 is then that of the reference, which closer steps do not change."""
+"""Accuracy of the two methods: growth up to 1e-2 then equals that of the reference, and smaller steps do not change
+it."""
 
 Advance = Callable[[int, State], State]
-"""The states of both motions, one after the other, at the end of the interval of an index, by those at its start."""
+"""Maps an interval index and the states of both motions at its start, concatenated, to those at its end."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Growth:
-    """times (k,) [s]; moved (k,) [m]: the displacement from the start, Frobenius norm over the free vertices; grown
-    (k,): what a perturbation of 1e-12 of the size at the start has become, relative to that, at most 1; scale: the
-    displacement of a free coordinate at the end, root mean square [m]."""
+    """Growth of a perturbation over a motion.
+
+    Attributes:
+      times: sample times (k,) [s].
+      displacement: displacement from the start (k,) [m], Frobenius norm over the free vertices.
+      growth_factor: size (k,) of a perturbation that was 1e-12 of the mesh size at the start, relative to the
+        displacement, at most 1.
+      scale: root mean square displacement of a free coordinate at the end [m].
+    """
 
     times: NDArray[np.float64]
     moved: NDArray[np.float64]
@@ -62,21 +69,30 @@ class Growth:
 
     @property
     def least(self) -> float:
-        """The least relative error that can be reached or measured at the end, round-off included."""
+        """The smallest relative error that can be reached or measured at the end, including round-off."""
         return _least(float(self.grown[-1]))
 
     def at(self, times: Sequence[float]) -> NDArray[np.float64]:
-        """The growth (k,) at other times [s], by interpolation."""
+        """Return the growth (k,) at other times [s] by interpolation."""
         return np.interp(times, self.times, self.grown)
 
     def longest(self, error: float) -> float:
-        """The longest horizon [s] at which a relative error can surely be reached and measured, rounded down to three
-        digits; 0 for none."""
+        """Return the longest horizon [s] at which a relative error can reliably be reached and measured.
+
+        It is rounded down to three digits, and 0 where there is none.
+        """
         fine = self.times[self.grown <= _SURE * MARGIN * error]
         return _rounded(floor, float(fine[-1]), 3) if len(fine) and error >= LEAST else 0.0
 
     def require(self, error: float, times: Sequence[float] = ()) -> None:
-        """Raise Unpredictable where a relative error cannot be measured at some times [s], the end if left out."""
+        """Require that a relative error can be measured at some times.
+
+        Args:
+          error: relative error.
+          times: times [s]; the end if omitted.
+        Raises:
+          Unpredictable: the perturbation has grown too large at one of the times.
+        """
         times = times or [float(self.times[-1])]
         for t, grown in zip(times, self.at(times), strict=True):
             if _least(grown) > error:
@@ -93,14 +109,20 @@ class Growth:
 
 
 def growth(spec: SceneSpec, size: int, horizon: float) -> Growth:
-    """Of the motion of a scene up to a horizon [s].
+    """Estimate the growth of a perturbation of a scene's motion up to an end time.
 
-    Raises Unpredictable where nothing moves and where the motion is not finite, Unintegrable.
+    Args:
+      spec: specification of the scene.
+      size: size of the scene.
+      t_end: end time [s].
+    Raises:
+      Unpredictable: nothing moves, or the motion is not finite.
+      Unintegrable: the scene has no equation of motion.
     """
     samples = max(_SAMPLES, ceil(horizon / _INTERVAL * (1.0 - 1e-9)))
     scene, begun, advance = _motion(spec, size, horizon / samples)
     half, length = len(begun) // 2, scene.mesh.size or 1.0
-    # Coordinates far from the origin are rounded by more than 1e-12 of the size.
+    # The round-off of coordinates far from the origin is larger than 1e-12 of the size.
     unit = max(ROUND_OFF * length, float(np.spacing(np.abs(begun[:half]).max(initial=0.0))))
     nudge = np.zeros_like(begun)
     nudge[:half] = np.random.default_rng(0).choice([-1.0, 1.0], half) * unit * (PERTURBATION / ROUND_OFF)
@@ -124,7 +146,7 @@ def growth(spec: SceneSpec, size: int, horizon: float) -> Growth:
 
 
 def _motion(spec: SceneSpec, size: int, interval: float) -> tuple[Scene, State, Advance]:
-    """The scene, its start, and what advances both motions."""
+    """Build the scene, its start, and the function that advances both motions."""
     scene = bind(spec.stepped(interval), size, "own", warns=False)
     if not scene.forces and not scene.moving:
         try:
@@ -163,6 +185,6 @@ def _least(grown: float) -> float:
 
 
 def _rounded(to_whole: Callable[[float], int], x: float, digits: int) -> float:
-    """Rounded to so many digits."""
+    """Round to a number of significant digits."""
     shift = digits - 1 - floor(log10(x))
     return round(to_whole(round(x * 10.0**shift, 6)) * 10.0**-shift, max(shift, 0))
