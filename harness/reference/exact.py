@@ -3,10 +3,11 @@
     minimise grad g . d + |d|_Q^2 / 2   such that   low <= l + n . A d <= high
 
 Lengths l and directions n are those at p. Q is that of the step's projective energies and of the penalties of exact
-lengths (`solvers.model.energies.augmented_lagrangian`). The solution d is zero if and only if p is a stationary point. The
-tensions t are the multipliers of its constraints: of all tensions, those that minimise the remaining gradient in the
-norm of Q^-1 once the length errors are corrected. The active set is found by a semismooth Newton method (Hintermueller,
-Ito and Kunisch 2002): a limit is active where l + t/k is beyond it. Linearly dependent lengths share their tension.
+lengths (`solvers.model.energies.augmented_lagrangian`). The solution d is zero if and only if p is a stationary point.
+The tensions t are the multipliers of its constraints: of all tensions, those that minimise the remaining gradient in
+the norm of Q^-1 once the length errors are corrected. The active set is found by a semismooth Newton method
+(Hintermueller, Ito and Kunisch 2002): a limit is active where l + t/k is beyond it. Linearly dependent lengths share
+their tension.
 
 With these tensions, the step of the Lagrangian has no length constraints. Its stationarity, its round-off and the
 curvature that certifies a minimum are therefore evaluated as for any other step. The penalties of a certificate are

@@ -1,14 +1,14 @@
-"""The minimum that solvers are graded against: Newton's method to round-off, and a certificate.
+"""Certified minima that solvers are compared with, by Newton's method to round-off.
 
-At a minimum grad g = 0 and the Hessian H is positive definite. Both are checked by the oracle, `solvers.problem`,
-whoever found the positions: steps |H^-1 grad g| go on for as long as each is shorter than half of the one before, and
-at the point where they end, which is the one that is stored, the smallest eigenvalue is positive beyond round-off
-(`harness.reference.curvature`) and one more step is short. The energy is not convex: there may be several minima. A
-basin is what Newton's method with a line search, which only descends, makes it.
+At a minimum grad g = 0 and the Hessian H is positive definite. Both are checked with `solvers.model.step_problem`,
+whatever method found the positions. Newton steps |H^-1 grad g| are repeated while each is shorter than half of the one
+before. The point where they end is stored. There the smallest eigenvalue must be positive beyond round-off
+(`harness.reference.hessian_curvature`) and one more step must be short. The energy is not convex, so there may be
+several minima. The basin of a minimum is defined by Newton's method with a line search, which only descends.
 
-Where the curvature cannot be told from zero along some direction, and points that way are as low, the minima are a
-valley: a circle, for a chain that may buckle to any side. No distance to one of its points means anything, so that it
-is no reference and says why.
+Where the curvature along some direction is zero within round-off, and points in that direction have the same energy,
+the minima form a continuum: for example a circle, for a chain that may buckle to any side. The distance to one of its
+points is meaningless, so such a point is not used as a reference, and the reason is reported.
 """
 
 from __future__ import annotations
@@ -28,31 +28,39 @@ from solvers.problem import Positions, Solver, StepProblem, StopRule
 from solvers.round_off import EPS
 
 TO_THE_END = StopRule(1000)
-"""Until round-off lets nothing descend any more: a tolerance would stop at saddles too."""
+"""Iterate until round-off prevents any further descent: a tolerance would stop at saddles too."""
 NEAR = 1e-9
-"""Of the shape's size: a certified minimum is known to this, and two that lie within a hundred times of it are one."""
+"""Accuracy of a certified minimum relative to the mesh size; two within a hundred times this distance are one."""
 REFACTORISATIONS = 5
 
 
 class Uncertified(RunFailed):
-    """There is no certified minimum to grade against."""
+    """There is no certified minimum to compare with."""
 
 
 MINIMUM, VALLEY, FLAT, SADDLE, ROUGH = "minimum", "valley", "flat", "saddle", "rough"
-"""Kinds of points where Newton's method ends: a certified minimum; one of a continuum of minima; where no curvature is
-negative and one cannot be told from zero; a saddle; a minimum that is not known to `NEAR`."""
+"""Kinds of points where Newton's method ends: a certified minimum; one of a continuum of minima; a point where no
+curvature is negative and one is zero within round-off; a saddle; a minimum less accurate than CERTIFIED_RTOL."""
 WALK = 1e-3
-"""Of the shape's size: how far along a valley its points are compared."""
+"""Distance along a continuum at which its points are compared, relative to the mesh size."""
 LEVEL = 64.0
-"""Times eps and the objective's terms: what two values may differ by and be one; sums of up to 1e5 terms."""
+"""Factor on eps and the objective's terms within which two values are equal; for sums of up to 1e5 terms."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Minimum:
-    """Where Newton's method ended. positions (n, 3) [m], read-only; all else is of this very point: g [J]; error: the
-    length of Newton's next step, at the vertex where it is largest [m], infinite where the Hessian has no factor;
-    smallest_eigenvalue: of the Hessian without the exactly pinned vertices [N/m], and its doubt [N/m]; near (n,) [m]:
-    what `NEAR` is at each vertex, of the size of its component; kind: see above."""
+    """End point of Newton's method, with its certificate.
+
+    Attributes:
+      positions: positions (n, 3) [m], read-only; all other attributes refer to this point.
+      objective: value g [J].
+      newton_step_length: length [m] of the next Newton step at the vertex where it is largest, infinite where the
+        Hessian has no factor.
+      min_eigenvalue: smallest eigenvalue of the Hessian without the exactly pinned vertices [N/m].
+      eigenvalue_uncertainty: bound on its uncertainty [N/m].
+      position_tolerance: CERTIFIED_RTOL times the size of each vertex's component (n,) [m].
+      kind: one of the kinds above.
+    """
 
     positions: Positions
     g: float
@@ -64,12 +72,12 @@ class Minimum:
 
     @property
     def certified(self) -> bool:
-        """Whether this is a minimum, known to `NEAR`, and no other is next to it."""
+        """Whether this is an isolated minimum, accurate to CERTIFIED_RTOL."""
         return self.kind == MINIMUM
 
     @property
     def flaw(self) -> str:
-        """What is wrong with a minimum that is not certified."""
+        """The reason why the minimum is not certified."""
         curvature = f"the smallest eigenvalue is {self.smallest_eigenvalue:.1e} N/m, give or take {self.doubt:.1e} N/m"
         return {
             VALLEY: f"the minima are a valley, all as low, to whose points no distance means anything: {curvature}",
@@ -80,43 +88,43 @@ class Minimum:
 
     @property
     def name(self) -> str:
-        """6 hex digits that stay, whatever minima are found later."""
+        """6 hex digits that do not change when other minima are found later."""
         return hashlib.sha256(self.positions.tobytes()).hexdigest()[:6]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownMinima:
-    """The minima known of one problem, the lowest first: an index is a branch. reason: why there is none."""
+    """The known minima of one problem, lowest first; `reason` states why there is none."""
 
     minima: tuple[Minimum, ...]
     reason: str = ""
 
     @property
     def best(self) -> Minimum:
-        """The lowest minimum known; raises Uncertified where there is none."""
+        """The lowest known minimum; raises UncertifiedError where there is none."""
         if not self.minima:
             raise Uncertified(self.reason)
         return self.minima[0]
 
     def branch(self, minimum: Minimum) -> int:
-        """The index of a minimum, by where it lies."""
+        """Return the index of a minimum, identified by its positions."""
         return next(i for i, known in enumerate(self.minima) if _same(known, minimum))
 
     def joined(self, found: Minimum) -> KnownMinima:
-        """With one more minimum; the same reference where it is known already, or is not certified."""
+        """Return the known minima with one more; unchanged if it is already known or is not certified."""
         if not found.certified or any(_same(known, found) for known in self.minima):
             return self
         return KnownMinima(tuple(sorted((*self.minima, found), key=lambda minimum: minimum.g)))
 
 
 def find_minima(problem: StepProblem, solver: Solver) -> KnownMinima:
-    """The minima to which Newton's method leads from the current positions and from the inertial target."""
+    """Find the minima that Newton's method reaches from the current positions and from the inertial target."""
     guesses = (guessed(problem, name).first_guess for name in ("current", "inertial"))
     return reference(polish(problem, guess, solver) for guess in guesses)
 
 
 def reference(found: Iterable[Minimum]) -> KnownMinima:
-    """The certified ones among what was found; where there is none, the reason."""
+    """Collect the certified minima; where there is none, the reason."""
     known, reason = KnownMinima(()), ""
     for one in found:
         known = known.joined(one)
@@ -125,14 +133,16 @@ def reference(found: Iterable[Minimum]) -> KnownMinima:
 
 
 def polish(problem: StepProblem, p: Positions, solver: Solver) -> Minimum:
-    """Newton's method from p (n, 3) [m] down to the minimum of its basin, which is certified."""
+    """Run Newton's method from p (n, 3) [m] to the minimum of its basin, and certify it."""
     solution = solver.prepare(problem.system).solve(replace(problem, first_guess=p), TO_THE_END)
     return certify(problem, solution.positions)
 
 
 def certify(problem: StepProblem, p: Positions) -> Minimum:
-    """Newton steps from p (n, 3) [m], close to a minimum, to where round-off ends them. Then, there: the curvature, the
-    value, and the length of one more step."""
+    """Refine p (n, 3) [m], close to a minimum, by Newton steps to round-off, and certify the result.
+
+    The certificate contains the curvature, the objective and the length of one more step at the final point.
+    """
     p = _pinned(problem, p)
     near = NEAR * sizes(problem.system, p)
     found = curvature(problem, p)
@@ -150,7 +160,7 @@ def certify(problem: StepProblem, p: Positions) -> Minimum:
 
 
 def _descend(problem: StepProblem, p: Positions, near: NDArray[np.float64]) -> None:
-    """Newton steps on p itself, for as long as each is shorter than half of the one before."""
+    """Apply Newton steps to p in place while each is shorter than half of the one before."""
     free = problem.system.free
     for _ in range(REFACTORISATIONS):
         solve = definite(free_hessian(problem, p))
@@ -169,14 +179,16 @@ def _descend(problem: StepProblem, p: Positions, near: NDArray[np.float64]) -> N
 
 
 def _step(problem: StepProblem, p: Positions) -> Positions | None:
-    """Newton's step (f, 3) [m] at p; None where the Hessian has no factor."""
+    """Compute Newton's step (f, 3) [m] at p; None where the Hessian has no factor."""
     free = problem.system.free
     solve = definite(free_hessian(problem, p)) if len(free) else np.copy
     return solve(problem.gradient(p)[free].ravel()).reshape(-1, 3) if solve else None
 
 
 def _level(problem: StepProblem, p: Positions, found: Curvature, near: NDArray[np.float64]) -> bool:
-    """Whether points are as low as p where the flat direction leads, both ways: the minima are a continuum."""
+    """Return whether the objective is equal on both sides of p along the degenerate direction: the minima form a
+    continuum.
+    """
     lowest, noise = problem.value(p), LEVEL * EPS * problem.magnitude(p)
     for way in (WALK, -WALK):
         q = p + way / NEAR * float(near.max()) * found.direction / np.abs(found.direction).max()
@@ -191,7 +203,7 @@ def _level(problem: StepProblem, p: Positions, found: Curvature, near: NDArray[n
 
 
 def _pinned(problem: StepProblem, p: Positions) -> Positions:
-    """A copy of p with the exactly pinned vertices on their targets."""
+    """Return a copy of p with the exactly pinned vertices at their targets."""
     pins, placed = problem.system.pins, p.copy()
     placed[pins.vertices[pins.exact]] = problem.pin_targets[pins.exact]
     return placed

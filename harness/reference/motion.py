@@ -1,10 +1,10 @@
-"""The equations of motion as a first-order system y' = F(t, y), y the positions and velocities of the free vertices.
+"""Equations of motion as a first-order system y' = F(t, y) of the free vertices' positions and velocities.
 
     M p'' = f(p, p', t) - grad E(p) - c M p'
 
-Springs are summed by a compiled loop. An energy that depends on where a step starts is begun at the motion itself, so
-that its gradient at p is the force there. Ether drag is known by what it does to the velocity in a step, v <- kept v,
-and so has the rate c = -ln(kept) / dt; no other filter of the velocity has an equation of motion.
+Springs are summed by a compiled loop. An energy that depends on the start of a step is initialised with the motion
+itself, so that its gradient at p is the force there. Ether drag is defined by its effect on the velocity in a step, v
+<- kept v, and so has the rate c = -ln(kept) / dt. No other velocity filter has an equation of motion.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from solvers.problem import Positions, Start, is_lagged
 
 Reals = NDArray[np.float64]
 State = Reals
-"""Positions [m] and velocities [m/s] of the free vertices, one after the other, shape (6 f,)."""
+"""Positions [m] and velocities [m/s] of the free vertices, concatenated, shape (6 f,)."""
 
 TICK = 1e-5
-"""Seconds over which the speed of moving pins is taken, which damping alone notices: good to ten digits, but a corner
-of their path is rounded."""
+"""Interval [s] of the finite difference for the velocity of moving pins, which only damping uses. It is accurate to ten
+digits, but rounds a corner of their path."""
 
 
 class Unintegrable(RunFailed):
@@ -42,7 +42,14 @@ class Field:
     """F of a scene whose pins are exact."""
 
     def __init__(self, scene: Scene, *, compiled: bool = True) -> None:
-        """compiled: whether springs are, or go through NumPy. Raises Unintegrable."""
+        """Check that the scene has equations of motion.
+
+        Args:
+          scene: scene with exact pins.
+          compiled: whether springs are summed by the compiled loop instead of NumPy.
+        Raises:
+          NotIntegrable: the scene has no equations of motion.
+        """
         system = scene.system
         self._scene, self._free, self._system = scene, system.free, system
         self._mass = system.mass[self._free, None]
@@ -64,11 +71,11 @@ class Field:
 
     @property
     def start(self) -> State:
-        """The scene's start."""
+        """The initial state of the scene (6 f,)."""
         return np.concatenate([part[self._free].ravel() for part in start(self._scene).now])
 
     def motion(self, t: float, y: State) -> tuple[Positions, Positions]:
-        """Positions [m] and velocities [m/s] of all vertices, each (n, 3); overwritten by the next call."""
+        """Return positions [m] and velocities [m/s] of all vertices, each (n, 3), overwritten by the next call."""
         self._p[self._free], self._v[self._free] = y.reshape(2, -1, 3)
         if self._scene.moving:
             held, h = self._system.pins.vertices, TICK
@@ -77,7 +84,7 @@ class Field:
         return self._p, self._v
 
     def __call__(self, t: float, y: State) -> State:
-        """F(t, y)."""
+        """Evaluate F(t, y)."""
         p, v = self.motion(t, y)
         push = np.negative(self._scene.load)
         if self._springs:
@@ -95,13 +102,13 @@ class Field:
         return out.reshape(-1)
 
     def witness(self) -> State:
-        """F at a state that stretches and moves everything: it stands for the equations of motion."""
+        """Evaluate F at a state that strains and moves everything, as a fingerprint of the equations of motion."""
         y = self.start
         return self(0.5, y + 0.01 * (self._scene.mesh.size or 1.0) * np.random.default_rng(1).normal(size=y.shape))
 
 
 def moving(spec: SceneSpec, size: int) -> Scene:
-    """A scene with equations of motion; what is a filter without one is taken as a force. Raises Unintegrable."""
+    """Build a scene with equations of motion, with filters converted to forces where needed; raises NotIntegrable."""
     scene = bind(spec, size)
     try:
         Field(scene)
@@ -141,7 +148,7 @@ def add_springs(
 
 
 def _drag(scene: Scene) -> float:
-    """The rate of the scene's ether drag [1/s]; raises Unintegrable for any other filter."""
+    """Return the rate of the scene's ether drag [1/s]; raises NotIntegrable for any other filter."""
     v = np.random.default_rng(0).uniform(1.0, 2.0, scene.mesh.rest.shape)
     kept = reduce(lambda v, filtered: filtered(v), scene.filters, v) / v
     if not kept.min() > 0.0 or np.ptp(kept) > 1e-12 * kept.max():

@@ -1,21 +1,21 @@
-"""The oracle of stationarity: how far a point is from one where the gradient vanishes, and what of that is round-off.
+"""Reference evaluator of stationarity: the norm of the gradient at a point, and the share due to round-off.
 
-    residual(p)     = |Q^-1 grad g(p)|_Q over the unpinned vertices, which a heavy pin does not blind
-    stationarity(p) = residual(p) / yardstick,   yardstick = max(residual(current positions), floor(current positions))
+    residual(p)     = |Q^-1 grad g(p)|_Q over the unpinned vertices, so that a heavy pin does not mask the rest
+    stationarity(p) = residual(p) / initial,   initial = max(residual(current positions), floor(current positions))
 
-with the Q of the system's projective energies, assembled here and factorised by SuperLU, whatever the solver does.
+Q is the matrix of the system's projective energies. It is assembled here and factorised by SuperLU, independently of
+the solver. Round-off is bounded for each vertex (`solvers.model.rounding_bound`): a gradient of at most FACTOR delta_i
+at vertex i may be round-off only; a larger one is significant, however distant or stiff another part of the scene is.
+Hence
 
-Round-off is told vertex by vertex (`solvers.round_off`): a gradient of at most FACTOR delta_i at vertex i may be no
-more than that, and what is longer is beyond doubt, however far away or stiff another part of the scene may be. So
+    floor(p)  = sqrt(sum_i (FACTOR delta_i)^2 / Q_ii)          bound on the round-off of the residual
+    beyond(p) = |Q^-1 (grad g less the part explained by round-off, for each vertex)|_Q / initial
 
-    floor(p)  = sqrt(sum_i (FACTOR delta_i)^2 / Q_ii)          what round-off may make of the residual
-    beyond(p) = |Q^-1 (grad g less what round-off explains of it, vertex by vertex)|_Q / yardstick
+A step is assessed by `beyond`: it is 0 where every vertex is in equilibrium to float64 accuracy.
 
-and a step is judged by `beyond`: it is 0 where each vertex is at rest for all that float64 can tell.
-
-Where Q has more than LARGEST entries conjugate gradients take the factor's place, from zero: |x_k|_Q grows towards
-|Q^-1 g|_Q (Hestenes and Stiefel 1952), so that what they give is a lower bound, near to the truth. Multigrid is their
-preconditioner, which says how soon they end and never where: ten iterations on meshes of any size.
+Where Q has more than MAX_DIRECT_NNZ entries, conjugate gradients from zero replace the factor. |x_k|_Q grows towards
+|Q^-1 g|_Q (Hestenes and Stiefel 1952), so that the result is a close lower bound. The preconditioner is multigrid,
+which affects only the number of iterations, not the limit: ten iterations on meshes of any size.
 """
 
 from __future__ import annotations
@@ -38,14 +38,21 @@ LARGEST = 1_500_000
 """Entries of Q up to which its factor takes seconds at most: sheets of some 150,000 vertices, solids of 50,000."""
 
 ACCURACY = 1e-9
-"""Of the gradient's length |D^-1/2 g|, D the diagonal of Q, what conjugate gradients leave: four digits of |Q^-1 g|_Q
-where a heavy pin makes up nearly all of g, and more elsewhere; they end after MOST steps."""
+"""Tolerance of conjugate gradients relative to the scaled gradient norm |D^-1/2 g|, D the diagonal of Q. It gives four
+digits of |Q^-1 g|_Q where a heavy pin contributes nearly all of g, and more elsewhere. The limit is
+MAX_CG_ITERATIONS."""
 
 MOST = 500
 
 
 class Reading(NamedTuple):
-    """reached: the stationarity; attainable: what round-off may make of it; beyond: what it does not explain."""
+    """Stationarity of a point.
+
+    Attributes:
+      stationarity: residual relative to the initial residual.
+      roundoff_bound: bound on the share of it that is due to round-off.
+      above_roundoff: the share that round-off does not explain.
+    """
 
     reached: float
     attainable: float
@@ -53,10 +60,10 @@ class Reading(NamedTuple):
 
 
 class Oracle:
-    """The residual of step problems of one system."""
+    """Evaluator of the residuals of step problems of one system."""
 
     def __init__(self, system: System) -> None:
-        """Raises NotPositiveDefinite."""
+        """Assemble Q; raises NotPositiveDefinite."""
         self._system = system
         self._Q = stiffness(system)
         self._known: tuple[StepProblem, float] | None = None
@@ -75,7 +82,7 @@ class Oracle:
         return Multigrid(self._free)
 
     def _solve(self, right: Positions) -> Positions:
-        """Q^-1 of a right-hand side (f, 3) [N] over the vertices that are not pinned exactly, (f, 3) [m]."""
+        """Return Q^-1 of a right-hand side (f, 3) [N] over the vertices that are not pinned exactly, (f, 3) [m]."""
         Q = self._free
         if Q.nnz <= LARGEST:
             return self._factor.solve(right)
@@ -87,17 +94,17 @@ class Oracle:
         return half * found.reshape(-1, 3)
 
     def _near(self, right: Positions) -> Positions:
-        """What a V-cycle, in float32, makes of a right-hand side (f, 3)."""
+        """Apply a V-cycle in float32 to a right-hand side (f, 3)."""
         size = float(np.abs(right).max(initial=0.0)) or 1.0
         self._multigrid.right_hand_side[:, :3] = right / size
         return size * self._multigrid.apply()[:, :3].astype(np.float64)
 
     def residual(self, problem: StepProblem, p: Positions) -> float:
-        """|Q^-1 grad g(p)|_Q [J^(1/2)] over the unpinned vertices."""
+        """Compute |Q^-1 grad g(p)|_Q [J^(1/2)] over the unpinned vertices."""
         return self.length(problem.gradient(p))
 
     def length(self, gradient: Positions) -> float:
-        """|Q^-1 g|_Q [J^(1/2)] of a gradient (n, 3) [N], over the unpinned vertices; infinite where it overflows."""
+        """Compute |Q^-1 g|_Q [J^(1/2)] of a gradient (n, 3) [N] over the unpinned vertices; infinite on overflow."""
         free, e = self._system.free, np.zeros_like(gradient)
         if len(free):
             e[free] = self._solve(gradient[free])
@@ -107,24 +114,32 @@ class Oracle:
         return length if np.isfinite(length) else np.inf
 
     def floor(self, problem: StepProblem, p: Positions) -> float:
-        """What round-off may make of the residual [J^(1/2)] at p."""
+        """Bound the round-off of the residual [J^(1/2)] at p."""
         return self._floor(gradient_round_off(problem, p))
 
     def _floor(self, bound: NDArray[np.float64]) -> float:
-        """The same of the bound (n,) [N] on the round-off at each vertex."""
+        """Bound the round-off of the residual [J^(1/2)] from a bound (n,) [N] on the gradient's round-off at each
+        vertex.
+        """
         loose = self._system.unpinned
         with np.errstate(over="ignore"):
             return FACTOR * float(np.sqrt(np.sum(bound[loose] ** 2 / self._Q.diagonal()[loose])))
 
     def yardstick(self, problem: StepProblem) -> float:
-        """The residual [J^(1/2)] at the current positions, or what round-off may make of it there, if that is more."""
+        """Compute the initial residual [J^(1/2)]: that at the current positions, or its round-off bound if larger."""
         if self._known is None or self._known[0] is not problem:
             floor = max(self.floor(problem, problem.current), np.finfo(float).tiny)
             self._known = problem, max(self.residual(problem, problem.current), floor)
         return self._known[1]
 
     def stationarity(self, problem: StepProblem, p: Positions, yardstick: float | None = None) -> Reading:
-        """How stationary p (n, 3) [m] is, by the step's yardstick or another [J^(1/2)]."""
+        """Measure the stationarity of p.
+
+        Args:
+          problem: step problem.
+          p: positions (n, 3) [m].
+          initial_residual: residual [J^(1/2)] that the result is relative to; that of the problem if omitted.
+        """
         yardstick = self.yardstick(problem) if yardstick is None else yardstick
         gradient, bound = problem.gradient(p), gradient_round_off(problem, p)
         reached = self.length(gradient) / yardstick
@@ -134,19 +149,23 @@ class Oracle:
 
 
 def stiffness(system: System) -> csr_array:
-    """Q (n, n) [N/m] of a system's projective energies. Raises NotPositiveDefinite."""
+    """Assemble Q (n, n) [N/m] of a system's projective energies; raises NotPositiveDefinite."""
     return assemble(system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)])
 
 
 def sizes(system: System, p: Positions) -> NDArray[np.float64]:
-    """The size of each vertex's component at p (n, 3) [m], (n,) [m]; see `component_sizes`."""
+    """Measure the size (n,) [m] of each vertex's component at p (n, 3) [m]."""
     return component_sizes(stiffness(system), p)
 
 
 def component_sizes(graph: csr_array, p: Positions) -> NDArray[np.float64]:
-    """The diagonal of the bounding box of each vertex's component of a graph (n, n) at p (n, 3) [m], (n,).
+    """Measure the bounding box diagonal (n,) [m] of each vertex's component of a graph.
 
-    A component without extent has the median size of those that have one; a metre where none has.
+    A component without extent is assigned the median size of those that have one, and 1 m where none has.
+
+    Args:
+      graph: adjacency matrix (n, n).
+      p: positions (n, 3) [m].
     """
     count, label = connected_components(graph, directed=False)
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
@@ -159,6 +178,6 @@ def component_sizes(graph: csr_array, p: Positions) -> NDArray[np.float64]:
 
 
 def symmetric_lu(matrix: csr_array) -> Any:
-    """SuperLU of a symmetric matrix, with its pivots on the diagonal. Raises RuntimeError where one is zero."""
+    """Factorise a symmetric matrix by SuperLU with pivots on the diagonal; raises RuntimeError where one is zero."""
     settings: Any = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
     return splu(matrix.tocsc(), **settings)

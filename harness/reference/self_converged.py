@@ -1,10 +1,11 @@
-"""The truth of a scene with contact: the model's own limit, where steps are halved until nothing moves any more.
+"""Self-converged reference for scenes with contact: steps are halved until the motion no longer changes.
 
-    |p_h(T) - p_(h/2)(T)| and |p(T) - q(T)| <= MARGIN error |q(T) - p(0)|,    p by implicit Euler, q by BDF2
+    |p_h(T) - p_(h/2)(T)| and |p(T) - q(T)| <= REFERENCE_MARGIN error |q(T) - p(0)|
 
-Frobenius norms over the free vertices; steps are solved by Newton's method. Contact has no equation of motion that
-could be integrated instead, and its limit may depend on the integrator: how much of a velocity an impact gives back,
-and which velocity lagged friction acts against, are theirs. Where the limits differ, there is no truth.
+Here p is the motion by implicit Euler and q the one by BDF2. Norms are Frobenius norms over the free vertices; steps
+are solved by Newton's method. Contact has no equation of motion that could be integrated instead, and its limit may
+depend on the integrator, which determines the restitution of an impact and the velocity that lagged friction opposes.
+Where the limits differ, there is no reference.
 """
 
 from __future__ import annotations
@@ -24,48 +25,53 @@ from solvers.methods.newton import Newton
 from solvers.problem import Positions, StopRule, System
 
 INTEGRATORS = ("implicit-euler", "bdf2")
-"""Which take contact."""
+"""Integrators that support contact."""
 SPENT = 60.0
-"""Processor seconds on a truth."""
+"""Limit on the processor time [s] for a reference."""
 LARGEST = 0.05
-"""Of the motion: a truth is at least good enough for this error."""
+"""Relative error for which a reference is always accurate enough."""
 _SOLVED = StopRule(100, 1e-6)
 _APART = 4.0
-"""Times what halving the steps still moves them, how far two limits are apart that differ."""
+"""Ratio of the distance between two limits to the last change by step halving above which the limits differ."""
 
 Bound = Callable[[float, str], Scene]
-"""The scene with steps of a length [s] and an integrator by name."""
+"""Builds the scene from a step size [s] and the name of an integrator."""
 
 
 class NotConverged(Unpredictable):
-    """The motion has no limit that is known well enough."""
+    """The motion has no limit that is known accurately enough."""
 
 
 def touches(system: System) -> bool:
-    """Whether a scene has contact."""
+    """Return whether a system has contact."""
     return without_contact(system) is not system
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SelfConverged(Trajectory):
-    """disagreement (k,): of the two integrators, or what halving the steps moved either, whichever is most; step: the
-    last one [s]; moved_last: the latter alone at the end, relative."""
+    """Self-converged reference trajectory.
+
+    Attributes:
+      disagreement: difference (k,) of the two integrators, or the last change of either by step halving, if larger.
+      step: last step size [s].
+      last_change: last change by step halving alone, at the end, relative to the displacement.
+    """
 
     step: float
     moved_last: float
 
     @property
     def truth(self) -> str:
-        """See Trajectory."""
+        """The kind of the reference."""
         return "self-converged"
 
     @property
     def differ(self) -> bool:
-        """Whether the integrators part by more than halving their steps explains."""
+        """Whether the integrators differ by more than step halving explains."""
         return float(self.disagreement[-1]) > _APART * self.moved_last
 
     def require(self, error: float) -> None:
-        """See Trajectory. Raises NotConverged."""
+        """Raise NotConverged where a relative error cannot be measured at one of the times."""
         for t, apart in zip(self.times, self.disagreement, strict=True):
             if apart <= MARGIN * error:
                 continue
@@ -85,8 +91,16 @@ class SelfConverged(Trajectory):
 
 
 def converge(bound: Bound, frame: float, times: Sequence[float], error: float) -> SelfConverged:
-    """The motion at ascending times [s], each a whole number of steps of about a frame [s], for relative errors down to
-    `error` if that takes no longer than SPENT. Raises NotConverged where not even two steps could be compared."""
+    """Compute a self-converged motion at given times.
+
+    Args:
+      build_scene: builds the scene from a step size and an integrator.
+      frame: approximate first step size [s].
+      times: ascending times [s], each a multiple of the step size.
+      error: smallest relative error to be measured, if that takes no longer than MAX_SECONDS.
+    Raises:
+      NotConverged: not even two step sizes could be compared.
+    """
     steps, began = max(1, round(times[-1] / frame)), thread_time()
     before: dict[str, _Motion] | None = None
     found: SelfConverged | None = None
@@ -108,7 +122,7 @@ def converge(bound: Bound, frame: float, times: Sequence[float], error: float) -
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Motion:
-    """free: vertices; begin (n, 3) [m]; positions, velocities (k, n, 3)."""
+    """A sampled motion: free vertices; start positions (n, 3) [m]; positions and velocities (k, n, 3)."""
 
     free: NDArray[np.int64]
     begin: Positions
@@ -117,7 +131,7 @@ class _Motion:
 
 
 def _motion(scene: Scene, times: Sequence[float], until: float) -> _Motion | None:
-    """None where the clock passed a time."""
+    """Sample the motion at the given times; None if the time limit is exceeded before the last one."""
     h = scene.system.time_step
     wanted = [round(t / h) for t in times]
     if any(abs(k * h - t) > 1e-9 * times[-1] for k, t in zip(wanted, times, strict=True)):
@@ -164,8 +178,8 @@ def _compared(
 
 
 def told_once(name: str) -> str:
-    """What a scene of this name with contact is told before anything is measured."""
+    """Return the note that is shown for a scene with contact before anything is measured."""
     return (
         f"{name}: contact has no certified reference; errors are by a self-converged motion (implicit Euler and BDF2, "
-        "steps halved until they agree), and refused where that does not converge"
+        "steps halved until they agree), and rejected where that does not converge"
     )

@@ -1,13 +1,13 @@
-"""The truth on disk: what was found once is found again by the digest of the question.
+"""Store of references on disk, indexed by a digest of the scene and the request.
 
-    run-SCENE-SIZE-INTEGRATOR.npz             how violent each step of a reference run is
-    problem-SCENE-SIZE-INTEGRATOR-FRAME.npz   a frozen problem
-    minima-PROBLEM.npz                        the minima known of it
-    trajectory-SCENE-SIZE-TIMES.npz           positions and velocities at some times; SCENE without its time step
-    growth-SCENE-SIZE-HORIZON.npz             how a perturbation of the start grows up to a horizon
-    converged-SCENE-SIZE-TIMES.npz            the same of a scene with contact, as far as it converged
+    run-SCENE-SIZE-INTEGRATOR.npz             decrease of the objective in each step of a reference run
+    problem-SCENE-SIZE-INTEGRATOR-FRAME.npz   a step snapshot
+    minima-PROBLEM.npz                        its known minima
+    trajectory-SCENE-SIZE-TIMES.npz           positions and velocities at some times; SCENE without its step size
+    growth-SCENE-SIZE-HORIZON.npz             growth of a perturbation of the start up to an end time
+    converged-SCENE-SIZE-TIMES.npz            positions and velocities of a scene with contact, self-converged
 
-Files have a partial name until they are complete, and hold arrays only.
+Files have a temporary name until they are complete, and contain arrays only.
 """
 
 from __future__ import annotations
@@ -33,20 +33,34 @@ from solvers.methods.newton import Newton
 from solvers.problem import Positions, Solver
 
 _CERTIFICATE = ("positions", "g", "error", "smallest_eigenvalue", "doubt", "near")
-"""What is kept of a minimum: all of the point that is stored."""
+"""Stored fields of a minimum: the complete certificate of the stored point."""
 _INTEGRATED = tuple(f.name for f in fields(Trajectory) if f.name != "growth")
-"""What is stored of a trajectory; the growth of perturbations has a file of its own."""
+"""Stored fields of a trajectory; the growth of perturbations has its own file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Store:
-    """folder: of all references, shared by everyone who asks about the same scenes; solver: Newton's method."""
+    """Store of all references in one folder, shared by all users of the same scenes.
+
+    Attributes:
+      folder: folder of the files.
+      solver: solver of reference runs, Newton's method.
+    """
 
     folder: Path
     solver: Solver = field(default_factory=Newton)
 
     def moments(self, spec: SceneSpec, size: int, integrator: IntegratorName = "implicit-euler") -> dict[str, Frozen]:
-        """The frozen problems of MOMENTS in the scene's `frames` steps. Raises InputError, RunFailed."""
+        """Load or compute the snapshots SNAPSHOT_NAMES of the scene's `frames` steps.
+
+        Args:
+          spec: specification of the scene.
+          size: size of the scene.
+          integrator: name of the integrator.
+        Raises:
+          InputError: the scene cannot be built.
+          RunFailed: a step of the reference run does not converge.
+        """
         asked = _Asked(spec, size, integrator)
         path = self.folder / f"run-{asked.name}.npz"
         violence = _read(path)["violence"] if path.exists() else np.empty(0)
@@ -61,9 +75,16 @@ class Store:
     def frames(
         self, spec: SceneSpec, size: int, frames: Collection[int], integrator: IntegratorName = "implicit-euler"
     ) -> dict[int, Frozen]:
-        """The frozen problems of these frames, counted from 1; the run goes on from the last one known before them.
+        """Load or compute the snapshots of given frames; a run continues from the last stored one before them.
 
-        Raises InputError, RunFailed.
+        Args:
+          spec: specification of the scene.
+          size: size of the scene.
+          frames: frames, counted from 1.
+          integrator: name of the integrator.
+        Raises:
+          InputError: the scene cannot be built.
+          RunFailed: a step of the reference run does not converge.
         """
         asked = _Asked(spec, size, integrator)
         known = self._known(asked, frames)
@@ -76,7 +97,9 @@ class Store:
         return {frame: known[frame] for frame in frames}
 
     def reference(self, frozen: Frozen) -> KnownMinima:
-        """The minima known of a problem, found now if there is none. Its `best` raises Uncertified."""
+        """Load the known minima of a problem, or find them; `lowest` of the result raises UncertifiedError if there is
+        none.
+        """
         path = self.folder / f"minima-{frozen.digest}.npz"
         if path.exists() and (stored := _read(path)).keys() >= set(_CERTIFICATE):  # else by code that certified less
             return _minima(stored)
@@ -86,8 +109,11 @@ class Store:
         return found
 
     def classify(self, frozen: Frozen, p: Positions) -> Minimum:
-        """The minimum in whose basin p (n, 3) [m] lies; one that is new and certified joins those known, and is the
-        new reference if it is the lowest. `reference(frozen).branch(minimum)` is its branch where it is certified."""
+        """Find the minimum in whose basin p (n, 3) [m] is.
+
+        A new certified minimum is added to the known ones, and becomes the reference if it is the lowest. Its index is
+        `find_minima(snapshot).find_index(minimum)` where it is certified.
+        """
         found, known = polish(frozen.problem, p, self.solver), self.reference(frozen)
         joined = known.joined(found)
         if joined is not known:
@@ -97,11 +123,21 @@ class Store:
     def trajectory(
         self, spec: SceneSpec, size: int, times: Sequence[float], *, error: float, told: Told | None = None
     ) -> Trajectory:
-        """The trajectory at ascending times [s], by which relative errors down to `error` can be measured; told: how
-        far it is, where it has to be made.
+        """Load or compute a reference trajectory at given times.
 
-        It is the same for every time step of the scene; with contact it is self-converged, from steps of about the
-        scene's own. Raises InputError, Unintegrable, Unpredictable.
+        It is the same for every step size of the scene. With contact it is self-converged, starting with steps of about
+        the scene's own step size.
+
+        Args:
+          spec: specification of the scene.
+          size: size of the scene.
+          times: ascending times [s].
+          error: smallest relative error to be measured.
+          report_progress: called with the progress of an integration.
+        Raises:
+          InputError: the scene cannot be built.
+          NotIntegrable: the scene has no equations of motion.
+          UnpredictableMotion: the reference would not be accurate enough.
         """
         name = _named(spec, size, times)
         if touches(bind(spec, size).system):
@@ -120,7 +156,16 @@ class Store:
         return found
 
     def growth(self, spec: SceneSpec, size: int, horizon: float) -> Growth:
-        """How a perturbation of the start grows up to a horizon [s]. Raises what `harness.reference.growth` raises."""
+        """Load or estimate the growth of a perturbation of the start up to an end time [s].
+
+        Args:
+          spec: specification of the scene.
+          size: size of the scene.
+          t_end: end time [s].
+        Raises:
+          UnpredictableMotion: nothing moves, or the motion is not finite.
+          NotIntegrable: the scene has no equations of motion.
+        """
         witness = Field(moving(spec, size)).witness()
         path = self.folder / f"growth-{_named(spec, size, [horizon])}.npz"
         stored: dict[str, Any] = dict(_read(path)) if path.exists() else {}
@@ -132,7 +177,9 @@ class Store:
         return found
 
     def _converged(self, path: Path, spec: SceneSpec, size: int, times: Sequence[float], error: float) -> SelfConverged:
-        """As it is stored, if it was made for such an error, else anew. Its witness is its first step."""
+        """Load the self-converged trajectory if stored for such an error, else compute it; its fingerprint is its first
+        step.
+        """
         witness = next(iter(reference_run(bind(spec, size), self.solver, 1, [1])[0].values())).positions
         stored: dict[str, Any] = dict(_read(path)) if path.exists() else {}
         known = bool(stored) and agree(stored.pop("witness"), witness)
@@ -147,7 +194,7 @@ class Store:
         return found
 
     def _known(self, asked: _Asked, frames: Iterable[int]) -> dict[int, Frozen]:
-        """Those of the frames that are on disk and as the scene states them today."""
+        """Load those of the snapshots that are on disk and match the present scene."""
         paths = [path for path in (self._problem(asked, frame) for frame in frames) if path.exists()]
         thawed = [thaw(_read(path), asked.scene) for path in paths]
         return {one.frame: one for one in thawed if one}
@@ -168,7 +215,7 @@ class Store:
 
 
 class _Asked:
-    """A scene of one size by one integrator, and its name in file names."""
+    """A scene of one size with one integrator, and its name in file names."""
 
     def __init__(self, spec: SceneSpec, size: int, integrator: IntegratorName) -> None:
         self.scene: Scene = bind(spec, size, integrator)
@@ -176,7 +223,7 @@ class _Asked:
 
 
 def _named(spec: SceneSpec, size: int, times: Sequence[float]) -> str:
-    """What is asked of a motion, in a file's name: the scene without its time step."""
+    """Return the part of a file name that identifies a motion: the scene without its step size, size and times."""
     return f"{spec.stepped(1.0).digest[:12]}-{size}-{'-'.join(f'{t:.9g}' for t in times)}"
 
 

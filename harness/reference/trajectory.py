@@ -1,9 +1,9 @@
-"""The trajectory that time stepping is graded against: an integration of the equations of motion as such.
+"""Reference trajectory for time stepping: a high-order integration of the equations of motion.
 
 Dormand and Prince's method of order 8 (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section
-II.10) at rtol 1e-12, checked by Adams methods of orders up to 12 (VODE; ibid., section III.1). A motion in which what
-is 1e-12 at the start grows past the error that is to be measured (`harness.reference.growth`) has no trajectory to
-grade against: it is refused.
+II.10) at rtol 1e-12, checked by Adams methods of orders up to 12 (VODE; ibid., section III.1). Where a perturbation of
+1e-12 at the start grows past the error to be measured (`harness.reference.perturbation_growth`), there is no reference
+trajectory, and the request is rejected.
 """
 
 from __future__ import annotations
@@ -22,21 +22,29 @@ from solvers.problem import Positions
 
 RTOL = 1e-12
 PERTURBATION = 1e-12
-"""Of the rest shape's size, at every coordinate."""
+"""Perturbation of every coordinate, relative to the rest shape's size."""
 MARGIN = 0.1
-"""Of the error to be measured: what the reference itself may be wrong by."""
+"""Maximum error of the reference, relative to the error to be measured."""
 
 
 class Unpredictable(RunFailed):
-    """The reference would be as uncertain as the error that is to be measured by it."""
+    """The reference would be as uncertain as the error that is to be measured with it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """times (k,) [s]; free: the vertices that are not pinned; positions (k, n, 3) [m] and velocities (k, n, 3) [m/s].
+    """Reference motion at some times.
 
-    moved (k,) [m]: the displacement from the start, Frobenius norm over the free vertices. In the same norm, relative
-    to it: disagreement (k,) of the two methods; growth (k,) of a perturbation of the start, 0 where none was estimated.
+    Norms are Frobenius norms over the free vertices.
+
+    Attributes:
+      times: times (k,) [s].
+      free_vertices: indices of the vertices that are not pinned.
+      positions: positions (k, n, 3) [m].
+      velocities: velocities (k, n, 3) [m/s].
+      displacement: displacement from the start (k,) [m].
+      disagreement: difference of the two methods (k,), relative to the displacement.
+      growth: size of a perturbation of the start (k,), relative to the displacement; 0 where none was estimated.
     """
 
     times: NDArray[np.float64]
@@ -49,15 +57,15 @@ class Trajectory:
 
     @property
     def truth(self) -> str:
-        """What kind of truth it is, in a word."""
+        """The kind of the reference."""
         return "integrated"
 
     def error(self, k: int, p: Positions) -> float:
-        """How far p (n, 3) [m] is from the positions at times[k], relative to the displacement from the start."""
+        """Measure the error of p (n, 3) [m] at times[k], relative to the displacement from the start."""
         return float(np.linalg.norm((p - self.positions[k])[self.free])) / float(self.moved[k])
 
     def require(self, error: float) -> None:
-        """Raises Unpredictable where a relative error of this size could not be told from the reference's own."""
+        """Raise UnpredictableMotion where a relative error could not be distinguished from the reference's own."""
         for k, t in enumerate(self.times):
             for found, what in ((self.growth[k], "a perturbation of 1e-12"), (self.disagreement[k], "round-off")):
                 if not found <= MARGIN * error:
@@ -68,11 +76,11 @@ class Trajectory:
 
 
 Told = Callable[[int, float], None]
-"""Is told, with each evaluation of the forces, which of the motions is followed, from 1 to 2, and up to when [s]."""
+"""Called at each evaluation of the forces with the current integration, 1 or 2, and the time reached [s]."""
 
 
 class _Telling:
-    """A field that tells how far each motion is: one that begins anew is the next."""
+    """A field that reports progress; an integration that restarts at time 0 is the second one."""
 
     def __init__(self, field: Field, told: Told) -> None:
         self._field, self._told, self._motion, self._until = field, told, 1, 0.0
@@ -86,9 +94,15 @@ class _Telling:
 
 
 def integrate(scene: Scene, times: Sequence[float], told: Told | None = None) -> Trajectory:
-    """The motion of a scene whose pins are exact, at ascending times after its start [s]; told: how far it is.
+    """Integrate the motion of a scene whose pins are exact.
 
-    Raises Unintegrable."""
+    Args:
+      scene: scene with exact pins.
+      times: ascending times after the start [s].
+      report_progress: called at each evaluation of the forces.
+    Raises:
+      NotIntegrable: the scene has no equations of motion.
+    """
     alone = Field(scene)
     start, atol = alone.start, RTOL * (scene.mesh.size or 1.0)
     field = _Telling(alone, told) if told else alone
@@ -107,12 +121,12 @@ def integrate(scene: Scene, times: Sequence[float], told: Told | None = None) ->
 
 
 def _apart(path: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """|p - q|_F [m] of states (k, 6 f), by their positions."""
+    """Compute |p - q|_F [m] of the positions of states (k, 6 f)."""
     return np.linalg.norm((path - other)[:, : path.shape[1] // 2], axis=1)
 
 
 def _dop853(field: Callable[[float, State], State], y: State, times: Sequence[float], atol: float) -> State:
-    """The states (k, 6 f); each time ends a step, for interpolation would not be as exact."""
+    """Integrate the states (k, 6 f); each time ends a step, since interpolation would be less accurate."""
     path, begin = list[State](), 0.0
     for end in times:
         solved = solve_ivp(field, (begin, end), y, "DOP853", [end], rtol=RTOL, atol=atol)
@@ -124,7 +138,7 @@ def _dop853(field: Callable[[float, State], State], y: State, times: Sequence[fl
 
 
 def _adams(field: Callable[[float, State], State], y: State, times: Sequence[float], atol: float) -> State:
-    """The states (k, 6 f)."""
+    """Integrate the states (k, 6 f) by Adams methods."""
     solver = ode(field).set_integrator("vode", method="adams", rtol=RTOL, atol=atol, order=12, nsteps=10**8)
     solver.set_initial_value(y, 0.0)
     path = list[State]()

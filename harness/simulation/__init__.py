@@ -1,1 +1,1 @@
-"""One run: steps through time, their measurement, and what is looked at in them."""
+"""Simulation of one run: time stepping, its timing, and the instrumentation pass."""

@@ -1,16 +1,16 @@
-"""When a step is solved well enough: once what is left of its residual adds little to the step's own local error.
+"""Automatic tolerance of a step's solve: the residual may add little to the step's own local error.
 
     rate |dp|_M <= |residual|_Q,    |dp|_M + T rate |dp|_M <= PART (|e_p|_M + T |e_v|_M),    T the simulated time
 
-An error dp of the unknown moves the motion by dp now and by T rate dp until its end, as the local errors e_p of the
-positions and e_v of the velocities do. Backward differences of the velocity at the ends of steps tell both of the step
-before, for an integrator of order q; an embedded method does so too, where it has one, though of the lower order. The
-lesser counts:
+PART is LOCAL_ERROR_SHARE. An error dp of the stage changes the motion by dp now and by T rate dp at its end, as do the
+local errors e_p of the positions and e_v of the velocities. Both are estimated for the previous step by backward
+differences of the velocity at the ends of steps, for an integrator of order q. An embedded method also provides an
+estimate, though of the lower order. The smaller one is used:
 
     e_p = h |D^q v|_M / (q + 1)!,    e_v = |D^(q+1) v|_M / (q + 1)!
 
-What is left of the residuals themselves enters there by a factor of at most PART 2^(q+1)/(q + 1)! <= 0.2 a step: the
-noise of one step lets the next have less of it, and none can keep itself alive. The first steps have no past.
+The residuals themselves enter the differences with a factor of at most PART 2^(q+1)/(q + 1)! <= 0.2 per step. The noise
+of one step thus reduces the next tolerance and cannot sustain itself. The first steps have no history.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from solvers.integrators import Motion
 from solvers.problem import Positions, StopRule, Unsupported
 
 PART = 0.1
-"""Of the local error, what residuals may add to it."""
+"""Share of the local error that residuals may add to it."""
 FIRST = 1e-10
-"""The tolerance of the steps that have no past, relative to the residual at their start."""
+"""Relative tolerance of the steps without a history, with respect to the residual at their start."""
 _NOTHING = 1e-300
-"""Residuals [J^(1/2)] below it are none: a scene at rest is solved to round-off, which ends it at once."""
+"""Smallest tolerance [J^(1/2)]: a scene at rest is solved to round-off, which ends its solve at once."""
 
 
 @dataclass(frozen=True, slots=True)
 class Auto:
-    """`tolerance: auto` with a limit of iterations."""
+    """`tolerance: auto` with a maximum number of iterations."""
 
     iterations: int
 
@@ -44,25 +44,34 @@ Stop = StopRule | Auto
 
 
 def stop_rule(iterations: int, tolerance: float | str | None) -> Stop:
-    """Of a run's options."""
+    """Build the stop rule from a run's options."""
     return Auto(iterations) if isinstance(tolerance, str) else StopRule(iterations, tolerance)
 
 
 @dataclass(frozen=True, slots=True)
 class Stated:
-    """One rule for all steps."""
+    """One stop rule for all steps."""
 
     rule: StopRule
 
     def done(self, after: Motion, error: Motion | None) -> None:
-        """A step ended."""
+        """Record the end of a step."""
 
 
 class LocalErrors:
-    """Of the steps of one motion as they are done; `rule` is that of the next one."""
+    """Stop rule from the local errors of the previous steps of one motion; `rule` is that of the next step."""
 
     def __init__(self, auto: Auto, scene: Scene, now: Motion, frames: int) -> None:
-        """frames: up to the end. Raises Unsupported where steps differ in length."""
+        """Start with no history.
+
+        Args:
+          auto: limit of the iterations.
+          scene: scene that is stepped.
+          now: motion at the start.
+          frames: number of steps up to the end.
+        Raises:
+          Unsupported: the step size is not constant.
+        """
         if scene.alternate:
             raise Unsupported("tolerance: auto differences steps of one length, and the scene alternates two; give one")
         system, order = scene.system, scene.integrator.order
@@ -73,7 +82,7 @@ class LocalErrors:
         self.rule = StopRule(auto.iterations, FIRST)
 
     def done(self, after: Motion, error: Motion | None) -> None:
-        """A step ended so; error: what an embedded method tells of it."""
+        """Record the end of a step and its embedded error estimate, if any."""
         self._past.append(after.velocity)
         if len(self._past) < self._order + 2:
             return
@@ -85,9 +94,9 @@ class LocalErrors:
         self.rule = StopRule(self._iterations, within=max(within, _NOTHING))
 
     def _size(self, moved: Positions, sped: Positions) -> float:
-        """Of e_p [m] and e_v [m/s], (n, 3), together [kg^(1/2) m]."""
+        """Return the norm [kg^(1/2) m] of e_p [m] and e_v [m/s], (n, 3), combined."""
         return self._norm(moved) + self._span * self._norm(sped)
 
     def _norm(self, x: Positions) -> float:
-        """|x|_M over the free vertices."""
+        """Return |x|_M over the free vertices."""
         return float(np.sqrt((self._mass * x[self._free] ** 2).sum()))

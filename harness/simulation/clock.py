@@ -1,12 +1,13 @@
-"""A second opinion about times: wall and CPU time by other clocks, around what is timed.
+"""Cross-check of times: wall time and CPU time by other clocks around the timed work.
 
-    pass_seconds = wall time of all that a phase did, by the kernel's raw clock
-    lost         = pass_seconds - CPU time             the process was stopped, or others had its processor
-    |pass_seconds - sum of the phase's times| <= max(3 % of it, 1 ms), and below that by no more than half as much
-                                                 again as was lost besides: who comes back finds the caches cold
+    pass_seconds = wall time of all work of a phase, by the kernel's raw clock
+    lost         = pass_seconds - CPU time             the process was preempted or stopped
+    |pass_seconds - sum of the phase's times| <= max(3 % of it, 1 ms)
 
-The times themselves are taken by `perf_counter`, call by call, elsewhere: an error in one place shows in the other. A
-delay can fall between two calls and be in the first sum alone; then it is in `lost` as well, and no failure.
+The sum may be less than pass_seconds by another 1.5 times the lost time, since caches are cold after a preemption.
+
+The times themselves are measured by `perf_counter`, call by call, elsewhere, so that an error in one place shows in the
+other. A delay between two calls is in pass_seconds alone. It is then in `lost` as well and is no error.
 """
 
 from __future__ import annotations
@@ -27,21 +28,21 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 SHARE, LEAST, CALL = 0.03, 1e-3, 5e-6
-"""The share of a wall time, and the seconds, by which two clocks may differ; seconds that reading them may take each
-time, with the call in between: a tenth of the shortest steps there are."""
+"""Relative and absolute [s] difference allowed between two clocks, and time [s] to read them once, including the call
+in between: a tenth of the shortest steps."""
 COLD = 1.5
-"""Of the seconds that were lost, what may be missing: caches are cold after them."""
+"""Time that may be missing, relative to the lost time: caches are cold after a preemption."""
 
 ITERATION_SHARE = 0.15
-"""The share of an iteration's time by which that of its phases may differ before their rows say so."""
+"""Relative difference between an iteration's time and the sum of its phases from which on their rows are flagged."""
 
 
 class ClocksDisagree(RunFailed):
-    """Two clocks tell of different times."""
+    """Two clocks measured different times."""
 
 
 def measured_again(measure: Callable[P, T]) -> Callable[P, T]:
-    """The same, done once more where its clocks disagree; raises ClocksDisagree where they do so twice."""
+    """Repeat a measurement once if its clocks disagree; a second ClockMismatch is raised."""
 
     @wraps(measure)
     def twice(*arguments: P.args, **named: P.kwargs) -> T:
@@ -55,10 +56,11 @@ def measured_again(measure: Callable[P, T]) -> Callable[P, T]:
 
 @dataclass
 class Watch:
-    """Adds up the wall and the CPU time of what is done within it, again and again.
+    """Sum of wall and CPU time over repeated contexts.
 
-    threads: how many may compute. While all of them do, the process takes so many seconds of CPU time a second; while
-    one does, it is the thread that called, and takes one.
+    Attributes:
+      num_threads: number of threads that may compute. While all of them do, the process uses this many CPU seconds per
+        second; while one does, it is the calling thread, which uses one.
     """
 
     threads: int = 1
@@ -80,16 +82,16 @@ class Watch:
 
     @property
     def lost(self) -> float:
-        """Seconds in which nothing was computed."""
+        """Seconds in which the process did not compute."""
         return max(0.0, self.wall - max(self.thread, self.process / self.threads))
 
     @property
     def tolerance(self) -> float:
-        """Seconds by which another clock may differ."""
+        """Difference [s] allowed to another clock."""
         return max(SHARE * self.wall, LEAST, CALL * self.entered)
 
     def columns(self, what: str, seconds: Iterable[float]) -> dict[str, Any]:
-        """The columns of rows with these times of `what`, which were taken within. Raises ClocksDisagree."""
+        """Build the check columns of the rows with given times; raises ClockMismatch."""
         told = sum(seconds)
         if not -self.tolerance <= self.wall - told <= self.tolerance + COLD * self.lost:  # so that NaN fails too
             raise ClocksDisagree(
@@ -105,7 +107,7 @@ class Watch:
 
 
 class Clock:
-    """Times one piece of work after the other, each of which its watch sees as well; seconds: of the last one."""
+    """Stopwatch for successive pieces of work, which its watch times as well; `seconds` is the last time."""
 
     def __init__(self, watch: Watch) -> None:
         self.watch, self.seconds, self._began = watch, 0.0, 0.0
@@ -120,9 +122,12 @@ class Clock:
 
 
 def working(prepared: Prepared, problem: StepProblem) -> dict[str, Callable[[], object]]:
-    """A solver's phases, each of which was seen to do something: what it returned was erased, and was there again.
+    """Return a solver's phases after checking that each computes.
 
-    Raises RunFailed for one that does nothing.
+    The returned array of each phase is overwritten with NaN, and a second call must restore it.
+
+    Raises:
+      RunFailed: a phase does nothing.
     """
     phases = prepared.phases(problem)
     for phase, call in phases.items():

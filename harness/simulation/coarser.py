@@ -1,9 +1,9 @@
-"""From a mesh to a coarser one of the same body, and back: by weights that keep all linear functions of the rest shape.
+"""Transfer of motions between a mesh and a coarser one of the same body, exact for linear functions.
 
-    f(x) = sum_j w_j f(x_j)   with   sum_j w_j = 1,   sum_j w_j x_j = x,   and sum_j w_j^2 |x_j - x|^4 least
+    f(x) = sum_j w_j f(x_j)   with   sum_j w_j = 1,   sum_j w_j x_j = x,   and sum_j w_j^2 |x_j - x|^4 minimal
 
-over the vertices x_j nearest to x at rest (moving least squares: Lancaster and Salkauskas 1981). So a motion that is
-rigid, or an affine strain, passes without change, whatever the meshes, and a vertex that both have keeps its value.
+over the vertices x_j nearest to x at rest (moving least squares: Lancaster and Salkauskas 1981). Rigid motions and
+affine strains are therefore transferred exactly, for any meshes, and a vertex of both meshes retains its value.
 """
 
 from __future__ import annotations
@@ -19,12 +19,19 @@ from solvers.integrators import Motion
 from solvers.problem import Positions, Prepared
 
 _NEAREST = 12
-"""Vertices that a value is taken from: the corners of a cell of a block, and what lies beside."""
+"""Number of vertices that a value is interpolated from: the corners of a cell of a block and adjacent vertices."""
 
 
 @dataclass(frozen=True, eq=False)
 class Coarser:
-    """A scene on a coarser mesh, ready to be solved. restrict (coarse, fine), prolong (fine, coarse): see above."""
+    """A scene on a coarser mesh with a prepared solver.
+
+    Attributes:
+      scene: scene on the coarser mesh.
+      prepared: its prepared solver.
+      restriction: weights (coarse, fine).
+      prolongation: weights (fine, coarse).
+    """
 
     scene: Scene
     prepared: Prepared
@@ -33,21 +40,21 @@ class Coarser:
 
     @classmethod
     def of(cls, fine: Scene, coarse: Scene, prepared: Prepared) -> Coarser:
-        """Between two scenes that differ in their meshes' size alone."""
+        """Build the transfer between two scenes that differ only in the size of their meshes."""
         a, b = fine.mesh.rest, coarse.mesh.rest
         return cls(coarse, prepared, interpolation(a, b), interpolation(b, a))
 
     def down(self, motion: Motion) -> Motion:
-        """The motion of the coarser mesh's vertices."""
+        """Restrict a motion to the vertices of the coarser mesh."""
         return Motion(self.restrict @ motion.positions, self.restrict @ motion.velocity)
 
     def up(self, displacement: Positions) -> Positions:
-        """A displacement of the coarser mesh's vertices [m] as that of the finer one's, (n, 3)."""
+        """Prolong a displacement [m] of the coarser mesh's vertices to the finer mesh, (n, 3)."""
         return self.prolong @ displacement
 
 
 def interpolation(known: Positions, wanted: Positions) -> csr_array:
-    """The weights w (wanted, known), of points at rest (n, 3) [m]."""
+    """Build the interpolation weights (targets, sources) between rest positions, each (n, 3) [m]."""
     from scipy.spatial import cKDTree  # for those who need it
 
     tree: Any = cKDTree(known)
@@ -58,7 +65,7 @@ def interpolation(known: Positions, wanted: Positions) -> csr_array:
     away = (known[near] - wanted[:, None, :]) / scale[:, :, None]
     linear = np.concatenate([np.ones((*near.shape, 1)), away], axis=2)
     normal = np.einsum("nki,nk,nkj->nij", linear, inverse, linear)
-    # Points of a line or a plane leave directions undetermined, which need no weights.
+    # Points on a line or in a plane leave directions undetermined, which need no weights.
     pseudo_inverse: Any = np.linalg.pinv  # of stacks of matrices, which its types do not tell
     first = np.asarray(pseudo_inverse(normal, rcond=1e-13, hermitian=True), np.float64)[:, :, 0]
     weights = inverse * np.einsum("nki,ni->nk", linear, first)

@@ -1,6 +1,6 @@
-"""What a solver promises, checked where no clock runs: answers of the right kind, and no writing to what was given.
+"""Check of a solver's contract, outside of timed code: types of its results, and no writes to its inputs.
 
-Errors blame the solver's own line, which whoever wrote it can mend, and not the line of ours that stumbled over it.
+Error messages state the line of the solver that its author can correct, not the line of the harness that failed.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ Arrays = dict[str, NDArray[Any]]
 
 
 _METHODS, _TOLD = ("iterates", "solve", "residual_at", "phases"), ("choice", "facts")
-"""What a prepared solver has (`solvers.problem.Prepared`)."""
+"""Methods and properties of a prepared solver (`solvers.model.step_problem.PreparedSolver`)."""
 
 
 class Contract:
-    """What a solver was given before it prepared itself."""
+    """Copies of a solver's inputs before it is prepared."""
 
     def __init__(self, system: System, solver: Solver) -> None:
         self._system, self._solver = system, solver
         self._before = {name: array.copy() for name, array in _of_system(system).items()}
 
     def checked(self, prepared: Any) -> Checked:
-        """The prepared solver with a check around each solve. Raises RunFailed where preparing wrote to the system."""
+        """Wrap the prepared solver with a check of each solve; raises RunFailed if preparing modified the system."""
         line = _line(type(self._solver), "prepare")
         self.require_untouched(line)
         lacks = [name for name in _METHODS if not callable(getattr(prepared, name, None))]
@@ -46,21 +46,21 @@ class Contract:
         return Checked(prepared, self, frozenset(map(str, sources.of_class(type(self._solver)))))
 
     def require_untouched(self, line: str) -> None:
-        """Raise RunFailed where the system is not as it was."""
+        """Raise RunFailed if the system has been modified."""
         written = _differing(self._before, _of_system(self._system))
         if written:
             raise RunFailed(f"{line}: wrote to {', '.join(written)}, which it was given; copy what is to be changed")
 
 
 class Checked(Passing):
-    """A prepared solver whose every solve is checked."""
+    """A prepared solver with a check of every solve."""
 
     def __init__(self, prepared: Prepared, contract: Contract, own: Collection[str]) -> None:
         super().__init__(prepared)
         self._contract, self._own = contract, own
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """The solver's answer; raises RunFailed where it is none, or something was written to."""
+        """Return the solver's solution; raises RunFailed if it is invalid or an input was modified."""
         before = {name: array.copy() for name, array in _of_problem(problem).items()}
         found: Any = self._prepared.solve(problem, stop)
         usual: Any = getattr(self._prepared, "usual", self._prepared)
@@ -79,7 +79,7 @@ class Checked(Passing):
         return found
 
     def _writes(self, problem: StepProblem, stop: StopRule) -> str:
-        """The line that writes to the problem's arrays, which this time cannot be written to; "" where none shows."""
+        """Locate the line that writes to the problem by a solve with read-only arrays; "" where none is found."""
         for array in _of_problem(problem).values():
             array.flags.writeable = False
         try:
@@ -106,7 +106,7 @@ def _of_problem(problem: StepProblem) -> Arrays:
 
 
 def _restored(problem: StepProblem, arrays: Arrays) -> StepProblem:
-    """The problem with copies of these arrays."""
+    """Return the problem with copies of the given arrays."""
     copies = {name: array.copy() for name, array in arrays.items()}
     begun = {
         f.name: copies.get(f"problem.start.{f.name}", getattr(problem.start, f.name)) for f in fields(problem.start)
@@ -135,5 +135,5 @@ def _held(energy: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _differing(before: Arrays, after: Arrays) -> list[str]:
-    """The names of the arrays that are not the same, to the last bit."""
+    """Return the names of the arrays that are not bitwise identical."""
     return [name for name, array in before.items() if array.tobytes() != after[name].tobytes()]

@@ -1,14 +1,17 @@
-"""Motion that keeps to an error: each step's own estimate of its error decides how long the next one is.
+"""Adaptive time stepping: the error estimate of each step determines the next step size.
 
-    ratio = error/tolerance,   error = rms over free coordinates of (dp, span dv),   a step is taken where ratio <= 1
+    ratio = error/tolerance,   error = rms over free coordinates of (dp, span dv);   a step is accepted where ratio <= 1
     h' = 0.9 h min(ratio^(-1/k), h/h_before (ratio_before/ratio^2)^(1/k)),   k one more than the pair's lower order
 
-by what this step says, and by what it says beside the one before (Gustafsson 1994; Hairer and Wanner, Solving Ordinary
-Differential Equations II, section IV.8). An implicit step is a part 2^-level of the horizon, and begins at a multiple
-of itself: so few factors are needed, those used last are kept (`FACTORS`), and the horizon is met exactly. It doubles
-where h' is twice as long; a control by proportion and integral, as the explicit methods have it, would not get there.
-What the solver of a step leaves undone is a part of the tolerance (`ALGEBRAIC`). Positions between steps are those of
-Hermite's cubic. Solvers with steps of their own choose them within a frame.
+The second argument of min is the predictive controller, which also uses the previous step (Gustafsson 1994; Hairer and
+Wanner, Solving Ordinary Differential Equations II, section IV.8). The step size of an implicit step is 2^-level of the
+end time, and the step starts at a multiple of its size. Few factors are therefore needed, the last ones used are cached
+(`MAX_FACTOR_BYTES`), and the end time is met exactly. The step size is doubled where h' is at least twice as large. The
+proportional-integral controller of the explicit methods would not reach that threshold.
+
+The algebraic error of a step's solve is limited to a share of the tolerance (`ALGEBRAIC_ERROR_SHARE`). Positions
+between steps are interpolated by cubic Hermite polynomials. Substepping solvers choose their step sizes within a frame
+themselves.
 """
 
 from __future__ import annotations
@@ -30,35 +33,45 @@ from solvers.integrators import Motion, RungeKutta
 from solvers.problem import Positions, Prepared, Solution, Solver, StopRule, Unsupported
 
 SAFETY, DECREASE, LEAST = 0.9, 0.1, 1e-10
-"""Of the step that the error allows; what a step shrinks by at once, at most; ratios below count as this."""
+"""Safety factor on the step size; smallest factor by which one rejected step shrinks it; lower bound on error
+ratios."""
 ALGEBRAIC = 0.1
-"""Of the tolerance, what the unknowns' residuals may add to a step's estimate of its error."""
+"""Share of the tolerance that the residuals of the stages may add to a step's error estimate."""
 FACTORS = 2**28
-"""Bytes of factors that are kept, beside the two used last."""
+"""Memory limit [bytes] of cached factors; the two used last are always cached."""
 SHORTEST = 1e-9
-"""Steps [s] are not shorter."""
+"""Minimum step size [s]."""
 TRIES = 200
-"""Iterations of a solve; one that needs more is a step too long."""
+"""Maximum number of iterations of a solve; a step that needs more is rejected."""
 _STALLED = 10.0
-"""Times the residual asked, what one may have that nothing lowers any more."""
+"""Factor on the requested residual up to which a stalled solve is accepted."""
 _FINEST = 60
-"""Levels: times are whole numbers of 2^-60 of the horizon."""
+"""Maximum level: times are multiples of 2^-60 of the end time."""
 
 
 class TooSlow(Exception):
-    """The processor seconds that were allowed are over."""
+    """The limit on processor time is exceeded."""
 
 
 class Stuck(RunFailed):
-    """The error would need steps below the floor."""
+    """The error tolerance would need steps below the minimum step size."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Path:
-    """A motion that kept to an error. positions (k + 1, n, 3) [m] at the start and at the end of each of k frames;
-    steps accepted and rejected, shortest and longest [s]; factorisations; iterations of the steps' solves; wall
-    seconds, those of preparing the first steps apart; frames (k,): of them, in which each frame was reached, those of
-    one step in equal parts; processor: seconds of this thread, preparing included."""
+    """A motion within an error tolerance.
+
+    Attributes:
+      positions: positions (k + 1, n, 3) [m] at the start and at the end of each of k frames.
+      num_accepted_steps: number of accepted steps.
+      num_rejected_steps: number of rejected steps.
+      num_factorisations: number of factorisations.
+      num_iterations: number of iterations of the steps' solves.
+      step_size_range: smallest and largest step size [s].
+      wall_seconds: wall time [s], without the preparation of the first steps.
+      frame_seconds: wall time (k,) [s] in which each frame was computed; frames of one step share its time equally.
+      cpu_seconds: processor time [s] of this thread, including preparation.
+    """
 
     positions: Positions
     accepted: int
@@ -72,39 +85,54 @@ class Path:
 
 
 class Follower(Protocol):
-    """A way to follow the motion; order: by which its error falls with the step; even: whether its steps have one
-    length. A setting is the error [m] that each step may have, or, of even steps, how many times as many as the longest
-    there are."""
+    """Integrator of a motion to an error tolerance, or with a fixed step size.
+
+    `order` is the order of convergence of the error, `has_fixed_step` states whether the step size is fixed. A setting
+    is the error tolerance [m] of each step or, with a fixed step size, the number of steps relative to that with the
+    largest step size.
+    """
 
     even: ClassVar[bool] = False
 
     @property
     def order(self) -> int:
-        """Of the error."""
+        """The order of convergence of the error."""
         ...
 
     def first(self, tolerance: float) -> float:
-        """The setting to begin with, where steps may err by a tolerance [m]."""
+        """Return the initial setting for an error tolerance [m] of the steps."""
         return 1.0 if self.even else tolerance
 
     def changed(self, setting: float, ratio: float, order: float | None = None) -> float:
-        """The setting at which the error of the end is about so many times as large: that of a step of h is of order
-        h^(order + 1); order: as it was measured, its own if left out. There are no longer even steps than the
-        longest."""
+        """Return the setting at which the final error is scaled by about a given ratio.
+
+        The error of a step of size h is of order h^(order + 1). Fixed step sizes are not increased beyond the largest.
+
+        Args:
+          setting: present setting.
+          ratio: new error over present error.
+          order: measured order of convergence; the theoretical one if omitted.
+        """
         order = order or self.order
         if self.even:
             return max(1.0, setting * ratio ** (-1.0 / order))
         return setting * ratio ** ((order + 1.0) / order)
 
     def follow(self, setting: float, *, limit: float = inf) -> Path:
-        """The motion up to the horizon; limit: processor seconds.
+        """Integrate the motion up to the end time.
 
-        Raises TooSlow, Stuck."""
+        Args:
+          setting: error tolerance [m] or number of steps relative to the smallest number.
+          cpu_limit: limit on the processor time [s].
+        Raises:
+          TimeBudgetExceeded: the limit is exceeded.
+          StepSizeUnderflow: the tolerance would need steps below the minimum step size.
+        """
         ...
 
 
 class _Ladder:
-    """A scene and a prepared solver for each length of steps; factors beyond FACTORS bytes are forgotten."""
+    """A scene and a prepared solver for each step size; factors beyond MAX_FACTOR_BYTES are discarded, oldest first."""
 
     def __init__(self, bound: Callable[[float], Scene], solver: Solver, horizon: float) -> None:
         self._bound, self._solver, self._horizon = bound, solver, horizon
@@ -112,7 +140,7 @@ class _Ladder:
         self.made = 0
 
     def length(self, level: int) -> float:
-        """Of steps [s]."""
+        """Return the step size [s] of a level."""
         return self._horizon * 0.5**level
 
     def at(self, level: int) -> tuple[Scene, Prepared]:
@@ -127,14 +155,20 @@ class _Ladder:
 
 
 def _bytes(prepared: Prepared) -> float:
-    """Of a solver's factors: an index and a number an entry."""
+    """Estimate the memory of a solver's factors: an index and a number for each entry."""
     return 12.0 * sum(count for name, count in prepared.facts.items() if name.startswith("nnz") and "factor" in name)
 
 
 @dataclass(frozen=True, eq=False)
 class Implicit(Follower):
-    """By an integrator with an embedded error. bound: the scene at a length of steps [s]; frames: within the
-    horizon [s]."""
+    """Adaptive stepping by an integrator with an embedded error estimate.
+
+    Attributes:
+      build_scene: builds the scene with a given step size [s].
+      solver: solver of the steps.
+      t_end: end time [s].
+      frames: number of frames up to the end time.
+    """
 
     bound: Callable[[float], Scene]
     solver: Solver
@@ -143,16 +177,18 @@ class Implicit(Follower):
 
     @property
     def order(self) -> int:
-        """See Follower."""
+        """The order of convergence of the integrator."""
         return self.bound(self.horizon / self.frames).integrator.order
 
     def follow(self, setting: float, *, limit: float = inf) -> Path:
-        """See Follower. Raises Unsupported for an integrator without an error, and for filters of the velocity."""
+        """Integrate the motion; raises Unsupported for an integrator without an error estimate and for velocity
+        filters.
+        """
         return _Following(self, setting, limit).path()
 
 
 class _Following:
-    """One motion by steps of the ladder."""
+    """One motion with steps of the levels."""
 
     def __init__(self, asked: Implicit, tolerance: float, limit: float) -> None:
         self._asked, self._tolerance, self._limit, self._cpu = asked, tolerance, limit, thread_time()
@@ -174,7 +210,7 @@ class _Following:
         self._began, self._reached = perf_counter(), list[float]()
 
     def path(self) -> Path:
-        """The motion."""
+        """Integrate to the end and return the motion."""
         while self._ticks < 1 << _FINEST:
             self._one()
             if thread_time() - self._cpu > self._limit:
@@ -184,7 +220,7 @@ class _Following:
         return Path(np.array(self._seen), *counts, self._lengths, self._reached[-1], shared, processor)
 
     def _one(self) -> None:
-        """Try a step."""
+        """Try one step."""
         scene, prepared = self._ladder.at(self._level)
         h, time = scene.system.time_step, self._time(self._ticks)
         done = Stages(scene, self._now, self._acceleration, time).done(prepared, self._stop(h), FIRST_GUESSES["motion"])
@@ -205,7 +241,7 @@ class _Following:
         self._follow(max(ratio, LEAST), h)
 
     def _follow(self, ratio: float, h: float) -> None:
-        """Choose the next step's level after a step of h [s]."""
+        """Choose the next step's level after a step of size h [s]."""
         (before, other), power = self._before, self._power
         change = SAFETY * min(ratio ** (-1.0 / power), h / other * (before / ratio**2) ** (1.0 / power))
         self._before = ratio, h
@@ -218,14 +254,17 @@ class _Following:
         return self._asked.horizon * (ticks / (1 << _FINEST))
 
     def _stop(self, h: float) -> StopRule:
-        """What residuals, which are at least rate |dp|_M, may add to the estimate: rate h |dp|, and of velocities rate
-        times as much, of positions."""
+        """Build the stop rule from the share of the error estimate that residuals may cause.
+
+        A residual is at least rate |dp|_M. It adds rate h |dp| to the positions, and rate times as much to the
+        velocities.
+        """
         speed = self._method.speed
         part = ALGEBRAIC * self._tolerance / (speed * (1.0 + speed * self._span / h))
         return StopRule(TRIES, within=part * speed / h * (3.0 * len(self._free) * self._mass) ** 0.5)
 
     def _ratio(self, done: Done) -> float:
-        """The step's error over the tolerance; infinite where a solve did not end."""
+        """Return the step's error relative to the tolerance; infinite where a solve did not converge."""
         error, within = done.end.error, self._stop(self._ladder.length(self._level)).within
         if error is None or not all(_solved(solution, within) for _, solution in done.stages):
             return inf
@@ -235,7 +274,7 @@ class _Following:
         return found if isfinite(found) else inf
 
     def _show(self, after: Motion, time: float, h: float) -> None:
-        """The frames that end in a step."""
+        """Add the frames that end within a step."""
         until, reached = self._time(self._ticks), perf_counter() - self._began
         while len(self._seen) <= self._asked.frames and (len(self._seen) * self._span) <= until * (1.0 + 1e-12):
             part = min(1.0, (len(self._seen) * self._span - time) / h)
@@ -252,21 +291,34 @@ class _Following:
 
 
 def _solved(solution: Solution, within: float) -> bool:
-    """Whether a solve ended near enough: round-off may keep what nothing lowers any more from the very residual."""
+    """Return whether a solve ended with a small enough residual; a stalled solve is allowed a larger one, due to
+    round-off.
+    """
     if solution.stopped == "stalled":
         return solution.residual <= _STALLED * within
     return solution.stopped != "iterations"
 
 
 def shares(reached: Sequence[float]) -> tuple[float, ...]:
-    """The wall seconds of each frame, by those at which it was reached: frames of one step share its own evenly."""
+    """Return the wall time [s] of each frame from the times at which frames were reached.
+
+    Frames of one step share its time equally.
+    """
     gone = np.diff(np.array(reached), prepend=0.0)
     steps = np.cumsum(gone > 0.0)
     return tuple(float(gone[steps == step].mean()) for step in steps)
 
 
 def hermite(before: Motion, after: Motion, h: float, part: float) -> Positions:
-    """Positions (n, 3) [m] after a part of a step of h [s]: of order 3, by the motions at both ends."""
+    """Interpolate positions within a step by cubic Hermite polynomials of the motions at both ends.
+
+    Args:
+      before: motion at the start.
+      after: motion at the end.
+      h: step size [s].
+      part: fraction of the step.
+    Returns: positions (n, 3) [m], accurate to order 3.
+    """
     (p, v), (q, w), s = before, after, part
     if s == 1.0:
         return q

@@ -1,20 +1,21 @@
-"""The balance of energy of a motion: what it has after each step, and what its scene can have given it.
+"""Energy balance of a motion: its energy after each step, and the energy that the scene can have supplied.
 
     gain = E_n - E_0 - work of sources,    E = kinetic energy + potentials - load . (p - p_0)
 
-A motion of the scene keeps its energy or loses it: its gain is at most zero. Sources are forces that change, pins that
-move, velocity filters, and energies that a step states anew, such as contact with moving obstacles. Their work in a
-step counts where it is positive: what a scene dissipates hides no gain. With the step's unknown x it is
+The exact motion of the scene conserves or dissipates energy: its gain is at most zero. Sources are forces that change,
+moving pins, velocity filters, and lagged energies, which change between steps, such as contact with moving obstacles.
+Only positive work in a step counts, so that dissipation in the scene hides no gain. With the step's solution x the work
+is
 
     f . (p' - p)                                          of forces, at the mean velocity of the step at most
     w (held - x) . (q' - q), grad U(x) . (q' - q)         of penalty and exact pins, whose targets move from q to q'
-    e(x) - grad e(x) . (p' - p) - e_before(x_before)      of an energy e; not positive where it is convex and steady
+    e(x) - grad e(x) . (p' - p) - e_before(x_before)      of an energy e; not positive where it is convex and constant
 
-A gain is measured by the energy that was available: that of the start, what potentials released, UNCERTAINTY times the
-work of sources, and what the load gives to bodies at rest in one step. Pinned vertices have no kinetic energy. Energy
-that is stored counts where a spring is strained by more than its length: stiff springs that a solve leaves a little too
-long have much of it, and move nothing. Exact lengths count with the penalties of their Lagrangian
-(`solvers.energies.augmented`). What round-off adds is no gain.
+A gain is measured relative to the available energy: that of the start, the energy released by potentials,
+ROUNDOFF_SAFETY times the work of sources, and the energy that the load gives to bodies at rest in one step. Pinned
+vertices have no kinetic energy. Stored energy counts where a spring is strained by more than its length: stiff springs
+that a solve leaves slightly too long store much energy, but move nothing. Exact lengths contribute the penalties of
+their Lagrangian (`solvers.model.energies.augmented_lagrangian`). The round-off bound is subtracted from a gain.
 """
 
 from __future__ import annotations
@@ -34,26 +35,27 @@ from solvers.problem import Energy, Positions, ProjectiveEnergy, StepProblem, is
 from solvers.round_off import FACTOR, gradient_round_off
 
 GROWTH = 1.0
-"""Gain over the available energy above which it has grown without a source. Converged steps of implicit Euler gained
-nothing on the shipped scenes, 50 iterations of local-global 0.07 at most; midpoint gains 2 to 300,000 where its step is
-too long."""
+"""Ratio of gain to available energy above which energy has grown without a source. Converged steps of implicit Euler
+gained nothing on the shipped scenes, 50 iterations of local-global at most 0.07. Midpoint gains 2 to 300,000 where its
+step size is too large."""
 
 UNCERTAINTY = 10.0
-"""On the work of sources, which is told from the ends of steps: what is faster than a step may take more, or give it
-at another time. Dormand and Prince's method of order 8 gains 2.3 times the work of gusts that frames take as even."""
+"""Factor on the work of sources, which is estimated from the ends of steps. Motions faster than a step may receive more
+work, or at another time. Dormand and Prince's method of order 8 gains 2.3 times the work of gusts taken as constant
+within frames."""
 
 BLOW_UP = 1e6
-"""Gain over the available energy from which on a motion has diverged: it is a thousand times as fast as it can be."""
+"""Ratio of gain to available energy above which a motion has diverged: it is a thousand times as fast as possible."""
 
 
 class Balance(NamedTuple):
-    """After a step: gained [J], what no source accounts for; available [J], what there was to move with."""
+    """Energy balance after a step: gain [J] that no source explains, and available energy [J]."""
 
     gained: float
     available: float
 
     def exceeds(self, times: float) -> bool:
-        """Whether the gain is more than `times` what was available, or not a number."""
+        """Return whether the gain is NaN or more than a ratio of the available energy."""
         return not self.gained <= times * self.available
 
     def __str__(self) -> str:
@@ -61,15 +63,19 @@ class Balance(NamedTuple):
 
 
 class Growth(NamedTuple):
-    """first: the first frame after which energy has grown without a source; times: the largest gain over what was
-    available."""
+    """Energy growth without a source.
+
+    Attributes:
+      first_frame: first frame after which energy has grown.
+      max_ratio: largest ratio of gain to available energy.
+    """
 
     first: int
     times: float
 
     @classmethod
     def of(cls, by_frame: Mapping[int, Mapping[str, Any]]) -> Growth | None:
-        """Of a run's columns by frame; None where its energy has not grown."""
+        """Build from a run's columns by frame; None where its energy has not grown."""
         balances = {frame: Balance(row["energy_gained"], row["energy_available"]) for frame, row in by_frame.items()}
         grown = {frame: balance for frame, balance in balances.items() if balance.exceeds(GROWTH)}
         if not grown:
@@ -78,7 +84,7 @@ class Growth(NamedTuple):
 
 
 class EnergyBalance:
-    """The balance of one run, whose steps are given in their order."""
+    """Energy balance of one run, whose steps are added in order."""
 
     def __init__(self, scene: Scene) -> None:
         system = scene.system
@@ -93,7 +99,7 @@ class EnergyBalance:
         self._at_start = self._given = self._released = self._sources = 0.0
 
     def after(self, step: Step) -> Balance:
-        """The balance after the next step."""
+        """Return the balance after the next step."""
         with np.errstate(over="ignore", invalid="ignore"):
             return self._after(step)
 
@@ -118,8 +124,11 @@ class EnergyBalance:
         return Balance(gained, available)
 
     def _begin(self, stated: StepProblem, x: Positions, moved: Positions) -> None:
-        """Take the energy of the start. An energy that is infinite there, since its obstacle is where it will be at
-        the step's end, begins with what makes no work of it."""
+        """Set the energy of the start.
+
+        An energy may be infinite there, since its obstacle is already where it is at the step's end. It then starts
+        with the value for which its work is zero.
+        """
         potentials = self._of_each(stated, self._first, self._first, 0.0)
         for k, energy in enumerate(stated.energies):
             if not np.isfinite(potentials[k]):
@@ -134,8 +143,10 @@ class EnergyBalance:
         return 0.5 * float(self._mass @ np.einsum("ij,ij->i", v, v))
 
     def _of_each(self, stated: StepProblem, x: Positions, p: Positions, time: float) -> NDArray[np.float64]:
-        """The potentials [J] of the energies, of penalty pins, of the load and of exact lengths, for a step's unknown
-        x and end p, both (n, 3) [m], at a time [s]."""
+        """Return the potentials [J] of the energies, of penalty pins, of the load and of exact lengths.
+
+        Evaluated for a step's solution x and end p, both (n, 3) [m], at a time [s].
+        """
         soft, vertices, weight = stated.system.penalty
         away = p[vertices] - self._scene.pins_at(time)[soft]
         return np.array(
@@ -148,7 +159,7 @@ class EnergyBalance:
         )
 
     def _work(self, step: Step, before: NDArray[np.float64], after: NDArray[np.float64], moved: Positions) -> float:
-        """The work [J] of sources in a step, between potentials before and after it."""
+        """Return the work [J] of sources in a step between potentials before and after it."""
         scene, stated, x, free = self._scene, step.problem, step.solution.positions, self._free
         work = list[float]()
         for k, (made, energy) in enumerate(_pairs(stated)):
@@ -171,8 +182,11 @@ class EnergyBalance:
         return float(sum(max(0.0, one) for one in work))
 
     def _work_of_forces(self, step: Step, moved: Positions) -> float:
-        """What forces that change give [J] at the mean velocity of a step. A drag that is taken where a step starts,
-        and turns the motion around, gives more: that is the method's doing and no source."""
+        """Return the work [J] of changing forces at the mean velocity of a step.
+
+        A drag evaluated at the start of a step, which reverses the motion, gives more. That is an effect of the method
+        and not a source.
+        """
         p, mean = self._now.positions, 0.5 * (self._now.velocity + step.state.now.velocity)
         times = self._scene.time(step.index - 1), self._scene.time(step.index)
         return max(
@@ -182,7 +196,7 @@ class EnergyBalance:
 
     @staticmethod
     def _pull(stated: StepProblem, x: Positions) -> Positions:
-        """The gradient (n, 3) [N] at x of the energies that are the same in all steps."""
+        """Return the gradient (n, 3) [N] at x of the energies that are constant over all steps."""
         gradient = np.zeros_like(x)
         for made, energy in _pairs(stated):
             if not is_lagged(made):
@@ -190,14 +204,14 @@ class EnergyBalance:
         return gradient
 
     def _along(self, energy: Energy, x: Positions, moved: Positions) -> float:
-        """grad e(x) . (p' - p) [J] over the vertices that are free."""
+        """Return grad e(x) . (p' - p) [J] over the free vertices."""
         gradient = np.zeros_like(x)
         energy.add_gradient(x, gradient)
         return _dot(gradient[self._free], moved[self._free])
 
 
 def _pairs(stated: StepProblem) -> zip[tuple[Energy, Energy]]:
-    """Each energy as the system has it and as the step states it."""
+    """Return pairs of each energy of the system and its state in the step problem."""
     return zip(stated.system.energies, stated.energies, strict=True)
 
 
@@ -206,13 +220,15 @@ def _dot(a: Positions, b: Positions) -> float:
 
 
 def _largest_strain(scene: Scene, p: Positions) -> float:
-    """Of springs at p (n, 3) [m]."""
+    """Return the largest strain of the springs at p (n, 3) [m]."""
     return float(np.abs(strains(p, scene.springs.edges, scene.springs.rest_length)[0]).max(initial=0.0))
 
 
 def _round_off(stated: StepProblem, x: Positions, steps: int) -> float:
-    """What the round-off of so many steps may add up to [J], 0 where it overflows: (FACTOR delta_i)^2 / Q_ii moves a
-    vertex in each."""
+    """Return a bound on the accumulated round-off [J] of a number of steps, 0 where it overflows.
+
+    In each step, (FACTOR delta_i)^2 / Q_ii is the energy of the round-off at vertex i.
+    """
     free = stated.system.free
     Q = assemble(stated.system, [e for e in stated.system.energies if isinstance(e, ProjectiveEnergy)])
     each = float(np.sum((FACTOR * gradient_round_off(stated, x)[free]) ** 2 / Q.diagonal()[free]))

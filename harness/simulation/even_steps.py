@@ -1,4 +1,4 @@
-"""Motion by an integrator with steps of one length, solved as well as their own errors ask for (`tolerance: auto`)."""
+"""Time stepping by an integrator with a fixed step size and automatic tolerance (`tolerance: auto`)."""
 
 from __future__ import annotations
 
@@ -19,8 +19,14 @@ from solvers.problem import Solver
 
 @dataclass(frozen=True, eq=False)
 class ImplicitEven(Follower):
-    """bound: the scene at a length of steps [s]; frames: within the horizon [s], each of which has so many steps, at
-    least one."""
+    """Stepping by an integrator with a fixed step size.
+
+    Attributes:
+      build_scene: builds the scene with a given step size [s].
+      solver: solver of the steps.
+      t_end: end time [s].
+      frames: number of frames up to the end time; the setting is the number of steps of each, at least one.
+    """
 
     bound: Callable[[float], Scene]
     solver: Solver
@@ -31,11 +37,11 @@ class ImplicitEven(Follower):
 
     @property
     def order(self) -> int:
-        """See Follower."""
+        """The order of convergence of the integrator."""
         return self.bound(self.horizon / self.frames).integrator.order
 
     def follow(self, setting: float, *, limit: float = inf) -> Path:
-        """See Follower. Raises Unsupported as the solver does."""
+        """Integrate the motion; raises Unsupported as the solver does."""
         cpu, parts = thread_time(), ceil(setting)
         scene = self.bound(self.horizon / (self.frames * parts))
         ready, seen, reached, iterations = prepare(scene, self.solver), [start(scene).now.positions], list[float](), 0

@@ -1,9 +1,9 @@
-"""Wall times of a run: preparing, whole steps, and the local and the global step apart.
+"""Wall times of a run: preparation, whole steps, and the local and global step separately.
 
-The timed passes record nothing. They come after a pass in which the phases are timed apart, each frame's next to an
-iteration of its solve, which warms up all that the steps use, and they repeat the whole simulation `rounds` times.
-All that is timed is timed once more by a `Watch`. Where times do not matter (`roughly`), there is the second pass
-alone.
+The timed passes record nothing. They follow an untimed pass in which the phases of each frame are timed separately,
+next to an iteration of its solve. This pass warms up all code that the steps use. The timed passes then repeat the
+whole simulation `rounds` times. All times are checked by a second clock (`PhaseWatch`). Where times do not matter
+(`prepare_untimed`), only the instrumentation pass is run.
 """
 
 from __future__ import annotations
@@ -27,23 +27,24 @@ from harness.simulation.step import Step, prepare, simulate, start
 from solvers.problem import Positions, Prepared, Solver
 
 PHASE_REPEATS = 3
-"""How often the local and the global step are timed in each frame, after calls that warm up."""
+"""Number of timings of the local and the global step in each frame, after warm-up calls."""
 
 ITERATION = "iteration"
-"""The phase that the others should add up to: the time of a whole solve over its iterations, taken next to theirs."""
+"""Phase that the others should add up to: the time of a whole solve divided by its iterations, measured next to
+theirs."""
 
 NO_CLOCK: AbstractContextManager[None] = nullcontext()
 
 LARGEST = 1e150
-"""Coordinates [m] from this one on count as not finite: their squares, and so all energies, are infinite."""
+"""Magnitude [m] from which on coordinates count as not finite: their squares, and so all energies, are infinite."""
 
 
 class Diverged(Exception):
-    """Positions are not finite any more; the message says since when."""
+    """Positions are no longer finite; the message states since when."""
 
 
 class StepFailed(Exception):
-    """A step, of this frame, ended with an error, the cause of this one."""
+    """The step of a frame failed; the error is the cause of this one."""
 
     def __init__(self, frame: int) -> None:
         super().__init__(f"frame {frame} failed")
@@ -52,8 +53,16 @@ class StepFailed(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """One measured time: phase, frame (None where it has none), round, wall seconds of each of so many calls;
-    device: columns of a device, what a step took there by events, and its state after the round."""
+    """One measured time.
+
+    Attributes:
+      phase: name of the phase.
+      frame: frame, None where there is none.
+      round: number of the round.
+      seconds: wall time [s] per call.
+      num_calls: number of calls.
+      device_columns: columns of a device: times of a step by events, and its state after the round.
+    """
 
     phase: str
     frame: int | None
@@ -65,7 +74,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Settings:
-    """How a scene is stepped and how often: the stop rule, first guess, frames and rounds of a run."""
+    """Settings of a run's time stepping: stop criterion, initial guess, number of frames and of rounds."""
 
     stop: Stop
     first_guess: str
@@ -75,9 +84,15 @@ class Settings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """What the timed passes found: the prepared solver, all times, a watch over those of each phase (of steps over
-    those of each round), and the final positions (n, 3) [m]. Without such passes final is None, and a clock times the
-    steps of the second one."""
+    """Result of the timed passes.
+
+    Attributes:
+      prepared: prepared solver.
+      timings: all times.
+      watches: watch over the times of each phase, and over those of the steps of each round.
+      final_positions: final positions (n, 3) [m], None without timed passes.
+      clock: without timed passes, the stopwatch of the steps of the instrumentation pass.
+    """
 
     prepared: Prepared
     timings: list[Timing]
@@ -87,14 +102,23 @@ class Measured:
 
     @staticmethod
     def pass_of(timing: Timing) -> int | None:
-        """The round of a time's watch."""
+        """Return the round of a time's watch."""
         return timing.round if timing.phase == "step" else None
 
 
 def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[str], None]) -> Measured:
-    """Prepare cold and warm, then time phases and steps; `tick` is told each pass's name after each step.
+    """Prepare the solver cold and warm, then time phases and steps.
 
-    Raises Unsupported, NotPositiveDefinite, StepFailed, RunFailed where the solver breaks its contract.
+    Args:
+      scene: scene that is stepped.
+      solver: solver of the steps.
+      settings: settings of the time stepping.
+      tick: called with the name of the pass after each step.
+    Raises:
+      Unsupported: the solver does not support the scene.
+      NotPositiveDefinite: a matrix is not positive definite.
+      StepError: a step failed.
+      RunFailed: the solver violates its contract.
     """
     timings: list[Timing] = []
     watches: dict[tuple[str, int | None], Watch] = {}
@@ -149,7 +173,7 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
 
 
 class _Steps(Clock):
-    """Times one step after the other, and keeps their times."""
+    """Stopwatch that records the times of successive steps."""
 
     def __init__(self, watch: Watch, timings: list[Timing]) -> None:
         super().__init__(watch)
@@ -161,8 +185,11 @@ class _Steps(Clock):
 
 
 def roughly(scene: Scene, solver: Solver) -> Measured:
-    """Prepare once, for a second pass that is the only one, whose clock is `Measured.clock`; whether the solver writes
-    to what it was given is not checked. Raises Unsupported, NotPositiveDefinite."""
+    """Prepare once, for an instrumentation pass without timed passes.
+
+    The clock of that pass is `RunMeasurement.clock`. Writes of the solver to its inputs are not checked. Raises
+    Unsupported, NotPositiveDefinite.
+    """
     preparing, stepping = (Watch(numba.get_num_threads()) for _ in range(2))
     clock = Clock(preparing)
     with clock:
@@ -175,7 +202,11 @@ def roughly(scene: Scene, solver: Solver) -> Measured:
 def steps(
     scene: Scene, prepared: Prepared, settings: Settings, clock: AbstractContextManager[None] = NO_CLOCK
 ) -> Iterator[Step]:
-    """The run's steps, each done within the clock; raises StepFailed, from Diverged where a position is not finite."""
+    """Iterate over the run's steps, each computed within the clock.
+
+    Raises:
+      StepError: a step failed, or, caused by DivergenceError, a position is not finite.
+    """
     run = simulate(scene, prepared, settings.stop, first_guess=settings.first_guess, frames=settings.frames)
     for frame in range(1, settings.frames + 1):
         try:
@@ -189,5 +220,5 @@ def steps(
 
 
 def digest(p: Positions) -> str:
-    """SHA-256 of positions (n, 3), so that two passes can be compared to the last bit."""
+    """Return the SHA-256 of positions (n, 3), to compare two passes bitwise."""
     return hashlib.sha256(np.ascontiguousarray(p).tobytes()).hexdigest()

@@ -1,6 +1,6 @@
-"""The second pass of a run: the same steps again, with everything that is looked at.
+"""Instrumentation pass of a run: repeats the steps and computes the columns of the solution.
 
-A thread beside the solver looks at each step while the solver does the next, one step behind at most.
+A second thread processes each step while the solver computes the next one, at most one step behind.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from solvers.energies.augmented import off
 from solvers.problem import Positions, Prepared
 
 _OWN = ("springs", "inertia", "force", "pins")
-"""Terms of the objective that have a column of their own."""
+"""Terms of the objective that have their own columns."""
 
 _WORST = ("iterations", "stalled", "tolerance", "floor")
-"""What may end a solve, the least welcome first."""
+"""Termination reasons of a solve, least desirable first."""
 
 
 def observe(
@@ -45,12 +45,21 @@ def observe(
     tick: Callable[[], None],
     clock: AbstractContextManager[None] = NO_CLOCK,
 ) -> dict[int, dict[str, Any]]:
-    """Simulate a run's frames and return, by frame, the columns of its rows that tell of the solution.
+    """Simulate a run's frames and return the solution columns of its rows by frame.
 
-    recorder: takes every frame, and how the solve converged in the frames `convergence`; stored: where to put the
-    positions after each step, (frames, n, 3) [m]; sample: called with each frame and its positions (n, 3) [m]; judge:
-    adds what an oracle says of each step; tick: called after each step; clock: within which each is done. Raises
-    StepFailed, from Diverged where the energy blows up.
+    Args:
+      scene: scene that is stepped.
+      prepared: prepared solver.
+      settings: settings of the time stepping.
+      recorder: recorder of every frame and of the convergence in the frames `convergence_frames`.
+      convergence_frames: frames whose convergence is recorded.
+      positions_out: output array for the positions after each step, (frames, n, 3) [m].
+      sample_frame: called with each frame and its positions (n, 3) [m].
+      verify_step: returns the accuracy columns of each step.
+      tick: called after each step.
+      clock: context within which each step is computed.
+    Raises:
+      StepError: a step failed, or, caused by DivergenceError, the energy diverges.
     """
     found: dict[int, dict[str, Any]] = {}
     energy = EnergyBalance(scene)
@@ -74,14 +83,14 @@ def observe(
         for step in steps(scene, prepared, settings, clock):
             if looked:
                 looked.result()  # raises here what went wrong there
-            # A solver's memory is one solve's: not beside the next step.
+            # A solver's memory may be reused by the next solve, so it is not read concurrently with the next step.
             balance = energy.after(step)
             if balance.exceeds(BLOW_UP):
                 raise StepFailed(step.index) from Diverged(f"from frame {step.index} on the motion has {balance}")
             looked = beside.submit(look, step, returned_residual(prepared, step), balance)
             if recorder and step.index in convergence:
                 norm = EnergyNorm(step.problem.system)
-                # A further round of friction starts where the one before ended: the first one is drawn.
+                # A further round of friction starts where the previous one ended; only the first one is drawn.
                 shown = step.counts[0] if step.friction else step.solution.iterations
                 curve = trace(prepared, step.problem, norm, shown)
                 looked.result()
@@ -93,7 +102,14 @@ def observe(
 
 
 def columns(scene: Scene, step: Step, terms: Mapping[str, float], residual: float) -> dict[str, Any]:
-    """What a step's rows tell of its solution; terms: of the objective [J]; residual [J^(1/2)]: at its positions."""
+    """Build the solution columns of a step's rows.
+
+    Args:
+      scene: scene that is stepped.
+      step: completed step.
+      terms: terms of the objective [J].
+      residual: residual norm [J^(1/2)] at the step's positions.
+    """
     p, s = step.positions, step.solution
     return {
         **{f"energy_{name}": terms[name] for name in _OWN if name in terms},
@@ -118,7 +134,7 @@ def columns(scene: Scene, step: Step, terms: Mapping[str, float], residual: floa
 
 
 def acting(step: Step) -> dict[str, Positions]:
-    """The forces (n, 3) [N] that a step's end is in balance with, by name: external ones, and those of contact."""
+    """Collect the external and contact forces (n, 3) [N] at a step's end, by name."""
     found, p = {"external": step.problem.force}, step.solution.positions
     contacts = [energy for energy in step.problem.energies if isinstance(energy, Contact)]
     if contacts:
@@ -130,21 +146,35 @@ def acting(step: Step) -> dict[str, Positions]:
 
 
 def penetration(scene: Scene, p: Positions, time: float) -> float | None:
-    """How deep the deepest vertex at p (n, 3) [m] is inside an obstacle at a time [s]; None without obstacles."""
+    """Compute the largest depth [m] of a vertex inside an obstacle; None without obstacles.
+
+    Args:
+      scene: scene with obstacles.
+      p: positions (n, 3) [m].
+      time: time [s].
+    """
     contacts = [energy for energy in scene.system.energies if isinstance(energy, Contact)]
     inside = [-one.distance(p, time).min(initial=0.0) for contact in contacts for one in contact.obstacles]
     return float(max(inside)) if inside else None
 
 
 def intersections(scene: Scene, p: Positions, time: float) -> int | None:
-    """How often the mesh passes through itself or an obstacle's surface at p (n, 3) [m] and a time [s], by edges and
-    triangles; None where no effect sees to that."""
+    """Count the edge-triangle intersections of the mesh with itself and with obstacle surfaces.
+
+    Args:
+      scene: scene with obstacles.
+      p: positions (n, 3) [m].
+      time: time [s].
+    Returns: their number; None where no effect prevents intersections.
+    """
     return sum(len(one.crossings(p, time)) for one in scene.apart) if scene.apart else None
 
 
 def returned_residual(prepared: Prepared, step: Step) -> float:
-    """The residual [J^(1/2)] at the positions that a step's solve returned: an iteration's work where it knows that of
-    the iterate before alone."""
+    """Compute the residual [J^(1/2)] at the positions that a step's solve returned.
+
+    It costs an iteration where the solver reports the residual of the previous iterate only.
+    """
     solution = step.solution
     if solution.residual_of == "previous":
         return prepared.residual_at(step.problem, solution.positions)
@@ -152,13 +182,15 @@ def returned_residual(prepared: Prepared, step: Step) -> float:
 
 
 def stopped(step: Step) -> str:
-    """What ended the iterations of the unknown that was left farthest from what was asked."""
+    """Return the termination reason of the least converged stage."""
     return min((solution.stopped for _, solution in step.stages), key=_WORST.index)
 
 
 def strain_of(scene: Scene, p: Positions) -> dict[str, float]:
-    """The columns of |length / rest length - 1| of the springs at p (n, 3) [m]: its largest value, and its 99th
-    percentile; both 0 without springs."""
+    """Compute the columns of |length / rest length - 1| of the springs at p (n, 3) [m].
+
+    The columns are its largest value and its 99th percentile; both are 0 without springs.
+    """
     of_spring, _ = strains(p, scene.springs.edges, scene.springs.rest_length)
     strain = np.abs(of_spring)
     percentile = float(np.percentile(strain, 99)) if len(strain) else 0.0
@@ -166,16 +198,21 @@ def strain_of(scene: Scene, p: Positions) -> dict[str, float]:
 
 
 def off_of(scene: Scene, p: Positions) -> float | None:
-    """The largest error of a length that is exact at p (n, 3) [m], over the longest allowed; None where none is."""
+    """Compute the largest error of an exact length at p (n, 3) [m], relative to the maximum length; None without any.
+    """
     errors = [np.abs(off(lengths, p) / lengths.high).max(initial=0.0) for lengths in scene.system.lengths]
     return float(max(errors)) if errors else None
 
 
 def require_numbers(by_frame: Mapping[int, dict[str, Any]], *, minimises: bool, tolerance: bool) -> None:
-    """What is measured of each frame is a number: raises StepFailed, from Diverged, where one is infinite or NaN.
+    """Require finite columns of each frame, and set columns that do not apply to None.
 
-    minimises: whether the solver has a residual; tolerance: whether it was to keep to one, which takes a yardstick.
-    What it has not becomes null.
+    Args:
+      by_frame: columns by frame.
+      is_minimiser: whether the solver has a residual.
+      has_rtol: whether it has a relative tolerance, which uses the initial residual.
+    Raises:
+      StepError: caused by DivergenceError, where a column is infinite or NaN.
     """
     known = {"residual": minimises, "last_residual": minimises, "yardstick": minimises and tolerance}
     for frame, columns in by_frame.items():

@@ -1,7 +1,7 @@
-"""Steps of a solver on a device: a host states each, and what it brings and leaves is copied.
+"""Time stepping with a solver on a device: the host builds each step problem, and its data is copied.
 
-A timed step does the iterations that the same step took in an untimed pass, and asks for no residual. The passes are
-the same to the last bit: residuals, by which the untimed ones end, change nothing.
+A timed step repeats the number of iterations of the same step in an untimed pass, without computing residuals. The
+passes are bitwise identical: residuals terminate the untimed solves, but change nothing else.
 """
 
 from __future__ import annotations
@@ -16,41 +16,41 @@ from solvers.problem import Prepared, Solution, StepProblem, StopRule
 
 
 class OnDevice(Passing):
-    """A prepared solver on a device, and how many iterations each of its solves took."""
+    """A prepared solver on a device that records the number of iterations of each solve."""
 
     def __init__(self, prepared: Prepared, usual: Remote) -> None:
-        """usual: the solver of the scene's own system, of two."""
+        """Wrap a prepared solver; `usual` is the one of the scene's own system, of two."""
         super().__init__(prepared)
         self.usual = usual
         self._counts = list[int]()
 
     def keep(self, step: Step) -> None:
-        """Take note of what a step took; steps come in their order."""
+        """Record the iteration counts of a step; steps are added in order."""
         self._counts += step.counts
 
     def again(self) -> Replayed:
-        """The same iterations, from the first step on."""
+        """Return a solver that repeats the same iteration counts from the first step on."""
         return Replayed(self._prepared, self._counts)
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """The solver's answer."""
+        """Return the solver's solution."""
         return self._prepared.solve(problem, stop)
 
 
 class Replayed(Passing):
-    """A prepared solver on a device, which does as many iterations in each solve as it is given."""
+    """A prepared solver on a device with a given number of iterations in each solve."""
 
     def __init__(self, prepared: Prepared, counts: Sequence[int]) -> None:
         super().__init__(prepared)
         self._left, self._told = iter(counts), dict[str, float]()
 
     def told(self) -> dict[str, float | None]:
-        """Columns of what was solved since the last call: seconds by events on the device."""
+        """Return the timing columns since the last call: times [s] by events on the device."""
         found, self._told = self._told, {}
         return {**found}
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """The solution after the given iterations, without a residual."""
+        """Return the solution after the given number of iterations, without a residual."""
         one: Any = self._prepared.of(problem) if isinstance(self._prepared, Turns) else self._prepared
         found, marks = one.replay(problem, next(self._left))
         for name, value in seconds(marks).items():
@@ -59,13 +59,13 @@ class Replayed(Passing):
 
 
 def on_device(prepared: Prepared) -> OnDevice | None:
-    """A prepared solver whose timed steps are replayed on its device; None of one that computes on the processor."""
+    """Wrap a prepared solver for replay on its device; None for one that runs on the processor."""
     usual = prepared.usual if isinstance(prepared, Turns) else prepared
     return OnDevice(prepared, usual) if isinstance(usual, Remote) else None
 
 
 def seconds(marks: Marks | None) -> dict[str, float]:
-    """Columns of a step by events on the stream: of kernels, and of transfers; none of a device without a clock."""
+    """Compute the times [s] of a step's kernels and transfers by events on the stream; empty without events."""
     if marks is None:
         return {}
     copies = marks.began.elapsed_time(marks.up) + marks.done.elapsed_time(marks.down)  # in milliseconds
@@ -73,5 +73,5 @@ def seconds(marks: Marks | None) -> dict[str, float]:
 
 
 def columns(prepared: Prepared) -> dict[str, Any]:
-    """What rows tell of a prepared solver's device; nothing of one on the processor."""
+    """Build the device columns of a prepared solver; empty for one on the processor."""
     return dict(prepared.usual.columns) if isinstance(prepared, OnDevice) else {}

@@ -1,5 +1,6 @@
-"""Motion that keeps to an error by a solver with steps of its own within frames (`own_steps` of its `about`): they
-are chosen by their error, or have one length, the longest that is stable or shorter.
+"""Time stepping to an error tolerance by a solver with substeps within frames (`own_steps` in its metadata).
+
+The substeps are adaptive, or have a fixed size: the largest stable one or a smaller one.
 """
 
 from __future__ import annotations
@@ -21,50 +22,61 @@ from solvers.problem import Positions, Solver, StepProblem, Unsupported
 
 
 class _Stepping(Protocol):
-    """A prepared solver with steps of its own."""
+    """A prepared solver with substeps."""
 
     @property
     def order(self) -> int:
-        """Of the error."""
+        """The order of convergence of the error."""
         ...
 
     @property
     def evaluations(self) -> int:
-        """Of the forces, in a step."""
+        """The number of force evaluations in a step."""
         ...
 
     @property
     def factorisations(self) -> int:
-        """In a step that is tried, 0 of explicit methods."""
+        """The number of factorisations in a tried step, 0 for explicit methods."""
         ...
 
     def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, Sequence[float]]:
-        """Positions [m] and velocities [m/s] at the frame's end, and steps accepted, rejected and the last one's length
-        [s]; h: the first one's."""
+        """Integrate one frame.
+
+        Args:
+          problem: step problem of the frame.
+          h: first step size [s].
+        Returns: positions [m] and velocities [m/s] at the frame's end, and the number of accepted steps, the number of
+          rejected steps and the last step size [s].
+        """
         ...
 
 
 @runtime_checkable
 class Controlled(_Stepping, Protocol):
-    """It can choose its steps within a frame by their error."""
+    """A solver with adaptive steps within a frame."""
 
     def within(self, tolerance: float) -> Controlled:
-        """The same with an error of each step [m]. Raises Unsupported where it chooses none."""
+        """Return the solver with an error tolerance [m] of each step; raises Unsupported where it has no error
+        estimate.
+        """
         ...
 
 
 @runtime_checkable
 class Even(_Stepping, Protocol):
-    """Its steps within a frame have one length, the longest that is stable."""
+    """A solver with fixed steps within a frame, of the largest stable size."""
 
     def refined(self, times: float) -> Even:
-        """The same with so many times the steps."""
+        """Return the solver with the number of steps multiplied by a factor."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Own(Follower):
-    """By a solver that chooses its steps within frames. scene: its step is a frame, its integrator `own`."""
+    """Stepping by a solver with adaptive substeps within frames.
+
+    The step of the scene is a frame, and its integrator is `own`.
+    """
 
     scene: Scene
     solver: Solver
@@ -72,7 +84,7 @@ class Own(Follower):
 
     @property
     def order(self) -> int:
-        """See Follower."""
+        """The order of convergence of the solver."""
         return self._order
 
     @cached_property
@@ -80,8 +92,11 @@ class Own(Follower):
         return self._prepared(1.0)[1].order
 
     def follow(self, setting: float, *, limit: float = inf) -> Path:
-        """See Follower. Raises Unsupported as the solver does, and for what changes in a frame where that would not be
-        noticed by the errors of steps."""
+        """Integrate the motion.
+
+        Raises Unsupported as the solver does, and for quantities that change within a frame where the error estimate
+        would not detect it.
+        """
         cpu = thread_time()
         scene, ready, pieces = self._prepared(setting)
         state, began = start(scene), perf_counter()
@@ -107,7 +122,7 @@ class Own(Follower):
         return Path(np.array(seen), *counts, (mean, mean), reached[-1], shares(reached), thread_time() - cpu)
 
     def _prepared(self, setting: float) -> tuple[Scene, _Stepping, int]:
-        """The scene, what steps it, and in how many pieces each frame is done."""
+        """Return the scene, the prepared solver and the number of pieces of each frame."""
         if changes := _changes(self.scene):
             raise Unsupported(f"takes {' and '.join(changes)} as even within a frame, which is of order 1")
         ready = self.solver.prepare(self.scene.system)
@@ -118,9 +133,11 @@ class Own(Follower):
 
 @dataclass(frozen=True, eq=False)
 class OwnEven(Own):
-    """By a solver whose steps have one length. bound: the scene at a length of steps [s].
+    """Stepping by a solver with a fixed substep size.
 
-    What changes within a frame is taken as even within so many pieces of each, which is of order 1."""
+    Quantities that change within a frame are taken as constant within each of a number of pieces, which is of order 1.
+    `build_scene` builds the scene with a given step size [s].
+    """
 
     bound: Callable[[float], Scene]
 
@@ -140,6 +157,6 @@ class OwnEven(Own):
 
 
 def _changes(scene: Scene) -> list[str]:
-    """What solvers with steps of their own take as even within a frame, though it changes."""
+    """List the quantities that substepping solvers take as constant within a frame although they change."""
     there = ("forces of place, speed and time", scene.forces), ("moving pins", scene.moving)
     return [what for what, some in there if some]

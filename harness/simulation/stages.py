@@ -1,9 +1,9 @@
-"""A step of several unknowns: the integrator asks for one after the other, a prepared solver answers each.
+"""A step of several stages: the integrator defines them one after the other, a prepared solver solves each.
 
-All forces, pins and energies are those of the time of the unknown. What the step formula takes as given - forces that
-depend on the motion, directions of dashpots - is taken where the unknown is expected first; the unknown is solved for
-again with it where that led, `order - 2` times: each time it is right to one order more. Exact pins have the very
-velocity of their motion. Filters of the velocity, and contact, belong to the whole step and have order 1.
+All forces, pins and energies are evaluated at the time of the stage. Lagged quantities - forces that depend on the
+motion, directions of dashpots - are evaluated at the expected position of the stage first. The stage is then solved
+again `order - 2` times with the quantities at the last solution; each solve gains one order of accuracy. Exact pins
+have the exact velocity of their motion. Velocity filters and contact apply to the whole step and are of order 1.
 """
 
 from __future__ import annotations
@@ -24,8 +24,14 @@ Guess = Callable[[StepProblem], StepProblem]
 
 
 class Done(NamedTuple):
-    """Each unknown's problem and solution; how the step ends; the iterations of each solve; how friction was solved, of
-    the worst unknown."""
+    """Result of a step.
+
+    Attributes:
+      stages: problem and solution of each stage.
+      end: end of the step.
+      iteration_counts: number of iterations of each solve.
+      friction_rounds: friction rounds of the worst stage.
+    """
 
     stages: tuple[tuple[StepProblem, Solution], ...]
     end: End
@@ -34,10 +40,10 @@ class Done(NamedTuple):
 
 
 class Stages:
-    """One step of a scene from a motion at a time, which is filtered already."""
+    """The stages of one step of a scene, from a filtered motion at a time."""
 
     def __init__(self, scene: Scene, now: Motion, acceleration: Positions | None, time: float) -> None:
-        """acceleration: at the start, (n, 3) [m/s^2], None where it is not known."""
+        """Start a step; `acceleration` (n, 3) [m/s^2] is that at the start, None where it is unknown."""
         method = scene.integrator
         assert isinstance(method, Staged)
         self.scene, self.time, pins = scene, time, scene.system.pins
@@ -49,7 +55,13 @@ class Stages:
         self._again = method.order - 2 if scene.forces or any(map(_lags, scene.system.energies)) else 0
 
     def done(self, prepared: Prepared, stop: StopRule, guess: Guess) -> Done:
-        """The step; prepared: for the scene's system."""
+        """Solve all stages of the step.
+
+        Args:
+          prepared: solver prepared for the scene's system.
+          stop: stop rule of each solve.
+          guess: function that sets the initial guess of a problem.
+        """
         found, counts, unknown = list[tuple[StepProblem, Solution]](), list[int](), next(self._unknowns)
         friction = list[FrictionRounds]()
         while True:
@@ -69,12 +81,16 @@ class Stages:
                 return Done(tuple(found), self._ended(ended.value), tuple(counts), worst)
 
     def first(self) -> StepProblem:
-        """The problem of the first unknown."""
+        """Build the problem of the first stage."""
         return self.stated(next(self._unknowns))
 
     def stated(self, unknown: Unknown, expected: Positions | None = None) -> StepProblem:
-        """An unknown's problem, its first guess the current positions; expected: where it is thought to be, (n, 3) [m],
-        by the motion so far if left out."""
+        """Build a stage's problem, with the current positions as initial guess.
+
+        Args:
+          stage: stage of the integrator.
+          expected: expected solution (n, 3) [m]; extrapolated from the motion if omitted.
+        """
         scene, system = self.scene, self.scene.system
         until = self.time + unknown.when * system.time_step
         held, moving = scene.pins_at(until), scene.pins_moving(until)
@@ -102,7 +118,7 @@ class Stages:
         return Solved(x, stated.start.velocity_at(x), acceleration)
 
     def _ended(self, end: End) -> End:
-        """Exact pins are where their motion has them, and move as it does."""
+        """Set the positions and velocities of exact pins at the end of the step."""
         return end._replace(motion=self._carried(end.motion, self.time + self.scene.system.time_step))
 
     def _carried(self, motion: Motion, time: float) -> Motion:
@@ -114,7 +130,7 @@ class Stages:
         return Motion(p, v)
 
     def _acceleration(self) -> Positions:
-        """M^-1 of all forces at the start, (n, 3) [m/s^2], zero at exact pins. Raises Unsupported."""
+        """Compute M^-1 of all forces at the start, (n, 3) [m/s^2], zero at exact pins; raises Unsupported."""
         (p, v), system = self.now, self.scene.system
         require_mass(self.scene)
         begun = Start(p, v, self.time, p - v / system.rate, system.rate, self.time)
@@ -126,15 +142,15 @@ class Stages:
 
 
 def require_mass(scene: Scene) -> None:
-    """Raise Unsupported where an integrator needs the acceleration of a vertex without mass."""
+    """Raise Unsupported if an integrator needs the acceleration of a massless vertex."""
     method, system = scene.integrator, scene.system
     if isinstance(method, Staged) and method.starts and not system.mass[system.free].all():
         raise Unsupported(
-            "the integrator starts from the acceleration, and vertices without mass have none; give them mass, or take "
+            "the integrator starts from the acceleration, and vertices without mass have none; give them mass, or use "
             "one that does not need it: sdirk-2, sdirk-3, sdirk-4, implicit-euler, bdf2, midpoint"
         )
 
 
 def _lags(energy: object) -> bool:
-    """Whether an energy takes something where the unknown is expected."""
+    """Return whether an energy depends on the expected solution of a stage."""
     return getattr(energy, "lagged", False)

@@ -1,4 +1,4 @@
-"""Steps through time: an integrator makes the step's problem, a prepared solver its minimiser, and that the motion."""
+"""Time loop: an integrator builds each step's problem, and a prepared solver minimises it."""
 
 from __future__ import annotations
 
@@ -25,9 +25,15 @@ from solvers.registry import SOLVERS, load, name_of
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """now, the motion at the start of the next step; before, one step earlier and filtered, None where there is none;
-    index of the last step, 0 at the start; acceleration (n, 3) [m/s^2] now, None where it is not known; kept: of the
-    last step's solution."""
+    """State between two steps.
+
+    Attributes:
+      motion: motion at the start of the next step.
+      previous_motion: motion one step earlier, filtered; None where there is none.
+      index: index of the last step, 0 at the start.
+      acceleration: acceleration (n, 3) [m/s^2] at `motion`, None where it is unknown.
+      warm_start: warm-start data of the last step's solution.
+    """
 
     now: Motion
     before: Motion | None
@@ -38,11 +44,17 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """A step that was done: its problem, its solution, the state after it and the iterations of each of its solves.
+    """A completed step.
 
-    A step of several unknowns has the problem and the solution of the last one; stages: those of all, in their order;
-    stop: by which each was solved; friction: how friction was solved; error: of the motion, by an embedded method, None
-    without one.
+    Attributes:
+      problem: step problem; that of the last stage in a step of several stages.
+      solution: its solution.
+      state: state after the step.
+      iteration_counts: number of iterations of each solve.
+      stages: problem and solution of each stage, in order.
+      stop_rule: stop rule of each solve.
+      friction_rounds: friction rounds of the step.
+      local_error: error of the motion by an embedded method, None without one.
     """
 
     problem: StepProblem
@@ -56,36 +68,43 @@ class Step:
 
     @property
     def iterations(self) -> int:
-        """Of all solves."""
+        """The total number of iterations of all solves."""
         return sum(self.counts)
 
     @property
     def index(self) -> int:
-        """Counted from 1."""
+        """The number of the step, counted from 1."""
         return self.state.index
 
     @property
     def positions(self) -> Positions:
-        """Where the vertices are after the step, (n, 3) [m]: not the solution, which may lie in the step's middle."""
+        """The positions (n, 3) [m] after the step; these differ from a solution at the middle of the step."""
         return self.state.now.positions
 
 
 def start(scene: Scene) -> State:
-    """The scene's start, moving with its velocity and its spin."""
+    """Build the scene's initial state, with its velocity and its spin."""
     p = scene.start.positions(scene.mesh.rest)
     return State(Motion(p, scene.velocity + scene.start.velocity(p)), None, 0)
 
 
 def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
-    """The next step's problem from a state, that of its first unknown; `first_guess` is a key of `FIRST_GUESSES`, or
-    COARSE, which solves the step on a coarser mesh and raises Unsupported where there is none."""
+    """Build the problem of the next step, or of its first stage.
+
+    Args:
+      scene: scene that is stepped.
+      state: state at the start of the step.
+      initial_guess: a key of `INITIAL_GUESSES`, or COARSE_TO_FINE, which solves the step on a coarser mesh.
+    Raises:
+      Unsupported: there is no coarser mesh.
+    """
     usual = scene.integrator
     if not isinstance(usual, Integrator):
         return _of_stages(first_guess)(_stages(scene, state).first())
     scene, time = scene.at(state.index), scene.time(state.index)
     dt = scene.system.time_step
-    # `before` was filtered when it was `now`. Filtered once more it has decayed as long as `now` has (an integrating
-    # factor); without that, BDF2 would decay at twice the rate.
+    # The previous motion was filtered when it was the current one. The second filtering makes it decay for as long as
+    # the current one (an integrating factor); without that, BDF2 would decay at twice the rate.
     now, before = (_filtered(scene, motion) for motion in (state.now, state.before or state.now))
     starts = usual.history and state.before is None
     method, system = (IMPLICIT_EULER, _first(scene)) if starts else (usual, scene.system)
@@ -110,9 +129,12 @@ def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
 
 
 def prepare(scene: Scene, solver: Solver) -> Prepared:
-    """The solver, ready for all of the scene's steps; raises what `solver.prepare` raises, and Unsupported where steps
-    differ in length and the integrator goes by two of them, where it needs masses that are not there, or where lengths
-    are exact and the solver does not keep them."""
+    """Prepare the solver for all of the scene's steps.
+
+    Raises:
+      Unsupported: the scene alternates step sizes with a multistep integrator, the integrator needs masses that are
+        zero, or the solver does not support exact lengths; also as `solver.prepare` raises.
+    """
     require_mass(scene)
     if scene.system.lengths and not getattr(solver, "keeps_lengths", False):
         raise Unsupported(f"{name_of(solver)}: {EXACT}")
@@ -126,8 +148,18 @@ def prepare(scene: Scene, solver: Solver) -> Prepared:
 def simulate(
     scene: Scene, prepared: Prepared, stop: Stop, *, first_guess: str, frames: int, state: State | None = None
 ) -> Iterator[Step]:
-    """The steps from a state (the scene's start if it is left out), one more each time it is asked, up to the frame
-    `frames`. prepared: by `prepare`. Raises Unsupported where a scene cannot be solved to the errors of its steps."""
+    """Iterate over the steps from a state up to a frame, each computed on demand.
+
+    Args:
+      scene: scene that is stepped.
+      prepared: result of `prepare`.
+      stop: stop criterion of the solves.
+      initial_guess: name of the initial guess.
+      frames: number of the last step.
+      initial_state: state to start from; the scene's start if omitted.
+    Raises:
+      Unsupported: the automatic tolerance does not support the scene.
+    """
     state = state or start(scene)
     step = _single if isinstance(scene.integrator, Integrator) else _staged
     rules = Stated(stop) if isinstance(stop, StopRule) else LocalErrors(stop, scene, state.now, frames)
@@ -139,7 +171,7 @@ def simulate(
 
 
 def _single(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, state: State) -> Step:
-    """The step of an integrator of one unknown."""
+    """Take a step of an integrator with one stage."""
     stated = problem(scene, state, first_guess)
     solved = solve_with_friction(prepared, stated, stop)
     stated, solution = solved.problem, solved.solution
@@ -152,7 +184,7 @@ def _single(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, 
 
 
 def _staged(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, state: State) -> Step:
-    """The step of an integrator of several unknowns."""
+    """Take a step of an integrator with several stages."""
     begun = _stages(scene, state)
     done = begun.done(prepared, stop, _of_stages(first_guess))
     after = State(done.end.motion, begun.now, state.index + 1, done.end.acceleration)
@@ -165,15 +197,15 @@ def _stages(scene: Scene, state: State) -> Stages:
 
 
 class Turns:
-    """Prepared for two systems of one scene, which differ in their rate."""
+    """A solver prepared for two systems of one scene that differ in their rate."""
 
     def __init__(self, usual: Prepared, other: Prepared, rate: float) -> None:
-        """rate: of the other [1/s]."""
+        """Combine two prepared solvers; `rate` [1/s] is that of the other system."""
         self.usual, self.other, self._rate = usual, other, rate
         self.choice, self.facts = usual.choice, usual.facts
 
     def of(self, problem: StepProblem) -> Prepared:
-        """The one that the problem is for."""
+        """Return the solver that is prepared for the problem."""
         return self.other if problem.system.rate == self._rate else self.usual
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
@@ -194,19 +226,19 @@ def _filtered(scene: Scene, motion: Motion) -> Motion:
 
 
 def _first(scene: Scene) -> System:
-    """The system of the first step of an integrator that needs a history."""
+    """Build the system of the first step of an integrator that needs a history."""
     return replace(scene.system, factor=IMPLICIT_EULER.factor)
 
 
 def _pinned(system: System, p: Positions, targets: Positions) -> Positions:
-    """A copy of p with its pinned vertices on their targets."""
+    """Return a copy of p with its pinned vertices at their targets."""
     placed = p.copy()
     placed[system.pins.vertices] = targets
     return placed
 
 
 def _assignment(stated: StepProblem) -> StepProblem:
-    """The current positions as they are, pinned vertices where the penalty left them."""
+    """Guess the current positions unchanged, with pinned vertices where the penalty left them."""
     return replace(stated, first_guess=stated.start.positions)
 
 
@@ -215,12 +247,12 @@ def _current(stated: StepProblem) -> StepProblem:
 
 
 def _inertial(stated: StepProblem) -> StepProblem:
-    """Where the vertices would go by inertia alone (Liu et al. 2013)."""
+    """Guess the inertial motion of the vertices (Liu et al. 2013)."""
     return replace(stated, first_guess=_pinned(stated.system, stated.target, stated.pin_targets))
 
 
 def _motion(stated: StepProblem) -> StepProblem:
-    """Where the motion so far leads: by inertia, and by the acceleration that it had last."""
+    """Guess by extrapolation with the current velocity and the last acceleration."""
     if stated.start.acceleration is None:
         return _inertial(stated)
     led = stated.target + stated.system.time_step**2 / stated.system.factor * stated.start.acceleration
@@ -236,26 +268,31 @@ FIRST_GUESSES: dict[str, Callable[[StepProblem], StepProblem]] = {
 
 
 def guessed(stated: StepProblem, first_guess: str) -> StepProblem:
-    """A problem with one of these first guesses, where that is free of intersections; see
-    `solvers.core.clearing.begun_free`, also for what it raises."""
+    """Set an initial guess by name, made intersection-free.
+
+    It raises what `solvers.contact.obstacle_advancement.intersection_free_guess` raises.
+    """
     return begun_free(FIRST_GUESSES[first_guess](stated))
 
 
 COARSE = "coarse"
-"""The first guess that is no function of the problem alone: it is where the coarser mesh goes."""
+"""Initial guess that depends on more than the problem: the solution on a coarser mesh."""
 COARSE_BY = "hybrid"
-"""What solves there; by name, so that runs which do not ask for it do not depend on its code."""
+"""Solver on coarser meshes, by name, so that runs without this guess do not depend on its code."""
 
 _NEAR_ENOUGH = StopRule(100, 1e-3)
-"""Of the solves on coarser meshes. What is left there is smooth, and costs the finer mesh more: with 1e-2 L-BFGS takes
-five times the iterations on a stiff cloth of 256 a side."""
+"""Stop rule of the solves on coarser meshes. The remaining error is smooth, and costs the finer mesh more: with 1e-2,
+L-BFGS needs five times the iterations on a stiff cloth of 256 a side."""
 
 _COARSER: WeakKeyDictionary[Scene, Coarser] = WeakKeyDictionary()
 
 
 def _coarse(scene: Scene, state: State, stated: StepProblem) -> StepProblem:
-    """Where the same scene on a mesh of half the size goes in this step, which itself starts from a coarser one (nested
-    iteration: Kronsjö and Dahlquist 1972); the mesh's own shape is kept beside that displacement."""
+    """Guess the displacement of this step on a mesh of half the size, interpolated to the finer mesh.
+
+    The coarser solve itself starts from a still coarser one (nested iteration: Kronsjö and Dahlquist 1972). The shape
+    of the finer mesh is preserved, since only the displacement is interpolated.
+    """
     level = _COARSER.get(scene)
     if level is None:
         if scene.halved is None:
@@ -277,10 +314,10 @@ def _coarse(scene: Scene, state: State, stated: StepProblem) -> StepProblem:
 
 
 def _of_stages(first_guess: str) -> Guess:
-    """A first guess of each unknown of a step that has several. Raises Unsupported."""
+    """Return the initial guess of each stage of a step that has several; raises Unsupported."""
     if first_guess == COARSE:
         raise Unsupported(
-            "first_guess: coarse is for integrators of one unknown a step (implicit-euler, bdf2, midpoint); "
-            "take motion, current or inertial"
+            "first_guess: coarse is for integrators with one stage per step (implicit-euler, bdf2, midpoint); "
+            "use motion, current or inertial"
         )
     return FIRST_GUESSES[first_guess]

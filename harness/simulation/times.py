@@ -1,8 +1,8 @@
-"""The times of a run as the columns of its rows, each set against those of another clock before it is believed.
+"""Timing columns of a run's rows, checked against another clock.
 
-Whether phases add up to an iteration is told by the medians over the frames: of the sum of the phases' own medians,
-and of an iteration of a whole solve next to them. Where steps are compiled as a whole they need not, and a phase of
-some microseconds is mostly the call.
+Whether phases add up to an iteration is decided by medians over the frames: of the sum of the phases' own medians, and
+of an iteration of a whole solve measured next to them. They need not add up where steps are compiled as a whole, or
+where a phase of some microseconds is mostly call overhead.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from harness.simulation.measure import ITERATION, Measured, Timing
 
 
 def rows(measured: Measured) -> list[dict[str, Any]]:
-    """The columns that tell of times, a row for each of them. Raises ClocksDisagree."""
+    """Build the timing columns, one row for each time; raises ClockMismatch."""
     groups: dict[tuple[str, int | None], list[Timing]] = defaultdict(list)
     for timing in measured.timings:
         groups[timing.phase, measured.pass_of(timing)].append(timing)
@@ -35,7 +35,7 @@ def rows(measured: Measured) -> list[dict[str, Any]]:
 
 
 def _adds_up(timings: list[Timing]) -> dict[str, bool]:
-    """By phase, whether all of them take as long as an iteration; nothing where there are none."""
+    """Check, by phase, whether all phases together take as long as an iteration; empty without phases."""
     by_frame: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for t in timings:
         if t.frame is not None and t.phase != "step":
@@ -51,7 +51,7 @@ def _adds_up(timings: list[Timing]) -> dict[str, bool]:
 
 
 def milliseconds(measured: Measured, frames: int) -> dict[str, list[float]]:
-    """The median over the rounds of each phase in each frame [ms]."""
+    """Compute the median over the rounds of each phase in each frame [ms]."""
     by_phase: dict[str, list[list[float]]] = {}
     for t in measured.timings:
         if t.frame is not None:

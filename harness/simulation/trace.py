@@ -1,4 +1,4 @@
-"""How a solve converges: residual and objective of each iterate, by the oracle and not by the solver."""
+"""Convergence of a solve: residual and objective of each iterate, computed independently of the solver."""
 
 from __future__ import annotations
 
@@ -13,14 +13,19 @@ from solvers.problem import Positions, Prepared, ProjectiveEnergy, StepProblem, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Convergence:
-    """residuals |p - previous p|_Q [J^(1/2)] over the unpinned vertices and objective [J] of iterates 1, 2, ..."""
+    """Convergence of a solve at the iterates 1, 2, ...
+
+    Attributes:
+      residuals: |p - previous p|_Q [J^(1/2)] over the unpinned vertices.
+      objective: objective [J].
+    """
 
     residuals: list[float]
     objective: list[float]
 
 
 class EnergyNorm:
-    """|e|_Q [J^(1/2)] over the unpinned vertices, from a Q that is assembled here."""
+    """Norm |e|_Q [J^(1/2)] over the unpinned vertices, with a Q that is assembled here."""
 
     def __init__(self, system: System) -> None:
         projective = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
@@ -28,14 +33,21 @@ class EnergyNorm:
         self._pinned = system.pins.vertices
 
     def __call__(self, e: Positions) -> float:
-        """The norm of a displacement (n, 3) [m]."""
+        """Compute the norm of a displacement (n, 3) [m]."""
         e = e.copy()
         e[self._pinned] = 0.0
         return energy_norm(self._Q, e)
 
 
 def trace(prepared: Prepared, problem: StepProblem, norm: EnergyNorm, iterations: int) -> Convergence:
-    """The convergence of a solve of `problem` over a number of iterations."""
+    """Trace the convergence of a solve over a number of iterations.
+
+    Args:
+      prepared: prepared solver.
+      problem: step problem.
+      norm: norm of the residuals.
+      iterations: number of iterations.
+    """
     residuals, objective = list[float](), list[float]()
     previous = problem.first_guess.copy()
     for p in islice(prepared.iterates(problem), iterations):
