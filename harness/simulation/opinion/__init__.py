@@ -1,6 +1,6 @@
-"""A second opinion of a scene's steps: each formula written once more, from where it was published, sharing no code
-with the solvers' energies and kernels.
+"""Independent reference implementation of a scene's steps, written from the published formulas.
 
-What both opinions share is the mesh, the start, the reading of files, and NumPy. One file states one group of terms,
-each as the *values* of its elements; nothing here knows a gradient, which complex steps take (see `derivatives`).
+It shares no code with the solvers' energies and kernels. Both implementations share the mesh, the start, the reading of
+files, and NumPy. Each module states one group of terms as the *values* of their elements. No module implements
+gradients; these are computed by complex steps (see `complex_step`).
 """

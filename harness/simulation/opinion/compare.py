@@ -1,6 +1,7 @@
-"""What differs between two opinions at one point.
+"""Comparison of the two implementations of a scene's terms at one point.
 
-Arrays may differ by the round-off of what was added up for them, energies and their derivatives as `derivatives` says.
+Arrays may differ by the round-off of the sums they result from; energies and their derivatives as `complex_step`
+states.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from harness.simulation.opinion.steps import Stated
 from solvers.problem import Energy, StepProblem
 
 _SETTLED = 1e-3
-"""Of a slope, how much friction's normal forces may change it when rounds have ended."""
+"""Relative change of a slope allowed by friction's normal forces once the friction rounds have ended."""
 
 
 class Finding(NamedTuple):
-    """Two figures of one thing that should be the same; their distance in parts of the size of the second."""
+    """Name of a term that differs between the implementations, and the difference relative to the reference value."""
 
     name: str
     by: float
@@ -32,8 +33,15 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Where opinions are compared: a step as it should be stated, as the harness states it, the unknown x (n, 3) [m]
-    and a direction (n, 3)."""
+    """A point of comparison.
+
+    Attributes:
+      scene_terms: reference terms of the scene.
+      reference_step: the step as the reference implementation builds it.
+      problem: the step as the harness builds it.
+      x: solution of the step (n, 3) [m].
+      direction: direction of the derivatives (n, 3).
+    """
 
     side: Side
     stated: Stated
@@ -43,14 +51,14 @@ class Place:
 
     @property
     def reach(self) -> float:
-        """The largest of the coordinates [m] that the step goes by."""
+        """The largest coordinate [m] that the step depends on."""
         m = self.stated.moment
         parts = (self.x, m.p, m.origin, m.time_step * m.v, self.stated.target)
         return max(float(np.abs(part).max(initial=0.0)) for part in parts)
 
     @property
     def aim(self) -> float:
-        """The size [m] of which eps is the round-off of the pins' targets."""
+        """The size [m] whose product with eps is the round-off of the pins' targets."""
         size = self.reach + sum(opinion.reach for opinion in self.side.opinions)
         moves = [motion for effect in self.side.declared.effects if (motion := getattr(effect, "motion", None))]
         end = self.stated.moment.time + self.stated.moment.time_step
@@ -59,12 +67,20 @@ class Place:
 
 
 def pressed(stated: Stated, problem: StepProblem, x: Array) -> Stated:
-    """The step with friction's normal forces at its unknown x (n, 3) [m], where the harness has a further round."""
+    """Return the step with friction's normal forces at its solution x (n, 3) [m], if the harness has a further round.
+    """
     return stated if problem.start.pressed is None else replace(stated, moment=replace(stated.moment, pressed=wide(x)))
 
 
 def differ(name: str, ours: Any, theirs: Any, size: float) -> Iterator[Finding]:
-    """Arrays that differ by more than the round-off of numbers of a size."""
+    """Compare arrays and yield a mismatch if they differ by more than round-off.
+
+    Args:
+      name: name of the term.
+      ours: array of the harness.
+      theirs: array of the reference implementation.
+      size: magnitude [unit of the arrays] of the numbers that determine the round-off.
+    """
     ours, theirs = wide(ours), wide(theirs)
     if ours.shape != theirs.shape:
         yield Finding(f"{name} (number)", 1.0)
@@ -79,7 +95,7 @@ def _part(away: float, size: float) -> float:
 
 
 def steps(at: Place) -> Iterator[Finding]:
-    """Masses, inertia, forces, pins."""
+    """Compare masses, inertia, forces and pins."""
     system, problem, stated = at.problem.system, at.problem, at.stated
     m, start, mass, reach = stated.moment, at.problem.start, at.side.declared.mass, at.reach
     dt, most = m.time_step, float(np.abs(mass).max(initial=0.0))
@@ -110,7 +126,7 @@ def steps(at: Place) -> Iterator[Finding]:
 
 
 def energies(at: Place) -> Iterator[Finding]:
-    """The energies of each effect, and the objective that all terms add up to."""
+    """Compare the energies of each effect, and the objective, which is the sum of all terms."""
     side, stated, reach = at.side, at.stated, at.reach
     free = at.direction.copy()
     free[[i for i, w in zip(stated.vertices, stated.weights, strict=True) if np.isinf(w)]] = 0.0
@@ -130,7 +146,7 @@ def energies(at: Place) -> Iterator[Finding]:
         parts.append(told)
     if not all(np.isfinite(part.value) for part in parts):
         return
-    # Forces are told in float64, each vertex's by a sum of its own.
+    # Forces are computed in float64, with a separate sum for each vertex.
     pulled = ROUNDINGS * EPS * float(np.abs(d).sum()) * stated.force_size
     room = [sum(part.allowed[k] for part in parts) for k in range(2)]
     value, slope = at.problem.value(at.x), float((at.problem.gradient(at.x) * free).sum())
@@ -139,7 +155,7 @@ def energies(at: Place) -> Iterator[Finding]:
 
 
 def _unsettled(at: Place, k: int, told: Told, x: Any, d: Any) -> Iterator[Finding]:
-    """Friction of effect k with the normal forces of the step's start, where those at x are others."""
+    """Compare friction of effect k with normal forces at the step's start and at x, where these differ."""
     effect, m, begin = at.side.declared.effects[k], at.stated.moment, at.side.begins[k]
     if m.pressed is not None or not getattr(effect, "friction", 0.0) or effect.friction_rounds == 1:
         return
@@ -150,7 +166,7 @@ def _unsettled(at: Place, k: int, told: Told, x: Any, d: Any) -> Iterator[Findin
 
 
 def _reach_of(at: Place, k: int) -> float:
-    """The largest coordinate [m] that effect k goes by, with what moves."""
+    """Return the largest coordinate [m] that effect k depends on, including moving parts."""
     effect, reach = at.side.declared.effects[k], at.reach + at.side.opinions[k].reach
     moving = [effect, *getattr(effect, "obstacles", ())]
     late = at.stated.moment.time + at.stated.moment.time_step
@@ -158,7 +174,7 @@ def _reach_of(at: Place, k: int) -> float:
 
 
 def _against(name: str, told: Told, own: Sequence[Energy], x: Array, d: Array) -> Iterator[Finding]:
-    """The energies of one effect against what is told of them."""
+    """Compare the energies of one effect with its reference derivatives."""
     gradient = np.zeros_like(x)
     for energy in own:
         energy.add_gradient(x, gradient)
@@ -169,7 +185,8 @@ def _against(name: str, told: Told, own: Sequence[Energy], x: Array, d: Array) -
 
 
 def _bend(energy: Any, x: Array, d: Array) -> float:
-    """The second derivative along d by an energy's Hessian, without its dense part where it tells that by columns."""
+    """Return the second derivative along d by an energy's Hessian, which may be split into a sparse part and columns.
+    """
     flat = d.ravel()
     if not hasattr(energy, "columns"):
         return float(flat @ (energy.hessian(x) @ flat))
@@ -183,7 +200,7 @@ def _told(name: str, ours: float, theirs: float, room: float) -> Iterator[Findin
 
 
 def _others(at: Place, x: Any, d: Any) -> Told:
-    """Inertia, the pins' penalties and the forces."""
+    """Evaluate inertia, the pins' penalties and the forces."""
     stated = at.stated
     soft = [i for i, w in enumerate(stated.weights) if np.isfinite(w)]
     held, weight = [stated.vertices[i] for i in soft], wide([stated.weights[i] for i in soft])

@@ -1,12 +1,15 @@
-"""Contact with Coulomb friction once more (formulas: `solvers.contact.energy`, `solvers.contact.planes`).
+"""Reference terms of contact with Coulomb friction.
+
+Formulas: `solvers.contact.half_space.half_space_potential`, `solvers.contact.half_space.separating_planes`.
 
     k_i/2 min(0, n.x_i - d)^2 + F_i h(|u_i|),   u_i = (I - nn')(x_i - a_i),   h(u) = u^2/(2 slip), beyond it u - slip/2
 
     k_i = 4 Q_ii max(1, speed dt / tolerance)     slip = creep (time of x - start)     F_i = mu k_i depth at x itself
 
-The half-space n.x >= d touches an obstacle, R outwards, where Newton's method for f = R ends, f the distance to the
-obstacle along the straight way of the vertex in one step, both seen from the obstacle. Here obstacles are told by the
-points of space that they were declared with, moved back and forth by their motion.
+The half-space n.x >= d is tangent to the obstacle offset by R. The point of tangency is where Newton's method for f = R
+ends, with f the distance to the obstacle along the vertex's displacement in one step, both relative to the obstacle. In
+this implementation obstacles are defined by the points of space with which they were declared, transformed by their
+motion.
 """
 
 from __future__ import annotations
@@ -21,11 +24,11 @@ from harness.simulation.opinion.motion import place
 
 _ITERATIONS = 40
 _THERE = 1e-6
-"""Of R: so near is on the surface."""
+"""Relative to R: distance within which a point is on the surface."""
 
 
 def contact(effect: Any, declared: Declared) -> Opinion:
-    """Contact with every obstacle of the effect; its stiffness follows from what else resists."""
+    """Build contact with every obstacle of the effect; its stiffness depends on the diagonal of Q."""
     depth = effect.thickness / 10 if effect.tolerance is None else effect.tolerance
 
     def needs(resists: Array) -> Begin:
@@ -48,7 +51,7 @@ def _of_obstacle(effect: Any, one: Any, k: Wide, moment: Moment) -> Values:
     n = out @ ended.turn.T
     d = (n * ended.there(touched + R * out)).sum(axis=1)
     carried = ended.there(a)
-    # Of the step's end; where x belongs to an earlier time, nearer to the start in proportion.
+    # The half-space is that of the step's end; where x is at an earlier time, it is interpolated from the start.
     w, started = moment.when, (n * moment.p).sum(axis=1)
     offset, anchor = started + w * (d - started), moment.p + w * (carried - moment.p)
     depth = w * (d - (n * carried).sum(axis=1))
@@ -71,8 +74,10 @@ def _of_obstacle(effect: Any, one: Any, k: Wide, moment: Moment) -> Values:
 
 
 def _half_space(one: Any, a: Wide, b: Wide, R: float) -> tuple[Wide, Wide]:
-    """The nearest points of the obstacle and the normals there, (n, 3) each, where Newton's method ends on the ways
-    from a to b (n, 3)."""
+    """Find the nearest points of the obstacle and the normals there, (n, 3) each.
+
+    They are those where Newton's method ends on the segments from a to b (n, 3).
+    """
     begin, end = wide(np.zeros(len(a))), wide(np.full(len(a), np.inf))
     far, touched, out = nearest(one, a)
     slope = (out * (b - a)).sum(axis=1)
@@ -93,13 +98,18 @@ def _half_space(one: Any, a: Wide, b: Wide, R: float) -> tuple[Wide, Wide]:
 
 
 def radius(one: Any) -> float:
-    """The radius [m] around what `nearest` tells the distance of."""
+    """Return the radius [m] around the shape whose distance `find_nearest` returns."""
     return one.radius if one.kind in ("sphere", "capsule") else 0.0
 
 
 def nearest(one: Any, x: Wide) -> tuple[Wide, Wide, Wide]:
-    """The distances (m,) [m] of points (m, 3) from an obstacle as declared, its radius aside, negative inside; the
-    nearest points of its surface and the normals there, (m, 3) each."""
+    """Find the nearest points of an obstacle as declared, excluding its radius.
+
+    Args:
+      one: declared obstacle.
+      x: points (m, 3) [m].
+    Returns: distances (m,) [m], negative inside; nearest points of the surface and the normals there, (m, 3) each.
+    """
     if one.kind == "plane":
         n = wide(one.normal)
         out = np.tile(n / np.sqrt(n @ n), (len(x), 1))
@@ -134,7 +144,7 @@ def _nearest_of_box(low: Wide, high: Wide, x: Wide) -> tuple[Wide, Wide, Wide]:
 
 
 def _reach(one: Any) -> float:
-    """The largest coordinate [m] that an obstacle is declared with, infinite planes by their point."""
+    """Return the largest coordinate [m] with which an obstacle is declared; infinite planes by their point."""
     sizes = [np.abs(getattr(one, name)).max() for name in _SIZES[one.kind]]
     moves = [np.abs(key.offset).max() for key in one.motion.keys] if one.motion else [0.0]
     return float(max(sizes) + max(moves))

@@ -1,4 +1,4 @@
-"""What a scene declares, as the second opinion reads it, and the moment of one step."""
+"""Declaration of a scene as read by the reference implementation, and the data of one step."""
 
 from __future__ import annotations
 
@@ -17,10 +17,20 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """One step: dt [s]; the unknown x moves with the velocity rate (x - origin), rate [1/s], and belongs to the time
-    `until` [s], the fraction `when` of the step; p, v (n, 3): where the step starts, filtered, at `time` [s];
-    expected (n, 3) [m]: where what is lagged is taken; pressed (n, 3) [m]: where friction's normal forces are taken,
-    None for the step's start."""
+    """Data of one step.
+
+    Attributes:
+      time_step: step size dt [s].
+      velocity_rate: factor [1/s] in the velocity at the solution x, rate (x - origin).
+      stage_fraction: fraction of the step at which x is evaluated.
+      time: time of the step's start [s].
+      stage_time: time of x [s].
+      p: positions (n, 3) [m] at the start.
+      v: filtered velocities (n, 3) [m/s] at the start.
+      lagged_positions: positions (n, 3) [m] at which lagged quantities are evaluated.
+      velocity_origin: origin (n, 3) [m] in the velocity.
+      normal_force_positions: positions (n, 3) [m] at which friction's normal forces are evaluated, None for the start.
+    """
 
     time_step: float
     rate: float
@@ -36,8 +46,15 @@ class Moment:
 
 @dataclass(frozen=True, eq=False)
 class Declared:
-    """A mesh, its masses (n,) [kg], dt [s], the models of all effects; staged: whether the integrator takes forces at
-    its unknowns, so that drag is a force."""
+    """Declaration of a scene.
+
+    Attributes:
+      mesh: mesh of the scene.
+      mass: masses (n,) [kg].
+      time_step: step size [s].
+      effects: models of all effects.
+      has_stages: whether the integrator evaluates forces at its stages, so that drag is a force.
+    """
 
     mesh: Mesh
     mass: Array
@@ -51,18 +68,18 @@ class Declared:
         return wide(self.mesh.rest)
 
     def of_kind(self, kind: str) -> list[Any]:
-        """The effects of a kind, in their order."""
+        """Return the effects of a kind, in order."""
         return [effect for effect in self.effects if effect.kind == kind]
 
 
 Begin = Callable[[Moment], Values]
 Force = Callable[[Array, Array, float], tuple[Array, float]]
-"""Positions (n, 3) [m], velocities (n, 3) [m/s], time [s] -> the force (n, 3) [N], and the size [N] of which eps is its
-round-off."""
+"""Maps positions (n, 3) [m], velocities (n, 3) [m/s] and time [s] to the force (n, 3) [N], and to the size [N] whose
+product with eps is its round-off."""
 
 
 class PinnedVertex(NamedTuple):
-    """A pin: its weight [N/m], where it is (3,) [m] and how fast (3,) [m/s] at a time [s]."""
+    """A pin: its weight [N/m], and its position (3,) [m] and velocity (3,) [m/s] as functions of time [s]."""
 
     weight: float
     place: Callable[[float], Wide]
@@ -71,13 +88,19 @@ class PinnedVertex(NamedTuple):
 
 @dataclass(frozen=True)
 class Opinion:
-    """What one effect is thought to contribute.
+    """Reference terms of one effect.
 
-    begin: the energy of a step; resists: its share (n,) [N/m] of the diagonal of Q at the rate 1/dt, None for none;
-    needs: the energy where it depends on the diagonal of Q (n,) [N/m] that all effects and inertia add up to;
-    force; decay: of velocities (n, 3) before a step; pins: by vertex;
-    shortest: the shortest length [m] that the energy goes by besides the springs', reach: the largest coordinate [m];
-    exact: of each edge (i, j) whose length is kept exactly, the shortest and the longest [m] that are allowed.
+    Attributes:
+      build_energy: builds the energy of a step.
+      diagonal: share (n,) [N/m] of the diagonal of Q at the rate 1/dt, None for none.
+      build_from_diagonal: builds the energy where it depends on the diagonal of Q (n,) [N/m], the sum over all
+        effects and inertia.
+      force: evaluates the force.
+      filter_velocity: filters velocities (n, 3) before a step.
+      pinned_vertices: pins by vertex.
+      min_length: smallest length [m] that the energy depends on, apart from the springs'.
+      coordinate_scale: largest coordinate [m].
+      exact_lengths: shortest and longest length [m] allowed for each inextensible edge (i, j).
     """
 
     begin: Begin | None = None
@@ -94,7 +117,7 @@ class Opinion:
 
 
 def counts(edges: NDArray[np.int64], weight: Array, n: int) -> Array:
-    """The sum (n,) of the weights (m,) of the edges (m, 2) at each vertex; an edge from a vertex to itself is none."""
+    """Sum the weights (m,) of the edges (m, 2) at each vertex (n,); edges from a vertex to itself are ignored."""
     i, j = edges.T
     apart = i != j
     ends = np.concatenate([i[apart], j[apart]])

@@ -1,19 +1,19 @@
-"""Derivatives along a direction d from values alone, and what round-off makes of both opinions.
+"""Derivatives along a direction d from values alone, with bounds on the round-off of both implementations.
 
     f'(x).d  = Im f(x + i h d) / h                               complex step (Squire and Trapp 1998): no cancellation
     d'f''(x) d = (f'(x + s d).d - f'(x - s d).d) / (2 s)         in extended precision, where the machine has it
 
-Values are those of elements, f = sum_e f_e, so that the sums of absolute values tell what was added up. A coordinate of
-the size X is known to eps X; with l the shortest length that the terms go by, an error of eps X is worth the fraction
-eps X / l of any term, and one derivative more of each:
+Values are those of elements, f = sum_e f_e, so that sums of absolute values measure the magnitude of what was summed. A
+coordinate of magnitude X has the error eps X. With l the smallest length that the terms depend on, an error of eps X
+is the fraction eps X / l of any term, and is multiplied by one more derivative of each:
 
     |error of f|   <= C eps ((1 + X/l) sum |f_e|   + X sum |f_e'|)
     |error of f'|  <= C eps ((1 + X/l) sum |f_e'|  + X sum |f_e''|)
-    |error of f''| <= C eps ((1 + X/l) sum |f_e''| + X sum |f_e'''|) + |what both sides' differences differ by|
+    |error of f''| <= C eps ((1 + X/l) sum |f_e''| + X sum |f_e'''|) + |difference of the one-sided differences|
                       + |error of f'| e/(eps s), e the eps of extended precision
 
-The last difference is s f''', and large where a corner of the energy (a limit, a contact) lies within s: there f''
-means nothing.
+The difference of the one-sided differences is s f'''. It is large where the energy has a kink (a limit, a contact)
+within s; there f'' is meaningless.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 Wide = NDArray[Any]
-"""Extended precision (`numpy.longdouble`), real or complex; shapes as stated where it is used."""
+"""Extended precision (`numpy.longdouble`), real or complex; shapes are stated where it is used."""
 Values = Callable[[Wide], Wide]
-"""Positions (n, 3) [m], real or complex, to the energies (e,) [J] of elements."""
+"""Maps positions (n, 3) [m], real or complex, to the energies (e,) [J] of elements."""
 
 EPS = float(np.finfo(float).eps)
 ROUNDINGS = 200.0
-"""C: how many roundings an element's energy passes, with room for sums of thousands of them."""
+"""C: number of roundings in an element's energy, with a margin for sums of thousands of elements."""
 _TINY = np.longdouble(1e-100)
 _STEP = 1e-6
-"""s, of the shortest length."""
+"""s, relative to the smallest length."""
 
 
 def wide(x: Any) -> Wide:
-    """An array in extended precision."""
+    """Convert to an array in extended precision."""
     return np.asarray(x, np.longdouble)
 
 
 def length(v: Wide) -> Wide:
-    """|v| of each row (m, 3), (m,), as an analytic function of complex rows."""
+    """Return the norm of each row (m, 3), (m,), as an analytic function of complex rows."""
     return np.sqrt((v * v).sum(axis=1))
 
 
 class Told(NamedTuple):
-    """The value [J], the derivatives [N] and [N/m] along a direction, and how far off each may be."""
+    """Value [J] and derivatives [N] and [N/m] along a direction, and the tolerance of each."""
 
     value: float
     slope: float
@@ -57,7 +57,15 @@ class Told(NamedTuple):
 
 
 def tell(values: Values, x: Wide, d: Wide, reach: float, shortest: float) -> Told:
-    """What an energy is at x along d, both (n, 3); reach: X [m]; shortest: l [m]."""
+    """Differentiate an energy at x along d.
+
+    Args:
+      values: energies of the elements.
+      x: positions (n, 3) [m].
+      d: direction (n, 3).
+      coordinate_scale: X [m].
+      min_length: l [m].
+    """
 
     def slopes(at: Wide) -> Wide:
         return np.imag(values(at + 1j * _TINY * d)) / _TINY

@@ -1,11 +1,11 @@
-"""Springs, strain limits and dashpots once more, and the rules by which their stiffness follows the mesh.
+"""Reference terms of springs, strain limits, sewing and dashpots, and their stiffness rules.
 
     springs         k/2 (|x_i - x_j| - r)^2                                     Liu et al. 2013, eq. 7
-    strain limits   k/2 (|x_i - x_j| - t)^2, t the allowed length nearest       Bouaziz et al. 2014, section 5.1
-    sewing          k/2 max(0, |x_i - x_j| - l(t))^2, l from the length at rest to the gap, evenly
+    strain limits   k/2 (|x_i - x_j| - t)^2, t the nearest allowed length       Bouaziz et al. 2014, section 5.1
+    sewing          k/2 max(0, |x_i - x_j| - l(t))^2, l linear in time from the rest length to the gap
     dashpots        c rate/2 (n.(x_i - x_j) - n.(o_i - o_j))^2, of which the gradient is the force -c n n'(v_i - v_j)
 
-with n the direction of the edge where the step starts, and o the origin from which the velocity of x is told.
+with n the direction of the edge at the start of the step, and o the origin in the velocity of x.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from harness.simulation.opinion.selected import chosen
 
 
 def stiffness(mesh: Mesh, effect: Any, stretch: Any, shear: Any, bend: float) -> Array:
-    """The stiffness (m,) [N/m] of each of a mesh's springs, by the effect's rule (see `harness.scenes.material`)."""
+    """Compute the stiffness (m,) [N/m] of each spring by the effect's rule (see `harness.scenes.material`)."""
     k, h = np.zeros(len(mesh.springs)), mesh.spacing
     for family, given in {"stretch": stretch, "shear": shear, "bend": bend}.items():
         for e in mesh.families[family]:
@@ -43,7 +43,7 @@ def stiffness(mesh: Mesh, effect: Any, stretch: Any, shear: Any, bend: float) ->
 
 
 def _woven(mesh: Mesh, weave: Any, i: int, j: int) -> float:
-    """The constant of one spring of a woven cloth, by the angle from the warp to it."""
+    """Return the constant of one spring of a woven cloth from its angle to the warp."""
     normal = np.zeros(3)
     for a, b, c in mesh.triangles:
         area = np.cross(mesh.rest[b] - mesh.rest[a], mesh.rest[c] - mesh.rest[a])
@@ -56,7 +56,7 @@ def _woven(mesh: Mesh, weave: Any, i: int, j: int) -> float:
 
 
 def _relieve(mesh: Mesh, k: Array) -> None:
-    """Take from each spring along a line twice the stiffness of every skip-one spring above it."""
+    """Subtract twice the stiffness of every skip-one spring from the springs along the same line."""
     joined: dict[int, dict[int, int]] = {}
     for e in mesh.families["stretch"].tolist():
         i, j = mesh.springs[e].tolist()
@@ -70,7 +70,7 @@ def _relieve(mesh: Mesh, k: Array) -> None:
 
 
 def springs(effect: Any, declared: Declared) -> Opinion:
-    """Springs along all edges that have stiffness."""
+    """Build springs along all edges that have stiffness."""
     k = of_springs(effect, declared)
     exact, k = _exact(declared, k, 1.0, 1.0), finite(k)
     edges, n = declared.mesh.springs, len(declared.mass)
@@ -83,26 +83,28 @@ def springs(effect: Any, declared: Declared) -> Opinion:
 
 
 def of_springs(effect: Any, declared: Declared) -> Array:
-    """The stiffness (m,) [N/m] of an effect `springs`."""
+    """Compute the stiffness (m,) [N/m] of an effect `springs`."""
     given = effect.stretch, effect.stretch if effect.shear is None else effect.shear
     stretch, shear = (np.inf if x == "exact" else x for x in given)
     return stiffness(declared.mesh, effect, stretch, shear, effect.bend)
 
 
 def finite(k: Array) -> Array:
-    """The stiffnesses (m,) [N/m] of what resists as an energy: none of what is exact."""
+    """Return the stiffnesses (m,) [N/m] with those of exact lengths set to zero."""
     return np.where(np.isinf(k), 0.0, k)
 
 
 def _exact(declared: Declared, k: Array, low: float, high: float) -> dict[tuple[int, int], tuple[float, float]]:
-    """The edges whose stiffness (m,) is infinite, with the lengths allowed [m], low and high times those at rest."""
+    """Return the edges with infinite stiffness (m,), with their allowed lengths [m]: low and high times the rest
+    length.
+    """
     edges = declared.mesh.springs
     r = _lengths(declared.rest, edges)
     return {(*edges[e].tolist(),): (low * float(r[e]), high * float(r[e])) for e in np.flatnonzero(np.isinf(k))}
 
 
 def strain_limits(effect: Any, declared: Declared) -> Opinion:
-    """Edges that resist beyond their limits."""
+    """Build edges that resist strains beyond their limits."""
     given = np.inf if effect.stiffness == "exact" else effect.stiffness
     k = stiffness(declared.mesh, effect, given, given, 0.0)
     exact, k = _exact(declared, k, effect.shortest, effect.longest), finite(k)
@@ -118,7 +120,7 @@ def strain_limits(effect: Any, declared: Declared) -> Opinion:
 
 
 def sewing(effect: Any, declared: Declared) -> Opinion:
-    """Threads between what is nearest at rest."""
+    """Build threads between the vertices that are nearest at rest."""
     rest, rows = declared.mesh.rest, (chosen(declared, effect.first), chosen(declared, effect.second))
     pairs = {(i, min(rows[1], key=lambda j: float(np.linalg.norm(rest[i] - rest[j])))) for i in rows[0]}
     pairs |= {(min(rows[0], key=lambda i: float(np.linalg.norm(rest[i] - rest[j]))), j) for j in rows[1]}
@@ -140,7 +142,7 @@ def sewing(effect: Any, declared: Declared) -> Opinion:
 
 
 def dashpots(effect: Any, declared: Declared) -> Opinion:
-    """Damping along the edges."""
+    """Build damping along the edges."""
     shear = effect.stretch if effect.shear is None else effect.shear
     c = stiffness(declared.mesh, effect, effect.stretch, shear, 0.0)
     resists = counts(declared.mesh.springs, c / declared.time_step, len(declared.mass))
@@ -148,7 +150,7 @@ def dashpots(effect: Any, declared: Declared) -> Opinion:
 
 
 def along_edges(declared: Declared, c: Array) -> Begin:
-    """The energy of dashpots with coefficients c (m,) [N s/m]."""
+    """Build the energy of dashpots with coefficients c (m,) [N s/m]."""
     i, j = declared.mesh.springs.T
     at_rest = declared.rest[i] - declared.rest[j]
 
@@ -162,7 +164,7 @@ def along_edges(declared: Declared, c: Array) -> Begin:
 
 
 def _unit(v: Wide, otherwise: Wide) -> Wide:
-    """The direction of v, else that at rest, else the first coordinate's."""
+    """Return the direction of v, or the direction at rest, or the first unit vector."""
     for u in (v, otherwise):
         if u.any():
             return u / np.sqrt(u @ u)

@@ -1,11 +1,11 @@
-"""External forces once more: weight, newtons a vertex, and wind.
+"""Reference terms of external forces: weight, constant forces, and wind.
 
-gravity          m g                          constant force   the same newtons on every vertex
-wind             the field on every vertex, or shared as the mass is, or on triangles (Keckeisen et al. 2004)
+gravity          m g                          constant force   the same force on every vertex
+wind             the field on every vertex, or distributed like the mass, or on triangles (Keckeisen et al. 2004)
 
     f = rho/2 A |u| (n.u) (C_D u/|u| + C_L (n - (n.u) u/|u|^2)),   at most m |u| / dt
 
-with u the air's velocity less the triangle's and n its normal on the side where n.u >= 0.
+with u the air's velocity relative to the triangle and n its normal on the side where n.u >= 0.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ Field = Callable[[Array, float], Array]
 
 
 def gravity(effect: Any, declared: Declared) -> Opinion:
-    """Weight."""
+    """Build the weight."""
     weight = declared.mass[:, None] * np.array(effect.acceleration)
     return Opinion(force=lambda p, v, t: (weight, float(np.abs(weight).max())))
 
 
 def constant_force(effect: Any, declared: Declared) -> Opinion:
-    """The same newtons on every vertex."""
+    """Build the same force on every vertex."""
     force = np.ones((len(declared.mass), 1)) * np.array(effect.force)
     return Opinion(force=lambda p, v, t: (force, float(np.abs(force).max())))
 
 
 def wind(effect: Any, declared: Declared) -> Opinion:
-    """The field, on what it acts on."""
+    """Build the wind field on vertices or triangles."""
     field, phase = _FIELDS[effect.field](effect, declared)
 
     def on_vertices(p: Array, v: Array, t: float) -> tuple[Array, float]:
@@ -75,7 +75,7 @@ def _mean(effect: Any) -> Array:
 
 
 def _most(effect: Any) -> Array:
-    """The largest that the field gets, about."""
+    """Return the approximate maximum of the field."""
     return effect.strength * np.array([6.0, 2.0, 1.0]) if effect.field == "assignment" else 3.0 * _mean(effect)
 
 
@@ -97,8 +97,11 @@ def _assignment(effect: Any, declared: Declared) -> tuple[Field, Callable[[Array
 
 
 def _gusts(effect: Any, declared: Declared) -> tuple[Field, Callable[[Array, float], float]]:
-    """Sixteen waves, their frequencies spread evenly by their logarithms from a quarter to four times the middle, with
-    random phases; the numbers are drawn in that order from NumPy's generator of the seed."""
+    """Build a field of sixteen waves with random frequencies and phases.
+
+    The logarithms of the frequencies are uniform between a quarter of and four times the central frequency. The random
+    numbers are drawn in this order from NumPy's generator with the given seed.
+    """
     mean, waves = _mean(effect), 16
     speed = float(np.sqrt((mean**2).sum()))
     if not speed:

@@ -1,8 +1,9 @@
-"""Key frames once more, with the axis k and the angle a of a turn:
+"""Reference implementation of key-frame motion, with the axis k and the angle a of a rotation.
 
     q(t) = about + R (q - about) + offset,   R v = v cos a + k x v sin a + k (k.v)(1 - cos a)
 
-Between keys straight, or by monotone cubics (Fritsch and Carlson 1980, with the slopes of Fritsch and Butland 1984).
+Interpolation between keys is linear, or by monotone cubics (Fritsch and Carlson 1980, with the slopes of Fritsch and
+Butland 1984).
 """
 
 from __future__ import annotations
@@ -18,18 +19,18 @@ _PI = 4 * np.arctan(np.longdouble(1))
 
 
 class Place(NamedTuple):
-    """A rigid motion at one time: the rotation R (3, 3), a point on its axis and the offset (3,) [m]."""
+    """A rigid motion at one time: the rotation R (3, 3), a point on its axis (3,) [m] and the offset (3,) [m]."""
 
     turn: Wide
     about: Wide
     offset: Wide
 
     def there(self, q: Wide) -> Wide:
-        """Where points declared at q (m, 3) [m] are."""
+        """Transform points declared at q (m, 3) [m] to their present positions."""
         return self.about + (q - self.about) @ self.turn.T + self.offset
 
     def back(self, x: Wide) -> Wide:
-        """Where points that are at x (m, 3) [m] were declared."""
+        """Transform points at x (m, 3) [m] to their declared positions."""
         return self.about + (x - self.offset - self.about) @ self.turn
 
 
@@ -37,7 +38,7 @@ _STILL = Place(wide(np.eye(3)), wide(np.zeros(3)), wide(np.zeros(3)))
 
 
 def place(motion: Any, time: float) -> Place:
-    """Where a motion (None: none) is at a time [s]."""
+    """Evaluate a motion (None: none) at a time [s]."""
     if motion is None:
         return _STILL
     times = wide([key.time for key in motion.keys])
@@ -51,7 +52,7 @@ def place(motion: Any, time: float) -> Place:
 
 
 def speed(motion: Any, q: Wide, time: float) -> Wide:
-    """How fast a point declared at q (3,) [m] moves at a time [s], right after it at a key, (3,) [m/s]."""
+    """Return the velocity (3,) [m/s] of a point declared at q (3,) [m] at a time [s]; right-sided at a key."""
     times = wide([key.time for key in motion.keys]) if motion else wide([0])
     if len(times) == 1 or not times[0] <= time < times[-1]:
         return wide([0, 0, 0])
@@ -69,7 +70,7 @@ def speed(motion: Any, q: Wide, time: float) -> Wide:
 
 
 def blur(motion: Any, size: float, time: float) -> float:
-    """How far [m] round-off may take points that lie within `size` [m] of zero, at a time [s]."""
+    """Bound the round-off [m] of moved points within `size` [m] of zero at a time [s]."""
     if motion is None:
         return EPS * size
     keys: list[Any] = list(motion.keys)
@@ -82,7 +83,7 @@ def blur(motion: Any, size: float, time: float) -> float:
 
 
 def _between(times: Wide, values: Wide, t: Any, how: str) -> Wide:
-    """Offset [m] and turn [degrees] at t, (4,)."""
+    """Interpolate offset [m] and rotation angle [degrees] at t, (4,)."""
     if len(times) == 1:
         return values[0]
     k = min(int(cast(int, np.searchsorted(times, t, side="right"))) - 1, len(times) - 2)
@@ -96,7 +97,7 @@ def _between(times: Wide, values: Wide, t: Any, how: str) -> Wide:
 
 
 def _slope(times: Wide, y: Wide, j: int) -> Any:
-    """The slope of the cubics at key j: a weighted harmonic mean, zero where the way turns back."""
+    """Return the slope of the cubics at key j: a weighted harmonic mean, zero at a local extremum."""
     h, last = np.diff(times), len(times) - 1
     rise = np.diff(y) / h
     if last == 1:

@@ -1,7 +1,8 @@
-"""Effects from outside, of which nobody has written a second opinion: they are held against themselves.
+"""Checks of effects without a reference implementation: their gradients against their own values.
 
-The gradient of an energy is compared with complex steps of its own value; where that does not take complex numbers, or
-is no analytic function of them, with central differences at two steps, whose distance tells how far off they are.
+The gradient of an energy is compared with complex steps of its own value. Where the value does not support complex
+numbers, or is not an analytic function, it is compared with central differences at two step sizes, whose difference
+estimates their error.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _TINY = 1e-100
 
 
 def from_outside(bound: Contribution) -> Opinion:
-    """The forces, filters and pins of an effect, as they are."""
+    """Build the terms of an effect from its own forces, filters and pins."""
 
     def force(p: Array, v: Array, t: float) -> tuple[Array, float]:
         parts = [np.asarray(one(p, v, t)) for one in bound.forces]
@@ -42,7 +43,7 @@ def _each(pin: Pin) -> list[tuple[int, Any]]:
 
 
 def resistance(energies: Sequence[Energy], n: int, time_step: float) -> Array:
-    """What energies say that they add to the diagonal of Q (n,) [N/m] at the rate 1/dt."""
+    """Sum the energies' own shares of the diagonal of Q (n,) [N/m] at the rate 1/dt."""
     zero, total = np.zeros((n, 3)), np.zeros(n)
     start = Start(zero, zero, 0.0, zero, 1.0 / time_step, 0.0)
     for energy in energies:
@@ -53,8 +54,16 @@ def resistance(energies: Sequence[Energy], n: int, time_step: float) -> Array:
 
 
 def own_slope(own: Sequence[Energy], x: Array, d: Array, reach: float, shortest: float) -> tuple[Told, float | None]:
-    """The values and gradients of energies along d at x, both (n, 3), and by how much of its size the gradient is not
-    that of the value, None where it is."""
+    """Compare the gradients of energies along d with derivatives of their own values.
+
+    Args:
+      own: energies.
+      x: positions (n, 3) [m].
+      d: direction (n, 3).
+      reach: largest coordinate [m].
+      shortest: smallest length [m].
+    Returns: values and slopes along d, and the largest relative error of a gradient, None where all are correct.
+    """
     values, slopes = list[float](), list[float]()
     wrong: float | None = None
     for energy in own:
@@ -74,7 +83,7 @@ def own_slope(own: Sequence[Energy], x: Array, d: Array, reach: float, shortest:
 
 
 def _by_complex_steps(energy: Any, x: Array, d: Array, slope: float, size: float, far: float) -> bool:
-    """Whether the derivative of the energy's value by a complex step is the slope."""
+    """Return whether the derivative of the energy's value by a complex step equals the slope."""
     try:
         with warnings.catch_warnings(action="error", category=np.exceptions.ComplexWarning):
             found = complex(energy.value(x + 1j * _TINY * d)).imag / _TINY
@@ -84,8 +93,7 @@ def _by_complex_steps(energy: Any, x: Array, d: Array, slope: float, size: float
 
 
 def _by_differences(energy: Any, x: Array, d: Array, h: float, reach: float) -> tuple[float, float]:
-    """The derivative by differences of the step h [m], the error of its second order taken out; and how far off it
-    is."""
+    """Return the derivative by Richardson-extrapolated central differences of step h [m], and its error bound."""
     values = [float(energy.value(x + s * h * d)) for s in (-1.0, -0.5, 0.5, 1.0)]
     rough, fine = (values[3] - values[0]) / (2 * h), (values[2] - values[1]) / h
     room = abs(rough - fine) + ROUNDINGS * EPS * (max(map(abs, values)) / h + reach / h * abs(fine))

@@ -1,8 +1,8 @@
-"""Where opinions are compared: random motions and unknowns around a scene's start and its rest shape.
+"""Sample points of the comparison: random motions and solutions around a scene's start and its rest shape.
 
-They differ from those by 1e-3 to 0.5 of the spacing of the mesh, and move by as much in a step. Where there are
-obstacles the mesh is brought up to one, so that something touches; no step starts where surfaces are closer than their
-thickness, for none may.
+They deviate by 1e-3 to 0.5 of the mesh spacing, and move by as much in a step. Where there are obstacles the mesh is
+moved to one, so that contact occurs. No step starts with surfaces closer than their minimum distance, since this is
+invalid.
 """
 
 from __future__ import annotations
@@ -24,13 +24,18 @@ from harness.simulation.step import State, start
 
 POINTS = 20
 FRACTIONS = (1e-3, 1e-2, 0.1, 0.5)
-"""Of the spacing."""
+"""Deviations relative to the mesh spacing."""
 
 
 @dataclass(frozen=True, eq=False)
 class SamplePoint:
-    """The state that a step starts from, shifts (n, 3) [m] of its unknown from where the velocity leads, and a
-    direction (n, 3)."""
+    """A sample point of the comparison.
+
+    Attributes:
+      state: state that a step starts from.
+      shift: displacement (n, 3) [m] of its solution from the position extrapolated with the velocity.
+      direction: direction of derivatives (n, 3).
+    """
 
     state: State
     shift: Array
@@ -38,13 +43,20 @@ class SamplePoint:
 
 
 def points(scene: Scene, declared: Declared, frames: int) -> Iterator[SamplePoint]:
-    """The points of a scene, the same each time; steps are any of the scene's frames, and every fifth the first."""
+    """Sample the points of a scene, with a fixed seed; steps are any of its frames, and every fifth is the first.
+
+    Args:
+      scene: scene that is stepped.
+      declared: its declaration.
+      frames: number of frames.
+    """
     rng, rest = np.random.default_rng(0), scene.mesh.rest
     begun = start(scene).now
     touching = [(effect, one) for effect in declared.of_kind("contact") for one in effect.obstacles]
     apart = declared.of_kind("self-contact")
     beside = [(effect, one) for effect in declared.of_kind("surface-contact") for one in against(effect, declared)]
-    # What forces may do in a step is limited where there are obstacles (`margin` of `solvers.contact.energy`).
+    # Where there are obstacles, the displacement by forces in a step is limited
+    # (`margin` of `solvers.contact.half_space.half_space_potential`).
     limit = 0.05 * scene.mesh.size if touching else np.inf
     for k in range(POINTS):
         index = 0 if k % 5 == 0 else int(rng.integers(1, max(2, frames)))
@@ -73,12 +85,12 @@ def points(scene: Scene, declared: Declared, frames: int) -> Iterator[SamplePoin
 
 
 def led(k: int, size: float, rest: Array) -> Array:
-    """A random acceleration (n, 3) [m/s^2] of a size, that of point k."""
+    """Return the random acceleration (n, 3) [m/s^2] of a given size for point k."""
     return size * np.random.default_rng(k).normal(size=rest.shape)
 
 
 def _brought(effect: Any, one: Any, p: Array, time: float, rng: np.random.Generator) -> Array:
-    """Positions (n, 3) [m] as a whole so near to an obstacle that a random vertex is within the thickness."""
+    """Translate positions (n, 3) [m] to an obstacle, so that a random vertex is within the contact thickness."""
     at = place(one.motion, time)
     which = int(rng.integers(len(p)))
     far, _, out = nearest(one, at.back(wide(p[which : which + 1])))

@@ -1,9 +1,10 @@
-"""The second opinion of a scene: whether two ways to write its steps agree at random points.
+"""Verification of a scene: its steps agree with an independent reference implementation at random points.
 
-At each point the harness states one step and does it, with a solver that answers the point. Compared are the masses,
-the inertia and its target, the forces, the pins, the motion after the step; the energy of each effect, its gradient and
-its Hessian along a random direction; and the objective that all add up to. An effect from outside has no second
-opinion: its energies' gradients are held against their own values; its forces, pins and filters are taken as they are.
+At each point the harness builds one step and takes it, with a solver that returns the point. The comparison covers the
+masses, the inertia and its target, the forces, the pins, and the motion after the step. It also covers the energy of
+each effect, its gradient and its Hessian along a random direction, and the objective, the sum of all terms. A plug-in
+effect has no reference implementation: its energies' gradients are checked against their own values, and its forces,
+pins and filters are not checked.
 """
 
 from __future__ import annotations
@@ -28,9 +29,15 @@ AGREES, DISAGREES, SINGLE = "agrees", "disagrees", "single opinion"
 
 
 def second_opinion(spec: SceneSpec, scene: Scene, integrator: str) -> str:
-    """`agrees`; `disagrees: what, by how much; ...`; or `single opinion: effects` where there is no second one.
+    """Compare a scene's terms with the reference implementation.
 
-    scene: what was built of the spec with the integrator of that name.
+    Args:
+      spec: specification of the scene.
+      scene: scene built from it with the integrator.
+      integrator: name of the integrator.
+    Returns: `agrees`; `disagrees: term, by relative difference; ...`; or `single opinion: effects` where some effects
+    have
+      no reference implementation.
     """
     with np.errstate(all="ignore"):  # what is not finite is compared like all else
         sides = [side(spec, scene)]
@@ -48,21 +55,24 @@ def second_opinion(spec: SceneSpec, scene: Scene, integrator: str) -> str:
 
 
 class _Answer:
-    """Stands for a prepared solver: what it answers is x (n, 3) [m], by the time of the unknown [s]; moves: whether it
-    tells the velocity at the step's end."""
+    """Substitute for a prepared solver, with a given solution.
+
+    Its solution is x (n, 3) [m] as a function of the time [s]. It returns the velocity at the step's end if
+    `with_velocity`.
+    """
 
     def __init__(self, x: Callable[[float], Array], *, moves: bool = False) -> None:
         self.x, self._moves = x, moves
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """The answer to any step."""
+        """Return the given solution of any step."""
         x = self.x(problem.start.until)
         v = problem.start.velocity_at(x) if self._moves else None
         return Solution(x, 0, float("nan"), float("nan"), "iterations", v)
 
 
 def _compared(sides: list[Side], scene: Scene, integrator: str, point: SamplePoint) -> Iterator[Finding]:
-    """What differs at one point."""
+    """Compare all terms at one point."""
     index, now, before = point.state.index, point.state.now, point.state.before
     own = sides[index % len(sides)]
     time = sum(sides[k % len(sides)].declared.time_step for k in range(len(sides))) * (index // len(sides))
@@ -91,7 +101,7 @@ def _compared(sides: list[Side], scene: Scene, integrator: str, point: SamplePoi
 
 
 def _staged(own: Side, scene: Scene, integrator: str, point: SamplePoint, time: float) -> Iterator[Finding]:
-    """The same for an integrator of several unknowns, each of which is answered by where the velocity leads."""
+    """Compare all terms for an integrator with several stages, each solved by extrapolation with the velocity."""
     now, dt = point.state.now, own.declared.time_step
 
     def x(until: float) -> Array:

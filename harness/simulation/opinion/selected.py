@@ -1,4 +1,4 @@
-"""Which vertices a selection of a scene names, once more."""
+"""Reference implementation of vertex selections."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from harness.simulation.opinion.declared import Declared
 
 
 def chosen(declared: Declared, selection: Any) -> list[int]:
-    """The vertices that any of its selectors names, then every k-th of them; of all where none names any."""
+    """Return every k-th of the vertices that any selector matches; without selectors, of all vertices."""
     mesh, one = declared.mesh, selection
     named = set[int](selection.indices)
     rows: list[list[float]] = mesh.rest.tolist()
@@ -47,7 +47,7 @@ def _squared(x: Any, y: Any) -> float:
 
 
 def _loops(mesh: Mesh) -> list[tuple[set[int], bool]]:
-    """The boundary loops, the longest first, and whether each is a hole."""
+    """Find the boundary loops, longest first, and whether each is a hole."""
     used = Counter(tuple(sorted(side)) for corners in mesh.triangles.tolist() for side in combinations(corners, 2))
     surfaces, rims = _joined(used), _joined([side for side, count in used.items() if count == 1])
 
@@ -61,7 +61,7 @@ def _loops(mesh: Mesh) -> list[tuple[set[int], bool]]:
 
 
 def _joined(pairs: Any) -> list[set[int]]:
-    """The connected pieces of a graph."""
+    """Find the connected components of a graph."""
     pieces = list[set[int]]()
     for pair in pairs:
         met = [piece for piece in pieces if piece & set(pair)]

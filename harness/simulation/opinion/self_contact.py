@@ -1,14 +1,15 @@
-"""Self-contact once more: a barrier between points and triangles, edges and edges (Li et al. 2020; with a thickness
-Li, Kaufman and Jiang 2021).
+"""Reference terms of self-contact: a barrier for point-triangle and edge-edge pairs.
+
+Li et al. 2020; with a minimum distance Li, Kaufman and Jiang 2021.
 
     m k r^2 b((d - t)/r),   b(x) = -(1 - x)^2 ln x for x < 1
     m = (2 - c/e) c/e for c < e,   c = |u x v|^2,   e = 1e-3 |u|^2 |v|^2
 
-with u, v at rest in e, and the mean k of the four vertices, a tenth of the diagonal of Q where the scene does not say.
-Where d at rest is below t + r, both t and r are smaller in proportion, less 1e-12. Here the places of the least
-distance come from all candidates, by comparison: inside, on every side and at every corner.
+with u, v at rest in e, and k the mean over the four vertices, a tenth of the diagonal of Q unless the scene states it.
+Where d at rest is below t + r, both t and r are scaled down in proportion, less 1e-12. In this implementation the
+nearest points are selected by comparing all candidates: the interior, every side and every corner.
 
-Friction is that of pairs in range at x itself (Li et al. 2020, section 5), F the barrier's force there:
+Friction acts on pairs within range at x itself (Li et al. 2020, section 5), with F the barrier's force there:
 
     mu F h(|u|),   h(u) = u^2/s - u^3/(3 s^2) for u < s,  u - s/3 beyond,   s = creep dt
     u = (I - nn')(z - z^t),   z = sum_i c_i x_i,   z^t = sum_i c_i x_i^t   with dd/dx_i = c_i n
@@ -33,12 +34,12 @@ _SIDES = ((1, 2), (1, 3), (2, 3))
 
 
 def self_contact(effect: Any, declared: Declared) -> Opinion:
-    """The barrier of all pairs that share no vertex."""
+    """Build the barrier of all pairs without a common vertex."""
     return barriers(effect, [Touching(declared)])
 
 
 def barriers(effect: Any, parts: Sequence[Touching]) -> Opinion:
-    """The barriers of an effect between all that its parts find, and their friction."""
+    """Build the barriers of an effect for all pairs of its parts, and their friction."""
     t, r = effect.thickness, effect.thickness if effect.range is None else effect.range
 
     def needs(resists: Array) -> Begin:
@@ -62,7 +63,10 @@ def barriers(effect: Any, parts: Sequence[Touching]) -> Opinion:
 
 
 class Touching:
-    """A mesh's points, edges and triangles. rest (n, 3) [m]: what lengths at rest are taken of."""
+    """Points, edges and triangles of a mesh.
+
+    `rest_positions` (n, 3) [m] are those from which rest lengths are computed.
+    """
 
     def __init__(self, declared: Declared) -> None:
         mesh = declared.mesh
@@ -81,24 +85,31 @@ class Touching:
         self.points = np.unique(np.append(self.edges, self.triangles))[:, None]
 
     def whole(self, x: Wide, time: float) -> Wide:
-        """Where all are that pairs may name, those of the mesh at x (n, 3) [m] first, at a time [s]."""
+        """Return the positions of all vertices of pairs at a time [s], with the mesh vertices x (n, 3) [m] first."""
         return x
 
     def near(self, x: Array, reach: float) -> tuple[Indices, Indices]:
-        """Points with triangles, and edges with edges, (k, 4) each, that are nearer than `reach` [m] at x (N, 3)."""
+        """Find point-triangle and edge-edge pairs, (k, 4) each, closer than a distance [m] at x (N, 3)."""
         return near(x, self.points, self.triangles, reach), near(x, self.edges, self.edges, reach)
 
     def apart(self, rows: Indices, edges: bool) -> Wide:
-        """How far pairs are apart at rest (k,) [m]."""
+        """Return the distances of pairs at rest (k,) [m]."""
         return length(_between(rows, wide(self.rest), edges))
 
     def nearest(self, x: Array, reach: float) -> float:
-        """The least distance of pairs at x (N, 3) [m], or `reach` where it is larger."""
+        """Return the minimum distance of pairs at x (N, 3) [m], at most `reach`."""
         least = [length(_between(rows, x, k == 1)) for k, rows in enumerate(self.near(x, reach))]
         return float(np.concatenate(least).min(initial=reach))
 
     def values(self, t: float, r: float, k: Array, time: float) -> Values:
-        """The energies [J] of thickness t and range r [m], with stiffnesses k (n,) [N/m], at a time [s]."""
+        """Build the barrier energies [J] at a time [s].
+
+        Args:
+          t: minimum distance [m].
+          r: barrier activation distance [m].
+          k: stiffnesses (n,) [N/m].
+          time: time [s].
+        """
 
         def of(x: Wide) -> Wide:
             x = self.whole(x, time)
@@ -122,7 +133,7 @@ class Touching:
         return np.where(closed, np.inf, m * np.where(feels, stiff * (scale * r) ** 2 * b, 0))
 
     def _of(self, rows: Indices, x: Wide, t: float, r: float, k: Array, edges: bool) -> tuple[Wide, Wide, Wide]:
-        """In what proportion t and r are smaller, m, and k [N/m], (k,) each."""
+        """Return the scale factor of t and r, the mollifier m, and the stiffness k [N/m] of each pair, (k,) each."""
         share = self.apart(rows, edges) / (wide(t) + wide(r))
         scale, m = np.where(share < 1, (1 - wide(1e-12)) * share, 1), wide(np.ones(len(rows)))
         if edges:
@@ -132,12 +143,21 @@ class Touching:
         return scale, m, wide(np.where(own, k[np.where(own, rows, 0)], 0).sum(axis=1)) / own.sum(axis=1)
 
     def rubs(self, friction: float, grip: Grip, slip: float, time: float) -> Values:
-        """What pairs that grip take to slip [J], at a time [s]."""
+        """Build the friction potential [J] of pairs at a time [s]."""
         return lambda x: friction * rubbed(self.whole(x, time), *grip, slip)
 
     def grip(self, p: Wide, begun: Wide, t: float, r: float, k: Array, edges: bool) -> Grip:
-        """Of pairs in range at p (N, 3) [m]: rows (g, 4), c (g, 4), n (g, 3), z^t (g, 3) [m], the force (g,) [N]; begun
-        (N, 3) [m]: where the step starts."""
+        """Find the friction data of pairs within range at p (N, 3) [m].
+
+        Args:
+          p: positions (N, 3) [m] at which normal forces are evaluated.
+          begun: positions (N, 3) [m] at the start of the step.
+          t: minimum distance [m].
+          r: barrier activation distance [m].
+          k: stiffnesses (n,) [N/m].
+          edges: edge-edge instead of point-triangle pairs.
+        Returns: rows (g, 4), c (g, 4), n (g, 3), z^t (g, 3) [m], and the force (g,) [N].
+        """
         rows = self.near(np.asarray(p, float), t + r)[int(edges)]
         z, four = _between(rows, p, edges), np.arange(4 * len(rows)).reshape(-1, 4)
         d = length(z)
@@ -158,8 +178,15 @@ class Touching:
 
 
 def near(x: Array, one: Indices, two: Indices, reach: float) -> Indices:
-    """Those of one (a, i) with those of two (b, j), by vertices (k, 4), that share none and are nearer than `reach` [m]
-    at x (N, 3): points and triangles, or edges and edges."""
+    """Find pairs of primitives that share no vertex and are closer than a distance.
+
+    Args:
+      x: positions (N, 3) [m].
+      one: vertices (a, i) of points or edges.
+      two: vertices (b, j) of triangles or edges.
+      radius: distance [m].
+    Returns: vertices of the pairs (k, 4).
+    """
     if not (len(one) and len(two)):
         return np.empty((0, 4), int)
     middles = [x[part].mean(axis=1) for part in (one, two)]
@@ -176,7 +203,7 @@ def near(x: Array, one: Indices, two: Indices, reach: float) -> Indices:
 
 
 def rubbed(x: Wide, rows: Indices, weights: Wide, n: Wide, anchor: Wide, force: Wide, slip: float) -> Wide:
-    """What pairs that grip take to slip (g,) [J], mu aside."""
+    """Compute the friction potential (g,) [J] of pairs, without the factor mu."""
     u = (weights[:, :, None] * x[rows]).sum(axis=1) - anchor
     u = u - (u * n).sum(axis=1)[:, None] * n
     square = (u * u).sum(axis=1)
@@ -187,7 +214,7 @@ def rubbed(x: Wide, rows: Indices, weights: Wide, n: Wide, anchor: Wide, force: 
 
 
 def _between(rows: Indices, x: Wide, edges: bool) -> Wide:
-    """From the nearest point of one to that of the other, (k, 3); where it is told by real parts."""
+    """Compute the vectors (k, 3) between nearest points of each pair; cases are selected by real parts."""
     a, b, c, d = (x[rows[:, i]] for i in range(4))
     found = [_inside(a, b, c, d, edges)]
     if edges:
@@ -201,7 +228,7 @@ def _between(rows: Indices, x: Wide, edges: bool) -> Wide:
 
 
 def _to_side(p: Wide, a: Wide, b: Wide) -> Wide:
-    """From the nearest point of the segment a b to p."""
+    """Compute the vector from the nearest point of the segment a b to p."""
     along, away = b - a, p - a
     square = (along * along).sum(axis=1)
     at = (along * away).sum(axis=1) / np.where(square == 0, 1, square)
@@ -210,7 +237,7 @@ def _to_side(p: Wide, a: Wide, b: Wide) -> Wide:
 
 
 def _inside(a: Wide, b: Wide, c: Wide, d: Wide, edges: bool) -> Wide:
-    """Between lines, or from a point to a plane; far away where that is not inside."""
+    """Compute the vector between lines, or from a plane to a point; a large vector where that point is not interior."""
     u, v, w = (b - a, d - c, a - c) if edges else (c - b, d - b, a - b)
     uu, uv, vv, uw, vw = ((f * g).sum(axis=1) for f, g in ((u, u), (u, v), (v, v), (u, w), (v, w)))
     det = uu * vv - uv * uv
@@ -239,7 +266,7 @@ def _sides(rows: Indices, rest: Wide) -> Wide:
 
 
 def gathered(effect: Any, declared: Declared, p: Array) -> Array:
-    """Positions (n, 3) [m] drawn together so far that the nearest pairs are well in range, at half of it at rest."""
+    """Contract positions (n, 3) [m] until the nearest pairs are well within range, half of it."""
     mesh, r = Touching(declared), effect.thickness if effect.range is None else effect.range
     wanted = effect.thickness + r
     reach = max(wanted, 2.0 * declared.mesh.spacing)

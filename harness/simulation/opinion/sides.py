@@ -1,4 +1,4 @@
-"""One side of the comparison: what a scene declares and what the second opinion makes of each effect."""
+"""Reference terms of a scene: its declaration and the terms of each effect."""
 
 from __future__ import annotations
 
@@ -39,8 +39,15 @@ _OPINIONS: dict[str, Callable[[Any, Declared], Opinion]] = {
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """A scene with steps of one length: what it declares, the opinion of each effect and its energies, None for none;
-    owned: which of the scene's energies are each effect's; outside: the effects of which there is no second opinion."""
+    """A scene with a fixed step size, and its reference terms.
+
+    Attributes:
+      declaration: declaration of the scene.
+      effect_terms: reference terms of each effect.
+      energy_builders: builder of the energy of each effect, None for none.
+      energy_indices: indices of the scene's energies that belong to each effect.
+      external_effects: effects without a reference implementation.
+    """
 
     declared: Declared
     opinions: list[Opinion]
@@ -49,23 +56,23 @@ class Side:
     outside: set[int]
 
     def name(self, k: int) -> str:
-        """Effect k in words."""
+        """Return a description of effect k."""
         return f"effects[{k}] {self.declared.effects[k].kind}"
 
     def shortest(self, k: int | None = None) -> float:
-        """The shortest length [m] that effect k goes by, springs at rest if left out."""
+        """Return the smallest length [m] that effect k depends on; without k, that of springs at rest."""
         lengths = self.declared.mesh.rest_lengths
         springs = float(lengths[lengths > 0.0].min(initial=self.declared.mesh.spacing))
         return springs if k is None else min(springs, self.opinions[k].shortest)
 
 
 def side(spec: SceneSpec, scene: Scene) -> Side:
-    """What is thought of a scene that was built of the spec."""
+    """Build the reference terms of a scene built from the specification."""
     mesh, dt = scene.mesh, spec.time_step
     mass = _mass(spec, mesh)
     declared = Declared(mesh, mass, dt, tuple(spec.effects), not getattr(scene.integrator, "splits", False))
     bound = [effect.bind(mesh, mass, dt).by(scene.integrator) for effect in declared.effects]
-    # In the order in which a scene lines them up: each effect's, then what follows from all of those.
+    # The order is that of the scene's energies: those of each effect first, then those derived from all of them.
     first = [energy for part in bound for energy in part.energies]
     owners = [k for k, part in enumerate(bound) for _ in part.energies]
     owners += [k for k, part in enumerate(bound) for derive in part.derived for _ in derive(first)]
@@ -88,7 +95,7 @@ def side(spec: SceneSpec, scene: Scene) -> Side:
 
 
 def _mass(spec: SceneSpec, mesh: Mesh) -> Array:
-    """The masses (n,) [kg]."""
+    """Compute the masses (n,) [kg]."""
     if spec.mass_per_area is not None:
         area = sum(float(np.linalg.norm(np.cross(b - a, c - a))) / 2 for a, b, c in mesh.rest[mesh.triangles])
         return spec.mass_per_area * area * mesh.shares
@@ -96,6 +103,6 @@ def _mass(spec: SceneSpec, mesh: Mesh) -> Array:
 
 
 def _known(effect: Any) -> bool:
-    """Whether an effect is the shipped one of its kind."""
+    """Return whether an effect is the shipped one of its kind."""
     kind: type = effect.__class__
     return effect.kind in _OPINIONS and EFFECTS.get(effect.kind) == f"{kind.__module__}:{kind.__qualname__}"

@@ -1,18 +1,18 @@
 # pyright: reportConstantRedefinition=false
-# V and A are the letters of the formulas.
-"""Steps of several unknowns once more: Butcher's tableaux, and generalised alpha as Newmark's formulas have it.
+# V and A are the symbols of the formulas.
+"""Reference steps of integrators with several stages: Butcher tableaux and generalised alpha.
 
 Runge-Kutta, a stage with the weights a_ij and the time c_i (Alexander 1977; Hairer and Wanner, table IV.6.5; Hosea and
 Shampine 1996; Kennedy and Carpenter 2003):
 
     x = p + dt sum_j a_ij V_j,     V_i = v + dt sum_j a_ij A_j,     the last stage ends the step
 
-Generalised alpha (Chung and Hulbert 1993):
+Generalised alpha by Newmark's formulas (Chung and Hulbert 1993):
 
     x = (1 - af) d' + af d,   a' = (d' - d - dt v) / (beta dt^2) - (1/(2 beta) - 1) a,   v' = v + dt ((1 - g) a + g a')
 
-Where an unknown is expected is told by the known acceleration nearest in time; from order 3 on, and where forces or
-dashpots go by it, it is the answer itself.
+The expected solution of a stage is extrapolated with the known acceleration nearest in time. From order 3 on, where
+forces or dashpots depend on it, it is the solution itself.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from harness.simulation.opinion.derivatives import Wide, wide
 from harness.simulation.opinion.steps import Motion, Stated, decayed, pushed
 
 Answer = Callable[[float], Array]
-"""The unknown (n, 3) [m] at a time [s] that the solver answers."""
+"""Maps the time [s] of a stage to the solution (n, 3) [m] that the solver returns."""
 
 _HALF = np.sqrt(wide(0.5))
 
@@ -55,7 +55,7 @@ def _esdirk3() -> list[Any]:
 
 
 def _quarters(*rows: list[Any]) -> list[Any]:
-    """Rows that end in a quarter."""
+    """Return the rows with a quarter appended to each."""
     return [[*row, wide(1) / 4] for row in rows]
 
 
@@ -87,14 +87,14 @@ _TABLEAUX: dict[str, list[Any]] = {
     ],
 }
 _ALPHAS = {"generalised-alpha": (wide(0), wide(1) / 3), "hht": (wide(0), wide(0.1)), "newmark": (wide(0), wide(0))}
-"""am and af; a spectral radius of 1/2 has (2/2 - 1)/(3/2) and (1/2)/(3/2)."""
+"""am and af; for a spectral radius of 1/2 they are (2/2 - 1)/(3/2) and (1/2)/(3/2)."""
 _ORDERS = {"sdirk-3": 3, "esdirk-3": 3, "sdirk-4": 4, "esdirk-4": 4}
 STAGED = (*_TABLEAUX, *_ALPHAS)
 
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """The unknowns of a step as they should be stated, the answers (n, 3) [m], and how the step ends."""
+    """The reference stages of a step, their solutions (n, 3) [m], and the end of the step."""
 
     stated: list[Stated]
     answers: list[Array]
@@ -119,14 +119,14 @@ class _Step:
         self.answers: list[Array] = []
 
     def carried(self, motion: Motion, time: float) -> list[Wide]:
-        """The motion with exact pins where they are at a time [s], and as fast."""
+        """Return the motion with positions and velocities of exact pins at a time [s]."""
         p, v = (wide(part).copy() for part in motion)
         for i, pin in self.exact:
             p[i], v[i] = pin.place(time), pin.speed(time)
         return [p, v]
 
     def state(self, c: Any, rate: Any, when: Any, target: Wide, origin: Wide, expected: Wide) -> tuple[Wide, Wide]:
-        """Note an unknown; returns the answer and its velocity."""
+        """Record a stage; returns its solution and velocity."""
         until = self.time + float(when) * self.declared.time_step
         origin, led = origin.copy(), target + self.dt**2 / c * expected
         held = wide([pin.place(until) for _, pin in self.pins]).reshape(-1, 3)
@@ -148,12 +148,12 @@ class _Step:
         return wide(x), rate * (wide(x) - origin)
 
     def free(self, a: Wide) -> Wide:
-        """An acceleration, none at exact pins."""
+        """Set an acceleration to zero at exact pins."""
         a[[i for i, _ in self.exact]] = 0
         return a
 
     def done(self, end: Motion, a: Wide) -> Steps:
-        """The whole step."""
+        """Return the completed step."""
         return Steps(self.stated, self.answers, self.carried(end, self.time + self.declared.time_step), a)
 
 
@@ -166,7 +166,17 @@ def stages(
     time: float,
     answer: Answer,
 ) -> Steps:
-    """The step of an integrator from a motion and its acceleration (n, 3) [m/s^2]."""
+    """Take the step of an integrator from a motion and its acceleration.
+
+    Args:
+      name: name of the integrator.
+      declared: declaration of the scene.
+      opinions: reference terms of the effects.
+      now: motion at the start.
+      acceleration: acceleration (n, 3) [m/s^2] at the start.
+      time: time [s] of the start.
+      answer: solution of a stage as a function of time.
+    """
     step = _Step(name, declared, opinions, now, time, answer)
     run = _alpha if name in _ALPHAS else _runge_kutta
     return run(name, step, wide(acceleration))
@@ -198,7 +208,7 @@ def _alpha(name: str, step: _Step, a: Wide) -> Steps:
     gamma, beta = wide(0.5) - am + af, (1 - am + af) ** 2 / 4
 
     def after(x: Wide) -> list[Wide]:
-        """d', v' and a' of an unknown."""
+        """Return d', v' and a' of a solution."""
         end = (x - af * d) / (1 - af)
         b = (end - d - dt * v) / (beta * dt**2) - (1 / (2 * beta) - 1) * a
         return [end, v + dt * ((1 - gamma) * a + gamma * b), b]

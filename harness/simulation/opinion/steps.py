@@ -1,12 +1,12 @@
-"""The step once more: what each integrator makes of a motion (Liu et al. 2013, eq. 6; Hairer and Wanner).
+"""Reference steps of integrators with one stage (Liu et al. 2013, eq. 6; Hairer and Wanner).
 
                      c     x             target                            velocity at x             after the step
     implicit Euler   1     p(t + dt)     p + dt v                          (x - p)/dt                x
     BDF2             9/4   p(t + dt)     (4 p - p')/3 + 2 dt/9 (4 v - v')  (3 x - 4 p + p')/(2 dt)   x
     midpoint         4     p(t + dt/2)   p + dt/2 v                        2 (x - p)/dt              2 x - p
 
-A step of BDF2 without a motion before it is one of implicit Euler. Forces and what is lagged are taken where it starts
-for implicit Euler, and else extrapolated to the time of x.
+A step of BDF2 without a previous motion is one of implicit Euler. Forces and lagged quantities are evaluated at the
+start of the step for implicit Euler, and otherwise extrapolated to the time of x.
 """
 
 from __future__ import annotations
@@ -26,8 +26,19 @@ Motion = Sequence[Array]
 
 @dataclass(frozen=True, eq=False)
 class Stated:
-    """One step as it should be stated: c, target (n, 3) [m], force (n, 3) [N] and the size [N] of its round-off, pinned
-    vertices with weights [N/m] and targets (q, 3) [m], and the moment; now: the motion at the start, filtered."""
+    """One reference step.
+
+    Attributes:
+      c: inertia factor.
+      inertial_target: target (n, 3) [m].
+      external_force: force (n, 3) [N].
+      force_size: size [N] of its round-off, divided by eps.
+      vertices: pinned vertices.
+      weights: their weights [N/m].
+      pin_targets: their targets (q, 3) [m].
+      step_moment: data of the step.
+      start_motion: motion at the start, filtered.
+    """
 
     c: float
     target: Any
@@ -40,7 +51,7 @@ class Stated:
     now: Motion
 
     def after(self, x: Array) -> tuple[Any, Any]:
-        """Positions and velocities at the step's end, from its unknown x (n, 3) [m]."""
+        """Return positions and velocities at the step's end from its solution x (n, 3) [m]."""
         m = self.moment
         v = m.rate * (wide(x) - m.origin)
         return (wide(x), v) if m.when == 1.0 else (2 * wide(x) - m.p, 2 * v - m.v)
@@ -49,7 +60,16 @@ class Stated:
 def state(
     integrator: str, declared: Declared, opinions: Sequence[Opinion], now: Motion, before: Motion | None, time: float
 ) -> Stated:
-    """The step from a motion now and one step before it (None: there is none), at a time [s]."""
+    """Build the reference step.
+
+    Args:
+      integrator: name of the integrator.
+      declared: declaration of the scene.
+      opinions: reference terms of the effects.
+      now: motion at the start.
+      before: motion one step earlier, None where there is none.
+      time: time [s] of the start.
+    """
     dt = declared.time_step
     now, earlier = decayed(now, opinions), decayed(before or now, opinions)
     (p, v), (p0, v0) = ((wide(a), wide(b)) for a, b in (now, earlier))
@@ -74,7 +94,7 @@ def state(
 
 
 def pushed(opinions: Sequence[Opinion], p: Array, v: Array, time: float) -> tuple[Array, float]:
-    """All forces (n, 3) [N] at a motion and a time [s], and the size [N] of their round-off."""
+    """Sum all forces (n, 3) [N] at a motion and a time [s], and the sizes [N] of their round-off."""
     force, size = np.zeros_like(p), 0.0
     for opinion in opinions:
         if opinion.force:
@@ -84,7 +104,7 @@ def pushed(opinions: Sequence[Opinion], p: Array, v: Array, time: float) -> tupl
 
 
 def decayed(motion: Motion, opinions: Sequence[Opinion]) -> Motion:
-    """The motion at a step's start, its velocity as filters leave it."""
+    """Return the motion at a step's start with filtered velocity."""
     p, v = motion
     for opinion in opinions:
         v = opinion.decay(v) if opinion.decay else v

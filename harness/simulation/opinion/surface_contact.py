@@ -1,8 +1,10 @@
-"""Contact with surfaces of obstacles once more: the barrier of `self_contact` between a mesh and each obstacle, points
-with triangles both ways and edges with edges; k is the mean of the mesh's vertices in a pair.
+"""Reference terms of contact with obstacle surfaces: the barrier of self-contact between a mesh and each obstacle.
 
-What triangles an obstacle has is declared (`harness.scenes.shapes`); where they are is told by the second opinion's own
-motion. In a step they are where they are at the unknown's time.
+Pairs are points with triangles in both directions and edges with edges; k is the mean over the mesh's vertices in a
+pair.
+
+The triangles of an obstacle are declared (`harness.scenes.shapes`); their positions are computed by the reference
+implementation's own motion. In a step they are at the time of the stage.
 """
 
 from __future__ import annotations
@@ -18,25 +20,27 @@ from harness.simulation.opinion.motion import place
 from harness.simulation.opinion.self_contact import Indices, Touching, barriers, near
 
 _SOME = 200
-"""Steps, none longer than the mesh's spacing."""
+"""Maximum number of moves towards an obstacle, none longer than the mesh spacing."""
 _WAYS = 20
-"""That are tried, of which some lead into another obstacle."""
+"""Number of directions that are tried, since some lead into another obstacle."""
 
 
 def surface_contact(effect: Any, declared: Declared) -> Opinion:
-    """The barriers between the mesh and all obstacles."""
+    """Build the barriers between the mesh and all obstacles."""
     return barriers(effect, against(effect, declared))
 
 
 def against(effect: Any, declared: Declared) -> list[Against]:
-    """The mesh with each obstacle."""
+    """Build the pairs of the mesh and each obstacle."""
     shapes = effect.shapes(np.asarray(declared.mesh.rest, float))
     return [Against(declared, one, *shape) for one, shape in zip(effect.obstacles, shapes, strict=True)]
 
 
 class Against(Touching):
-    """A mesh, and an obstacle's points (o, 3) [m], as declared, and triangles (f, 3), whose vertices follow the
-    mesh's."""
+    """A mesh and one obstacle.
+
+    The obstacle has points (o, 3) [m], as declared, and triangles (f, 3), whose vertices are numbered after the mesh's.
+    """
 
     def __init__(self, declared: Declared, one: Any, points: Array, triangles: Indices) -> None:
         super().__init__(declared)
@@ -49,7 +53,7 @@ class Against(Touching):
         self.rest = np.concatenate([self.rest, points])
 
     def obstacle(self, time: float) -> Wide:
-        """Where the obstacle's points are at a time [s], (o, 3) [m]."""
+        """Return the positions (o, 3) [m] of the obstacle's points at a time [s]."""
         points = self._declared
         if self._frames:
             x = np.asarray(self._frames.stored, float)
@@ -60,20 +64,20 @@ class Against(Touching):
         return place(self._motion, time).there(points)
 
     def whole(self, x: Wide, time: float) -> Wide:
-        """See Touching."""
+        """Return the positions of mesh and obstacle vertices at a time [s]."""
         return np.concatenate([x, self.obstacle(time)])
 
     def near(self, x: Array, reach: float) -> tuple[Indices, Indices]:
-        """See Touching."""
+        """Find the pairs of mesh and obstacle closer than a distance [m]."""
         points = near(x, self.points, self._faces, reach), near(x, self._corners, self.triangles, reach)
         return np.concatenate(points), near(x, self.edges, self._sides, reach)
 
     def apart(self, rows: Indices, edges: bool) -> Wide:
-        """See Touching: what is at rest is not beside the obstacle."""
+        """Return infinite rest distances: the rest shape is not near the obstacle."""
         return wide(np.full(len(rows), np.inf))
 
     def clear(self, p: Array, time: float, apart: float) -> bool:
-        """Whether no pair is nearer than `apart` [m], the mesh at p (n, 3) [m], at a time [s]."""
+        """Return whether no pair is closer than `apart` [m], with the mesh at p (n, 3) [m], at a time [s]."""
         return self.nearest(np.concatenate([p, np.asarray(self.obstacle(time), float)]), apart) >= apart
 
 
@@ -83,8 +87,18 @@ Beside = tuple[Any, Against]
 
 
 def met(all_: list[Beside], k: int, p: Array, spacing: float, times: tuple[float, float], rng: Rng) -> list[Array]:
-    """Positions (n, 3) [m] as a whole near to obstacle k, where it is at each of two times [s]; at the first one free
-    of all obstacles, as every step starts. spacing [m]: of the mesh."""
+    """Translate positions near to an obstacle at each of two times.
+
+    At the first time they are separated from all obstacles, as at the start of every step.
+
+    Args:
+      all_: effects with mesh and obstacle.
+      k: index of the obstacle.
+      p: positions (n, 3) [m].
+      spacing: mesh spacing [m].
+      times: two times [s].
+      rng: random generator.
+    """
     effect, one = all_[k % len(all_)]
     found = list[Array]()
     for _ in range(_WAYS):
@@ -96,8 +110,19 @@ def met(all_: list[Beside], k: int, p: Array, spacing: float, times: tuple[float
 
 
 def brought(effect: Any, one: Against, p: Array, spacing: float, time: float, way: Array, rng: Rng) -> Array:
-    """Positions (n, 3) [m] as a whole outside of an obstacle, and so near to it that some pair is in range, at a time
-    [s]: from far away along a way (3,), each time by what is free. spacing [m]: of the mesh."""
+    """Translate positions to an obstacle until some pair is in range.
+
+    The mesh starts far away and moves against a direction, each time by the free distance.
+
+    Args:
+      effect: contact effect.
+      one: mesh and obstacle.
+      p: positions (n, 3) [m].
+      spacing: mesh spacing [m].
+      time: time [s].
+      way: unit vector (3,) from the obstacle.
+      rng: random generator.
+    """
     reach = effect.thickness if effect.range is None else effect.range
     there = np.asarray(one.obstacle(time), float)
     middle = 0.5 * (there.max(axis=0) + there.min(axis=0))

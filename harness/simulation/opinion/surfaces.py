@@ -1,11 +1,12 @@
-"""Bending and gas once more, from the triangles.
+"""Reference terms of bending and gas, from the triangles.
 
-bending   B/2 |K x|^2 / (A0 + A1) over each pair of triangles that share an edge x0 x1 and have x2, x3 across, with
-          K = (c03 + c04, c01 + c02, -c01 - c03, -c02 - c04), the cotangents c of the angles at the edge and the areas
-          A at rest (Bergou et al. 2006, with 3/(A0 + A1) halved and thirded as `solvers.energies.bending` argues:
-          a cylinder of curvature k stores B/2 k^2 a unit of area). Rectangles count as cut by either diagonal, half
-          each.
-gas       -p0 V0 ln(V/V0), V = sum of a.(b x c)/6 over triangles that face outwards
+bending   B/2 |K x|^2 / (A0 + A1) over each pair of triangles that share an edge x0 x1 and have opposite vertices x2,
+x3,
+          with K = (c03 + c04, c01 + c02, -c01 - c03, -c02 - c04), the cotangents c of the angles at the edge and the
+          areas A at rest (Bergou et al. 2006, with 3/(A0 + A1) divided by 2 and by 3 as derived in
+          `solvers.model.energies.bending_energy`: a cylinder of curvature k stores B/2 k^2 per unit of area).
+          Rectangles count as cut by either diagonal, half each.
+gas       -p0 V0 ln(V/V0), V = sum of a.(b x c)/6 over outward triangles
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from harness.simulation.opinion.derivatives import Values, Wide, wide
 
 Triangle = frozenset[int]
 _SAME = 1e-6
-"""Of a diagonal: rectangles are told from other quadrangles by less."""
+"""Relative tolerance, with respect to a diagonal, within which a quadrangle is a rectangle."""
 
 
 def bending(effect: Any, declared: Declared) -> Opinion:
-    """The quadratic bending energy of the mesh's triangles."""
+    """Build the quadratic bending energy of the mesh's triangles."""
     corners, K, weight = stencils(effect.stiffness, declared)
     share = np.asarray(weight[:, None] * K**2, float)
     resists = np.asarray(np.bincount(corners.ravel(), share.ravel(), len(declared.mass)), float)
@@ -32,7 +33,7 @@ def bending(effect: Any, declared: Declared) -> Opinion:
 
 
 def damped_bending(effect: Any, b: float, declared: Declared) -> Any:
-    """b times the matrix of the bending as damping: the energy of a step."""
+    """Build damping by b times the bending matrix."""
     corners, K, weight = stencils(effect.stiffness, declared)
 
     def begin(moment: Moment) -> Values:
@@ -50,8 +51,7 @@ def _bent(corners: Any, K: Wide, weight: Wide, origin: Any) -> Values:
 
 
 def stencils(B: float, declared: Declared) -> tuple[Any, Wide, Wide]:
-    """The corners (h, 4), the coefficients K (h, 4) and the weights (h,) of all pairs of triangles, for a rigidity
-    B."""
+    """Build the corners (h, 4), coefficients K (h, 4) and weights (h,) of all hinges for a rigidity B."""
     rest, surface = declared.rest, [frozenset(t) for t in declared.mesh.triangles.tolist()]
     pairs = list(_pairs(surface))
     rectangles, share = [pair for pair in pairs if _rectangle(rest[list(pair)])], B
@@ -66,7 +66,7 @@ def stencils(B: float, declared: Declared) -> tuple[Any, Wide, Wide]:
 
 
 def _pairs(surface: Sequence[Triangle]) -> Iterator[tuple[int, int, int, int]]:
-    """Edges that two triangles share, and the two corners across."""
+    """Find the edges that two triangles share, and the two opposite vertices."""
     tips: dict[Triangle, list[int]] = {}
     for triangle in surface:
         for tip in triangle:
@@ -78,14 +78,14 @@ def _pairs(surface: Sequence[Triangle]) -> Iterator[tuple[int, int, int, int]]:
 
 
 def _rectangle(x: Wide) -> bool:
-    """Whether the diagonals of x (4, 3) are equally long and halve each other."""
+    """Return whether the diagonals of x (4, 3) are equally long and bisect each other."""
     one, two, apart = x[0] - x[1], x[2] - x[3], x[0] + x[1] - x[2] - x[3]
     a, b, c = (np.sqrt(v @ v) for v in (one, two, apart))
     return bool(max(abs(a - b), c) <= _SAME * a)
 
 
 def _stencil(x: Wide) -> tuple[list[Any], Any]:
-    """K and A0 + A1 of the corners x (4, 3)."""
+    """Compute K and A0 + A1 of the corners x (4, 3)."""
     edge = x[1] - x[0]
 
     def cotangent(u: Wide, v: Wide) -> Any:
@@ -99,7 +99,7 @@ def _stencil(x: Wide) -> tuple[list[Any], Any]:
 
 
 def gas(effect: Any, declared: Declared) -> Opinion:
-    """Gas at constant temperature in the closed mesh."""
+    """Build isothermal gas in the closed mesh."""
     a, b, c = declared.mesh.triangles.T
     about = declared.rest.mean(axis=0)
 
@@ -125,6 +125,6 @@ def _cross(u: Wide, v: Wide) -> Wide:
 
 
 def triangle_areas(x: Array, triangles: Any) -> Array:
-    """The areas (f,) [m^2] of triangles at x (n, 3) [m]."""
+    """Compute the areas (f,) [m^2] of triangles at x (n, 3) [m]."""
     a, b, c = (x[corner] for corner in triangles.T)
     return 0.5 * np.sqrt((_cross(b - a, c - a) ** 2).sum(axis=1))

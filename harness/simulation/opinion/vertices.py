@@ -1,4 +1,4 @@
-"""What acts vertex by vertex, once more: attachments, drag, Rayleigh damping, decay of the velocity, pins.
+"""Reference terms per vertex: attachments, drag, Rayleigh damping, velocity decay, pins.
 
 attachments   k/2 |x_i - q_i(t)|^2, the stiffness shared equally
 air drag      c rate/2 |x_i - o_i|^2, of which the gradient is c v_i; quadratic: m dv/dt = -c |v| v, solved exactly
@@ -24,7 +24,7 @@ from harness.simulation.opinion.surfaces import damped_bending
 
 
 def attachments(effect: Any, declared: Declared) -> Opinion:
-    """Springs of no length to points."""
+    """Build springs of zero length to points."""
     vertices = chosen(declared, effect)
     k = np.longdouble(effect.stiffness) / len(vertices)
     given = declared.rest[vertices] if effect.to is None else np.broadcast_to(wide(effect.to), (len(vertices), 3))
@@ -39,12 +39,12 @@ def attachments(effect: Any, declared: Declared) -> Opinion:
 
 
 def _reach(motion: Any) -> float:
-    """How far [m] key frames take points, turns apart."""
+    """Return the largest translation [m] of key frames, without rotations."""
     return max((float(np.abs(key.offset).max()) for key in motion.keys), default=0.0) if motion else 0.0
 
 
 def air_drag(effect: Any, declared: Declared) -> Opinion:
-    """Drag in still air, as an energy or of the velocity."""
+    """Build drag in still air, as an energy or as a velocity filter."""
     c = effect.coefficient * declared.mesh.shares
     if effect.law == "linear":
         return Opinion(_drag(c), c / declared.time_step)
@@ -53,7 +53,7 @@ def air_drag(effect: Any, declared: Declared) -> Opinion:
     def force(p: Array, v: Array, t: float) -> tuple[Array, float]:
         speed = np.sqrt((v**2).sum(axis=1))
         drag = np.minimum(c * speed, mass / dt)
-        # A speed is known to the round-off of positions, times the rate.
+        # The accuracy of a speed is the round-off of positions, times the rate.
         return -drag[:, None] * v, float((drag + c * speed).max()) * (float(speed.max()) + declared.mesh.size / dt)
 
     if declared.staged:
@@ -75,7 +75,7 @@ def _drag(c: Array) -> Begin:
 
 
 def ether_drag(effect: Any, declared: Declared) -> Opinion:
-    """Decay of all velocity, or drag in proportion to mass."""
+    """Build decay of all velocities, or drag proportional to mass."""
     if declared.staged:
         c = effect.rate * declared.mass
         return Opinion(_drag(c), c / declared.time_step)
@@ -83,7 +83,7 @@ def ether_drag(effect: Any, declared: Declared) -> Opinion:
 
 
 def rayleigh(effect: Any, declared: Declared) -> Opinion:
-    """Damping in proportion to the masses and to the stiffness of springs and bending."""
+    """Build damping proportional to the masses and to the stiffness of springs and bending."""
     b, parts = effect.stiffness, [_drag(effect.mass * declared.mass)]
     if b:
         parts += [along_edges(declared, b * finite(of_springs(s, declared))) for s in declared.of_kind("springs")]
@@ -101,14 +101,14 @@ def rayleigh(effect: Any, declared: Declared) -> Opinion:
 
 
 def pins(effect: Any, declared: Declared) -> Opinion:
-    """Vertices that are held."""
+    """Build pinned vertices."""
     weight = math.inf if effect.weight == "exact" else float(effect.weight)
     held = {i: pin(weight, effect.motion, declared.rest[i]) for i in chosen(declared, effect)}
     return Opinion(pins=held, reach=_reach(effect.motion))
 
 
 def pin(weight: float, motion: Any, q: Wide) -> PinnedVertex:
-    """A pin of a point declared at q (3,) [m]."""
+    """Build a pin of a point declared at q (3,) [m]."""
 
     def there(time: float) -> Wide:
         return place(motion, time).there(q[None])[0]
