@@ -158,5 +158,8 @@ class Replay:
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     def absolute_positions(self, frame: int) -> Positions:
-        """Return the positions (n, 3) [m] of the recorded frame with an index counted from 0, with the origin added."""
+        """Return the positions (n, 3) [m] of a recorded frame in absolute coordinates.
+
+        `frame` is the index among the recorded frames, counted from 0. The origin is added to the stored positions.
+        """
         return self.positions[frame] + self.origin

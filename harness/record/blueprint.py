@@ -38,7 +38,10 @@ def spring_cadence(info: RecordingInfo) -> int:
 
 
 def application(info: RecordingInfo) -> str:
-    """Return the application name of a scene, for which the viewer stores one layout, so that its camera fits."""
+    """Return the application name of a scene.
+
+    The viewer stores one layout for each application; one for each scene makes the camera fit.
+    """
     return f"springbench {info.properties.get('scene', info.title)}"
 
 

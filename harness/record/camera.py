@@ -204,8 +204,7 @@ class _Sight:
 
 
 def _outermost(p: NDArray[np.float64], of: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the vertices that are extreme along some axis, with axes spread over all directions, and their positions.
-    """
+    """Return the vertices that are extreme along axes spread over all directions, and their positions."""
     if len(of) <= 2 * _SUPPORTS:
         return of, p[of]
     turn = np.arange(_SUPPORTS)

@@ -28,7 +28,10 @@ def counted(batch: pa.RecordBatch, timeline: str) -> NDArray[Any]:
 
 
 def column(batch: pa.RecordBatch, name: str) -> Any:
-    """Return a column; it is untyped since pyarrow's stubs do not type arrays that depend on the schema."""
+    """Return a column, untyped.
+
+    pyarrow's stubs do not type arrays that depend on the schema.
+    """
     return cast(Any, batch[name])
 
 

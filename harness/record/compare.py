@@ -49,7 +49,10 @@ _PAINTED = (
 
 
 class Look(NamedTuple):
-    """Line style of a run: a colour such as `#0072b2`, which is lightened here where it is dark."""
+    """Line style of a run.
+
+    `color` is a colour such as `#0072b2`, which is lightened in side-by-side recordings where it is dark.
+    """
 
     color: str
 
@@ -62,6 +65,7 @@ def side_by_side(out: Path, recordings: Mapping[str, Path], title: str, looks: M
       recordings: paths of the recordings by solver name.
       title: title of the new recording.
       styles: line styles by solver name.
+
     Raises:
       InputError: a file is not the recording of a run.
       RunFailed: `out` cannot be written.
@@ -179,7 +183,10 @@ def residuals(source: Source) -> dict[int, list[float]]:
 
 
 def on_dark(color: str) -> str:
-    """Return a colour such as `#0072b2` mixed with white where it is dark, as on the dark results page."""
+    """Return a colour such as `#0072b2`, mixed with white where it is dark.
+
+    The mixture is that of the dark results page.
+    """
     parts = [int(color[k : k + 2], 16) for k in (1, 3, 5)]
     by = max(0.0, 0.5 - float(np.dot((0.2126, 0.7152, 0.0722), parts)) / 255)
     return "#" + "".join(f"{round(part + (255 - part) * by):02x}" for part in parts)

@@ -30,7 +30,10 @@ Points = NDArray[np.float64]
 
 
 def colours(numbers: Iterable[int]) -> Colours:
-    """Return colours 0xRRGGBBAA as an array; Rerun reads a list of three or four numbers as one colour."""
+    """Return colours 0xRRGGBBAA as an array.
+
+    Rerun reads a list of three or four numbers as the components of one colour.
+    """
     return np.array(list(numbers), np.uint32)
 
 
@@ -101,7 +104,7 @@ def _across(iterations: NDArray[np.int64], last: int) -> NDArray[np.float64]:
 
 
 def _round(last: int) -> int:
-    """Return a tick step of 1, 2 or 5 times a power of ten, for about five ticks."""
+    """Return a round tick step (1, 2 or 5 times a power of ten) for about five ticks."""
     power = 10 ** math.floor(math.log10(max(1.0, last / 5)))
     return int(next(f * power for f in (1, 2, 5, 10) if f * power * 5 >= last))
 

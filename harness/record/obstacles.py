@@ -39,7 +39,14 @@ def declared(obstacles: Sequence[AnySurface]) -> dict[str, str]:
 
 
 class Obstacles:
-    """Obstacles near a mesh with rest positions (n, 3) [m], in an open recording relative to an origin (3,) [m]."""
+    """Obstacles of an open recording.
+
+    Args:
+      stream: open recording.
+      obstacles: declared obstacles.
+      rest: rest positions of the mesh (n, 3) [m].
+      origin: origin of the recorded positions (3,) [m].
+    """
 
     def __init__(self, stream: rr.RecordingStream, obstacles: Sequence[AnySurface], rest: Array, origin: Array) -> None:
         self._stream, self._origin = stream, origin
@@ -71,7 +78,9 @@ def _sphere(one: Sphere, rest: Array, origin: Array) -> rr.Ellipsoids3D:
 
 
 def _capsule(one: Capsule, rest: Array, origin: Array) -> rr.Capsules3D:
-    """Build a capsule; Rerun's extends along z, so it is rotated by 180 degrees about the bisector of z and its axis.
+    """Build a capsule.
+
+    Rerun's capsule extends along z. It is rotated by 180 degrees about the bisector of z and the capsule's axis.
     """
     first, last = np.array(one.ends)
     length = float(np.linalg.norm(last - first))

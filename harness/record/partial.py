@@ -1,7 +1,7 @@
-"""A Rerun file under a temporary name until it is complete, so that a kill leaves no truncated file.
+"""Rerun file with a temporary name until it is complete.
 
-The stream has no batching thread of its own, which would slow down concurrent work and lose its last batch in a kill.
-Logged data is written to disk by `flush_stream`.
+A kill therefore leaves no truncated file under the final name. The stream has no batching thread of its own, which
+would slow down concurrent work and lose its last batch in a kill. Logged data is written to disk by `flush_stream`.
 
 The library has no public call to end the threads of a destroyed stream, to write a layout without leaving threads
 running, or to release a stream whose writer has died. `tests/contracts/test_rerun_gaps.py` fails once it has one.
@@ -88,7 +88,10 @@ class PartialFile:
         sketch.disconnect()
 
     def finish(self, layout: rrb.Blueprint) -> Path:
-        """Close the file, check that it is complete, rename it to its final name and return that path."""
+        """Close the file, check that it is complete, and give it its final name.
+
+        Returns: the final path.
+        """
         try:
             self.lay_out(layout)
             self.flush()
@@ -120,7 +123,10 @@ class PartialFile:
         return cannot_write(self._path, self._cause() or error)
 
     def _cause(self) -> OSError | None:
-        """Find why the library's writer died, by a test write to the file; the library does not report it."""
+        """Find why the library's writer died.
+
+        The library does not report the cause, so a test write to the file repeats the error.
+        """
         try:
             with self._partial.open("ab") as file:
                 file.write(bytes(_PAGE))

@@ -99,6 +99,7 @@ def read_replay(path: Path, frames: Collection[int] | None = None) -> Replay:
     Args:
       path: path of the recording.
       frames: indices of the frames, -1 for the last; all if omitted.
+
     Raises:
       InputError: the file is not the recording of a run or lacks a selected frame.
     """
@@ -232,6 +233,7 @@ def positions(
     Args:
       source: open recording.
       frames: indices of the frames; all if omitted.
+
     Returns: tuples whose positions are relative to the origin.
     """
     for chunk in source.chunks(content="/scene/mesh", components=_POSITIONS):

@@ -257,7 +257,10 @@ class RerunRecorder:
         curves.draw(self._stream, "/curves/objective", above, colours)
 
     def _send_changes(self) -> None:
-        """Write each energy's change from the start relative to its largest change, so that small ones stay visible."""
+        """Write each energy's change from the start, relative to its largest change.
+
+        Small energies thus stay visible.
+        """
         for name, by_frame in self._energies.items():
             frames, values = np.array(list(by_frame)), np.array(list(by_frame.values()))
             change = values - values[0]
@@ -293,7 +296,10 @@ class RerunRecorder:
         return rr.TimeColumn("frame", sequence=frames), self._seconds(frames)
 
     def _at(self, frames: NDArray[np.int64]) -> Iterable[rr.TimeColumn]:
-        """Build the time columns of scene entities; on the iterations timeline of a run the scene is static."""
+        """Build the time columns of scene entities.
+
+        On the iterations timeline of a run the scene is static.
+        """
         iterations = frames if self._info.iterates else np.zeros_like(frames)
         return (
             rr.TimeColumn("frame", sequence=frames),
@@ -314,7 +320,7 @@ class RerunRecorder:
 
 
 def _segments(ends: NDArray[np.float32]) -> Any:
-    """Build line strips of two points each from (m, 2, 3), without the library's Python loop over them."""
+    """Build line strips of two points each from (m, 2, 3), without a Python loop."""
     points: Any = rr.components.Position3DBatch(ends.reshape(-1, 3)).as_arrow_array()
     offsets: Any = pa.array(np.arange(0, 2 * len(ends) + 1, 2, dtype=np.int32))
     return pa.ListArray.from_arrays(offsets, points, type=_STRIPS)

@@ -56,6 +56,7 @@ def strain_range(
       positions: vertex positions, each (n, 3) [m].
       springs: vertex pairs (m, 2).
       rest_lengths: rest lengths (m,) [m].
+
     Returns: the range of `round_scale_end` over all strains; DEFAULT_STRAIN_RANGE without springs.
     """
     found = [strains(p, springs, rest_lengths)[1] for p in positions if len(rest_lengths)]
@@ -134,6 +135,7 @@ def strains(
       p: positions (n, 3) [m].
       springs: vertex pairs (m, 2).
       rest_lengths: rest lengths (m,) [m].
+
     Returns: strains of the springs (m,), and for each vertex (n,) the one of largest magnitude among its springs.
     """
     of_spring, of_vertex = np.empty(len(rest_lengths)), np.zeros(len(p))

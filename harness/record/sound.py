@@ -7,7 +7,7 @@ written is therefore first read in the child process of `harness.execution.sandb
 Files that can be read are noted in the user's cache folder, for all processes, since reading a whole recording takes
 far longer than what a report needs from it. A note identifies the state of a file by its inode, size and times; the
 change time is set by the system and cannot be forged. Notes are not stored with the results, which may come from
-anybody.
+any source.
 """
 
 from __future__ import annotations
@@ -94,7 +94,10 @@ def _state(path: Path) -> bytes:
 
 
 def whole_messages(path: Path) -> tuple[bool, int]:
-    """Return whether the file has its end mark, and the offset [bytes] of the end of its last complete message."""
+    """Find the end of the last complete message.
+
+    Returns: whether the file has its end mark, and the offset [bytes] of the end of its last complete message.
+    """
     size, place = path.stat().st_size, _HEADER
     with path.open("rb") as file:
         while place + 16 <= size:
@@ -114,6 +117,7 @@ def require_sound(path: Path, read: Callable[[Path], None]) -> None:
     Args:
       path: path of the recording.
       read_recording: function at module level that reads it.
+
     Raises:
       InputError: the recording cannot be read.
     """

@@ -43,7 +43,9 @@ def require_frames(path: Path, info: RecordingInfo, times: Mapping[int, float], 
       info: properties of the recording.
       times: time [s] of each checked frame.
       run: positions (n, 3) [m] of each checked frame; the last of them is the run's last frame.
+
     Returns: SHA-256 of the positions in the recording's last frame, as stored (float32 bytes).
+
     Raises:
       RunFailed: the recording does not end with that frame, or times, positions or colours of a frame differ.
       InputError: the file cannot be read.
@@ -70,7 +72,13 @@ def require_frames(path: Path, info: RecordingInfo, times: Mapping[int, float], 
 
 
 class _Recorded(NamedTuple):
-    """Time [s], positions (n, 3) [m] relative to the origin, and colours (n,) as 0xRRGGBBAA of a frame."""
+    """A recorded frame.
+
+    Attributes:
+      time: time [s].
+      positions: positions (n, 3) [m] relative to the origin.
+      colours: colours (n,) as 0xRRGGBBAA.
+    """
 
     time: float
     positions: NDArray[np.float32]
@@ -78,7 +86,7 @@ class _Recorded(NamedTuple):
 
 
 def _read(path: Path, wanted: Collection[int]) -> tuple[NDArray[np.float64], int, dict[int, _Recorded]]:
-    """Read the origin, the number of the last frame (-1 for none), and the selected frames that are recorded."""
+    """Read the origin, the number of the last frame (-1 for none), and the selected frames."""
     end, found = -1, dict[int, _Recorded]()
     with open_recording(path) as source:
         origin = read_origin(properties(source)[1])

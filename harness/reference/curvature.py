@@ -137,6 +137,7 @@ def across(problem: StepProblem, p: Positions, at: Curvature, *, most: float = S
       p: positions (n, 3) [m].
       at: curvature at p.
       max_fraction: maximum length of the step relative to the mesh extent; longer steps are scaled down.
+
     Returns: positions (n, 3) [m].
     """
     free, q, x = problem.system.free, p.copy(), at.direction[problem.system.free].ravel()

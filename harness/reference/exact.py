@@ -64,7 +64,10 @@ class Exact:
         return replace(problem, system=self._with(tension, firm))
 
     def tensions(self, problem: StepProblem, p: Positions) -> NDArray[np.float64]:
-        """Compute the tensions (m,) [N] at p (n, 3) [m], zero where an edge is within its limits."""
+        """Compute the tensions (m,) [N] at p (n, 3) [m].
+
+        They are zero where an edge is within its limits.
+        """
         x, k, rows = self.lengths, self._penalties, len(self._columns)
         length, n = directions(p[x.edges[:, 0]] - p[x.edges[:, 1]], x.rest_direction)
         J = _along(x, n, len(p))[:, self._columns]
@@ -134,10 +137,10 @@ def _along(x: Lengths, n: Positions, vertices: int) -> csr_array:
 
 
 def _solved(Q: csr_array, J: csr_array, gives: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Solve [Q J'; J 0] x = b by iterative refinement with a factor of a slightly compliant matrix.
+    """Solve [Q J'; J 0] x = b by iterative refinement.
 
-    The compliance avoids a singular matrix where lengths are linearly dependent; refinement removes its effect on the
-    others.
+    The factor is that of a slightly compliant matrix. The compliance avoids a singular matrix where lengths are
+    linearly dependent; refinement removes its effect on the others.
     """
     if not len(gives):
         return np.asarray(splu(Q.tocsc()).solve(right))

@@ -85,8 +85,10 @@ def reference_run(
       num_steps: number of the last step.
       frames: steps to return; the snapshot steps if empty.
       initial_state: state from which to continue; the start of the scene if omitted.
+
     Returns: the steps by frame, and for all steps (num_steps,) the decrease of the objective [J] from the current
       positions to the solution, nan before the initial state.
+
     Raises:
       RunFailed: a step does not converge.
     """

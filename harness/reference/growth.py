@@ -90,6 +90,7 @@ class Growth:
         Args:
           error: relative error.
           times: times [s]; the end if omitted.
+
         Raises:
           Unpredictable: the perturbation has grown too large at one of the times.
         """
@@ -115,6 +116,7 @@ def growth(spec: SceneSpec, size: int, horizon: float) -> Growth:
       spec: specification of the scene.
       size: size of the scene.
       t_end: end time [s].
+
     Raises:
       Unpredictable: nothing moves, or the motion is not finite.
       Unintegrable: the scene has no equation of motion.

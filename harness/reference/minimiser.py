@@ -139,9 +139,10 @@ def polish(problem: StepProblem, p: Positions, solver: Solver) -> Minimum:
 
 
 def certify(problem: StepProblem, p: Positions) -> Minimum:
-    """Refine p (n, 3) [m], close to a minimum, by Newton steps to round-off, and certify the result.
+    """Refine p (n, 3) [m], close to a minimum, by Newton steps, and certify the result.
 
-    The certificate contains the curvature, the objective and the length of one more step at the final point.
+    The steps continue to round-off. The certificate contains the curvature, the objective and the length of one more
+    step at the final point.
     """
     p = _pinned(problem, p)
     near = NEAR * sizes(problem.system, p)
@@ -186,8 +187,9 @@ def _step(problem: StepProblem, p: Positions) -> Positions | None:
 
 
 def _level(problem: StepProblem, p: Positions, found: Curvature, near: NDArray[np.float64]) -> bool:
-    """Return whether the objective is equal on both sides of p along the degenerate direction: the minima form a
-    continuum.
+    """Return whether the minima form a continuum.
+
+    The objective is compared on both sides of p along the degenerate direction.
     """
     lowest, noise = problem.value(p), LEVEL * EPS * problem.magnitude(p)
     for way in (WALK, -WALK):

@@ -1,10 +1,11 @@
-"""Equations of motion as a first-order system y' = F(t, y) of the free vertices' positions and velocities.
+"""Equations of motion as a first-order system y' = F(t, y) of the free vertices.
 
     M p'' = f(p, p', t) - grad E(p) - c M p'
 
-Springs are summed by a compiled loop. An energy that depends on the start of a step is initialised with the motion
-itself, so that its gradient at p is the force there. Ether drag is defined by its effect on the velocity in a step, v
-<- kept v, and so has the rate c = -ln(kept) / dt. No other velocity filter has an equation of motion.
+The state y is the positions and velocities. Springs are summed by a compiled loop. An energy that depends on the start
+of a step is initialised with the motion itself, so that its gradient at p is the force there. Ether drag is defined by
+its effect on the velocity in a step, v <- a v, and so has the rate c = -ln(a) / dt. No other velocity filter has an
+equation of motion.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ class Field:
         Args:
           scene: scene with exact pins.
           compiled: whether springs are summed by the compiled loop instead of NumPy.
+
         Raises:
           NotIntegrable: the scene has no equations of motion.
         """
@@ -102,7 +104,7 @@ class Field:
         return out.reshape(-1)
 
     def witness(self) -> State:
-        """Evaluate F at a state that strains and moves everything, as a fingerprint of the equations of motion."""
+        """Evaluate F at a strained and moving state, as a fingerprint of the equations."""
         y = self.start
         return self(0.5, y + 0.01 * (self._scene.mesh.size or 1.0) * np.random.default_rng(1).normal(size=y.shape))
 
@@ -129,7 +131,18 @@ def add_springs(
     direction: Reals,
     out: Positions,
 ) -> None:
-    """Add the springs' gradient k (1 - r/l) (p_i - p_j) [N] at p (n, 3) [m] to `out` (n, 3)."""
+    """Add the springs' gradient [N] to `out` (n, 3).
+
+    The gradient is k (1 - r/l) (p_i - p_j) at p (n, 3) [m].
+
+    Args:
+      p: positions (n, 3) [m].
+      edges: vertex pairs (m, 2).
+      stiffness: k (m,) [N/m].
+      rest_length: r (m,) [m].
+      direction: unit vectors (m, 3) used where the length is zero.
+      out: forces (n, 3) [N], incremented.
+    """
     for e in range(len(edges)):
         i, j = edges[e, 0], edges[e, 1]
         x, y, z = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2]

@@ -82,7 +82,7 @@ class Oracle:
         return Multigrid(self._free)
 
     def _solve(self, right: Positions) -> Positions:
-        """Return Q^-1 of a right-hand side (f, 3) [N] over the vertices that are not pinned exactly, (f, 3) [m]."""
+        """Return Q^-1 of a right-hand side (f, 3) [N] over the free vertices, (f, 3) [m]."""
         Q = self._free
         if Q.nnz <= LARGEST:
             return self._factor.solve(right)
@@ -118,9 +118,7 @@ class Oracle:
         return self._floor(gradient_round_off(problem, p))
 
     def _floor(self, bound: NDArray[np.float64]) -> float:
-        """Bound the round-off of the residual [J^(1/2)] from a bound (n,) [N] on the gradient's round-off at each
-        vertex.
-        """
+        """Bound the residual's round-off [J^(1/2)] from that of the gradient (n,) [N]."""
         loose = self._system.unpinned
         with np.errstate(over="ignore"):
             return FACTOR * float(np.sqrt(np.sum(bound[loose] ** 2 / self._Q.diagonal()[loose])))

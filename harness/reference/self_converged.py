@@ -94,10 +94,11 @@ def converge(bound: Bound, frame: float, times: Sequence[float], error: float) -
     """Compute a self-converged motion at given times.
 
     Args:
-      build_scene: builds the scene from a step size and an integrator.
+      bound: builds the scene from a step size and an integrator.
       frame: approximate first step size [s].
       times: ascending times [s], each a multiple of the step size.
       error: smallest relative error to be measured, if that takes no longer than MAX_SECONDS.
+
     Raises:
       NotConverged: not even two step sizes could be compared.
     """
@@ -131,7 +132,7 @@ class _Motion:
 
 
 def _motion(scene: Scene, times: Sequence[float], until: float) -> _Motion | None:
-    """Sample the motion at the given times; None if the time limit is exceeded before the last one."""
+    """Sample the motion at the given times; None if the time limit is exceeded."""
     h = scene.system.time_step
     wanted = [round(t / h) for t in times]
     if any(abs(k * h - t) > 1e-9 * times[-1] for k, t in zip(wanted, times, strict=True)):

@@ -57,6 +57,7 @@ class Store:
           spec: specification of the scene.
           size: size of the scene.
           integrator: name of the integrator.
+
         Raises:
           InputError: the scene cannot be built.
           RunFailed: a step of the reference run does not converge.
@@ -75,13 +76,16 @@ class Store:
     def frames(
         self, spec: SceneSpec, size: int, frames: Collection[int], integrator: IntegratorName = "implicit-euler"
     ) -> dict[int, Frozen]:
-        """Load or compute the snapshots of given frames; a run continues from the last stored one before them.
+        """Load or compute the snapshots of given frames.
+
+        A run continues from the last stored snapshot before the first missing one.
 
         Args:
           spec: specification of the scene.
           size: size of the scene.
           frames: frames, counted from 1.
           integrator: name of the integrator.
+
         Raises:
           InputError: the scene cannot be built.
           RunFailed: a step of the reference run does not converge.
@@ -97,8 +101,9 @@ class Store:
         return {frame: known[frame] for frame in frames}
 
     def reference(self, frozen: Frozen) -> KnownMinima:
-        """Load the known minima of a problem, or find them; `lowest` of the result raises UncertifiedError if there is
-        none.
+        """Load the known minima of a problem, or find them.
+
+        `lowest` of the result raises UncertifiedError if there is none.
         """
         path = self.folder / f"minima-{frozen.digest}.npz"
         if path.exists() and (stored := _read(path)).keys() >= set(_CERTIFICATE):  # else by code that certified less
@@ -134,6 +139,7 @@ class Store:
           times: ascending times [s].
           error: smallest relative error to be measured.
           report_progress: called with the progress of an integration.
+
         Raises:
           InputError: the scene cannot be built.
           NotIntegrable: the scene has no equations of motion.
@@ -162,6 +168,7 @@ class Store:
           spec: specification of the scene.
           size: size of the scene.
           t_end: end time [s].
+
         Raises:
           UnpredictableMotion: nothing moves, or the motion is not finite.
           NotIntegrable: the scene has no equations of motion.
@@ -177,8 +184,9 @@ class Store:
         return found
 
     def _converged(self, path: Path, spec: SceneSpec, size: int, times: Sequence[float], error: float) -> SelfConverged:
-        """Load the self-converged trajectory if stored for such an error, else compute it; its fingerprint is its first
-        step.
+        """Load the self-converged trajectory if stored for such an error, else compute it.
+
+        Its fingerprint is its first step.
         """
         witness = next(iter(reference_run(bind(spec, size), self.solver, 1, [1])[0].values())).positions
         stored: dict[str, Any] = dict(_read(path)) if path.exists() else {}
@@ -223,7 +231,10 @@ class _Asked:
 
 
 def _named(spec: SceneSpec, size: int, times: Sequence[float]) -> str:
-    """Return the part of a file name that identifies a motion: the scene without its step size, size and times."""
+    """Return the part of a file name that identifies a motion.
+
+    It consists of the scene without its step size, its size, and the times.
+    """
     return f"{spec.stepped(1.0).digest[:12]}-{size}-{'-'.join(f'{t:.9g}' for t in times)}"
 
 

@@ -100,6 +100,7 @@ def integrate(scene: Scene, times: Sequence[float], told: Told | None = None) ->
       scene: scene with exact pins.
       times: ascending times after the start [s].
       report_progress: called at each evaluation of the forces.
+
     Raises:
       NotIntegrable: the scene has no equations of motion.
     """

@@ -59,7 +59,10 @@ class Stated:
 
 
 class LocalErrors:
-    """Stop rule from the local errors of the previous steps of one motion; `rule` is that of the next step."""
+    """Stop rule from the local errors of the previous steps of one motion.
+
+    `rule` is that of the next step.
+    """
 
     def __init__(self, auto: Auto, scene: Scene, now: Motion, frames: int) -> None:
         """Start with no history.
@@ -69,6 +72,7 @@ class LocalErrors:
           scene: scene that is stepped.
           now: motion at the start.
           frames: number of steps up to the end.
+
         Raises:
           Unsupported: the step size is not constant.
         """

@@ -61,6 +61,11 @@ class Watch:
     Attributes:
       num_threads: number of threads that may compute. While all of them do, the process uses this many CPU seconds per
         second; while one does, it is the calling thread, which uses one.
+      wall_seconds: total wall time [s].
+      num_entries: number of contexts.
+      process_seconds: total CPU time [s] of the process.
+      thread_seconds: total CPU time [s] of the calling thread.
+      start_times: the three clocks at the start of the present context [s].
     """
 
     threads: int = 1

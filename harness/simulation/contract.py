@@ -1,6 +1,7 @@
-"""Check of a solver's contract, outside of timed code: types of its results, and no writes to its inputs.
+"""Check of a solver's contract: types of its results, and no writes to its inputs.
 
-Error messages state the line of the solver that its author can correct, not the line of the harness that failed.
+The check is outside of timed code. Error messages state the line of the solver that its author can correct, not the
+line of the harness that failed.
 """
 
 from __future__ import annotations
@@ -79,7 +80,10 @@ class Checked(Passing):
         return found
 
     def _writes(self, problem: StepProblem, stop: StopRule) -> str:
-        """Locate the line that writes to the problem by a solve with read-only arrays; "" where none is found."""
+        """Locate the line that writes to the problem; "" where none is found.
+
+        The solve is repeated with read-only arrays.
+        """
         for array in _of_problem(problem).values():
             array.flags.writeable = False
         try:

@@ -124,6 +124,7 @@ class Follower(Protocol):
         Args:
           setting: error tolerance [m] or number of steps relative to the smallest number.
           cpu_limit: limit on the processor time [s].
+
         Raises:
           TimeBudgetExceeded: the limit is exceeded.
           StepSizeUnderflow: the tolerance would need steps below the minimum step size.
@@ -291,8 +292,9 @@ class _Following:
 
 
 def _solved(solution: Solution, within: float) -> bool:
-    """Return whether a solve ended with a small enough residual; a stalled solve is allowed a larger one, due to
-    round-off.
+    """Return whether a solve ended with a small enough residual.
+
+    A stalled solve is allowed a larger one, since round-off may prevent any further reduction.
     """
     if solution.stopped == "stalled":
         return solution.residual <= _STALLED * within
@@ -317,6 +319,7 @@ def hermite(before: Motion, after: Motion, h: float, part: float) -> Positions:
       after: motion at the end.
       h: step size [s].
       part: fraction of the step.
+
     Returns: positions (n, 3) [m], accurate to order 3.
     """
     (p, v), (q, w), s = before, after, part

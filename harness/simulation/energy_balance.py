@@ -1,4 +1,4 @@
-"""Energy balance of a motion: its energy after each step, and the energy that the scene can have supplied.
+"""Energy balance of a motion: its energy compared with that supplied by the scene.
 
     gain = E_n - E_0 - work of sources,    E = kinetic energy + potentials - load . (p - p_0)
 
@@ -8,7 +8,7 @@ Only positive work in a step counts, so that dissipation in the scene hides no g
 is
 
     f . (p' - p)                                          of forces, at the mean velocity of the step at most
-    w (held - x) . (q' - q), grad U(x) . (q' - q)         of penalty and exact pins, whose targets move from q to q'
+    w (target - x) . (q' - q), grad U(x) . (q' - q)       of penalty and exact pins, whose targets move from q to q'
     e(x) - grad e(x) . (p' - p) - e_before(x_before)      of an energy e; not positive where it is convex and constant
 
 A gain is measured relative to the available energy: that of the start, the energy released by potentials,

@@ -114,6 +114,7 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
       solver: solver of the steps.
       settings: settings of the time stepping.
       tick: called with the name of the pass after each step.
+
     Raises:
       Unsupported: the solver does not support the scene.
       NotPositiveDefinite: a matrix is not positive definite.

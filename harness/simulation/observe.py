@@ -58,6 +58,7 @@ def observe(
       verify_step: returns the accuracy columns of each step.
       tick: called after each step.
       clock: context within which each step is computed.
+
     Raises:
       StepError: a step failed, or, caused by DivergenceError, the energy diverges.
     """
@@ -165,6 +166,7 @@ def intersections(scene: Scene, p: Positions, time: float) -> int | None:
       scene: scene with obstacles.
       p: positions (n, 3) [m].
       time: time [s].
+
     Returns: their number; None where no effect prevents intersections.
     """
     return sum(len(one.crossings(p, time)) for one in scene.apart) if scene.apart else None
@@ -187,9 +189,9 @@ def stopped(step: Step) -> str:
 
 
 def strain_of(scene: Scene, p: Positions) -> dict[str, float]:
-    """Compute the columns of |length / rest length - 1| of the springs at p (n, 3) [m].
+    """Compute the strain columns: the largest absolute strain of a spring and its 99th percentile.
 
-    The columns are its largest value and its 99th percentile; both are 0 without springs.
+    The strain is |length / rest length - 1| at p (n, 3) [m]; both columns are 0 without springs.
     """
     of_spring, _ = strains(p, scene.springs.edges, scene.springs.rest_length)
     strain = np.abs(of_spring)
@@ -198,7 +200,13 @@ def strain_of(scene: Scene, p: Positions) -> dict[str, float]:
 
 
 def off_of(scene: Scene, p: Positions) -> float | None:
-    """Compute the largest error of an exact length at p (n, 3) [m], relative to the maximum length; None without any.
+    """Compute the largest error of an exact length, relative to its maximum length.
+
+    Args:
+      scene: scene with the lengths.
+      p: positions (n, 3) [m].
+
+    Returns: the error, None without exact lengths.
     """
     errors = [np.abs(off(lengths, p) / lengths.high).max(initial=0.0) for lengths in scene.system.lengths]
     return float(max(errors)) if errors else None
@@ -208,9 +216,10 @@ def require_numbers(by_frame: Mapping[int, dict[str, Any]], *, minimises: bool, 
     """Require finite columns of each frame, and set columns that do not apply to None.
 
     Args:
-      by_frame: columns by frame.
+      columns_by_frame: columns by frame.
       is_minimiser: whether the solver has a residual.
       has_rtol: whether it has a relative tolerance, which uses the initial residual.
+
     Raises:
       StepError: caused by DivergenceError, where a column is infinite or NaN.
     """

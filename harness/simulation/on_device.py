@@ -1,7 +1,8 @@
-"""Time stepping with a solver on a device: the host builds each step problem, and its data is copied.
+"""Time stepping with a solver on a device.
 
-A timed step repeats the number of iterations of the same step in an untimed pass, without computing residuals. The
-passes are bitwise identical: residuals terminate the untimed solves, but change nothing else.
+The host builds each step problem; its data is copied to the device, and the solution back. A timed step repeats the
+number of iterations of the same step in an untimed pass, without computing residuals. The passes are bitwise identical:
+residuals terminate the untimed solves, but change nothing else.
 """
 
 from __future__ import annotations
@@ -65,7 +66,10 @@ def on_device(prepared: Prepared) -> OnDevice | None:
 
 
 def seconds(marks: Marks | None) -> dict[str, float]:
-    """Compute the times [s] of a step's kernels and transfers by events on the stream; empty without events."""
+    """Compute the times [s] of a step's kernels and transfers by events on the stream.
+
+    Returns: columns; empty without events.
+    """
     if marks is None:
         return {}
     copies = marks.began.elapsed_time(marks.up) + marks.done.elapsed_time(marks.down)  # in milliseconds

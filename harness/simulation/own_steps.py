@@ -45,6 +45,7 @@ class _Stepping(Protocol):
         Args:
           problem: step problem of the frame.
           h: first step size [s].
+
         Returns: positions [m] and velocities [m/s] at the frame's end, and the number of accepted steps, the number of
           rejected steps and the last step size [s].
         """
@@ -56,8 +57,10 @@ class Controlled(_Stepping, Protocol):
     """A solver with adaptive steps within a frame."""
 
     def within(self, tolerance: float) -> Controlled:
-        """Return the solver with an error tolerance [m] of each step; raises Unsupported where it has no error
-        estimate.
+        """Return the solver with an error tolerance [m] of each step.
+
+        Raises:
+          Unsupported: the method has no error estimate.
         """
         ...
 

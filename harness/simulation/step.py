@@ -78,7 +78,10 @@ class Step:
 
     @property
     def positions(self) -> Positions:
-        """The positions (n, 3) [m] after the step; these differ from a solution at the middle of the step."""
+        """The positions (n, 3) [m] after the step.
+
+        They differ from a solution at the middle of the step.
+        """
         return self.state.now.positions
 
 
@@ -95,6 +98,7 @@ def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
       scene: scene that is stepped.
       state: state at the start of the step.
       initial_guess: a key of `INITIAL_GUESSES`, or COARSE_TO_FINE, which solves the step on a coarser mesh.
+
     Raises:
       Unsupported: there is no coarser mesh.
     """
@@ -157,6 +161,7 @@ def simulate(
       initial_guess: name of the initial guess.
       frames: number of the last step.
       initial_state: state to start from; the scene's start if omitted.
+
     Raises:
       Unsupported: the automatic tolerance does not support the scene.
     """
@@ -288,7 +293,7 @@ _COARSER: WeakKeyDictionary[Scene, Coarser] = WeakKeyDictionary()
 
 
 def _coarse(scene: Scene, state: State, stated: StepProblem) -> StepProblem:
-    """Guess the displacement of this step on a mesh of half the size, interpolated to the finer mesh.
+    """Guess the displacement of this step on a mesh of half the size, interpolated.
 
     The coarser solve itself starts from a still coarser one (nested iteration: Kronsjö and Dahlquist 1972). The shape
     of the finer mesh is preserved, since only the displacement is interpolated.

@@ -67,7 +67,9 @@ class Place:
 
 
 def pressed(stated: Stated, problem: StepProblem, x: Array) -> Stated:
-    """Return the step with friction's normal forces at its solution x (n, 3) [m], if the harness has a further round.
+    """Return the step with friction's normal forces at its solution x (n, 3) [m].
+
+    It is unchanged unless the harness has a further friction round.
     """
     return stated if problem.start.pressed is None else replace(stated, moment=replace(stated.moment, pressed=wide(x)))
 
@@ -155,7 +157,7 @@ def energies(at: Place) -> Iterator[Finding]:
 
 
 def _unsettled(at: Place, k: int, told: Told, x: Any, d: Any) -> Iterator[Finding]:
-    """Compare friction of effect k with normal forces at the step's start and at x, where these differ."""
+    """Compare friction of effect k with normal forces at the step's start and at x."""
     effect, m, begin = at.side.declared.effects[k], at.stated.moment, at.side.begins[k]
     if m.pressed is not None or not getattr(effect, "friction", 0.0) or effect.friction_rounds == 1:
         return
@@ -185,7 +187,9 @@ def _against(name: str, told: Told, own: Sequence[Energy], x: Array, d: Array) -
 
 
 def _bend(energy: Any, x: Array, d: Array) -> float:
-    """Return the second derivative along d by an energy's Hessian, which may be split into a sparse part and columns.
+    """Return the second derivative along d by an energy's Hessian.
+
+    The Hessian may be split into a sparse part and columns.
     """
     flat = d.ravel()
     if not hasattr(energy, "columns"):

@@ -108,6 +108,7 @@ def nearest(one: Any, x: Wide) -> tuple[Wide, Wide, Wide]:
     Args:
       one: declared obstacle.
       x: points (m, 3) [m].
+
     Returns: distances (m,) [m], negative inside; nearest points of the surface and the normals there, (m, 3) each.
     """
     if one.kind == "plane":

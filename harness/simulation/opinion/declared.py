@@ -79,7 +79,13 @@ product with eps is its round-off."""
 
 
 class PinnedVertex(NamedTuple):
-    """A pin: its weight [N/m], and its position (3,) [m] and velocity (3,) [m/s] as functions of time [s]."""
+    """A pin.
+
+    Attributes:
+      weight: penalty weight [N/m], infinite for an exact pin.
+      position: position (3,) [m] at a time [s].
+      velocity: velocity (3,) [m/s] at a time [s].
+    """
 
     weight: float
     place: Callable[[float], Wide]
@@ -95,7 +101,7 @@ class Opinion:
       diagonal: share (n,) [N/m] of the diagonal of Q at the rate 1/dt, None for none.
       build_from_diagonal: builds the energy where it depends on the diagonal of Q (n,) [N/m], the sum over all
         effects and inertia.
-      force: evaluates the force.
+      evaluate_force: evaluates the force.
       filter_velocity: filters velocities (n, 3) before a step.
       pinned_vertices: pins by vertex.
       min_length: smallest length [m] that the energy depends on, apart from the springs'.
@@ -117,7 +123,15 @@ class Opinion:
 
 
 def counts(edges: NDArray[np.int64], weight: Array, n: int) -> Array:
-    """Sum the weights (m,) of the edges (m, 2) at each vertex (n,); edges from a vertex to itself are ignored."""
+    """Sum the weights of the edges at each vertex; edges from a vertex to itself are ignored.
+
+    Args:
+      edges: vertex pairs (m, 2).
+      weight: weights (m,).
+      n: number of vertices.
+
+    Returns: sums (n,).
+    """
     i, j = edges.T
     apart = i != j
     ends = np.concatenate([i[apart], j[apart]])

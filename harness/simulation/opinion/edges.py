@@ -95,8 +95,9 @@ def finite(k: Array) -> Array:
 
 
 def _exact(declared: Declared, k: Array, low: float, high: float) -> dict[tuple[int, int], tuple[float, float]]:
-    """Return the edges with infinite stiffness (m,), with their allowed lengths [m]: low and high times the rest
-    length.
+    """Return the edges with infinite stiffness (m,), with their allowed lengths [m].
+
+    These are `low` and `high` times the rest length.
     """
     edges = declared.mesh.springs
     r = _lengths(declared.rest, edges)

@@ -19,7 +19,13 @@ _PI = 4 * np.arctan(np.longdouble(1))
 
 
 class Place(NamedTuple):
-    """A rigid motion at one time: the rotation R (3, 3), a point on its axis (3,) [m] and the offset (3,) [m]."""
+    """A rigid motion at one time.
+
+    Attributes:
+      rotation: R (3, 3).
+      axis_point: a point on its axis (3,) [m].
+      offset: translation (3,) [m].
+    """
 
     turn: Wide
     about: Wide
@@ -52,7 +58,13 @@ def place(motion: Any, time: float) -> Place:
 
 
 def speed(motion: Any, q: Wide, time: float) -> Wide:
-    """Return the velocity (3,) [m/s] of a point declared at q (3,) [m] at a time [s]; right-sided at a key."""
+    """Return the velocity (3,) [m/s] of a point; right-sided at a key.
+
+    Args:
+      motion: key frames, None for none.
+      q: declared point (3,) [m].
+      time: time [s].
+    """
     times = wide([key.time for key in motion.keys]) if motion else wide([0])
     if len(times) == 1 or not times[0] <= time < times[-1]:
         return wide([0, 0, 0])
@@ -97,7 +109,7 @@ def _between(times: Wide, values: Wide, t: Any, how: str) -> Wide:
 
 
 def _slope(times: Wide, y: Wide, j: int) -> Any:
-    """Return the slope of the cubics at key j: a weighted harmonic mean, zero at a local extremum."""
+    """Return the cubics' slope at key j: a weighted harmonic mean, zero at an extremum."""
     h, last = np.diff(times), len(times) - 1
     rise = np.diff(y) / h
     if last == 1:

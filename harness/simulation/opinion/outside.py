@@ -62,6 +62,7 @@ def own_slope(own: Sequence[Energy], x: Array, d: Array, reach: float, shortest:
       d: direction (n, 3).
       reach: largest coordinate [m].
       shortest: smallest length [m].
+
     Returns: values and slopes along d, and the largest relative error of a gradient, None where all are correct.
     """
     values, slopes = list[float](), list[float]()

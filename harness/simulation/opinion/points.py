@@ -43,7 +43,9 @@ class SamplePoint:
 
 
 def points(scene: Scene, declared: Declared, frames: int) -> Iterator[SamplePoint]:
-    """Sample the points of a scene, with a fixed seed; steps are any of its frames, and every fifth is the first.
+    """Sample the points of a scene, with a fixed seed.
+
+    Steps are any of the scene's frames, and every fifth is the first.
 
     Args:
       scene: scene that is stepped.
@@ -90,7 +92,7 @@ def led(k: int, size: float, rest: Array) -> Array:
 
 
 def _brought(effect: Any, one: Any, p: Array, time: float, rng: np.random.Generator) -> Array:
-    """Translate positions (n, 3) [m] to an obstacle, so that a random vertex is within the contact thickness."""
+    """Translate positions (n, 3) [m] so that a random vertex is within the contact thickness."""
     at = place(one.motion, time)
     which = int(rng.integers(len(p)))
     far, _, out = nearest(one, at.back(wide(p[which : which + 1])))

@@ -35,6 +35,7 @@ def second_opinion(spec: SceneSpec, scene: Scene, integrator: str) -> str:
       spec: specification of the scene.
       scene: scene built from it with the integrator.
       integrator: name of the integrator.
+
     Returns: `agrees`; `disagrees: term, by relative difference; ...`; or `single opinion: effects` where some effects
     have
       no reference implementation.

@@ -85,7 +85,12 @@ class Touching:
         self.points = np.unique(np.append(self.edges, self.triangles))[:, None]
 
     def whole(self, x: Wide, time: float) -> Wide:
-        """Return the positions of all vertices of pairs at a time [s], with the mesh vertices x (n, 3) [m] first."""
+        """Return the positions of all vertices of pairs, those of the mesh first.
+
+        Args:
+          x: positions of the mesh (n, 3) [m].
+          time: time [s].
+        """
         return x
 
     def near(self, x: Array, reach: float) -> tuple[Indices, Indices]:
@@ -133,7 +138,7 @@ class Touching:
         return np.where(closed, np.inf, m * np.where(feels, stiff * (scale * r) ** 2 * b, 0))
 
     def _of(self, rows: Indices, x: Wide, t: float, r: float, k: Array, edges: bool) -> tuple[Wide, Wide, Wide]:
-        """Return the scale factor of t and r, the mollifier m, and the stiffness k [N/m] of each pair, (k,) each."""
+        """Return the scale factor of t and r, the mollifier and the stiffness [N/m], (k,) each."""
         share = self.apart(rows, edges) / (wide(t) + wide(r))
         scale, m = np.where(share < 1, (1 - wide(1e-12)) * share, 1), wide(np.ones(len(rows)))
         if edges:
@@ -156,6 +161,7 @@ class Touching:
           r: barrier activation distance [m].
           k: stiffnesses (n,) [N/m].
           edges: edge-edge instead of point-triangle pairs.
+
         Returns: rows (g, 4), c (g, 4), n (g, 3), z^t (g, 3) [m], and the force (g,) [N].
         """
         rows = self.near(np.asarray(p, float), t + r)[int(edges)]
@@ -185,6 +191,7 @@ def near(x: Array, one: Indices, two: Indices, reach: float) -> Indices:
       one: vertices (a, i) of points or edges.
       two: vertices (b, j) of triangles or edges.
       radius: distance [m].
+
     Returns: vertices of the pairs (k, 4).
     """
     if not (len(one) and len(two)):
@@ -237,7 +244,10 @@ def _to_side(p: Wide, a: Wide, b: Wide) -> Wide:
 
 
 def _inside(a: Wide, b: Wide, c: Wide, d: Wide, edges: bool) -> Wide:
-    """Compute the vector between lines, or from a plane to a point; a large vector where that point is not interior."""
+    """Compute the vector between lines, or from a plane to a point.
+
+    It is a large vector where the nearest points are not interior.
+    """
     u, v, w = (b - a, d - c, a - c) if edges else (c - b, d - b, a - b)
     uu, uv, vv, uw, vw = ((f * g).sum(axis=1) for f, g in ((u, u), (u, v), (v, v), (u, w), (v, w)))
     det = uu * vv - uv * uv

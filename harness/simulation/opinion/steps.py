@@ -94,7 +94,14 @@ def state(
 
 
 def pushed(opinions: Sequence[Opinion], p: Array, v: Array, time: float) -> tuple[Array, float]:
-    """Sum all forces (n, 3) [N] at a motion and a time [s], and the sizes [N] of their round-off."""
+    """Sum all forces (n, 3) [N], and the sizes [N] of their round-off.
+
+    Args:
+      opinions: reference terms of the effects.
+      p: positions (n, 3) [m].
+      v: velocities (n, 3) [m/s].
+      time: time [s].
+    """
     force, size = np.zeros_like(p), 0.0
     for opinion in opinions:
         if opinion.force:

@@ -77,7 +77,13 @@ class Against(Touching):
         return wide(np.full(len(rows), np.inf))
 
     def clear(self, p: Array, time: float, apart: float) -> bool:
-        """Return whether no pair is closer than `apart` [m], with the mesh at p (n, 3) [m], at a time [s]."""
+        """Return whether no pair is closer than a distance.
+
+        Args:
+          p: positions of the mesh (n, 3) [m].
+          time: time [s].
+          apart: distance [m].
+        """
         return self.nearest(np.concatenate([p, np.asarray(self.obstacle(time), float)]), apart) >= apart
 
 

@@ -51,7 +51,10 @@ def _bent(corners: Any, K: Wide, weight: Wide, origin: Any) -> Values:
 
 
 def stencils(B: float, declared: Declared) -> tuple[Any, Wide, Wide]:
-    """Build the corners (h, 4), coefficients K (h, 4) and weights (h,) of all hinges for a rigidity B."""
+    """Build the stencils of all hinges for a rigidity B.
+
+    Returns: corners (h, 4), coefficients K (h, 4) and weights (h,).
+    """
     rest, surface = declared.rest, [frozenset(t) for t in declared.mesh.triangles.tolist()]
     pairs = list(_pairs(surface))
     rectangles, share = [pair for pair in pairs if _rectangle(rest[list(pair)])], B
