@@ -1,1 +1,1 @@
-"""Pictures and plots, drawn from rows and recordings alone: nothing here simulates."""
+"""Pictures, plots and tables, computed from result rows and recordings only; this package simulates nothing."""

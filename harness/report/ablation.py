@@ -1,9 +1,9 @@
 # pyright: reportUnknownMemberType=false
-# pyarrow's stubs say nothing of the kinds of files that Parquet is read from.
-"""What an ablation found, in words: the verdict on each effect follows from the numbers of its rows.
+# pyarrow's stubs do not type the kinds of files that Parquet is read from.
+"""Summaries of an ablation study: the verdict on each effect follows from its result rows.
 
-An effect is called for where leaving it out moves some vertex further than the scene's solver and its time step are
-wrong by anyway. Its price is a difference of times; where the interval holds zero, none was measured.
+An effect matters where removing it displaces some vertex by more than the error that the scene's solver and time step
+have in any case. Its cost is a difference of times; where the confidence interval contains zero, no cost was measured.
 """
 
 from __future__ import annotations
@@ -24,24 +24,25 @@ Row = Mapping[str, Any]
 CAPTION = "CPU time: mean over frames of medians over rounds; displacements in mean rest lengths, energy of the largest"
 
 PRICES = (
-    "CPU time, medians over rounds; ≥ the least that reading the effect's numbers once allows; intervals in the rows"
+    "CPU time, medians over rounds; ≥ lower bound: reading the effect's data once; intervals in the rows"
 )
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    """The rows of an ablation."""
+    """Return the rows of an ablation file."""
     return read_rows([path], pa.schema([])).to_pylist()
 
 
 def of_kind(rows: Sequence[Row], kind: str) -> list[Row]:
-    """The rows of a kind, in their order."""
+    """Return the rows of one kind, in their order."""
     return [row for row in rows if row["kind"] == kind]
 
 
 def known_error(rows: Sequence[Row]) -> tuple[float, str]:
-    """The largest displacement that the scene is wrong by anyway [mean rest lengths], and whose error that is.
+    """Return the largest known error of the scene and its source.
 
-    nan where no error is known.
+    Returns: the displacement error [mean rest lengths] and a phrase that names its source; (nan, "") if no error is
+    known.
     """
     known = [(row["largest"], row["name"]) for row in of_kind(rows, "error") if row["status"] == "ok"]
     size, name = max(known, default=(float("nan"), ""))
@@ -49,7 +50,12 @@ def known_error(rows: Sequence[Row]) -> tuple[float, str]:
 
 
 def verdict(row: Row, rows: Sequence[Row]) -> str:
-    """What the numbers of one effect say, as a sentence."""
+    """Describe the cost and the influence of one effect in a sentence.
+
+    Args:
+        row: row of the effect, of kind `without`.
+        rows: all rows of the ablation.
+    """
     if row["status"] == "impossible":
         return f"the scene is impossible without it ({row['reason']})"
     (whole,) = of_kind(rows, "whole")
@@ -77,7 +83,7 @@ def _price(row: Row, whole: float) -> str:
 
 
 def _figure(value: float) -> str:
-    """Two digits, and no exponent where people would not write one."""
+    """Format a number with two significant digits, and without an exponent from 100 on."""
     return f"{value:.2g}" if value < 100 else f"{value:.0f}"
 
 
@@ -86,7 +92,7 @@ def _relative(value: float) -> str:
 
 
 def ablation_table(rows: Sequence[Row]) -> Table:
-    """A row an effect: its price, and what leaving it out changes."""
+    """Build a table with one row per effect: its cost, and what changes without it."""
     (whole,) = of_kind(rows, "whole")
     headings = (
         "without",
@@ -133,7 +139,7 @@ def ablation_table(rows: Sequence[Row]) -> Table:
 
 
 def price_table(rows: Sequence[Row]) -> Table:
-    """A row an effect, a column a solver: the price, and its bound."""
+    """Build a table of overheads: one row per effect, one column per solver, each with its lower bound."""
     found = {(row["name"], row["solver"]): row for row in of_kind(rows, "price")}
     effects, solvers = (list(dict.fromkeys(key[k] for key in found)) for k in (0, 1))
     table = Table(box=SIMPLE_HEAD, title="an iteration with the effect over one without", caption=PRICES)
@@ -150,7 +156,7 @@ def _priced(row: Row) -> str:
 
 
 def sentences(rows: Sequence[Row]) -> list[str]:
-    """The verdicts, the suggestions, and what could not be found out."""
+    """Return sentences on all effects, on suggested effects, and on errors that are unknown."""
     said = [f"{row['name']}: {verdict(row, rows)}" for row in of_kind(rows, "without")]
     said += [f"not listed: {row['name']}: {row['reason']}" for row in of_kind(rows, "suggestion")]
     unknown = [row for row in of_kind(rows, "error") if row["status"] != "ok"]

@@ -1,8 +1,8 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
-"""The picture of an ablation: what an effect costs to the right, what it changes upwards, one point an effect.
+# Matplotlib's stubs do not type most keywords.
+"""Plot of an ablation: cost of each effect on the x-axis, largest displacement without it on the y-axis.
 
-What lies below the lines of the errors changes less than the scene is wrong by anyway.
+Effects below the error lines change less than the error that the scene has in any case.
 """
 
 from __future__ import annotations
@@ -23,13 +23,18 @@ from harness.report.style import INK, MUTED, PAGE, RC, RULE, WARNING, numbered
 
 _ERRORS = {"solver": "error of the solver", "time-step": "error of the time step"}
 _NOTHING = 1e-6
-"""Displacements below this, in mean rest lengths, are drawn at it."""
+"""Displacements below this value [mean rest lengths] are drawn at it."""
 _APART = 18
-"""Pixels between two names."""
+"""Vertical distance between two names [pixels]."""
 
 
 def draw_ablation(rows: Sequence[Row], path: Path) -> None:
-    """Draw an ablation's picture to `path`, PNG."""
+    """Draw the plot of an ablation as a PNG file.
+
+    Args:
+        rows: all rows of the ablation.
+        path: target file.
+    """
     (whole,) = of_kind(rows, "whole")
     points = [row for row in of_kind(rows, "without") if row["status"] == "ok"]
     with matplotlib.rc_context(RC):
@@ -55,7 +60,7 @@ def draw_ablation(rows: Sequence[Row], path: Path) -> None:
 
 
 def _errors(ax: Axes, rows: Sequence[Row], points: Sequence[Row]) -> None:
-    """Lines of the errors, a scale that holds them and the points, and a shade over what lies below both."""
+    """Draw the error lines, set limits that contain all points, and shade the region below both errors."""
     known = [row for row in of_kind(rows, "error") if row["status"] == "ok"]
     values = [max(row["largest"], _NOTHING) for row in (*known, *points)]
     low, high = min(values, default=1e-3) / 4.0, max(values, default=1.0) * 4.0
@@ -78,8 +83,11 @@ def _errors(ax: Axes, rows: Sequence[Row], points: Sequence[Row]) -> None:
 
 
 def _effects(ax: Axes, points: Sequence[Row], whole: float, *, hollow: bool) -> None:
-    """One point an effect with its interval and its name; names that would meet are moved apart. hollow: where other
-    code than today's measured them."""
+    """Draw one point per effect with its interval and its name.
+
+    Names that would overlap are moved apart. `full_run` is the time of a step with all effects [s]; markers are hollow
+    if `is_stale`, that is, if other code than the current version measured them.
+    """
     taken: list[tuple[float, float]] = []
     face: Any = {"mfc": PAGE, "mew": 1.8} if hollow else {}
     for i, row in enumerate(sorted(points, key=lambda row: -row["largest"])):

@@ -1,7 +1,10 @@
 # pyright: reportUnknownMemberType=false
-# pyarrow's stubs say nothing of some keywords.
-"""Certificates of no intersections as CSV, one line for each run: in how many of its frames nothing passes through
-anything, told exactly (`harness.scenes.intersections`), and how many steps converged."""
+# pyarrow's stubs do not type some keywords.
+"""Certificates of intersection-free runs as CSV, one line per run.
+
+Each line states in how many frames no primitives intersect, by the exact test of `harness.scenes.intersections`, and
+how many steps converged.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +25,16 @@ from rows_of group by run_id, scene, size, solver, parameters order by scene, si
 
 
 def certificates(rows: pa.Table, folder: Path) -> list[Path]:
-    """Write certificates.csv: the run, its status, its frames, how many of them are free of intersections, how many
-    steps came to the tolerance or to round-off, the mean of their iterations, and why a run has no frames."""
+    """Write certificates.csv and return its path.
+
+    The columns are: the run, its status, its frames, the number of intersection-free frames, the number of steps that
+    ended at the tolerance or at round-off, the mean number of their iterations, and the reason where a run has no
+    frames.
+
+    Args:
+        rows: rows of a sweep.
+        folder: folder that the file is written to.
+    """
     path = folder / "certificates.csv"
     with replacing(path) as partial:
         csv.write_csv(pa.Table.from_pylist(answers(_QUERY, rows)), partial)

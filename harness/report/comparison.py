@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
-"""Solvers side by side: for each scene and size the final frames, one camera, one scale, and what they cost."""
+# Matplotlib's stubs do not type most keywords.
+"""Side-by-side pictures of solvers: final frames per scene and size, with one camera, one scale, and their costs."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _HEADING, _CAPTION, _GAP = 26, 104, 16
 
 
 class _Grid(NamedTuple):
-    """How panels and the tiles within one are laid out; `width` and `height` of a tile [pixels]."""
+    """Layout of the panels and of the tiles within a panel; `width` and `height` of a tile [pixels]."""
 
     panel_columns: int
     tile_columns: int
@@ -51,11 +51,16 @@ class _Grid(NamedTuple):
 
 
 def draw_comparison(replays: Mapping[str, Replay], path: Path) -> None:
-    """Draw the final frames of several runs to `path`, WIDTH pixels wide and HEIGHT at most, PNG.
+    """Draw the final frames of several runs as one PNG picture, PAGE_WIDTH pixels wide, at most PAGE_HEIGHT high.
 
-    replays: by a label that is used where the solver's name alone does not tell; of each scene and size the run of the
-    lowest residual is what the others' distances are taken from. Raises RunFailed where the system cannot draw, and
-    ValueError for no replays.
+    Distances refer to the run with the lowest residual of each scene and size.
+
+    Args:
+        replays: runs by label; the label is shown where the solver's name is ambiguous.
+        path: target file.
+    Raises:
+        RunFailed: if the system cannot draw.
+        ValueError: if there are no replays.
     """
     if not replays:
         raise ValueError("a comparison needs at least one recording")
@@ -91,13 +96,13 @@ def draw_comparison(replays: Mapping[str, Replay], path: Path) -> None:
 
 
 def _shape(finite: Sequence[Replay]) -> float:
-    """Width over height of what most runs show at their end."""
+    """Return the median ratio of width to height of the final frames."""
     shapes = [shape(seen(r, [-1]), natural_angles(r.positions[-1], area_vectors(r, -1))) for r in finite]
     return float(np.clip(np.median(shapes), 0.5, 2.2)) if shapes else 1.0
 
 
 def _layout(panels: int, tiles: int, aspect: float) -> _Grid:
-    """The grid in which scenes of this width / height are largest, places that stay empty counted against it."""
+    """Return the grid that shows scenes of this aspect ratio largest, with a penalty for empty cells."""
 
     def grid(panel_columns: int, tile_columns: int) -> _Grid:
         columns = panel_columns * tile_columns
@@ -135,7 +140,7 @@ def _panel(
     grid: _Grid,
     looks: Mapping[str, Mark],
 ) -> None:
-    """The tiles of one scene and size, row by row; all with one camera."""
+    """Draw the tiles of one scene and size row by row, all with the same camera."""
     finite = [replay for _, replay in panel if _ends_finite(replay)]
     points = np.concatenate([r.positions[-1][framed(r, [-1])] for r in finite] or [np.zeros((1, 3))])
     areas = np.concatenate([area_vectors(r, -1) for r in finite] or [np.zeros((0, 3))])
@@ -145,7 +150,7 @@ def _panel(
     solvers = [_solver(*entry) for entry in panel]
     best = panel[reference([replay for _, replay in panel])][1]
     for k, (label, replay) in enumerate(panel):
-        # Runs of one solver that differ in their settings go by their labels.
+        # Runs of one solver with different settings are shown by their labels.
         name = solvers[k] if solvers.count(solvers[k]) == 1 else label
         row, column = divmod(k, grid.tile_columns)
         x, y = left + column * (grid.width + _GAP), top + row * (grid.height + _CAPTION)
@@ -163,7 +168,7 @@ def _panel(
 
 
 def _caption(page: Figure, solver: str, mark: Mark, facts: Mapping[str, str], x: int, y: int, width: int) -> None:
-    """The solver's mark and name, and below them a small table: what, and how much."""
+    """Draw the solver's marker and name, and a small table of quantities below them."""
     small = width < 210
     dot = Line2D([(x + 8) / WIDTH], [1 - (y + 12) / HEIGHT], color=mark.color, marker=mark.marker, markersize=7)
     page.add_artist(dot)
@@ -195,7 +200,7 @@ def _ends_finite(replay: Replay) -> bool:
 
 
 def _distance(replay: Replay, reference: Replay) -> float:
-    """The largest distance of a vertex from the reference's, in mean rest lengths; NaN where they end apart."""
+    """Return the largest vertex distance [mean rest lengths]; NaN if the runs end in different frames or non-finite."""
     comparable = (
         _ends_finite(replay)
         and _ends_finite(reference)
@@ -209,8 +214,12 @@ def _distance(replay: Replay, reference: Replay) -> float:
 
 
 def reference(replays: Sequence[Replay]) -> int:
-    """Which of the runs of one scene the others' distances are taken from: the one whose last residual is the lowest
-    of those that end finite, so that the nearest to the minimum judges and not the first of a list; else the first."""
+    """Return the index of the run that the distances of one scene refer to.
+
+    It is the run with the lowest last residual among those that end finite, so that the run closest to the minimum is
+    the
+    reference, whatever the order of the list. If no run ends finite, it is the first one with the lowest residual.
+    """
 
     def badness(k: int) -> tuple[bool, float]:
         known = "/residual" in replays[k].scalars and len(replays[k].scalars["/residual"][1])
@@ -221,13 +230,13 @@ def reference(replays: Sequence[Replay]) -> int:
 
 
 def distance_words(replay: Replay, best: Replay) -> str:
-    """The distance from the run that is nearest to the minimum, in words."""
+    """Format the distance from the reference run `best`, the one closest to the minimum."""
     distance = _distance(replay, best)
     return "reference" if replay is best else "–" if np.isnan(distance) else f"{distance:.2g}"
 
 
 def _last(replay: Replay, name: str) -> str:
-    """The last recorded value of a scalar, in words."""
+    """Format the last recorded value of a scalar."""
     if f"/{name}" not in replay.scalars:
         return "–"
     _, values = replay.scalars[f"/{name}"]

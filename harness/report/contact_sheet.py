@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords, and PyVista is known in part.
-"""A sheet of scenes: each in a tile with its name and its effects, all type of one size; at the foot what drew them."""
+# Matplotlib's stubs do not type most keywords, and PyVista is only partly typed.
+"""Gallery of scenes: one tile per scene with its name and effects, and the provenance at the foot.
+
+All text of one kind has one size.
+"""
 
 from __future__ import annotations
 
@@ -26,22 +29,26 @@ from harness.report.solids import framed, seen
 from harness.report.style import DPI, INK, MUTED, PAGE, RC, WIDTH
 
 _MOST, _FEWEST = 5, 3
-"""Tiles in a row."""
+"""Largest and smallest number of tiles in a row."""
 _LINES = 70
-"""Pixels for each vertex from which on the mesh's lines are drawn: the mesh is to be seen, if only as a texture."""
+"""Pixels per vertex above which mesh lines are drawn; low, because the mesh should be visible at least as a texture."""
 _BOB, _HEAVY = 0.03, 20.0
-"""Vertices so many times heavier than most are drawn as balls, of this radius in the scene's size."""
+"""Radius of balls [share of the scene's size], drawn at vertices whose mass exceeds this multiple of the median."""
 _MARGIN, _GAP, _TILE, _CAPTION, _FOOT = 28, 20, 290, 78, 24
-"""Pixels: around the sheet, between tiles, a tile's height, the type below it, the type at the sheet's foot."""
+"""Pixels: margin of the sheet, gap between tiles, height of a tile, caption below it, text at the foot of the sheet."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tile:
-    """A scene at one moment.
+    """A scene at one time.
 
-    replay: of the start and the frame to be drawn, its properties with the processor (`cpu`) and the `commit`; mass: of
-    its vertices (n,) [kg]; name and effects: in words; angles: azimuth and elevation [degrees], chosen by the mesh's
-    shape where None.
+    Attributes:
+        replay: recording of the start and of the frame to draw; its properties include the processor (`cpu`) and
+            `commit`.
+        mass: vertex masses (n,) [kg].
+        name: name of the scene.
+        effect_words: effects of the scene, in words.
+        angles: azimuth and elevation of the camera [degrees]; None to choose them by the mesh's shape.
     """
 
     replay: Replay
@@ -52,9 +59,14 @@ class Tile:
 
 
 def draw_sheet(tiles: Sequence[Tile], path: Path, facts: Sequence[str] = ()) -> None:
-    """Draw the tiles row by row, PNG, with facts, processor and commit at the foot.
+    """Draw the tiles row by row as a PNG file, with facts, processor and commit at the foot.
 
-    Raises RunFailed where the system cannot draw.
+    Args:
+        tiles: scenes in the order in which they are drawn.
+        path: target file.
+        facts: phrases at the foot, before processor and commit.
+    Raises:
+        RunFailed: if the system cannot draw.
     """
     columns = abreast(len(tiles))
     width = (WIDTH - 2 * _MARGIN - (columns - 1) * _GAP) // columns
@@ -75,7 +87,7 @@ def draw_sheet(tiles: Sequence[Tile], path: Path, facts: Sequence[str] = ()) -> 
 
 
 def abreast(count: int) -> int:
-    """How many tiles in a row leave the fewest places blank; of those that leave as few, 4 or what is nearest."""
+    """Return the number of columns that leaves the fewest cells empty; ties go to the number closest to 4."""
     if count < _FEWEST:
         return max(count, 1)
     return min(range(_FEWEST, _MOST + 1), key=lambda columns: (-count % columns, abs(columns - 4)))
@@ -86,7 +98,7 @@ def _words(tile: Tile) -> str:
 
 
 def _lines(effects: str, width: int) -> list[tuple[str, int, float, str]]:
-    """The effects in two lines at most, with their places."""
+    """Wrap the effects into at most two lines, each with its vertical offset, size and colour."""
     lines = wrap(effects, int(width / 7.2), max_lines=2, placeholder=" …")
     return [(words, 40 + 16 * k, 10.0, MUTED) for k, words in enumerate(lines)]
 

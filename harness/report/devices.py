@@ -1,9 +1,9 @@
-"""What a CUDA device saves, from a sweep's rows alone: time to a residual on it and on the processor beside it.
+"""Speedup of a CUDA device, from the rows of a sweep: time to a residual, compared with the processor of that computer.
 
-    time(errors, vertices) = least over solvers of the median wall seconds of a step, of runs whose every step got there
+    time(errors, vertices) = min over solvers of the median wall seconds of a step, for runs whose every step converged
 
-Times are compared within one computer. Where no run on a device ended well, in the simulator none, nothing is said of
-what one saves, but why there is none, and the command that fills it in.
+Times are compared within one computer. If no run on a device succeeded (runs in the simulator do not count), the
+summary states the reason and the command that produces such runs, instead of a speedup.
 """
 
 from __future__ import annotations
@@ -19,12 +19,18 @@ from harness.report.sql import answer
 from solvers.device import SIMULATED
 
 ALIKE = 1.05
-"""Times within this factor are alike, and neither side pays."""
+"""Times within this factor count as equal: neither side is faster."""
 
 
 class Run(NamedTuple):
-    """One run. asked: whether for a device; vertices: None where it failed before it knew; seconds: of a step, None
-    without; reached: whether all steps ended by their tolerance."""
+    """One run of a sweep.
+
+    Attributes:
+        device_requested: whether the run requested a device.
+        vertices: number of vertices; None if the run failed before its scene was built.
+        seconds: median wall time of a step [s]; None without timed steps.
+        has_converged: whether all steps ended at their tolerance.
+    """
 
     place: str
     scene: str
@@ -41,7 +47,7 @@ class Run(NamedTuple):
 
     @property
     def got_there(self) -> bool:
-        """Whether its steps were to reach a residual, and all did."""
+        """Whether the steps had a target residual and all of them reached it."""
         return bool(self.status == "ok" and self.tolerance and self.reached and self.vertices and self.seconds)
 
 
@@ -57,7 +63,7 @@ from rows_of group by run_id order by any_value("size"), any_value(solver), run_
 
 
 class Pair(NamedTuple):
-    """The best of both sides to one residual on one mesh; None where no run got there."""
+    """The fastest run on each side for one residual and one mesh; None where no run reached the residual."""
 
     vertices: int
     there: Run | None
@@ -65,30 +71,35 @@ class Pair(NamedTuple):
 
     @property
     def ratio(self) -> float | None:
-        """The processor's time over the device's."""
+        """The processor's time divided by the device's; None unless both sides reached the residual."""
         if self.there and self.here and self.there.seconds and self.here.seconds:
             return self.here.seconds / self.there.seconds
         return None
 
 
 Panel = tuple[str, float]
-"""A scene, and the tolerance that its steps were solved to."""
+"""A scene, and the residual tolerance of its steps."""
 
 
 def runs(table: pa.Table) -> list[Run]:
-    """The runs of a sweep, from its rows (schema: `harness.base.columns.SCHEMA`); none where no run asked for a
-    device."""
+    """Return the runs of a sweep from its rows (schema: `harness.base.columns.SCHEMA`).
+
+    The list is empty if no run requested a device.
+    """
     found = [_on_one(Run(*row)) for row in answer(_RUNS, table)]
     return found if any(run.asked for run in found) else []
 
 
 def _on_one(run: Run) -> Run:
-    """The run, of the simulator's a refusal: its times are no device's."""
+    """Mark a run in the simulator as unsupported, because its times are not those of a device."""
     return run._replace(status="unsupported", reason=SIMULATED) if run.device == SIMULATED else run
 
 
 def pairs(found: Sequence[Run]) -> dict[Panel, list[Pair]]:
-    """By scene and tolerance, the meshes by their vertices, on computers where a run on a device ended well."""
+    """Return device pairs by scene and tolerance, in order of the number of vertices.
+
+    Only computers with a successful run on a device count.
+    """
     places = {run.place for run in found if run.asked and run.status == "ok"}
     groups: dict[Panel, dict[tuple[str, int], list[Run]]] = defaultdict(lambda: defaultdict(list))
     for run in found:
@@ -110,7 +121,7 @@ def _pair(vertices: int, mine: Sequence[Run]) -> Pair:
 
 
 def pays_from(compared: Sequence[Pair]) -> Pair | None:
-    """The smallest mesh from which on the device is faster wherever both sides got there; None for none."""
+    """Return the smallest mesh from which on the device is faster wherever both sides converged, or None."""
     both = [pair for pair in compared if pair.ratio is not None]
     first = None
     for pair in reversed(both):
@@ -121,13 +132,22 @@ def pays_from(compared: Sequence[Pair]) -> Pair | None:
 
 
 def told(table: pa.Table, config: str) -> list[str]:
-    """What the rows of a sweep say of devices, in sentences."""
+    """Summarise the device runs of a sweep's rows in sentences.
+
+    Args:
+        table: rows of the sweep.
+        config: path of the sweep's config; "" if it no longer exists.
+    """
     return words(runs(table), config)
 
 
 def words(found: Sequence[Run], config: str) -> list[str]:
-    """What runs say, in sentences; nothing of a sweep in which none asked for a device. config: of the sweep, "" where
-    it is gone."""
+    """Summarise runs in sentences; empty if no run of the sweep requested a device.
+
+    Args:
+        all_runs: runs of the sweep.
+        config: path of the sweep's config; "" if it no longer exists.
+    """
     asked = [run for run in found if run.asked]
     if not asked:
         return []
@@ -141,7 +161,7 @@ def words(found: Sequence[Run], config: str) -> list[str]:
 
 
 def _why(runs: Sequence[Run]) -> str:
-    """The reason that most of them give."""
+    """Return the most common reason or status of these runs."""
     return Counter(run.reason or run.status for run in runs).most_common(1)[0][0]
 
 
@@ -164,7 +184,7 @@ def _said(panel: Panel, compared: Sequence[Pair]) -> str:
 
 
 def _faster(pair: Pair) -> str:
-    """Of a pair in which both sides got there."""
+    """Describe the speedup of a pair in which both sides converged."""
     assert pair.there
     assert pair.here
     assert pair.ratio is not None
@@ -175,7 +195,7 @@ def _faster(pair: Pair) -> str:
 
 
 def _without_time(asked: Sequence[Run]) -> Iterator[str]:
-    """Runs on a device without a time."""
+    """Describe the runs on a device that have no time."""
     failed = [run for run in asked if run.status != "ok"]
     if failed:
         yield f"{len(failed)} of {len(asked)} runs on a device have no time: {_why(failed)}."

@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
-"""The picture of what a device saves: seconds of a step against vertices, the best of both sides, by residual."""
+# Matplotlib's stubs do not type most keywords.
+"""Plot of device speedups: seconds of a step against vertices, the fastest run of each side, per residual."""
 
 from __future__ import annotations
 
@@ -24,8 +24,12 @@ _SIDES = (("device", FASTER, "-"), ("processor", INK, (0, (5, 2))))
 
 
 def draw_devices(results: Path) -> Iterator[tuple[Path | None, list[str]]]:
-    """Draw `pictures/devices.png` of each sweep in a folder of results, or of one sweep, that asked for a device, and
-    tell what its rows say; no picture where no run on one got to a residual."""
+    """Draw `pictures/devices.png` for each sweep that requested a device.
+
+    Args:
+        results: folder of results, or the folder of one sweep.
+    Yields: the picture, or None if no run on a device reached its residual; and sentences on the sweep's rows.
+    """
     for folder in shelf.folders(results, "rows"):
         try:
             found = runs(rows.read(shelf.units(folder), left_out=lambda mistake: None))
@@ -43,7 +47,14 @@ def draw_devices(results: Path) -> Iterator[tuple[Path | None, list[str]]]:
 
 
 def draw(compared: dict[tuple[str, float], list[Pair]], path: Path, title: str, facts: Sequence[str]) -> None:
-    """Draw the best of both sides to `path`, PNG, WIDTH pixels wide and HEIGHT at most."""
+    """Draw the fastest runs of both sides as a PNG file, PAGE_WIDTH pixels wide, at most PAGE_HEIGHT high.
+
+    Args:
+        pairs_by_panel: device pairs by scene and tolerance.
+        path: target file.
+        title: title of the picture.
+        facts: phrases below the title.
+    """
     columns = min(_COLUMNS, len(compared))
     lines = ceil(len(compared) / columns)
     width = (WIDTH - _LEFT - 40 - _GAP * (columns - 1)) / columns

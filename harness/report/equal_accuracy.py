@@ -1,8 +1,8 @@
-"""Which runs of a sweep are equally accurate, how long they take, and which are not compared.
+"""Comparison of run times at equal accuracy, within a sweep.
 
-Two runs are compared where they solve the same steps on the same machine and the same error of both is known: the
-largest distance from the reference motion where the runs were judged, else the largest residual of a step. A run of
-unknown error is never called as accurate as another one.
+Two runs are compared if they solve the same steps on the same machine and the same error is known for both: the
+largest distance from the reference motion where the runs were verified, otherwise the largest residual of a step. A
+run of unknown error never counts as equally accurate.
 """
 
 from __future__ import annotations
@@ -17,17 +17,22 @@ from harness.report.page import factor, quantity
 from harness.report.timing_table import ROUND_OFF, RunTimes
 
 SAME = 10.0
-"""Errors within this factor of the lowest are called equal."""
+"""Errors within this factor of the lowest count as equal."""
 
 _LISTED = 4
-"""Runs that a sentence lists."""
+"""Maximum number of runs that a sentence lists."""
 
 
 class Comparison(NamedTuple):
-    """The runs of one scene, size and machine that solve the same steps.
+    """Runs of one scene, size and machine that solve the same steps.
 
-    what: the error in words; lowest: its smallest value; equal: the runs within SAME of that or of round-off, the
-    fastest first; worse: those beyond, with the quotient of their error and the lowest; unknown: the others.
+    Attributes:
+        group_label: scene and size.
+        error_label: name of the error.
+        lowest_error: smallest error of these runs.
+        equal_runs: runs within a factor EQUAL_ERROR_FACTOR of the lowest error or of round-off, the fastest first.
+        worse_runs: runs beyond that, each with its error divided by the lowest.
+        unknown_runs: runs whose error is unknown.
     """
 
     where: str
@@ -39,8 +44,12 @@ class Comparison(NamedTuple):
 
 
 def comparisons(found: Iterable[RunTimes]) -> Iterator[Comparison]:
-    """One for each scene of several timed runs: of the steps that most runs of known error solve, then of the largest
-    size."""
+    """Yield one comparison for each scene that has several timed runs.
+
+    Of the groups of runs that solve the same steps, the one with the most runs of known error is chosen, then the
+    largest
+    size.
+    """
     scenes: dict[str, dict[tuple[object, ...], list[RunTimes]]] = defaultdict(lambda: defaultdict(list))
     for run in found:
         if run.status == "ok" and run.step and run.asked is None:
@@ -53,7 +62,12 @@ def comparisons(found: Iterable[RunTimes]) -> Iterator[Comparison]:
 
 
 def sentences(compared: Comparison, names: Mapping[str, str]) -> Iterator[tuple[str, list[str]]]:
-    """What a comparison says, each sentence with the ids of its runs. names: of the runs, by their ids."""
+    """Describe a comparison in sentences, each with the ids of its runs.
+
+    Args:
+        comparison: comparison to describe.
+        names: labels of the runs by their ids.
+    """
     not_compared = [
         *(f"{names[run.run_id]} (its error is {_times(by)} as large)" for run, by in compared.worse),
         *(f"{names[run.run_id]} (its error is unknown)" for run in compared.unknown),

@@ -1,4 +1,4 @@
-"""Which frames of a recording can be drawn, and the scale of strain that shows what is in them."""
+"""Selection of the frames of a recording that can be drawn, and the strain scale that suits them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _BLOWN_UP = 1e4  # coordinates this many times larger than the start's are drawn
 
 
 def drawable_frames(replay: Replay) -> NDArray[np.int64]:
-    """The recorded frames before the first that is not finite (or has blown up beyond drawing)."""
+    """Return the indices of the recorded frames before the first that is not finite or has blown up."""
     start = replay.positions[0]
     limit = _BLOWN_UP * (max(float(np.abs(start).max(initial=0.0)), spacing(replay)) or 1.0)
     with np.errstate(invalid="ignore"):
@@ -25,12 +25,17 @@ def drawable_frames(replay: Replay) -> NDArray[np.int64]:
 
 
 def shown_limit(replays: Sequence[Replay], frames: Sequence[int]) -> float:
-    """The end of a scale that shows the strains of these frames, one of each recording (`scale_end`)."""
+    """Return the end of a colour scale for the strains of these frames, see `scale_end`.
+
+    Args:
+        replays: recordings.
+        frames: one frame index per recording.
+    """
     return scale_end(np.concatenate([vertex_strain(r, k) for r, k in zip(replays, frames, strict=True)]))
 
 
 def largest_strain(replay: Replay) -> float:
-    """The run's largest strain, as its rows have it; NaN where no frame after the start was recorded."""
+    """Return the largest strain of the run as its rows state it; NaN if no frame after the start was recorded."""
     if "/strain/largest" in replay.scalars:
         return quantities.largest_strain(*replay.scalars["/strain/largest"])
     strains = [np.abs(spring_strain(replay, k)).max(initial=0.0) for k in range(len(replay.frames))]
@@ -38,8 +43,10 @@ def largest_strain(replay: Replay) -> float:
 
 
 def strain_ends(replays: Sequence[Replay]) -> tuple[float, float]:
-    """The smallest and the largest strain of a spring in all frames after the start that can be drawn; 0 where there is
-    none below, or above. That of larger magnitude is the run's largest strain."""
+    """Return the smallest and the largest spring strain over all drawable frames after the start.
+
+    An end is 0 where there is no strain below or above zero. The end of larger magnitude is the run's largest strain.
+    """
     low = high = 0.0
     for replay in replays:
         shown = [int(k) for k in drawable_frames(replay) if replay.frames[k] > 0]

@@ -1,9 +1,9 @@
-"""Compares two stored pytest-benchmark files: what became slower?
+"""Comparison of two pytest-benchmark files: detection of performance regressions.
 
-A benchmark that was measured against a yardstick stores `extra_info["ratio"]` (median, low, high): it is slower
-where the new interval lies wholly above the old one, by more than a margin. Of others the minima are compared, with a
-wide margin, and a difference between two machines is a remark only. A benchmark that vanished counts as a
-regression: deleting a gate must not open it. Of files without a common benchmark nothing can be told.
+A benchmark that was measured against a baseline stores `extra_info["ratio"]` (median, low, high). It is slower if the
+new interval lies wholly above the old one by more than a margin. For other benchmarks the minima are compared, with a
+wide margin; between two machines such a difference is only a remark. A missing benchmark counts as a regression, so
+that deleting a benchmark cannot hide one. Without a common benchmark the result is "cannot tell".
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from harness.base.errors import InputError, Mistake
 from harness.report.stored import CANNOT_TELL
 
 RATIO_MARGIN = 0.10
-"""Beyond both intervals: those of two runs of the same code lay up to 4 % apart on a loaded machine."""
+"""Margin beyond both intervals: those of two runs of the same code differed by up to 4 % on a loaded machine."""
 OTHER_MACHINE_MARGIN = 0.25
-"""The same for ratios from different machines: two programs do not gain alike from another processor."""
+"""Margin for ratios from different machines: two programs do not speed up equally on another processor."""
 MINIMUM_MARGIN = 0.5
-"""Minima of two runs lie 4 % apart on an idle machine; another program on the same core doubles them."""
+"""Margin for minima: those of two runs differ by 4 % on an idle machine; another process on the core doubles them."""
 
 _MOST = 2**25
-"""Bytes of a stored file; each time of each benchmark takes 20."""
+"""Maximum size of a stored file [bytes]; each time of each benchmark takes 20."""
 
 REGRESSIONS = ("slower", "vanished")
 
@@ -53,7 +53,7 @@ class Ratio(BaseModel):
 
 
 class Extra(BaseModel):
-    """What a benchmark tells beside its times."""
+    """Additional data of a benchmark, besides its times."""
 
     ratio: Ratio | None = None
 
@@ -73,7 +73,7 @@ class Benchmark(BaseModel):
 
 
 class Commit(BaseModel):
-    """The state of the code that was measured. time: of the commit, ISO 8601."""
+    """The version of the measured code; `time` is that of the commit, ISO 8601."""
 
     id: str = "unknown"
     time: str | None = None
@@ -81,8 +81,11 @@ class Commit(BaseModel):
 
 
 class Stored(BaseModel):
-    """A file that pytest-benchmark stored, as far as it is compared; unknown keys are passed over. datetime: when it
-    was measured, ISO 8601."""
+    """The compared part of a pytest-benchmark file; unknown keys are ignored.
+
+    Attributes:
+        datetime: time of the measurement, ISO 8601.
+    """
 
     datetime: str = ""
     commit_info: Commit = Commit()
@@ -96,17 +99,22 @@ class Stored(BaseModel):
 
     @property
     def machine(self) -> tuple[Any, ...]:
-        """What decides about speed: the processor and how many of its cores may be used."""
+        """The properties that determine speed: the processor, its number of cores and the usable cores."""
         told = self.machine_info.get("cpu")
         cpu = cast(Mapping[str, Any], told) if isinstance(told, Mapping) else dict[str, Any]()
         return (cpu.get("brand_raw"), cpu.get("count"), self.machine_info.get("affinity"))
 
 
 def compare(base: Path, new: Path, console: Console) -> int:
-    """Print a table of what changed from `base` to `new`; 1 if anything became slower or vanished, CANNOT_TELL if they
-    have no benchmark in common, else 0.
+    """Print a table of the changes from `base` to `new`.
 
-    Raises InputError for a file that pytest-benchmark did not store.
+    Args:
+        base: pytest-benchmark file of the old version.
+        new: pytest-benchmark file of the new version.
+        console: console that the table is printed on.
+    Returns: 1 if a benchmark became slower or is missing, CANNOT_TELL if there is no common benchmark, otherwise 0.
+    Raises:
+        InputError: if pytest-benchmark did not write one of the files.
     """
     old, now = read_stored(base), read_stored(new)
     if not old.by_name.keys() & now.by_name.keys():
@@ -129,7 +137,7 @@ def compare(base: Path, new: Path, console: Console) -> int:
 
 
 def _judged(old: Benchmark | None, new: Benchmark | None, same_machine: bool) -> tuple[str, str]:
-    """The change in words, and a verdict: slower, vanished, faster, unchanged, new, or not judged."""
+    """Return the change and its class: slower, vanished, faster, unchanged, new, or not judged."""
     if old is None or new is None:
         return "", "new" if old is None else "vanished"
     was, now = old.extra_info.ratio, new.extra_info.ratio
@@ -148,7 +156,7 @@ def _judged(old: Benchmark | None, new: Benchmark | None, same_machine: bool) ->
 
 
 def _figure(benchmark: Benchmark | None) -> str:
-    """The ratio with its interval, else the minimum."""
+    """Format the ratio with its interval, or the minimum if there is no ratio."""
     if benchmark is None:
         return ""
     ratio = benchmark.extra_info.ratio
@@ -158,7 +166,11 @@ def _figure(benchmark: Benchmark | None) -> str:
 
 
 def read_stored(path: Path) -> Stored:
-    """The stored benchmarks of a file; raises InputError."""
+    """Read the benchmarks of a pytest-benchmark file.
+
+    Raises:
+        InputError: if the file cannot be read, is too large or has another format.
+    """
     wanted = "wanted a file that pytest-benchmark stored; `pytest tests/bench --benchmark-only` makes one"
     try:
         if path.exists() and not path.is_file():

@@ -1,15 +1,15 @@
 # pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
 # ruptures has no types.
-"""What the gates' stored results say over time: where did a gate become slower or faster, and by how much?
+"""Detection of changes in the stored results of benchmarks over time.
 
-The stored results of a gate, on one kind of machine, in the order of their commits, are logarithms y of its ratio to
-its yardstick (of its least time, where it has none), with noise of one standard deviation sigma, whose means change at
-some commits. The changes are those of the least penalised negative log-likelihood (twice that, less a constant),
+The results of a benchmark on one kind of machine, in the order of their commits, are logarithms y of its ratio to the
+baseline (of its minimum time, if it has no baseline). They have noise with one standard deviation sigma, and means
+that change at some commits. The changes minimise the penalised negative log-likelihood (times two, up to a constant),
 
-    sum over results of (y - mean of its stretch)^2 / sigma^2 + 5 log(n) for each change,
+    sum over results of (y - mean of its segment)^2 / sigma^2 + 5 log(n) per change,
 
-found exactly by PELT (Killick, Fearnhead and Eckley 2012; the library ruptures). Sigma comes from the differences of
-neighbours, which a change hardly moves, and is no less than the results' own intervals say.
+found exactly by PELT (Killick, Fearnhead and Eckley 2012; the library ruptures). Sigma is estimated from differences
+of neighbours, which a change hardly affects, and is at least as large as the results' own intervals imply.
 """
 
 from __future__ import annotations
@@ -31,28 +31,29 @@ from harness.base.errors import InputError, Mistake
 from harness.report.gate import Benchmark, Stored, read_stored
 
 FEWEST = 6
-"""Results of a gate below which nothing is said of changes: two stretches, and their noise."""
+"""Minimum number of results for change detection: two segments, and their noise."""
 SHORTEST = 2
-"""Results of a stretch: a single one that lies apart is an outlier."""
+"""Minimum number of results in a segment: a single deviating result is an outlier."""
 PENALTY = 5.0
-"""Of a change, in log(n). The modified BIC (Zhang and Siegmund 2007) has about 3; then 14 of 200 series of 30 results
-of noise alone show a change, with this 1 of 400, and 99 of 100 steps of five times the noise are placed within a
-commit.
+"""Penalty of a change, in units of log(n).
+
+The modified BIC (Zhang and Siegmund 2007) has about 3; then 14 of 200 series of 30 results of pure noise show a change.
+With 5 it is 1 of 400 series, and 99 of 100 steps of five times the noise are located within one commit.
 """
 FLOOR = 0.005
-"""The least noise that is believed, of the logarithm: results are rounded, and repeat by chance."""
+"""Minimum noise of the logarithm: results are rounded, and may coincide by chance."""
 CHANGED = "*"
-"""Behind a commit whose files were changed."""
+"""Suffix of a commit whose files were modified."""
 
 _INTERVAL = 2 * 1.96
-"""Standard deviations that a 95 % interval spans."""
+"""Width of a 95 % interval [standard deviations]."""
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class StoredResult:
-    """A stored result. value, low, high: the ratio to the yardstick, or the least time [s] alone."""
+    """A stored result; `value`, `low` and `high` are the ratio to the baseline, or all three the minimum time [s]."""
 
     commit: str
     value: float
@@ -62,9 +63,11 @@ class StoredResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GateHistory:
-    """A gate on one kind of machine, in the order of its commits.
+    """Results of a benchmark on one kind of machine, in the order of their commits.
 
-    starts: of its stretches, 0 first, the others are changes; ratio: whether values are ratios, or seconds.
+    Attributes:
+        is_ratio: whether values are ratios; otherwise they are seconds.
+        segment_starts: first index of each segment; 0 is first, the others are changes.
     """
 
     gate: str
@@ -75,7 +78,7 @@ class GateHistory:
 
     @property
     def levels(self) -> list[float]:
-        """The geometric mean of each stretch."""
+        """The geometric mean of each segment."""
         ends = (*self.starts[1:], len(self.points))
         return [
             math.exp(float(np.mean([math.log(p.value) for p in self.points[a:b]])))
@@ -84,14 +87,17 @@ class GateHistory:
 
     @property
     def changes(self) -> list[tuple[int, float]]:
-        """Where the gate changed, and the ratio of its levels there."""
+        """The index of each change, and the ratio of the new level to the old one."""
         levels = self.levels
         return [(at, new / old) for at, old, new in zip(self.starts[1:], levels, levels[1:], strict=False)]
 
 
 def stored_files(places: Iterable[Path]) -> list[Path]:
-    """The files of pytest-benchmark in these folders, and those that are named. Raises InputError for what is not
-    there."""
+    """Return the pytest-benchmark files in these folders, and the files among the paths.
+
+    Raises:
+        InputError: if a path does not exist.
+    """
     found: list[Path] = []
     for place in places:
         if not place.exists():
@@ -101,12 +107,16 @@ def stored_files(places: Iterable[Path]) -> list[Path]:
 
 
 def history(files: Sequence[Path]) -> list[GateHistory]:
-    """The gates in stored files and their changes; the largest first. Raises InputError for foreign files."""
+    """Read the benchmark histories in stored files, the largest change first.
+
+    Raises:
+        InputError: if pytest-benchmark did not write one of the files.
+    """
     return histories(map(read_stored, files))
 
 
 def histories(stored: Iterable[Stored]) -> list[GateHistory]:
-    """The same of what was read from files."""
+    """Build the benchmark histories of stored results, the largest change first."""
     points: dict[tuple[str, str, bool], list[StoredResult]] = defaultdict(list)
     for one in sorted(stored, key=lambda s: (s.commit_info.time or s.datetime, s.datetime)):
         for benchmark in one.benchmarks:
@@ -132,7 +142,7 @@ def _point(stored: Stored, benchmark: Benchmark) -> StoredResult:
 
 
 def changes(points: Sequence[StoredResult]) -> tuple[int, ...]:
-    """The starts of the stretches of results that belong together; 0 alone where nothing changed or little is known."""
+    """Return the starts of the segments; (0,) if nothing changed or there are too few results."""
     if len(points) < FEWEST:
         return (0,)
     from ruptures import Pelt
@@ -145,13 +155,13 @@ def changes(points: Sequence[StoredResult]) -> tuple[int, ...]:
 
 
 def noise(y: Array) -> float:
-    """The standard deviation of results about their stretch's mean, by the median difference of neighbours."""
+    """Estimate the noise of results around their segment's mean from the median difference of neighbours."""
     apart = np.abs(np.diff(y))
     return max(float(np.median(apart)) / (0.6745 * math.sqrt(2)), FLOOR)
 
 
 def history_table(found: Sequence[GateHistory]) -> Table:
-    """The gates, their last level, and their changes in words."""
+    """Build a table of the benchmarks, their last level and their changes."""
     table = Table("gate", "results", "now", "changes", box=SIMPLE_HEAD)
     for series in found:
         told = [f"{100 * (r - 1):+.1f} % at {series.points[k].commit}" for k, r in series.changes]

@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
-"""The picture of `springbench history`: a panel for each gate, results by commit, levels and changes."""
+# Matplotlib's stubs do not type most keywords.
+"""Plot of `springbench history`: one panel per benchmark with results by commit, levels and changes."""
 
 from __future__ import annotations
 
@@ -17,13 +17,18 @@ from harness.report.history import CHANGED, FEWEST, GateHistory
 from harness.report.style import DPI, FASTER, INK, MUTED, RC, SLOWER, WIDTH
 
 MOST = 12
-"""Panels; the gates that changed most are shown."""
+"""Maximum number of panels; the benchmarks with the largest changes are shown."""
 _ROW = 190
-"""Pixels of a panel's height."""
+"""Height of a panel [pixels]."""
 
 
 def draw_history(found: Sequence[GateHistory], path: Path) -> int:
-    """Draw the gates of which enough is known, at most MOST of them, and return how many are drawn."""
+    """Draw at most MAX_PANELS benchmarks that have enough results, and return how many were drawn.
+
+    Args:
+        gate_histories: benchmark histories, the largest change first.
+        path: target file; its suffix determines the format, PNG by default.
+    """
     shown = [series for series in found if len(series.points) >= FEWEST]
     count = len(shown)
     shown = shown[:MOST]
@@ -89,7 +94,7 @@ def _panel(axis: Any, series: GateHistory) -> None:
 
 
 def _ticks(series: GateHistory) -> list[int]:
-    """The results whose commits are named: those of changes, then the last, the first and others that have room."""
+    """Choose the results whose commits are labelled: changes first, then the last, the first and others that fit."""
     count = len(series.points)
     wanted = [*(at for at, _ in series.changes), count - 1, *range(0, count, max(1, count // 8))]
     ticks = list[int]()

@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
-# PyVista's filters and meshes are known in part.
-"""What is in recordings, without a viewer: `springbench inspect`; and in the viewer: `springbench view`."""
+# PyVista's filters and meshes are only partly typed.
+"""Inspection of recordings: `springbench inspect` prints a summary, `springbench view` opens the viewer."""
 
 from __future__ import annotations
 
@@ -29,18 +29,24 @@ from harness.report.page import quantity
 _SURFACE = (".obj", ".ply", ".stl", ".vtk", ".vtp")
 _LINES = (".vtk", ".vtp")
 _SINGLE = (".ply", ".stl")
-"""Formats of single precision, which does not resolve a mesh far from zero."""
+"""Formats with single precision, which does not resolve a mesh far from the origin."""
 _MOST = 50
-"""Recordings of a folder that are opened together."""
+"""Maximum number of recordings of a folder that are opened together."""
 _MILLISECONDS = "/milliseconds/"
 
 
 def inspect(paths: list[Path], *, frame: int | None, export: Path | None, csv: Path | None, console: Console) -> None:
-    """Print what is in each recording, and of two what differs.
+    """Print the contents of each recording, and the differences between two.
 
-    frame: the frame that `export` writes, the last one if left out; export: mesh file of that frame, its format by
-    suffix; csv: file for the scalars in long form. Raises InputError for files that are no recordings, frames that
-    are not there, suffixes that are unknown, and where `export` or `csv` is asked of several recordings.
+    Args:
+        paths: recordings, or folders of recordings.
+        frame: frame that `export` writes; None for the last one.
+        export: mesh file of that frame; its suffix determines the format.
+        csv: file for the scalars in long form.
+        console: console that the summary is printed on.
+    Raises:
+        InputError: if a file is not a recording, a frame is missing, a suffix is unknown, or `export` or `csv` is given
+            for several recordings.
     """
     paths = find_recordings(paths)
     if len(paths) != 1 and (export or csv):
@@ -62,9 +68,10 @@ def inspect(paths: list[Path], *, frame: int | None, export: Path | None, csv: P
 
 
 def find_recordings(paths: Sequence[Path]) -> list[Path]:
-    """Return the paths, each folder among them replaced by the recordings below it.
+    """Return the paths, with each folder replaced by the recordings below it.
 
-    Raises: InputError for a folder without recordings, or with more than a viewer can show.
+    Raises:
+        InputError: if a folder has no recordings, or more than a viewer can show.
     """
     found: list[Path] = []
     for path in paths:
@@ -83,7 +90,9 @@ def find_recordings(paths: Sequence[Path]) -> list[Path]:
 def view(paths: list[Path]) -> None:
     """Open recordings in the Rerun viewer and wait until it is closed.
 
-    Raises InputError for files that are no recordings, RunFailed where there is no display or no viewer.
+    Raises:
+        InputError: if a file is not a recording.
+        RunFailed: if there is no display or no viewer.
     """
     paths = find_recordings(paths)
     for path in paths:
@@ -126,7 +135,7 @@ def _print_summary(found: Summary, console: Console) -> None:
 
 
 def _print_difference(paths: list[Path], console: Console) -> None:
-    """How far apart two runs ended, and their times side by side."""
+    """Print the distance between the final positions of two runs, and their times side by side."""
     for path in paths:
         read_replay(path, [-1])  # refuses what is not one run's recording
     first, second = (summary(path) for path in paths)
@@ -163,7 +172,7 @@ def _ratio(times: list[dict[str, NDArray[np.float64]]], entity: str) -> float:
 
 
 def _series(scalars: pa.Table) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Each entity's finite values in the order of the frames, of those without iterations."""
+    """Yield each entity's finite values in the order of the frames, without values of single iterations."""
     once = scalars.filter(scalars["iteration"].is_null())
     entities, values = once["entity"].to_numpy(), once["value"].to_numpy()
     for entity in dict.fromkeys(entities):

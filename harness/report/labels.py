@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
-"""Names at the ends of lines, moved apart where lines end side by side."""
+# Matplotlib's stubs do not type most keywords.
+"""Labels at the ends of lines, moved apart where lines end close together."""
 
 from __future__ import annotations
 
@@ -9,20 +9,25 @@ from collections.abc import Sequence
 from matplotlib.axes import Axes
 
 LINE = 17
-"""Pixels between the names."""
+"""Distance between labels [pixels]."""
 
 End = tuple[float, float, str, str]
-"""Where a line ends, by the axes' scales; its name and colour."""
+"""The end of a line in data coordinates, its label and its colour."""
 
 
 def direct_labels(ax: Axes, ends: Sequence[End]) -> None:
-    """Names at the right of the lines' ends; where lines end at the same size, moved apart."""
+    """Draw labels to the right of the lines' ends; labels that would overlap are moved apart.
+
+    Args:
+        ax: axes of the lines.
+        ends: line ends with label and colour.
+    """
     for column in sorted({x for x, *_ in ends}):
         here = sorted((end for end in ends if end[0] == column), key=lambda end: end[1])
         wanted = ax.transData.transform([(x, y) for x, y, *_ in here])
         at = spread(wanted[:, 1].tolist(), ax.bbox.y0 + 6, ax.bbox.y1 - 6)
         for (x, y, words, color), height in zip(here, at, strict=True):
-            # As shares of the figure: pixels mean something else in vector formats.
+            # In fractions of the figure, because pixels have another meaning in vector formats.
             x_share, y_share = ax.figure.transFigure.inverted().transform((wanted[0, 0] + 16, height))
             line = {"arrowstyle": "-", "color": color, "alpha": 0.45, "linewidth": 0.8, "shrinkA": 1, "shrinkB": 5}
             ax.annotate(
@@ -38,7 +43,13 @@ def direct_labels(ax: Axes, ends: Sequence[End]) -> None:
 
 
 def spread(wanted: Sequence[float], bottom: float, top: float) -> list[float]:
-    """The sorted heights [pixels], at least LINE apart: pushed up from below, then down from the top."""
+    """Return sorted heights [pixels] that are at least LABEL_SPACING apart: moved up from below, then down from the top.
+
+    Args:
+        targets: preferred heights, ascending [pixels].
+        bottom: lower limit [pixels].
+        top: upper limit [pixels].
+    """
     at = list(wanted)
     for k in range(1, len(at)):
         at[k] = max(at[k], at[k - 1] + LINE)

@@ -1,4 +1,4 @@
-"""What the end of a sweep says: what was learned, in sentences, and what to do next, in commands."""
+"""Summary at the end of a sweep: findings in sentences, and suggested commands."""
 
 from __future__ import annotations
 
@@ -16,16 +16,22 @@ from harness.report.equal_accuracy import comparisons
 from harness.report.timing_table import WIDTH, RunTimes, labels, runs
 
 SOLVED = 1e-2
-"""Of the residual at a step's start: where a method that does not minimise leaves more, that is said."""
+"""Share of a step's initial residual above which a remainder of a method that does not minimise is reported."""
 
 GROWS = 1.5
-"""The largest strain is said to grow where it does by this factor, and by as much more than what 99 % stay below."""
+"""Factor by which the largest strain has to grow to be reported, and to exceed the growth of the 99th percentile."""
 
 
 def closing(table: pa.Table, config: Path, results: Path, folder: Path) -> list[str]:
-    """The last lines of a sweep, none longer than WIDTH but for paths: what was learned, what to do next, the page.
+    """Build the last lines of a sweep: findings, suggested commands, and the address of the results page.
 
-    table: its rows; config: what was run; results: the folder of all sweeps' results; folder: that of this one's.
+    No line is longer than TABLE_WIDTH, except for paths.
+
+    Args:
+        table: rows of the sweep.
+        config: config that was run.
+        results: folder of the results of all sweeps.
+        folder: folder of this sweep's results.
     """
     found, page = runs(table), results / "index.html"
     told = sentences(found)
@@ -35,16 +41,20 @@ def closing(table: pa.Table, config: Path, results: Path, folder: Path) -> list[
 
 
 def sentences(found: Sequence[RunTimes]) -> list[str]:
-    """What runs say of which solver is fastest, of how they stopped and of their strain; each a line or more."""
+    """Summarise the fastest solvers, the termination reasons and the strains of runs, in lines."""
     fine, names = [run for run in found if run.status == "ok"], labels(found)
     told = [*_fastest(fine, names), *_stopped(fine), *_unsolved(fine, names), *_strain(fine, names)]
     return [line for sentence in told for line in wrap(sentence, WIDTH - 2, subsequent_indent="  ")]
 
 
 def commands(found: Sequence[RunTimes], config: Path, results: Path, recordings: Path) -> list[str]:
-    """What to do next, with a word on each: replay a run, find the fastest at equal accuracy, see everything.
+    """Suggest commands with a comment each: replay a run, find the fastest at equal accuracy, update the page.
 
-    config: what was run; recordings: the folder of the sweep's.
+    Args:
+        timed_runs: runs of the sweep.
+        config: config that was run.
+        results: folder of the results of all sweeps.
+        recordings: folder of this sweep's recordings.
     """
     told: list[tuple[str, Path | str, str]] = []
     if best := _to_see(found, recordings):
@@ -61,7 +71,7 @@ def _fastest(found: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[st
 
 
 def _stopped(fine: Sequence[RunTimes]) -> Iterator[str]:
-    """How many runs the limit of iterations stopped above round-off."""
+    """Describe how many runs the iteration limit stopped above round-off."""
     limited = [run for run in fine if run.stopped == "iterations" and not _at_round_off(run)]
     if limited:
         many = f"All {len(fine)} runs" if len(limited) == len(fine) else f"{len(limited)} of {len(fine)} runs"
@@ -73,7 +83,7 @@ def _at_round_off(run: RunTimes) -> bool:
 
 
 def _unsolved(fine: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[str]:
-    """Of methods that do not minimise: what they left of a step's residual, by the oracle."""
+    """Describe the residual that methods which do not minimise leave, as the independent check measured it."""
     for run in fine:
         if run.left is not None and run.left > SOLVED:
             yield (
@@ -84,8 +94,10 @@ def _unsolved(fine: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[st
 
 
 def _strain(fine: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[str]:
-    """How the largest strain changes with the mesh, and whether the material does, by runs that differ in nothing
-    else and were solved to a tolerance or to round-off."""
+    """Describe how the largest strain and the material change with the mesh.
+
+    Only runs that differ in nothing else and were solved to a tolerance or to round-off are compared.
+    """
     sizes: dict[str, dict[str, dict[int, RunTimes]]] = defaultdict(lambda: defaultdict(dict))
     for run in fine:
         solved = run.stopped in ("tolerance", "floor") or _at_round_off(run)
@@ -99,7 +111,7 @@ def _strain(fine: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[str]
 
 
 def _strain_words(coarse: RunTimes, fine: RunTimes) -> str:
-    """What the strains of two sizes say; empty where they say nothing."""
+    """Compare the strains of two sizes in words; empty if they do not differ notably."""
     largest, finest = coarse.largest_strain or 0.0, fine.largest_strain or 0.0
     most, below = coarse.strain_99 or 1.0, fine.strain_99 or 1.0
     change = f"from {100 * largest:.3g} to {100 * finest:.3g} %, from size {coarse.size} to {fine.size}"
@@ -124,7 +136,7 @@ def _strain_words(coarse: RunTimes, fine: RunTimes) -> str:
 
 
 def _to_see(found: Sequence[RunTimes], recordings: Path) -> Path | None:
-    """A recording of the largest mesh: of the fastest at equal accuracy where runs were compared."""
+    """Return a recording of the largest mesh, that of the fastest run at equal accuracy where runs were compared."""
     best = {compared.equal[0].run_id for compared in comparisons(found) if compared.equal}
     timed = [run for run in found if run.step]
     order = sorted(timed, key=lambda run: (-(run.vertices or 0), run.run_id not in best, run.step))
@@ -133,6 +145,6 @@ def _to_see(found: Sequence[RunTimes], recordings: Path) -> Path | None:
 
 
 def _scene(config: Path, name: str) -> Path | None:
-    """The file of a scene, where it lies as the project's own do."""
+    """Return the scene's file if it is in one of the usual folders, else None."""
     known = (config, *(folder / f"{name}.yaml" for folder in (config.parent, config.parent / "scenes")))
     return next((path for path in known if path.stem == name and path.is_file()), None)

@@ -1,6 +1,7 @@
-"""On which machines rows were made, and which of their numbers may be compared across machines: the foot of tables.
+"""Footer of tables: the machines of the rows, and which numbers may be compared across machines.
 
-A machine is told by the id of its kind, and where several of one kind were at work by the computer's own after it.
+A machine is identified by the id of its kind, followed by the computer's own id where several computers are of one
+kind.
 """
 
 from __future__ import annotations
@@ -14,23 +15,23 @@ from harness.report.sql import answer
 COMPARE = (
     "compare times within one machine; across machines compare ratios of such times, iterations, residuals and errors"
 )
-"""What holds for all rows."""
+"""Rule that holds for all rows."""
 
 _SHOWN = 8
-"""So many machines have a line of their own."""
+"""Maximum number of machines with a line of their own."""
 
 COLUMNS = ("cpu", "cores", "machine_bandwidth", "machine_flops", "machine_step")
-"""The columns that tell of a machine."""
+"""Columns that describe a machine."""
 
 KNOWN = ("machine", "node", *COLUMNS)
-"""All that the foot of a table is made of."""
+"""All columns that the footer of a table needs."""
 
 Place = tuple[str | None, str | None]
 """The ids of a machine's kind and of the computer."""
 
 
 def names(places: Iterable[Place]) -> dict[Place, str]:
-    """Machines in few letters; none for rows that do not say."""
+    """Assign short names to machines; rows without a machine get none."""
     known = sorted({(machine, node) for machine, node in places if machine}, key=str)
     kinds = [machine for machine, _ in known]
     return {
@@ -40,7 +41,7 @@ def names(places: Iterable[Place]) -> dict[Place, str]:
 
 
 def foot(table: pa.Table) -> list[str]:
-    """Lines for the foot of a table that is made of rows: their machines, and which numbers may be compared."""
+    """Return the footer lines of a table of rows: its machines, and which numbers may be compared."""
     able = ", ".join(f'any_value("{name}")' for name in COLUMNS)
     found = answer(f"select machine, node, {able} from rows_of where machine is not null group by all", table)
     known = names((machine, node) for machine, node, *_ in found)
@@ -50,7 +51,7 @@ def foot(table: pa.Table) -> list[str]:
 
 
 def _able(cpu: str | None, cores: int | None, bandwidth: float | None, flops: float | None, step: float | None) -> str:
-    """What a machine is, and what it can do."""
+    """Describe a machine and its measured performance."""
     words = [cpu or "unknown processor", f"{cores} core{'s' if cores != 1 else ''}" if cores else ""]
     if bandwidth and flops and step:
         words += [

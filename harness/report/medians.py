@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
-# pyarrow's stubs say nothing of some keywords.
-"""The time of a step of each run as CSV: for tables of one's own."""
+# pyarrow's stubs do not type some keywords.
+"""Median time of a step for each run, as CSV."""
 
 from __future__ import annotations
 
@@ -23,9 +23,16 @@ from rows_of where status = 'ok' group by run_id having steps > 0 order by scene
 
 
 def medians(rows: pa.Table, folder: Path) -> list[Path]:
-    """Write medians.csv, a line for each run: scene, size, solver, run_id, machine and node, its ms a step in seconds,
-    of how many steps, and the solver with the settings in which its runs differ; times of two machines are not to be
-    compared."""
+    """Write medians.csv, one line per run, and return its path.
+
+    The columns are scene, size, solver, run_id, machine, node, median time of a step [s], number of steps, and the
+    solver
+    with the settings in which its runs differ. Times of different machines must not be compared.
+
+    Args:
+        rows: rows of a sweep.
+        folder: folder that the file is written to.
+    """
     label = labels(runs(rows))
     found = [(*row, label[row[3]]) for row in answer(_SQL, rows)]
     names = ("scene", "size", "solver", "run_id", "machine", "node", "median_seconds", "steps", "label")

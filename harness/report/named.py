@@ -1,4 +1,4 @@
-"""The reports that a sweep names, shipped ones and somebody's own: each is told the rows and writes its files."""
+"""Reports that a sweep names, built in or from plug-ins: each receives the rows and writes its files."""
 
 from __future__ import annotations
 
@@ -16,20 +16,30 @@ from harness.config.sweep import EVERY_REPORT
 from solvers.plugins import Plugin, load
 
 _SECONDS, _GIB = 600.0, 2.0
-"""What a report of somebody's own may take at most, and the memory [GiB] of it."""
+"""Limits of a plug-in report: wall time [s] and memory [GiB]."""
 
 
 class Report(Protocol):
-    """A report: a function."""
+    """A report: a function that writes files."""
 
     def __call__(self, rows: pa.Table, folder: Path) -> Iterable[Path]:
-        """Write files into the folder of a sweep's results, from all of its rows, and tell which."""
+        """Write files into the folder of a sweep's results, from all of its rows, and return their paths."""
         ...
 
 
 def draw_reports(names: Iterable[str], table: pa.Table, folder: Path, seconds: float | None = None) -> list[Path]:
-    """The files that the named reports wrote; somebody's own do so in a process of their own, within these
-    seconds at most. Raises RunFailed where one fails."""
+    """Run the named reports and return the files that they wrote.
+
+    Plug-in reports run in a process of their own.
+
+    Args:
+        names: names of built-in reports, or plug-ins.
+        table: rows of the sweep.
+        folder: folder of the sweep's results.
+        seconds: time limit of a plug-in [s]; None for the default of 600 s, which is also the maximum.
+    Raises:
+        RunFailed: if a report fails.
+    """
     drawn: list[Path] = []
     for name in names:
         if isinstance(name, Plugin):

@@ -1,4 +1,7 @@
-"""Can this process draw? VTK segfaults where the system has no OpenGL libraries, so a child process tries first."""
+"""Check whether this process can draw with OpenGL.
+
+VTK crashes with a segmentation fault where the system has no OpenGL libraries, so a child process tries first.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +24,11 @@ raise SystemExit(not window.SupportsOpenGL())
 _SECONDS = 60
 
 _TRIES = list["subprocess.Popen[bytes]"]()
-"""The child that tries, if one has begun."""
+"""The child process of the probe, if it was started."""
 
 
 def begin() -> None:
-    """Begin to find out, beside whatever this process does until it asks."""
+    """Start the probe in the background."""
     if _TRIES or problem.cache_info().currsize:
         return
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
@@ -36,9 +39,9 @@ def begin() -> None:
 
 @cache
 def problem() -> str | None:
-    """Why pictures of scenes cannot be drawn here and what to do about it; None where they can.
+    """Return why scenes cannot be drawn and how to fix it; None if drawing works.
 
-    Without a display VTK is told to draw through EGL. The answer is found once a process.
+    Without a display VTK is configured to draw through EGL. The result is computed once per process.
     """
     begin()
     child = _TRIES.pop()
@@ -57,7 +60,7 @@ def problem() -> str | None:
 
 
 def require() -> None:
-    """Raise RunFailed, with the command that installs what is missing, where OpenGL cannot draw."""
+    """Raise RunFailed, with the command that installs what is missing, if OpenGL cannot draw."""
     message = problem()
     if message is not None:
         raise RunFailed(message)

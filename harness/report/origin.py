@@ -1,4 +1,4 @@
-"""By which code and on which machine rows were made, in words: for pictures, figures and the page."""
+"""Provenance of rows in words: code version and machine, for pictures, figures and the page."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from harness.report.style import MUTED, WIDTH
 
 _DIRTY = "-dirty"
 NEEDED = ("cpu", "threads", "commit", "code")
-"""The columns that `measured_on` looks at."""
+"""The columns that `describe_provenance` reads."""
 
 
 def abridged(commit: str) -> str:
-    """A commit in few letters; where files differed from it, it says so: no checkout has what was run."""
+    """Abbreviate a commit; a suffix marks modified files, because no checkout contains the code that was run."""
     return f"{commit:.7}{_DIRTY if commit.endswith(_DIRTY) else ''}"
 
 
 def commits(known: Iterable[object]) -> list[str]:
-    """The commit that all of it was made by, in words, or how many there are; nothing where none is known."""
+    """Return the common commit in words, or the number of commits; empty if none is known."""
     found = sorted({str(commit) for commit in known if commit})
     return [f"commit {abridged(found[0])}" if len(found) == 1 else f"{len(found)} commits"] if found else []
 
 
 def processors(known: Iterable[object]) -> list[str]:
-    """The processors in words, two at most."""
+    """Describe the processors, or their number if there are more than two."""
     found = sorted({str(cpu) for cpu in known if cpu})
     return [shorten(cpu, 60) for cpu in found] if len(found) <= 2 else [f"{len(found)} kinds of processors"]
 
 
 def machine_and_commit(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Processor and commit of rows, or of recordings' properties."""
+    """Describe processor and commit of rows, or of the properties of recordings."""
     return [*processors(row.get("cpu") for row in rows), *commits(row.get("commit") for row in rows)]
 
 
 def measured_on(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Processor, threads, commit and code of rows, in words."""
+    """Describe processor, threads, commit and source fingerprint of rows."""
     threads, codes = (sorted({row[key] for row in rows if row.get(key)}) for key in ("threads", "code"))
     words = [*processors(row.get("cpu") for row in rows)]
     words += [f"{', '.join(map(str, threads))} thread{'s' if threads != [1] else ''}"] if threads else []
@@ -49,6 +49,12 @@ def measured_on(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def made_by(page: Figure, replays: Iterable[Replay], y: float) -> None:
-    """On which machine and by which code recordings were made, right-aligned at pixel y from the top."""
+    """Draw machine and code version of recordings, right-aligned.
+
+    Args:
+        page: figure to draw on.
+        replays: recordings.
+        y: distance of the baseline from the top [pixels].
+    """
     words = machine_and_commit([replay.properties for replay in replays])
     text(page, WIDTH - 36, y, "   ·   ".join(words), size=9, color=MUTED, ha="right")

@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
+# Matplotlib's stubs do not type most keywords.
 """A page of WIDTH x HEIGHT pixels: its title, its scale of strain, type and pictures placed by the pixel."""
 
 from __future__ import annotations
@@ -25,24 +25,34 @@ from harness.report.style import DPI, HEIGHT, INK, MUTED, PAGE, STRAIN_MAP, WIDT
 
 
 def new_page() -> Figure:
-    """An empty page, to be drawn on within `matplotlib.rc_context(RC)`."""
+    """Create an empty page, to be drawn on within `matplotlib.rc_context(RC)`."""
     page = Figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI, facecolor=PAGE)
     FigureCanvasAgg(page)
     return page
 
 
 def text(page: Figure, x: float, y: float, words: str, *, size: float, color: str = INK, **more: Any) -> None:
-    """Type with its baseline at pixel (x, y) from the upper left corner; size in points."""
+    """Draw text with its baseline at pixel (x, y) from the upper left corner.
+
+    Args:
+        page: figure to draw on.
+        x: distance from the left edge [pixels].
+        y: distance of the baseline from the top [pixels].
+        words: text.
+        size: font size [points].
+        color: colour of the text.
+        **more: further keywords of `Figure.text`.
+    """
     page.text(x / WIDTH, 1 - y / HEIGHT, words, size=size, color=color, **more)
 
 
 def axes(page: Figure, left: float, top: float, width: float, height: float) -> Axes:
-    """Axes in a rectangle given in pixels from the upper left corner."""
+    """Add axes in a rectangle given in pixels from the upper left corner."""
     return page.add_axes((left / WIDTH, 1 - (top + height) / HEIGHT, width / WIDTH, height / HEIGHT))
 
 
 def ticks(words: Callable[[float], str]) -> FuncFormatter:
-    """Ticks that are written as `words` has it."""
+    """Build a tick formatter from a function that formats a value."""
 
     def written(value: float, _: int | None) -> str:
         return words(value)
@@ -51,14 +61,19 @@ def ticks(words: Callable[[float], str]) -> FuncFormatter:
 
 
 def paste(page: Figure, pixels: NDArray[np.uint8], left: int, top: int) -> None:
-    """Put a picture on the page, pixel for pixel, with its upper left corner at (left, top)."""
+    """Paste a picture pixel for pixel, with its upper left corner at (left, top)."""
     page.figimage(pixels, xo=left, yo=HEIGHT - top - pixels.shape[0], origin="upper")
 
 
 def save(page: Figure, path: Path, *, used: float = HEIGHT) -> None:
-    """Write the page under a partial name and rename it: a kill leaves all of it or nothing. Raises CannotWrite.
+    """Write the page as PNG atomically: an interrupted run leaves the whole file or none.
 
-    used: the pixels from the top that are drawn on; what is empty below is cut off.
+    Args:
+        page: figure to write.
+        path: target file.
+        used_height: height that is drawn on [pixels from the top]; the empty part below is cropped.
+    Raises:
+        CannotWrite: if the file cannot be written.
     """
     with replacing(path) as partial:
         page.savefig(partial, format="png", dpi=DPI)
@@ -69,14 +84,21 @@ def save(page: Figure, path: Path, *, used: float = HEIGHT) -> None:
 
 
 def header(page: Figure, headline: str, facts: Sequence[str], *, letters: int = 56) -> None:
-    """The title in the upper left corner, at most so many letters of it, and a line of facts below."""
+    """Draw the title, shortened to `max_letters`, in the upper left corner and a line of facts below it."""
     text(page, 40, 50, shorten(headline, letters), size=21, weight="bold")
     text(page, 41, 82, "   ·   ".join(facts), size=11.5, color=MUTED)
 
 
 def strain_scale(page: Figure, limit: float, ends: tuple[float, float], *, pins: bool) -> None:
-    """The colour bar in the upper right corner: percent ticks below, what they mean in words above. ends: the smallest
-    and the largest strain of a spring in all frames, told above; where the bar does not reach them it ends in a tip."""
+    """Draw the colour bar of strains in the upper right corner, with percent ticks below and labels above.
+
+    Args:
+        page: figure to draw on.
+        limit: strain at the ends of the bar.
+        ends: smallest and largest spring strain of all frames, stated above the bar; an end outside the bar gets an
+            arrow tip.
+        pins: whether to draw the legend entry of pinned vertices.
+    """
     left, top, width = 1180, 50, 380
     bar = axes(page, left, top, width, 12)
     bar.imshow(np.linspace(0, 1, 512)[None], cmap=STRAIN_MAP, aspect="auto", interpolation="bilinear")
@@ -101,7 +123,7 @@ def strain_scale(page: Figure, limit: float, ends: tuple[float, float], *, pins:
 
 
 def headline(replay: Replay) -> str:
-    """The scene and its size in words."""
+    """Return the scene and its size as a headline."""
     scene, size = replay.properties.get("scene"), replay.properties.get("size")
     if scene is None:
         return replay.title
@@ -109,33 +131,33 @@ def headline(replay: Replay) -> str:
 
 
 def clock(replay: Replay, frame: int) -> str:
-    """The time of a recorded frame in words."""
+    """Format the time of a recorded frame."""
     return f"{replay.times[frame]:.2f} s"
 
 
 def count(number: int) -> str:
-    """A whole number with thin spaces between thousands."""
+    """Format an integer with thin spaces between thousands."""
     return f"{number:,}".replace(",", "\u2009")
 
 
 def quantity(value: float) -> str:
-    """A number to three significant digits, without an exponent where people would not write one."""
+    """Format a number to three significant digits, with an exponent only from 1e7 on."""
     if value >= 1e7:
         return f"{value:.1e}"
     return f"{value:.3g}" if value < 1000 else count(round(value))
 
 
 def factor(value: float) -> str:
-    """A ratio to two significant digits, or to the last one before the point."""
+    """Format a ratio to two significant digits, or to an integer from 100 on."""
     return f"{value:.2g}" if value < 100 else quantity(value)
 
 
 def shorten(words: str, limit: int) -> str:
-    """The words, or as many of their letters as fit into `limit` with an ellipsis."""
+    """Shorten text to `limit` characters, with an ellipsis at the end."""
     return words if len(words) <= limit else words[: limit - 1].rstrip() + "…"
 
 
 def step_words(dt: float) -> str:
-    """A time step [s] in words: 1/30 s, or milliseconds where it is no whole part of a second."""
+    """Format a time step [s]: as 1/30 s, or in milliseconds if it is not the inverse of an integer."""
     whole = round(1 / dt)
     return f"1/{whole} s" if abs(whole * dt - 1) < 1e-9 else f"{1e3 * dt:.3g} ms"

@@ -1,7 +1,8 @@
 """SQL over the rows of all sweeps, accuracy configs and ablations (DuckDB on the Parquet files).
 
-A query runs in the child that `harness.base.child` keeps: it may ask for more time or memory than there is. What only
-reads is answered from the files; for other statements (PIVOT, CREATE) all rows are read into memory first.
+A query runs in the child process of `harness.base.child`, because it may need more time or memory than is allowed.
+Read-only queries are answered from the files; for other statements (PIVOT, CREATE) all rows are loaded into memory
+first.
 """
 
 from __future__ import annotations
@@ -22,35 +23,35 @@ from harness.base import child, columns, rows, shelf, union
 from harness.base.errors import InputError, Mistake
 
 _TABLES: dict[str, pa.Schema] = {"rows": columns.SCHEMA, "accuracy": pa.schema([]), "ablation": pa.schema([])}
-"""The tables by the names of their folders, with the columns that they have even where no row has them."""
+"""The tables by the names of their folders, with the columns that exist even if no row has them."""
 
 _OPENING = 1e-3
-"""Seconds of processor time more for each file: a file takes a third of that."""
+"""Additional processor time per file [s]; a file takes a third of it."""
 _OF_FILES = (duckdb.IOException, duckdb.InvalidInputException)
-"""What damaged files raise; and the base of all errors, as it is."""
+"""Exceptions that damaged files raise; DuckDB also raises its base class of all errors for them."""
 _TRIES = 2
-"""Files that are packed while a query reads them are looked for again."""
+"""Number of attempts: files that are packed while a query reads them are located again."""
 
 SHOWN, PRINTED = 1_000, 1_000_000
-"""Rows of an answer in a table and in CSV; the rest of them is left out."""
+"""Maximum number of rows of a result in a table and in CSV; the rest is omitted."""
 MEMORY = 2**30
-"""Bytes that a query may take, the tables included."""
+"""Memory limit of a query, tables included [bytes]."""
 _CELL, _COLUMNS = 1_000, 200
-"""Characters of a cell in a table, and its columns: who prints more has lost the table."""
+"""Maximum number of characters per cell, and of columns, in a printed table; larger tables are unreadable."""
 _CHARACTERS = 50_000_000
-"""Of all texts of an answer together."""
+"""Maximum number of characters of all texts of a result together."""
 
 
 @dataclass(frozen=True, slots=True)
 class QueryResult:
-    """Names of columns and the rows of values that a query gave; more: whether there are more than these."""
+    """Column names and rows of a query result; `is_truncated` states whether further rows were omitted."""
 
     columns: list[str]
     values: list[tuple[Any, ...]]
     more: bool = False
 
     def table(self) -> Table:
-        """The answer as a table to print; what cells hold is text and no markup."""
+        """Build a printable table of the result; cell contents are plain text, not markup."""
         table = Table()
         for name in self.columns[:_COLUMNS]:
             table.add_column(Text(_shown(name)))
@@ -59,7 +60,7 @@ class QueryResult:
         return table
 
     def write_csv(self, file: TextIO) -> None:
-        """Write the answer as CSV with all digits."""
+        """Write the result as CSV with all digits."""
         writer = csv.writer(file)
         writer.writerow(self.columns)
         writer.writerows(self.values)
@@ -71,10 +72,15 @@ def _shown(value: Any) -> str:
 
 
 def answer(sql: str, results: Path, *, most: int = SHOWN, seconds: float = 15.0) -> QueryResult:
-    """What a query says of the tables `rows`, `accuracy` and `ablation`; it can read nothing else and write nothing.
+    """Run a query on the tables `rows`, `accuracy` and `ablation`; it has no other read access and cannot write.
 
-    most: rows of the answer; seconds: of processor time that it may take. Raises InputError where there are no rows,
-    where the query takes too much, or with DuckDB's message where it is wrong.
+    Args:
+        sql: query.
+        results: folder of results.
+        max_rows: maximum number of rows of the result.
+        cpu_seconds: limit of the processor time [s].
+    Raises:
+        InputError: if there are no rows, if the query exceeds a limit, or, with DuckDB's message, if it is invalid.
     """
     if not 0.0 < seconds <= 1e6:
         raise InputError(Mistake(f"came {seconds:g}; wanted a number of seconds above 0", key="--seconds"))
@@ -124,8 +130,11 @@ def _found(sql: str, units: dict[str, list[Path]], most: int, *, in_memory: bool
 
 
 def _offer(connection: duckdb.DuckDBPyConnection, units: dict[str, list[Path]], *, lazily: bool) -> None:
-    """The tables of rows, and no way to anything else. lazily: read while they are asked for, from files that are then
-    within reach, so this is for statements that only read; else the tables are in memory."""
+    """Register the tables of rows and disable all other access.
+
+    With `as_views`, rows are read from files on demand, and these files stay accessible, so that this mode is only for
+    read-only statements. Otherwise the tables are in memory.
+    """
     files: list[str] = []
     for table, schema in _TABLES.items():
         if not units[table] and not len(schema):
@@ -141,5 +150,5 @@ def _offer(connection: duckdb.DuckDBPyConnection, units: dict[str, list[Path]], 
 
 
 def _plain(row: tuple[Any, ...]) -> tuple[Any, ...]:
-    """A row without DuckDB's own types."""
+    """Convert a row's DuckDB types to plain Python values."""
     return tuple(v if isinstance(v, (int, float, bool, str, type(None))) else str(v) for v in row)

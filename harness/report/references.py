@@ -1,6 +1,6 @@
-"""Where methods come from: in a line for tables and what appears on hovering, and as BibTeX.
+"""Citations of methods: as a line for tables and tooltips, and as BibTeX.
 
-Rows carry a solver's reference as JSON (authors as BibTeX has them, year, title, doi), so none of its code is needed.
+Rows contain a solver's reference as JSON (authors as in BibTeX, year, title, doi), so its code is not needed.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from harness.base.files import replacing
 
 
 def cited(reference: str | None) -> str:
-    """The reference in a line: family names, year, title, doi; nothing for none."""
+    """Format a reference as a line: family names, year, title, doi; empty for none."""
     if not reference:
         return ""
     found = json.loads(reference)
@@ -26,7 +26,7 @@ def cited(reference: str | None) -> str:
 
 
 def bibtex(references: Iterable[str | None]) -> str:
-    """An entry for each different reference, in the order of their keys; Unicode, for biber and recent BibTeX."""
+    """Format one BibTeX entry per distinct reference, sorted by key; Unicode, for biber and recent BibTeX."""
     known = sorted({reference for reference in references if reference}, key=lambda r: (_key(json.loads(r)), r))
     entries, keys = list[str](), [_key(json.loads(reference)) for reference in known]
     for k, reference in enumerate(known):
@@ -40,7 +40,14 @@ def bibtex(references: Iterable[str | None]) -> str:
 
 
 def write_bibtex(path: Path, references: Iterable[str | None]) -> Path:
-    """Write the entries and return the path. Raises CannotWrite."""
+    """Write the BibTeX entries and return the path.
+
+    Args:
+        path: target file.
+        references: references as JSON, or None.
+    Raises:
+        CannotWrite: if the file cannot be written.
+    """
     with replacing(path) as partial:
         partial.write_text(bibtex(references), encoding="utf-8")
     return path

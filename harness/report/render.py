@@ -1,8 +1,8 @@
 # pyright: reportUnknownMemberType=false
-# PyVista's filters and meshes are known in part.
-"""Shaded renderings of a recording's frames: surface or tubes coloured by strain, pins, a soft shadow.
+# PyVista's filters and meshes are only partly typed.
+"""Shaded renderings of recorded frames: surface or tubes coloured by strain, pinned vertices, and a soft shadow.
 
-All frames of a run share one camera, so that what moves in the pictures is the scene and not the viewer.
+All frames of a run share one camera, so that apparent motion is that of the scene.
 """
 
 from __future__ import annotations
@@ -38,9 +38,12 @@ _MATERIAL: dict[str, Any] = {"ambient": 0.62, "diffuse": 0.44, "specular": 0.06,
 
 
 def spring_strain(replay: Replay, frame: int) -> NDArray[np.float64]:
-    """Strain length / rest length - 1 of each spring, shape (m,), 0 where the rest length is 0.
+    """Compute the strain, length / rest length - 1, of each spring.
 
-    `frame` counts the recorded frames.
+    Args:
+        replay: recording.
+        frame: index among the recorded frames.
+    Returns: strains (m,); 0 where the rest length is 0.
     """
     i, j = replay.springs.T
     p = replay.positions[frame].astype(np.float64)
@@ -50,7 +53,7 @@ def spring_strain(replay: Replay, frame: int) -> NDArray[np.float64]:
 
 
 def vertex_strain(replay: Replay, frame: int) -> NDArray[np.float64]:
-    """The strain of the most strained spring at each vertex, with its sign, shape (n,)."""
+    """Return the signed strain of the most strained spring at each vertex, shape (n,)."""
     strain = np.repeat(spring_strain(replay, frame), 2)
     ends = replay.springs.ravel()
     by_size = np.argsort(np.abs(strain))
@@ -60,14 +63,21 @@ def vertex_strain(replay: Replay, frame: int) -> NDArray[np.float64]:
 
 
 def spacing(replay: Replay) -> float:
-    """The mean rest length [m], or 1 where there are no springs."""
+    """Return the mean rest length [m], or 1 if there are no springs."""
     return float(replay.rest_lengths.mean()) if len(replay.rest_lengths) else 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A camera: `position` and `target` (3,) [m], y up, and the height `ground` [m] that the shadow falls on; what it
-    frames lies within the box from `low` to `high` (3,) [m]."""
+    """A camera with y up.
+
+    Attributes:
+        position: position of the camera (3,) [m].
+        target: focal point (3,) [m].
+        ground_height: height of the plane that receives the shadow [m].
+        box_low: lower corner of the box of all framed points (3,) [m].
+        box_high: upper corner of that box (3,) [m].
+    """
 
     position: Points
     target: Points
@@ -76,53 +86,58 @@ class View:
     high: Points
 
     def scaled(self, by: float) -> View:
-        """The view of a scene whose coordinates are multiplied."""
+        """Return the view of a scene whose coordinates are multiplied by `factor`."""
         return View(by * self.position, by * self.target, by * self.ground, by * self.low, by * self.high)
 
     def near(self, p: Points) -> Points:
-        """Those of the points (n, 3) that are in the box or within its diagonal of it; all where none is."""
+        """Return the points (n, 3) in the box or within its diagonal of it; all points if there are none."""
         around = _extent(np.stack([self.low, self.high]))
         inside = ((p >= self.low - around) & (p <= self.high + around)).all(axis=1)
         return p[inside] if inside.any() else p
 
 
 def natural_angles(points: Points, areas: Points) -> tuple[float, float]:
-    """Azimuth and elevation [degrees] of a three-quarter view of points (q, 3), y up.
+    """Choose azimuth and elevation [degrees] of a three-quarter view.
 
-    areas: area vectors (f, 3) of the triangles; of the four corners, the view is from where most area shows.
+    Args:
+        points: points (q, 3), y up.
+        areas: area vectors (f, 3) of the triangles; of the four corner views the one that shows most area is chosen.
     """
     x, y, z = np.ptp(points, axis=0)
     corner = 32.0 if x >= z else 58.0
     elevation = 8.0 + 12.0 * min(2.0 * min(x, z) / max(x, y, z, 1e-30), 1.0)
 
     def shown(azimuth: float) -> float:
-        # The front has a head start: between like views the choice must not hang on round-off.
+        # The front view gets a bonus, so that the choice between similar views does not depend on round-off.
         return float(np.abs(areas @ _towards(azimuth, elevation)).sum()) * (1.05 if azimuth == corner else 1.0)
 
     return max((corner, -corner, 180.0 - corner, corner - 180.0), key=shown), elevation
 
 
 def area_vectors(replay: Replay, frame: int) -> Points:
-    """Half the cross product of two sides of each triangle [m^2], shape (f, 3)."""
+    """Compute half the cross product of two edges of each triangle [m^2], shape (f, 3)."""
     p = replay.positions[frame].astype(np.float64)
     a, b, c = (p[corner] for corner in replay.triangles.T)
     return np.cross(b - a, c - a) / 2.0
 
 
 def _towards(azimuth: float, elevation: float) -> Points:
-    """The unit vector from the scene to the viewer at these angles [degrees]."""
+    """Return the unit vector from the scene to the viewer at these angles [degrees]."""
     azimuth, elevation = np.radians(azimuth), np.radians(elevation)
     level = np.cos(elevation)
     return np.array([np.sin(azimuth) * level, np.sin(elevation), np.cos(azimuth) * level])
 
 
 def frame_all(points: Points, *, aspect: float, angles: tuple[float, float]) -> View:
-    """The nearest camera that sees all points (q, 3) [m] in a view of width / height `aspect`.
+    """Compute the closest camera that sees all points.
 
-    angles: azimuth and elevation [degrees] of the viewer.
+    A point with camera coordinates (a, b, c), c towards the viewer, is visible from (ea, eb, ec) where
+    |a - ea| <= tan (ec - c), and likewise for b. Each pair of bounds is tight at one ec; the larger ec sees all points.
 
-    A point with camera coordinates (a, b, c), c towards the viewer, is seen from (ea, eb, ec) where
-    |a - ea| <= tan (ec - c), and alike for b. Each pair of bounds is tight at one ec; the further one sees all.
+    Args:
+        points: points (q, 3) [m].
+        aspect: width / height of the view.
+        angles: azimuth and elevation [degrees] of the viewer.
     """
     axes = _camera_axes(angles)
     ground = _ground(points)
@@ -140,7 +155,7 @@ def frame_all(points: Points, *, aspect: float, angles: tuple[float, float]) -> 
 
 
 def _camera_axes(angles: tuple[float, float]) -> Points:
-    """What is right, up and towards the viewer, as rows (3, 3)."""
+    """Return the directions right, up and towards the viewer as rows (3, 3)."""
     towards = _towards(*angles)
     right = np.cross([0.0, 1.0, 0.0], towards)
     right /= np.linalg.norm(right)
@@ -148,52 +163,57 @@ def _camera_axes(angles: tuple[float, float]) -> Points:
 
 
 def _ground(points: Points) -> float:
-    """The height [m] that the shadow of points (q, 3) falls on."""
+    """Return the height [m] of the plane that receives the shadow of points (q, 3)."""
     return float(points[:, 1].min() - 0.02 * _extent(points))
 
 
 def shape(points: Points, angles: tuple[float, float]) -> float:
-    """Width over height of points (q, 3) [m] and of their shadow as they are seen from afar at these angles."""
+    """Return width / height of points (q, 3) [m] and their shadow, seen from far away at these angles."""
     whole = np.concatenate([points, _cast(points, _ground(points))])
     across, up, _ = np.ptp(_camera_axes(angles) @ whole.astype(np.float64).T, axis=1)
     return float(across / max(up, 1e-30))
 
 
 def _extent(p: Points) -> float:
-    """The diagonal of the points' bounding box [m], never zero."""
+    """Return the diagonal of the points' bounding box [m], at least 1e-30."""
     return max(float(np.linalg.norm(np.ptp(p, axis=0).astype(np.float64))), 1e-30)
 
 
 def _cast(p: Points, ground: float) -> Points:
-    """Where the light from the upper left casts the points (q, 3) on the ground."""
+    """Project points (q, 3) onto the ground along the light from the upper left."""
     fall = p[:, 1] - ground
     return np.stack([p[:, 0] + 0.18 * fall, np.full(len(p), ground), p[:, 2] - 0.22 * fall], axis=1)
 
 
 def _is_closed(triangles: NDArray[np.int64]) -> bool:
-    """Whether the surface bounds a solid: every edge has two triangles. Its sharp edges are drawn sharp."""
+    """Return whether every edge has two triangles; such surfaces bound a solid and get sharp edges."""
     edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     return bool((np.unique(edges @ [triangles.max() + 1, 1], return_counts=True)[1] == 2).all())
 
 
 def _balls(at: Points, radius: float) -> pv.PolyData:
-    """A sphere at each point (q, 3)."""
+    """Make a sphere at each point (q, 3)."""
     ball = pv.Sphere(radius=radius, theta_resolution=16, phi_resolution=12)
     return cast(pv.PolyData, pv.PolyData(at).glyph(geom=ball, orient=False, scale=False))
 
 
 class _Sizes(NamedTuple):
-    """The diagonal of what is framed, and the mean rest length, in the units of a picture."""
+    """Diagonal of the framed box and mean rest length, in picture units."""
 
     extent: float
     spacing: float
 
 
 class Studio:
-    """One off-screen window of `width` x `height` pixels, reused for all frames; a context manager.
+    """One off-screen window, reused for all frames; a context manager.
 
-    mesh_lines: how many pixels each vertex needs for the mesh's lines to be drawn; background: a colour, or None for
-    none, and no shadow either. Raises RunFailed where the system cannot draw.
+    Args:
+        width: width of the pictures [pixels].
+        height: height of the pictures [pixels].
+        mesh_lines: pixels per vertex from which on mesh lines are drawn.
+        background: background colour; None for a transparent background without a shadow.
+    Raises:
+        RunFailed: if the system cannot draw.
     """
 
     def __init__(
@@ -206,7 +226,8 @@ class Studio:
         self._plotter = pv.Plotter(off_screen=True, window_size=size, lighting="none")
         self._plotter.background_color = pv.Color(background or "white")
         self._plotter.disable_anti_aliasing()
-        # From the camera's upper left, so that every view is lit alike; the fill keeps the scale's colours true.
+        # Lights are attached to the camera (key light at the upper left), so that all views are lit alike; the fill
+        # light preserves the colours of the scale.
         for place, strength in (((-1.2, 1.5, 1.6), 0.7), ((0.6, -0.5, 2.0), 0.55)):
             light = pv.Light(position=place, intensity=strength, light_type="camera light")
             self._plotter.add_light(light)
@@ -222,11 +243,19 @@ class Studio:
     def draw(
         self, replay: Replay, frame: int, view: View, more: Sequence[pv.PolyData] = (), dots: Sequence[Dots] = ()
     ) -> NDArray[np.uint8]:
-        """A recorded frame as pixels (height, width, 3), or 4 without a background, with more solids than its
-        obstacles, and with dots at points (q, 3) in a colour; it must be finite."""
+        """Render a recorded frame, which must be finite.
+
+        Args:
+            replay: recording.
+            frame: index among the recorded frames.
+            view: camera.
+            extra_solids: solids that are drawn in addition to the obstacles.
+            coloured_points: pairs of points (q, 3) and their colour.
+        Returns: pixels (height, width, 3), or 4 channels without a background.
+        """
         plotter = self._plotter
         plotter.clear_actors()
-        # A power of two: pictures of what is large or small are drawn as others are, and others are the same.
+        # Scaling by a power of two is exact: scenes of all sizes render alike, and scenes of size 1 are unchanged.
         unit = 2.0 ** -round(math.log2(float(np.linalg.norm(view.position - view.target))))
         view = view.scaled(unit)
         plotter.camera.position = tuple(view.position)
@@ -296,7 +325,9 @@ class Studio:
         self._plotter.add_mesh(_balls(p, 1.5 * radius), color=_JOINT, smooth_shading=True, **_MATERIAL)
 
     def _tube(self, sizes: _Sizes) -> float:
-        """The radius of a spring: thin against its length and the scene, but no less than about a pixel."""
+        """Return the radius of a spring's tube: thin relative to its length and the scene, but at least about a
+        pixel.
+        """
         thin = min(0.07 * sizes.spacing, 0.007 * sizes.extent)
         return max(thin, 1.1 * sizes.extent / self._height)
 
@@ -307,7 +338,7 @@ class Studio:
             self._plotter.add_mesh(_balls(at, radius), color=colour, smooth_shading=True, **_MATERIAL)
 
     def _shadow(self, replay: Replay, p: NDArray[np.float32], view: View, sizes: _Sizes, behind: str) -> None:
-        """A soft shadow on the ground: the scene seen from the light, as a blurred picture on an unlit plane."""
+        """Add a soft shadow: the scene projected from the light, as a blurred texture on an unlit plane."""
         ground = view.ground
         flat, near = (_cast(points, ground)[:, [0, 2]] for points in (p, view.near(p)))
         centre = (near.min(axis=0) + near.max(axis=0)) / 2

@@ -1,11 +1,11 @@
-"""How robust each solver is: the outcome of each run of a sweep that was judged, from its rows alone.
+"""Robustness of solvers: the outcome of each verified run of a sweep, from its rows only.
 
-A run that means to minimise is right where every step's answer is stationary to the tolerance that was asked for, but
-for what is round-off, vertex by vertex, and a certified minimum, and the motion is that of the reference in every
-frame: all three by the oracle, never by what the solver says of itself. What it says is compared: a step that ended
-because its residual was small enough, and that the oracle finds not stationary, makes the run wrong and not merely
-unconverged. A method that does not minimise is graded by the motion alone. Where the second opinion
-disputes the steps themselves, no run of them is right.
+A run of a minimising solver is correct if, in every step, the result is stationary to the requested tolerance, up to
+round-off at each vertex, and a certified minimum, and if the motion matches the reference in every frame. All three
+are checked by the reference evaluator, never by the solver's own report. That report is compared: if a step ended
+because its residual met the tolerance, but the evaluator finds it not stationary, the run is falsely converged instead
+of merely unconverged. A method that does not minimise is scored by its motion only. If the independent implementation
+of the formulas disagrees with the steps themselves, no run of them is correct.
 """
 
 from __future__ import annotations
@@ -28,21 +28,29 @@ from harness.config.options import OPTIONS
 from solvers.registry import OPTIONAL, SOLVERS
 
 SLACK = 1.1
-"""On the tolerance: the oracle and a solver factorise the same matrix by different ways. Of 1372 runs of configs/hard
-none changes its outcome at 1.0, and 8 become right at 2.2; all 7902 steps that took themselves for converged were."""
+"""Factor on the tolerance, because the reference evaluator and a solver factorise the same matrix differently.
+
+Of 1372 runs of configs/hard none changes its outcome at 1.0, and 8 become correct at 2.2. All 7902 steps that their
+solver reported as converged were converged.
+"""
 ASKED = 1e-6
-"""The tolerance by which a run is graded that was asked for none."""
+"""Tolerance that scores a run for which none was requested."""
 SAME = 1e-2
-"""Of the rest shape's size: a motion within this of the reference is the same; steps are solved to 1e-6 of what they
-move by, and what is unstable multiplies that. There is a gap to put it in: of 670 runs of configs/hard that end at
-minima 595 stay within 0.5 % and 71 leave by more than 2 %. Half of it takes 2 of the right ones away, twice adds 2."""
+"""Share of the rest shape's size: a motion within this distance of the reference counts as the same.
+
+Steps are solved to 1e-6 of their displacement, and instability amplifies that error. The limit lies in a gap: of 670
+runs of configs/hard that end at minima, 595 stay within 0.5 % and 71 deviate by more than 2 %. Half the limit would
+remove 2 of the correct runs, twice the limit would add 2.
+"""
 CLOSE = 0.05
-"""Of the rest shape's size: how near a method that does not minimise has to come, about what an eye would notice. A
-convention: of its 240 runs of configs/hard 97 are within it, 73 within half of it and 104 within twice."""
+"""Share of the rest shape's size: required distance of a method that does not minimise, roughly what is visible.
+
+A convention: of its 240 runs of configs/hard, 97 are within it, 73 within half of it and 104 within twice.
+"""
 
 
 class Outcome(NamedTuple):
-    """What became of a run: words for it and a colour."""
+    """The outcome of a run: label, colour and description."""
 
     words: str
     color: str
@@ -68,7 +76,7 @@ REFUSED = Outcome("refused", "#d9d9d6", "refused before it began, with a reason"
 OUTCOMES = (RIGHT, OTHER, VALLEY, SADDLE, SHORT, WRONG, GROWN, DIVERGED, LATE, FAILED, DISPUTED, REFUSED)
 
 _CLAIMS = ("tolerance", "floor")
-"""How a solve ends that takes itself for converged."""
+"""Termination reasons with which a solver claims convergence."""
 _ENDED = {
     "time-limit": LATE,
     "unsupported": REFUSED,
@@ -80,15 +88,27 @@ _ENDED = {
 }
 
 _WHOLE = ("disputed", "energy-growth")
-"""How runs stand that were done to their end, with a row for each step."""
+"""Statuses of runs that were completed and have a row for each step."""
 
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """One run: its case, its solver, what became of it and why; worst: the largest `beyond` of a step, or where
-    `graded` is "distance" the largest distance from the reference, None where there is none;
-    reference: where the solver comes from, as rows have it; run_id: of the run; cpu and commit: where it was
-    done, and by which code; name: the solver's, which may have spaces in it, without the parameters behind it."""
+    """The outcome of one verified run.
+
+    Attributes:
+        case: scene, with the options in which its runs differ.
+        solver: solver, with the parameters in which its runs differ.
+        outcome: outcome of the run.
+        worst_error: largest `beyond` of a step, or, if `error_kind` is "distance", the largest distance from the
+            reference; None if unknown.
+        error_kind: "stationarity" or "distance".
+        reason: why the run is not correct.
+        citation: reference of the solver as in the rows.
+        run_id: id of the run.
+        cpu: processor that executed the run.
+        commit: version of the code that executed the run.
+        solver_name: name of the solver without its parameters; it may contain spaces.
+    """
 
     case: str
     solver: str
@@ -104,7 +124,7 @@ class Judged:
 
     @property
     def figure(self) -> str:
-        """The worst residual in few characters: a power of ten, or per cent of the size."""
+        """The worst error in few characters: a power of ten, or a percentage of the scene's size."""
         if self.worst is None:
             return ""
         if self.graded == "distance":
@@ -115,9 +135,12 @@ class Judged:
 
 
 def read_cells(folder: Path) -> list[Judged]:
-    """The outcomes of the runs in a sweep's folder, the newest where one was repeated; by case, then by solver.
+    """Read the outcomes of the runs in a sweep's folder, ordered by case and solver; of repeated runs the newest.
 
-    Units with invalid values are left out, as on the page, which names them. Raises InputError where no run was judged.
+    Units with invalid values are omitted; the results page lists them.
+
+    Raises:
+        InputError: if no run was verified.
     """
     files = shelf.units(folder / "rows")
     needed = "run_id", "scene", "size", "solver", "phase", "status", "started"
@@ -144,12 +167,15 @@ def read_cells(folder: Path) -> list[Judged]:
 
 
 def _numbered(name: str) -> list[tuple[int, str]]:
-    """By which names are sorted that have numbers in them: 8 before 16."""
+    """Return a key that sorts names with numbers naturally, 8 before 16."""
     return [(len(part.lstrip("0")) if k % 2 else 0, part) for k, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
 def judged(run: Sequence[dict[str, Any]]) -> tuple[Outcome, float | None, str, str]:
-    """The outcome of a run from its rows, one a step; its worst figure, what that is, and why it is not right."""
+    """Classify a run from its rows, one per step.
+
+    Returns: outcome, worst error, kind of that error, and the reason why the run is not correct.
+    """
     first = run[0]
     if first["status"] != "ok":
         where = f"frame {first['frame']}: " if first["frame"] and first["status"] not in _WHOLE else ""
@@ -184,14 +210,14 @@ _OPTIONS = ("size", *(option.column for option in OPTIONS.values() if option.col
 
 
 def _case(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
-    """The scene, with the options that the runs of that scene differ in."""
+    """Return the scene with the options in which the runs of that scene differ."""
     own = [other for other in runs if other["scene"] == row["scene"]]
     varied = [str(row[key]) for key in _OPTIONS if any(other[key] != row[key] for other in own)]
     return " ".join([row["scene"], *varied])
 
 
 def _solver(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
-    """The solver's name, with the parameters in which the runs of that name differ."""
+    """Return the solver's name with the parameters in which its runs differ."""
     stated = {run["parameters"] or "{}" for run in runs if run["solver"] == row["solver"]}
     others = [json.loads(text) for text in stated]
     own = json.loads(row["parameters"] or "{}")  # what a solver from outside was not given is not among them
@@ -201,8 +227,14 @@ def _solver(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """One solver over all cases: how many ended in each outcome, in the order of OUTCOMES; the shares that were right
-    and that stayed finite, of those it did not refuse (None where it refused all); the cell with the worst figure."""
+    """Score of one solver over all cases.
+
+    Attributes:
+        outcome_counts: number of runs with each outcome, in the order of OUTCOMES.
+        correct_share: share of correct runs among supported cases; None if no case is supported.
+        finite_share: share of runs that stayed finite, likewise.
+        worst_run: run with the largest error.
+    """
 
     solver: str
     counts: tuple[int, ...]
@@ -212,7 +244,7 @@ class Score:
 
 
 def scores(cells: Sequence[Judged]) -> list[Score]:
-    """A score for each solver, in the cells' order."""
+    """Compute a score for each solver, in the order of the cells."""
     found: list[Score] = []
     for solver in dict.fromkeys(cell.solver for cell in cells):
         own = [cell for cell in cells if cell.solver == solver]
@@ -228,13 +260,12 @@ def scores(cells: Sequence[Judged]) -> list[Score]:
 
 
 def percent(share: float | None) -> str:
-    """A share in words; nothing for none."""
+    """Format a share in percent; empty for None."""
     return "" if share is None else f"{share:.0%}"
 
 
 def summary(cells: Sequence[Judged]) -> Table:
-    """A row for each solver: how many cases ended how, in the ways that any did; the shares of those it did not refuse,
-    the worst residual."""
+    """Build a table with one row per solver: counts of the outcomes that occur, shares, and the worst error."""
     found = scores(cells)
     there = [k for k, _ in enumerate(OUTCOMES) if any(score.counts[k] for score in found)]
     table = Table(box=SIMPLE_HEAD, caption_justify="left")

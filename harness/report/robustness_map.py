@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
-"""The robustness map: solvers x cases, coloured by outcome, the worst residual in each cell."""
+# Matplotlib's stubs do not type most keywords.
+"""Robustness map: solvers x cases, coloured by outcome, with the worst error in each cell."""
 
 from __future__ import annotations
 
@@ -32,17 +32,18 @@ from harness.report.robustness import (
 from harness.report.style import DPI, INK, MUTED, PAGE, RULE
 
 _ROW, _COLUMN, _LEFT, _TOP, _ACROSS, _LEGEND, _LINE = 0.2, 0.64, 2.3, 1.35, 2.1, 0.26, 0.17
-"""Inches: a cell's height and width, room for the cases' names and for the solvers', the legend's columns and rows, and
-a line of the note."""
+"""Inches: height and width of a cell, space for the names of cases and of solvers, column width and row height of
+the legend, and height of a line of the note.
+"""
 
 _NARROWEST, _TURNED = 6.5, 0.075
-"""Inches: the least width, and what a letter takes across in a name that is turned."""
+"""Inches: minimum width, and the horizontal extent of a letter in a rotated name."""
 
 _TITLE, _NOTE, _LETTER = 13.0, 8.0, 0.64
-"""Points of the type, and the width of a letter in it."""
+"""Font sizes of title and note [points], and the width of a letter in units of the font size."""
 
 _SCORES, _HEADING = 3, 1.2
-"""Rows for the solvers' scores, and rows from the last case of a family to the first of the next."""
+"""Number of rows for the solvers' scores, and rows between two families of cases."""
 
 NOTE = (
     "Figures: the largest residual |Q\u207b\u00b9 grad g|_Q that a step ended with, over its value at its start "
@@ -52,14 +53,21 @@ NOTE = (
 
 
 def headline(cells: Sequence[Judged], name: str) -> str:
-    """The map in a line of words."""
+    """Return the headline of the map: counts of the main outcomes."""
     of = {outcome: sum(cell.outcome == outcome for cell in cells) for outcome in OUTCOMES}
     broken = of[DIVERGED] + of[FAILED]
     return f"{name}: {of[RIGHT]} of {len(cells)} runs right, {of[WRONG]} silently wrong, {broken} diverged or failed"
 
 
 def draw_map(cells: Sequence[Judged], path: Path, title: str, older: Collection[str] = ()) -> None:
-    """Draw the map to a PNG. older: the ids of the runs that other code than today's did, which get a hollow mark."""
+    """Draw the map as a PNG file.
+
+    Args:
+        cells: verified runs.
+        path: target file.
+        title: title of the map.
+        stale_ids: ids of runs that were executed by other code than the current version; they get a hollow mark.
+    """
     solvers = list(dict.fromkeys(cell.solver for cell in cells))
     places, rows = _places(list(dict.fromkeys(cell.case for cell in cells)))
     used = [outcome for outcome in OUTCOMES if any(cell.outcome == outcome for cell in cells)]
@@ -100,7 +108,10 @@ def draw_map(cells: Sequence[Judged], path: Path, title: str, older: Collection[
 
 
 def _places(cases: Sequence[str]) -> tuple[dict[str, float], float]:
-    """The row of each case, with room above each family for its name; and how many rows there are in all."""
+    """Lay out the cases, with space above each family for its name.
+
+    Returns: the row of each case, and the total number of rows.
+    """
     places, y = dict[str, float](), float(_SCORES)
     for _, family in groupby(cases, _family):
         y += _HEADING
@@ -111,7 +122,7 @@ def _places(cases: Sequence[str]) -> tuple[dict[str, float], float]:
 
 
 def _draw_scores(ax: Axes, cells: Sequence[Judged]) -> None:
-    """The solvers' scores above their columns: both shares as bars, and the worst of their figures."""
+    """Draw the solvers' scores above their columns: both shares as bars, and the worst error."""
     for y, words in enumerate(("right", "finite", "worst")):
         ax.text(-0.1, y + 0.53, words, ha="right", va="center", fontsize=8.5, color=INK, weight="bold")
     for x, score in enumerate(scores(cells)):
@@ -123,11 +134,11 @@ def _draw_scores(ax: Axes, cells: Sequence[Judged]) -> None:
 
 
 _BARS = ("#8fcbad", "#c4ccd6")
-"""Of the shares that are right and finite."""
+"""Colours of the bars for the correct and the finite share."""
 
 
 def _legend(figure: Figure, cells: Sequence[Judged], used: Sequence[Outcome], across: int, top: float) -> None:
-    """The outcomes that the map has, so many in a row, from `top` [inches] down."""
+    """Draw the legend of the outcomes, with `columns` entries per row, from `top` [inches] downwards."""
     width, height = figure.get_size_inches()
     for k, outcome in enumerate(used):
         row, column = divmod(k, across)
@@ -139,7 +150,7 @@ def _legend(figure: Figure, cells: Sequence[Judged], used: Sequence[Outcome], ac
 
 
 def _fitted(words: str, width: float, size: float) -> list[str]:
-    """The words in lines that fit into a width [inches] in type of a size [points]."""
+    """Wrap text into lines that fit a width [inches] at a font size [points]."""
     return wrap(words, int(72.0 * (width - 0.3) / (_LETTER * size)))
 
 
@@ -157,9 +168,12 @@ def _ink(outcome: Outcome) -> str:
 
 
 def draw_maps(results: Path, older: Callable[[Path], Collection[str]]) -> Iterator[tuple[Path, list[Judged]]]:
-    """Draw the maps of those sweeps in a folder of results, or of one sweep, whose runs were judged.
+    """Draw the maps of all sweeps with verified runs in a folder of results, or of one sweep.
 
-    older: tells the ids of those runs in a sweep's folder that other code than today's did.
+    Args:
+        results: folder of results, or the folder of one sweep.
+        find_stale: returns the ids of those runs in a sweep's folder that other code than the current version executed.
+    Yields: each picture and its runs.
     """
     for rows in shelf.folders(results, "rows"):
         with suppress(InputError):

@@ -1,9 +1,9 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
-"""The picture of one run: its final frame large, four earlier ones beside it, the scale of strain above.
+# Matplotlib's stubs do not type most keywords.
+"""Picture of one run: its final frame large, four earlier frames next to it, and the strain scale above.
 
-The scale is that of the strains that are seen: most of a mesh would be grey on one that a pin's neighbours set, and
-all of it one colour on one that is too short.
+The scale covers the typical strains of the shown frames. On a scale set by the neighbours of a pin most of a mesh would
+be grey, and on a scale that is too short all of it would have one colour.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _EARLIER = 4  # any grid that they are put in is full
 
 
 class PixelBox(NamedTuple):
-    """A place on the page [pixels from the top left]."""
+    """A rectangle on the page [pixels from the top left]."""
 
     left: int
     top: int
@@ -57,9 +57,13 @@ class PixelBox(NamedTuple):
 
 
 def layout(final: float, whole: float, earlier: int) -> tuple[PixelBox, list[PixelBox]]:
-    """Where the final frame goes and where the earlier ones, so that scenes of these shapes fill their places.
+    """Lay out the final frame and the earlier ones, so that scenes of these aspect ratios fill their boxes.
 
-    final, whole: width over height of the final frame and of all of them, as they are seen.
+    Args:
+        final: width / height of the final frame.
+        full_run: width / height of all frames together.
+        earlier: number of earlier frames.
+    Returns: the box of the final frame, and those of the earlier ones.
     """
     if not earlier:
         return PixelBox(_LEFT, _TOP, _RIGHT - _LEFT, _HEIGHT), []
@@ -83,11 +87,16 @@ def layout(final: float, whole: float, earlier: int) -> tuple[PixelBox, list[Pix
 
 
 def draw_run(replay: Replay, path: Path, *, camera: tuple[float, float] | None = None) -> None:
-    """Draw a run's picture to `path`, WIDTH x HEIGHT pixels, PNG.
+    """Draw the picture of a run as a PNG file of PAGE_WIDTH x PAGE_HEIGHT pixels.
 
-    camera: azimuth and elevation [degrees] to look from; chosen by the scene's shape where None.
-    Where positions are not finite the picture says so and shows the frames before.
-    Raises RunFailed where the system cannot draw.
+    If positions become non-finite, the picture states it and shows the frames before.
+
+    Args:
+        replay: recording.
+        path: target file.
+        camera: azimuth and elevation [degrees]; None to choose them by the scene's shape.
+    Raises:
+        RunFailed: if the system cannot draw.
     """
     good = drawable_frames(replay)
     shown = np.unique(np.linspace(0, len(good) - 1, _EARLIER + 1).round().astype(int)) if len(good) else good
@@ -144,7 +153,7 @@ def _frames(page: Figure, replay: Replay, shown: NDArray[np.int64], camera: tupl
 
 
 def _notice(page: Figure, replay: Replay, good: int) -> None:
-    """Say in words from where on the positions cannot be drawn."""
+    """Draw a notice with the frame from which on positions cannot be drawn."""
     words = f"not finite from frame {int(replay.frames[good])} on"
     below = f"shown: up to the last finite frame, {int(replay.frames[good - 1])}" if good else "no frame can be drawn"
     middle, y = WIDTH / 2, _TOP + 40 if good else _TOP + _HEIGHT / 2

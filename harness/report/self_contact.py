@@ -1,4 +1,4 @@
-"""Whether a picture shows a surface that may pass through itself, in words."""
+"""Notes on surfaces in a picture that may intersect themselves."""
 
 from __future__ import annotations
 
@@ -10,11 +10,17 @@ from harness.record.base import SELF_CONTACT, Replay
 from harness.scenes.intersections import crossings
 
 _LARGEST = 50_000
-"""Triangles up to which the frames drawn are tested for intersections, some 0.1 s each."""
+"""Maximum number of triangles for which frames are tested for intersections, about 0.1 s each."""
 
 
 def self_contact_words(replay: Replay, frames: Iterable[int]) -> list[str]:
-    """Say of a surface simulated without self-contact that it was, and whether it intersects itself in these frames."""
+    """Describe a surface simulated without self-contact, and whether it intersects itself in these frames.
+
+    Args:
+        replay: recording.
+        frames: indices of the frames to test.
+    Returns: at most one phrase; empty if self-contact was simulated or there is no surface.
+    """
     if not len(replay.triangles) or replay.properties.get(SELF_CONTACT, True):
         return []
     if len(replay.triangles) > _LARGEST:

@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
-"""The picture of a scene at its start: its mesh, obstacles, and in a colour each which vertices its effects choose."""
+# Matplotlib's stubs do not type most keywords.
+"""Preview of a scene at its start: mesh, obstacles, and the vertices that its effects select, one colour each."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ _LEFT, _TOP, _GAP, _ROW = 36, 114, 40, 24
 _LEGEND, _TALL = 420, 750
 _LETTERS = 52
 _LINES = 120
-"""Pixels of the view for each vertex from which on the mesh's lines are drawn: choices are told by where they are."""
+"""Pixels per vertex above which mesh lines are drawn: selections are recognised by their place on the mesh."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Choice:
-    """Vertices (q,) that an effect chooses, and what it says of them."""
+    """Vertices (q,) that an effect selects, and their description."""
 
     name: str
     how: str
@@ -46,10 +46,17 @@ def draw_scene(
     *,
     camera: tuple[float, float] | None = None,
 ) -> None:
-    """Draw the scene of a replay of one frame to `path`, PNG, WIDTH pixels wide.
+    """Draw the preview of a scene as a PNG file, PAGE_WIDTH pixels wide.
 
-    facts: below the title; notes: what else may be chosen, by kind; camera: azimuth and elevation [degrees], chosen by
-    the mesh's shape where None. Raises RunFailed where the system cannot draw.
+    Args:
+        replay: recording of one frame.
+        selections: vertices selected by effects.
+        facts: phrases below the title.
+        notes: further possible selections, as pairs of kind and description.
+        path: target file.
+        camera: azimuth and elevation [degrees]; None to choose them by the mesh's shape.
+    Raises:
+        RunFailed: if the system cannot draw.
     """
     wide, p = WIDTH - 2 * _LEFT - _GAP - _LEGEND, replay.positions[0]
     angles = camera or natural_angles(p, area_vectors(replay, 0))
@@ -77,7 +84,7 @@ def _vertices(count: int) -> str:
 
 
 def _paragraph(page: Figure, words: str, x: float, y: float) -> float:
-    """Small type in a few lines; where the next one goes."""
+    """Draw small text in a few lines, and return the y position below it."""
     for line in wrap(words, _LETTERS, max_lines=6, placeholder=" …"):
         text(page, x, y, line, size=9.5, color=MUTED)
         y += 16

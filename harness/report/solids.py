@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
-# PyVista's filters and meshes are known in part.
-"""Obstacles as meshes that can be drawn, where they are at a time."""
+# PyVista's filters and meshes are only partly typed.
+"""Drawable meshes of obstacles, at their positions at a given time."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:  # a recording without obstacles imports none of them
 
 _ZERO = np.zeros(3)
 _LEVEL = 0.999
-"""Planes whose normal is as upright as this are the ground, which pictures show by the shadow on it."""
+"""Planes whose unit normal has a larger y component are the ground, which pictures show by the shadow on it."""
 
 
 def solids(replay: Replay, frame: int) -> list[pv.PolyData]:
-    """The obstacles of a recording, where they are in a recorded frame."""
+    """Build the meshes of a recording's obstacles at the time of a recorded frame."""
     if KEY not in replay.properties:
         return []
     from harness.scenes.shapes import from_json
@@ -36,16 +36,17 @@ def solids(replay: Replay, frame: int) -> list[pv.PolyData]:
 
 
 def framed(replay: Replay, frames: Iterable[int]) -> NDArray[np.bool_]:
-    """The vertices (n,) that a camera frames in recorded frames."""
+    """Return the mask (n,) of the vertices that a camera frames in these recorded frames."""
     start = replay.positions[0].astype(np.float64)
     moved = [np.linalg.norm(replay.positions[k] - start, axis=1) for k in frames]
     return framed_vertices(start, np.max(moved, axis=0))
 
 
 def seen(replay: Replay, frames: Sequence[int]) -> NDArray[np.float32]:
-    """All points (q, 3) [m] of the mesh and of the obstacles in recorded frames: what a camera should see.
+    """Return all points (q, 3) [m] of mesh and obstacles that a camera should see in these frames.
 
-    Vertices far from all others are left out; where the others are one point, all of the mesh at its start is seen.
+    Vertices far from all others are omitted. If the others coincide in one point, the whole mesh at its start is
+    included.
     """
     near = framed(replay, frames)
     points = np.concatenate(
@@ -57,9 +58,14 @@ def seen(replay: Replay, frames: Sequence[int]) -> NDArray[np.float32]:
 def solid(
     obstacle: AnySurface, time: float, seen: NDArray[np.floating], origin: NDArray[np.float64] = _ZERO
 ) -> pv.PolyData | None:
-    """The obstacle at a time [s]; of a plane the part below the points `seen` (q, 3) [m]; None for the level ground.
+    """Build the mesh of an obstacle at a time.
 
-    origin: what all points, those seen and those returned, are relative to.
+    Args:
+        obstacle: shape of the scene.
+        time: time [s].
+        framed_points: points (q, 3) [m] relative to `origin`; of a plane only the part below them is built.
+        origin: point that `framed_points` and the returned points are relative to (3,) [m].
+    Returns: the mesh, or None for the level ground.
     """
     made = _MADE[obstacle.kind](obstacle, seen + origin)
     if made is None:
@@ -74,7 +80,7 @@ def solid(
 
 
 def _shifted(shape: pv.PolyData, by: Sequence[float] | NDArray[np.float64]) -> pv.PolyData:
-    """The shape, moved in double precision: VTK's sources make points in single precision."""
+    """Translate a mesh in double precision, because VTK's sources create points in single precision."""
     shape.points = np.asarray(shape.points, np.float64) + by
     return shape
 

@@ -1,4 +1,4 @@
-"""Questions in SQL to a table of rows, all to one database in memory: opening one takes longer than most answers."""
+"""SQL queries on a table of rows, in one shared in-memory database: opening one takes longer than most queries."""
 
 from __future__ import annotations
 
@@ -12,13 +12,19 @@ import pyarrow as pa
 
 
 def answer(question: str, table: pa.Table, known: Mapping[str, Any] | None = None) -> list[tuple[Any, ...]]:
-    """The rows that SQL answers about `rows_of`, the table; known: the values of its parameters by name."""
+    """Return the rows that a query selects from `rows_of`, the table.
+
+    Args:
+        sql: query.
+        table: table that the query calls `rows_of`.
+        parameters: values of the query's parameters by name.
+    """
     with _asked(table) as cursor:
         return cursor.execute(question, known).fetchall()
 
 
 def answers(question: str, table: pa.Table) -> list[dict[str, Any]]:
-    """The same with the names of the answer's columns."""
+    """Return the rows that a query selects from `rows_of` as dictionaries by column name."""
     with _asked(table) as cursor:
         done = cursor.execute(question)
         names = [column[0] for column in done.description or ()]
@@ -37,5 +43,5 @@ def _asked(table: pa.Table) -> Generator[duckdb.DuckDBPyConnection]:
 
 @cache
 def _database() -> duckdb.DuckDBPyConnection:
-    # Of one thread: what is timed later in this process has no other one beside it.
+    # One thread only, so that no other thread disturbs later timings in this process.
     return duckdb.connect(config={"threads": 1})

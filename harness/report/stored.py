@@ -1,9 +1,9 @@
-"""Compares two stored results, folders or archives of rows: what became slower, and what else changed with it?
+"""Comparison of two stored results, folders or archives of rows: regressions in time, and other changes.
 
-Runs are paired by what they were asked to do, and compared step by step (`harness.base.statistics.changed`). The load
-may have been another on the day of the other results, and no statistics sees that: hence a margin beyond the interval,
-and `springbench gate --against` for what is smaller. Times of two machines do not compare; with a yardstick, a solver
-that both ran, the ratios to it do.
+Runs are paired by their inputs, and compared step by step (`harness.base.statistics.changed`). The load of the machine
+may have differed between the two results, and statistics cannot detect that: hence a margin beyond the interval, and
+`springbench gate --against` for smaller changes. Times of two machines are not comparable; with a baseline solver that
+both ran, the ratios to it are.
 """
 
 from __future__ import annotations
@@ -30,20 +30,21 @@ from harness.base.console import narrow
 from harness.base.errors import InputError, Mistake
 
 CANNOT_TELL = 3
-"""The exit code of a gate where valid results have nothing that can be compared: 2 would blame one of the files, and
-neither 0 nor 1 would be true."""
+"""Exit code if valid results have nothing comparable: 2 would mean an invalid file, and 0 or 1 would be untrue."""
 
 MARGIN = 0.10
-"""Beyond the interval: minima of two runs of the same code lie up to 4 % apart on an idle machine, more on others."""
+"""Margin beyond the interval: minima of two runs of the same code differ by up to 4 % on an idle machine, more on
+others.
+"""
 
 ASKED = (
     *("scene", "size", "solver", "parameters", "time_step", "integrator", "first_guess", "max_iterations"),
     *("tolerance", "threads"),
 )
-"""The columns that pair two runs."""
+"""Columns that identify the same run in two results."""
 
 _ROWS, _MOST = ".parquet", 2**31
-"""What is unpacked of an archive, and how many bytes of it at most."""
+"""Suffix of the files that are unpacked from an archive, and their maximum total size [bytes]."""
 
 Row = Mapping[str, Any]
 Key = tuple[Any, ...]
@@ -51,8 +52,17 @@ Key = tuple[Any, ...]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredRun:
-    """What the rows of a run say. seconds: of each frame's step, the least over its rounds; status: ok, or what it is;
-    machine, cpu: where it ran; iterations: of all frames; residual, error, digest: of the last frame, where known."""
+    """The rows of a run in summary.
+
+    Attributes:
+        row: first row of the run.
+        status: "ok", or the first other status.
+        seconds_by_frame: time of each frame's step [s], the minimum over its rounds.
+        num_iterations: total over all frames.
+        last_residual: residual of the last frame, if known.
+        last_stationarity: stationarity of the last frame, if known.
+        positions_digest: digest of the last positions, if known.
+    """
 
     row: Row
     status: str
@@ -64,18 +74,24 @@ class StoredRun:
 
     @property
     def name(self) -> str:
-        """The run in words."""
+        """Scene, size, solver and parameters of the run."""
         size = f" {self.row['size']}" if self.row["size"] else ""
         given = "" if self.row["parameters"] in (None, "{}") else f" {self.row['parameters']}"
         return f"{self.row['scene']}{size} {self.row['solver']}{given}"
 
 
 def compare(old: Path, new: Path, console: Console, yardstick: str | None = None) -> int:
-    """Print what changed from `old` to `new`; 1 if anything became slower or fails now, CANNOT_TELL with the reasons
-    if nothing can be compared, else 0.
+    """Print what changed from `old` to `new`.
 
-    yardstick: the name of a solver; times are then its multiples, which compare between machines too. Raises InputError
-    for what holds no results, or those of no such solver.
+    Args:
+        old: folder or archive of the old results.
+        new: folder or archive of the new results.
+        console: console that the table is printed on.
+        baseline_solver: times are divided by those of this solver, so that they are comparable between machines.
+    Returns: 1 if a run became slower or fails now, CANNOT_TELL (with the reasons) if nothing is comparable, otherwise
+    0.
+    Raises:
+        InputError: if there are no results, or none of the baseline solver.
     """
     was, now = read(old), read(new)
     for path, runs in ((old, was), (new, now)):
@@ -116,7 +132,11 @@ def compare(old: Path, new: Path, console: Console, yardstick: str | None = None
 
 
 def read(path: Path) -> dict[Key, StoredRun]:
-    """The runs of a folder of results or of an archive of one, by what they were asked to do. Raises InputError."""
+    """Read the runs of a folder of results, or of an archive of one, by their inputs.
+
+    Raises:
+        InputError: if there are no rows or they cannot be read.
+    """
     with _folder(path) as folder:
         files = [unit for of_rows in shelf.folders(folder, "rows") for unit in shelf.units(of_rows)]
         if not files:
@@ -133,7 +153,7 @@ def read(path: Path) -> dict[Key, StoredRun]:
 
 @contextmanager
 def _folder(path: Path) -> Generator[Path]:
-    """The folder itself, or one with what an archive holds."""
+    """Yield the folder itself, or a temporary folder with the unpacked archive."""
     if path.is_dir():
         yield path
         return
@@ -161,7 +181,7 @@ def _folder(path: Path) -> Generator[Path]:
 
 
 def _unpack(packed: tarfile.TarFile, info: tarfile.TarInfo, folder: Path) -> None:
-    """A regular file of an archive, inside the folder whatever it is called."""
+    """Unpack a regular file of an archive, always inside the folder, whatever its name."""
     inside = [part for part in PurePosixPath(info.name).parts if part not in ("/", "..")]
     target, source = folder.joinpath(*inside), packed.extractfile(info)
     assert source is not None, "only links and folders have no content"
@@ -190,7 +210,7 @@ def _run(found: Sequence[Row]) -> StoredRun:
 
 
 def _incomparable(old: StoredRun, new: StoredRun, yardstick: str | None) -> str:
-    """Why two times do not compare, empty where they do."""
+    """Return why two times are not comparable; empty if they are."""
     if old.status != "ok":
         return f"there is no old time: {old.status}"
     if old.row["machine"] != new.row["machine"] and yardstick is None:
@@ -200,7 +220,7 @@ def _incomparable(old: StoredRun, new: StoredRun, yardstick: str | None) -> str:
 
 
 def _unit(runs: Mapping[Key, StoredRun], key: Key, yardstick: str) -> float | None:
-    """One over the seconds of the yardstick's step in the same scene, size and steps; None where it was not run."""
+    """Return 1 / (median step time of the baseline [s]) in the same scene, size and steps; None if it was not run."""
     at = {name: key[ASKED.index(name)] for name in ("scene", "size", "time_step", "integrator", "threads")}
     found = [run for run in runs.values() if run.row["solver"] == yardstick and run.status == "ok" and run.seconds]
     found = [run for run in found if all(run.row[name] == value for name, value in at.items())]
@@ -208,7 +228,7 @@ def _unit(runs: Mapping[Key, StoredRun], key: Key, yardstick: str) -> float | No
 
 
 def _judged(old: StoredRun, new: StoredRun, units: Sequence[float | None]) -> tuple[tuple[str, str, str], str]:
-    """Old and new times, their change with its interval, and a verdict: slower, faster, unchanged or fails now."""
+    """Return both times, their change with its interval, and its class: slower, faster, unchanged or fails now."""
     if new.status != "ok":
         return ("", "", ""), "fails now"
     frames = sorted(set(old.seconds) & set(new.seconds))
@@ -221,7 +241,7 @@ def _judged(old: StoredRun, new: StoredRun, units: Sequence[float | None]) -> tu
 
 
 def _beside(old: StoredRun, new: StoredRun) -> tuple[str, str, str, str]:
-    """What changed beside the time: iterations, residual, error, and whether the last positions are the same."""
+    """Compare iterations, residual, stationarity error and last positions."""
     told: list[str] = []
     for name in ("iterations", "residual", "error"):
         was, now = getattr(old, name), getattr(new, name)

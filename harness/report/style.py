@@ -1,4 +1,4 @@
-"""The visual language of all pictures: page, type, the strain scale, and a colour and marker for each solver."""
+"""Visual style of all pictures: page size, colours, strain scale, and a colour and marker for each solver."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from harness.record.shading import STRAIN_COLOURS
 from solvers.registry import OPTIONAL, SOLVERS, about, load
 
 WIDTH, HEIGHT, DPI = 1600, 900, 100
-"""Every picture's size in pixels, and the dots per inch that turn it into a matplotlib figure."""
+"""Size of every picture [pixels], and the dots per inch that convert it into the size of a Matplotlib figure."""
 
 PAGE, INK, MUTED, RULE = "#fcfbf9", "#23262b", "#6c7078", "#dcdad5"
-"""Background, text, secondary text, hairlines."""
+"""Colours of background, text, secondary text and hairlines."""
 
 OLDER = "Hollow marks: measured by other code than today's."
-"""What hollow marks mean, in all pictures; those of the page are told beside the newest rows."""
+"""Meaning of hollow marks in all pictures; the results page defines its own relative to the newest rows."""
 
 WARNING = "#b3261e"
-"""Words that a reader must not miss."""
+"""Colour of text that a reader must not miss."""
 
 SLOWER, FASTER = WARNING, "#1b7f5c"
-"""Where gates changed."""
+"""Colours of benchmark changes."""
 
 STRAIN_MAP = LinearSegmentedColormap.from_list("strain", STRAIN_COLOURS, N=512)
-"""The scale of the recordings, from -strain_range to strain_range."""
+"""Colour map of strains in recordings, from -strain_range to strain_range."""
 
 RC: Any = {
     "font.family": "DejaVu Sans",
@@ -49,7 +49,7 @@ RC: Any = {
 
 
 class Mark(NamedTuple):
-    """How one solver is drawn: a colour, a matplotlib marker and a matplotlib line style."""
+    """Style of one solver: a colour, a Matplotlib marker and a Matplotlib line style."""
 
     color: str
     marker: Any
@@ -60,30 +60,30 @@ DASHED, DOTTED, DASH_DOTTED = (0, (5, 2)), (0, (1, 1.6)), (0, (6, 2, 1, 2))
 _DASHES = ("-", DASHED, DOTTED, DASH_DOTTED)
 
 STARS: tuple[Any, ...] = ((4, 1, 0), (6, 1, 0), (3, 1, 0), (8, 1, 0), (3, 1, 180))
-"""Of four, six, three, eight and three points, the last upside down."""
+"""Stars with four, six, three, eight and three points, the last upside down."""
 CORNERS: tuple[Any, ...] = ((3, 0, 45), (3, 0, -45), (3, 0, 135), (3, 0, -135))
-"""Triangles that point up and to the left, up and to the right, down and to the left, down and to the right."""
+"""Triangles that point to the upper left, upper right, lower left and lower right."""
 HOURGLASS: Any = ((-1, 1), (1, 1), (-1, -1), (1, -1), (-1, 1))
 BOWTIE: Any = ((-1, -1), (-1, 1), (1, -1), (1, 1), (-1, -1))
-"""Two triangles that meet at their points, one above the other and side by side."""
+"""Two triangles that touch at their tips, one above the other and side by side."""
 LOZENGE: Any = ((-1, 0), (0, 0.5), (1, 0), (0, -0.5), (-1, 0))
-"""A diamond that lies on its side."""
+"""A diamond, wider than high."""
 ARROWHEAD: Any = ((0, 1), (0.9, -0.8), (0, -0.25), (-0.9, -0.8), (0, 1))
-"""A triangle that points up, notched below."""
+"""A triangle that points up, with a notch below."""
 BARS: tuple[Any, ...] = (
     ((-0.9, 1), (0.9, 1), (0.9, 0.6), (0.2, 0.6), (0.9, -0.9), (-0.9, -0.9), (-0.2, 0.6), (-0.9, 0.6), (-0.9, 1)),
     ((-0.9, -1), (0.9, -1), (0.9, -0.6), (0.2, -0.6), (0.9, 0.9), (-0.9, 0.9), (-0.2, -0.6), (-0.9, -0.6), (-0.9, -1)),
 )
-"""Triangles that point up and down to a bar."""
+"""Triangles that point up and down, with a bar at the tip."""
 CHEVRON: Any = ((-1, -0.7), (0, 0.1), (1, -0.7), (1, 0), (0, 0.8), (-1, 0), (-1, -0.7))
-"""A broad stroke that is bent to point up."""
+"""A broad chevron that points up."""
 SPEARHEADS: tuple[Any, ...] = (
     ((1, 0), (-1, 0.5), (-1, -0.5), (1, 0)),
     ((-1, 0), (1, 0.5), (1, -0.5), (-1, 0)),
     ((0, -1), (0.5, 1), (-0.5, 1), (0, -1)),
     ((0, 1), (0.5, -1), (-0.5, -1), (0, 1)),
 )
-"""Slim triangles that point to the right, to the left, down and up."""
+"""Slim triangles that point right, left, down and up."""
 _MARKERS: tuple[Any, ...] = (
     "s",
     "o",
@@ -111,7 +111,8 @@ _MARKERS: tuple[Any, ...] = (
     *SPEARHEADS,
 )
 
-# Okabe and Ito's palette, less its yellow and black, and six more: for families in the order of the registry.
+# Okabe and Ito's palette without its yellow and black, and with three further colours; for families in the order of the
+# registry.
 _FAMILIES = (
     "#0072b2",
     "#00a878",
@@ -127,14 +128,14 @@ _FAMILIES = (
 _MEMBERS: tuple[tuple[float, Any], ...] = (
     *((0.0, "-"), (-0.27, DASHED), (0.3, (0, (14, 2))), (0.2, DASH_DOTTED), (-0.12, (0, (1, 3)))),
 )
-"""How much lighter the members of a family are drawn, or darker where negative, and in which line style."""
+"""Lightening of a family's members (darkening where negative), and their line styles."""
 _MANY: tuple[tuple[float, Any], ...] = (
     *((0.0, "-"), (-0.3, DOTTED), (0.3, (0, (10, 3))), (-0.48, (0, (3, 1, 1, 1, 1, 1)))),
     *((0.15, (0, (8, 2, 2, 2, 2, 2))), (-0.16, (0, (1, 3))), (0.42, (0, (12, 2, 1, 2)))),
 )
-"""The same for a family of more than five, or of engines alone, in line styles that others hardly have."""
+"""Shades and line styles for families of more than five members, and for engines; other families rarely use these."""
 _VARIANTS: tuple[Any, ...] = (*_DASHES, *(dash for _, dash in _MANY[2:]))
-"""The line styles of what differs from a solver in its settings alone."""
+"""Line styles of variants that differ from a solver only in their settings."""
 _STRANGERS = (
     *("#8a8a00", "#00a0a0", "#8c564b", "#4c6ef5", "#5a9e2f", "#c9506b", "#b8860b", "#6a3d9a", "#1f8a70", "#e377c2"),
     *("#3b7a9e", "#d97b66", "#7a9a01", "#9c4f96"),
@@ -142,10 +143,11 @@ _STRANGERS = (
 
 
 def marks(solvers: Iterable[str] = ()) -> dict[str, Mark]:
-    """The mark of each of the registry's solvers, and of these others: always the same, and nobody else's.
+    """Return the style of each solver: of the registry, and of these others; styles are stable and distinct.
 
-    What other solvers get follows from their names; where two would get the same colour, the later by alphabet gets the
-    next that is free, and once there is none the next free mark.
+    The style of a solver outside the registry follows from a hash of its name. If two would get the same colour, the
+    later
+    one in alphabetical order gets the next free colour, and if there is none, the next free style.
     """
     looks = dict(_shipped((*SOLVERS, *OPTIONAL)))
     free = [Mark(color, marker, dash) for dash in _DASHES for color in _STRANGERS for marker in _MARKERS]
@@ -161,7 +163,10 @@ def marks(solvers: Iterable[str] = ()) -> dict[str, Mark]:
 
 @cache
 def _shipped(names: tuple[str, ...]) -> dict[str, Mark]:
-    """The marks of the registry's solvers: the colour of their family, a marker of their own; as many as there are."""
+    """Return the styles of the registry's solvers: the colour of their family, and a marker of their own.
+
+    Solvers beyond the number of markers get no style here.
+    """
     families: dict[str, list[str]] = {}
     for name in names:
         families.setdefault(about(load((SOLVERS | OPTIONAL)[name]), name).family, []).append(name)
@@ -175,23 +180,29 @@ def _shipped(names: tuple[str, ...]) -> dict[str, Mark]:
 
 
 def _members(family: Sequence[str]) -> Sequence[tuple[float, Any]]:
-    """The shades and line styles of a family's members; engines' solid light brown would be others' green
-    to some, and their darkest brown is black."""
+    """Return the shades and line styles of a family's members.
+
+    For engines one style is skipped: their solid light brown would look like a green of others to some readers, and
+    their
+    darkest brown like black.
+    """
     if not set(family) & SOLVERS.keys():
         return *_MANY[:3], *_MANY[4:]
     return _MANY if len(family) > len(_MEMBERS) else _MEMBERS
 
 
 def shade(color: str, by: float) -> str:
-    """A colour mixed with white, or with black where `by` is negative."""
+    """Mix a colour with white, or with black if `amount` is negative."""
     end = 1.0 if by > 0.0 else 0.0
     red, green, blue = ((1.0 - abs(by)) * part + abs(by) * end for part in to_rgb(color))
     return to_hex((red, green, blue))
 
 
 def looks(labelled: Iterable[tuple[str, str]]) -> dict[str, Mark]:
-    """A mark for each label of (label, solver); all labels of a solver have its colour and its marker, the first its
-    line style too."""
+    """Assign a style to each (label, solver) pair.
+
+    All labels of a solver have its colour and marker, and the first one also its line style.
+    """
 
     def dashed(own: Mark, k: int) -> Mark:
         styles = [own.dash, *(dash for dash in _VARIANTS if dash != own.dash)]
@@ -201,7 +212,10 @@ def looks(labelled: Iterable[tuple[str, str]]) -> dict[str, Mark]:
 
 
 def shades(labelled: Iterable[tuple[str, str]]) -> dict[str, Mark]:
-    """The same where there are no line styles: the first label has its solver's colour, others lie around it."""
+    """Assign a shade to each (label, solver) pair, for charts without line styles.
+
+    The first label has its solver's colour, the others have lighter and darker shades of it.
+    """
 
     def shaded(own: Mark, k: int) -> Mark:
         step = 0.22 * ((k + 1) // 2) * (1.0 if k % 2 else -1.0)
@@ -220,6 +234,8 @@ def _varied(labelled: Iterable[tuple[str, str]], vary: Callable[[Mark, int], Mar
 
 
 def numbered(number: int) -> Mark:
-    """The mark of what is no solver, by its number from 0: 64 different ones, the first 8 in different colours."""
-    # The marker moves on once more with each turn of the colours.
+    """Return the style of something that is not a solver, by its index from 0: 64 styles, the first 8 in distinct
+    colours.
+    """
+    # The marker is shifted by one with each pass through the colours.
     return Mark(_FAMILIES[number % 8], _MARKERS[(number + number // 8) % 8], (0, (3, 1.2)))

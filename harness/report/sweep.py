@@ -1,4 +1,4 @@
-"""The pictures of a sweep: of each run, of what compares runs, and of their times; its recordings side by side."""
+"""Pictures of a sweep: of each run, of solver comparisons, and of run times; and side-by-side recordings."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from harness.report.references import write_bibtex
 
 
 class Pictured(NamedTuple):
-    """A run, and where its recording and its picture are to be."""
+    """A run, and the paths of its recording and its picture."""
 
     run: RunSpec
     recording: Path
@@ -38,10 +38,16 @@ def draw_sweep(
     at_once: int = 1,
     older: Collection[str] = (),
 ) -> None:
-    """Pictures of runs, and what compares runs, where it is missing or older than a recording that it shows.
+    """Draw the pictures and comparisons that are missing or older than one of their recordings.
 
-    table: the rows of all of them; say: prints a remark; at_once: how many processes draw; older: the ids of the runs
-    that other code than today's did.
+    Args:
+        name: name of the sweep.
+        jobs: runs with their recordings and pictures.
+        folder: folder of the sweep's results.
+        table: rows of all runs.
+        print_message: prints a remark.
+        num_concurrent: number of drawing processes.
+        stale_ids: ids of runs that were executed by other code than the current version.
     """
     write_bibtex(folder / "references.bib", table["reference"].to_pylist())
     drawn = [p for p in pictured if p.run.record and p.recording.exists()]
@@ -67,7 +73,7 @@ def draw_sweep(
 
 
 def get_ready() -> None:
-    """Load what draws, in this process, piece by piece and beside nothing that is timed."""
+    """Load the drawing modules in this process, in parts, none of them while a timing runs."""
     from harness.report import opengl
 
     with beside(_silent):
@@ -80,7 +86,7 @@ def get_ready() -> None:
 
 
 def _loaded() -> str | None:
-    """What draws is loaded, here, for processes that are forks of this one; returns why it cannot draw, if so."""
+    """Load the drawing modules for forked processes; return why drawing is impossible, or None."""
     from harness.report import opengl
 
     opengl.begin()
@@ -91,7 +97,7 @@ def _loaded() -> str | None:
 def _draw_runs(
     wanting: Sequence[Pictured], say: Callable[[str], None], at_once: int, meanwhile: Callable[[], None]
 ) -> None:
-    """Pictures of runs, in processes; of those that are lost is said why they are."""
+    """Draw the pictures of runs in parallel processes, and report why a process was lost."""
     done, remarks = 0, Remarks(say)
 
     def tick(said: str) -> None:
@@ -105,7 +111,7 @@ def _draw_runs(
 
 
 def _draw_groups(groups: Sequence[Compared], say: Callable[[str], None], *, pictures: bool) -> None:
-    """What compares the runs of groups: recordings, and pictures where these can be drawn."""
+    """Create the side-by-side recordings of groups, and their pictures if `pictures` is true."""
     if not groups:
         return
     from harness.record.compare import Look, side_by_side
@@ -139,13 +145,13 @@ def _silent(said: str) -> None:
 
 
 def _stale(made: Path, sources: Iterable[Path]) -> bool:
-    """Whether a file is missing, or older than one of those it was made from."""
+    """Return whether a file is missing, or older than one of its sources."""
     return not made.exists() or any(made.stat().st_mtime_ns < source.stat().st_mtime_ns for source in sources)
 
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """Runs that differ in nothing but their solver or its settings, by what they differ in; and what compares them."""
+    """Runs that differ only in their solver or its settings, by these differences, and the files that compare them."""
 
     label: str
     runs: dict[str, Pictured]
@@ -154,22 +160,22 @@ class Compared:
 
     @property
     def recordings(self) -> dict[str, Path]:
-        """Of the runs."""
+        """The recordings of the runs by label."""
         return {name: p.recording for name, p in self.runs.items()}
 
     @property
     def old_recording(self) -> bool:
-        """Whether the recording of all of them is to be made."""
+        """Whether the side-by-side recording has to be made."""
         return _stale(self.recording, self.recordings.values())
 
     @property
     def old_picture(self) -> bool:
-        """Whether their picture is to be drawn."""
+        """Whether the comparison picture has to be drawn."""
         return next(iter(self.runs.values())).run.pictures and _stale(self.picture, self.recordings.values())
 
 
 def compared(drawn: list[Pictured], folder: Path) -> list[Compared]:
-    """Those of two runs and more, by scene and size."""
+    """Group runs by scene and size; only groups of two or more runs are returned."""
     alike: dict[str, list[Pictured]] = {}
     for p in drawn:
         alike.setdefault(f"{p.run.scene_name}-{p.run.size}", []).append(p)
@@ -186,7 +192,7 @@ def compared(drawn: list[Pictured], folder: Path) -> list[Compared]:
 
 
 def _distinct(p: Pictured, group: list[Pictured]) -> str:
-    """The solver's name, with the parameters and options in which the group's runs of this solver differ."""
+    """Return the solver's name with the parameters and options in which the group's runs of this solver differ."""
 
     def settings(run: RunSpec) -> dict[str, Any]:
         return {**run.solver.parameters, **{option: getattr(run, option) for option in OPTIONS}}

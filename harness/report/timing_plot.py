@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
-"""Milliseconds a step and of preparing against vertices, by solver; a pair of panels for each scene."""
+# Matplotlib's stubs do not type most keywords.
+"""Step time and preparation time [ms] against number of vertices, by solver; a pair of panels for each scene."""
 
 from __future__ import annotations
 
@@ -31,18 +31,30 @@ _DASHES = (DASHED, DOTTED, DASH_DOTTED)  # the further variants of one solver
 
 
 def timing(rows: pa.Table, folder: Path) -> list[Path]:
-    """The times of a sweep as a report that a sweep can name."""
+    """Write the timing plot of a sweep; a report that a sweep can name.
+
+    Args:
+        rows: rows of the sweep.
+        folder: folder that the file is written to.
+    Returns: the path of the picture.
+    """
     path = folder / "timing.png"
     draw_timing(rows, path, folder.name)
     return [path]
 
 
 def draw_timing(table: pa.Table, path: Path, title: str, older: Collection[str] = ()) -> None:
-    """Draw the times of a sweep's runs to `path`, WIDTH pixels wide and HEIGHT at most, PNG.
+    """Draw the times of a sweep's runs as a PNG file, PAGE_WIDTH pixels wide and at most PAGE_HEIGHT high.
 
-    table: rows (schema: `harness.base.columns.SCHEMA`); older: the ids of the runs that other code than today's did,
-    whose marks are hollow. Runs that failed are crosses at the upper edge, and words; a scene of one size has a row for
+    Failed runs are crosses at the upper edge, with their reasons in words at the foot. A scene of one size has a row
+    for
     each solver instead of a point in an empty frame.
+
+    Args:
+        table: rows (schema: `harness.base.columns.SCHEMA`).
+        path: target file.
+        title: title of the picture.
+        stale_ids: ids of runs that were executed by other code than the current version; their marks are hollow.
     """
     found = runs(table)
     names = labels(found)
@@ -68,7 +80,7 @@ def draw_timing(table: pa.Table, path: Path, title: str, older: Collection[str] 
 
 
 def _facts(table: pa.Table) -> list[str]:
-    """The machine and the code, and what the marks mean."""
+    """Return the machine, the code version and the meaning of the marks."""
     threads: list[int] = sorted(set[Any](table["threads"].drop_null().to_pylist()))
     facts = ["median and quartiles of all steps"]
     if threads:
@@ -85,8 +97,10 @@ def _scene(
     box: tuple[float, float, float, float],
     older: Collection[str],
 ) -> float:
-    """The two panels of one scene within a box (left, top, width, height) in pixels; all scenes have the same
-    scales of time. Returns how far down they reach."""
+    """Draw the two panels of one scene within a box (left, top, width, height) [pixels].
+
+    All scenes have the same time scales. Returns the y position of the lower end [pixels].
+    """
     left, top, width, height = box
     text(page, left, top + 14, shorten(scene, int(width / 10)), size=12.5, weight="bold")
     room = height - 56 - 64 - 44  # less the headings and the ticks of both panels
@@ -122,7 +136,7 @@ def _scene(
 
 
 def _variants(series: Mapping[str, Sequence[RunTimes]], looks: Mapping[str, Mark]) -> list[Any]:
-    """A line style for each series: the solver's own for the first of a solver."""
+    """Assign a line style to each series: the solver's own style to the first series of a solver."""
     dashes: list[Any] = []
     solvers = [members[0].solver for members in series.values()]
     for k, solver in enumerate(solvers):
@@ -133,7 +147,7 @@ def _variants(series: Mapping[str, Sequence[RunTimes]], looks: Mapping[str, Mark
 
 
 def _times(found: Sequence[RunTimes], *fields: str) -> list[float]:
-    """All times [ms] in these fields of the runs; at least two, so that there is always a scale."""
+    """Return all times [ms] in these fields of the runs; at least two, so that a scale always exists."""
     times = [getattr(run, field) for run in found for field in fields]
     return [time for time in times if time] or [0.1, 10.0]
 
@@ -141,7 +155,7 @@ def _times(found: Sequence[RunTimes], *fields: str) -> list[float]:
 def _scales(
     ax: Axes, sizes: Sequence[int], times: Sequence[float], labels_share: float, *, crosses: bool = False
 ) -> None:
-    """Logarithmic scales with room for direct labels at the right and, if need be, for crosses at the top."""
+    """Set logarithmic scales with space for direct labels at the right and, if needed, for crosses at the top."""
     sizes = sizes or [1, 10]
     first, last = (sizes[0] / 1.15, sizes[-1] * 1.15) if len(sizes) > 1 else (sizes[0] / 2, sizes[0] * 2)
     ax.set_xscale("log")
@@ -164,7 +178,7 @@ def _scales(
 
 
 def _apart(ax: Axes, sizes: Sequence[int]) -> list[int]:
-    """The sizes whose tick labels do not run into each other; the largest is always among them."""
+    """Select the sizes whose tick labels do not overlap; the largest is always included."""
     at = {size: ax.transData.transform((size, 1.0))[0] for size in sizes}
     kept = [sizes[-1]]
     for size in reversed(sizes[:-1]):
@@ -176,7 +190,7 @@ def _apart(ax: Axes, sizes: Sequence[int]) -> list[int]:
 def _draw_steps(
     ax: Axes, name: str, members: Sequence[RunTimes], look: Mark, dash: Any, older: Collection[str]
 ) -> list[End]:
-    """One line with its quartile band; returns where its direct label belongs, with its words and colour."""
+    """Draw one line with its quartile band, and return the position, text and colour of its direct label."""
     timed = sorted((run for run in members if run.step), key=lambda run: run.vertices or 0)
     if not timed:
         return []
@@ -211,7 +225,7 @@ def _draw_prepare(ax: Axes, members: Sequence[RunTimes], look: Mark, older: Coll
 
 
 def _crosses(ax: Axes, failed: Sequence[RunTimes], looks: Mapping[str, Mark]) -> None:
-    """A cross at the upper edge for each failed run; those of one size below each other."""
+    """Draw a cross at the upper edge for each failed run; those of one size are stacked."""
     taken: dict[int, int] = {}
     for run in failed:
         size = run.vertices or 0
@@ -225,7 +239,7 @@ def _crosses(ax: Axes, failed: Sequence[RunTimes], looks: Mapping[str, Mark]) ->
 
 
 def _notes(page: Figure, failed: Sequence[RunTimes], names: Mapping[str, str], top: float) -> None:
-    """Which runs failed and why, at the foot of the page."""
+    """Draw the failed runs and their reasons at the foot of the page."""
     for k, run in enumerate(failed[:_NOTES]):
         where = f"{run.scene}, size {run.size}" if run.size else run.scene
         why = f"{run.status}: {run.reason}" if run.reason else run.status

@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
-"""The times of a scene of one size: a row for each solver, the fastest first, a step and preparing side by side."""
+# Matplotlib's stubs do not type most keywords.
+"""Times of a scene of one size: one row per solver, the fastest first; step and preparation side by side."""
 
 from __future__ import annotations
 
@@ -16,14 +16,16 @@ from harness.report.style import INK, MUTED, PAGE, Mark
 from harness.report.timing_table import RunTimes
 
 HEADINGS = "milliseconds a step", "milliseconds to prepare, once a run: marks warm, bars cold"
-"""Of the two panels of a scene."""
+"""Headings of the two panels of a scene."""
 _SHORT = "ms a step", "ms to prepare"
-"""Where there is no room for these."""
+"""Short headings for narrow panels."""
 _TICK = 38.0
-"""Pixels of a number below an axis."""
+"""Width of a tick label [pixels]."""
 
 _ROW, _NAMES, _HEAD, _GAP, _LETTER = 42.0, 0.3, 96.0, 48.0, 8.2
-"""Pixels of a row, part of the width for the solvers' names at most, pixels above, between panels, and of a letter."""
+"""Row height [pixels], maximum share of the width for names, space above and between panels [pixels], and letter
+width [pixels].
+"""
 
 
 def draw_rows(
@@ -35,9 +37,9 @@ def draw_rows(
     box: tuple[float, float, float, float],
     older: Collection[str],
 ) -> float:
-    """Two panels within a box (left, top, width, height) in pixels; a run that failed is a cross with its status.
+    """Draw two panels within a box (left, top, width, height) [pixels].
 
-    Returns how far down they reach.
+    A failed run is a cross with its status. Returns the y position of the lower end [pixels].
     """
     left, top, width, height = box
     here = sorted((run for run in found if run.scene == scene), key=lambda run: (run.step is None, run.step or 0.0))
@@ -72,7 +74,9 @@ def draw_rows(
 
 
 def _scales(ax: Axes, values: Sequence[float], labels: Sequence[str], width: float) -> None:
-    """Times by logarithms, over a decade at least; the rows' names at the left of the first panel; width [pixels]."""
+    """Set a logarithmic time axis over at least a decade, with row names at the left of the first panel; width
+    [pixels].
+    """
     low, high = (min(values), max(values)) if values else (0.1, 10.0)
     reach = max((high / low) ** (1.0 + 40.0 / width) * 1.3, 10.0) ** 0.5
     middle, named = (low * high) ** 0.5, 6.0 * log10(reach)

@@ -1,4 +1,4 @@
-"""What the rows of a sweep say about each run, in milliseconds, and the table that ends a sweep."""
+"""Summary of each run of a sweep from its rows, in milliseconds, and the table printed at the end of a sweep."""
 
 from __future__ import annotations
 
@@ -26,15 +26,24 @@ from harness.report.sql import answer
 
 
 class RunTimes(NamedTuple):
-    """One run: what it was and where, and its times [ms]; None where the rows do not say.
+    """One run: identification, status, and its times [ms]; None where the rows lack a value.
 
-    cold and warm: of preparing; local, global_: medians of one such step; step, lower, upper, least, iterations,
-    residual, worst_residual, largest_strain, strain_99: see `harness.base.quantities`; stopped: what ended a step's
-    iterations, the least welcome, None where the solver has no limit of iterations and nothing else ended them;
-    interrupted: whether steps were, in any round; adds_up: whether the phases add up to an iteration; round_off
-    [J^(1/2)]: residuals below it are round-off (`ROUND_OFF`); distance: the largest over all frames, where each was
-    judged; modulus_exponent: of the rows; left: of a solver that does not minimise, the largest stationarity that the
-    oracle measured. The fields are the columns of `_SUMMARY`, in order.
+    The fields are the columns of `_SUMMARY`, in order. The statistics step, lower, upper, least, num_iterations,
+    residual,
+    worst_residual, max_strain and strain_p99 are defined in `harness.base.quantities`.
+
+    Attributes:
+        cold, warm: time of the preparation.
+        local, global_: median time of one such step.
+        termination_reason: the least favourable reason that ended a step's iterations; None if the solver has no
+            iteration limit and nothing else ended them.
+        preempted: whether steps were interrupted, in any round.
+        phases_consistent: whether the phases add up to an iteration.
+        roundoff_residual: residuals below it are round-off (`ROUNDOFF_FRACTION`) [J^(1/2)].
+        reference_distance: the largest over all frames, if every frame was verified.
+        modulus_exponent: value of the rows.
+        max_stationarity_audit: largest stationarity that the reference evaluator measured, for a solver that does not
+            minimise.
     """
 
     run_id: str
@@ -76,8 +85,10 @@ class RunTimes(NamedTuple):
 
 
 ROUND_OFF = 1e-12
-"""Of the residual at a step's start, and of the square root of the step's largest energy: below, all may be round-off
-of 1e-16 that the matrix has made larger."""
+"""Share of a step's initial residual, and of the square root of the step's largest energy, that may be round-off.
+
+It is the round-off of 1e-16, amplified by the matrix.
+"""
 
 _ENERGIES = ", ".join(
     ["yardstick", *(f"sqrt(abs({name}))" for name in SCHEMA.names if name.startswith("energy_")), "0.0"]
@@ -109,20 +120,22 @@ from rows_of group by run_id order by min(place)
 
 
 def runs(table: pa.Table) -> list[RunTimes]:
-    """The runs in a table of rows (schema: `harness.base.columns.SCHEMA`), in the order of their first rows."""
+    """Return the runs in a table of rows (schema: `harness.base.columns.SCHEMA`), in the order of their first rows."""
     numbered = table.append_column("place", pa.array(np.arange(len(table))))
     return [RunTimes(*row) for row in answer(_SUMMARY, numbered)]
 
 
 def _stated(run: RunTimes) -> dict[str, Any]:
-    """A run's options; of one whose steps were chosen for an error that and what was chosen."""
+    """Return a run's options; with a requested error, only that and the options that were set."""
     options = json.loads(run.settings)
     return {key: value for key, value in options.items() if value is not None or options["asked"] is None}
 
 
 def labels(found: Sequence[RunTimes]) -> dict[str, str]:
-    """By run id, the solver's name and those of its settings in which the solver's runs of the scene differ; and the
-    machine where there are several, so that no line in a plot and no row stands for two."""
+    """Return a label by run id: the solver with the settings in which its runs of the scene differ.
+
+    If there are several machines, the label includes the machine, so that each label denotes one curve or table row.
+    """
     parameters: dict[str, dict[str, Any]] = {run.run_id: json.loads(run.parameters or "{}") for run in found}
     settings = {run.run_id: _stated(run) | parameters[run.run_id] for run in found}
     places = machine_names((run.machine, run.node) for run in found)
@@ -166,22 +179,24 @@ _NUMBERS = (
 )
 
 WIDTH = 100
-"""Characters that a line of the table takes, unless its numbers alone take more."""
+"""Maximum width of a line [characters], unless its numbers need more."""
 
 _NAMES = 12
-"""Characters within which solvers' and scenes' names are folded, where there is no place for more."""
+"""Width at which names of solvers and scenes are folded if space is short [characters]."""
 
 INTERRUPTED = "! the process was interrupted while steps were timed: its least time is nearest to the truth"
 APART = "~ local and global, timed alone, do not add up to an iteration within 15 %"
 OTHER = "† by other code than today's"
-"""What the marks in the table mean."""
+"""Meanings of the marks in the table."""
 SHARED = "timed beside others, up to {} at once, each on cores of its own: slower than alone by what they share"
 
 
 def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
-    """One line for each run: what it was, how it ended, and its times [ms], marked where they are doubtful.
+    """Build a table with one line per run: identification, status and times [ms], with marks on doubtful values.
 
-    other_code: the ids of the runs that were done by other code than today's, which are marked.
+    Args:
+        table: rows of the sweep.
+        stale_ids: ids of runs that were executed by other code than the current version; they are marked.
     """
     found = runs(table)
     names, scenes = labels(found), {run.scene for run in found}
@@ -226,24 +241,24 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
     marks[SHARED.format(max(shared, default=0))] = bool(shared)
     out.caption = Text("\n".join([*(words for words, there in marks.items() if there), *_methods(table), *foot(table)]))
     longest = max(map(len, [*names.values(), *scenes]), default=0)
-    # Lines longer than a narrow terminal keep their numbers; Rich would cut them to ellipses.
+    # Lines longer than a narrow terminal keep their numbers; Rich would replace them by ellipses.
     most = Measurement.get(wide := Console(width=1000), wide.options, out).maximum
     out.width = max(min(most, WIDTH), most - max(0, longest - _NAMES))
     return out
 
 
 def _ended(run: RunTimes) -> str:
-    """What ended the iterations of a run that succeeded; else how the run itself ended."""
+    """Return the termination reason of a successful run, otherwise its status."""
     return escape(run.stopped or "ok") if run.status == "ok" else f"[bold red]{escape(run.status)}[/]"
 
 
 def _apart(run: RunTimes, value: float | None) -> str:
-    """The mark of a phase's time where the phases do not add up to an iteration."""
+    """Return the mark of a phase's time if the phases do not add up to an iteration."""
     return "~" if value is not None and run.adds_up is False else ""
 
 
 def _methods(table: pa.Table) -> list[str]:
-    """Where each solver comes from."""
+    """Return the citation of each solver."""
     known = dict(zip(*(table[name].to_pylist() for name in ("solver", "reference")), strict=True))
     solvers: dict[str, list[str]] = defaultdict(list)
     for solver, reference in known.items():

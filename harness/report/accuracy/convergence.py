@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
+# Matplotlib's stubs do not type most keywords.
 """Convergence on a frozen step: gap, largest error and stationarity, against iterations and against seconds."""
 
 from __future__ import annotations

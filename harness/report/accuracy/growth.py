@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
+# Matplotlib's stubs do not type most keywords.
 """Growth with size: the time to a gap of 1e-3 against the number of vertices, and the powers fitted to it."""
 
 from __future__ import annotations

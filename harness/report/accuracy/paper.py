@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
+# Matplotlib's stubs do not type most keywords.
 """Our curves over figures 2 and 3 of Liu et al. 2013, and by how much they differ.
 
 The paper's values are read from its figures and text: the relative error (g - g*)/(g0 - g*), g0 at the inertial target,

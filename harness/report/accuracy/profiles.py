@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
+# Matplotlib's stubs do not type most keywords.
 """Performance profiles (Dolan and More 2002) and data profiles (More and Wild 2009) over all frozen steps.
 
 A step from one first guess is a problem of its own. With t the time of a solver on a problem,

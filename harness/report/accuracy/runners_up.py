@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
+# Matplotlib's stubs do not type most keywords.
 """What a recommendation was chosen from: all ways that were measured, the error that was asked for, the runners-up."""
 
 from __future__ import annotations

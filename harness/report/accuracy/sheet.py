@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
+# Matplotlib's stubs do not type most keywords.
 """What the pictures of accuracy share: a page with one legend at its right, logarithmic axes, notes at its foot."""
 
 from __future__ import annotations

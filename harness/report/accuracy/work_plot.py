@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
+# Matplotlib's stubs do not type most keywords.
 """Work against precision: the error of a simulated second against the wall time that it takes, and the Pareto front."""
 
 from __future__ import annotations

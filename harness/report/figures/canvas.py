@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
+# Matplotlib's stubs do not type most keywords.
 """A figure put together at its width: title, panels, one legend below them, notes at the foot; nothing over data.
 
 The height follows: each strip is as high as its type, each frame as high as its width asks for.

@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
+# Matplotlib's stubs do not type most keywords.
 """Names at the ends of curves, right of the frame, where they fit: a legend that needs no looking up."""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
+# Matplotlib's stubs do not type most keywords.
 """Panels drawn in their frames: curves, cells, pictures. Sizes are points, as they will be in print."""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
+# Matplotlib's stubs do not type most keywords.
 """The axes of figures for print: limits, ticks that do not meet, numbers without small type in them."""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
+# Matplotlib's stubs do not type most keywords.
 """The files of a figure: itself in each format, its data as CSV, and a short script that draws it again from these."""
 
 from __future__ import annotations

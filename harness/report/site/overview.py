@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-# pyarrow's stubs know not every kind of file that Parquet is written to.
+# pyarrow's stubs do not type every kind of file that Parquet is written to.
 """Everything that the page says of one sweep: its line in the index, and the scripts with its runs and its charts."""
 
 from __future__ import annotations

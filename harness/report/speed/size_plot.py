@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-# Matplotlib's stubs say nothing of most keywords.
+# Matplotlib's stubs do not type most keywords.
 """One quantity against mesh size on a page of its own: a line for each candidate, named at the right."""
 
 from __future__ import annotations
