@@ -2,7 +2,7 @@
 # pyarrow's stubs do not type some keywords.
 """Certificates of intersection-free runs as CSV, one line per run.
 
-Each line states in how many frames no primitives intersect, by the exact test of `harness.scenes.intersections`, and
+Each line states in how many frames no primitives intersect, by the exact test of `harness.scenes.edge_triangle_intersections`, and
 how many steps converged.
 """
 

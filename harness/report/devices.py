@@ -82,7 +82,7 @@ Panel = tuple[str, float]
 
 
 def runs(table: pa.Table) -> list[Run]:
-    """Return the runs of a sweep from its rows (schema: `harness.base.columns.SCHEMA`).
+    """Return the runs of a sweep from its rows (schema: `harness.results.run_schema.RUN_SCHEMA`).
 
     The list is empty if no run requested a device.
     """

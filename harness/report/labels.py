@@ -43,7 +43,7 @@ def direct_labels(ax: Axes, ends: Sequence[End]) -> None:
 
 
 def spread(wanted: Sequence[float], bottom: float, top: float) -> list[float]:
-    """Return sorted heights [pixels] that are at least LABEL_SPACING apart: moved up from below, then down from the top.
+    """Return sorted heights [pixels], at least LABEL_SPACING apart: moved up from below, then down from the top.
 
     Args:
         targets: preferred heights, ascending [pixels].

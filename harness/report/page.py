@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""A page of WIDTH x HEIGHT pixels: its title, its scale of strain, type and pictures placed by the pixel."""
+"""Layout of a picture of PAGE_WIDTH x PAGE_HEIGHT pixels: title, strain scale, text and images at pixel positions."""
 
 from __future__ import annotations
 

@@ -230,7 +230,7 @@ class Score:
     """Score of one solver over all cases.
 
     Attributes:
-        outcome_counts: number of runs with each outcome, in the order of OUTCOMES.
+        outcome_counts: number of runs with each outcome, in the order of RUN_OUTCOMES.
         correct_share: share of correct runs among supported cases; None if no case is supported.
         finite_share: share of runs that stayed finite, likewise.
         worst_run: run with the largest error.

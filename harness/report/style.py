@@ -111,8 +111,7 @@ _MARKERS: tuple[Any, ...] = (
     *SPEARHEADS,
 )
 
-# Okabe and Ito's palette without its yellow and black, and with three further colours; for families in the order of the
-# registry.
+# For families in the order of the registry: four colours of Okabe and Ito's palette, and six more.
 _FAMILIES = (
     "#0072b2",
     "#00a878",

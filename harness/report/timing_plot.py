@@ -51,7 +51,7 @@ def draw_timing(table: pa.Table, path: Path, title: str, older: Collection[str] 
     each solver instead of a point in an empty frame.
 
     Args:
-        table: rows (schema: `harness.base.columns.SCHEMA`).
+        table: rows (schema: `harness.results.run_schema.RUN_SCHEMA`).
         path: target file.
         title: title of the picture.
         stale_ids: ids of runs that were executed by other code than the current version; their marks are hollow.

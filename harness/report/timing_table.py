@@ -28,9 +28,9 @@ from harness.report.sql import answer
 class RunTimes(NamedTuple):
     """One run: identification, status, and its times [ms]; None where the rows lack a value.
 
-    The fields are the columns of `_SUMMARY`, in order. The statistics step, lower, upper, least, num_iterations,
+    The fields are the columns of `_SUMMARY_QUERY`, in order. The statistics step, lower, upper, least, num_iterations,
     residual,
-    worst_residual, max_strain and strain_p99 are defined in `harness.base.quantities`.
+    worst_residual, max_strain and strain_p99 are defined in `harness.results.quantities`.
 
     Attributes:
         cold, warm: time of the preparation.
@@ -39,7 +39,7 @@ class RunTimes(NamedTuple):
             iteration limit and nothing else ended them.
         preempted: whether steps were interrupted, in any round.
         phases_consistent: whether the phases add up to an iteration.
-        roundoff_residual: residuals below it are round-off (`ROUNDOFF_FRACTION`) [J^(1/2)].
+        roundoff_residual: residuals below it are round-off (`ROUNDOFF_RATIO`) [J^(1/2)].
         reference_distance: the largest over all frames, if every frame was verified.
         modulus_exponent: value of the rows.
         max_stationarity_audit: largest stationarity that the reference evaluator measured, for a solver that does not
@@ -120,7 +120,7 @@ from rows_of group by run_id order by min(place)
 
 
 def runs(table: pa.Table) -> list[RunTimes]:
-    """Return the runs in a table of rows (schema: `harness.base.columns.SCHEMA`), in the order of their first rows."""
+    """Return the runs in a table of rows (schema: `harness.results.run_schema.RUN_SCHEMA`), in the order of their first rows."""
     numbered = table.append_column("place", pa.array(np.arange(len(table))))
     return [RunTimes(*row) for row in answer(_SUMMARY, numbered)]
 

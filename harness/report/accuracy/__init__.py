@@ -1,4 +1,4 @@
-"""What the rows of `springbench accuracy` say: pictures, findings and a table."""
+"""Reports on the rows of `springbench accuracy`: pictures, findings and a table."""
 
 from __future__ import annotations
 
@@ -19,10 +19,13 @@ from harness.report.references import write_bibtex
 
 
 def draw(folder: Path, files: Iterable[Path] | None = None) -> list[Path]:
-    """Draw all that the rows under `folder`/accuracy say to `folder`/report; returns the files.
+    """Draw the report on the rows under `folder`/accuracy to `folder`/report, and return the files.
 
-    folder: of one config's results; files: those of its rows that count, all if left out. Raises InputError where
-    there are no rows.
+    Args:
+        folder: results of one config.
+        files: files of rows to include; None for all.
+    Raises:
+        InputError: if there are no rows.
     """
     everything = read(folder, files)
     table, out = without_short(everything), folder / "report"

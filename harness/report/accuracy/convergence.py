@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Convergence on a frozen step: gap, largest error and stationarity, against iterations and against seconds."""
+"""Convergence on a step snapshot: energy gap, largest error and stationarity, against iterations and wall time."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ GUESSES: dict[str, str] = {
     "motion": "from where the motion leads",
     "assignment": "as in the assignment",
 }
-"""The first guesses, in words."""
+"""Initial guesses in words."""
 
 _LEAST = 1e-16  # what is smaller is drawn there: double precision knows nothing below
 
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """A row of panels: what it shows of a curve, in words, and its share of the height."""
+    """A row of panels: its label, the values of a curve that it shows, and its share of the height."""
 
     name: str
     values: Callable[[Curve], Values]
@@ -60,7 +60,12 @@ _ROWS = (
 
 
 def draw_convergence(table: Measurements, folder: Path) -> list[Path]:
-    """A picture for each problem that solvers were measured on; returns the files."""
+    """Draw a picture for each problem that solvers were measured on, and return the files.
+
+    Args:
+        table: data of an accuracy measurement.
+        folder: folder that the files are written to.
+    """
     drawn: list[Path] = []
     marked = looks((curve.label, curve.solver) for curve in table.curves)
     for problem in table.problems:
@@ -73,7 +78,7 @@ def draw_convergence(table: Measurements, folder: Path) -> list[Path]:
 
 
 def _grouped(curves: Sequence[Curve]) -> list[str]:
-    """The same in few sentences: one for each way to end early and each minimum, with all whom it befell."""
+    """Group the remarks on curves: one sentence per kind of early end and per minimum, with all curves concerned."""
     ends: dict[str, list[str]] = {}
     for curve in curves:
         cause = f"{curve.status}: {curve.reason}" if curve.status in ("failed", "unsupported") else curve.status
@@ -91,7 +96,7 @@ def _who(curve: Curve, curves: Sequence[Curve]) -> str:
 
 
 def remarks(curves: Sequence[Curve]) -> list[str]:
-    """What did not go well, in words: a sentence for each failure and each other minimum."""
+    """Describe failures and convergence to another minimum, one sentence each."""
     words: list[str] = []
     for curve in curves:
         if curve.status != "ok":
@@ -148,7 +153,7 @@ def _draw(stem: Path, problem: Problem, curves: list[Curve], marked: dict[str, M
 
 
 def _panel(ax: Axes, row: _Row, curves: Sequence[Curve], marked: dict[str, Mark], against: str) -> None:
-    """The curves of one first guess, failures marked at their ends."""
+    """Draw the curves of one initial guess, with failures marked at their ends."""
     for curve in curves:
         if not len(curve.iterations):
             continue
@@ -179,7 +184,7 @@ def _panel(ax: Axes, row: _Row, curves: Sequence[Curve], marked: dict[str, Mark]
 
 
 def _vertical(ax: Axes, row: _Row, curves: Sequence[Curve], problem: Problem, column: int, *, last: bool) -> None:
-    """The same scale in all panels of a row; round-off shaded, metres at the right of the errors."""
+    """Set the same scale in all panels of a row; shade round-off, and show metres at the right of the errors."""
     all_values = np.concatenate([np.maximum(row.values(curve), _LEAST) for curve in curves] or [[np.nan]])
     low, high = limits(all_values, margin=2.0)
     if row is _ROWS[0] and np.isfinite(problem.round_off):
@@ -198,7 +203,7 @@ def _vertical(ax: Axes, row: _Row, curves: Sequence[Curve], problem: Problem, co
 
 
 def _meanings(words: Sequence[str]) -> list[tuple[Line2D | Patch, str]]:
-    """What the other marks mean."""
+    """Build the legend entries of the other marks."""
     shaded: list[tuple[Line2D | Patch, str]] = [(Patch(color=MUTED, alpha=0.16, linewidth=0), "round-off")]
     if any(word.startswith("×") for word in words):
         cross = Line2D([], [], color=INK, marker="x", linestyle="", markersize=8, markeredgewidth=2)

@@ -1,8 +1,8 @@
-"""Outside engines beside ours: the least wall time for which a motion ends within an error, by each one's best setting.
+"""Comparison with external engines: the shortest wall time for a motion within an error, over each engine's settings.
 
-    ratio = least time of an engine's settings within the error / least time of all of our methods within it
+    ratio = (shortest time of an engine's settings within the error) / (shortest time of all own methods within it)
 
-Above 1, ours is the faster. Nothing is told of meshes that no engine was tried on.
+Above 1 the own methods are faster. Meshes without runs of an engine are omitted.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from solvers.about import ENGINE
 
 OURS = "springbench"
 ERRORS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
-"""Relative errors of the positions at the horizon."""
+"""Relative errors of the positions at the end time."""
 WILD = 1.0
-"""Errors from here on tell of no motion: nothing moved, or it exploded."""
+"""Relative errors from here on do not represent a motion: nothing moved, or it exploded."""
 
 
 class Standing(NamedTuple):
-    """Who ends within one error on one mesh: the cheapest simulation by program, of those that reach it."""
+    """For one error on one mesh, the cheapest simulation of each program that reaches it."""
 
     mesh: str
     error: float
     best: dict[str, WorkPoint]
 
     def ratio(self, engine: str) -> float | None:
-        """How many times as long as ours the engine takes; None where either does not get there."""
+        """Return the engine's time divided by the own time; None if either does not reach the error."""
         if engine not in self.best or OURS not in self.best:
             return None
         return self.best[engine].seconds / self.best[OURS].seconds
 
 
 def program(work: WorkPoint) -> str:
-    """Whose program did it: an engine's name, or OURS."""
+    """Return the program of a simulation: an engine's name, or OWN_PROGRAM."""
     return work.solver if work.family == ENGINE else OURS
 
 
 def met(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
-    """Simulations by mesh, of the meshes on which both engines and ours were tried."""
+    """Return simulations by mesh, for the meshes with runs of both engines and own methods."""
     meshes: dict[str, list[WorkPoint]] = {}
     for work in works:
         meshes.setdefault(work.mesh, []).append(work)
@@ -52,7 +52,7 @@ def met(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
 
 
 def fronts(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
-    """Each program's settings that none of its others beats in both time and error, the cheapest first; ours first."""
+    """Return the Pareto front of each program's settings in time and error, cheapest first; own methods come first."""
     by_program: dict[str, list[WorkPoint]] = {OURS: []}
     for work in works:
         by_program.setdefault(program(work), []).append(work)
@@ -61,7 +61,12 @@ def fronts(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
 
 
 def standings(works: Iterable[WorkPoint], errors: Sequence[float] = ERRORS) -> list[Standing]:
-    """By mesh and error, the largest error first."""
+    """Compare the programs by mesh and error, the largest error first.
+
+    Args:
+        works: simulations.
+        errors: relative errors.
+    """
     found = list[Standing]()
     for mesh, here in met(works).items():
         by_program = fronts(here)
@@ -72,17 +77,19 @@ def standings(works: Iterable[WorkPoint], errors: Sequence[float] = ERRORS) -> l
 
 
 def engines(works: Iterable[WorkPoint]) -> list[str]:
-    """The engines that were tried, by name."""
+    """Return the sorted names of the engines that were measured."""
     return sorted({program(work) for work in works} - {OURS})
 
 
 def marks(works: Iterable[WorkPoint]) -> dict[str, Mark]:
-    """A look for each program, ours in ink."""
+    """Assign a style to each program; the own methods are drawn in the text colour."""
     return {OURS: Mark(INK, "o")} | {name: numbered(k)._replace(dash="-") for k, name in enumerate(engines(works))}
 
 
 def table(works: Sequence[WorkPoint]) -> Iterator[str]:
-    """The ratios as rows of Markdown: a mesh and error in each, an engine in each column, and our best in words."""
+    """Format the ratios as a Markdown table: one row per mesh and error, one column per engine, and the best own
+    setting.
+    """
     names = engines(works)
     if not names:
         return
@@ -98,7 +105,7 @@ def table(works: Sequence[WorkPoint]) -> Iterator[str]:
 
 
 def settings(works: Iterable[WorkPoint]) -> Iterator[str]:
-    """By which setting an engine is fastest, as sentences."""
+    """Describe the fastest setting of each engine in sentences."""
     for one in standings(works):
         for name, best in one.best.items():
             if name != OURS:
@@ -106,7 +113,7 @@ def settings(works: Iterable[WorkPoint]) -> Iterator[str]:
 
 
 def _refused(works: Iterable[WorkPoint]) -> set[str]:
-    """Programs that could not be asked: the network is beyond them, or they are not installed."""
+    """Find the programs that do not support the mesh's spring network, or are not installed."""
     by_program: dict[str, set[str]] = {}
     for work in works:
         by_program.setdefault(program(work), set()).add(work.status)

@@ -1,4 +1,4 @@
-"""What was found, in words (`findings.md`) and as a table for programs (`summary.json`)."""
+"""Findings of an accuracy measurement, in words (`findings.md`) and as a table for programs (`summary.json`)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Chapters = dict[str, list[str]]
 
 
 def findings(table: Measurements) -> Chapters:
-    """Sentences by the title of their chapter; chapters without any are left out."""
+    """Summarise the findings as sentences by chapter title; chapters without sentences are omitted."""
     compared = without_short(table)
     chapters = {
         "Over all steps": list(_profiles(compared)),
@@ -41,7 +41,7 @@ def findings(table: Measurements) -> Chapters:
 
 
 def failures(table: Measurements) -> list[dict[str, str]]:
-    """Each run with a status other than ok: what it was, its status and the reason."""
+    """List each run whose status is not ok: what it was, its status and the reason."""
     curves = [
         (f"{c.problem.name}, {GUESSES.get(c.first_guess, c.first_guess)}", c.label, c.status, c.reason)
         for c in table.curves
@@ -52,12 +52,19 @@ def failures(table: Measurements) -> list[dict[str, str]]:
 
 
 def summary(table: Measurements) -> list[dict[str, Any]]:
-    """One entry a curve: what it was, what it reached, and the seconds to each accuracy, null where not reached."""
+    """Build one entry per curve: identification, result, and seconds to each accuracy (null if not reached)."""
     return [_entry(curve) for curve in table.curves]
 
 
 def write_findings(path: Path, title: str, chapters: Chapters, failed: list[dict[str, str]]) -> None:
-    """Write the chapters and the failures as Markdown."""
+    """Write the chapters and the failures as Markdown.
+
+    Args:
+        path: target file.
+        title: heading of the file.
+        chapters: sentences by chapter title.
+        failed: failures, as `list_failures` returns them.
+    """
     lines = [f"# {title}", ""]
     for chapter, sentences in chapters.items():
         lines += [f"## {chapter}", "", *(s if s.startswith("|") else f"- {s}" for s in sentences), ""]
@@ -114,7 +121,7 @@ def _finite(value: float) -> float | None:
 
 
 def _methods(table: Measurements) -> Iterator[str]:
-    """Where each solver comes from."""
+    """Yield the citation of each solver."""
     references = {each.solver: each.reference for each in (*table.curves, *table.works)}
     for solver, reference in references.items():
         if reference:
@@ -162,7 +169,9 @@ def _growth(table: Measurements) -> Iterator[str]:
 
 
 def _paper(table: Measurements) -> Iterator[str]:
-    """Every curve of both figures as a row of one table: our error over the paper's, bold where it is far off."""
+    """Yield a table with one row per curve of both figures: own error / the paper's, bold where they differ
+    strongly.
+    """
     by_curve: dict[str, dict[int, PaperComparison]] = {}
     for found in comparisons(table):
         by_curve.setdefault(found.curve, {})[found.iterations] = found
@@ -178,6 +187,6 @@ def _paper(table: Measurements) -> Iterator[str]:
 
 
 def _cell(found: PaperComparison) -> str:
-    """Ours, theirs and the ratio."""
+    """Format the own error, the paper's error and their ratio."""
     far = "**" if max(found.ratio, 1 / found.ratio) > FAR else ""
     return f"{found.ours:.2g} / {found.theirs:.2g} = {far}{found.ratio:.2g}{far}"

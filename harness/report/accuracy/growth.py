@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Growth with size: the time to a gap of 1e-3 against the number of vertices, and the powers fitted to it."""
+"""Scaling with size: time to a gap of 1e-3 against the number of vertices, and fitted exponents."""
 
 from __future__ import annotations
 
@@ -39,11 +39,14 @@ _FITTED, _COLUMNS, _ABREAST = 3, 4, 3  # sizes that a fit needs; scenes in a row
 
 
 class SizeGrowth(NamedTuple):
-    """A solver's times to TARGET on the sizes of a scene where it got there.
+    """A solver's times to GAP_TARGET on the sizes of a scene where it reached it.
 
-    vertices (k,), seconds (k,): median over the moments; exponent: of the fit, nan for too few sizes;
-    lost: the vertices of the sizes on which it did not get there; older: on which of the others (k,) other code than
-    today's took part.
+    Attributes:
+        vertices: numbers of vertices (k,).
+        seconds: median over the snapshots (k,) [s].
+        exponent: exponent of the fitted power law; nan for too few sizes.
+        unsolved_sizes: numbers of vertices of the sizes on which the gap was not reached.
+        stale: which of the sizes (k,) involve measurements by other code than the current version.
     """
 
     scene: str
@@ -57,7 +60,12 @@ class SizeGrowth(NamedTuple):
 
 
 def growths(table: Measurements, other: Callable[[Curve], bool] = older) -> list[SizeGrowth]:
-    """The growth of each solver on each scene with two sizes or more; other: which curves are of other code."""
+    """Fit the scaling of each solver on each scene with two sizes or more.
+
+    Args:
+        table: data of an accuracy measurement.
+        is_stale_curve: returns whether other code measured a curve.
+    """
     groups: dict[tuple[str, str, str], dict[int, list[Curve]]] = {}
     for curve in table.curves:
         sizes = groups.setdefault((curve.problem.scene, curve.first_guess, curve.label), {})
@@ -81,7 +89,7 @@ def _exponent(times: dict[int, float]) -> float:
 
 
 def draw_growth(table: Measurements, stem: Path) -> list[Path]:
-    """A column for each scene that has several sizes, a row for each first guess; returns the files."""
+    """Draw a column for each scene with several sizes and a row for each initial guess; return the files."""
     found = growths(table)
     scenes = list(dict.fromkeys(growth.scene for growth in found))[:_COLUMNS]
     if not scenes:
@@ -110,7 +118,7 @@ def draw_growth(table: Measurements, stem: Path) -> list[Path]:
             ax = panel(page, left, top, width, height, f"{scene}, {GUESSES[guess]}")
             here = [g for g in found if (g.scene, g.first_guess) == (scene, guess)]
             sizes = sorted({n for g in here for n in (*g.vertices, *g.lost)}) or [1, 10]
-            # Room at the right for the names of lines whose power is known.
+            # Space at the right for the labels of lines with a fitted exponent.
             room = 1 / max(width / 170 - 1, 1) if any(np.isfinite(g.exponent) for g in here) else 0.0
             log_axis(ax.xaxis, sizes[0] / 1.2, 1.2 * sizes[-1] * (sizes[-1] / sizes[0]) ** room, unit="plain")
             ax.xaxis.set_major_locator(FixedLocator(sizes[:: ceil(len(sizes) / 5)]))

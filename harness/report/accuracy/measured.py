@@ -1,7 +1,7 @@
 """The rows of an accuracy measurement as problems, curves and simulations (`harness.experiments.accuracy`).
 
-The gap of an energy g is (g - g*)/(g0 - g*): g0 at the current positions (in the paper's reproduction at the inertial
-target), g* of the lowest minimum that is known. Rows hold energies, so a lower minimum mends all gaps at once.
+The gap of an energy g is (g - g*)/(g0 - g*): g0 at the current positions (at the inertial target in the reproduction of
+Liu et al. 2013), g* at the lowest known minimum. Rows contain energies, so a lower minimum corrects all gaps.
 """
 
 from __future__ import annotations
@@ -20,10 +20,17 @@ Values = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A frozen step. g0, minima (ascending), magnitude [J]; mean_rest_length [m]; time_step [s].
+    """A step snapshot.
 
-    names: of the minima, stable while their order may change; doubt: why `best` is no certified minimum, empty where
-    it is; paper: whether it belongs to the reproduction of the paper.
+    Attributes:
+        time_step: [s].
+        mean_rest_length: [m].
+        objective_magnitude: magnitude of the objective's terms [J].
+        objective_initial: g0 [J].
+        minima: objective values of the known minima, ascending [J].
+        minimum_ids: stable names of the minima, whose order may change.
+        uncertified_reason: why the lowest minimum is not certified; empty if it is.
+        is_liu2013: whether it belongs to the reproduction of Liu et al. 2013.
     """
 
     digest: str
@@ -45,7 +52,7 @@ class Problem:
 
     @property
     def best(self) -> float:
-        """g* [J]; nan where nothing is known."""
+        """g* [J]; nan if no minimum is known."""
         return self.minima[0] if self.minima else np.nan
 
     @property
@@ -55,33 +62,40 @@ class Problem:
 
     @property
     def name(self) -> str:
-        """Mesh and moment; problems that differ in nothing else have the same."""
+        """Mesh, snapshot and, if not implicit Euler, the integrator; problems that differ otherwise share the label."""
         frame = "" if self.moment.startswith("frame") else f" (frame {self.frame})"
         euler = "" if self.integrator == "implicit-euler" else f", {self.integrator}"
         return f"{self.mesh}, {self.moment}{frame}{euler}"
 
     @property
     def round_off(self) -> float:
-        """The gap below which energies are round-off; infinite where the step starts at its minimum."""
+        """The gap below which energies are round-off; infinite if the step starts at its minimum."""
         scale = self.g0 - self.best
         return float(np.finfo(np.float64).eps) * self.magnitude / scale if scale > 0 else np.inf
 
     def gap(self, g: Values) -> Values:
-        """The gaps of energies [J]."""
+        """Compute the gaps of energies [J]."""
         return (g - self.best) / (self.g0 - self.best)
 
     def branch(self, name: str | None) -> int | None:
-        """The number of the minimum of this name, 0 for the lowest; None for none."""
+        """Return the index of the minimum with this name, 0 for the lowest; None if unknown."""
         return self.names.index(name) if name in self.names else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """One solver's way to the minimum of one problem; family, reference: what it states of itself.
+    """The convergence of one solver to the minimum of one problem.
 
-    iterations, gap, largest [mean rest lengths], stationarity (k,); seconds (rounds, k), nan where not timed;
-    warm, cold: seconds to prepare, nan where not known; branch: the minimum that was reached;
-    status and reason: of the rows; recording: relative to the results' folder, or ""; code: by which it was measured.
+    Attributes:
+        family, citation: metadata of the solver.
+        iterations, gap, stationarity: values (k,) of the recorded iterates.
+        max_vertex_error: (k,) [mean rest lengths].
+        seconds: (rounds, k) [s]; nan if not timed.
+        warm_seconds, cold_seconds: preparation time [s]; nan if unknown.
+        minimum_index: minimum that was reached.
+        status, reason: values of the rows.
+        recording_path: relative to the folder of the results, or "".
+        source_fingerprint: code that the curve was measured by.
     """
 
     problem: Problem
@@ -108,10 +122,13 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class WorkPoint:
-    """One simulation of a horizon [s]: its relative error, and wall seconds a simulated second (nan if it failed).
+    """One simulation up to `t_end` [s]: its relative error, and wall seconds per simulated second (nan if it failed).
 
-    family, reference, minimises, own_steps: what the solver states of itself; code: by which it was measured; cpu: CPU
-    seconds a simulated second of the best round; stiffness: k/m [1/s^2] of the median spring and the mean free vertex.
+    Attributes:
+        family, citation, is_minimiser, is_substepping: metadata of the solver.
+        cpu_seconds_per_simulated_second: CPU time of the best round.
+        stiffness: k/m [1/s^2] of the median spring and the mean free vertex.
+        source_fingerprint: code that the simulation was measured by.
     """
 
     scene: str
@@ -147,14 +164,14 @@ class WorkPoint:
 
     @property
     def setting(self) -> str:
-        """What was chosen, in words."""
+        """The solver, the integrator, the time step and the stop rule in words."""
         stop = stop_words(self.tolerance, self.iterations)
         steps = "" if self.own_steps else f"{self.integrator}, "
         return f"{self.label}, {steps}dt {step_words(self.time_step)}, {stop}"
 
 
 def stop_words(tolerance: float | None, iterations: int) -> str:
-    """What ends a step's iterations."""
+    """Format the stop rule of a step's iterations."""
     if tolerance is None:
         return f"{iterations} iterations"
     return f"tolerance {tolerance:g}" if tolerance else "tolerance auto"
@@ -162,8 +179,12 @@ def stop_words(tolerance: float | None, iterations: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """All that the rows say, in their order; machine: processor, threads and commit, in words; newest: the
-    code of the rows that were measured last."""
+    """All data of the rows, in their order.
+
+    Attributes:
+        machine_words: processor, threads and commit in words.
+        newest_fingerprint: source fingerprint of the latest rows.
+    """
 
     problems: tuple[Problem, ...]
     curves: tuple[Curve, ...]
@@ -173,30 +194,36 @@ class Measurements:
 
 
 def older(one: Curve | WorkPoint) -> bool:
-    """Whether other code than today's measured it; of rows that do not say by which code nobody can tell."""
+    """Return whether other code than the current version measured it; rows without a fingerprint count as current."""
     return one.code not in ("", machine.code_hash())
 
 
 def by_other_code(measured: Iterable[Curve | WorkPoint], newest: str | None = None) -> list[str]:
-    """A sentence about those that other code than today's measured, or than `newest`, if there are any: for what has no
-    marks of its own for them."""
+    """Describe which results were measured by other code than the current version, in at most one sentence.
+
+    For charts that have no marks of their own for stale results.
+
+    Args:
+        measured: curves or simulations.
+        newest_fingerprint: source fingerprint to compare with; None for the current version.
+    """
     names = sorted({one.label for one in measured if (older(one) if newest is None else one.code != newest)})
     than = "today's" if newest is None else "that of the newest rows"
     return [f"Measured by other code than {than}, in whole or in part: {', '.join(names)}."] if names else []
 
 
 def by_self_converged(works: Iterable[WorkPoint]) -> list[str]:
-    """A sentence about the meshes whose errors are told by a self-converged motion, if there are any."""
+    """Describe which meshes have errors relative to a self-converged motion, in at most one sentence."""
     names = sorted({work.mesh for work in works if work.truth == "self-converged"})
     return [f"Errors by a self-converged reference, for there is contact: {', '.join(names)}."] if names else []
 
 
 LONG = 500
-"""Iterations from which on a curve of the paper's reproduction is worth a picture of its own: Figure 2 has 1000."""
+"""Iterations from which on a curve of the reproduction gets a picture of its own: Figure 2 of the paper has 1000."""
 
 
 def without_short(table: Measurements) -> Measurements:
-    """The table less the many short curves from which the paper's Figure 3 takes means."""
+    """Return the data without the many short curves, from which only means for the paper's Figure 3 are taken."""
     long = {c.problem.digest for c in table.curves if not c.problem.paper or c.iterations.max(initial=0.0) >= LONG}
     problems = tuple(p for p in table.problems if p.digest in long)
     return replace(table, problems=problems, curves=tuple(c for c in table.curves if c.problem.digest in long))

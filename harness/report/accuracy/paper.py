@@ -1,10 +1,10 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Our curves over figures 2 and 3 of Liu et al. 2013, and by how much they differ.
+"""Reproduction of figures 2 and 3 of Liu et al. 2013: own curves over the paper's, and their differences.
 
 The paper's values are read from its figures and text: the relative error (g - g*)/(g0 - g*), g0 at the inertial target,
 of the curtain (1 m x 1 m, 1 kg, dt = 1/30 s). Figure 2 is one step of the 81 x 81 curtain on one core of 2012; figure 3
-has means over 50 frames. Pins, damping and frames are not stated there.
+has means over 50 frames. The paper does not state pins, damping and frames.
 """
 
 from __future__ import annotations
@@ -52,17 +52,17 @@ FIGURE_3 = {
     (21, 1200): (0.237, 0.100, 0.035, 0.0156),
     (21, 2400): (0.26, 0.132, 0.062, 0.035),
 }
-"""Vertices a side and stiffness [N/m]: mean relative error after each of ITERATIONS of local-global."""
+"""Vertices per side and stiffness [N/m]: mean relative error after each of LIU2013_ITERATIONS of local-global."""
 
 FAR = 2.0
-"""A ratio to the paper beyond which a sentence says so."""
+"""Ratio to the paper's error beyond which a sentence reports the difference."""
 
 _COLORS = ("#0b3c5d", "#2f7fb8", "#3fae8f", "#c9a227", "#d9822b", "#c0392b", "#7b2d8b")
 _HEADINGS = ("Figure 2, by iterations", "Figure 2, by time", "Figure 3, by size", "Figure 3, 21 × 21 by stiffness")
 
 
 class PaperComparison(NamedTuple):
-    """Ours against the paper's: which curve, after how many iterations, both errors, over how many frames."""
+    """One point of a curve: iterations, own error, the paper's error, and the number of frames averaged over."""
 
     curve: str
     iterations: int
@@ -72,12 +72,12 @@ class PaperComparison(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """Ours over theirs."""
+        """The own error divided by the paper's."""
         return self.ours / self.theirs
 
     @property
     def sentence(self) -> str:
-        """What differs."""
+        """The comparison in words."""
         when = f"after {self.iterations} iteration{'s' if self.iterations > 1 else ''}"
         over = f"over {self.frames} frame{'s' if self.frames > 1 else ''}"
         values = f"ours {self.ours:.2g} {over}, the paper's {self.theirs:.2g}, ratio {self.ratio:.2g}"
@@ -85,12 +85,12 @@ class PaperComparison(NamedTuple):
 
 
 def stiffness(problem: Problem) -> float:
-    """The springs' stiffness [N/m] of the paper's curtain, whose vertices share 1 kg."""
+    """Return the springs' stiffness [N/m] of the paper's curtain, whose vertices share 1 kg."""
     return problem.stiffness_ratio / (problem.vertices * problem.time_step**2)
 
 
 def comparisons(table: Measurements) -> list[PaperComparison]:
-    """All points of the paper that our rows have a counterpart of."""
+    """Return all points of the paper that the rows have a counterpart of."""
     found: list[PaperComparison] = []
     for curve in _long(table)[:1]:
         for iterations, (theirs, _) in FIGURE_2.items():
@@ -109,7 +109,10 @@ def comparisons(table: Measurements) -> list[PaperComparison]:
 
 
 def at(curve: Curve, iterations: int) -> float:
-    """The gap after so many iterations, at least round-off; a curve that converged before keeps what it ended with."""
+    """Return the gap after n iterations, at least round-off; a curve that converged before keeps its last gap.
+
+    Returns: the gap; nan if it is unknown or the minimum is not certified.
+    """
     if curve.problem.doubt or not len(curve.iterations) or curve.status in ("failed", "diverged", "unsupported"):
         return np.nan
     k = int(np.searchsorted(curve.iterations, iterations, side="right")) - 1
@@ -119,7 +122,7 @@ def at(curve: Curve, iterations: int) -> float:
 
 
 def own(table: Measurements) -> Iterator[Curve]:
-    """The paper's local-global by our fastest backend that was measured, from the paper's first guess."""
+    """Select the paper's local-global by the fastest measured backend, from the paper's initial guess."""
     paper = [c for c in table.curves if c.problem.paper and c.first_guess == "inertial"]
     theirs = [c for c in paper if c.family == LOCAL_GLOBAL]
     solver = min(theirs, key=_iteration_seconds).solver if theirs else None
@@ -127,7 +130,7 @@ def own(table: Measurements) -> Iterator[Curve]:
 
 
 def _iteration_seconds(curve: Curve) -> float:
-    """Of one iteration a vertex, as sizes differ; infinite where nothing was timed."""
+    """Return the time of one iteration per vertex [s], as sizes differ; infinite if nothing was timed."""
     done = curve.iterations.max(initial=0.0) * curve.problem.vertices
     seconds = float(np.median(curve.seconds[:, -1])) if len(curve.iterations) else np.nan
     return seconds / done if done and np.isfinite(seconds) else np.inf
@@ -138,12 +141,15 @@ def _long(table: Measurements) -> list[Curve]:
 
 
 def _frames(table: Measurements, side: int, k: float) -> list[Curve]:
-    """The curves of one curtain; a tenth leaves room for how pins are counted, and tells all stiffnesses apart."""
+    """Select the curves of one curtain, with a stiffness tolerance of 10 %.
+
+    The tolerance allows for different ways to count pins, and still separates all stiffnesses.
+    """
     return [c for c in own(table) if c.problem.vertices == side**2 and abs(stiffness(c.problem) / k - 1) < 0.1]
 
 
 def draw_paper(table: Measurements, stem: Path) -> list[Path]:
-    """Four panels of ours over the paper's; nothing where no row belongs to the reproduction. Returns the files."""
+    """Draw four panels of own results over the paper's, and return the files; none without rows of the reproduction."""
     found = comparisons(table)
     if not found:
         return []
@@ -204,7 +210,7 @@ def _figure_2(
 
 
 def _figure_3(ax: Axes, compared: Sequence[PaperComparison], keys: Sequence[tuple[int, int]]) -> None:
-    """Ours and theirs in one colour for each curtain, with the ratios below."""
+    """Draw own and published errors in one colour per curtain, with the ratios below."""
     for row, (side, k) in enumerate(keys):
         color = _COLORS[list(FIGURE_3).index((side, k))]
         theirs = FIGURE_3[side, k]
@@ -219,12 +225,12 @@ def _figure_3(ax: Axes, compared: Sequence[PaperComparison], keys: Sequence[tupl
 
 
 def _below(ax: Axes, row: int, words: str, color: str) -> None:
-    """A line of words below a panel."""
+    """Draw a line of text below a panel."""
     ax.text(0.0, -(62 + 17 * row) / ax.bbox.height, words, color=color, fontsize=8.5, transform=ax.transAxes)
 
 
 def _scales(axes: Sequence[Axes]) -> None:
-    """One scale of errors for all; iterations, or time."""
+    """Set one error scale for all panels; the x-axis is iterations, or time."""
     drawn = [line for ax in axes for line in ax.lines]
     errors = limits((value for line in drawn for value in np.asarray(line.get_ydata(), float)), least=1e-12)
     for k, ax in enumerate(axes):

@@ -1,4 +1,4 @@
-"""A picture of the mesh of each frozen step, the last iterate of a solve that was recorded."""
+"""Pictures of the mesh of each step snapshot: the last iterate of a recorded solve."""
 
 from __future__ import annotations
 
@@ -9,9 +9,13 @@ from harness.report.accuracy.measured import Curve, Measurements, Problem
 
 
 def draw_meshes(table: Measurements, results: Path, folder: Path) -> dict[str, Path]:
-    """The pictures that could be drawn, by the digest of their problem; of the solve that came nearest the minimum.
+    """Draw the mesh of each problem, from the recorded solve that came closest to the minimum.
 
-    Where the system cannot draw, or nothing was recorded, there are none.
+    Args:
+        table: data of an accuracy measurement.
+        results: folder of the results.
+        folder: folder that the pictures are written to.
+    Returns: the pictures by the digest of their problem; empty if the system cannot draw or nothing was recorded.
     """
     if opengl.problem() is not None:
         return {}
@@ -29,11 +33,17 @@ def draw_meshes(table: Measurements, results: Path, folder: Path) -> dict[str, P
 
 
 def place(problem: Problem, folder: Path) -> Path:
-    """Where the picture of a problem's mesh lies."""
+    """Return the path of the picture of a problem's mesh."""
     return folder / f"{problem.scene}-{problem.size}-{problem.moment}-{problem.digest}.png"
 
 
 def nearest(table: Measurements, problem: Problem, results: Path) -> Curve | None:
-    """Of the solves of a problem whose recordings are there, the one that came nearest the lowest minimum."""
+    """Find the recorded solve of a problem that came closest to the lowest minimum, or None.
+
+    Args:
+        table: data of an accuracy measurement.
+        problem: step snapshot.
+        results: folder of the results, which contains the recordings.
+    """
     recorded = [c for c in table.curves if c.problem is problem and c.recording and (results / c.recording).is_file()]
     return min(recorded, key=lambda curve: (curve.status != "ok", curve.gap[-1]), default=None)

@@ -1,14 +1,15 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Performance profiles (Dolan and More 2002) and data profiles (More and Wild 2009) over all frozen steps.
+"""Performance profiles (Dolan and More 2002) and data profiles (More and Wild 2009) over all step snapshots.
 
-A step from one first guess is a problem of its own. With t the time of a solver on a problem,
+A step with one initial guess is one problem. With t the time of a solver on a problem,
 
-    performance profile  rho(tau)  = share of the problems with t <= tau * (the least t of all solvers)
-    data profile         d(kappa)  = share of the problems with t <= kappa * (one iteration of the yardstick)
+    performance profile  rho(tau)  = share of the problems with t <= tau * (the smallest t of all solvers)
+    data profile         d(kappa)  = share of the problems with t <= kappa * (one iteration of the baseline)
 
-the yardstick being the plain local-global iteration. What is not reached, or failed, counts as infinite time. Only
-solvers that were tried on as many problems as any are compared: the others' shares would tell what was tried.
+where the baseline is the plain local-global iteration. An accuracy that is not reached, or a failure, counts as
+infinite time. Only solvers that were measured on the maximum number of problems are compared, because the shares of the
+others would depend on the selection of problems.
 """
 
 from __future__ import annotations
@@ -42,13 +43,25 @@ from solvers.about import LOCAL_GLOBAL
 
 
 def least_ratios(table: Measurements, target: float) -> dict[str, Values]:
-    """By label the times to the target over the least of all solvers, (problems,); infinite where not reached."""
+    """Return times to the target divided by the smallest of all solvers, by label.
+
+    Args:
+        table: data of an accuracy measurement.
+        target: energy gap.
+    Returns: ratios (problems,); infinite where the gap is not reached.
+    """
     found = judged(table, target)
     return _ratios(table, found, target, [min(seconds_to(curve, target) for curve in race) for race in found])
 
 
 def iteration_ratios(table: Measurements, target: float) -> dict[str, Values]:
-    """By label the times to the target over that of one iteration of the yardstick, where that was tried."""
+    """Return times to the target divided by that of one baseline iteration, by label.
+
+    Args:
+        table: data of an accuracy measurement.
+        target: energy gap.
+    Returns: ratios (problems,), for the problems where the baseline was measured.
+    """
     units = [(race, iteration_seconds(race, yardstick(table))) for race in judged(table, target)]
     known = [(race, unit) for race, unit in units if np.isfinite(unit)]
     return _ratios(table, [race for race, _ in known], target, [unit for _, unit in known])
@@ -67,37 +80,39 @@ def _ratios(
 
 
 def partly_tried(table: Measurements) -> dict[str, int]:
-    """By label on how many problems the solvers were tried that were tried on fewer than others."""
+    """Return the number of measured problems by label, for solvers measured on fewer problems than others."""
     tried = Counter(label for race in races(table).values() for label in {curve.label for curve in race})
     return {label: count for label, count in sorted(tried.items()) if count < max(tried.values())}
 
 
 def yardstick(table: Measurements) -> str:
-    """The backend of the plain local-global iteration that data profiles count in: of those that ran on most problems
-    the last by alphabet; "" where none was measured."""
+    """Return the backend of the plain local-global iteration that data profiles use as the unit.
+
+    Of the backends measured on most problems it is the last in alphabetical order; "" if none was measured.
+    """
     tried = Counter(curve.solver for curve in table.curves if curve.family == LOCAL_GLOBAL)
     return max(tried, key=lambda name: (tried[name], name), default="")
 
 
 def not_shown(table: Measurements) -> list[str]:
-    """A sentence about the solvers that profiles leave out, if there are any."""
+    """Describe the solvers that profiles omit, in at most one sentence."""
     count = len(races(table))
     names = ", ".join(f"{label} (on {tried} of {count})" for label, tried in partly_tried(table).items())
     return [f"Not shown, as not tried on every problem: {names}."] if names else []
 
 
 def share(values: Values, at: Values) -> Values:
-    """The share of `values` (k,) that is at most each of `at` (m,); shape (m,)."""
+    """Return the share of `values` (k,) that is at most each of `at` (m,); shape (m,)."""
     return np.searchsorted(np.sort(values), at, side="right") / len(values)
 
 
 def judged(table: Measurements, target: float) -> list[list[Curve]]:
-    """The races that this accuracy can be judged on: some solver reaches it, none of them at once."""
+    """Return the races for which this accuracy is meaningful: some solver reaches it, but no initial guess does."""
     return [r for r in races(table).values() if askable(r[0].problem, target) and contested(r, target)]
 
 
 def iteration_seconds(race: Iterable[Curve], solver: str) -> float:
-    """Median seconds of one iteration of a solver in a race; nan where it did not take part."""
+    """Return the median time of one iteration of a solver in a race [s]; nan if it did not take part."""
     for curve in race:
         if curve.solver == solver and len(curve.iterations) > 1 and np.isfinite(curve.seconds).all():
             spans = curve.seconds[:, -1] - curve.seconds[:, 0]
@@ -112,7 +127,7 @@ _KINDS = (
 
 
 def draw_profiles(table: Measurements, stem: Path) -> list[Path]:
-    """A row of performance profiles and a row of data profiles, a column for each accuracy; returns the files."""
+    """Draw a row of performance profiles and a row of data profiles, one column per accuracy; return the files."""
     if not any(judged(table, target) for target in TARGETS):
         return []
     missed = partly_tried(table)
@@ -139,7 +154,7 @@ def draw_profiles(table: Measurements, stem: Path) -> list[Path]:
 
 
 def _steps(ax: Axes, found: Mapping[str, Values], marked: Mapping[str, Mark]) -> None:
-    """The profiles of all solvers as steps."""
+    """Draw the profiles of all solvers as steps."""
     finite = np.concatenate([values[np.isfinite(values)] for values in found.values()])
     low, high = finite.min(initial=1.0), 2.0 * finite.max(initial=5.0)
     for label, values in found.items():

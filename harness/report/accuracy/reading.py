@@ -1,4 +1,4 @@
-"""Reads the rows of an accuracy measurement into `harness.report.accuracy.measured`."""
+"""Reader of the rows of an accuracy measurement, as objects of `harness.report.accuracy.accuracy_data`."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from harness.report.accuracy.measured import Curve, Measurements, Problem, Value
 from harness.report.origin import commits, processors
 
 ROUND_OFF = 100 * float(np.finfo(np.float64).eps)
-"""An energy this share of its terms' magnitude below g* is a lower minimum and not round-off: sums of up to 1e5
-terms err by some tens of eps."""
+"""Energy difference, relative to the terms' magnitude, beyond which a value below g* is a lower minimum.
+
+Smaller differences are round-off: sums of up to 1e5 terms have errors of some tens of eps.
+"""
 
 PAPER = "liu2013"
-"""The config that reproduces the paper; there g0 is taken at the inertial target."""
+"""The config that reproduces Liu et al. 2013; its g0 is taken at the inertial target."""
 
 _Row = dict[str, Any]
 _Label = Callable[[_Row], str]
@@ -31,13 +33,20 @@ _Label = Callable[[_Row], str]
 def read(
     folder: Path, files: Iterable[Path] | None = None, left_out: Callable[[Mistake], None] | None = None
 ) -> Measurements:
-    """The rows in these files, all under `folder`/accuracy if left out; left_out: see `harness.base.rows.read`. Raises
-    InputError where there are none."""
+    """Read the rows of an accuracy measurement.
+
+    Args:
+        folder: folder of the results.
+        files: files of rows; None for all under `folder`/accuracy.
+        on_invalid: called for each invalid unit, see `harness.results.parquet_rows.read_rows`.
+    Raises:
+        InputError: if there are no rows.
+    """
     units = shelf.units(folder / "accuracy") if files is None else sorted(files)
     if not units:
         raise InputError(Mistake("holds no accuracy rows; run `springbench accuracy CONFIG` first", folder))
     kinds: dict[str, list[_Row]] = defaultdict(list)
-    # In rows made before there were any.
+    # Columns that older rows do not have.
     missing = dict.fromkeys(("family", "reference", "minimises", "own_steps", "code", "started", "commit"))
     table = read_rows(units, pa.schema([]), needed=("kind",), promote="permissive", left_out=left_out)
     for row in table.to_pylist():
@@ -56,7 +65,7 @@ def read(
 
 
 def _problems(kinds: dict[str, list[_Row]]) -> dict[str, Problem]:
-    """By digest; a solver that went below all certified minima shows that they are not the lowest."""
+    """Build the snapshots by digest; an energy below all certified minima shows that they are not the lowest."""
     lowest: dict[str, float] = {}
     for row in kinds["curve"]:
         if row["g"] is not None and row["g"] < lowest.get(row["problem"], np.inf):
@@ -175,7 +184,7 @@ def _work(row: _Row, label: _Label) -> WorkPoint:
 
 
 def _labels(rows: Sequence[_Row]) -> _Label:
-    """Gives a row's solver, and those of its parameters and threads in which the solver's rows differ."""
+    """Return a function that labels a row: its solver, with the parameters and threads in which its rows differ."""
     values: dict[tuple[str, str], set[str]] = defaultdict(set)
 
     def settings(row: _Row) -> _Row:

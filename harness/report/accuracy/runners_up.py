@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""What a recommendation was chosen from: all ways that were measured, the error that was asked for, the runners-up."""
+"""Plot of a recommendation: all measured candidates, the requested error, and the runners-up."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from harness.report.page import quantity
 from harness.report.style import INK, MUTED, RULE, marks
 
 SHOWN = 4
-"""Runners-up that are told in words."""
+"""Number of runners-up that are described in words."""
 
 
 class RunnerUp(NamedTuple):
-    """A way: its solver's name, its relative error, its wall seconds a simulated second, and all of it in words."""
+    """A candidate: solver, relative error, wall seconds per simulated second, and its description."""
 
     solver: str
     error: float
@@ -29,8 +29,17 @@ class RunnerUp(NamedTuple):
 
 
 def draw_ways(stem: Path, title: str, facts: Sequence[str], points: Sequence[RunnerUp], asked: float) -> list[Path]:
-    """The picture of ways, the cheapest first, and the files it left. The first that keeps to the error `asked` is
-    the recommended one."""
+    """Draw the candidates of a recommendation, and return the files.
+
+    The recommended candidate is the first one within the requested error.
+
+    Args:
+        stem: path of the files without suffix.
+        title: title of the picture.
+        facts: phrases below the title.
+        points: candidates, the cheapest first.
+        error_requested: relative error.
+    """
     within = [point for point in points if point.error <= asked]
     words = [f"recommended: {_told(within[0])}"] if within else []
     words += [f"{k}. runner-up: {_told(point, within[0])}" for k, point in enumerate(within[1 : SHOWN + 1], 1)]

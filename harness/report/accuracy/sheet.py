@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""What the pictures of accuracy share: a page with one legend at its right, logarithmic axes, notes at its foot."""
+"""Shared layout of accuracy plots: a page with one legend at the right, logarithmic axes, and notes at the foot."""
 
 from __future__ import annotations
 
@@ -26,19 +26,25 @@ from harness.report.page import axes, header, new_page, quantity, save, shorten,
 from harness.report.style import HEIGHT, INK, MUTED, PAGE, RC, WIDTH, Mark
 
 LEFT, TOP, RIGHT, BOTTOM = 40, 118, 1384, HEIGHT - 34
-"""Where panels may be, in pixels; right of it stands the legend."""
+"""Area of the panels [pixels]; the legend is to the right of it."""
 
 _LINE, _NOTES, _LETTERS, _WIDE = 17, 5, 21, 220
 
 _END = 0.04
-"""Of an axis: a label so near to its end would stand out."""
+"""Share of an axis: a label closer to its end than this would extend beyond it."""
 
 
 @contextmanager
 def sheet(stem: Path, title: str, facts: Sequence[str]) -> Generator[Figure]:
-    """A page that is saved as `stem`.png and `stem`.svg once it is drawn."""
+    """Yield a page that is saved as `stem`.png and `stem`.svg after drawing.
+
+    Args:
+        stem: path of the files without suffix.
+        title: title of the page.
+        facts: phrases below the title.
+    """
     stem.parent.mkdir(parents=True, exist_ok=True)
-    # The salt makes the same picture the same file.
+    # The salt makes SVG ids, and thus files of equal pictures, reproducible.
     with matplotlib.rc_context({**RC, "svg.hashsalt": stem.name}):
         page = new_page()
         header(page, title, facts, letters=84)
@@ -49,15 +55,24 @@ def sheet(stem: Path, title: str, facts: Sequence[str]) -> Generator[Figure]:
 
 
 def files(stem: Path) -> list[Path]:
-    """The files that `sheet` leaves."""
+    """Return the paths of the files that `plot_sheet` writes."""
     return [stem.with_suffix(".png"), stem.with_suffix(".svg")]
 
 
 def line(
     ax: Axes, x: ArrayLike, y: ArrayLike, look: Mark, *, spaced: bool = True, older: ArrayLike = False, **more: Any
 ) -> None:
-    """A solver's line; `spaced` markers keep a distance, as iterates lie dense. older: whether other code measured it,
-    or which of its points (k,), whose marks are hollow."""
+    """Draw a solver's line.
+
+    Args:
+        ax: axes.
+        x, y: points (k,).
+        style: style of the line and its markers.
+        spaced_markers: whether markers keep a distance, for dense iterates.
+        stale: whether other code than the current version measured it, in total or per point (k,); such markers are
+            hollow.
+        **more: further keywords of `Axes.plot`.
+    """
     hollow = np.broadcast_to(np.asarray(older, bool), np.shape(x))
     every: dict[str, Any] = {"markevery": 0.12} if spaced and np.size(x) > 3 else {}
     more = {"linewidth": 1.5, "markersize": 5 * size(look)} | mark(look, hollow=bool(hollow.all())) | every | more
@@ -68,17 +83,17 @@ def line(
 
 
 def mark(look: Mark, *, hollow: bool) -> dict[str, Any]:
-    """How a marker is filled, and its edge; hollow: of what other code measured."""
+    """Return the fill and edge of a marker, hollow if other code than the current version measured it."""
     return {"mfc": PAGE, "mec": look.color, "mew": 1.3} if hollow else {"mfc": look.color, "mec": PAGE, "mew": 0.5}
 
 
 def size(look: Mark) -> float:
-    """By how much a marker is enlarged so that all look equally large."""
+    """Return the factor that makes all markers appear equally large."""
     return {"*": 1.8, "P": 1.35, "X": 1.35, "p": 1.2, "h": 1.15, "d": 1.2}.get(look.marker, 1.0)
 
 
 def legend(page: Figure, entries: Mapping[str, Mark], *, below: Sequence[tuple[Line2D | Patch, str]] = ()) -> None:
-    """The solvers at the page's right, then other marks and their meanings."""
+    """Draw the legend at the right of the page: solvers first, then other marks and their meanings."""
     handles: list[Line2D | Patch] = [
         Line2D(
             [],
@@ -104,7 +119,7 @@ def legend(page: Figure, entries: Mapping[str, Mark], *, below: Sequence[tuple[L
 
 
 def notes(page: Figure, words: Sequence[str]) -> None:
-    """What failed or is doubtful, in words at the foot: as many lines as fit, and how many more there are."""
+    """Draw notes on failures and doubts at the foot: as many lines as fit, and the number of further ones."""
     shown = _lines(words)
     for k, sentence in enumerate(shown):
         y = HEIGHT - 16 - _LINE * (len(shown) - 1 - k)
@@ -112,12 +127,12 @@ def notes(page: Figure, words: Sequence[str]) -> None:
 
 
 def foot(words: Sequence[str]) -> float:
-    """The height [pixels] above which panels and their axes' labels must stay for these notes."""
+    """Return the y position [pixels] that panels and their axis labels must stay above for these notes."""
     return BOTTOM - _LINE * len(_lines(words))
 
 
 def _lines(words: Sequence[str]) -> list[str]:
-    """The sentences in lines of the page's width, the first of them in two where there is room."""
+    """Wrap the notes to the page's width, each into two lines if there is space for all."""
     lines = [line for sentence in words for line in wrap(sentence, _WIDE, max_lines=2, placeholder=" …")]
     if len(lines) > _NOTES:
         lines = [shorten(sentence, _WIDE) for sentence in words]
@@ -125,7 +140,7 @@ def _lines(words: Sequence[str]) -> list[str]:
 
 
 def panel(page: Figure, left: float, top: float, width: float, height: float, title: str = "") -> Axes:
-    """Axes with a heading."""
+    """Add axes with a heading."""
     ax = axes(page, left, top, width, height)
     if title:
         text(page, left, top - 8, title, size=10, color=INK)
@@ -136,7 +151,13 @@ def panel(page: Figure, left: float, top: float, width: float, height: float, ti
 
 
 def log_axis(axis: Axis, low: float, high: float, *, unit: str = "power") -> None:
-    """A logarithmic axis from low to high; unit: power (of ten), time, plain or percent."""
+    """Format a logarithmic axis.
+
+    Args:
+        axis: axis to format.
+        low, high: limits.
+        unit: format of the tick labels: power (of ten), time, plain or percent.
+    """
     if axis is axis.axes.xaxis:
         axis.axes.set_xscale("log")
         axis.axes.set_xlim(low, high)
@@ -154,14 +175,14 @@ def log_axis(axis: Axis, low: float, high: float, *, unit: str = "power") -> Non
 
 
 def _inward(ax: Axes) -> None:
-    """Let the labels at the ends of the x axis end there, so that those of two panels side by side do not touch."""
+    """Align the labels at the ends of the x-axis inwards, so that those of neighbouring panels do not overlap."""
     for tick, at in zip(ax.xaxis.get_major_ticks(), ax.xaxis.get_majorticklocs(), strict=False):
         x = ax.transAxes.inverted().transform(ax.transData.transform((at, ax.get_ylim()[1])))[0]
         tick.label1.set_horizontalalignment("left" if x < _END else "right" if x > 1 - _END else "center")
 
 
 def iteration_axis(ax: Axes, last: float) -> None:
-    """Iterations by logarithms, with a place for the first guess, iteration 0."""
+    """Format a logarithmic axis of iterations that includes the initial guess, iteration 0."""
     ax.set_xscale("symlog", linthresh=1.0, linscale=0.35)
     ax.set_xlim(-0.08, 1.15 * max(last, 10.0))
     decades = [10.0**k for k in range(6) if 10.0**k <= max(last, 10.0)]
@@ -172,7 +193,13 @@ def iteration_axis(ax: Axes, last: float) -> None:
 
 
 def limits(values: Iterable[float], *, least: float = 0.0, margin: float = 1.3) -> tuple[float, float]:
-    """Limits of a logarithmic axis: around all positive and finite values, none of them below `least`."""
+    """Return limits of a logarithmic axis around all positive finite values, at least `lower_bound`.
+
+    Args:
+        values: values to include.
+        lower_bound: minimum of the smallest value.
+        margin: factor between the extreme values and the limits.
+    """
     array = np.array([value for value in values if np.isfinite(value) and value > 0.0])
     if not len(array):
         return 0.1, 10.0

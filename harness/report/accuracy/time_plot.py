@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Seconds to each accuracy for every solver on a mesh: the step alone, and with set-up spread over many steps."""
+"""Time to each accuracy for every solver on a mesh: of the step only, and with set-up amortised over many steps."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _COLUMNS = {None: "the step alone", **{n: f"set-up over {count(n)} step{'s' if n
 
 
 def draw_times(table: Measurements, folder: Path) -> list[Path]:
-    """A picture for each mesh; of problems whose minimum is certified alone. Returns the files."""
+    """Draw a picture for each mesh, only of problems with a certified minimum; return the files."""
     drawn: list[Path] = []
     marked = looks((curve.label, curve.solver) for curve in table.curves)
     for mesh in dict.fromkeys(problem.mesh for problem in table.problems):
@@ -53,20 +53,22 @@ def draw_times(table: Measurements, folder: Path) -> list[Path]:
 
 
 _ALIKE = 2.0
-"""A factor between times below which two panels would look the same."""
+"""Factor between times below which two panels would look alike."""
 
 
 def differing(series: Mapping[str, Mapping[str, Sequence[Curve]]]) -> tuple[dict[int | None, str], str]:
-    """The columns in which some time differs from the one shown before it, and a sentence about the others.
+    """Select the columns in which some time differs from the previously shown one.
 
-    series: curves by first guess, then by label.
+    Args:
+        series: curves by initial guess, then by label.
+    Returns: the columns by number of steps, and a sentence about the others.
     """
     groups = [curves for group in series.values() for curves in group.values()]
 
     def found(steps: int | None) -> NDArray[np.float64]:
         return np.array([middle(curves, target, steps) for curves in groups for target in TARGETS])
 
-    # From many steps to few: set-up adds least where it is spread over most.
+    # From many steps to few: set-up contributes least where it is amortised over most steps.
     kept, last, alike = [None], found(None), list[int]()
     for steps in sorted(STEPS, reverse=True):
         times = found(steps)
@@ -81,9 +83,9 @@ def differing(series: Mapping[str, Mapping[str, Sequence[Curve]]]) -> tuple[dict
 
 
 def middle(curves: Sequence[Curve], target: float, steps: int | None = None) -> float:
-    """The median over a solver's problems that can be judged [s]; infinite where half of them are not solved."""
+    """Return the median time over a solver's solvable problems [s]; infinite if half of them are unsolved."""
     times = [seconds_to(curve, target, steps) for curve in curves if askable(curve.problem, target)]
-    # The upper of the two in the middle: a mean with infinity would hide what was solved or was not.
+    # The upper of the two middle values: a mean with infinity would hide the solved half.
     return sorted(times)[len(times) // 2] if times else np.nan
 
 
@@ -133,7 +135,7 @@ def _draw(
 def _panel(
     ax: Axes, series: dict[str, list[Curve]], marked: dict[str, Mark], steps: int | None, span: tuple[float, float]
 ) -> None:
-    """Times to all accuracies; a cross at the upper edge where a solver reaches the next one no more."""
+    """Draw times to all accuracies, with a cross at the upper edge where a solver fails to reach the next one."""
     ticks = [power(target) for target in TARGETS]
     taken: dict[int, int] = {}
     for label, curves in series.items():
@@ -161,7 +163,7 @@ def _panel(
 
 
 def _words(curves: Sequence[Curve], guesses: Sequence[str]) -> list[str]:
-    """Who overtakes whom on the hardest step, the one of the last moment, from each first guess."""
+    """Describe the crossings on the last snapshot, the hardest step, from each initial guess."""
     words: list[str] = []
     for guess in guesses:
         race = [curve for curve in curves if curve.problem is curves[-1].problem and curve.first_guess == guess]

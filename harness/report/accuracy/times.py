@@ -1,7 +1,7 @@
-"""Seconds to an accuracy: when a curve first reaches a gap, what set-up adds, and where solvers overtake each other.
+"""Time to accuracy: when a curve first reaches a gap, amortised set-up, and crossings between solvers.
 
-Rows keep about 12 iterates a decade. Between two that are kept the gap is taken to fall geometrically, and a solver
-can stop at whole iterations alone: the first at or below the accuracy counts.
+Rows contain about 12 iterates per decade. Between two of them the gap is assumed to decrease geometrically. A solver
+can stop only after whole iterations: the first one at or below the accuracy counts.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from harness.report.accuracy.measured import Curve, Measurements, Problem
 from harness.report.page import quantity
 
 TARGETS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
-"""The gaps at which solvers are compared."""
+"""Energy gaps at which solvers are compared."""
 
 STEPS = (1, 10, 100, 1000)
-"""The numbers of steps over which set-up is spread."""
+"""Numbers of steps over which set-up is amortised."""
 
 FATAL = ("unsupported", "diverged", "failed")
-"""Statuses of curves that reach nothing; the others, such as time-limit, keep what they reached before."""
+"""Statuses of curves that reach nothing; with others, such as time-limit, earlier results count."""
 
 _FINE = tuple(10.0 ** (-k / 2) for k in range(1, 19))  # half decades, in which solvers overtake each other
 
 
 @dataclass(frozen=True, slots=True)
 class Reached:
-    """When a curve came to an accuracy: the iteration; seconds: median and quartiles over the rounds."""
+    """When a curve reached an accuracy: the iteration, and median and quartiles of the time over the rounds [s]."""
 
     iteration: int
     seconds: float
@@ -38,7 +38,13 @@ class Reached:
 
 
 def reach(curve: Curve, target: float) -> Reached | None:
-    """When the gap is first at most `target`; None where it never is, or the run failed, or was not timed."""
+    """Find when the gap is first at most `target`.
+
+    Args:
+        curve: convergence of a solver.
+        target: energy gap.
+    Returns: the iteration and its time; None if the gap is not reached, the run failed or was not timed.
+    """
     at = np.flatnonzero(curve.gap <= target)
     if not len(at) or curve.status in FATAL:
         return None
@@ -46,7 +52,7 @@ def reach(curve: Curve, target: float) -> Reached | None:
     iteration, seconds = curve.iterations[k], curve.seconds[:, k]
     if k > 0 and curve.iterations[k] - curve.iterations[k - 1] > 1:
         before, start = curve.gap[k - 1], curve.iterations[k - 1]
-        # A gap of round-off, even negative, has no logarithm.
+        # A gap of round-off, possibly negative, has no logarithm.
         end = max(curve.gap[k], min(curve.problem.round_off, target))
         share = log(before / target) / log(before / end) if end < before else 1.0
         iteration = ceil(start + share * (iteration - start))
@@ -59,7 +65,13 @@ def reach(curve: Curve, target: float) -> Reached | None:
 
 
 def seconds_to(curve: Curve, target: float, steps: int | None = None) -> float:
-    """Median seconds to the accuracy, infinite where it is not reached; with set-up spread over `steps` if given."""
+    """Return the median time to the accuracy [s], infinite if it is not reached.
+
+    Args:
+        curve: convergence of a solver.
+        target: energy gap.
+        steps: number of steps over which set-up is amortised; None to omit set-up.
+    """
     reached = reach(curve, target)
     if reached is None:
         return inf
@@ -67,12 +79,12 @@ def seconds_to(curve: Curve, target: float, steps: int | None = None) -> float:
 
 
 def askable(problem: Problem, target: float) -> bool:
-    """Whether an accuracy can be judged: the minimum is certified and the accuracy is above round-off."""
+    """Return whether the minimum is certified and the accuracy is above round-off."""
     return not problem.doubt and target > problem.round_off
 
 
 def left_out(problems: Iterable[Problem]) -> list[str]:
-    """A sentence about the steps that comparisons leave out, if there are any."""
+    """Describe the steps that comparisons exclude, in at most one sentence."""
     problems = list(problems)
     doubtful = [problem.name for problem in problems if problem.doubt]
     if not doubtful:
@@ -82,7 +94,7 @@ def left_out(problems: Iterable[Problem]) -> list[str]:
 
 
 def races(table: Measurements) -> dict[tuple[str, str], list[Curve]]:
-    """The curves that race from the same start: by problem and first guess, in the order of the rows."""
+    """Group the curves with the same start, by problem and initial guess, in the order of the rows."""
     found: dict[tuple[str, str], list[Curve]] = {}
     for curve in table.curves:
         found.setdefault((curve.problem.digest, curve.first_guess), []).append(curve)
@@ -90,15 +102,17 @@ def races(table: Measurements) -> dict[tuple[str, str], list[Curve]]:
 
 
 def contested(race: Sequence[Curve], target: float) -> bool:
-    """Whether the accuracy is one that some solver reaches and the first guess does not have already."""
+    """Return whether some solver reaches the accuracy and the initial guess does not have it already."""
     times = [reached for curve in race if (reached := reach(curve, target))]
     return bool(times) and all(reached.iteration > 0 for reached in times)
 
 
 def crossings(race: Iterable[Curve]) -> list[str]:
-    """Who is the fastest to which accuracy, set-up apart: a sentence for the coarsest, and one for each change.
+    """Describe which solver is fastest to which accuracy, without set-up.
 
-    A solver takes the lead where its upper quartile is below the leader's lower one: less may be chance.
+    One sentence describes the coarsest accuracy, and one each change of the fastest solver. A solver takes the lead if
+    its
+    upper quartile is below the leader's lower quartile, because a smaller difference may be chance.
     """
     race = list(race)
     if len(race) < 2:
@@ -123,11 +137,11 @@ def crossings(race: Iterable[Curve]) -> list[str]:
 
 
 def power(value: float) -> str:
-    """A gap in words: 1e-3, 3e-4."""
+    """Format a gap: 1e-3, 3e-4."""
     return f"{value:.0e}".replace("e-0", "e-").replace("e+00", "")
 
 
 def duration(seconds: float) -> str:
-    """A time in words with three significant digits: 41.2 ms, 1.3 s."""
+    """Format a time with three significant digits: 41.2 ms, 1.3 s."""
     unit, scale = next(((u, s) for u, s in (("s", 1.0), ("ms", 1e-3)) if seconds >= 0.9995 * s), ("µs", 1e-6))
     return f"{quantity(seconds / scale)} {unit}"

@@ -1,9 +1,9 @@
-"""Which family of methods keeps to an error for the least processor time, by the stiffness number of a mesh.
+"""Cheapest family of methods for an error in processor time, by the stiffness number of a mesh.
 
-    stiffness number = k dt^2/m,    dt = 1/30 s, a frame;    k the median spring's stiffness, m the mean free vertex's
+    stiffness number = k dt^2/m,    dt = 1/30 s, a frame;    k of the median spring, m of the mean free vertex
 
-A method's price of an error is the least of its simulations that end within it, whatever their steps and tolerances.
-Families are the solvers' own; those that minimise an integrator's step are told apart by its order.
+The cost of a method for an error is the minimum over its simulations within that error, whatever their time steps and
+tolerances. Families are those of the solvers; methods that minimise an integrator's step are grouped by its order.
 """
 
 from __future__ import annotations
@@ -19,15 +19,18 @@ from solvers.integrators import INTEGRATORS
 FRAME = 1.0 / 30.0
 """Seconds."""
 ERRORS = tuple(10.0**-k for k in range(1, 9))
-"""Relative errors of the positions at the horizon."""
+"""Relative errors of the positions at the end time."""
 NOBODY = "none that was tried"
 CLOSE = 1.25
-"""Times as much: prices that are nearer than this are called alike."""
+"""Cost ratio below which two families count as equal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One error on one mesh. prices: processor seconds a simulated second by family, of those that reach it."""
+    """One error on one mesh, with the cheapest simulation of each family that reaches it.
+
+    Costs are processor seconds per simulated second.
+    """
 
     scene: str
     vertices: int
@@ -37,18 +40,18 @@ class Cell:
 
     @property
     def winner(self) -> str:
-        """The family of the cheapest."""
+        """The family of the cheapest simulation."""
         return min(self.prices, key=lambda name: self.prices[name].cpu, default=NOBODY)
 
     @property
     def ahead(self) -> float:
-        """How many times as much the next family takes; infinite without one."""
+        """The cost of the second cheapest family divided by the cheapest; infinite without a second one."""
         order = sorted(work.cpu for work in self.prices.values())
         return order[1] / order[0] if len(order) > 1 else inf
 
 
 def family(work: WorkPoint) -> str:
-    """The family of a simulation's method."""
+    """Return the family of a simulation's method."""
     if not work.minimises:
         return work.family
     shipped = INTEGRATORS.get(work.integrator)
@@ -56,7 +59,9 @@ def family(work: WorkPoint) -> str:
 
 
 def cells(works: Iterable[WorkPoint], errors: Sequence[float] = ERRORS) -> list[Cell]:
-    """Of each mesh and each error, by vertices, stiffness and error; meshes without springs have none."""
+    """Build a cell for each mesh and error, ordered by vertices, stiffness and error; meshes without springs have
+    none.
+    """
     meshes: dict[tuple[str, int, float], list[WorkPoint]] = {}
     for work in works:
         if isfinite(work.stiffness) and work.vertices:
@@ -75,6 +80,6 @@ def cells(works: Iterable[WorkPoint], errors: Sequence[float] = ERRORS) -> list[
 
 
 def families(found: Sequence[Cell]) -> dict[str, Mark]:
-    """A look for each family that wins or is tried: always the same for the same names."""
+    """Assign a style to each family; equal sets of names get equal styles."""
     names = sorted({name for cell in found for name in cell.prices})
     return {name: numbered(k) for k, name in enumerate(names)}

@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Work against precision: the error of a simulated second against the wall time that it takes, and the Pareto front."""
+"""Work-precision diagram: error of a simulation against its wall time, and the Pareto front."""
 
 from __future__ import annotations
 
@@ -35,31 +35,31 @@ from solvers.about import LOCAL_GLOBAL
 from solvers.integrators import INTEGRATORS
 
 ACROSS = 4
-"""Panels in a row."""
+"""Number of panels in a row."""
 
 _PLAIN, _OWN = 4.4, 7.0
-"""The size of a mark; of a method with steps of its own, which has no line that leads to it."""
+"""Marker sizes: the smallest of a tolerance, and that of substepping methods, which have no connected line."""
 
 _WILD = 1e3
-"""Errors beyond it are those of motions that exploded, finite as they may be: they are above the panel."""
+"""Relative errors beyond it belong to motions that exploded, even if finite: they are above the panel."""
 
 ERRORS = (0.1, 0.03, 0.01, 0.003, 0.001)
-"""The errors at which the front is told in words."""
+"""Errors at which the Pareto front is described in words."""
 
 
 def is_default(work: WorkPoint) -> bool:
-    """Whether this is what is done most often: implicit Euler at 1/30 s with 50 iterations of local-global."""
+    """Return whether this is the most common setting: implicit Euler at 1/30 s with 50 iterations of local-global."""
     same_method = work.family == LOCAL_GLOBAL and work.integrator == "implicit-euler"
     return same_method and work.tolerance is None and work.iterations == 50 and abs(30 * work.time_step - 1) < 1e-9
 
 
 def default(works: Iterable[WorkPoint]) -> WorkPoint | None:
-    """What is done most often, among these, by the fastest of its backends."""
+    """Find the most common setting among these, by the fastest of its backends."""
     return min((w for w in works if is_default(w) and _known(w)), key=lambda w: w.seconds, default=None)
 
 
 def front(works: Iterable[WorkPoint]) -> list[WorkPoint]:
-    """Those that no other beats in both time and error, the cheapest first."""
+    """Return the Pareto front in time and error, the cheapest first."""
     kept: list[WorkPoint] = []
     for work in sorted((w for w in works if _known(w)), key=lambda w: (w.seconds, w.error)):
         if not kept or work.error < kept[-1].error:
@@ -68,7 +68,7 @@ def front(works: Iterable[WorkPoint]) -> list[WorkPoint]:
 
 
 def findings(works: Sequence[WorkPoint]) -> list[str]:
-    """The cheapest way to each error that the default does not reach, or reaches for more, in words."""
+    """Describe the cheapest setting for each error, compared with the default setting's method."""
     base = default(works)
     words: list[str] = []
     if base:
@@ -92,7 +92,7 @@ def findings(works: Sequence[WorkPoint]) -> list[str]:
 
 
 def same_method(work: WorkPoint, base: WorkPoint | None) -> bool:
-    """Whether it differs from the default in the time step alone."""
+    """Return whether it differs from the default only in the time step."""
     return base is not None and (work.label, work.integrator, work.tolerance, work.iterations) == (
         base.label,
         base.integrator,
@@ -102,7 +102,7 @@ def same_method(work: WorkPoint, base: WorkPoint | None) -> bool:
 
 
 def draw_work(table: Measurements, folder: Path) -> list[Path]:
-    """A picture for each mesh, a panel for each integrator; returns the files."""
+    """Draw a picture for each mesh, one panel per integrator; return the files."""
     drawn: list[Path] = []
     marked = looks((work.label, work.solver) for work in table.works)
     for mesh in dict.fromkeys(work.mesh for work in table.works):
@@ -154,14 +154,16 @@ def _draw(stem: Path, mesh: str, works: list[WorkPoint], marked: dict[str, Mark]
 
 
 def _sizes(works: Iterable[WorkPoint]) -> dict[float | None, float]:
-    """Sizes of the marks by tolerance, larger for tighter ones; None: fixed iterations, the least. Methods with steps
-    of their own have no iterations, and the largest marks."""
+    """Assign marker sizes by tolerance, larger for tighter ones; None, fixed iterations, gets the smallest.
+
+    Substepping methods have no iterations, and the largest markers.
+    """
     tolerances = sorted({work.tolerance for work in works if work.tolerance is not None}, reverse=True)
     return {None: 2.8, **{tolerance: _PLAIN + 1.6 * k for k, tolerance in enumerate(tolerances)}}
 
 
 def _panel(ax: Axes, works: list[WorkPoint], marked: dict[str, Mark], sizes: dict[float | None, float]) -> None:
-    """Points of one integrator; those that differ in the time step alone are joined, or in the substeps alone."""
+    """Draw the points of one integrator; those that differ only in the time step, or in the substeps, are joined."""
     chains: dict[tuple[str, float | None, float, str], list[WorkPoint]] = {}
     divided = _divided(works)
     for work in works:
@@ -183,7 +185,7 @@ def _panel(ax: Axes, works: list[WorkPoint], marked: dict[str, Mark], sizes: dic
 
 
 def _divided(works: Iterable[WorkPoint]) -> set[str]:
-    """The methods with steps of their own that were tried with several numbers of them in a time step, by label."""
+    """Find the labels of substepping methods that were measured with several numbers of substeps per time step."""
     tried: dict[str, set[int]] = {}
     for work in works:
         if work.own_steps:
@@ -192,7 +194,7 @@ def _divided(works: Iterable[WorkPoint]) -> set[str]:
 
 
 def _front(ax: Axes, works: list[WorkPoint]) -> None:
-    """The front of all integrators, the same in each panel: the least error that a budget buys."""
+    """Draw the Pareto front of all integrators, the same in each panel: the smallest error for each wall time."""
     best = front(works)
     if best:
         x, y = [work.seconds for work in best], [work.error for work in best]

@@ -1,1 +1,1 @@
-"""Figures for print: any panel or picture at a stated width, with its data and a script beside it."""
+"""Figures for print: any panel or picture at a given width, with its data and a script that reproduces it."""

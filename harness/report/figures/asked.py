@@ -1,4 +1,4 @@
-"""What the command line asks of a figure: its width, formats and type. Lengths are in millimetres."""
+"""Options of a figure from the command line: its width, formats and font size. Lengths are in millimetres."""
 
 from __future__ import annotations
 
@@ -8,17 +8,23 @@ from dataclasses import dataclass
 from harness.base.errors import InputError, Mistake, did_you_mean
 
 LEAST = 6.0
-"""Points: no type is smaller, for what is smaller cannot be read in print."""
+"""Minimum font size [points], because smaller type is not readable in print."""
 
 _UNITS = {"mm": 1.0, "cm": 10.0, "in": 25.4, "pt": 25.4 / 72.0}
 _NARROWEST, _WIDEST = 40.0, 400.0
-"""Millimetres: with less there is no room for type, and no page has more."""
+"""Minimum and maximum width [mm]: below there is no space for text, and no page is wider."""
 FORMATS = ("pdf", "svg", "png")
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """width [mm]; size of the type [points]; selectors: parts of panels' names, those of one joined by colons."""
+    """Options of a figure.
+
+    Attributes:
+        width_mm: width [mm].
+        font_size: font size [points].
+        selectors: parts of panel names; the parts of one selector are joined by colons on the command line.
+    """
 
     width: float = 85.0
     formats: tuple[str, ...] = ("pdf", "svg", "png")
@@ -29,17 +35,28 @@ class Asked:
 
     @property
     def small(self) -> float:
-        """The size of ticks and of the foot [points]."""
+        """The font size of ticks and of the foot [points]."""
         return max(LEAST, self.size - 1.0)
 
     @property
     def background(self) -> str:
-        """The page, as matplotlib has it."""
+        """The background colour in Matplotlib's terms."""
         return "none" if self.transparent else "white"
 
 
 def asked(width: str, formats: str, size: float, panels: str, *, titled: bool, transparent: bool) -> Asked:
-    """What the words of the command line ask for. Raises InputError with all mistakes in them."""
+    """Parse the figure options of the command line.
+
+    Args:
+        width: length with unit, such as 85mm.
+        formats: formats separated by commas.
+        font_size: font size [points].
+        panels: selectors separated by commas.
+        has_title: whether the figure has a title and a line on the machine.
+        is_transparent: whether the background is transparent.
+    Raises:
+        InputError: with all mistakes in the options.
+    """
     mistakes: list[Mistake] = []
     millimetres = _length(width, mistakes)
     wanted = tuple(dict.fromkeys(word.strip().lower() for word in formats.split(",") if word.strip()))

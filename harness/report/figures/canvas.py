@@ -1,8 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""A figure put together at its width: title, panels, one legend below them, notes at the foot; nothing over data.
+"""Composition of a figure at its width: title, panels, one legend below them, and notes at the foot.
 
-The height follows: each strip is as high as its type, each frame as high as its width asks for.
+Nothing covers data. The height follows from the width: each strip is as high as its text, and each frame has the height
+that suits its width.
 """
 
 from __future__ import annotations
@@ -35,17 +36,17 @@ from harness.report.style import INK, MUTED, STRAIN_MAP
 
 INCH = 25.4
 _PANEL, _PICTURE = 58.0, 36.0
-"""Millimetres that a panel and that a picture wants for its width, at a type of 8 points."""
+"""Preferred minimum width of a panel and of a picture [mm], at a font size of 8 points."""
 _COLUMN = 1.5
-"""Rows of frames together are so high at most, in the figure's width: a page of two columns has room for them."""
+"""Maximum total height of the rows of frames, in units of the figure's width, so that a two-column page has space."""
 _TALL = 48.0 / INCH
-"""A frame wider than 85 mm becomes flatter: as high as 0.3 of its width and this [inches]."""
+"""A frame wider than 85 mm becomes flatter: its height is 0.3 of its width plus this [inches]."""
 _FIVE = 55.0
-"""Millimetres in which a colour bar has five numbers, at a type of 8 points."""
+"""Width from which on a colour bar has five numbers [mm], at a font size of 8 points."""
 _BAR = 18.0
-"""Points of a colour bar, and around it."""
+"""Height of a colour bar with its margins [points]."""
 _PAD = 3.0
-"""Points between strips, and around."""
+"""Padding between strips and at the border [points]."""
 
 RC: Any = {
     "font.family": "DejaVu Sans",
@@ -71,7 +72,13 @@ RC: Any = {
 
 
 def compose(panels: Sequence[Panel], title: str, asked: Asked) -> Figure:
-    """The figure of these panels; of one subject where they have one, which the title then names."""
+    """Compose the figure of these panels.
+
+    Args:
+        panels: panels of the figure.
+        title: title; the panels' subject is appended if they share one.
+        options: options of the figure.
+    """
     rc: Any = {**RC, "font.size": asked.size, "xtick.labelsize": asked.small, "ytick.labelsize": asked.small}
     with matplotlib.rc_context(rc):
         figure = Figure((asked.width / INCH, 4.0), dpi=DPI, facecolor=asked.background, layout="constrained")
@@ -94,7 +101,7 @@ def compose(panels: Sequence[Panel], title: str, asked: Asked) -> Figure:
 
 
 DPI = 100
-"""Of the canvas that type is measured on; vectors have none, and pictures have DOTS."""
+"""Resolution of the canvas that text is measured on; vector formats have none, and images use RASTER_DPI."""
 
 
 def _columns(panels: Sequence[Panel], asked: Asked) -> int:
@@ -105,7 +112,7 @@ def _columns(panels: Sequence[Panel], asked: Asked) -> int:
 
 
 def _heights(panels: Sequence[Panel], heads: Sequence[list[str]], columns: int, asked: Asked) -> list[float]:
-    """The height of each row of panels [inches]."""
+    """Compute the height of each row of panels [inches]."""
     width = asked.width / INCH / columns
     room = _COLUMN * asked.width / INCH / -(-len(panels) // columns)
     wanted = [_height(panel, len(head), width, room, asked) for panel, head in zip(panels, heads, strict=True)]
@@ -125,7 +132,7 @@ def _height(panel: Panel, head: int, width: float, room: float, asked: Asked) ->
 
 
 def _head(panel: Panel, asked: Asked, columns: int, *, several: bool) -> list[str]:
-    """What stands above a panel of curves or cells, in lines."""
+    """Return the title lines of a panel."""
     if isinstance(panel, Picture):
         return [panel.title, *panel.facts]
     words = [panel.subject if several else "", panel.title, panel.y.words if isinstance(panel, Plot) else ""]
@@ -146,12 +153,12 @@ def _draw(ax: Axes, panel: Panel, head: Sequence[str], asked: Asked, columns: in
 
 
 def wrapped(words: str, room: float, size: float) -> list[str]:
-    """The words in lines that fit into `room` [points]; a letter takes some 0.6 of the type's size."""
+    """Wrap text into lines that fit into `room` [points]; a letter is about 0.6 of the font size wide."""
     return textwrap.wrap(words, max(12, int(room / (0.58 * size))), break_long_words=True) or [""]
 
 
 def _strain_scale(figure: Figure, axes: Sequence[Axes], panels: Sequence[Panel], asked: Asked) -> float:
-    """One scale of strain for all pictures, which share their limit; how high it is [inches]."""
+    """Draw one strain scale for all pictures, which share their limit; return its height [inches]."""
     pictures = [panel for panel in panels if isinstance(panel, Picture)]
     if not pictures:
         return 0.0
@@ -175,7 +182,7 @@ def _strain_scale(figure: Figure, axes: Sequence[Axes], panels: Sequence[Panel],
 
 
 def _strips(figure: Figure, panels: Sequence[Panel], title: str, height: float, asked: Asked, *, legend: bool) -> None:
-    """Title, legend and foot, and the height [inches] that all of it has with the panels."""
+    """Draw title, legend and foot, and set the figure's height, given that of the panels [inches]."""
     room = asked.width / INCH * 72.0 - 2.0 * _PAD
     said = list(dict.fromkeys(note for panel in panels for note in panel.notes))
     machines = list(dict.fromkeys(panel.machine for panel in panels if panel.machine))
@@ -201,12 +208,12 @@ def _strips(figure: Figure, panels: Sequence[Panel], title: str, height: float, 
 
 
 def _tall(lines: Sequence[str], size: float) -> float:
-    """The height of lines of type [inches]."""
+    """Return the height of lines of text [inches]."""
     return 1.42 * size * len(lines) / 72.0
 
 
 def _legend(figure: Figure, panels: Sequence[Panel], asked: Asked, room: float) -> Legend | None:
-    """The legend in as many columns as fit; read downwards its order is that of the curves."""
+    """Draw the legend in as many columns as fit; read downwards, its order is that of the curves."""
     entries = _entries(panels)
     if not entries:
         return None
@@ -242,7 +249,7 @@ def _entries(panels: Sequence[Panel]) -> list[Any]:
 
 
 def ordered(series: Sequence[Series]) -> list[Series]:
-    """Series as their curves end, the highest first; those without a point last."""
+    """Sort series by the end values of their curves, the highest first; those without a point come last."""
 
     def end(one: Series) -> float:
         known = one.y[np.isfinite(one.y) & np.isfinite(one.x)]
@@ -252,7 +259,7 @@ def ordered(series: Sequence[Series]) -> list[Series]:
 
 
 def _settle(axes: Sequence[Axes], panels: Sequence[Panel], asked: Asked) -> None:
-    """What needs the frames' final size: ticks that would meet, figures in cells, names at the ends of curves."""
+    """Adjust what depends on the final size of the frames: tick labels, values in cells, labels at curve ends."""
     figure: Any = axes[0].figure
     warnings.simplefilter("ignore", UserWarning)  # where frames have no room the faults are told
     figure.draw_without_rendering()
@@ -271,7 +278,7 @@ def _settle(axes: Sequence[Axes], panels: Sequence[Panel], asked: Asked) -> None
 
 
 def texts(figure: Figure) -> list[Text]:
-    """All type that is seen."""
+    """Return all visible text objects of a figure."""
     found: list[Text] = [*figure.texts, *(text for legend in figure.legends for text in legend.get_texts())]
     for ax in figure.axes:
         found += [*ax.texts, ax.title, ax.xaxis.label, ax.yaxis.label]

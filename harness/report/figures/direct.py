@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Names at the ends of curves, right of the frame, where they fit: a legend that needs no looking up."""
+"""Direct labels at the ends of curves, to the right of the frame, where they fit; they replace a legend."""
 
 from __future__ import annotations
 
@@ -16,13 +16,19 @@ from harness.report.figures.panel import Panel, Plot, Series
 from harness.report.figures.scales import in_points
 
 _MOST, _SHARE = 9, 0.3
-"""Names of a frame, and the part of the width that they may take."""
+"""Maximum number of labels of a frame, and maximum share of the width for them."""
 _BESIDE = 7.0
-"""Points from the frame to the names."""
+"""Distance from the frame to the labels [points]."""
 
 
 def label_directly(axes: Sequence[Axes], panels: Sequence[Panel], asked: Asked) -> bool:
-    """Whether the curves could be named at their ends, or the points beside them, so that no legend is needed."""
+    """Add labels to curve ends or points; return whether they make a legend unnecessary.
+
+    Args:
+        axes: axes of the panels.
+        panels: panels of the figure; only a single one gets direct labels.
+        options: options of the figure.
+    """
     panel = panels[0]
     if len(panels) > 1 or not isinstance(panel, Plot):
         return False
@@ -49,7 +55,7 @@ def _end(series: Series) -> list[float]:
 
 
 class _Names:
-    """The names of one frame: made before the layout, so that it leaves them room; put in place after it."""
+    """Labels of one frame: created before the layout, which reserves space for them, and positioned after it."""
 
     def __init__(self, ax: Axes, known: Sequence[Series], asked: Asked) -> None:
         self._ax, self._gap = ax, 1.25 * asked.small
@@ -67,12 +73,12 @@ class _Names:
         setattr(self._names[0], "settle", self.settle)  # noqa: B010 no attribute of Text: done after the layout
 
     def _beside(self) -> float:
-        """Where the names begin, in parts of the frame's width."""
+        """Return the x position of the labels, in units of the frame's width."""
         width, _ = in_points(self._ax)
         return 1.0 + _BESIDE / width
 
     def settle(self) -> None:
-        """Move the names to the heights of their ends, and apart."""
+        """Move the labels to the heights of their curve ends, and apart."""
         ax = self._ax
         _, points = in_points(ax)
         wanted = [ax.transAxes.inverted().transform(ax.transData.transform(end))[1] * points for end in self._ends]
@@ -84,7 +90,13 @@ class _Names:
 
 
 def apart(wanted: Sequence[float], gap: float, top: float) -> list[float]:
-    """The sorted heights, at least `gap` apart and from 0 to `top` where there is room: moved as little as it takes."""
+    """Spread sorted heights to be at least `gap` apart, with small displacements.
+
+    Args:
+        targets: preferred heights, ascending.
+        gap: minimum distance.
+        top: upper limit, exceeded only if the space from 0 is too small.
+    """
     at = list(wanted)
     for _ in range(60):
         for k in range(1, len(at)):
@@ -99,7 +111,7 @@ def apart(wanted: Sequence[float], gap: float, top: float) -> list[float]:
 
 
 def _dark(color: str) -> str:
-    """A colour in which small type can be read on white."""
+    """Darken a colour until small text in it is readable on white."""
     from matplotlib.colors import to_rgb
 
     from harness.report.style import shade
@@ -110,7 +122,7 @@ def _dark(color: str) -> str:
 
 
 def _name_points(ax: Axes, series: Sequence[Series], asked: Asked) -> None:
-    """The names of single points, each on that side of its point where it meets no other name and no other point."""
+    """Label single points, each on a side where its label overlaps no other label and no other point."""
     for one in series:
         for x, y in zip(one.x, one.y, strict=True):
             name = ax.annotate(
@@ -135,7 +147,7 @@ _SIDES: tuple[tuple[float, float, Any], ...] = tuple(
 
 
 def _place(ax: Axes, name: Annotation) -> None:
-    """The first side on which a name is within the frame and meets none that was placed before it."""
+    """Place a label on the first side where it is inside the frame and overlaps no earlier label or point."""
     before = [other for other in ax.texts[: ax.texts.index(name)] if isinstance(other, Annotation)]
     taken = [other.get_window_extent() for other in before]
     points = [ax.transData.transform(line.get_xydata()) for line in ax.lines if line.get_marker() not in ("None", "")]

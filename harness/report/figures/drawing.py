@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Panels drawn in their frames: curves, cells, pictures. Sizes are points, as they will be in print."""
+"""Drawing of panels in their frames: curves, cells, pictures. Sizes are in points of the printed figure."""
 
 from __future__ import annotations
 
@@ -20,15 +20,21 @@ from harness.report.figures.scales import in_points, set_scales
 from harness.report.style import INK, MUTED, RULE, Mark
 
 _LINE, _MARKER, _FEW = 1.1, 3.6, 12
-"""Width of curves and size of marks [points]; up to so many points, each has a mark."""
+"""Width of curves and size of markers [points]; curves of at most this many points get a marker at each."""
 _INSET = 2.2
-"""Points from a cell's corner to the dot in it."""
+"""Distance from a cell's corner to the dot in it [points]."""
 DOTS = 300
-"""Dots an inch of what cannot be vectors."""
+"""Resolution of images in vector formats [dots per inch]."""
 
 
 def draw_plot(ax: Axes, panel: Plot, asked: Asked) -> None:
-    """Curves with their intervals, below them what is shaded and lines that mark a value."""
+    """Draw curves with their intervals, shaded bands and lines at marked values.
+
+    Args:
+        ax: axes.
+        panel: panel to draw.
+        options: options of the figure.
+    """
     set_scales(ax, panel)
     for band in panel.bands:
         low, high = max(band.low, ax.get_ylim()[0]), min(band.high, ax.get_ylim()[1])
@@ -68,7 +74,13 @@ def _curve(ax: Axes, series: Series) -> None:
 
 
 def mark(look: Mark, grown: float = 1.0, *, hollow: bool = False) -> dict[str, Any]:
-    """How a solver's mark is drawn, how much larger than others; hollow: of what other code measured."""
+    """Return the style of a solver's marker.
+
+    Args:
+        style: style of the solver.
+        marker_scale: size relative to other markers.
+        is_stale: whether other code measured it; such markers are hollow.
+    """
     face = "white" if hollow else look.color
     edge, width = (look.color, 0.9) if hollow else ("white", 0.35)
     size = grown * _MARKER * enlarged(look)
@@ -88,14 +100,22 @@ def _interval(ax: Axes, series: Series, low: Values, high: Values) -> None:
 
 
 def handle(series: Series) -> Line2D:
-    """A curve's entry in the legend."""
+    """Build a curve's entry in the legend."""
     look = series.look
     line = "none" if not series.joined else look.dash
     return Line2D([], [], linestyle=line, linewidth=_LINE, label=series.label, **mark(look))
 
 
 def draw_grid(ax: Axes, panel: CellMap, asked: Asked) -> None:
-    """Cells, those of other code with a dot in the corner; rows named at the left, columns above."""
+    """Draw the cells of a map, with row names at the left and column names above.
+
+    Cells measured by other code have a dot in the corner, unless that holds for all.
+
+    Args:
+        ax: axes.
+        panel: map to draw.
+        options: options of the figure.
+    """
     rows, columns = names(panel)
     ax.set_xlim(0, len(columns))
     ax.set_ylim(len(rows), 0)
@@ -114,7 +134,7 @@ def draw_grid(ax: Axes, panel: CellMap, asked: Asked) -> None:
 
 
 def write_cells(ax: Axes, panel: CellMap, asked: Asked) -> None:
-    """The figures of all cells, where the longest fits. To be called once the frame has its size."""
+    """Write the values of all cells if the longest one fits; call it after the frame has its final size."""
     rows, columns = names(panel)
     longest = max((len(cell.figure) for cell in panel.cells), default=0)
     width, _ = in_points(ax)
@@ -125,17 +145,24 @@ def write_cells(ax: Axes, panel: CellMap, asked: Asked) -> None:
 
 
 def names(panel: CellMap) -> tuple[list[str], list[str]]:
-    """The names of rows and of columns, in their order."""
+    """Return the names of rows and of columns, in their order."""
     return list(dict.fromkeys(c.row for c in panel.cells)), list(dict.fromkeys(c.column for c in panel.cells))
 
 
 def ink_on(color: str) -> str:
-    """Type that can be read on a colour."""
+    """Return a text colour that is readable on the given colour."""
     red, green, blue = to_rgb(color)
     return INK if 0.3 * red + 0.6 * green + 0.1 * blue > 0.47 else "white"
 
 
 def draw_picture(ax: Axes, panel: Picture, asked: Asked, width: float) -> None:
-    """The mesh, rendered in as many dots as its place [inches] has."""
+    """Draw the mesh, rendered at the resolution of its place in print.
+
+    Args:
+        ax: axes.
+        panel: picture to draw.
+        options: options of the figure.
+        width: width of the place [inches].
+    """
     ax.imshow(panel.render(round(width * DOTS), None if asked.transparent else "white"), interpolation="antialiased")
     ax.set_axis_off()

@@ -1,4 +1,4 @@
-"""What results offer: panels by name, made when they are asked for, and the choice that `--panels` makes of them."""
+"""Panels that results provide, by name and built on demand, and their selection by `--panels`."""
 
 from __future__ import annotations
 
@@ -9,14 +9,19 @@ from harness.base.errors import InputError, Mistake
 from harness.report.figures.panel import Panel
 
 MOST = 12
-"""Panels of one figure."""
+"""Maximum number of panels of a figure."""
 _TOLD = 12
-"""Names that a message lists."""
+"""Maximum number of names that a message lists."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Entry:
-    """A panel that could be drawn. of, name: as `panel.Plot` has them; make: the panel."""
+    """A panel that can be drawn.
+
+    Attributes:
+        group, name: as in `panel.CurvePlot`.
+        build_panel: returns the panel.
+    """
 
     of: tuple[str, ...]
     name: tuple[str, ...]
@@ -29,15 +34,22 @@ class Entry:
 
 
 def ready(panels: Iterable[Panel]) -> list[Entry]:
-    """Entries of panels that are there already."""
+    """Wrap panels that are already built as entries."""
     return [Entry(panel.of, panel.name, lambda panel=panel: panel) for panel in panels]
 
 
 def chosen(entries: Sequence[Entry], selectors: Sequence[tuple[str, ...]]) -> list[Entry]:
-    """The entries that the selectors name, in their order; where a selector does not say of what, those of the first.
+    """Select the entries that match the selectors, in their order.
 
-    A selector names each panel that has all of its parts. Raises InputError for one that names none, and for more
-    panels than a figure holds.
+    A selector matches each panel whose name has all of its parts. If no part of a selector names a group, only the
+    panels of
+    the first matching group are selected.
+
+    Args:
+        entries: available panels.
+        selectors: parts of panel names.
+    Raises:
+        InputError: if a selector matches nothing, or if there are too many panels for a figure.
     """
     found: list[Entry] = []
     for selector in selectors or ((),):

@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-"""What is wrong with a figure as it would be printed: type that is too small, cut, or over other type."""
+"""Checks of a figure as it would be printed: text that is too small, cut off, or overlaps other text."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from harness.report.figures.asked import LEAST
 from harness.report.figures.canvas import texts
 
 _SLACK = 0.75
-"""Points by which boxes of type may meet: they hold more than ink."""
+"""Allowed overlap of text boxes [points], because they are larger than the ink."""
 
 
 def faults(figure: Figure) -> list[str]:
-    """All faults in words, none where the figure is sound."""
+    """Find all layout faults and describe them; empty if the figure is correct."""
     slack = _SLACK * figure.dpi / 72.0
     seen = texts(figure)
     small = [(text.get_text(), float(text.get_fontsize())) for text in seen]

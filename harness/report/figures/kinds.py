@@ -1,4 +1,4 @@
-"""The kinds of figures: what each is drawn from, which panels it has, and what draws them."""
+"""Kinds of figures: the rows that each needs, its panels, and how they are prepared."""
 
 from __future__ import annotations
 
@@ -26,9 +26,15 @@ from solvers.plugins import load
 
 
 class Kind(NamedTuple):
-    """A kind of figure. title: its name for people; wanted: the rows that it is drawn from, in words; panels: what a
-    folder of results has, by name, told which runs are of other code; usual: the panels that are drawn where none are
-    asked for; draw: what is done to those that were chosen."""
+    """A kind of figure.
+
+    Attributes:
+        title: title of the figure.
+        required_rows: description of the rows that it is drawn from.
+        list_panels: returns the panels of a folder of results by name, given a function that finds stale runs.
+        default_panels: selectors that apply if the command line gives none.
+        prepare_panels: builds the panels from the selected entries.
+    """
 
     title: str
     wanted: str
@@ -47,7 +53,7 @@ def _sheet(entries: Sequence[Entry]) -> list[Panel]:
 
 
 def _maps(entries: Sequence[Entry]) -> list[Panel]:
-    """Families of hard cases as one map."""
+    """Merge the families of hard cases into one map."""
     panels = [entry.make() for entry in entries]
     grids = [panel for panel in panels if isinstance(panel, CellMap)]
     rest = [panel for panel in panels if not isinstance(panel, CellMap)]
@@ -94,7 +100,11 @@ KINDS: dict[str, Kind] = {
 
 
 def kind(name: str) -> Kind:
-    """The kind of this name; an installed report that has `panels` is one too. Raises InputError for others."""
+    """Find the kind with this name; an installed report with a `panels` attribute is a kind too.
+
+    Raises:
+        InputError: if there is no such kind.
+    """
     if name in KINDS:
         return KINDS[name]
     known = {*KINDS, *(other for other in EVERY_REPORT if other not in EVERY_REPORT.shipped[0])}

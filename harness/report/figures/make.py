@@ -1,4 +1,4 @@
-"""A figure made: its panels chosen, put together, checked and written."""
+"""Production of a figure: selection of its panels, composition, checks and output."""
 
 from __future__ import annotations
 
@@ -14,11 +14,19 @@ from harness.report.figures.kinds import Kind
 from harness.report.figures.of_runs import Older
 
 _TOLD = 3
-"""Faults that a message lists."""
+"""Maximum number of faults that a message lists."""
 
 
 class Made(NamedTuple):
-    """A figure that was written. others: how many panels more there are, and the name of one of them."""
+    """A figure that was written.
+
+    Attributes:
+        paths: files.
+        panel_names: names of its panels.
+        size_mm: width and height [mm].
+        other_panel_count: number of further panels in the results.
+        other_panel_example: name of one of them.
+    """
 
     paths: list[Path]
     panels: list[str]
@@ -28,10 +36,18 @@ class Made(NamedTuple):
 
 
 def make(name: str, kind: Kind, results: Path, older: Older, folder: Path, asked: Asked) -> Made:
-    """Write the figure of a kind to files in `folder`, of the results in another one.
+    """Write the figure of a kind to files.
 
-    older: see `Kind.panels`. Raises InputError where the results hold nothing of the kind, where no panel has the names
-    that were asked for, where curves and maps were, and where the type does not fit into the width.
+    Args:
+        name: name of the kind.
+        kind: kind of figure.
+        results: folder of the results.
+        find_stale: see `FigureKind.list_panels`.
+        folder: folder that the files are written to.
+        options: options of the figure.
+    Raises:
+        InputError: if the results contain nothing of the kind, if no panel matches a selector, if curves and maps are
+            selected together, or if the text does not fit the width.
     """
     entries = kind.panels(results, older)
     if not entries:

@@ -1,4 +1,6 @@
-"""The panels of `springbench accuracy`: convergence, times, work, profiles, growth, and the paper's figures."""
+"""Panels of `springbench accuracy`: convergence, time to accuracy, work-precision, profiles, scaling, Liu et al.
+2013.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,7 @@ WANTED = "rows of `springbench accuracy CONFIG`"
 
 
 def convergence(folder: Path) -> list[Entry]:
-    """Error against time and iterations, of each frozen step from each first guess."""
+    """Build panels of error against time and iterations, for each step snapshot and initial guess."""
     table = without_short(read(folder))
     marked = looks((curve.label, curve.solver) for curve in table.curves)
     found: list[Entry] = []
@@ -95,7 +97,7 @@ def _hollow(measured: Iterable[Curve | WorkPoint]) -> list[str]:
 
 
 def _ended(curves: Sequence[Curve]) -> list[str]:
-    """Those that ended early, by how."""
+    """Describe the curves that ended early, grouped by status."""
     by: dict[str, list[str]] = {}
     for curve in curves:
         if curve.status != "ok":
@@ -104,7 +106,7 @@ def _ended(curves: Sequence[Curve]) -> list[str]:
 
 
 def times(folder: Path) -> list[Entry]:
-    """Seconds to each accuracy, of each mesh from each first guess; set-up apart, and spread over steps."""
+    """Build panels of the time to each accuracy, for each mesh and initial guess, without and with amortised set-up."""
     table = without_short(read(folder))
     marked = looks((curve.label, curve.solver) for curve in table.curves)
     plots: list[Plot] = []
@@ -141,7 +143,7 @@ def _reaching(curves: Sequence[Curve], marked: dict[str, Mark], steps: int | Non
 
 
 def work(folder: Path) -> list[Entry]:
-    """Error of whole simulations against their wall time, of each mesh by integrator."""
+    """Build panels of error against wall time of whole simulations, for each mesh and integrator."""
     table = read(folder)
     known = [w for w in table.works if w.status == "ok" and 0.0 < w.error < np.inf and 0.0 < w.seconds < np.inf]
     marked = looks((work.label, work.solver) for work in table.works)
@@ -192,7 +194,7 @@ def _chains(works: Sequence[WorkPoint], marked: dict[str, Mark], tolerances: Seq
 
 
 def profiles(folder: Path) -> list[Entry]:
-    """Performance and data profiles, by accuracy."""
+    """Build panels of performance and data profiles, one per accuracy."""
     table = without_short(read(folder))
     kinds = {
         "performance": ("time, over the fastest solver's", "performance profile", least_ratios),
@@ -227,7 +229,7 @@ def _stairs(found: dict[str, Values], marked: dict[str, Mark]) -> Iterator[Serie
 
 
 def growth(folder: Path) -> list[Entry]:
-    """Seconds to a gap against the number of vertices, of each scene from each first guess."""
+    """Build panels of time to a gap against the number of vertices, for each scene and initial guess."""
     table = without_short(read(folder))
     marked = looks((curve.label, curve.solver) for curve in table.curves)
     found = [one for one in growths(table) if one.vertices]
@@ -256,7 +258,7 @@ def growth(folder: Path) -> list[Entry]:
 
 
 def paper(folder: Path) -> list[Entry]:
-    """Figures 2 and 3 of Liu et al. 2013 beside ours."""
+    """Build panels of figures 2 and 3 of Liu et al. 2013, compared with own results."""
     from harness.report.accuracy.paper import comparisons, own
 
     table = read(folder)

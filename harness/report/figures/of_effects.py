@@ -1,4 +1,4 @@
-"""The panels of ablations: what effects cost and change, and what each adds to an iteration of every solver."""
+"""Panels of ablations: cost and influence of effects, and their overhead per iteration for every solver."""
 
 from __future__ import annotations
 
@@ -30,19 +30,23 @@ _CLASSES = (
     (3.0, "2 to 3", "#2f78b5"),
     (np.inf, "above 3", "#0f3f70"),
 )
-"""Up to which price, in words, in which colour."""
+"""Upper limits of the overhead classes, their labels and colours."""
 _REFUSED, _BROKEN = "#bcb8b0", "#dd8f88"
-"""Colours of what a solver does not support, and of what ended in any other way without a price."""
+"""Colours of what a solver does not support, and of other cases without an overhead."""
 _READ = (
     "CPU time of an iteration with the effect over one without, the median over rounds; of those whose interval of "
     "95 % holds 1 nothing can be told."
 )
 _ALL = "all"
-"""The price of all effects together, as the rows name it."""
+"""Name of the overhead of all effects together in the rows."""
 
 
 def _ablations(folder: Path, kind: str) -> Iterator[tuple[str, Sequence[Row]]]:
-    """The rows of each ablation that holds rows of a kind, by the name of its file. Raises InputError without any."""
+    """Yield the rows of each ablation with rows of a kind, and the name of its file.
+
+    Raises:
+        InputError: if there are none.
+    """
     found = [(path.stem, ablation.read(path)) for path in shelf.units(folder / "ablation")]
     found = [(stem, table) for stem, table in found if ablation.of_kind(table, kind)]
     if not found:
@@ -52,7 +56,7 @@ def _ablations(folder: Path, kind: str) -> Iterator[tuple[str, Sequence[Row]]]:
 
 
 def effects(folder: Path) -> list[Entry]:
-    """What each effect of a scene costs, and what leaving it out changes."""
+    """Build panels of the cost of each effect of a scene, and of the changes without it."""
     plots: list[Plot] = []
     for stem, table in _ablations(folder, "without"):
         (whole,) = ablation.of_kind(table, "whole")
@@ -90,7 +94,7 @@ def _effect(k: int, row: Row, whole: float, *, older: bool) -> Series:
 
 
 def prices(folder: Path) -> list[Entry]:
-    """What each effect adds to an iteration: a map of all solvers, and for each a panel with intervals."""
+    """Build panels of the overhead per iteration: a map of all solvers, and intervals for each solver."""
     found = _labelled([row for _, table in _ablations(folder, "price") for row in ablation.of_kind(table, "price")])
     marked = looks((row["label"], row["solver"]) for row in found)
     panels: list[Panel] = []
@@ -105,7 +109,7 @@ def prices(folder: Path) -> list[Entry]:
 
 
 def _labelled(rows: Sequence[Row]) -> list[Row]:
-    """Rows with their solver's name as a `label`, and with its parameters where it was measured with several."""
+    """Add a `label` to rows: the solver, with its parameters if it was measured with several."""
     settings: dict[str, set[str]] = {row["solver"]: set() for row in rows}
     for row in rows:
         settings[row["solver"]].add(row["parameters"] or "{}")
@@ -121,7 +125,7 @@ def _other(row: Row) -> bool:
 
 
 def _map(of: tuple[str, ...], subject: str, here: Sequence[Row]) -> CellMap:
-    """Effects down, the dearest first and all of them together last; solvers across."""
+    """Build the overhead map: effects in rows, the most expensive first and all together last; solvers in columns."""
     known = [row for row in here if row["status"] == "ok"]
     paid = {row["name"]: [r["price"] for r in known if r["name"] == row["name"]] for row in here}
     order = sorted(paid, key=lambda name: (name == _ALL, -median(paid[name] or [0.0])))
@@ -150,7 +154,7 @@ def _unpriced(status: str) -> str:
 
 
 def _intervals(of: tuple[str, ...], subject: str, look: Mark, rows: Sequence[Row]) -> Plot:
-    """A solver's prices with their intervals, the dearest effect first."""
+    """Build a plot of a solver's overheads with their intervals, the most expensive effect first."""
     mine, label = sorted(rows, key=lambda row: -row["price"]), rows[0]["label"]
     older = np.array([_other(row) for row in mine])
     x, low, high = (np.array([row[key] for row in mine], float) for key in ("price", "price_low", "price_high"))

@@ -1,4 +1,4 @@
-"""Outside engines beside ours: the Pareto front of each program, over all of its settings, a panel a mesh."""
+"""Comparison with external engines: the Pareto front of each program over all settings, one panel per mesh."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NOTE = (
 
 
 def engines(folder: Path) -> list[Entry]:
-    """A panel for each mesh on which both engines and ours were tried."""
+    """Build a panel for each mesh with runs of both engines and own methods."""
     table = read(folder)
     looks = marks(table.works)
     plots: list[Plot] = []

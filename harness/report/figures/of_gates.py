@@ -1,4 +1,4 @@
-"""The panels of stored results of gates: each gate's results by commit, its level, and where that changed."""
+"""Panels of stored benchmark results: each benchmark's results by commit, its level, and changes of the level."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WANTED = f"{FEWEST} stored results of a gate, by `pytest tests/bench --benchmark
 
 
 def gates(folder: Path) -> list[Entry]:
-    """The gates of which enough is known, the one that changed most first."""
+    """Build a panel for each benchmark with enough results, the largest change first."""
     return ready(_panel(one) for one in history(stored_files([folder])) if len(one.points) >= FEWEST)
 
 
@@ -40,7 +40,7 @@ def _panel(gate: GateHistory) -> Plot:
 
 
 def _levels(gate: GateHistory, x: np.ndarray) -> Iterator[Series]:
-    """The level of each stretch, with a gap before the next."""
+    """Build the series of segment levels, with a gap between segments."""
     ends = (*gate.starts[1:], len(x))
     across = [(start - 0.35, end - 0.65, np.nan) for start, end in zip(gate.starts, ends, strict=True)]
     up = [(level, level, np.nan) for level in gate.levels]

@@ -1,4 +1,4 @@
-"""The panels of judged runs: each solver's shares, and the map of hard cases, a grid for each family of them."""
+"""Panels of verified runs: each solver's shares, and the robustness map, with one map per family of cases."""
 
 from __future__ import annotations
 
@@ -17,7 +17,12 @@ from harness.report.style import OLDER, Mark, marks
 
 
 def hard(folder: Path, older: Older) -> list[Entry]:
-    """Shares of the cases that each solver gets right, and of those it survives; then a map for each family."""
+    """Build the panel of each solver's correct and finite shares, then one map per family.
+
+    Args:
+        folder: folder of a sweep's results.
+        find_stale: returns the ids of stale runs in a table of rows.
+    """
     table = sweep_rows(folder)
     cells, other = read_cells(folder), older(table)
     told = measured_on(table.select(NEEDED).to_pylist())
@@ -36,7 +41,7 @@ def _cell(cell: Judged, *, older: bool) -> Cell:
 
 
 def together(grids: Sequence[CellMap]) -> CellMap:
-    """One map of several families, whose rows then name their family."""
+    """Merge the maps of several families into one, whose rows include the name of their family."""
     if len(grids) == 1:
         return grids[0]
     cells = [cell._replace(row=f"{grid.title}: {cell.row}") for grid in grids for cell in grid.cells]

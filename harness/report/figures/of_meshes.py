@@ -1,4 +1,4 @@
-"""Pictures of recorded meshes: one run at its last frame, the solvers of a scene side by side, or all scenes."""
+"""Pictures of recorded meshes: the last frame of one run, of all solvers of a scene, or of all scenes."""
 
 from __future__ import annotations
 
@@ -36,11 +36,16 @@ from harness.report.style import Mark, marks
 from harness.report.timing_table import RunTimes, labels, runs
 
 _LEAST, _MOST = 0.6, 1.9
-"""Width over height of a picture."""
+"""Minimum and maximum aspect ratio, width / height, of a picture."""
 
 
 class _Recorded(NamedTuple):
-    """A run that has a recording. label: what tells it from the others; told: by what it was measured."""
+    """A run with a recording.
+
+    Attributes:
+        label: label that distinguishes it from other runs.
+        machine_words: provenance of the measurement.
+    """
 
     run: RunTimes
     label: str
@@ -55,26 +60,26 @@ class _Recorded(NamedTuple):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """The label's parts."""
+        """The parts of the label."""
         return tuple(self.label.split(", "))
 
     def entry(self, of: tuple[str, ...], name: tuple[str, ...]) -> Entry:
-        """Its last frame as a panel of this name."""
+        """Build an entry for the last frame, with this group and name."""
         return Entry(of, name, partial(_made, of, name, self.path, self.label, self.look, self.told))
 
 
 def run(folder: Path) -> list[Entry]:
-    """The last frame of each run that was recorded."""
+    """Build an entry for the last frame of each recorded run."""
     return [one.entry((*one.mesh, *one.parts), ("mesh",)) for one in _recorded(folder)]
 
 
 def comparison(folder: Path) -> list[Entry]:
-    """The last frames of all solvers of a scene and size, by one camera and one scale."""
+    """Build entries for the last frames of all solvers of a scene and size, with one camera and one scale."""
     return [one.entry(one.mesh, one.parts) for one in _recorded(folder)]
 
 
 def scenes(folder: Path) -> list[Entry]:
-    """The last frame of each scene at its largest size, by the run of the lowest residual."""
+    """Build an entry for the last frame of each scene at its largest size, from the run with the lowest residual."""
     best = {one.run.scene: one for one in sorted(_recorded(folder), key=_worth)}
     return [one.entry(("scenes",), (scene,)) for scene, one in sorted(best.items())]
 
@@ -85,7 +90,11 @@ def _worth(one: _Recorded) -> tuple[bool, int, float]:
 
 
 def _recorded(folder: Path) -> list[_Recorded]:
-    """The runs that were recorded, the largest first. Raises InputError where there are none."""
+    """Find the recorded runs, the largest first.
+
+    Raises:
+        InputError: if there are none.
+    """
     table = sweep_rows(folder)
     found = runs(table)
     names, looks = labels(found), marks(run.solver for run in found)
@@ -141,19 +150,21 @@ def _subject(replay: Replay) -> str:
 
 
 class _Render(Renderer):
-    """Renders one frame by one camera (`panel.Renderer`)."""
+    """Renders one frame with one camera (`panel.MeshRenderer`)."""
 
     def __init__(self, replay: Replay, frame: int, view: View) -> None:
         self.replay, self.frame, self.view, self.aspect = replay, frame, view, 1.0
 
     def __call__(self, width: int, background: str | None) -> NDArray[np.uint8]:
-        """See `panel.Renderer`."""
+        """Render the frame, see `panel.MeshRenderer`."""
         with Studio(width, max(1, round(width / self.aspect)), background=background) as studio:
             return studio.draw(self.replay, self.frame, self.view)
 
 
 def alike(pictures: Sequence[Picture]) -> list[Picture]:
-    """Pictures of one scene by one camera, one scale of strain and one shape, with the distance from the best."""
+    """Give pictures of one scene the same camera, strain scale and aspect ratio, and state distances from the
+    reference.
+    """
     renders: list[Any] = [picture.render for picture in pictures]
     replays = [render.replay for render in renders]
     limit = shown_limit(replays, [render.frame for render in renders])
@@ -181,7 +192,7 @@ _FROM = "Distance: of the farthest vertex from the reference, the run of the low
 
 
 def sheet(pictures: Sequence[Picture]) -> list[Picture]:
-    """Pictures of several scenes: each by a camera of its own, all of one shape and by one scale of strain."""
+    """Build pictures of several scenes, each with its own camera, with one aspect ratio and one strain scale."""
     limit = max(picture.limit for picture in pictures)
     aspect = float(np.median([picture.aspect for picture in pictures]))
     out: list[Picture] = []

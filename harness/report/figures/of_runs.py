@@ -1,4 +1,4 @@
-"""The panels of sweeps and of speed reports: times against size."""
+"""Panels of sweeps and of speed reports: times against size."""
 
 from __future__ import annotations
 
@@ -19,14 +19,18 @@ from harness.report.style import OLDER, Mark, looks
 from harness.report.timing_table import RunTimes, labels, runs
 
 Older = Callable[[pa.Table], Collection[str]]
-"""The ids of those runs in rows that other code than today's measured."""
+"""Returns the ids of those runs in a table of rows that other code than the current version measured."""
 
 _VERTICES = Scale("vertices", "sizes", "plain")
 _NEEDED = ("run_id", "scene", "size", "solver", "phase", "status")
 
 
 def sweep_rows(folder: Path) -> pa.Table:
-    """The rows of a sweep. Raises InputError where there are none, or where they are a speed report's."""
+    """Read the rows of a sweep.
+
+    Raises:
+        InputError: if there are none, or if they belong to a speed report.
+    """
     units = shelf.units(folder / "rows")
     if not units:
         raise InputError(Mistake("holds no rows of runs; wanted those of `springbench run CONFIG`", folder))
@@ -37,7 +41,12 @@ def sweep_rows(folder: Path) -> pa.Table:
 
 
 def timing(folder: Path, older: Older) -> list[Entry]:
-    """Times of a step and of preparing, of each scene."""
+    """Build panels of step and preparation times, for each scene.
+
+    Args:
+        folder: folder of a sweep's results.
+        find_stale: returns the ids of stale runs in a table of rows.
+    """
     table = sweep_rows(folder)
     found, other = runs(table), older(table)
     names = labels(found)
@@ -84,7 +93,7 @@ def _by_size(
     fields: Sequence[str],
     other: Collection[str],
 ) -> tuple[list[Series], tuple[Scale, Scale]]:
-    """Curves against vertices; with one size alone a row of its own for each solver, the fastest first."""
+    """Build curves against the number of vertices, or, for a single size, one row per solver, the fastest first."""
     each: dict[str, list[RunTimes]] = {}
     for run in sorted(timed, key=lambda run: run.vertices or 0):
         each.setdefault(names[run.run_id], []).append(run)
@@ -104,7 +113,7 @@ def _by_size(
 
 
 def speed(folder: Path) -> list[Entry]:
-    """Times of each phase against size, and the part of the binding limit that is reached."""
+    """Build panels of each phase's time against size, and of the reached share of the binding limit."""
     units = shelf.units(folder / "rows")
     table = rows.read(units, needed=_NEEDED) if units else None
     if table is None or speed_figures.MACHINE not in table["solver"].unique().to_pylist():

@@ -1,4 +1,4 @@
-"""The map of winners: stiffness number by error, coloured by the family of the cheapest method, a grid a mesh size."""
+"""Map of winners: stiffness number against error, coloured by the cheapest family of methods, one map per mesh size."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NONE = "#e9e7e2"
 
 
 def winners(folder: Path) -> list[Entry]:
-    """A grid for each number of vertices."""
+    """Build a map for each number of vertices."""
     table = read(folder)
     found = cells(table.works)
     looks = families(found)

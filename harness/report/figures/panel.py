@@ -1,6 +1,6 @@
-"""What a figure is made of: panels of curves, grids of cells and pictures of meshes, as plain data.
+"""Panels of a figure as plain data: plots of curves, maps of cells, and pictures of meshes.
 
-The same panel is drawn, written as CSV and drawn again by the script beside it.
+The same panel is drawn, written as CSV, and reproduced by the script next to the CSV file.
 """
 
 from __future__ import annotations
@@ -19,8 +19,14 @@ Row = dict[str, str | float | int | bool]
 
 
 class Scale(NamedTuple):
-    """An axis. words: what it shows, with its unit; kind: how it is divided (`sizes`: as `log`, with a tick at each
-    value); unit: how its ticks are written; names: of its places 0, 1, ... where kind is `names`."""
+    """An axis.
+
+    Attributes:
+        label: quantity with its unit.
+        division: scale of the axis; `sizes` is `log` with a tick at each value.
+        tick_format: format of the tick labels.
+        place_names: names of the positions 0, 1, ... if `division` is `names`.
+    """
 
     words: str
     kind: Literal["log", "sizes", "linear", "iterations", "names"] = "log"
@@ -30,12 +36,16 @@ class Scale(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:
-    """One curve: points x, y (k,), in order; what is not a number is a gap.
+    """One curve: ordered points x, y (k,); nan is a gap.
 
-    low, high: an interval (k,) of y, or of x where `across`; older: which points (k,) other code measured, drawn
-    hollow; steps: whether it is constant between points; joined: whether a line joins them; named: whether each point
-    is named by `label`; setting: what tells curves of one label apart, in the data; grown: how much larger than others
-    its marks are.
+    Attributes:
+        lower, upper: interval (k,) of y, or of x if `is_horizontal`.
+        stale: which points (k,) other code measured; they are drawn hollow.
+        is_stepped: whether the curve is constant between points.
+        is_connected: whether a line connects the points.
+        labels_points: whether `label` is drawn at each point.
+        setting: distinguishes curves of the same label in the data.
+        marker_scale: marker size relative to other curves.
     """
 
     label: str
@@ -54,7 +64,7 @@ class Series:
 
 
 class Band(NamedTuple):
-    """A range of y that is shaded, and what that means."""
+    """A shaded range of y, and its meaning."""
 
     low: float
     high: float
@@ -62,7 +72,7 @@ class Band(NamedTuple):
 
 
 class Line(NamedTuple):
-    """A value of y that a line marks, and what it is."""
+    """A value of y that a line marks, and its meaning."""
 
     y: float
     words: str
@@ -72,8 +82,12 @@ class Line(NamedTuple):
 class Plot:
     """Curves in one frame.
 
-    of: the parts of the name that say what was measured, such as scene and size; name: those that say which panel of it
-    this is; `--panels` chooses by both. subject, title: the same for people; notes: at the figure's foot.
+    Attributes:
+        group: parts of the name that identify the measurement, such as scene and size.
+        name: parts of the name that identify the panel within the group; `--panels` selects by group and name.
+        subject, title: the same in words.
+        notes: sentences at the foot of the figure.
+        machine_words: provenance of the data.
     """
 
     of: tuple[str, ...]
@@ -88,15 +102,17 @@ class Plot:
     notes: Sequence[str] = ()
     machine: str = ""
     aspect: float = 0.72
-    """Height over width of the frame."""
+    """Height / width of the frame."""
 
     def rows(self) -> list[Row]:
-        """The data as rows of a CSV file, all of the same keys."""
+        """Return the data as rows of a CSV file, all with the same keys."""
         return [row for series in self.series for row in _points(":".join((*self.of, *self.name)), series)]
 
 
 class Cell(NamedTuple):
-    """One cell of a grid: its row and column by name, its outcome and colour, its figure; older: by other code."""
+    """One cell of a map: its row and column by name, its outcome, colour and value, and whether other code measured
+    it.
+    """
 
     row: str
     column: str
@@ -107,7 +123,7 @@ class Cell(NamedTuple):
 
 
 def dotted(cells: Sequence[Cell]) -> list[str]:
-    """What the dots in cells mean; there are none where other code measured all of them."""
+    """Describe the dots in cells; there are no dots if other code measured all cells."""
     if cells and all(cell.older for cell in cells):
         return ["Measured by other code than today's."]
     return ["Dot: measured by other code than today's."] if any(cell.older for cell in cells) else []
@@ -115,7 +131,7 @@ def dotted(cells: Sequence[Cell]) -> list[str]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CellMap:
-    """Coloured cells, rows by columns; outcomes: their meanings with colours, in the order of the legend."""
+    """Coloured cells in rows and columns; `outcomes` are pairs of meaning and colour, in the order of the legend."""
 
     of: tuple[str, ...]
     name: tuple[str, ...]
@@ -127,14 +143,23 @@ class CellMap:
     machine: str = ""
 
     def rows(self) -> list[Row]:
-        """The data as rows of a CSV file."""
+        """Return the data as rows of a CSV file."""
         return [{"panel": ":".join((*self.of, *self.name)), **cell._asdict()} for cell in self.cells]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """A rendered mesh. p (n, 3) [m], triangles (f, 3) or springs (m, 2), strain (n,), limit: of the scale of strain;
-    pixels: a picture of width / height `aspect` is rendered by `render(width in pixels, background)`."""
+    """A rendered mesh.
+
+    Attributes:
+        p: vertex positions (n, 3) [m].
+        springs: vertex indices (m, 2); drawn if there are no triangles.
+        triangles: vertex indices (f, 3).
+        strain: strain of each vertex (n,).
+        strain_limit: end of the strain scale.
+        aspect: width / height of the picture.
+        render: returns the pixels, given width [pixels] and background.
+    """
 
     of: tuple[str, ...]
     name: tuple[str, ...]
@@ -154,17 +179,17 @@ class Picture:
     mesh: str = field(default="")
 
     def rows(self) -> list[Row]:
-        """The vertices as rows of a CSV file."""
+        """Return the vertices as rows of a CSV file."""
         panel = ":".join((*self.of, *self.name))
         table = zip(*self.p.T.tolist(), self.strain.tolist(), strict=True)
         return [{"panel": panel, "x": x, "y": y, "z": z, "strain": e} for x, y, z, e in table]
 
 
 class Renderer:
-    """Draws a picture at a width [pixels] on a background, or transparent where that is None."""
+    """Draws a picture at a width [pixels] on a background colour, or transparently for None."""
 
     def __call__(self, width: int, background: str | None) -> NDArray[np.uint8]:
-        """Pixels (height, width, 3 or 4)."""
+        """Return the pixels (height, width, 3 or 4)."""
         raise NotImplementedError
 
 

@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""The axes of figures for print: limits, ticks that do not meet, numbers without small type in them."""
+"""Axes of figures for print: limits, tick labels that do not overlap, and numbers without small type."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from harness.report.page import count, quantity, ticks
 
 _SUPERSCRIPTS = str.maketrans("-0123456789.", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹·")
 _ROOM = 0.06
-"""Of the axis, left free at each end."""
+"""Share of the axis that is empty at each end."""
 
 
 def in_points(ax: Axes) -> tuple[float, float]:
-    """Width and height of a frame [points]."""
+    """Return width and height of a frame [points]."""
     figure = ax.get_figure(root=True)
     assert figure
     return ax.bbox.width / figure.dpi * 72.0, ax.bbox.height / figure.dpi * 72.0
 
 
 def _superscript(words: str) -> str:
-    """A number as an exponent, of letters of the full size: mathematics would set it in 0.7 of it."""
+    """Convert a number to superscript characters of the full font size, because math text would use 0.7 of it."""
     return words.translate(_SUPERSCRIPTS)
 
 
 def power(value: float) -> str:
-    """A power of ten, or a number where an exponent would not help."""
+    """Format a power of ten, or a plain number between 0.01 and 1000."""
     if 0.01 < value < 1000.0:
         return f"{value:g}"
     exponent = int(np.floor(np.log10(value) + 1e-9))
@@ -59,7 +59,7 @@ _WRITTEN: dict[str, Callable[[float], str]] = {
 
 
 def set_scales(ax: Axes, panel: Plot) -> None:
-    """Limits and ticks of both axes, from what the panel holds."""
+    """Set limits and ticks of both axes from the panel's data."""
     points = _extent(panel)
     for axis, scale, values in zip((ax.xaxis, ax.yaxis), (panel.x, panel.y), points, strict=True):
         _SET[scale.kind](axis, scale, values)
@@ -67,7 +67,7 @@ def set_scales(ax: Axes, panel: Plot) -> None:
 
 
 def _extent(panel: Plot) -> tuple[Values, Values]:
-    """All values along x and along y, the ends of intervals and the lines across included."""
+    """Return all finite x and y values, including interval ends and marked lines."""
     found: tuple[list[Values], list[Values]] = ([], [])
     for series in panel.series:
         ends = [end for end in (series.low, series.high) if end is not None]
@@ -92,7 +92,7 @@ def _log(axis: Axis, scale: Scale, values: Values) -> None:
 
 
 def _sizes(axis: Axis, scale: Scale, values: Values) -> None:
-    """By logarithms, with a tick at each value."""
+    """Set a logarithmic axis with a tick at each value."""
     _log(axis, scale, values)
     axis.set_major_locator(FixedLocator(np.unique(values).tolist()))
 
@@ -150,7 +150,9 @@ def _written(axis: Axis, scale: Scale) -> None:
 
 
 def thin(ax: Axes) -> None:
-    """Take away ticks until their labels do not meet: every second one, every third. To be called once drawn."""
+    """Remove ticks until their labels do not overlap: keep every second one, every third, and so on; call it after
+    drawing.
+    """
     for axis in (ax.xaxis, ax.yaxis):
         places = [float(at) for at in np.asarray(axis.get_majorticklocs()) if _seen(axis, float(at))]
         for every in range(1, max(2, len(places))):
@@ -169,7 +171,7 @@ def _boxes(axis: Axis) -> list[Bbox]:
 
 
 def _meet(boxes: Sequence[Bbox]) -> bool:
-    """Whether two neighbours are nearer than a space."""
+    """Return whether two neighbouring labels are closer than a space."""
     gap = 2.0
     return any(_near(a, b, gap) for a, b in pairwise(boxes))
 

@@ -1,4 +1,4 @@
-"""The scripts that are written beside figures: what they share, and what draws curves, cells and meshes."""
+"""Templates of the scripts that reproduce figures: a common head, and the code for curves, cells and meshes."""
 
 HEAD = '''"""Draws {name} again from {name}.csv, for you to change; needs Python with matplotlib alone."""
 

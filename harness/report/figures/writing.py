@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""The files of a figure: itself in each format, its data as CSV, and a short script that draws it again from these."""
+"""Output files of a figure: the figure in each format, its data as CSV, and a short script that reproduces it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,17 @@ from harness.report.figures.panel import CellMap, Panel, Picture, Plot, Row
 
 
 def write(figure: Figure, panels: Sequence[Panel], stem: Path, title: str, asked: Asked) -> list[Path]:
-    """Write stem.pdf and so on, stem.csv and stem.py; returns the files. Raises CannotWrite."""
+    """Write the figure in all formats, its data as CSV and its script, and return the files.
+
+    Args:
+        figure: figure to write.
+        panels: panels of the figure, all of one type.
+        stem: path of the files without suffix.
+        title: title of the figure.
+        options: options of the figure.
+    Raises:
+        CannotWrite: if a file cannot be written.
+    """
     stem.parent.mkdir(parents=True, exist_ok=True)
     about = "; ".join(dict.fromkeys(words for panel in panels for words in (panel.subject, panel.machine) if words))
     paths: list[Path] = []
@@ -43,7 +53,7 @@ def write(figure: Figure, panels: Sequence[Panel], stem: Path, title: str, asked
 
 
 def _metadata(kind: str, title: str, about: str) -> dict[str, Any]:
-    """Who made it, of what; without a date, so that the same data is the same file."""
+    """Build the metadata of a file, without a date, so that equal data gives equal files."""
     if kind == "pdf":
         return {"Title": title, "Subject": about, "Creator": "springbench", "CreationDate": None}
     if kind == "svg":
@@ -52,7 +62,7 @@ def _metadata(kind: str, title: str, about: str) -> dict[str, Any]:
 
 
 def _table(path: Path, rows: Sequence[Row], about: Sequence[str]) -> None:
-    """Rows as CSV, below comments that say what they are of."""
+    """Write rows as CSV, below comments that describe them."""
     with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         for words in filter(None, about):
             file.write("# " + " ".join(words.split()) + "\n")
@@ -69,7 +79,7 @@ def _mesh(panel: Picture) -> list[Row]:
 
 
 def script(figure: Figure, panels: Sequence[Panel], name: str, asked: Asked) -> str:
-    """A script that needs nothing but matplotlib and the CSV beside it."""
+    """Build a script that needs only Matplotlib and the CSV file next to it."""
     kind = type(panels[0])
     said = {"name": name, "width": asked.width, "size": asked.size, "small": asked.small}
     inches = tuple(round(float(side), 3) for side in figure.get_size_inches())
@@ -91,7 +101,7 @@ def script(figure: Figure, panels: Sequence[Panel], name: str, asked: Asked) -> 
 
 
 def _stated(panel: Plot) -> tuple[str, dict[str, Any]]:
-    """What a script has to know of a panel beside its points."""
+    """Describe the properties of a panel that a script needs, except its points."""
     axes = {
         key: {"words": scale.words, "scale": _SCALES[scale.kind], "names": list(scale.names)}
         for key, scale in (("x", panel.x), ("y", panel.y))
@@ -112,6 +122,6 @@ def _told(what: object) -> str:
 
 
 def millimetres(figure: Figure) -> tuple[float, float]:
-    """Width and height."""
+    """Return width and height [mm]."""
     across, up = figure.get_size_inches()
     return float(across) * INCH, float(up) * INCH

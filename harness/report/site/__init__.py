@@ -1,13 +1,13 @@
-"""The page of all results: one `index.html` that a browser opens from the file system, without network or server.
+"""The results page: one `index.html` that a browser opens from the file system, without network or server.
 
-    index.html                     beside the folders of the sweeps, or in that of one sweep
-    site/*.js, *.css               the page's own scripts and its style; plotly.js, loaded when a plot is asked for
-    site/data/index.js             which sweeps there are: all that the first view shows
-    site/data/<sweep>/runs.js      the table of its runs; <chart>.js, runs/<run id>.js and so on: loaded when asked for
+    index.html                     next to the folders of the sweeps, or in the folder of one sweep
+    site/*.js, *.css               scripts and style of the page; plotly.js, loaded when a plot is opened
+    site/data/index.js             list of sweeps: all data of the first view
+    site/data/<sweep>/runs.js      table of its runs; <chart>.js, runs/<run id>.js and so on: loaded on demand
+    site/viewer.js                 Rerun's web viewer, if `springbench report` added it: loaded for a recording
 
-    site/viewer.js                 Rerun's web viewer, if `springbench report` put it there: loaded for a recording
-
-Data are scripts, since a page from the file system may load nothing else: each calls `springbench.give(name, value)`.
+Data files are scripts, because a page from the file system cannot load anything else. Each calls
+`springbench.give(name, value)`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The charts of ablations for the page: what each effect costs and changes, and what it adds to an iteration."""
+"""Charts of ablations for the results page: cost and influence of each effect, and its overhead per iteration."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NAMES = {"type": "category", "autorange": "reversed"}
 
 
 def charts(rows: Sequence[Row]) -> tuple[dict[str, dict[str, Any]], list[str]]:
-    """The charts by their ids, and the verdicts, of the rows of one scene or of several."""
+    """Build the charts by their ids, and the verdicts in sentences, from the rows of one or several scenes."""
     made = {"ablation": _effects(rows), "prices": _prices(rows)}
     by_whole = [_of(whole, rows) for whole in of_kind(rows, "whole") if whole["status"] == "ok"]
     words = [f"{some[0]['scene']}: {said}" for some in by_whole for said in sentences(some)]
@@ -28,7 +28,7 @@ def charts(rows: Sequence[Row]) -> tuple[dict[str, dict[str, Any]], list[str]]:
 
 
 def _of(whole: Row, rows: Sequence[Row]) -> list[Row]:
-    """The rows that belong to one whole scene: of its unit."""
+    """Select the rows that belong to one full run: those of its unit."""
     return [whole, *(row for row in rows if row is not whole and row["file"] == whole["file"])]
 
 

@@ -1,8 +1,8 @@
-"""The charts of an accuracy measurement for the page: convergence, times, work and precision, profiles, growth,
-winners, engines.
+"""Charts of an accuracy measurement for the results page.
 
-A chart is a list of items, each a line with its solver, what it was, and named columns of numbers; the page filters
-items by `filters`, puts them into a panel each `panel`, and draws the chosen columns.
+These are convergence, time to accuracy, work-precision, profiles, scaling, winners and engines. A chart is a list of
+items, each a line with its solver, a description, and named columns of numbers. The page filters items by `filters`,
+draws one panel per `panel`, and shows the selected columns.
 """
 
 from __future__ import annotations
@@ -41,7 +41,12 @@ _SHARES = {"range": [-0.02, 1.05], "tickformat": ".0%"}
 
 
 def charts(everything: Measurements, folder: Path) -> dict[str, Item]:
-    """The charts that the rows have something for, by their ids; folder: of the sweep's results."""
+    """Build the charts with data in the rows, by their ids.
+
+    Args:
+        all_data: data of an accuracy measurement.
+        folder: folder of the sweep's results.
+    """
     table = without_short(everything)
     pictures: dict[str, Item] = {}
     for problem in table.problems:
@@ -64,7 +69,7 @@ def charts(everything: Measurements, folder: Path) -> dict[str, Item]:
 
 
 def _run(table: Measurements, curve: Curve, pictures: Mapping[str, Item]) -> Item:
-    """What all items of a curve say."""
+    """Build the fields that all items of a curve share."""
     return {
         "label": curve.label,
         "what": f"{curve.problem.name}, {GUESSES.get(curve.first_guess, curve.first_guess)}",

@@ -1,4 +1,4 @@
-"""What is the same in every page: its scripts and its style, and Plotly's, which comes with that package."""
+"""Static files of the results page: its scripts and its style, and Plotly's script from the installed package."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _STATIC = _HERE / "static"
 
 @cache
 def version() -> str:
-    """12 hexadecimal digits of SHA-256 over what makes a page."""
+    """Return a version: 12 hexadecimal digits of SHA-256 over the files that determine a page."""
     parts = sorted(path for path in _HERE.rglob("*") if path.suffix in (".py", ".js", ".css", ".html"))
     return sha256(b"".join(path.read_bytes() for path in parts)).hexdigest()[:12]
 
 
 def place(results: Path) -> str:
-    """Put the page beside the folders of results, where it is not there as it is now; returns its version."""
+    """Install the page next to the folders of results unless it is up to date; return its version."""
     site, stamp = results / "site", results / "site" / "version.txt"
     if stamp.is_file() and stamp.read_text() == version() and (results / "index.html").is_file():
         return version()
@@ -36,7 +36,7 @@ def place(results: Path) -> str:
 
 
 def plotly() -> Path:
-    """Plotly's script, found without loading the package."""
+    """Return the path of Plotly's script, without importing the package."""
     found = find_spec("plotly")
     (home,) = (found.submodule_search_locations if found else None) or (None,)
     return Path(str(home)) / "package_data" / "plotly.min.js"

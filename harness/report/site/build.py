@@ -1,4 +1,4 @@
-"""Brings the page up to date: what is new of each sweep, then the index of all."""
+"""Update of the results page: new data of each sweep, then the index of all sweeps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from harness.report.site.folders import KINDS, Folder, folder_of, folders, store
 from harness.report.site.overview import Overview, overview
 
 SUMMARY = "summary.json"
-"""What the index says of a sweep, kept beside its data."""
+"""File with a sweep's entry in the index, stored next to its data."""
 
 
 def update(
@@ -29,11 +29,17 @@ def update(
     viewer: bool = False,
     say: Callable[[str], None] = lambda words: None,
 ) -> Path:
-    """Write what is new of a folder of results, or of one sweep, to its page; returns `index.html`.
+    """Update the results page of a folder of results, or of one sweep, and return `index.html`.
 
-    only: the folders of sweeps that have something new, all if left out; recorded: whether recordings, and what the
-    page draws of their meshes, become scripts; viewer: whether Rerun's is put beside them; say: prints a remark.
-    Raises InputError where there are no rows, CannotWrite.
+    Args:
+        results: folder of results, or the folder of one sweep.
+        changed_folders: folders of sweeps with new data; None for all.
+        with_recordings: whether recordings, and meshes drawn from them, are converted to scripts.
+        with_viewer: whether Rerun's viewer is added.
+        print_message: prints a remark.
+    Raises:
+        InputError: if there are no rows.
+        CannotWrite: if a file cannot be written.
     """
     found = folders(results) if only is None else [folder_of(path, results) for path in only]
     data, code = results / "site" / "data", place(results)
@@ -51,9 +57,15 @@ def update(
 
 
 def keep(results: Path, folder: Path, say: Callable[[str], None], *, quiet: bool = False) -> None:
-    """Bring the page of all results up to date with what is new in a sweep's folder; says where it is, unless `quiet`.
+    """Update the page of all results with the new data of a sweep's folder, and print its path unless `is_quiet`.
 
-    Where rows beside those of this sweep are damaged, it says so: what was measured is there all the same.
+    If rows are damaged, it prints a remark instead of raising: the measured data is stored in any case.
+
+    Args:
+        results: folder of results.
+        folder: folder of the sweep.
+        print_message: prints a remark.
+        is_quiet: whether to omit the path of the page.
     """
     try:
         page = update(results, only=[folder])
@@ -75,7 +87,7 @@ def _write(home: Path, folder: Folder, found: Overview, state: str) -> None:
 
 
 def _known(home: Path) -> dict[str, Any]:
-    """What was written of a sweep the last time; nothing where that is not there, or not whole."""
+    """Read the summary written by the last update of a sweep; empty if it is missing or incomplete."""
     try:
         return json.loads((home / SUMMARY).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -83,7 +95,7 @@ def _known(home: Path) -> dict[str, Any]:
 
 
 def _state(folder: Folder, code: str, recorded: bool) -> str:
-    """What changes when there is something new of a sweep, or when this program would tell it otherwise."""
+    """Return a hash that changes if a sweep has new data, or if this program would present it differently."""
     told: list[Any] = [code, recorded]
     for kind in KINDS:
         home = folder.path / kind
@@ -98,13 +110,13 @@ def _state(folder: Folder, code: str, recorded: bool) -> str:
 
 
 def _called(results: Path) -> str:
-    """The folder as commands call it from where this one was called; its name alone where it lies elsewhere."""
+    """Return the folder's path relative to the current directory, or its name if it is elsewhere."""
     there, here = results.resolve(), Path.cwd()
     return there.relative_to(here).as_posix() if there.is_relative_to(here) else there.name
 
 
 def _index(results: Path, data: Path) -> None:
-    """The index of all sweeps that were written and are still there; those that never were are counted."""
+    """Write the index of all existing sweeps with a summary; the others are listed as absent."""
     there = {folder.slug: folder for folder in folders(results)}
     known = {slug: _known(data / slug) for slug in there}
     told = sorted((summary for summary in known.values() if summary), key=lambda s: s["to"] or "", reverse=True)

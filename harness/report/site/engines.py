@@ -1,4 +1,4 @@
-"""Outside engines beside ours as a chart of the page: the front of each program, over all of its settings."""
+"""Chart of external engines for the results page: the Pareto front of each program over all of its settings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _NOTE = (
 
 
 def chart(table: Measurements) -> dict[str, Any]:
-    """The chart, without items where no engine was measured beside ours."""
+    """Build the chart; it has no items if no engine was measured."""
     items = [
         _item(table, mesh, name, front)
         for mesh, here in met(table.works).items()

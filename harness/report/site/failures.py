@@ -1,4 +1,4 @@
-"""What did not succeed, by cause: each cause once, in words, with the runs that it stopped."""
+"""Failed runs grouped by cause: each cause in words, with the runs that it stopped."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 _NUMBER = re.compile(r"[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?", re.IGNORECASE)
 
 MOST = 200
-"""So many causes at most: more of them are no overview."""
+"""Maximum number of causes: more would not be an overview."""
 
 
 class Failed(NamedTuple):
-    """One run that did not succeed: where and by whom, its status and the reason; run: its id, if it has one."""
+    """One failed run: scene, solver, status and reason, and its run id if it has one."""
 
     where: str
     solver: str
@@ -24,8 +24,12 @@ class Failed(NamedTuple):
 
 
 def causes(failed: Iterable[Failed]) -> list[dict[str, Any]]:
-    """The causes, the most frequent first. Reasons that differ in numbers, or in the names of their scene and solver,
-    are one cause, told in the words of its first run."""
+    """Group failed runs by cause, the most frequent first.
+
+    Reasons that differ only in numbers, or in the names of their scene and solver, are one cause, described in the
+    words of
+    its first run.
+    """
     groups: dict[tuple[str, str], list[Failed]] = {}
     for one in failed:
         groups.setdefault((one.status, _cause(one)), []).append(one)

@@ -1,4 +1,4 @@
-"""The folders of results that a page is about."""
+"""Folders of results that a page shows."""
 
 from __future__ import annotations
 
@@ -14,15 +14,21 @@ from harness.base.errors import InputError, Mistake
 from harness.base.files import safe_name
 
 KINDS = ("rows", "accuracy", "ablation")
-"""The folders of rows that a sweep's folder may have, by what made them."""
+"""Subfolders for rows in a sweep's folder, by the command that produces them."""
 
 _STORED = "*bit/[0-9][0-9][0-9][0-9]_*.json"
-"""Results of gates, as pytest-benchmark calls them: in a folder for the system and Python, by number."""
+"""Benchmark files as pytest-benchmark names them: numbered, in a folder for the system and the Python version."""
 
 
 class Folder(NamedTuple):
-    """A sweep's results. path; name: for people; slug: of its data, a name that files and URLs take; up: the relative
-    URL of its folder as seen from the page, escaped, with a slash at its end."""
+    """The folder of a sweep's results.
+
+    Attributes:
+        path: path of the folder.
+        name: name that the page shows.
+        slug: name of its data that is valid in files and URLs.
+        relative_url: escaped URL of the folder relative to the page, with a trailing slash.
+    """
 
     path: Path
     name: str
@@ -31,12 +37,12 @@ class Folder(NamedTuple):
 
 
 def stored(folder: Path) -> list[Path]:
-    """The stored results of gates in a folder."""
+    """Find the stored benchmark results in a folder."""
     return sorted(folder.glob(_STORED))
 
 
 def folder_of(path: Path, results: Path) -> Folder:
-    """A sweep's folder as the page in `results` sees it."""
+    """Return a sweep's folder as the page in `results` refers to it."""
     parts = path.relative_to(results).parts
     up = "".join(f"{quote(os.fsencode(part), safe='')}/" for part in parts)
     name = os.fsencode("/".join(parts) or path.resolve().name).decode(errors="replace")
@@ -44,7 +50,7 @@ def folder_of(path: Path, results: Path) -> Folder:
 
 
 def _slug(parts: tuple[str, ...]) -> str:
-    """A name for each folder, unlike any other's: its parts joined by ~, or a hash where that is not safe or unique."""
+    """Make a unique name for a folder: its parts joined by ~, or a hash if that is unsafe or ambiguous."""
     joined = "~".join(parts) or "this"
     unique = joined.count("~") == max(len(parts) - 1, 0) and parts != ("this",)
     if unique and re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._~-]{0,99}", joined):
@@ -53,7 +59,11 @@ def _slug(parts: tuple[str, ...]) -> str:
 
 
 def folders(results: Path) -> list[Folder]:
-    """All of them in a folder of results, or that of one sweep. Raises InputError where there is none."""
+    """Find all sweep folders in a folder of results, or the folder of one sweep.
+
+    Raises:
+        InputError: if there is none.
+    """
     if not results.is_dir():
         raise InputError(Mistake("is no folder; wanted a folder of results, or that of one sweep", results))
     found = {folder.parent for kind in KINDS for folder in shelf.folders(results, kind) if shelf.units(folder)}

@@ -1,4 +1,4 @@
-"""What the rows of each run say frame by frame, a script for each run: loaded where a run is opened or compared."""
+"""Per-frame data of each run, in a script per run: loaded when a run is opened or compared."""
 
 from __future__ import annotations
 
@@ -23,19 +23,26 @@ _FIGURES = {
     "springs": "max(energy_springs)",
     "distance": "max(distance)",
 }
-"""Columns of a run's script, and each as SQL over the rounds of a frame."""
+"""Columns of a run's script, each as SQL over the rounds of a frame."""
 
 _MOST = "3e38"
-"""What a number in single precision is at most."""
+"""Largest finite number in single precision, rounded down."""
 
 
 def write(folder: Folder, table: pa.Table, data: Path, wanted: Collection[str]) -> None:
-    """Write the scripts of these runs."""
+    """Write the scripts of these runs.
+
+    Args:
+        folder: folder of the sweep's results.
+        table: rows of the sweep.
+        data: folder of the page's data of this sweep.
+        run_ids: runs to write.
+    """
     if not wanted:
         return
     inner = ", ".join(f"{sql} as {name}" for name, sql in _FIGURES.items())
-    # Single precision, whose shortest decimals to_json writes, is more than a page shows; what is beyond it is so large
-    # that its logarithm alone says anything.
+    # Single precision, whose shortest decimals to_json writes, is more accurate than the display. Values outside its
+    # range are so large that only their order of magnitude matters.
     outer = ", ".join(
         f"'{name}': list(case when isfinite({name}) then least(greatest({name}, -{_MOST}), {_MOST})::float end "
         "order by frame)"

@@ -1,4 +1,4 @@
-"""Stored results of gates for the page: each gate by commit, its level, and where that changed."""
+"""Stored benchmark results for the results page: each benchmark by commit, its level, and changes of the level."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _KINDS = {
 
 
 def read(files: Iterable[Path], say: Say) -> list[Stored]:
-    """What is stored in these files; a remark on each that is damaged."""
+    """Read stored benchmark results, with a remark on each damaged file."""
     found: list[Stored] = []
     for path in files:
         try:
@@ -48,14 +48,14 @@ def read(files: Iterable[Path], say: Say) -> list[Stored]:
 
 
 def charts(stored: Sequence[Stored]) -> tuple[dict[str, Chart], list[Chart]]:
-    """The charts by their ids, of ratios and of times, and findings: the changes, the largest first."""
+    """Build the charts of ratios and of times by their ids, and the findings: the changes, the largest first."""
     found = histories(stored)
     made = {name: _chart(name, [one for one in found if one.ratio == (name == "gates")]) for name in _KINDS}
     return {name: chart for name, chart in made.items() if chart["items"]}, [*_findings(found)]
 
 
 def made(stored: Sequence[Stored]) -> list[Chart]:
-    """By which commits and on which machines, the newest first."""
+    """Return commits and machines of the results, the newest first."""
     dates: dict[tuple[str, str | None, int], list[str]] = {}
     for one in stored:
         cpu, cores, usable = one.machine
@@ -87,7 +87,7 @@ def _chart(name: str, found: Sequence[GateHistory]) -> Chart:
 
 
 def _items(gate: GateHistory, panel: str) -> Iterable[Chart]:
-    """The results, the level with a gap before each change, and the changes, by commits told apart."""
+    """Build items of the results, of the level with a gap before each change, and of the changes."""
     names = _named(gate.points)
     scale = 1.0 if gate.ratio else 1e3
     same = {"what": gate.gate, "gate": gate.gate, "panel": panel, "parameters": "{}"}
@@ -114,7 +114,7 @@ _ENDS = (("", "value"), ("_low", "low"), ("_high", "high"))
 
 
 def _named(points: Sequence[StoredResult]) -> list[str]:
-    """Their commits, with a number where one was measured before."""
+    """Return the commits of the points, with a number where a commit was measured repeatedly."""
     seen = Counter[str]()
     names: list[str] = []
     for point in points:

@@ -1,4 +1,4 @@
-"""The map of hard cases for the page: solvers x cases, what became of each run and why."""
+"""Robustness map for the results page: solvers x cases, with the outcome of each run and its reason."""
 
 from __future__ import annotations
 
@@ -16,13 +16,17 @@ TITLE = "Hard cases"
 
 
 def judged(table: pa.Table) -> bool:
-    """Whether an oracle judged any of these rows."""
+    """Return whether any of these rows was verified."""
     columns = [table[name] for name in ("stationarity", "distance") if name in table.column_names]
     return any(column.null_count < len(column) for column in columns)
 
 
 def chart(folder: Folder) -> dict[str, Any]:
-    """The map: cells by case and solver, the solvers' shares, and what the colours mean. Raises InputError."""
+    """Build the map: cells by case and solver, the solvers' shares, and the meanings of the colours.
+
+    Raises:
+        InputError: if no run was verified.
+    """
     cells = read_cells(folder.path)
     words = [outcome.words for outcome in OUTCOMES]
     return {
@@ -46,5 +50,5 @@ def chart(folder: Folder) -> dict[str, Any]:
 
 
 def outcomes(map_of: dict[str, Any]) -> dict[str, Any]:
-    """By run id, what became of it."""
+    """Return the outcome and its reason by run id."""
     return {cell[5]: {"words": map_of["outcomes"][cell[2]]["words"], "reason": cell[4]} for cell in map_of["cells"]}

@@ -1,4 +1,4 @@
-"""Colours, marks and line styles of `harness.report.style`, and axes, as Plotly and the page's legends name them."""
+"""Colours, markers and line styles of `harness.report.plot_style`, and axes, in Plotly's terms."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ LOG = {"type": "log"}
 
 
 def drawn(mark: Mark) -> dict[str, str]:
-    """A mark in Plotly's names."""
+    """Return a style in Plotly's terms."""
     return {"color": mark.color, "symbol": _SYMBOLS[mark.marker], "dash": _DASHES.get(mark.dash, "longdash")}
 
 
 def axis(column: str, title: str, how: Mapping[str, Any] = LOG) -> dict[str, Any]:
-    """What a chart can be drawn by: a column of its items, and how Plotly draws the axis."""
+    """Return a possible axis of a chart: a column of its items, its title, and the layout for Plotly."""
     return {"column": column, "title": title, "axis": how}

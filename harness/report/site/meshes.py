@@ -1,6 +1,7 @@
-"""Meshes for the page, from recordings: the last frame of each run, and each solve's iterates beside its reference.
+"""Meshes for the results page from recordings: the last frame of each run, and iterates of solves with a reference.
 
-Positions are single precision, relative to the recording's origin: differences below 1e-7 of a scene's size are none.
+Positions are in single precision relative to the recording's origin: differences below 1e-7 of a scene's size are not
+resolved.
 """
 
 from __future__ import annotations
@@ -24,13 +25,21 @@ from harness.report.site.viewer import write_recording
 Say = Callable[[str], None]
 
 KEPT = 25
-"""So many iterates of a solve at most, evenly spread over those that were recorded: of more a slider shows no more."""
+"""Maximum number of iterates of a solve, evenly spaced over the recorded ones; a slider does not resolve more."""
 _NEAR = 1e-6
-"""Of the largest distance: where the scale of distances ends."""
+"""Lower end of the distance scale, relative to the largest distance."""
 
 
 def write_last(folder: Folder, home: Path, units: Sequence[str], say: Say) -> set[str]:
-    """The last frames of these runs, where they are not there yet; returns the units whose are there."""
+    """Write the last frames of these runs unless they are up to date.
+
+    Args:
+        folder: folder of the sweep's results.
+        data_folder: folder of the page's data of this sweep.
+        units: units of rows, whose names are those of their recordings.
+        print_message: prints a remark.
+    Returns: the units with a script.
+    """
     there: set[str] = set()
     for unit in units:
         recording, target = folder.path / "recordings" / f"{unit}.rrd", script.below(home / "meshes", unit)
@@ -45,7 +54,15 @@ def write_last(folder: Folder, home: Path, units: Sequence[str], say: Say) -> se
 
 
 def write_solves(folder: Folder, home: Path, table: Measurements, say: Say) -> dict[str, str]:
-    """The iterates of all solves that were recorded; returns the names of their scripts by their recordings."""
+    """Write the iterates of all recorded solves.
+
+    Args:
+        folder: folder of the sweep's results.
+        data_folder: folder of the page's data of this sweep.
+        table: data of an accuracy measurement.
+        print_message: prints a remark.
+    Returns: the names of the scripts by their recordings.
+    """
     written: dict[str, str] = {}
     for problem in table.problems:
         recorded = [curve for curve in table.curves if curve.problem is problem and curve.recording]
@@ -58,7 +75,14 @@ def write_solves(folder: Folder, home: Path, table: Measurements, say: Say) -> d
 
 
 def write_recordings(folder: Folder, home: Path, recordings: Mapping[str, str]) -> dict[str, str]:
-    """Recordings with their titles as scripts, where they are not there yet; returns the names of those by these."""
+    """Write recordings with their titles as scripts unless they are up to date.
+
+    Args:
+        folder: folder of the sweep's results.
+        data_folder: folder of the page's data of this sweep.
+        recordings: titles by path of the recording.
+    Returns: the names of the scripts by their recordings.
+    """
     there = {name: f"recordings/{Path(name).stem}" for name in recordings if (folder.path / name).is_file()}
     for name in there:
         write_recording(folder.path / name, script.below(home / "recordings", Path(name).stem), recordings[name])
@@ -66,7 +90,7 @@ def write_recordings(folder: Folder, home: Path, recordings: Mapping[str, str]) 
 
 
 def _solves(folder: Folder, home: Path, curves: Sequence[Curve], best: Curve, say: Say) -> dict[str, str]:
-    """Those of one step; best: whose last iterate all are held against."""
+    """Write the solves of one snapshot; the last iterate of `best` is the reference of all."""
     truth = folder.path / best.recording
     targets = {curve.recording: script.below(home / "solves", Path(curve.recording).stem) for curve in curves}
     stale = [name for name, target in targets.items() if not _fresh(target, folder.path / name, truth)]
@@ -84,7 +108,7 @@ def _solves(folder: Folder, home: Path, curves: Sequence[Curve], best: Curve, sa
 
 
 def _iterates(replay: Replay, reference: NDArray[np.float32]) -> dict[str, Any]:
-    """Some of a solve's iterates, and the ends of the scale of their distances [m] from the reference."""
+    """Select some of a solve's iterates, with the limits of their distances [m] from the reference."""
     kept = np.unique(np.linspace(0, len(replay.frames) - 1, min(KEPT, len(replay.frames))).round().astype(int))
     farthest = float(np.linalg.norm(replay.positions[kept] - reference, axis=2).max()) or 1.0
     return _shape(replay) | {
@@ -96,7 +120,7 @@ def _iterates(replay: Replay, reference: NDArray[np.float32]) -> dict[str, Any]:
 
 
 def _shape(replay: Replay) -> dict[str, Any]:
-    """What does not change: triangles, springs, and the mean rest length [m]."""
+    """Return the constant data of a mesh: triangles, springs, and the mean rest length [m]."""
     lengths = replay.rest_lengths
     return {
         "triangles": _packed(replay.triangles, np.uint32),
@@ -106,7 +130,7 @@ def _shape(replay: Replay) -> dict[str, Any]:
 
 
 def _packed(values: NDArray[Any], kind: type) -> str:
-    """The bytes of an array, little endian, in base 64."""
+    """Encode the bytes of an array, little endian, in base64."""
     return b64encode(np.ascontiguousarray(values, np.dtype(kind).newbyteorder("<")).tobytes()).decode()
 
 
@@ -115,7 +139,7 @@ def _fresh(made: Path, *sources: Path) -> bool:
 
 
 def _read(recording: Path, frames: list[int] | None, say: Say) -> Replay | None:
-    """A recording; None, and a remark, where it is damaged."""
+    """Read a recording; return None, after a remark, if it is damaged."""
     from harness.record.reader import read_replay  # brings Rerun along, which a page of what is there already needs not
 
     try:

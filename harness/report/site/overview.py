@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # pyarrow's stubs do not type every kind of file that Parquet is written to.
-"""Everything that the page says of one sweep: its line in the index, and the scripts with its runs and its charts."""
+"""Data of one sweep for the results page: its entry in the index, and the scripts with its runs and charts."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from harness.report.site.sentences import sentences
 Say = Callable[[str], None]
 
 _PICTURES = 3
-"""So many pictures of a sweep stand in the overview."""
+"""Maximum number of pictures of a sweep in the overview."""
 
 _HASH = re.compile(r"-[0-9a-f]{12}$")
 
 
 class Overview(NamedTuple):
-    """summary: what the index says of a sweep; scripts: the rest by name."""
+    """The sweep's entry in the index (`summary`), and its other data by name (`scripts`)."""
 
     summary: dict[str, Any]
     scripts: dict[str, Any]
@@ -42,7 +42,7 @@ _Read = Callable[[Folder, Path, bool, Say], "_Told"]
 
 
 class _Told(NamedTuple):
-    """What one kind of rows has to say."""
+    """The contribution of one kind of rows to a sweep's data."""
 
     scripts: dict[str, Any]
     plots: list[tuple[str, str]]
@@ -53,8 +53,14 @@ class _Told(NamedTuple):
 
 
 def overview(folder: Folder, home: Path, *, recorded: bool, say: Say) -> Overview:
-    """What the rows of a sweep say. home: the folder of its data, where scripts of single runs are written; recorded:
-    whether meshes and recordings become scripts too, which takes longer."""
+    """Build the data of a sweep from its rows.
+
+    Args:
+        folder: folder of the sweep's results.
+        data_folder: folder of the page's data, where scripts of single runs are written.
+        with_recordings: whether meshes and recordings are converted to scripts, which takes longer.
+        print_message: prints a remark.
+    """
     kinds = {"rows": _runs, "accuracy": _accuracy, "ablation": _ablation, "gates": _gates}
     there = [kind for kind in kinds if kind != "gates" and shelf.units(folder.path / kind)]
     there += ["gates"] if stored(folder.path) else []
@@ -81,7 +87,11 @@ def overview(folder: Folder, home: Path, *, recorded: bool, say: Say) -> Overvie
 
 
 def _of_kind(kind: str, read: _Read, folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
-    """What one kind of rows has to say. Raises InputError for rows that do not belong together."""
+    """Build the section of one kind of rows.
+
+    Raises:
+        InputError: if the rows are inconsistent.
+    """
     try:
         return read(folder, home, recorded, say)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
@@ -121,7 +131,7 @@ def _runs(folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
 
 
 def _add_recorded(folder: Folder, home: Path, found: Sequence[dict[str, Any]], anew: bool, say: Say) -> None:
-    """Whether a run's last frame and its recording are among the page's data; anew: those that are not are taken in."""
+    """Mark whether each run's last frame and recording are in the page's data; with `include_missing`, add them."""
     there = {part: {path.stem for path in (home / part).glob("*.js")} for part in ("meshes", "recordings")}
     if anew and (recorded := {run["unit"]: title(run) for run in found if run["recording"]}):
         from harness.report.site.meshes import write_last, write_recordings
@@ -134,7 +144,7 @@ def _add_recorded(folder: Folder, home: Path, found: Sequence[dict[str, Any]], a
 
 
 def _without(folder: Folder, home: Path, found: Sequence[dict[str, Any]]) -> list[str]:
-    """The runs whose script is missing, or older than their rows."""
+    """Find the runs whose script is missing or older than their rows."""
     scripts, rows_of = _written(home / "runs"), _written(folder.path / "rows")
     packed = shelf.packed_file(folder.path / "rows")
     otherwise = packed.stat().st_mtime_ns if packed.exists() else 0
@@ -142,7 +152,7 @@ def _without(folder: Folder, home: Path, found: Sequence[dict[str, Any]]) -> lis
 
 
 def _written(folder: Path) -> dict[str, int]:
-    """When each file in a folder was written [ns], by their stems."""
+    """Return the modification time [ns] of each file in a folder by its stem."""
     if not folder.is_dir():
         return {}
     with os.scandir(folder) as entries:
@@ -150,7 +160,7 @@ def _written(folder: Path) -> dict[str, int]:
 
 
 def _parquet(path: Path, found: Sequence[dict[str, Any]]) -> None:
-    """The table of runs as a file for programs."""
+    """Write the table of runs as a Parquet file for other programs."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as partial:
         pq.write_table(pa.Table.from_pylist([{k: v for k, v in r.items() if k != "settings"} for r in found]), partial)
@@ -202,17 +212,17 @@ def _plain(folder: Folder, kind: str, say: Say = lambda words: None) -> pa.Table
 
 
 def _remark(say: Say) -> Callable[[Mistake], None]:
-    """Says of each unit of rows that is left out why it is."""
+    """Return a function that prints a remark on each skipped unit of rows."""
     return lambda mistake: say(f"not on the page: {mistake}")
 
 
 def title(run: dict[str, Any]) -> str:
-    """A run in words."""
+    """Return the scene, size and label of a run."""
     return f"{run['scene']}{' ' + str(run['size']) if run['size'] else ''}, {run['label']}"
 
 
 def _pictures(folder: Folder) -> list[dict[str, str]]:
-    """The best of a sweep's pictures: solvers side by side before single runs, large meshes before small ones."""
+    """Select pictures of a sweep: solver comparisons before single runs, large meshes before small ones."""
     found = sorted((folder.path / "pictures").glob("*.png"), key=_worth, reverse=True)
     found += [p for name in ("convergence", "work") for p in sorted((folder.path / "report").glob(f"{name}/*.png"))][:2]
     times = [path for path in found if path.stem == "timing"]

@@ -1,4 +1,4 @@
-"""The reproduction of figures 2 and 3 of Liu et al. 2013 as a chart of the page: our errors over the paper's."""
+"""Chart of the reproduction of figures 2 and 3 of Liu et al. 2013 for the results page: own errors and the paper's."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NOTE = "Relative error (g − g*)/(g0 − g*) after iterations of local-global:
 
 
 def chart(table: Measurements) -> dict[str, Any]:
-    """The chart, without items where no row belongs to the reproduction."""
+    """Build the chart; it has no items if no row belongs to the reproduction."""
     found = comparisons(table)
     items = [
         {

@@ -1,4 +1,4 @@
-"""By which code and on which machine rows were made, and where the config lies that says how to make them again."""
+"""Provenance of rows for the results page: code version, machine, and the config that reproduces them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,12 @@ from rows_of where machine is not null group by all order by max(started) desc
 
 
 def made(table: pa.Table, unit: str) -> list[dict[str, Any]]:
-    """Machines and commits of rows, the newest first; unit: the column that counts what was measured."""
+    """Collect machines and commits of rows, the newest first.
+
+    Args:
+        table: rows.
+        unit: column whose distinct values are counted.
+    """
     lacking = [name for name in (*_COLUMNS, "code", "started", unit) if name not in table.column_names]
     for name in lacking:
         table = table.append_column(name, pa.nulls(len(table), pa.string()))
@@ -29,7 +34,7 @@ def made(table: pa.Table, unit: str) -> list[dict[str, Any]]:
 
 
 def config_of(folder: Path) -> str:
-    """The config of a sweep's folder as it is best called in a command line; empty where it is not known or gone."""
+    """Find the config of a sweep's folder, in the form suited to a command line; "" if unknown or deleted."""
     note = folder / CLAIM
     said = note.read_text(errors="replace").strip() if note.is_file() else ""
     path = folder / said
@@ -43,7 +48,7 @@ def config_of(folder: Path) -> str:
 
 
 def scenes_of(folder: Path) -> dict[str, str]:
-    """By name, the files of the scenes that a sweep's config lists, called like the config itself."""
+    """Find the scene files that a sweep's config lists, by scene name, relative to the same folder as the config."""
     from harness.base.yaml import read_yaml
 
     called = config_of(folder)

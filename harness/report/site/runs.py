@@ -1,4 +1,4 @@
-"""A sweep's runs as the table of the page: one line a run, of what its rows say."""
+"""Table of a sweep's runs for the results page: one line per run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from solvers.registry import OPTIONAL, SOLVERS, load
 Run = dict[str, Any]
 
 MACHINE = "machine"
-"""The solver of rows that are no solver's: the limits of the machine itself, in a speed report."""
+"""Solver column of rows that belong to no solver: the limits of the machine itself, in a speed report."""
 
 _NEEDED = ("run_id", "scene", "size", "solver", "phase", "status")
 
@@ -45,13 +45,24 @@ from rows_of group by run_id
 
 
 def read(folder: Folder, left_out: Callable[[Mistake], None]) -> pa.Table:
-    """The rows of a sweep, with the name of each one's unit; left_out: called with each that is invalid. Raises
-    InputError for damaged ones."""
+    """Read the rows of a sweep, with the name of each row's unit.
+
+    Args:
+        folder: folder of the sweep's results.
+        on_invalid: called for each invalid unit.
+    Raises:
+        InputError: if rows are damaged.
+    """
     return rows.read(shelf.units(folder.path / "rows"), needed=_NEEDED, named=True, left_out=left_out)
 
 
 def table_of(folder: Folder, table: pa.Table) -> list[Run]:
-    """The runs in rows, by scene, size and solver: what each was, how it ended, and its times [ms]."""
+    """Build records of the runs, ordered by scene, size and solver: identification, status, and times [ms].
+
+    Args:
+        folder: folder of the sweep's results.
+        table: rows of the sweep.
+    """
     there = {
         part: _files(folder.path / part, suffix) for part, suffix in (("pictures", ".png"), ("recordings", ".rrd"))
     }
@@ -72,7 +83,13 @@ def table_of(folder: Folder, table: pa.Table) -> list[Run]:
 
 
 def as_script(folder: Folder, found: Sequence[Run], outcomes: Mapping[str, Any]) -> dict[str, Any]:
-    """The table as columns; outcomes: of judged runs by their ids, an outcome's words and its reason."""
+    """Build the table of runs as columns.
+
+    Args:
+        folder: folder of the sweep's results.
+        run_records: records of the runs.
+        outcomes: outcome and reason of verified runs by their ids.
+    """
     columns = {name: [run[name] for run in found] for name in _SHOWN if found and name in found[0]}
     columns["parameters"] = [run["parameters"] or "{}" for run in found]
     if outcomes:
@@ -90,13 +107,13 @@ def as_script(folder: Folder, found: Sequence[Run], outcomes: Mapping[str, Any])
 
 
 def references(pairs: Any) -> dict[str, dict[str, str]]:
-    """By solver, the reference in a line and as BibTeX."""
+    """Format references by solver, as a line and as BibTeX."""
     known = {solver: reference for solver, reference in pairs if reference}
     return {s: {"cited": cited(reference), "bibtex": bibtex([reference])} for s, reference in known.items()}
 
 
 _EXACT = ("time_step", "tolerance", "asked")
-"""What a command line asks for to the last digit."""
+"""Columns that commands need to the last digit."""
 
 _SHOWN = (
     *("run_id", "unit", "scene", "size", "solver", "label", "options", "plain", "family", "vertices", "springs"),
@@ -133,14 +150,14 @@ _SHOWN = (
 
 
 def _more(table: pa.Table) -> dict[str, Run]:
-    """What the table of a sweep's end does not say of its runs, by their ids."""
+    """Query details of runs that the table at the end of a sweep does not include, by run id."""
     return {run.pop("run_id"): run for run in answers(_MORE, table)}
 
 
 def _is_plain(solver: str, parameters: str | None) -> bool:
-    """Whether a solver has its parameters' usual values, so that its name alone calls it.
+    """Return whether a solver has default parameters, so that its name alone identifies it.
 
-    Of shipped ones alone is that known: a report imports nobody's own code.
+    This is known only for solvers of the package, because a report does not import plug-in code.
     """
     given, shipped = json.loads(parameters or "{}"), SOLVERS | OPTIONAL
     if solver not in shipped or not given:
@@ -154,8 +171,11 @@ def _files(folder: Path, suffix: str) -> set[str]:
 
 
 def _other_code(found: Sequence[Run]) -> list[str]:
-    """Of each run: `other code` than the newest run of its scene by its solver, an `earlier commit` than the newest of
-    all, or nothing."""
+    """Classify each run as `other code`, `earlier commit` or current ("").
+
+    `other code` is relative to the newest run of its scene and solver, `earlier commit` relative to the newest run of
+    all.
+    """
     newest: dict[Any, Run] = {}
     for run in sorted(found, key=lambda run: run["started"] or ""):
         newest[run["scene"], run["solver"]] = newest[None] = run

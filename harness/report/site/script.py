@@ -1,4 +1,4 @@
-"""Data as scripts that a page from the file system may load: each hands one value over by its name."""
+"""Data as scripts that a page from the file system can load: each passes one value by name."""
 
 from __future__ import annotations
 
@@ -13,16 +13,32 @@ from typing import Any
 from harness.base.files import is_file_name, replacing
 
 _PROTOTYPE = re.compile(r'(?<!\\)"__proto__":')
-"""A key of JSON that a script would take for the object's prototype."""
+"""A JSON key that a script would interpret as the object's prototype."""
 
 
 def write(path: Path, name: str, value: Any) -> Path:
-    """Write `springbench.give(name, value)`; what is no JSON raises ValueError. Returns the path."""
+    """Write `springbench.give(name, value)` to a file and return its path.
+
+    Args:
+        path: target file.
+        name: name of the value.
+        value: value that can be represented as JSON.
+    Raises:
+        ValueError: if the value cannot be represented as JSON.
+    """
     return write_text(path, name, json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":")))
 
 
 def write_text(path: Path, name: str, value: str) -> Path:
-    """The same of a value that is JSON already. Raises CannotWrite."""
+    """Write a script for a value that is already JSON, and return its path.
+
+    Args:
+        path: target file.
+        name: name of the value.
+        value: JSON.
+    Raises:
+        CannotWrite: if the file cannot be written.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     value = _PROTOTYPE.sub('["__proto__"]:', value)
     with replacing(path) as partial:
@@ -31,26 +47,32 @@ def write_text(path: Path, name: str, value: str) -> Path:
 
 
 def below(folder: Path, name: str) -> Path:
-    """The script of a name in a folder. Raises ValueError for what is no file's name."""
+    """Return the path of the script with this name in a folder.
+
+    Raises:
+        ValueError: if the name is not a valid file name.
+    """
     if not is_file_name(name):
         raise ValueError(f"{name!r} is no file's name")
     return folder / f"{name}.js"
 
 
 def number(value: Any) -> float | int | None:
-    """To five digits, which is more than a page shows; None for what is missing or not finite."""
+    """Round to five digits, more than the page displays; None for missing or non-finite values."""
     if value is None or isinstance(value, int):
         return value
     return float(f"{value:.5g}") if math.isfinite(value) else None
 
 
 def numbers(values: Iterable[Any]) -> list[float | int | None]:
-    """The same of each."""
+    """Round each value to five digits, see `round_number`."""
     return [number(value) for value in values]
 
 
 def column(values: Sequence[Any]) -> Any:
-    """A column as the page reads it: numbers as they are; words as a list of different ones, `of`, and where, `at`."""
+    """Encode a column for the page: numbers as they are; strings as a list of distinct ones, `of`, and indices,
+    `at`.
+    """
     if str not in set(map(type, values)):
         return numbers(values)
     known = [word for word, _ in Counter(v for v in values if v is not None).most_common()]

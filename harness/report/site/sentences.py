@@ -1,4 +1,4 @@
-"""Sentences on the runs of a sweep: who is fastest where errors are equal, and how many runs did not converge."""
+"""Sentences on the runs of a sweep: the fastest at equal accuracy, and the number of unconverged runs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Run = dict[str, Any]
 
 
 def sentences(found: Sequence[Run]) -> list[dict[str, Any]]:
-    """Sentences, each with the ids of its runs (`equal_accuracy`)."""
+    """Describe runs in sentences, each with the ids of its runs (`equal_accuracy`)."""
     names = {run["run_id"]: run["label"] for run in found}
     told = [
         {"words": words, "runs": runs}
@@ -27,7 +27,7 @@ def _times(run: Run) -> RunTimes:
 
 
 def _unconverged(found: Sequence[Run]) -> Iterator[dict[str, Any]]:
-    """How many runs ended their steps by the limit of iterations and not by what they reached."""
+    """Describe how many runs ended a step at the iteration limit."""
     done = [run for run in found if run["status"] == "ok" and run["stopped"]]
     short = [run for run in done if run["stopped"] == "iterations"]
     if short:

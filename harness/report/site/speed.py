@@ -1,4 +1,4 @@
-"""The chart of a speed report for the page: times and bytes a second by size, beside what the machine allows."""
+"""Chart of a speed report for the results page: times and bandwidth by size, compared with the machine's limits."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _COLUMNS = {
 
 
 def is_speed(table: pa.Table) -> bool:
-    """Whether rows are those of a speed report: the machine's own limits are among them."""
+    """Return whether rows belong to a speed report, which contains the machine's own limits."""
     return MACHINE in table["solver"].unique().to_pylist()
 
 
 def chart(table: pa.Table) -> tuple[dict[str, Any], list[str]]:
-    """The chart, and what there is to say."""
+    """Build the chart, and remarks in sentences."""
     found = figures(table)
     timed = [f for f in found if f.status == "ok"]
     reference = dict(zip(*(table[name].to_pylist() for name in ("solver", "reference")), strict=True))

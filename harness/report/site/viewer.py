@@ -1,9 +1,9 @@
-"""Recordings replayed in a page: Rerun's own web viewer, and recordings, as scripts that a page may load from files.
+"""Replay of recordings in a page: Rerun's web viewer, and recordings, as scripts that a page can load from files.
 
-The viewer is the one that the installed `rerun` serves to browsers: a script and its WebAssembly. Both go into one
-`viewer.js`, the latter gzipped in base64. A recording becomes a script of the same kind. `static/replay.js` takes them
-when somebody asks for a recording. How the viewer is started from a page is not documented: all that knows it is here
-and there, and it holds for VERSION alone.
+The viewer is the one that the installed `rerun` serves to browsers: a script and its WebAssembly module. Both are
+packed into one `viewer.js`, the module as gzipped base64. A recording becomes a script of the same kind.
+`static/replay.js` loads them when a recording is opened. The start of the viewer from a page is undocumented: the code
+that depends on it is in this module and in that script, and is valid only for RERUN_VERSION.
 """
 
 from __future__ import annotations
@@ -30,22 +30,24 @@ from harness.base.errors import RunFailed
 from harness.base.files import replacing
 
 VERSION = "0.41.0"
-"""Of rerun-sdk; a test says when another one is installed, and then opens recordings in it."""
+"""Version of rerun-sdk; a test fails if another one is installed, and then recordings have to be checked in it."""
 
 VIEWER = "viewer.js"
-"""The name of the viewer's script, which lies beside `replay.js`."""
+"""File name of the viewer's script, which is stored next to `replay.js`."""
 
 _SCRIPT, _WASM = "re_viewer.js", "re_viewer_bg.wasm"
 _HEADER, _END, _STORE, _DATA, _LAID_OUT = 12, 0, 1, 2, 3
-"""A recording is a header and messages, each a kind and a length of 8 bytes, then its bytes: the end, a store of a
-recording's or a layout's, a part of one, and that a layout is complete."""
+"""Format of a recording: a header, then messages with 8 bytes each for kind and length, and their data.
+
+The kinds are: end, store (of a recording or of a layout), data of a store, and completion of a layout.
+"""
 
 _PATIENCE = 30.0
-"""Seconds that the viewer's server may take to answer."""
+"""Timeout of the viewer's server [s]."""
 
 _HEAD = "// Rerun's web viewer {version}, https://rerun.io, MIT or Apache-2.0; packed by springbench, {how}\n"
 _TAKEN = "springbench.taken = {};\n"
-"""How a script hands over what it brings; `replay.js` asks for one at a time."""
+"""Statement by which a script passes its content; `replay.js` loads one script at a time."""
 
 _QUIET = """{{"wasm": {wasm}, "start": ((console, fetch) => {{
 {script}
@@ -54,18 +56,22 @@ return wasm_bindgen;
   Object.assign(Object.create(window.console), {{debug() {{}}, info() {{}}, warn() {{}}}}),
   async () => new Response(null, {{status: 204}}),
 )}}"""
-"""The viewer tells the console of all that it does, thousands of lines, and its makers of its use: here neither."""
+"""Wrapper that suppresses the viewer's thousands of console messages and its usage reports to its authors."""
 
 
 def binary() -> Path:
-    """Rerun's own program, which the wheel brings; its script is a wrapper that outlives a kill of it."""
+    """Return the path of Rerun's executable from the wheel; its wrapper script would leave a process behind when
+    killed.
+    """
     return Path(rerun_cli.__file__).with_name("rerun.exe" if os.name == "nt" else "rerun")
 
 
 def write_viewer(folder: Path) -> Path:
-    """Write `folder`/viewer.js, some 19 MB, where it is not there for the installed version; returns its path.
+    """Write `folder`/viewer.js, about 19 MB, unless it exists for the installed version; return its path.
 
-    Raises RunFailed where the viewer is not installed or does not answer, CannotWrite.
+    Raises:
+        RunFailed: if the viewer is not installed or does not answer.
+        CannotWrite: if the file cannot be written.
     """
     how = sha256(_QUIET.encode()).hexdigest()[:8]
     path, head = folder / VIEWER, _HEAD.format(version=version("rerun-sdk"), how=how)
@@ -79,9 +85,15 @@ def write_viewer(folder: Path) -> Path:
 
 
 def write_recording(recording: Path, script: Path, title: str) -> Path:
-    """Write a recording (.rrd) as a script, where that is not there or older; returns the script's path.
+    """Write a recording (.rrd) as a script unless that is up to date; return the script's path.
 
-    title: what stands above it in the page. Raises InputError where the recording cannot be read, CannotWrite.
+    Args:
+        recording: recording.
+        script: target file.
+        title: heading of the recording in the page.
+    Raises:
+        InputError: if the recording cannot be read.
+        CannotWrite: if the file cannot be written.
     """
     made = recording.stat().st_mtime_ns
     if not script.is_file() or script.stat().st_mtime_ns < made:
@@ -93,9 +105,9 @@ def write_recording(recording: Path, script: Path, title: str) -> Path:
 
 
 def layout_first(data: bytes) -> bytes:
-    """A recording's messages with those of its layout before the others, so that the viewer opens with it at once.
+    """Move the messages of a recording's layout before the others, so that the viewer opens with it immediately.
 
-    The index at the file's end, which may be half of it, is left out: nothing is looked for in a stream.
+    The index at the end of the file, up to half of its size, is omitted, because a stream needs no lookup.
     """
     messages, place = list[tuple[int, bytes]](), _HEADER
     while place + 16 <= len(data):
@@ -125,7 +137,7 @@ def _packed(data: bytes) -> str:
 
 
 def _served() -> tuple[str, bytes]:
-    """The viewer's script and its WebAssembly, as it serves them itself, on the loopback alone."""
+    """Fetch the viewer's script and its WebAssembly module from its own server, on the loopback interface only."""
     with _serving() as address:
         script, wasm = (_fetched(f"{address}/{name}") for name in (_SCRIPT, _WASM))
     return script.decode().replace("arg0.fetch(", "fetch("), wasm  # that of the window, else
@@ -147,7 +159,11 @@ def _serving() -> Generator[str]:
 
 
 def _fetched(url: str) -> bytes:
-    """What is served at an address, as soon as there is an answer. Raises RunFailed where there is none in time."""
+    """Fetch the content of an address, with retries.
+
+    Raises:
+        RunFailed: if there is no answer in time.
+    """
     direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     until = time.monotonic() + _PATIENCE
     while True:

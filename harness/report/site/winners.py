@@ -1,4 +1,4 @@
-"""The map of winners as a chart of the page: a point for each error on each mesh, of the family that is cheapest."""
+"""Map of winners as a chart of the results page: the cheapest family of methods for each error on each mesh."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NOTE = (
 
 
 def chart(table: Measurements) -> dict[str, Any]:
-    """The chart, without items where fewer than two families were measured."""
+    """Build the chart; it has no items if fewer than two families were measured."""
     found = [cell for cell in cells(table.works) if cell.prices]
     looks = families(found)
     of: dict[tuple[int, str], list[Cell]] = {}
@@ -60,6 +60,6 @@ def _item(table: Measurements, vertices: int, name: str, mine: list[Cell]) -> di
 
 
 def _next(cell: Cell) -> str:
-    """The family that is the second cheapest."""
+    """Return the second cheapest family."""
     order = sorted(cell.prices, key=lambda name: cell.prices[name].cpu)
     return order[1] if len(order) > 1 else "none that was tried"

@@ -1,1 +1,1 @@
-"""What the rows of `springbench speed` say: figures, a table, and pictures against size."""
+"""Reports on the rows of `springbench speed`: figures, a table, and plots against size."""

@@ -1,9 +1,9 @@
-"""What a phase moves and computes, by count: the other side of the machine's limits.
+"""Operation counts of a phase: bytes moved and flops, for comparison with the machine's limits.
 
-    global step   2 x 3 flops for each entry of a factor that a solve reads, once a pass, and the vectors
+    global step   2 x 3 flops for each entry of a factor that a solve reads, once per pass, and the vectors
     local step    two indices and a weight for each spring, and the vectors
 
-A factor that hides how much it reads counts as L twice; one that hides L has no count at all.
+A factor whose read volume is unknown counts as L twice; without the size of L there is no count.
 """
 
 from __future__ import annotations
@@ -15,18 +15,20 @@ _ENTRY = {"float64": 8, "float32": 4, "float16": 2}
 """Bytes of an entry of the factor, by the solver's `precision`."""
 
 _SPRING_BYTES, _SPRING_FLOPS = 16, 19
-"""k r and two indices; a difference, its length, a division and a sum at each end."""
+"""Per spring: k r and two indices; a difference, its length, a division, and a sum at each end."""
 
 _LOCAL_BYTES, _GLOBAL_BYTES = 72, 176
-"""Bytes of the vectors that are moved at each vertex. Local: p and y read, b written. Global: b read, p written, and a
-work vector of 4 numbers read and written in each pass."""
+"""Bytes of the vectors that are moved per vertex.
+
+Local: p and y read, b written. Global: b read, p written, and a work vector of 4 numbers read and written in each pass.
+"""
 
 _VECTORS = 80
-"""Bytes of the vectors that there are at each vertex: b and p, or in an iteration y and p, and the work vector."""
+"""Bytes of the stored vectors per vertex: b and p, or in an iteration y and p, and the work vector."""
 
 
 class Counted(NamedTuple):
-    """bytes moved, flops computed, and the bytes that are gone through again and again."""
+    """Bytes moved, flops, and the bytes that are accessed repeatedly."""
 
     bytes: float
     flops: float
@@ -34,9 +36,13 @@ class Counted(NamedTuple):
 
 
 def count(facts: Mapping[str, float], vertices: int, springs: int, precision: str = "float64") -> dict[str, Counted]:
-    """The work of one local step, one global step and one iteration, which is both; what is not known is left out.
+    """Count the work of one local step, one global step and one iteration (both); unknown counts are omitted.
 
-    facts: of a prepared solver (`nnz_factor`, `panel_bytes`, `flops_per_solve`).
+    Args:
+        stats: `nnz_factor`, `panel_bytes` and `flops_per_solve` of a prepared solver, as far as known.
+        vertices: number of vertices.
+        springs: number of springs.
+        precision: number format of the factor.
     """
     moved = _SPRING_BYTES * springs + _LOCAL_BYTES * vertices
     local = Counted(moved, _SPRING_FLOPS * springs, moved)

@@ -1,4 +1,4 @@
-"""What the rows of a speed report say: milliseconds, bytes a second, which limit binds and how near it is, ratios."""
+"""Figures of a speed report from its rows: times, bandwidth, the binding limit and its reached share, speedups."""
 
 from __future__ import annotations
 
@@ -16,34 +16,41 @@ from harness.base.statistics import Interval, ratio
 from harness.report.speed.counts import Counted, count
 
 MACHINE, YARDSTICK = "machine", "eigen"
-"""What rows of candidates that are no solvers have as their solver."""
+"""Solver column of rows of candidates that are not solvers."""
 
 CAREFUL = "cholmod"
-"""The solver that is a careful program in C++."""
+"""The solver that represents carefully written C++."""
 
 STEP = 50
-"""Iterations of the step that all steps are stated as, however many were done."""
+"""Number of iterations to which all step times are scaled, whatever their actual number."""
 
 Row = dict[str, Any]
 
 
 class Limit(NamedTuple):
-    """What binds, `bandwidth` or `arithmetic`, and the seconds that some work takes at least."""
+    """The binding resource, `bandwidth` or `arithmetic`, and the minimum time of some work [s]."""
 
     binds: str
     seconds: float
 
 
 class Figures(NamedTuple):
-    """One candidate at one size. Times [ms]: the median over the rounds; None: not measured or not known.
+    """One candidate at one size. Times are medians over the rounds [ms]; None: not measured or unknown.
 
-    step: of STEP iterations; entries: of the factor L; touched: bytes a second of an iteration, by what the
-    factor's panels hold; binds: the limit that binds; reached: the part of it that an iteration reaches, by those
-    bytes and flops; passes: the part of the time that two passes over the entries of L alone take, both from where
-    they lie, which a program that uses entries twice while they are in the cache exceeds; faster: than the yardstick a
-    step; careful_faster: than a careful program; solves_faster: than cholespy a global step; apart: from float64's
-    converged positions, in the scene's size; code, commit, cpu, cores: by which it was
-    measured, and where.
+    Attributes:
+        step: time of STEP_ITERATIONS iterations.
+        factor_entries: number of entries of the factor L.
+        achieved_bandwidth: bytes per second of an iteration, by the size of the factor's panels.
+        binding_limit: resource that binds.
+        roofline_fraction: share of the binding limit that an iteration reaches, by those bytes and flops.
+        two_pass_fraction: share of the time that two passes over the entries of L would take, both from the location of
+            the working set; a program that uses entries twice while they are in the cache exceeds it.
+        speedup: of a step, over the C++ baseline.
+        speedup_over_cholmod: of a step, over carefully written C++.
+        solve_speedup_over_cholespy: of a global step.
+        precision_error: distance from the converged positions in float64, relative to the scene's size.
+        source_fingerprint, commit: code that the candidate was measured by.
+        cpu, cores: machine of the measurement.
     """
 
     scene: str
@@ -80,12 +87,12 @@ class Figures(NamedTuple):
 
     @property
     def older(self) -> bool:
-        """Whether other code than today's measured it; of rows that do not say by which code nobody can tell."""
+        """Whether other code than the current version measured it; rows without a fingerprint count as current."""
         return self.code not in ("", machine.code_hash())
 
 
 class MachineLimits:
-    """The measured limits of one size's turns: bandwidth by working set, and flops, by number of threads."""
+    """Measured limits of the machine, from the rounds of one size: bandwidth by working set, and flops, by threads."""
 
     def __init__(self, rows: Sequence[Row]) -> None:
         best: dict[tuple[int, str], dict[float, float]] = defaultdict(dict)
@@ -96,25 +103,35 @@ class MachineLimits:
         self._best = best
 
     def bandwidth(self, threads: int, working_set: float, kernel: str = "read") -> float:
-        """Bytes a second from a working set [bytes], between the measured ones by logarithms."""
+        """Return the bandwidth for a working set, interpolated on logarithmic scales.
+
+        Args:
+            threads: number of threads.
+            working_set: size [bytes].
+            kernel: name of the microbenchmark.
+        Returns: bytes per second.
+        """
         at = sorted(self._best[threads, kernel].items())
         known, rates = np.log(np.array(at)).T
         return float(np.exp(cast(float, np.interp(np.log(working_set), known, rates))))
 
     def flops(self, threads: int, precision: str) -> float:
-        """Flops a second; below float32 there is no arithmetic."""
+        """Return flops per second; precisions below float32 compute in float32."""
         kind = "float64" if precision == "float64" else "float32"
         return self._best[threads, f"fma {kind}"][0.0]
 
     def limit(self, counted: Counted, threads: int, precision: str) -> Limit:
-        """What no order of reading goes below: each byte comes once from where the working set lies, and as often as
-        it is moved besides from the nearest cache."""
+        """Compute the lower bound of the time for any order of access.
+
+        Each byte is loaded once from the location of the working set, and repeated accesses come from the fastest
+        cache.
+        """
         again = (counted.bytes - counted.working_set) / max(self._best[threads, "read"].values())
         far = counted.working_set / self.bandwidth(threads, counted.working_set)
         return self._binding(far + again, counted, threads, precision)
 
     def passes(self, counted: Counted, threads: int, precision: str) -> Limit:
-        """The same where all that is moved comes from where the working set lies, each time."""
+        """Compute the time if all moved bytes are loaded from the location of the working set each time."""
         far = counted.bytes / self.bandwidth(threads, counted.working_set)
         return self._binding(far, counted, threads, precision)
 
@@ -125,7 +142,7 @@ class MachineLimits:
 
 
 def figures(table: pa.Table) -> list[Figures]:
-    """The figures of all candidates in the rows, in their order; the machine's own rows are what they refer to."""
+    """Compute the figures of all candidates in the rows, in their order, relative to the machine's own rows."""
     runs: dict[str, list[Row]] = defaultdict(list)
     for row in table.to_pylist():
         runs[row["run_id"]].append(row)
@@ -143,7 +160,7 @@ def figures(table: pa.Table) -> list[Figures]:
 
 
 def _labels(firsts: Sequence[Row]) -> dict[str, str]:
-    """By run id, the solver with those of its parameters that vary, and its threads where there are several."""
+    """Label candidates by run id: the solver with its varying parameters, and its threads if several."""
     values: dict[tuple[str, str], set[str]] = defaultdict(set)
     for row in firsts:
         for key, value in json.loads(row["parameters"]).items():
@@ -205,26 +222,26 @@ def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], l
 
 
 def _times(found: Sequence[Row], phase: str) -> NDArray[np.float64]:
-    """The seconds of a phase by round; of a step, an iteration's."""
+    """Return the seconds of a phase by round; for a step, those of one iteration."""
     return np.array(
         [row["seconds"] / (row["iterations"] if phase == "step" else 1) for row in found if row["phase"] == phase]
     )
 
 
 def _on_one(group: Mapping[str, list[Row]], those: Callable[[Row], bool]) -> str:
-    """The label of the candidate of those rows that ran on one thread."""
+    """Return the label of the single-threaded candidate whose rows satisfy the predicate."""
     return next((label for label, found in group.items() if found[0]["threads"] == 1 and those(found[0])), "")
 
 
 def _by_cholespy(row: Row) -> bool:
-    """Whether a candidate solves with cholespy."""
+    """Return whether a candidate solves with cholespy."""
     return json.loads(row["parameters"]).get("linear") == "cholespy"
 
 
 def _against(
     group: Mapping[str, list[Row]], yardstick: str, phase: str, times: Mapping[str, NDArray[np.float64]]
 ) -> Interval | None:
-    """How many times faster than a yardstick in the same rounds; None where that has no times."""
+    """Compute the speedup over a baseline in the same rounds; None if the baseline has no times."""
     theirs = _times(group.get(yardstick, ()), phase)
     rounds = min(len(theirs), len(times[phase]))
     return ratio(theirs[:rounds], times[phase][:rounds]) if rounds else None

@@ -1,4 +1,4 @@
-"""The pictures of a speed report: each quantity against size."""
+"""Plots of a speed report: each quantity against size."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from harness.report.style import OLDER
 
 @dataclass(frozen=True, slots=True)
 class SpeedPicture:
-    """One picture: the stem of its file, its title, what it shows of a candidate, whether that is a share."""
+    """One plot: the stem of its file, its title, the plotted value of a candidate, and whether that is a share."""
 
     stem: str
     title: str
@@ -32,7 +32,12 @@ PICTURES = (
 
 
 def draw(found: Sequence[Figures], folder: Path) -> None:
-    """Draw all pictures of each scene to `folder`, WIDTH x HEIGHT pixels, PNG."""
+    """Draw all plots of each scene as PNG files of PAGE_WIDTH x PAGE_HEIGHT pixels.
+
+    Args:
+        candidates: figures of all candidates.
+        folder: folder that the files are written to.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     cores = sorted({f.cores for f in found if f.cores})
     loads = [f.load for f in found if f.load is not None]
@@ -49,7 +54,7 @@ def draw(found: Sequence[Figures], folder: Path) -> None:
 
 
 def _series(members: Sequence[Figures], picture: SpeedPicture) -> list[CandidateLine]:
-    """A line for each candidate of a scene."""
+    """Build a line for each candidate of a scene."""
     lines: list[CandidateLine] = []
     for label in dict.fromkeys(f.label for f in members):
         mine = [f for f in members if f.label == label]

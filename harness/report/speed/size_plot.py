@@ -1,6 +1,8 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""One quantity against mesh size on a page of its own: a line for each candidate, named at the right."""
+"""Plot of one quantity against mesh size on a page of its own: a line for each candidate, with a legend at the
+right.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,15 @@ _LEFT, _TOP, _NAMES, _BELOW = 110, 130, 400, 70
 
 
 class CandidateLine(NamedTuple):
-    """The line of a candidate: its name, what it is called with one thread, its solver, vertices and values (k,), and
-    which of them (k,) other code than today's measured."""
+    """The line of a candidate.
+
+    Attributes:
+        name: label of the candidate.
+        single_thread_name: label of the same candidate on one thread.
+        solver: name of its solver.
+        vertices, values: points (k,).
+        stale: which points (k,) were measured by other code than the current version.
+    """
 
     name: str
     alone: str
@@ -33,11 +42,20 @@ class CandidateLine(NamedTuple):
 
 
 def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[CandidateLine], *, share: bool) -> None:
-    """Draw to `path`, WIDTH x HEIGHT pixels, PNG; `share`: values are parts of a whole, drawn in percent.
+    """Draw a plot as a PNG file of PAGE_WIDTH x PAGE_HEIGHT pixels.
 
-    Candidates have the colour and the marker of their solver, and a line style of their own; with more threads than one
-    they are thinner; what other code than today's measured is hollow. A series without values is not drawn; it keeps
-    its line style free, so that pictures of the same candidates look alike.
+    Candidates have the colour and the marker of their solver, and a line style of their own. Multithreaded candidates
+    have
+    thinner lines, and stale points are hollow. A series without values is not drawn, but its line style stays reserved,
+    so
+    that candidates look the same in all plots.
+
+    Args:
+        path: target file.
+        title: title of the plot.
+        facts: phrases below the title.
+        series: lines of the candidates.
+        is_share: whether values are shares, drawn in percent.
     """
     drawn = [line for line in series if line.values]
     marked = looks((line.alone, line.solver) for line in series)
@@ -78,7 +96,7 @@ def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[
 
 
 def _scales(ax: Axes, drawn: Sequence[CandidateLine], share: bool) -> None:
-    """Vertices by logarithms; times by logarithms too, shares from nothing up."""
+    """Set a logarithmic vertex axis; times are logarithmic too, shares start at zero."""
     sizes = sorted({n for line in drawn for n in line.vertices})
     ax.set_xscale("log")
     ax.set_xlabel("vertices", fontsize=10, loc="left")

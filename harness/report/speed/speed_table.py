@@ -1,4 +1,4 @@
-"""The table of a speed report: a line for each candidate at each size, and what the machine itself can do."""
+"""Table of a speed report: a line for each candidate at each size, compared with the machine's limits."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _NUMBERS = (
 
 
 def speed_table(found: Sequence[Figures]) -> Table:
-    """A line for each candidate at each size; ratios with their 95 % intervals."""
+    """Build a table with a line for each candidate at each size; speedups have their 95 % intervals."""
     title = "medians over the rounds, and of the ratios round by round with their 95 % intervals"
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     table.add_column("scene", justify="right")
@@ -56,7 +56,7 @@ def speed_table(found: Sequence[Figures]) -> Table:
 
 
 def _places(found: Sequence[Figures]) -> Callable[[Figures], str]:
-    """How a scene of a size is called: by its size where there is one scene."""
+    """Return a function that labels a candidate's scene: by its size only, if there is one scene."""
     if len({f.scene for f in found}) == 1:
         return lambda f: count(f.size)
     return lambda f: f"{f.scene} {count(f.size)}"
@@ -95,7 +95,7 @@ def _ratio(interval: Interval | None) -> str:
 
 
 def remarks(found: Sequence[Figures]) -> list[str]:
-    """What was left out or failed and why, what the solvers chose, and how the cost of a solve grows."""
+    """Describe omitted and failed candidates with reasons, the solvers' choices, and how the cost of a solve scales."""
     where = _places(found)
     told: dict[str, list[str]] = defaultdict(list)
     for f in sorted(found, key=lambda f: f.status == "ok"):
@@ -112,7 +112,13 @@ def remarks(found: Sequence[Figures]) -> list[str]:
 
 
 def exponents(found: Sequence[Figures], figure: str = "global_", least: int = 10_000) -> dict[tuple[str, str], float]:
-    """The power of n by which a figure grows, that of a solve's time, by scene and label, from `least` vertices on."""
+    """Fit exponents of the growth of a figure with the number of vertices, by scene and label.
+
+    Args:
+        candidates: figures of all candidates.
+        figure: field that is fitted; by default the time of a global step.
+        min_vertices: smallest size that is included.
+    """
     by_label: dict[tuple[str, str], list[tuple[int, float]]] = defaultdict(list)
     for f in found:
         value = getattr(f, figure)
