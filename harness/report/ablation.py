@@ -24,7 +24,7 @@ Row = Mapping[str, Any]
 CAPTION = "CPU time: mean over frames of medians over rounds; displacements in mean rest lengths, energy of the largest"
 
 PRICES = (
-    "CPU time, medians over rounds; ≥ the lower bound of reading the effect's numbers once; confidence intervals in the rows"
+    "CPU time, medians over rounds; ≥ lower bound of reading the effect's numbers once; confidence intervals in rows"
 )
 
 

@@ -2,8 +2,8 @@
 # pyarrow's stubs do not type some keywords.
 """Certificates of intersection-free runs as CSV, one line per run.
 
-Each line states in how many frames no primitives intersect, by the exact test of `harness.scenes.edge_triangle_intersections`, and
-how many steps converged.
+Each line states in how many frames no primitives intersect, by the exact test of
+`harness.scenes.edge_triangle_intersections`, and how many steps converged.
 """
 
 from __future__ import annotations

@@ -217,8 +217,7 @@ def reference(replays: Sequence[Replay]) -> int:
     """Return the index of the run that the distances of one scene refer to.
 
     It is the run with the lowest last residual among those that end finite, so that the run closest to the minimum is
-    the
-    reference, whatever the order of the list. If no run ends finite, it is the first one with the lowest residual.
+    the reference, whatever the order of the list. If no run ends finite, it is the first one with the lowest residual.
     """
 
     def badness(k: int) -> tuple[bool, float]:

@@ -1,8 +1,8 @@
 """Comparison of run times at equal accuracy, within a sweep.
 
-Two runs are compared if they solve the same steps on the same machine and the same error is known for both: the
-largest distance from the reference motion where the runs were verified, otherwise the largest residual of a step. A
-run of unknown error never counts as equally accurate.
+Two runs are compared if they solve the same steps on the same machine and the same error is known for both: the largest
+distance from the reference motion where the runs were verified, otherwise the largest residual of a step. A run of
+unknown error never counts as equally accurate.
 """
 
 from __future__ import annotations
@@ -47,8 +47,7 @@ def comparisons(found: Iterable[RunTimes]) -> Iterator[Comparison]:
     """Yield one comparison for each scene that has several timed runs.
 
     Of the groups of runs that solve the same steps, the one with the most runs of known error is chosen, then the
-    largest
-    size.
+    largest size.
     """
     scenes: dict[str, dict[tuple[object, ...], list[RunTimes]]] = defaultdict(lambda: defaultdict(list))
     for run in found:

@@ -3,13 +3,13 @@
 """Detection of changes in the stored results of benchmarks over time.
 
 The results of a benchmark on one kind of machine, in the order of their commits, are logarithms y of its ratio to the
-baseline (of its minimum time, if it has no baseline). They have noise with one standard deviation sigma, and means
-that change at some commits. The changes minimise the penalised negative log-likelihood (times two, up to a constant),
+baseline (of its minimum time, if it has no baseline). They have noise with one standard deviation sigma, and means that
+change at some commits. The changes minimise the penalised negative log-likelihood (times two, up to a constant),
 
     sum over results of (y - mean of its segment)^2 / sigma^2 + 5 log(n) per change,
 
-found exactly by PELT (Killick, Fearnhead and Eckley 2012; the library ruptures). Sigma is estimated from differences
-of neighbours, which a change hardly affects, and is at least as large as the results' own intervals imply.
+found exactly by PELT (Killick, Fearnhead and Eckley 2012; the library ruptures). Sigma is estimated from differences of
+neighbours, which a change hardly affects, and is at least as large as the results' own intervals imply.
 """
 
 from __future__ import annotations

@@ -100,8 +100,8 @@ def view(paths: list[Path]) -> None:
             pass
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise RunFailed(
-            "there is no display to open the viewer on; `springbench inspect` prints what is in a recording, "
-            "and `rerun FILE.rrd` shows it on a machine that has a screen"
+            "there is no display for the viewer; `springbench inspect` prints the contents of a recording, "
+            "and `rerun FILE.rrd` shows it on a machine with a display"
         )
     binary = Path(rerun_cli.__file__).with_name("rerun.exe" if sys.platform == "win32" else "rerun")
     if not binary.is_file():

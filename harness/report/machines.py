@@ -13,7 +13,7 @@ import pyarrow as pa
 from harness.report.sql import answer
 
 COMPARE = (
-    "compare times within one machine; across machines compare ratios of such times, iterations, residuals and errors"
+    "compare times only on one machine; across machines compare ratios of such times, iterations, residuals and errors"
 )
 """Rule that holds for all rows."""
 

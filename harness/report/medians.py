@@ -26,8 +26,7 @@ def medians(rows: pa.Table, folder: Path) -> list[Path]:
     """Write medians.csv, one line per run, and return its path.
 
     The columns are scene, size, solver, run_id, machine, node, median time of a step [s], number of steps, and the
-    solver
-    with the settings in which its runs differ. Times of different machines must not be compared.
+    solver with the settings in which its runs differ. Times of different machines must not be compared.
 
     Args:
         rows: rows of a sweep.

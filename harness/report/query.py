@@ -1,6 +1,6 @@
 """SQL over the rows of all sweeps, accuracy configs and ablations (DuckDB on the Parquet files).
 
-A query runs in the child process of `harness.execution.sandbox`, because it may need more time or memory than is allowed.
+A query runs in the child process of `harness.execution.sandbox`, because it may exceed the allowed time or memory.
 Read-only queries are answered from the files; for other statements (PIVOT, CREATE) all rows are loaded into memory
 first.
 """

@@ -131,8 +131,11 @@ def _towards(azimuth: float, elevation: float) -> Points:
 def frame_all(points: Points, *, aspect: float, angles: tuple[float, float]) -> View:
     """Compute the closest camera that sees all points.
 
-    A point with camera coordinates (a, b, c), c towards the viewer, is visible from (ea, eb, ec) where
-    |a - ea| <= tan (ec - c), and likewise for b. Each pair of bounds is tight at one ec; the larger ec sees all points.
+    A point with camera coordinates (a, b, c), c towards the viewer, is visible from (ea, eb, ec) if
+
+        |a - ea| <= tan (ec - c),
+
+    and likewise for b. Each pair of bounds is tight at one ec; the larger ec sees all points.
 
     Args:
         points: points (q, 3) [m].

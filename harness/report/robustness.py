@@ -1,11 +1,11 @@
 """Robustness of solvers: the outcome of each verified run of a sweep, from its rows only.
 
 A run of a minimising solver is correct if, in every step, the result is stationary to the requested tolerance, up to
-round-off at each vertex, and a certified minimum, and if the motion matches the reference in every frame. All three
-are checked by the reference evaluator, never by the solver's own report. That report is compared: if a step ended
-because its residual met the tolerance, but the evaluator finds it not stationary, the run is falsely converged instead
-of merely unconverged. A method that does not minimise is scored by its motion only. If the independent implementation
-of the formulas disagrees with the steps themselves, no run of them is correct.
+round-off at each vertex, and a certified minimum, and if the motion matches the reference in every frame. All three are
+checked by the reference evaluator, never by the solver's own report. That report is compared: if a step ended because
+its residual met the tolerance, but the evaluator finds it not stationary, the run is falsely converged instead of
+merely unconverged. A method that does not minimise is scored by its motion only. If the independent implementation of
+the formulas disagrees with the steps themselves, no run of them is correct.
 """
 
 from __future__ import annotations

@@ -46,9 +46,9 @@ _SCORES, _HEADING = 3, 1.2
 """Number of rows for the solvers' scores, and rows between two families of cases."""
 
 NOTE = (
-    "Figures: the largest residual |Q\u207b\u00b9 grad g|_Q that a step ended with, over its value at its start "
-    "(or round-off); of methods that do not minimise, the largest distance from a converged run, in per cent of the "
-    "size. Shares: of the cases that a solver does not refuse."
+    "Numbers: the largest final residual |Q\u207b\u00b9 grad g|_Q of a step, over its value at the start of the step "
+    "(or round-off); for methods that do not minimise, the largest distance from a converged run, in percent of the "
+    "scene's size. Shares: of the cases that a solver supports."
 )
 
 

@@ -1,9 +1,9 @@
 """Comparison of two stored results, folders or archives of rows: regressions in time, and other changes.
 
-Runs are paired by their inputs, and compared step by step (`harness.results.bootstrap_statistics.estimate_slowdown`). The load of the machine
-may have differed between the two results, and statistics cannot detect that: hence a margin beyond the interval, and
-`springbench gate --against` for smaller changes. Times of two machines are not comparable; with a baseline solver that
-both ran, the ratios to it are.
+Runs are paired by their inputs, and compared step by step (`harness.results.bootstrap_statistics.estimate_slowdown`).
+The load of the machine may have differed between the two results, and statistics cannot detect that: hence a margin
+beyond the interval, and `springbench gate --against` for smaller changes. Times of two machines are not comparable;
+with a baseline solver that both ran, the ratios to it are.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ def compare(old: Path, new: Path, console: Console, yardstick: str | None = None
         new: folder or archive of the new results.
         console: console that the table is printed on.
         baseline_solver: times are divided by those of this solver, so that they are comparable between machines.
-    Returns: 1 if a run became slower or fails now, INCONCLUSIVE_EXIT_CODE (with the reasons) if nothing is comparable, otherwise
-    0.
+    Returns: 1 if a run became slower or fails now; INCONCLUSIVE_EXIT_CODE, after the reasons, if nothing is comparable;
+        otherwise 0.
     Raises:
         InputError: if there are no results, or none of the baseline solver.
     """

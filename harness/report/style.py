@@ -145,8 +145,7 @@ def marks(solvers: Iterable[str] = ()) -> dict[str, Mark]:
     """Return the style of each solver: of the registry, and of these others; styles are stable and distinct.
 
     The style of a solver outside the registry follows from a hash of its name. If two would get the same colour, the
-    later
-    one in alphabetical order gets the next free colour, and if there is none, the next free style.
+    later one in alphabetical order gets the next free colour, and if there is none, the next free style.
     """
     looks = dict(_shipped((*SOLVERS, *OPTIONAL)))
     free = [Mark(color, marker, dash) for dash in _DASHES for color in _STRANGERS for marker in _MARKERS]
@@ -182,8 +181,7 @@ def _members(family: Sequence[str]) -> Sequence[tuple[float, Any]]:
     """Return the shades and line styles of a family's members.
 
     For engines one style is skipped: their solid light brown would look like a green of others to some readers, and
-    their
-    darkest brown like black.
+    their darkest brown like black.
     """
     if not set(family) & SOLVERS.keys():
         return *_MANY[:3], *_MANY[4:]

@@ -47,8 +47,7 @@ def draw_timing(table: pa.Table, path: Path, title: str, older: Collection[str] 
     """Draw the times of a sweep's runs as a PNG file, PAGE_WIDTH pixels wide and at most PAGE_HEIGHT high.
 
     Failed runs are crosses at the upper edge, with their reasons in words at the foot. A scene of one size has a row
-    for
-    each solver instead of a point in an empty frame.
+    for each solver instead of a point in an empty frame.
 
     Args:
         table: rows (schema: `harness.results.run_schema.RUN_SCHEMA`).

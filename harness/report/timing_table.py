@@ -29,8 +29,7 @@ class RunTimes(NamedTuple):
     """One run: identification, status, and its times [ms]; None where the rows lack a value.
 
     The fields are the columns of `_SUMMARY_QUERY`, in order. The statistics step, lower, upper, least, num_iterations,
-    residual,
-    worst_residual, max_strain and strain_p99 are defined in `harness.results.quantities`.
+    residual, worst_residual, max_strain and strain_p99 are defined in `harness.results.quantities`.
 
     Attributes:
         cold, warm: time of the preparation.
@@ -120,7 +119,10 @@ from rows_of group by run_id order by min(place)
 
 
 def runs(table: pa.Table) -> list[RunTimes]:
-    """Return the runs in a table of rows (schema: `harness.results.run_schema.RUN_SCHEMA`), in the order of their first rows."""
+    """Return the runs in a table of rows, in the order of their first rows.
+
+    The rows have the schema `harness.results.run_schema.RUN_SCHEMA`.
+    """
     numbered = table.append_column("place", pa.array(np.arange(len(table))))
     return [RunTimes(*row) for row in answer(_SUMMARY, numbered)]
 

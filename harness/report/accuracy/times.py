@@ -111,8 +111,7 @@ def crossings(race: Iterable[Curve]) -> list[str]:
     """Describe which solver is fastest to which accuracy, without set-up.
 
     One sentence describes the coarsest accuracy, and one each change of the fastest solver. A solver takes the lead if
-    its
-    upper quartile is below the leader's lower quartile, because a smaller difference may be chance.
+    its upper quartile is below the leader's lower quartile, because a smaller difference may be chance.
     """
     race = list(race)
     if len(race) < 2:

@@ -42,8 +42,7 @@ def chosen(entries: Sequence[Entry], selectors: Sequence[tuple[str, ...]]) -> li
     """Select the entries that match the selectors, in their order.
 
     A selector matches each panel whose name has all of its parts. If no part of a selector names a group, only the
-    panels of
-    the first matching group are selected.
+    panels of the first matching group are selected.
 
     Args:
         entries: available panels.

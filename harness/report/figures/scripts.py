@@ -11,7 +11,7 @@ HERE = Path(__file__).parent
 
 
 def rows(name):
-    """The rows of a CSV file beside this script, without its comments."""
+    """Return the rows of a CSV file next to this script, without its comments."""
     with open(HERE / name, encoding="utf-8", newline="") as file:
         return list(csv.DictReader(line for line in file if not line.startswith("#")))
 

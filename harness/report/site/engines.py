@@ -10,7 +10,7 @@ from harness.report.site.marks import axis, drawn
 from harness.report.site.script import numbers
 
 _NOTE = (
-    "Each line is what no other setting of the same program beats in both time and error; "
+    "Each line is the Pareto front of a program's settings in time and error; "
     f"{OURS}: of all of its methods that were tried. Errors are those of the positions at the end, relative to the way "
     "from the start. springbench repeat CONFIG prints a script that repeats an engine's point without us."
 )

@@ -27,8 +27,7 @@ def causes(failed: Iterable[Failed]) -> list[dict[str, Any]]:
     """Group failed runs by cause, the most frequent first.
 
     Reasons that differ only in numbers, or in the names of their scene and solver, are one cause, described in the
-    words of
-    its first run.
+    words of its first run.
     """
     groups: dict[tuple[str, str], list[Failed]] = {}
     for one in failed:

@@ -26,7 +26,7 @@ _MARKS = {
     _FASTER: Mark(FASTER, "v"),
 }
 _NOTE = (
-    "Stored results of a gate with their 95 % intervals, by commit, and the level of those that belong together: where "
+    "Stored results of a benchmark with their 95 % intervals, by commit, and the level of each segment of them: where "
     f"it changed beyond noise there is a triangle. Of fewer than {FEWEST} results nothing is said. "
     f"{CHANGED}: with changes beyond the commit."
 )

@@ -11,8 +11,8 @@ from harness.report.site.marks import axis, drawn
 from harness.report.site.script import numbers
 
 _NOTE = (
-    "Each point is the family of methods that keeps to an error for the least processor time, whatever its steps and "
-    "tolerances; where none stands nobody came so near. Stiffness number: k dt²/m at dt = 1/30 s. Errors are those of "
+    "Each point is the family of methods that reaches an error in the least processor time, whatever its steps and "
+    "tolerances; without a point no method reached it. Stiffness number: k dt²/m at dt = 1/30 s. Errors are those of "
     f"the positions at the end, relative to the way from the start. Prices within a factor of {CLOSE} are alike."
 )
 

@@ -45,10 +45,8 @@ def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[
     """Draw a plot as a PNG file of PAGE_WIDTH x PAGE_HEIGHT pixels.
 
     Candidates have the colour and the marker of their solver, and a line style of their own. Multithreaded candidates
-    have
-    thinner lines, and stale points are hollow. A series without values is not drawn, but its line style stays reserved,
-    so
-    that candidates look the same in all plots.
+    have thinner lines, and stale points are hollow. A series without values is not drawn, but its line style stays
+    reserved, so that candidates look the same in all plots.
 
     Args:
         path: target file.
