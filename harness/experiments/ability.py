@@ -8,8 +8,8 @@
 
 One thread is measured in its own CPU time; the best of five repetitions counts. NumPy and SciPy do the work, so nothing
 is compiled. The figures are cached for a day in the user's cache, per computer and library versions. They are not
-cached if other programs used so much of the processor that the thread had less than 95 % of the wall time; the next
-process then measures again.
+cached if the thread had less than 95 % of the wall time, because other programs used the processor. The next process
+then measures again.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Best-first search for the cheapest setting of a study that meets an error.
 
 A method is a solver with an integrator; its settings are time steps and tolerances. Shorter steps and smaller
-tolerances are taken to cost more, so that a method's last cost bounds those that follow, and the method with the least
-bound is measured next. The search omits
+tolerances are assumed to cost more. A method's last cost is therefore a lower bound of those that follow. The method
+with the smallest bound is measured next. The search omits
 
     smaller tolerances at a time step    once one meets the error, or smaller ones no longer change it
     the rest of a method                 once it costs more than SLOWER times the best that meets the error
