@@ -28,8 +28,9 @@ def solver_class(run: RunSpec) -> Any:
 def parts(run: RunSpec) -> frozenset[Part]:
     """Return the source parts of a run, without importing solvers or user code.
 
-    These are the file of the solver, and the classes of the mesh and the effects. Where the run needs them, the files of
-    the reference solver and of the solver for initial guesses, and the module of error-controlled runs are added.
+    These are the file of the solver, and the classes of the mesh and the effects. Where the run needs them, there are
+    also the files of the reference solver and of the solver for initial guesses, and the module of error-controlled
+    runs.
     """
     named = {"mesh": run.scene.mesh, **{f"effects[{i}]": effect for i, effect in enumerate(run.scene.effects)}}
     shipped = [type(part) for place, part in named.items() if place not in run.scene.own]
