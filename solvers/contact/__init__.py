@@ -1,1 +1,1 @@
-"""Contact: its energy, and what the prefactored methods make of it."""
+"""Contact: broad phase, continuous collision detection, potentials and friction."""

@@ -1,9 +1,9 @@
-"""Patches of a surface as affine images of their rest shape.
+"""Clusters of a surface as affine images of their rest shape.
 
     x_i = x_P + F_P (X_i - X_P) + y_i,     F_P = f_1 t_1' + f_2 t_2'
 
-X: the rest shape; t_1, t_2: the plane in which a patch P lies there; F_P: the least squares fit, y_i what it leaves.
-All of it is sums over vertices, which no rotation of a patch changes.
+X: rest shape; t_1, t_2: axes of the plane of a cluster P at rest; F_P: least squares fit; y_i: its residual.
+All of these are sums over vertices, which are invariant to rotations of a cluster.
 """
 
 from __future__ import annotations
@@ -23,14 +23,19 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _THIN = 1e-12
-"""Of the square of a patch's length: one that is not even so wide has no plane."""
+"""Minimum squared width relative to the squared length of a cluster, below which it has no plane."""
 
 
 class Rest(NamedTuple):
-    """Patches at rest, in eights: vertices (m, k) of each, the first one repeated where there are fewer; plane
-    (k, 2, m): where they lie along t_1 and t_2 [m]; weights (3, m): of their sum in the mean, and of their moments in
-    f_1 and f_2; centre, t1, t2, normal (m, 4): X_P [m] and axes; size (m, 4): rho, and how far vertices lie out of the
-    plane [m]."""
+    """Clusters at rest, padded to multiples of eight.
+
+    Attributes:
+        vertices: vertices of each cluster (m, k); the first one repeats where there are fewer.
+        plane_coordinates: along t_1 and t_2 [m], (k, 2, m).
+        weights: of the vertex sum in the mean, and of the moments in f_1 and f_2, (3, m).
+        centre, t1, t2, normal: X_P [m] and axes (m, 4).
+        extents: radius rho, and largest distance of a vertex from the plane [m], (m, 4).
+    """
 
     vertices: Indices
     plane: Array
@@ -43,8 +48,13 @@ class Rest(NamedTuple):
 
 
 class Lie(NamedTuple):
-    """How patches lie at a position: centre x_P [m], f1, f2 and their normal (m, 4); rest (m, 4): the largest y_i along
-    the plane, and across it [m]."""
+    """Poses of clusters at a position.
+
+    Attributes:
+        centre: x_P [m], (m, 4).
+        f1, f2, normal: columns of the deformation, and their normal (m, 4).
+        fit_residual: largest y_i in the plane, and normal to it [m], (m, 4).
+    """
 
     centre: Array
     f1: Array
@@ -54,7 +64,13 @@ class Lie(NamedTuple):
 
 
 def rest(x: Array, members: Indices, many: int) -> Rest:
-    """Patches at rest, x (n, 3) [m]; members: which have which vertices (k, 2)."""
+    """Fit the planes of clusters at rest.
+
+    Args:
+        x: rest shape (n, 3) [m].
+        members: pairs of a cluster and a vertex (k, 2).
+        num_clusters: number of clusters.
+    """
     patch, vertex = np.unique(members, axis=0).T
     count = np.bincount(patch, minlength=many)
     slot = np.arange(len(patch)) - np.repeat(np.cumsum(count) - count, count)
@@ -80,8 +96,16 @@ def rest(x: Array, members: Indices, many: int) -> Rest:
 
 @kernel
 def lie(known, x, leaf, boxes, tile, out):
-    """Write how patches lie at x (n, 4) to `out`, and their boxes to a tree's leaves from the node `leaf` on. tile
-    (3 k, 8): scratch."""
+    """Fit the poses of clusters, and write their boxes to the leaves of a tree.
+
+    Args:
+        rest_clusters: clusters at rest.
+        x: positions (n, 4) [m]; column 3 is padding.
+        leaf: first leaf node.
+        boxes: boxes of the tree (nodes, 6, 8), updated.
+        tile: scratch (3 k, 8).
+        out: poses, overwritten.
+    """
     many, width, last = len(known.centre), known.vertices.shape[1], len(known.vertices) - 1
     for first in range(0, many, 8):
         o = rows(x, known.vertices, first, last, 0)
@@ -96,7 +120,7 @@ def lie(known, x, leaf, boxes, tile, out):
             centre = centre[0] + p[0], centre[1] + p[1], centre[2] + p[2]
             f1, f2 = added(f1, loaded(known.plane, at), p), added(f2, loaded(known.plane, at + many), p)
             low, high = smaller(low, p), larger(high, p)
-        # A vertex that is there again is where p is zero.
+        # Repeated vertices contribute nothing: their p is zero.
         centre = _times(loaded(known.weights, first), centre)
         f1, f2 = _times(loaded(known.weights, many + first), f1), _times(loaded(known.weights, 2 * many + first), f2)
         e1 = unit(f1)
@@ -121,8 +145,17 @@ def lie(known, x, leaf, boxes, tile, out):
 
 @kernel
 def spread(vertices, pairs, known, p, q, way, tile, low, high):
-    """The largest diagonal of the boxes around q - p of the vertices of two patches, of the first pairs of them; way
-    (n, 4), low, high (m, 4), tile (3, 8) or more: scratch."""
+    """Return the largest relative displacement [m] of two vertices of the first cluster pairs, as a box diagonal.
+
+    Args:
+        vertices: vertices of each cluster (m, k).
+        pairs: cluster pairs (k, 2).
+        rest_clusters: number of pairs to include.
+        p: start positions (n, 3) [m].
+        q: end positions (n, 3) [m].
+        displacement, low, high: scratch, (n, 4), (m, 4) and (m, 4).
+        tile: scratch of at least (3, 8).
+    """
     for i in range(len(p)):
         way[i, 0], way[i, 1], way[i, 2] = q[i, 0] - p[i, 0], q[i, 1] - p[i, 1], q[i, 2] - p[i, 2]
     for first in range(0, len(vertices), 8):
@@ -146,7 +179,7 @@ def spread(vertices, pairs, known, p, q, way, tile, low, high):
 
 @inner
 def put(v, tile, first, out):
-    """Write a vector of eight patches to their rows."""
+    """Store a vector packet in the rows of eight clusters."""
     for axis in range(3):
         stored(v[axis], tile, 8 * axis)
     for lane in range(8):
@@ -156,7 +189,7 @@ def put(v, tile, first, out):
 
 @inner
 def unit(v):
-    """A vector of eight, of length 1."""
+    """Return a packet of vectors scaled to unit length."""
     size = root(dot(v, v))
     return ratio(v[0], size), ratio(v[1], size), ratio(v[2], size)
 
@@ -168,7 +201,7 @@ def _times(t, v):
 
 @inner
 def added(v, t, w):
-    """v + t w."""
+    """Return v + t w."""
     return v[0] + t * w[0], v[1] + t * w[1], v[2] + t * w[2]
 
 

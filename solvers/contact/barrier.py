@@ -1,11 +1,12 @@
-"""The barrier of pairs: a function of positions, zero from a range on, infinite where the gap closes.
+"""Barrier potential of collisions: zero beyond the activation distance, infinite where a gap closes.
 
     E(p) = sum over pairs of m k r^2 b((d - t)/r),     b(x) = -(1 - x)^2 ln x  for 0 < x < 1
 
-d is the distance of a point and a triangle, or of two edges; t the thickness, r the range, k a stiffness [N/m] (Li et
-al. 2020, "Incremental potential contact", with the offset of Li, Kaufman and Jiang 2021, "Codimensional incremental
-potential contact"; there b is of d^2). m is 1 but for edges that are nearly parallel (`contact.mollifier`). The sum
-goes over contacts, each of which stands for all pairs that have its closest points (`contact.contacts`).
+d is the distance of a point and a triangle or of two edges, t the minimum distance, r the activation distance `dhat`,
+and k a stiffness [N/m]. Sources: Li et al. 2020, "Incremental potential contact", where b is a function of d^2; the
+offset t is that of Li, Kaufman and Jiang 2021, "Codimensional incremental potential contact". m is 1 except for nearly
+parallel edges (`contact.potentials.edge_edge_mollifier`). The sum is over collisions, each of which represents all
+pairs that share its closest points (`contact.collisions`).
 """
 
 from __future__ import annotations
@@ -23,28 +24,30 @@ Array = NDArray[np.float64]
 
 @inner
 def law(x):
-    """b and its first two derivatives, for 0 < x < 1."""
+    """Return b and its first two derivatives, for 0 < x < 1."""
     y, log = 1.0 - x, np.log(x)
     return -y * y * log, y * (2.0 * log - y / x), 4.0 * y / x + y * y / (x * x) - 2.0 * log
 
 
 @inner
 def pushing(gap):
-    """The gap over the range that a pair pushes by: a closed one as if a millionth were left; below 1e-154 b''
-    overflows."""
+    """Return the relative gap at which forces are evaluated.
+
+    A closed gap counts as 1e-6, so that forces remain finite; below 1e-154 b'' overflows.
+    """
     return max(gap, 1e-100) if gap > 0.0 else 1e-6
 
 
 @inner
 def length(contacts, k):
-    """d [m] of a contact, and (d - t)/r."""
+    """Return the distance d [m] of a collision, and the relative gap (d - t)/r."""
     z0, z1, z2 = contacts.between[k, 0], contacts.between[k, 1], contacts.between[k, 2]
     d = np.sqrt(z0 * z0 + z1 * z1 + z2 * z2)
     return d, (d / contacts.scale[k] - contacts.thickness) / contacts.reach
 
 
 def distances(pairs: Pairs, p: Array) -> Array:
-    """Of each pair at p (n, 3) [m]."""
+    """Return the distance [m] of each candidate pair at p (n, 3) [m]."""
     out = np.empty(len(pairs.vertices))
     _distances(pairs.vertices, pairs.points, p, out)
     return out
@@ -58,8 +61,16 @@ def _distances(vertices, points, p, out):
 
 @kernel
 def press(contacts, p, out):
-    """Add the gradient [N] at p (n, 3) to `out`; contacts whose gap is closed push as if a millionth of it were left.
-    Returns the energy [J], infinite where a gap is closed."""
+    """Compute the barrier energy and add its gradient.
+
+    Args:
+        collisions: active collisions.
+        p: positions (n, 3) [m].
+        out: gradient (n, 3) [N], updated; closed gaps exert the force of a millionth of the activation distance.
+
+    Returns:
+        Energy [J]; infinite where a gap is closed.
+    """
     total = 0.0
     for k in range(len(contacts.vertices)):
         x, c, z = contacts.vertices[k], contacts.weights[k], contacts.between[k]
@@ -95,7 +106,7 @@ def _add(out, i, c, g0, g1, g2):
 
 @kernel
 def forces(contacts, out):
-    """Write -f' (a,) [N] of contacts to `out`."""
+    """Write the normal forces -f' [N] of collisions to `out` (a,)."""
     for k in range(len(contacts.vertices)):
         gap, m = length(contacts, k)[1], 1.0
         if contacts.parallel[k] > 0.0:

@@ -1,7 +1,7 @@
-"""Second derivatives of contacts of two to four vertices.
+"""Packed Hessian blocks of collisions of two to four vertices.
 
-They are symmetric: of each row is kept what lies before the end of the block of its own vertex. Row a of vertex i has
-3 (i + 1) numbers, after those of the rows above.
+The blocks are symmetric. Each row is stored up to the end of its own vertex's diagonal block: row a of vertex i has
+3 (i + 1) numbers, and follows the rows above it.
 """
 
 from __future__ import annotations
@@ -20,19 +20,21 @@ from solvers.problem import Positions
 Array = NDArray[np.float64]
 
 NUMBERS = 90
-"""Of a contact of four vertices."""
+"""Number of stored entries of a collision of four vertices."""
 
 
 class Room:
-    """Memory of numbers that is handed out again when no one holds the array that it was handed out as: of new memory
-    the system clears each page, which takes as long as to compute what goes there."""
+    """Array memory that is reused once the last array is no longer referenced.
+
+    The system clears each page of new memory, which takes as long as to compute the entries.
+    """
 
     def __init__(self) -> None:
         self._memory = np.empty(0)
         self._held: Callable[[], Array | None] = lambda: None
 
     def take(self, many: int) -> Array:
-        """An array (many,). Parts of it do not hold it."""
+        """Return an array (num_entries,). References to views of it do not prevent its reuse."""
         if len(self._memory) < many or self._held() is not None:
             self._memory = np.empty(many)
         out = self._memory[:many]
@@ -41,8 +43,13 @@ class Room:
 
 
 class Blocks(NamedTuple):
-    """vertices (a, 4), -1 for none and for those of obstacles; packed: the rows [N/m] of one contact after those of
-    another, for vertices up to the last that it has; starts (a + 1,): where they begin, and end."""
+    """Packed symmetric blocks.
+
+    Attributes:
+        vertices: (a, 4); -1 for none and for those of obstacles.
+        block_starts: first entry of each block, and the end of the last one, (a + 1,).
+        packed: rows [N/m] of consecutive blocks, up to the last vertex of each collision.
+    """
 
     vertices: NDArray[np.int64]
     starts: NDArray[np.int64]
@@ -50,29 +57,29 @@ class Blocks(NamedTuple):
 
     @classmethod
     def whole(cls, vertices: NDArray[np.int64], values: Array) -> Blocks:
-        """Of symmetric blocks (a, 12, 12) of vertices (a, 4)."""
+        """Build packed blocks from symmetric blocks (a, 12, 12) of vertices (a, 4)."""
         row, column = np.nonzero(np.arange(12) // 3 <= np.arange(12)[:, None] // 3)
         return cls(vertices, NUMBERS * np.arange(len(vertices) + 1), np.ravel(values[:, row, column]))
 
     @property
     def values(self) -> Array:
-        """The blocks with zeros for vertices that are none, (a, 12, 12)."""
+        """Dense blocks (a, 12, 12), with zeros for missing vertices."""
         out = np.zeros((len(self.vertices), 12, 12))
         spread(self.starts, self.packed, out)
         return out
 
     def of(self, values: Array) -> Blocks:
-        """The same contacts with other values (a, 12, 12)."""
+        """Return blocks of the same vertices with other values (a, 12, 12)."""
         return Blocks.whole(self.vertices, values)
 
     def followed(self, other: Blocks) -> Blocks:
-        """These, and then others."""
+        """Return these blocks followed by others."""
         end = self.starts[-1]
         starts, packed = np.append(self.starts, end + other.starts[1:]), np.append(self.packed[:end], other.packed)
         return Blocks(np.concatenate([self.vertices, other.vertices]), starts, packed)
 
     def matrix(self, n: int) -> csr_array:
-        """Their sum, (3n, 3n) [N/m]."""
+        """Return the sum of all blocks as a sparse matrix (3n, 3n) [N/m]."""
         values = self.values.ravel()
         at = (3 * self.vertices[:, :, None] + np.arange(3)).reshape(-1, 12)
         rows, columns = np.repeat(at, 12, axis=1).ravel(), np.tile(at, 12).ravel()
@@ -80,36 +87,36 @@ class Blocks(NamedTuple):
         return csr_array(coo_array((values[own], (rows[own], columns[own])), shape=(3 * n, 3 * n)))
 
     def add_product(self, x: Positions, out: Positions) -> None:
-        """Add their product with x (n, 3) to `out`."""
+        """Add the product with x (n, 3) to `out` (n, 3)."""
         multiply(*self, x, out)
 
     def add(self, places: NDArray[np.int64], values: Array) -> None:
-        """Add them to blocks (b, 3, 3), at places (a, 16); -1 for none."""
+        """Add the blocks to `values` (b, 3, 3), at block indices (a, 16); -1 for none."""
         scatter(self.starts, self.packed, places, values)
 
 
 @inner
 def row(i, a):
-    """Where row a of vertex i begins."""
+    """Return the offset of row a of vertex i."""
     return 9 * i * (i + 1) // 2 + 3 * a * (i + 1)
 
 
 @inner
 def count(numbers):
-    """The vertices of a contact of so many numbers."""
+    """Return the number of vertices of a block with n entries."""
     return 4 if numbers == NUMBERS else 3 if numbers == 54 else 2
 
 
 @kernel
 def scatter(starts, packed, places, values):
-    """Add blocks to `values` (b, 3, 3), at places (a, 16); -1 for none."""
+    """Add packed blocks to `values` (b, 3, 3), at block indices (a, 16); -1 for none."""
     for k in range(len(places)):
         add_at(packed[starts[k] : starts[k + 1]], places[k], values)
 
 
 @inner
 def add_at(H, places, values):
-    """Add the rows H of a contact to `values` (b, 3, 3), at places (16,); -1 for none."""
+    """Add one packed block H to `values` (b, 3, 3), at block indices (16,); -1 for none."""
     for i in range(count(len(H))):
         for j in range(i + 1):
             at, across = places[4 * i + j], places[4 * j + i]
@@ -129,7 +136,7 @@ def add_at(H, places, values):
 
 @kernel
 def spread(starts, packed, out):
-    """Write blocks to the corners of `out` (a, 12, 12)."""
+    """Write packed blocks to the leading parts of dense blocks `out` (a, 12, 12)."""
     for k in range(len(out)):
         H = packed[starts[k] : starts[k + 1]]
         for i in range(count(len(H))):
@@ -141,7 +148,7 @@ def spread(starts, packed, out):
 
 @kernel
 def multiply(vertices, starts, packed, x, out):
-    """Add the product of blocks with x (n, 3) to `out`; vertices: -1 for those that do not move."""
+    """Add the product of packed blocks with x (n, 3) to `out`; vertices are -1 where they do not move."""
     for k in range(len(vertices)):
         H = packed[starts[k] : starts[k + 1]]
         for i in range(count(len(H))):

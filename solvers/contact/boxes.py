@@ -1,12 +1,13 @@
-"""Boxes around primitives, and which of them may come to their limits on a way.
+"""Axis-aligned bounding boxes (AABB) of primitives, and tests of which may violate distance limits during a motion.
 
-A pair that comes nearer than t + s d, d its distance at the begin of a way, where no two vertices move beside each
-other by more than M, stays d - M apart: so d < (t + M)/(1 - s), and it comes nearer than
+Let a pair have the distance d at the start of a linear motion in which no two vertices move relative to each other by
+more than M. It keeps at least the distance d - M. If it comes closer than t + s d, then d < (t + M)/(1 - s), so that it
+comes closer than
 
     t + s d < (t + s M)/(1 - s)
 
-What stays farther apart than that does not come to its limits. Nor is anything in two boxes farther apart at the begin
-than the diagonal of the box around both: where that is short, it tells more.
+A pair that stays farther apart violates no limit. Also, no two points in two boxes are farther apart at the start than
+the diagonal of the union of both boxes; where that is short, it gives the tighter bound.
 """
 
 from __future__ import annotations
@@ -28,8 +29,12 @@ _NUMBERS = 48
 
 
 class Limits(NamedTuple):
-    """What no pair may come to on a way: nearer than `reach` [m], or than `share` of its distance where the way begins
-    and `closed` [m] more. moved [m]: no two vertices move beside each other by more than that on the way."""
+    """Limits that no pair may violate during a motion.
+
+    A pair violates them if it comes closer than `inflation_radius` [m], or closer than `min_distance` [m] plus
+    `relative_min_distance` times its initial distance. max_displacement [m]: upper bound of the displacement of any two
+    vertices relative to each other.
+    """
 
     reach: float
     closed: float
@@ -38,7 +43,7 @@ class Limits(NamedTuple):
 
 
 class Gaps(NamedTuple):
-    """How far pairs are apart at least [m]: near of what is near each other at rest, and far of all else."""
+    """Lower bounds of distances [m]: `near_clearance` of pairs close at rest, `far_clearance` of all others."""
 
     near: float
     far: float
@@ -46,8 +51,14 @@ class Gaps(NamedTuple):
 
 @inner
 def hulls(corners, first, last, x):
-    """The least and the largest corners of the boxes at x (n, 4) of eight primitives from `first` on; beyond the last,
-    of that one."""
+    """Return the lower and upper corners of the boxes of eight primitives at x (n, 4).
+
+    Args:
+        corners: vertices of each primitive (m, k).
+        first: index of the first of the eight primitives.
+        last: index of the last primitive, which is repeated in lanes beyond it.
+        x: positions (n, 4) [m]; column 3 is padding.
+    """
     low = rows(x, corners, first, last, 0)
     high = low
     for a in range(1, corners.shape[1]):
@@ -58,15 +69,22 @@ def hulls(corners, first, last, x):
 
 @inner
 def put_boxes(low, high, boxes, node):
-    """Write eight boxes to a node."""
+    """Store eight boxes in a node."""
     for axis in range(3):
         stored(low[axis], boxes, _NUMBERS * node + 8 * axis)
         stored(high[axis], boxes, _NUMBERS * node + 24 + 8 * axis)
 
 
 def apart(one: tuple[int, int], other: tuple[int, int], p: Positions, q: Positions, limits: Limits) -> bool:
-    """Whether one box around vertices from a first to a last one, and one around others, tell that nothing comes to its
-    limits on the straight way from p to q, (n, 3) both."""
+    """Return whether the boxes of two vertex ranges prove that no limit is violated.
+
+    Args:
+        one: first and last vertex of one range.
+        other: first and last vertex of the other range.
+        p: start positions (n, 3) [m] of the linear motion.
+        q: end positions (n, 3) [m].
+        query: limits of the distances.
+    """
     low, high = np.empty((2, 2, 3)), np.empty((2, 2, 3))
     for k, x in enumerate((p, q)):
         for j, (first, last) in enumerate((one, other)):
@@ -82,7 +100,7 @@ def apart(one: tuple[int, int], other: tuple[int, int], p: Positions, q: Positio
 
 @kernel
 def extent(x, first, last, low, high):
-    """Write the least and the largest coordinates (3,) of rows of x (n, 3)."""
+    """Write the smallest and largest coordinates (3,) of the rows `first` to `last` of x (n, 3)."""
     low[:], high[:] = np.inf, -np.inf
     for i in range(first, last):
         for axis in range(3):
@@ -91,7 +109,7 @@ def extent(x, first, last, low, high):
 
 @inner
 def hull(boxes, many):
-    """The least and the largest corner of the first of eight boxes (6, 8)."""
+    """Return the corners of the union of the first `num_boxes` boxes of a node (6, 8)."""
     l0, l1, l2, h0, h1, h2 = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf
     for k in range(many):
         l0, l1, l2 = min(l0, boxes[0, k]), min(l1, boxes[1, k]), min(l2, boxes[2, k])
@@ -101,16 +119,26 @@ def hull(boxes, many):
 
 @kernel
 def widest(limits):
-    """So far apart all comes to no limits [m]."""
+    """Return the distance [m] beyond which no limit can be violated."""
     beside = limits.share * limits.moved if limits.share > 0.0 else 0.0
     return max(limits.reach, (limits.closed + beside) / (1.0 - limits.share))
 
 
 @inner
 def met(boxes, there, node, low, high, lower, upper, limits):
-    """Which boxes of a node may come to their limits with another box, as bits: not those that lie so far apart along
-    one axis, on the same side, at the begin and at the end of their ways. Boxes that are the same at both hold all of
-    these ways."""
+    """Return as bits which boxes of a node may violate the limits with another box.
+
+    Boxes that are separated by the inflation along one axis, on the same side at the start and at the end of the
+    motion, are excluded. If both arrays of boxes are the same, the boxes contain the whole motion.
+
+    Args:
+        boxes: start boxes (nodes, 6, 8) [m].
+        end_boxes: end boxes (nodes, 6, 8) [m].
+        node: index of the node.
+        low, high: corners of the other box at the start.
+        lower, upper: corners of the other box at the end.
+        query: limits of the distances.
+    """
     at, most = _NUMBERS * node, widest(limits)
     x0, x1, x2 = loaded(boxes, at), loaded(boxes, at + 8), loaded(boxes, at + 16)
     y0, y1, y2 = loaded(boxes, at + 24), loaded(boxes, at + 32), loaded(boxes, at + 40)
@@ -131,31 +159,31 @@ def met(boxes, there, node, low, high, lower, upper, limits):
 
 @inner
 def one_of(boxes, slot):
-    """The least and the largest corner of one of eight boxes (6, 8)."""
+    """Return the lower and upper corner of one box of a node (6, 8)."""
     return (boxes[0, slot], boxes[1, slot], boxes[2, slot]), (boxes[3, slot], boxes[4, slot], boxes[5, slot])
 
 
 @inner
 def smaller(a, b):
-    """The least coordinates of eights of points."""
+    """Return the componentwise minimum of packets of points."""
     return where(a[0] < b[0], a[0], b[0]), where(a[1] < b[1], a[1], b[1]), where(a[2] < b[2], a[2], b[2])
 
 
 @inner
 def larger(a, b):
-    """The largest ones."""
+    """Return the componentwise maximum of packets of points."""
     return where(a[0] > b[0], a[0], b[0]), where(a[1] > b[1], a[1], b[1]), where(a[2] > b[2], a[2], b[2])
 
 
 @inner
 def _width(x, y, low, high):
-    """From the least to the largest of two intervals."""
+    """Return the width of the union of two intervals."""
     return where(y > high, y, high) - where(x < low, x, low)
 
 
 @inner
 def share_vertex(first, e, second, f):
-    """Whether two primitives have a vertex in common."""
+    """Return whether two primitives have a common vertex."""
     shared = False
     for a in range(first.shape[1]):
         for b in range(second.shape[1]):

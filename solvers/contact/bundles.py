@@ -1,4 +1,4 @@
-"""The half-spaces of contact in the order in which blocks go through them (see `solvers.kernels.half_spaces`)."""
+"""Half-spaces of contact in the order of vertex-block packets (see `solvers.kernels.half_spaces`)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,14 @@ from solvers.vectors.springs import LANES
 
 
 def half_spaces(contacts: list[ContactEnergy], row: NDArray[np.int64], bundles: Bundles, unknowns: int) -> HalfSpaces:
-    """Those of a step that has begun, by the rows of their vertices, of which the first ones are unknowns."""
+    """Pack the half-spaces of the current step.
+
+    Args:
+        contacts: vertex contacts of the step.
+        row: row of each vertex; the first rows are the unknowns.
+        spring_packets: packets of the springs.
+        num_unknowns: number of rows that are unknowns.
+    """
     known = [contact for contact in contacts if isinstance(contact, Contact)]
     fields = [np.concatenate(field) for field in zip(*(contact.planes for contact in known), strict=True)]
     slip = np.concatenate([np.full(len(contact.planes.vertices), contact.slip) for contact in known])
@@ -25,7 +32,16 @@ def half_spaces(contacts: list[ContactEnergy], row: NDArray[np.int64], bundles: 
 def of_planes(
     planes: Planes, slip: NDArray[np.float64], row: NDArray[np.int64], bundles: Bundles, unknowns: int, *, both: bool
 ) -> HalfSpaces:
-    """Half-spaces, and what they slip by in a step (k,) [m]; both: whether they hold from both sides."""
+    """Pack contact planes.
+
+    Args:
+        planes: the half-spaces.
+        smoothing_length: smoothing length of friction of each half-space [m], (k,).
+        row: row of each vertex; the first rows are the unknowns.
+        spring_packets: packets of the springs.
+        num_unknowns: number of rows that are unknowns.
+        is_two_sided: whether the planes act from both sides.
+    """
     vertices, normal, offset, anchor, stiffness, grip = planes
     rows = row[vertices]
     order = np.argsort(rows, kind="stable")

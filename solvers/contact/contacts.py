@@ -1,9 +1,9 @@
-"""What is in range at a position: the closest points of all pairs, each once.
+"""Active collisions at a position: the distinct closest point pairs of all candidates.
 
-Where a closest point is a vertex, or lies on an edge, all triangles and edges around it have it in common: a point and
-a point, or a point and an edge, then stand for many pairs, with the sum of their stiffnesses (Li et al. 2020,
-"Incremental potential contact", section 5, count them so too). Apart stay pairs with a mollifier, which depends on four
-vertices, and those with a range of their own. Distances are found eight at a time.
+If a closest point is a vertex or lies on an edge, all triangles and edges around it share it. One point-point or
+point-edge collision then represents many pairs, with the sum of their stiffnesses (counted in the same way by Li et al.
+2020, "Incremental potential contact", section 5). Pairs with a mollifier, which depends on four vertices, and pairs
+with scaled distances remain separate. Distances are computed in 8-lane packets.
 """
 
 from __future__ import annotations
@@ -21,13 +21,21 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 POINTS, POINT_EDGE, POINT_TRIANGLE, EDGES = 2, 3, 4, 5
-"""The kinds of contacts."""
+"""Kinds of collisions."""
 
 
 class Pairs(NamedTuple):
-    """Pairs of points and triangles, then of edges. vertices (k, 4); points: how many are of the first kind; scale
-    (k,): of thickness and range, at most 1; stiffness (k,) [N/m]; parallel (k,): e [m^4], 0 of a point and a triangle;
-    thickness, reach: t and r [m]."""
+    """Candidate pairs: point-triangle pairs, then edge-edge pairs.
+
+    Attributes:
+        vertices: vertices of each pair (k, 4).
+        num_point_triangle: number of point-triangle pairs.
+        distance_scale: factor on `min_distance` and `dhat`, at most 1, (k,).
+        stiffness: barrier stiffness [N/m], (k,).
+        mollifier_threshold: e of the mollifier [m^4], 0 for point-triangle pairs, (k,).
+        min_distance: minimum distance [m].
+        dhat: barrier activation distance beyond the minimum distance [m].
+    """
 
     vertices: Indices
     points: int
@@ -39,10 +47,20 @@ class Pairs(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """vertices (a, 4): of points and points the last ones are the second again, of a point and an edge the third; kind
-    (a,); weights: c (a, 4); between: z (a, 3) [m]; stiffness (a,): of all that it stands for [N/m]; scale, parallel:
-    as of pairs, the latter 0 where there is no mollifier; crossed (a,): |u x v|^2 of edges [m^4]; thickness, reach: t
-    and r [m]."""
+    """Active collisions.
+
+    Attributes:
+        vertices: (a, 4); point-point collisions repeat their second vertex, point-edge ones their third.
+        kind: kind of each collision (a,).
+        coefficients: c of the distance vector (a, 4).
+        distance_vector: z [m], (a, 3).
+        stiffness: sum over all pairs that the collision represents [N/m], (a,).
+        distance_scale: as for candidates, (a,).
+        mollifier_threshold: as for candidates, 0 where no mollifier is active, (a,).
+        cross_squarednorm: |u x v|^2 of edge pairs [m^4], (a,).
+        min_distance: minimum distance [m].
+        dhat: barrier activation distance beyond the minimum distance [m].
+    """
 
     vertices: Indices
     kind: Indices
@@ -57,7 +75,13 @@ class Contacts(NamedTuple):
 
 
 def room(many: int, thickness: float, reach: float) -> Contacts:
-    """Space for so many."""
+    """Allocate uninitialised collisions.
+
+    Args:
+        capacity: number of collisions.
+        min_distance: minimum distance [m].
+        dhat: barrier activation distance [m].
+    """
     return Contacts(
         vertices=np.empty((many, 4), np.int64),
         kind=np.empty(many, np.int64),
@@ -73,7 +97,16 @@ def room(many: int, thickness: float, reach: float) -> Contacts:
 
 
 def in_range(pairs: Pairs, x: Array, space: Contacts) -> Contacts:
-    """Those at x (n, 4) [m], positions with a column more, written to a space for as many as there are pairs."""
+    """Build the active collisions at a position.
+
+    Args:
+        candidates: candidate pairs.
+        x: positions (n, 4) [m]; column 3 is padding.
+        buffer: collisions of at least the number of candidates; overwritten.
+
+    Returns:
+        Collisions that are views of the buffer.
+    """
     slots = np.empty(1 << (2 * len(pairs.vertices)).bit_length(), np.int32)
     count = gather(pairs, x, np.empty((9, 8)), slots, space)
     written: Any = (a[:count] for a in space[:-2])
@@ -82,7 +115,15 @@ def in_range(pairs: Pairs, x: Array, space: Contacts) -> Contacts:
 
 @kernel
 def gather(pairs, x, tile, slots, out):
-    """Write them to `out`; how many they are. tile (9, 8), slots (2^s,), more than there are pairs: scratch."""
+    """Write the active collisions to `out`, and return their number.
+
+    Args:
+        candidates: candidate pairs.
+        x: positions (n, 4) [m]; column 3 is padding.
+        tile: scratch (9, 8).
+        slots: hash table, (2^s,), of more entries than candidates; overwritten.
+        out: collisions of at least the number of candidates.
+    """
     slots[:] = -1
     count, end, edges = 0, pairs.points, False
     limit = (pairs.thickness + pairs.reach) ** 2
@@ -101,8 +142,7 @@ def gather(pairs, x, tile, slots, out):
 
 @inner
 def eight(vertices, x, first, last, edges, limit, tile):
-    """Which of eight pairs, up to the last one, have |z|^2 below a limit, as bits; their c, z, |z|^2 and |u x v|^2 go
-    to the rows of a tile (9, 8)."""
+    """Return as bits which of eight pairs have |z|^2 below a limit; tile (9, 8) gets c, z, |z|^2, |u x v|^2."""
     a, b = rows(x, vertices, first, last, 0), rows(x, vertices, first, last, 1)
     c, d = rows(x, vertices, first, last, 2), rows(x, vertices, first, last, 3)
     if edges:
@@ -125,7 +165,7 @@ def eight(vertices, x, first, last, edges, limit, tile):
 
 @inner
 def take(pairs, e, edges, tile, lane, slots, out, count):
-    """Add a pair that may be in range; how many there are then."""
+    """Add a pair if it is active, merging equal point-point and point-edge ones; return the new count."""
     scale = pairs.scale[e]
     if scale < 1.0 and not tile[7, lane] < (scale * (pairs.thickness + pairs.reach)) ** 2:
         return count
@@ -155,7 +195,7 @@ def take(pairs, e, edges, tile, lane, slots, out, count):
     elif kind == POINT_EDGE and b < a:
         a, b, s, t = b, a, t, s
     if kind <= POINT_EDGE and scale == 1.0:
-        # Vertices near each other are near each other in memory, and so are their slots.
+        # Neighbouring vertices have nearby indices, so nearby slots keep the table in cache.
         slot = (16 * i + ((5 * a + b) & 15)) & (len(slots) - 1)
         while slots[slot] >= 0:
             k = slots[slot]
@@ -179,7 +219,7 @@ def take(pairs, e, edges, tile, lane, slots, out, count):
 
 
 def padded(p: Array) -> Array:
-    """Positions (n, 3) with a column more, (n, 4): one load of a register brings a row."""
+    """Return positions (n, 3) padded to (n, 4): a row then fits one vector load."""
     x = np.empty((len(p), 4))
     pad(p, x)
     return x
@@ -187,6 +227,6 @@ def padded(p: Array) -> Array:
 
 @kernel
 def pad(p, x):
-    """The same, to x (n, 4): NumPy takes seven times as long for rows so short."""
+    """Copy positions (n, 3) to x (n, 4); NumPy takes seven times as long for such short rows."""
     for i in range(len(p)):
         x[i, 0], x[i, 1], x[i, 2], x[i, 3] = p[i, 0], p[i, 1], p[i, 2], 0.0

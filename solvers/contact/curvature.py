@@ -1,12 +1,14 @@
-"""The barrier's second derivatives, in closed form.
+"""Hessian of the barrier potential in closed form.
 
-With z = sum_i c_i x_i and its free places, the ways w_a in which c changes along them (`contact.closest`), D = |z|^2/2,
+With z = sum_i c_i x_i, its local coordinates, the directions w_a in which c changes along them
+(`contact.geometry.distance`), and D = |z|^2/2,
 
     D'' = c c' (x) I - B G^-1 B',     B_ia = c_i z_a + w_ia z,     z_a = sum_i w_ia x_i,     G_ab = z_a z_b
 
-so that f(d)'' = f'' g g' + f'/d (c c' (x) (I - n n') - B G^-1 B'), and f' is negative: only the first part of the
-bracket bends downwards. `keep` says how much of what bends downwards is kept: with 1 the blocks are exact, with 0 they
-are positive semidefinite, and never less than exact ones. A contact of k vertices has a block of 3 k rows.
+so that f(d)'' = f'' g g' + f'/d (c c' (x) (I - n n') - B G^-1 B'). f' is negative, so that only the first term in the
+bracket has negative curvature. `negative_fraction` is the fraction of the negative curvature that is included. With 1
+the blocks are exact; with 0 they are positive semidefinite and never less than the exact ones. A collision of k
+vertices has a block of 3 k rows.
 """
 
 from __future__ import annotations
@@ -27,15 +29,26 @@ from solvers.vectors.eights import loaded, stored
 Array = NDArray[np.float64]
 
 _WORK, _SPARE = 16, 8
-"""Numbers of a row of scratch, two vectors; of what is written beyond a block."""
+"""Length of a scratch row, two vectors; number of entries written beyond the end of a block."""
 
 _G, _DC, _FIRST, _SECOND = range(4)
-"""The rows of scratch, by what is in them."""
+"""Rows of the scratch array, by content."""
 
 
 def curvature(contacts: Contacts, grip: Grip, p: Array, n: int, keep: float, room: Room) -> Blocks:
-    """The second derivatives [N/m] of contacts at p (N, 3), and of what grips, of n vertices that move; keep: of what
-    bends downwards; room: for them."""
+    """Build the Hessian blocks of collisions and of friction.
+
+    Args:
+        collisions: active collisions.
+        tangential_collisions: friction.
+        p: positions (N, 3) [m] of all vertices.
+        n: number of vertices that move.
+        negative_fraction: fraction of the negative curvature to include.
+        buffer: memory of the blocks.
+
+    Returns:
+        Blocks [N/m].
+    """
     width = np.minimum(contacts.kind, 4)
     starts = np.concatenate([[0], np.cumsum(9 * width * (width + 1) // 2)])
     packed = room.take(int(starts[-1]) + _SPARE)
@@ -47,13 +60,13 @@ def curvature(contacts: Contacts, grip: Grip, p: Array, n: int, keep: float, roo
 
 
 def coupled(contacts: Contacts, grip: Grip, n: int) -> NDArray[np.int64]:
-    """The vertices (a, 4) of contacts, and of what grips; -1 for none and for those beyond the first n."""
+    """Return the vertices (a, 4) of collisions and friction; -1 for none and for those beyond the first n."""
     met = np.where(np.arange(4) < contacts.kind[:, None], contacts.vertices, -1)
     return moving(met, grip, n)
 
 
 def moving(met: NDArray[np.int64], grip: Grip, n: int) -> NDArray[np.int64]:
-    """Vertices (a, 4), followed by those of what grips; -1 for those beyond the first n."""
+    """Return vertices (a, 4) followed by those of friction; -1 for those beyond the first n."""
     both = np.concatenate([met, grip.vertices])
     return np.where(both < n, both, -1)
 
@@ -61,7 +74,16 @@ def moving(met: NDArray[np.int64], grip: Grip, n: int) -> NDArray[np.int64]:
 def add_curvature(
     contacts: Contacts, grip: Grip, p: Array, keep: float, places: NDArray[np.int64], values: Array
 ) -> None:
-    """Add the second derivatives [N/m] at p (N, 3) to blocks `values` (b, 3, 3), at places (a, 16); -1 for none."""
+    """Add the Hessian [N/m] of collisions and friction to existing 3x3 blocks.
+
+    Args:
+        collisions: active collisions.
+        tangential_collisions: friction.
+        p: positions (N, 3) [m] of all vertices.
+        negative_fraction: fraction of the negative curvature to include.
+        block_indices: target block of each vertex pair, (a, 16); -1 for none.
+        values: blocks (b, 3, 3) [N/m], updated.
+    """
     many = len(contacts.vertices)
     enter(contacts, p, keep, places[:many], np.zeros((4, _WORK)), np.empty(NUMBERS + _SPARE), values)
     if len(grip.vertices):
@@ -70,14 +92,24 @@ def add_curvature(
 
 @kernel
 def curve(contacts, p, keep, starts, work, out):
-    """Write the block of each contact at p (n, 3) to `out` from where it starts; work (4, 16): scratch, zero."""
+    """Write the Hessian block of each collision at p (n, 3) to `out`, at its start; scratch (4, 16): zero initially."""
     for k in range(len(contacts.vertices)):
         _curve(contacts, k, p, keep, work, out[starts[k] :])
 
 
 @kernel
 def enter(contacts, p, keep, places, work, block, values):
-    """Add the block of each contact at p (n, 3) to blocks `values`; work (4, 16), zero, block (98,): scratch."""
+    """Add the Hessian block of each collision at p (n, 3) to `values`.
+
+    Args:
+        collisions: active collisions.
+        p: positions (n, 3) [m].
+        negative_fraction: fraction of the negative curvature to include.
+        block_indices: target block of each vertex pair, (a, 16); -1 for none.
+        scratch: (4, 16), zero initially.
+        block: scratch (98,).
+        values: blocks (b, 3, 3) [N/m], updated.
+    """
     for k in range(len(contacts.vertices)):
         many = min(contacts.kind[k], 4)
         _curve(contacts, k, p, keep, work, block)
@@ -85,11 +117,10 @@ def enter(contacts, p, keep, places, work, block, values):
 
 
 class Terms(NamedTuple):
-    """The weights in the block of a contact, with m = grad |u x v|^2 of edges and the columns b of B, orthogonal by G,
+    """Weights of the terms of a Hessian block, with m = grad |u x v|^2 of edges and the G-orthogonal columns b of B.
 
-    along g g' + mixed (g m' + m g') + bent m m' - lag b1 b1' - hold b2 b2' + side c c' (x) I,
-
-    and that of how edges turn (`contact.mollifier`).
+    normal g g' + mollifier_cross (g m' + m g') + mollifier_outer m m' - first_tangent b1 b1' - second_tangent b2 b2'
+    + isotropic c c' (x) I, and edge_rotation, that of the rotation of edges (`contact.potentials.edge_edge_mollifier`).
     """
 
     along: float
@@ -103,7 +134,7 @@ class Terms(NamedTuple):
 
 @inner
 def terms(contacts, k, p, keep, work):
-    """Of contact k at p (n, 3); what they weigh, g, m, b1 and b2, goes to the rows of work, of 12 numbers or more."""
+    """Return the weights of collision k at p (n, 3), and write g, m, b1 and b2 to the rows of scratch (12 or more)."""
     x, kind = contacts.vertices[k], contacts.kind[k]
     many = min(kind, 4)
     z0, z1, z2 = contacts.between[k, 0], contacts.between[k, 1], contacts.between[k, 2]
@@ -137,7 +168,7 @@ def terms(contacts, k, p, keep, work):
 
 @inner
 def weighed(terms, work, r):
-    """What row r of the block takes of g, m, b1 and b2."""
+    """Return the factors of g, m, b1 and b2 in row r of the block."""
     g, dc = work[_G, r], work[_DC, r]
     lag, hold = terms.lag * work[_FIRST, r], terms.hold * work[_SECOND, r]
     return terms.along * g + terms.mixed * dc, terms.mixed * g + terms.bent * dc, lag, hold
@@ -145,7 +176,7 @@ def weighed(terms, work, r):
 
 @inner
 def summed(weights, g, dc, first, second):
-    """An entry of the row, or eight that follow each other."""
+    """Return one entry of the row, or a packet of eight consecutive ones."""
     along, mixed, lag, hold = weights
     return (along * g + mixed * dc) - (lag * first + hold * second)
 
@@ -160,7 +191,7 @@ def _curve(contacts, k, p, keep, work, H):
     for i in range(many):
         for a in range(3):
             at, r = row(i, a), 3 * i + a
-            # What is written beyond the row's end is written over by the rows that follow.
+            # Entries written beyond the row's end are overwritten by the rows that follow.
             weights = weighed(found, work, r)
             stored(summed(weights, g_low, dc_low, first_low, second_low), H, at)
             if i > 1:
@@ -174,7 +205,7 @@ def _curve(contacts, k, p, keep, work, H):
 
 @inner
 def _rows(p, x, kind, c, z0, z1, z2, first, second):
-    """The columns of B, made orthogonal by G: the weights of their squares in B G^-1 B'."""
+    """Write the columns of B, orthogonalised by G, and return the weights of their squares in B G^-1 B'."""
     around = kind in (POINT_EDGE, POINT_TRIANGLE)
     if around:
         one, two = (1, 2), (1, 3)
@@ -200,7 +231,7 @@ def _rows(p, x, kind, c, z0, z1, z2, first, second):
 
 @inner
 def _way(p, x, ends, c, z0, z1, z2, out):
-    """z_a of a way along which c grows at the first of two ends as it falls at the other, and its column of B (12,)."""
+    """Write the column of B (12,) where c moves from the second of two ends to the first; return z_a."""
     i, j = ends
     a0, a1, a2 = p[x[i], 0] - p[x[j], 0], p[x[i], 1] - p[x[j], 1], p[x[i], 2] - p[x[j], 2]
     for k in range(4):

@@ -1,17 +1,17 @@
-"""Contact of vertices with convex obstacles, and Coulomb friction, as one convex energy a step.
+"""Penalty contact of vertices with convex obstacles, and Coulomb friction, as one convex energy per step.
 
     E(x) = sum_i k_i/2 min(0, n_i.x_i - d_i)^2 + F_i h(|u_i|),   u_i = (I - n_i n_i')(x_i - a_i)
 
-n_i, d_i: the half-space that keeps the vertex out during this step (see `solvers.contact.planes`). a_i: where
-the vertex would be had it moved with the obstacle. F_i = mu k_i depth_i, with the depth at `Start.pressed`, an iterate
-of this step, or where that is None at the step's start (Li et al. 2020, "Incremental potential contact", section 5;
-`solvers.contact.friction_rounds` iterates it to convergence). h is the length, rounded where a vertex moves by less
-than `slip` = creep (t_x - t), with t_x the time of the unknown:
+n_i, d_i: the half-space that contains the vertex during this step (`solvers.contact.half_space.separating_planes`).
+a_i: position of the vertex if it moved with the obstacle. F_i = mu k_i depth_i, with the depth at `start.pressed`, an
+iterate of this step, or at the step's start if that is None (Li et al. 2020, "Incremental potential contact", section
+5; `solvers.contact.lagged_friction` iterates it to convergence). h is the length, smoothed where a vertex moves by less
+than s = eps_v (t_x - t), the smoothing length, with t_x the time of the stage:
 
-    h(u) = u^2/(2 slip) for u <= slip,   u - slip/2 beyond
+    h(u) = u^2/(2 s) for u <= s,   u - s/2 beyond
 
-What sticks moves at most at the speed `creep`. Half-spaces, depth and friction refer to the end of the step: where the
-unknown is another time's position (see `solvers.integrators`), both are drawn nearer to the start in proportion.
+A sticking vertex moves at most at the speed `eps_v`. Half-spaces, depth and friction refer to the end of the step. If
+the stage is the position at another time (`solvers.integrators`), both are moved towards the start in proportion.
 """
 
 from __future__ import annotations
@@ -39,9 +39,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Obstacle:
-    """All points within a radius [m] of the box from low to high (3,) [m] of a frame: its origin in the first row and
-    its three orthonormal axes in the others, (4, 3), at a time [s]: the same array at all times where it does not move.
-    Extents may be infinite."""
+    """Rounded box: all points within a radius of a box in a moving frame.
+
+    Attributes:
+        low, high: corners (3,) of the box in its frame [m]; extents may be infinite.
+        radius: radius [m].
+        frame: time [s] -> frame (4, 3), its origin in row 0 and its orthonormal axes in the others; the same array at
+            all times for a static obstacle.
+    """
 
     low: Array
     high: Array
@@ -49,7 +54,12 @@ class Obstacle:
     frame: Callable[[float], Array]
 
     def distance(self, p: Positions, time: float) -> Array:
-        """The distances (n,) [m] of points (n, 3) from its surface, negative inside."""
+        """Return the signed distances (n,) [m] of points (n, 3) from the surface, negative inside.
+
+        Args:
+            p: positions (n, 3) [m].
+            time: time [s].
+        """
         frame = self.frame(time)
         x = (p - frame[0]) @ frame[1:].T
         outside = np.linalg.norm(x - np.clip(x, self.low, self.high), axis=1)
@@ -58,8 +68,16 @@ class Obstacle:
 
 
 class Planes(NamedTuple):
-    """Half-spaces of vertices (k,): normal n (k, 3), offset d (k,) [m], anchor a (k, 3) [m], stiffness (k,) [N/m], and
-    grip F (k,) [N]."""
+    """Half-spaces of vertices.
+
+    Attributes:
+        vertices: (k,).
+        normal: unit normals n (k, 3).
+        offset: d [m], (k,).
+        friction_anchor: a [m], (k, 3).
+        stiffness: penalty stiffness [N/m], (k,).
+        friction_limit: F [N], (k,).
+    """
 
     vertices: NDArray[np.int64]
     normal: Positions
@@ -75,11 +93,19 @@ _NONE = Planes(np.empty(0, np.int64), _VECTORS, _NUMBERS, _VECTORS, _NUMBERS, _N
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """Contact of all vertices with obstacles, at a thickness [m] from their surfaces.
+    """Contact of all vertices with obstacles.
 
-    friction: mu; stiffness: k (n,) [N/m]; creep: speed below which a vertex sticks [m/s]; margin [m]: how far forces
-    may bring a vertex in one step beyond where its velocity does; time_step: dt [s]; friction_rounds: solves of a step
-    at most, each with the normal forces of the one before; planes, slip [m]: of a step that has begun.
+    Attributes:
+        obstacles: convex obstacles.
+        min_distance: minimum distance from their surfaces [m].
+        friction: friction coefficient mu.
+        stiffness: penalty stiffness k [N/m], (n,).
+        eps_v: speed below which a vertex sticks [m/s].
+        safety_margin: maximum displacement by forces in one step, in addition to that by the velocity [m].
+        time_step: dt [s].
+        friction_iterations: maximum number of solves of a step, each with the normal forces of the previous one.
+        active_planes: half-spaces of the current step.
+        smoothing_length: s of the current step [m].
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -97,33 +123,33 @@ class Contact:
 
     @cached_property
     def elements(self) -> Elements:
-        """The half-spaces of a step that has begun; none before."""
+        """Half-spaces of the current step as elements; none before a step."""
         p, count = self.planes, len(self.planes.vertices)
         numbers = p.normal, p.offset, p.anchor, p.stiffness, p.grip, np.full(count, self.slip)
         return Elements(p.vertices[:, None], np.ones((count, 1)), np.column_stack(numbers))
 
     def idle(self) -> bool:
-        """Whether nothing can be touched in this step."""
+        """Return whether no vertex can collide in this step."""
         return not len(self.planes.vertices)
 
     @cached_property
     def _near(self) -> tuple[Array, Array]:
-        """The corners of what is near each obstacle, in its frame, (o, 3) [m]."""
+        """Corners of the activation region of each obstacle, in its frame, (o, 3) [m]."""
         reach = np.array([[one.radius + self.thickness + self.margin] for one in self.obstacles])
         return np.array([o.low for o in self.obstacles]) - reach, np.array([o.high for o in self.obstacles]) + reach
 
     def frames(self, time: float) -> Array:
-        """The obstacles' frames at a step's start and end, (o, 2, 4, 3)."""
+        """Return the obstacles' frames at a step's start and end, (o, 2, 4, 3)."""
         return np.array([(one.frame(time), one.frame(time + self.time_step)) for one in self.obstacles])
 
     @cached_property
     def _resting(self) -> Array | None:
-        """Their frames in all steps where none moves."""
+        """Frames in all steps if no obstacle moves, else None."""
         rest = all(one.frame(0.0) is one.frame(1.0) for one in self.obstacles)
         return self.frames(0.0) if rest else None
 
     def begin_step(self, start: Start) -> Contact:
-        """The energy of a step; idle after one test of a box while nothing is near."""
+        """Return the energy of a step; while nothing is near, a single box test finds that it is inactive."""
         p, v = (x if x.flags.carray else np.array(x, order="C") for x in (start.positions, start.velocity))
         frames = self.frames(start.time) if self._resting is None else self._resting
         touched = np.empty(len(frames), np.bool_)
@@ -146,8 +172,11 @@ class Contact:
         when: float,
         pressed: Positions | None,
     ) -> Planes:
-        """The half-spaces of one obstacle; when: the unknown's time within the step, 1 at its end; pressed: where
-        friction's normal forces are taken (n, 3) [m], None for the step's start."""
+        """Build the half-spaces of one obstacle.
+
+        stage_fraction: time of the stage within the step, 1 at its end; normal_force_positions: where friction's normal
+        forces are evaluated (n, 3) [m], None for the step's start.
+        """
         n, body = len(p), Rounded(obstacle.low, obstacle.high, obstacle.radius + self.thickness)
         found = HalfSpaces(np.empty(n, np.int64), np.empty((n, 3)), np.empty(n), np.empty((n, 3)))
         k = contact_planes.planes(p, v, self.time_step, frames, body, self.margin + way, found, np.empty((5, 3)))
@@ -161,7 +190,7 @@ class Contact:
         return Planes(vertices, normal, offset, here + when * (carried - here), stiffness, grip)
 
     def friction_gradient(self, p: Positions) -> Positions | None:
-        """The gradient of friction alone [N], shape (n, 3); None where nothing is in contact."""
+        """Return the gradient of friction alone [N], (n, 3); None without contact."""
         if self.idle():
             return None
         out = np.zeros_like(p)
@@ -169,18 +198,18 @@ class Contact:
         return out
 
     def gap(self, p: Positions) -> Array:
-        """n.x - d (k,) [m]."""
+        """Return the gaps n.x - d [m], (k,)."""
         return _dots(self.planes.normal, p[self.planes.vertices]) - self.planes.offset
 
     def _slipped(self, p: Positions) -> tuple[NDArray[np.int64], Positions, Array]:
-        """Which half-spaces have friction (q,), u (q, 3) and |u| (q,) [m] there."""
+        """Return the half-spaces with friction (q,), and u (q, 3) and |u| (q,) [m] there."""
         grips, planes = np.flatnonzero(self.planes.grip), self.planes
         u, n = p[planes.vertices[grips]] - planes.anchor[grips], planes.normal[grips]
         u -= _dots(u, n)[:, None] * n
         return grips, u, np.sqrt(_dots(u, u))
 
     def value(self, p: Positions) -> float:
-        """The energy [J] at p, shape (n, 3)."""
+        """Return the energy [J] at p (n, 3)."""
         if self.idle():
             return 0.0
         grips, _, length = self._slipped(p)
@@ -189,7 +218,7 @@ class Contact:
         return 0.5 * float(pressed) + float(self.planes.grip[grips] @ rounded)
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
-        """Add the gradient [N], shape (n, 3), to `out`."""
+        """Add the gradient [N] at p to `out`, (n, 3) each."""
         if self.idle():
             return
         planes, gap = self.planes, self.gap(p)
@@ -201,8 +230,12 @@ class Contact:
         np.add.at(out, planes.vertices[grips], (planes.grip[grips] / np.maximum(self.slip, length))[:, None] * u)
 
     def add_absolute_terms(self, p: Positions, out: Array) -> None:
-        """Add k (|x| + |d|) [N] of what presses, or may by round-off, and F/max(slip, |u|) (|x| + |a|) of friction to
-        `out` (n,) (`solvers.round_off`)."""
+        """Add k (|x| + |d|) [N] of penalties that are or may be active, and F/max(s, |u|) (|x| + |a|) of friction.
+
+        Args:
+            p: positions (n, 3) [m].
+            out: sums (n,) [N], updated (`solvers.round_off`).
+        """
         if self.idle():
             return
         planes, size = self.planes, np.sqrt(_dots(p, p))[self.planes.vertices]
@@ -215,7 +248,7 @@ class Contact:
         np.add.at(out, planes.vertices[grips], friction)
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
-        """The Hessian [N/m], shape (3n, 3n): blocks of vertices that press or grip."""
+        """Return the Hessian [N/m], (3n, 3n), with blocks of vertices in contact."""
         rows, n = self.rows(p, p, cautious=False), len(p)
         blocks = np.zeros((n, 3, 3))
         np.add.at(blocks, rows.vertices, _outer(rows.weight, rows.direction))
@@ -226,9 +259,12 @@ class Contact:
         return scipy.sparse.csr_array(scipy.sparse.bsr_array((blocks[columns], columns, indptr), shape=(3 * n, 3 * n)))
 
     def rows(self, p: Positions, trial: Positions, *, cautious: bool) -> ContactRows:
-        """The stiffnesses at p (n, 3) of what presses there or at the trial position, and of friction.
+        """Build the penalty rows of active contacts and of friction.
 
-        Those of friction are exact, and majorise the energy where `cautious`.
+        Args:
+            p: positions (n, 3) [m].
+            trial: trial positions (n, 3) [m]; penalties active at p or there are included.
+            majorise: whether friction majorises the energy; its stiffness is exact otherwise.
         """
         planes, gap = self.planes, self.gap(p)
         pressed = np.flatnonzero((gap < 0.0) | (self.gap(trial) < 0.0))
@@ -250,12 +286,12 @@ def _dots(a: Positions, b: Positions) -> Array:
 
 
 def _outer(weight: Array, direction: Positions) -> Array:
-    """w dd' of each row, (r, 3, 3)."""
+    """Return w dd' of each row, (r, 3, 3)."""
     return weight[:, None, None] * direction[:, :, None] * direction[:, None, :]
 
 
 def _across(normal: Positions) -> Positions:
-    """A unit vector across each normal, (k, 3)."""
+    """Return a unit vector perpendicular to each normal, (k, 3)."""
     least = np.eye(3)[np.abs(normal).argmin(axis=1)]
     across = np.cross(normal, least)
     return across / np.sqrt(_dots(across, across))[:, None]

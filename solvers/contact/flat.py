@@ -1,17 +1,17 @@
-"""Patches that lie as an affine image of their rest shape, seen along some plane: nothing in them can meet.
+"""Distance bounds of clusters that are affine images of their rest shape, by projection onto a plane.
 
-Let a and b be points of primitives of two patches P and Q, and A and B where they are at rest; x_P, F_P and y_i as
-`solvers.contact.affine` has them. With e_1, e_2 of P's plane, seen from which bending is of second order, and
-E = (e_1, e_2)'
+Let a and b be points of primitives of two clusters P and Q, and A and B the same points at rest. x_P, F_P and y_i are
+those of `solvers.contact.broad_phase.cluster_fit`. Let e_1, e_2 span P's plane, projected on which bending is a
+second-order effect, and E = (e_1, e_2)'. Then
 
     |a - b| >= |E (a - b)| >= l |A - B| - z,     l = least eigenvalue of the symmetric part of E F_P (t_1, t_2)
     z = |E (x_Q - x_P - F_P (X_Q - X_P))| + |E (F_Q - F_P)| rho_Q + |E y_i| + |E y_j|
 
-at most, |A - B| less what it has out of the plane. On a straight way E stays, l is concave and z convex, so that what
-holds at both ends holds between them.
+at most, with |A - B| reduced by its part out of the plane. On a linear motion E is constant, l concave and z convex. A
+bound that is satisfied at both ends is therefore satisfied between them.
 
-Of the distance at the begin, which is at most |F_P| |A - B| + z without E, so much stays as is asked for where that is
-less than the bound: it is linear in |A - B|.
+The initial distance is at most |F_P| |A - B| + z without E. The required fraction of it remains where it is less than
+the bound, which is linear in |A - B|.
 """
 
 from __future__ import annotations
@@ -31,8 +31,14 @@ Indices = NDArray[np.int64]
 
 
 class Beside(NamedTuple):
-    """Pairs of patches. patches (k, 2); apart (k,): at rest, at least [m]; there (8, k): of the centre [m] and the axes
-    of the second along the plane of the first; its rho [m]; how far both lie out of that plane [m]."""
+    """Pairs of clusters.
+
+    Attributes:
+        clusters: (k, 2).
+        rest_distance: lower bound of the distance at rest [m], (k,).
+        relative_pose: centre [m] and axes of the second cluster along the plane of the first; its rho [m]; distance of
+            both from that plane [m]; (8, k).
+    """
 
     patches: Indices
     apart: Array
@@ -40,14 +46,19 @@ class Beside(NamedTuple):
 
     @classmethod
     def room(cls, many: int) -> Beside:
-        """Space for so many."""
+        """Allocate pairs for a capacity, rounded up to a multiple of eight."""
         eights = 8 * (-(-many // 8))
         return cls(np.empty((eights, 2), np.int64), np.empty(eights), np.empty((8, eights)))
 
 
 class Sight(NamedTuple):
-    """How patches are seen on a way, (m, 4) each. e1, e2; begin, end: l, the largest stretch, and |E y_i| [m]; each
-    (m, 1): their numbers."""
+    """Projections of clusters during a motion.
+
+    Attributes:
+        e1, e2: axes of the projection (m, 4).
+        start_bounds, end_bounds: l, the largest stretch, and |E y_i| [m], (m, 4).
+        indices: cluster indices (m, 1).
+    """
 
     e1: Array
     e2: Array
@@ -57,14 +68,21 @@ class Sight(NamedTuple):
 
     @classmethod
     def room(cls, many: int) -> Sight:
-        """Space for so many."""
+        """Allocate the projections of a number of clusters."""
         e1, e2, begin, end = np.empty((4, many, 4))
         return cls(e1, e2, begin, end, np.arange(many)[:, None])
 
 
 @kernel
 def relate(known, first, count, out):
-    """Write how pairs of patches lie to each other at rest, from the first one on, to `out`."""
+    """Compute the relative poses of cluster pairs at rest.
+
+    Args:
+        rest_clusters: clusters at rest.
+        first: first pair to compute.
+        count: end of the pairs to compute.
+        out: cluster pairs, updated.
+    """
     for at in range(first // 8 * 8, count, 8):
         end, x, k = count - 1, out.patches, len(out.apart)
         t1, t2, n = rows(known.t1, x, at, end, 0), rows(known.t2, x, at, end, 0), rows(known.normal, x, at, end, 0)
@@ -81,9 +99,20 @@ def relate(known, first, count, out):
 
 @kernel
 def doubtful(begin, end, pairs, count, limits, enough, sight, tile, out):
-    """Write those of the first pairs of patches to `out` (k, 2) whose primitives may come to their limits on the
-    straight way from how they lie at its begin to how they lie at its end, or end less than `enough` [m] apart; how
-    many they are, and how far those of the others are apart at the end, at least [m]. sight, tile: scratch."""
+    """Write the cluster pairs that are not proved to be separated during a linear motion.
+
+    Args:
+        begin, end: poses at the start and at the end.
+        pairs: cluster pairs.
+        count: number of pairs to test.
+        query: limits of the distances.
+        min_end_distance: required distance at the end [m].
+        basis, tile: scratch.
+        out: clusters of the unresolved pairs (k, 2).
+
+    Returns:
+        Number of unresolved pairs, and a lower bound of the end distances of all others [m].
+    """
     for first in range(0, len(sight.e1), 8):
         _look(begin, end, first, tile, sight)
     found, least = 0, np.inf
@@ -101,7 +130,7 @@ def doubtful(begin, end, pairs, count, limits, enough, sight, tile, out):
 
 @inner
 def _look(begin, end, first, tile, sight):
-    """Write how eight patches are seen."""
+    """Write the projections of eight clusters."""
     last, x = first + 7, sight.each
     a1, a2 = rows(begin.f1, x, first, last, 0), rows(begin.f2, x, first, last, 0)
     b1, b2 = rows(end.f1, x, first, last, 0), rows(end.f2, x, first, last, 0)
@@ -116,7 +145,7 @@ def _look(begin, end, first, tile, sight):
 
 @inner
 def _stretch(lies, x, first, e1, e2, f1, f2):
-    """l, the largest stretch, and |E y_i| of eight patches."""
+    """Return l, the largest stretch, and |E y_i| of eight clusters."""
     a, d, b = dot(e1, f1), dot(e2, f2), 0.5 * (dot(e1, f2) + dot(e2, f1))
     least = 0.5 * (a + d) - root(0.25 * (a - d) * (a - d) + b * b)
     a, d, b = dot(f1, f1), dot(f2, f2), dot(f1, f2)
@@ -127,7 +156,7 @@ def _stretch(lies, x, first, e1, e2, f1, f2):
 
 @inner
 def _clear(begin, end, pairs, sight, first, last, limits, enough):
-    """Which of eight pairs can not, and end at least `enough` apart, as bits; and how far they are apart at the end."""
+    """Return as bits which of eight pairs are separated, and their distances at the end."""
     e1, e2 = rows(sight.e1, pairs.patches, first, last, 0), rows(sight.e2, pairs.patches, first, last, 0)
     here, there = rows(sight.begin, pairs.patches, first, last, 0), rows(sight.end, pairs.patches, first, last, 0)
     out = loaded(pairs.there, 7 * len(pairs.apart) + first)
@@ -146,7 +175,7 @@ def _clear(begin, end, pairs, sight, first, last, limits, enough):
 
 @inner
 def _off(lies, pairs, first, last, e1, e2):
-    """z less what the first patches have in it alone, of eight pairs, and the same without E."""
+    """Return z without the first clusters' own part, of eight pairs, and the same without E."""
     room, x = len(pairs.apart), pairs.patches
     f1, f2 = rows(lies.f1, x, first, last, 0), rows(lies.f2, x, first, last, 0)
     c = minus(rows(lies.centre, x, first, last, 1), rows(lies.centre, x, first, last, 0))
@@ -164,7 +193,7 @@ def _off(lies, pairs, first, last, e1, e2):
 
 @inner
 def _less(v, s, f1, t, f2):
-    """v less s f_1 and t f_2."""
+    """Return v - s f_1 - t f_2."""
     return v[0] - s * f1[0] - t * f2[0], v[1] - s * f1[1] - t * f2[1], v[2] - s * f1[2] - t * f2[2]
 
 

@@ -1,15 +1,16 @@
-"""Friction with the normal forces of the step itself, by a fixed-point iteration around its solves.
+"""Lagged friction: a fixed-point iteration over the solves of a step, which updates the normal forces.
 
-    x_0 = argmin E(x; N at the step's start),     x_{k+1} = argmin E(x; N(x_k)),     k + 1 < rounds
+    x_0 = argmin E(x; N at the step's start),     x_{k+1} = argmin E(x; N(x_k)),     k + 1 < max_iterations
 
-Normal forces N, contact points and directions are fixed in a solve, so that friction has a potential (Li et al. 2020,
-"Incremental potential contact", section 5). With f(x; N) the gradient of friction, f(x_k; N(x_k)) - f(x_k; N(x_{k-1}))
-is what x_k lacks to solve the step with its own normal forces; the rounds end once its largest component is at most
-TOLERANCE times that of f, or after `friction_rounds` of the energies. The iteration need not converge: where friction
-itself presses contacts together, as a wedge does, or where mu N is so large that a vertex sticks out of the range of
-contact in one round and, not pressed there, slides back in the next. Iterates that return to an earlier one repeat
-without end, so the rounds end as well, at the iterate of the cycle on which the largest friction acts: the others slide
-as if there were little or none. The change that was left is reported, and is then not small.
+Normal forces N, contact points and directions are constant in a solve, so that friction has a potential (Li et al.
+2020, "Incremental potential contact", section 5). With f(x; N) the gradient of friction, f(x_k; N(x_k)) - f(x_k;
+N(x_{k-1})) is the residual of x_k with its own normal forces. The iteration ends once its largest component is at most
+FRICTION_RTOL times that of f, or after `friction_iterations` of the energies.
+
+The iteration need not converge. Friction itself may press contacts together, as in a wedge. Or mu N may be so large
+that a vertex leaves the activation distance in one iteration and, without normal force there, slides back in the next.
+A cycle of iterates also ends the iteration, at its iterate with the largest friction: the others slide as if there were
+little or none. The remaining change is reported, and is then not small.
 """
 
 from __future__ import annotations
@@ -23,14 +24,15 @@ import numpy as np
 from solvers.problem import Energy, Positions, Prepared, Solution, StepProblem, StopRule, System
 
 ROUNDS = 20
-"""Solves of a step at most, where an effect does not say."""
+"""Default maximum number of solves of a step."""
 
 TOLERANCE = 1e-4
-"""Of the largest force of friction: a smaller change ends the rounds."""
+"""Change relative to the largest friction force below which the iteration has converged."""
 
 PERIOD, RETURN = 4, 1e-2
-"""Rounds of the longest cycle that is noticed, and how near to an earlier iterate the last one has to be, relative to
-its distance from the one before. Iterates that converge by less than 1 % a round would not do so in ROUNDS either."""
+"""Longest detected cycle, and the distance from an earlier iterate that counts as a return, relative to the distance
+from the previous one. Iterates that converge by less than 1 % per iteration would not converge within the maximum
+number of iterations either."""
 
 
 @runtime_checkable
@@ -41,20 +43,26 @@ class FrictionEnergy(Energy, Protocol):
     friction_rounds: int
 
     def friction_gradient(self, p: Positions) -> Positions | None:
-        """The gradient of friction alone [N] at p (n, 3), in a step that has begun; None where it is zero."""
+        """Return the gradient of friction alone [N] at p (n, 3), in the current step; None where it is zero."""
         ...
 
 
 class FrictionRounds(NamedTuple):
-    """How many rounds a step took, and the change of friction that was left, relative to its largest component."""
+    """Number of iterations of a step, and the last change of friction relative to its largest component."""
 
     rounds: int
     change: float
 
 
 class FrictionSolve(NamedTuple):
-    """A solved step: the problem of the last round with the first guess of the first one, its solution, and the
-    iterations of each; None for friction where the scene has none."""
+    """A solved step.
+
+    Attributes:
+        problem: the problem of the last iteration, with the initial guess of the first one.
+        solution: its solution.
+        iteration_counts: solver iterations of each solve.
+        convergence: convergence of friction; None where the scene has none.
+    """
 
     problem: StepProblem
     solution: Solution
@@ -63,7 +71,13 @@ class FrictionSolve(NamedTuple):
 
 
 def solve_with_friction(prepared: Prepared, problem: StepProblem, stop: StopRule) -> FrictionSolve:
-    """Solve a step until its friction has the normal forces of the solution; one solve where there is no friction."""
+    """Solve a step until friction has the normal forces of the solution; once without friction.
+
+    Args:
+        prepared: the prepared solver.
+        problem: the step.
+        stop: stop rule of each solve.
+    """
     solution = prepared.solve(problem, stop)
     rounds = _most_rounds(problem.system)
     if not rounds:
@@ -84,24 +98,24 @@ def solve_with_friction(prepared: Prepared, problem: StepProblem, stop: StopRule
 
 
 def has_friction(energy: Energy) -> TypeGuard[FrictionEnergy]:
-    """Whether an energy has friction whose normal forces are found in rounds."""
+    """Return whether an energy has friction with lagged normal forces."""
     return getattr(energy, "friction", 0.0) > 0.0 and hasattr(energy, "friction_rounds")
 
 
 def _most_rounds(system: System) -> int:
-    """The largest number of rounds, 0 without friction."""
+    """Return the maximum number of friction iterations of all energies, 0 without friction."""
     return max((energy.friction_rounds for energy in system.energies if has_friction(energy)), default=0)
 
 
 class _Round(NamedTuple):
-    """Where a round ended, (n, 3) [m], and the largest component of the friction that acted there [N]."""
+    """Final positions (n, 3) [m] of an iteration, and the largest component of its friction [N]."""
 
     positions: Positions
     acting: float
 
 
 def _is_cycle_at_largest(earlier: deque[_Round], x: Positions, acting: float) -> bool:
-    """Whether x (n, 3) [m] returns to an earlier iterate than the last, and no iterate since then had more friction."""
+    """Return whether x (n, 3) [m] returns to an iterate before the last, and none since then had more friction."""
     if len(earlier) < 2:
         return False
     moved = _largest(x - earlier[-1].positions)
@@ -112,8 +126,7 @@ def _is_cycle_at_largest(earlier: deque[_Round], x: Positions, acting: float) ->
 
 
 def _friction_change(problem: StepProblem, following: StepProblem, x: Positions) -> tuple[float, float]:
-    """The change of friction at x (n, 3) [m] from one problem to the next, relative to its largest component there,
-    and the largest component [N] in the first one."""
+    """Return the relative change of friction at x (n, 3) between two problems, and its largest component [N] before."""
     before, after = (
         [energy.friction_gradient(x) for energy in each.energies if has_friction(energy)]
         for each in (problem, following)
@@ -127,5 +140,5 @@ def _friction_change(problem: StepProblem, following: StepProblem, x: Positions)
 
 
 def _largest(force: Positions | None) -> float:
-    """The largest component, 0 without a force."""
+    """Return the largest component, 0 without a force."""
     return 0.0 if force is None else float(np.abs(force).max(initial=0.0))

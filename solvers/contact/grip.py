@@ -1,11 +1,11 @@
-"""Coulomb friction of pairs with given normal forces: a convex function of positions within the step.
+"""Lagged Coulomb friction of collisions with given normal forces: a convex function of positions within the step.
 
     E(p) = sum over pairs of mu F h(|u|),     u = (I - nn') sum_i c_i (x_i - x_i^t)
 
-F: the barrier's force at `Start.pressed`, an iterate of this step, or where that is None at the step's start; c, n:
-where the pair is nearest there, and its direction; x^t: the step's start (Li et al. 2020, "Incremental potential
-contact", section 5; `solvers.contact.friction_rounds` iterates them to convergence). h is the length, smoothed where a
-pair slips by less than s in a step; its slope is continuous, and below 1 there:
+F: the barrier's normal force at `start.pressed`, an iterate of this step, or at the step's start if that is None; c, n:
+coefficients and direction of the closest points there; x^t: positions at the step's start (Li et al. 2020, "Incremental
+potential contact", section 5; `solvers.contact.lagged_friction` iterates them to convergence). h is the length,
+smoothed where a pair slips by less than s in a step; its slope is continuous, and below 1 there:
 
     h(u) = u^2/s - u^3/(3 s^2)  for u < s,     u - s/3 beyond
 """
@@ -27,8 +27,16 @@ Array = NDArray[np.float64]
 
 
 class Grip(NamedTuple):
-    """Contacts that grip. vertices (g, 4), with no weight where there are fewer; weights: c (g, 4); normal (g, 3);
-    anchor: sum_i c_i x_i^t (g, 3) [m]; force: mu F (g,) [N]; slip: s [m]."""
+    """Collisions with friction.
+
+    Attributes:
+        vertices: (g, 4); missing vertices have zero coefficients.
+        coefficients: c (g, 4).
+        normal: unit normals (g, 3).
+        friction_anchor: sum_i c_i x_i^t [m], (g, 3).
+        friction_limit: mu F [N], (g,).
+        smoothing_length: s [m].
+    """
 
     vertices: NDArray[np.int64]
     weights: Array
@@ -39,7 +47,14 @@ class Grip(NamedTuple):
 
     @classmethod
     def of(cls, contacts: Contacts, start: Positions, friction: float, slip: float) -> Self:
-        """The friction of contacts; start: all vertices' positions at the step's start [m]; slip: s [m]."""
+        """Build the friction of collisions.
+
+        Args:
+            collisions: active collisions.
+            start: positions of all vertices at the step's start [m].
+            friction: friction coefficient mu.
+            smoothing_length: s [m].
+        """
         between, force = contacts.between, np.empty(len(contacts.vertices))
         barrier.forces(contacts, force)
         normal = between / np.sqrt(np.einsum("ij,ij->i", between, between))[:, None]
@@ -48,7 +63,7 @@ class Grip(NamedTuple):
         return cls(vertices, weights, normal, anchor, friction * force, slip)
 
     def value(self, p: Positions) -> float:
-        """The energy [J] at p (n, 3)."""
+        """Return the energy [J] at p (n, 3)."""
         return hold(self, p)
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
@@ -56,7 +71,7 @@ class Grip(NamedTuple):
         pull(self, p, out)
 
     def blocks(self, p: Positions) -> Blocks:
-        """The second derivatives at p (n, 3), positive semidefinite."""
+        """Return the Hessian blocks at p (n, 3), positive semidefinite."""
         many = len(self.vertices)
         packed = np.empty(NUMBERS * many)
         curve(self, p, packed)
@@ -65,13 +80,13 @@ class Grip(NamedTuple):
 
 @inner
 def combined(x, c, p, axis):
-    """sum_i c_i p_i [m] along an axis."""
+    """Return sum_i c_i p_i [m] along an axis."""
     return c[0] * p[x[0], axis] + c[1] * p[x[1], axis] + c[2] * p[x[2], axis] + c[3] * p[x[3], axis]
 
 
 @kernel
 def combine(vertices, weights, p, out):
-    """Write sum_i c_i p_i [m] of each contact to `out`."""
+    """Write sum_i c_i p_i [m] of each collision to `out`."""
     for e in range(len(vertices)):
         for axis in range(3):
             out[e, axis] = combined(vertices[e], weights[e], p, axis)
@@ -79,7 +94,7 @@ def combine(vertices, weights, p, out):
 
 @inner
 def slipped(grip, p, e):
-    """u and |u| [m] of contact e."""
+    """Return the tangential displacement u and |u| [m] of collision e."""
     x, c, n = grip.vertices[e], grip.weights[e], grip.normal[e]
     u0 = combined(x, c, p, 0) - grip.anchor[e, 0]
     u1 = combined(x, c, p, 1) - grip.anchor[e, 1]
@@ -91,27 +106,27 @@ def slipped(grip, p, e):
 
 @inner
 def rate(length, slip):
-    """h'(u)/u [1/m]."""
+    """Return h'(u)/u [1/m]."""
     return (2.0 - length / slip) / slip if length < slip else 1.0 / length
 
 
 @inner
 def rounded(length, slip):
-    """h [m] of a length."""
+    """Return h [m] of a length."""
     y = min(length / slip, 1.0)
     return slip * (y * y - y * y * y / 3.0) + max(length - slip, 0.0)
 
 
 @inner
 def bends(u0, u1, u2, length, slip):
-    """h'(u)/u, h''(u) less that [1/m], and u/|u|."""
+    """Return h'(u)/u, h''(u) minus that [1/m], and u/|u|."""
     flat, least = rate(length, slip), max(length, 1e-300)
     return flat, max(2.0 * (1.0 - length / slip) / slip, 0.0) - flat, (u0 / least, u1 / least, u2 / least)
 
 
 @inner
 def bent(n, second, a, b):
-    """Entry (a, b) of the second derivatives of h by u [1/m], across the direction n (3,); second: of `bends`."""
+    """Return entry (a, b) of the Hessian of h [1/m], tangential to n (3,); second: from `friction_f2_terms`."""
     flat, more, u = second
     same = 1.0 if a == b else 0.0
     return flat * (same - n[a] * n[b]) + more * u[a] * u[b]
@@ -119,7 +134,7 @@ def bent(n, second, a, b):
 
 @kernel
 def hold(grip, p):
-    """The energy [J] at p (n, 3)."""
+    """Return the friction energy [J] at p (n, 3)."""
     total, s = 0.0, grip.slip
     for e in range(len(grip.vertices)):
         length = slipped(grip, p, e)[3]
@@ -129,7 +144,7 @@ def hold(grip, p):
 
 @kernel
 def pull(grip, p, out):
-    """Add the gradient [N] at p (n, 3) to `out`."""
+    """Add the friction gradient [N] at p (n, 3) to `out`."""
     for e in range(len(grip.vertices)):
         u0, u1, u2, length = slipped(grip, p, e)
         w = grip.force[e] * rate(length, grip.slip)
@@ -142,7 +157,7 @@ def pull(grip, p, out):
 
 @kernel
 def curve(grip, p, out):
-    """Write the rows of each contact's block at p (n, 3) to `out`."""
+    """Write the packed Hessian block of each collision at p (n, 3) to `out`."""
     for e in range(len(grip.vertices)):
         n, c, H = grip.normal[e], grip.weights[e], out[NUMBERS * e : NUMBERS * (e + 1)]
         u0, u1, u2, length = slipped(grip, p, e)

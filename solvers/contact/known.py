@@ -1,10 +1,11 @@
-"""Which pairs may be near, and how far a way may be gone: what was looked up, kept while it holds.
+"""Cache of candidate pairs and of clearances, as in a neighbour list with a skin.
 
-What is near is looked up for a point, and kept for as long as the vertices stay close to it (their common motion
-apart). It changes no bit of what is computed: pairs out of range add nothing, and all others come in one order. Steps
-are bounded by what they may meet on the way (`solvers.contact.ways`). Where that was nothing the last time, patches
-tell first (`solvers.contact.patches`), and what is kept is how far all is apart where the way ends: other ways are free
-while no vertices move beside each other by more than that, neighbours at rest among themselves, and all others.
+Candidates are found at one position and reused while the vertices stay close to it, apart from a common translation.
+The cache changes no bit of the results: pairs beyond the activation distance contribute nothing, and all others come in
+one order. Step sizes are limited by the pairs that may collide along the displacement (`solvers.contact.ccd`). Where
+the previous query found none, clusters of primitives are tested first (`contact.broad_phase.cluster_culling`). The
+cache then stores the clearance at the end of the displacement, separately for pairs close to each other at rest and for
+all others. A later displacement is collision-free if no two vertices move relative to each other by more than that.
 """
 
 from __future__ import annotations
@@ -23,52 +24,78 @@ from solvers.problem import Positions
 Array = NDArray[np.float64]
 
 ROUND = 8.0 * np.finfo(np.float64).eps
-"""Of the largest coordinate: by so much boxes are made wider."""
+"""Inflation of bounding boxes, relative to the largest coordinate."""
 
 
 WIDE = 1.5
-"""Of the range: so far pairs are looked up. More would be looked at each time for longer than it takes to look them up
-anew now and then."""
+"""Query radius relative to the activation distance. A larger one makes each evaluation slower by more than the rarer
+broad phases save."""
 _MANY = 3
-"""Positions around which is kept what is near them: of a step these are its start, free fall and where it goes."""
+"""Maximum number of cached positions: of a step these are its start, the inertial prediction and the solution."""
 
 
 class Surfaces(Protocol):
-    """What may touch: finds pairs among all vertices."""
+    """Interface of a set of primitives among which candidate pairs are found."""
 
     @property
     def thickness(self) -> float:
-        """So far apart pairs stay at least [m]."""
+        """Minimum distance of all pairs [m]."""
         ...
 
     @property
     def reach(self) -> float:
-        """So far beyond that they feel each other [m]."""
+        """Barrier activation distance beyond the minimum distance [m]."""
         ...
 
     def clear(self, p: Positions, q: Positions, limits: Limits) -> Gaps | None:
-        """How far pairs are apart at q, where none comes to its limits on the straight way from p to q, (n, 3) [m]
-        both; None where some does, or that would take long to say."""
+        """Return lower bounds of the distances at q, if the linear displacement from p to q violates no limit.
+
+        Args:
+            p: start positions (n, 3) [m].
+            q: end positions (n, 3) [m].
+            query: limits that no pair may violate.
+
+        Returns:
+            Clearance bounds at q; None if a pair violates a limit, or if the test would take long.
+        """
         ...
 
     def unevenness(self, p: Positions, q: Positions) -> float:
-        """How far any two vertices of what is near each other at rest have moved from p to q, contiguous (n, 3) both,
-        beside each other, at most [m]."""
+        """Return the largest relative displacement of two vertices that are close to each other at rest.
+
+        Args:
+            p: start positions, contiguous (n, 3) [m].
+            q: end positions, contiguous (n, 3) [m].
+
+        Returns:
+            Upper bound [m].
+        """
         ...
 
     def within(self, p: Positions, reach: float) -> Pairs:
-        """Pairs that are nearer than `reach` [m] at p (n, 3) [m]."""
+        """Return the pairs closer than `inflation_radius` [m] at p (n, 3) [m]."""
         ...
 
     def on_way(self, x: Array, y: Array, limits: Limits, edges: bool) -> Pairs:
-        """Pairs of edges, or of points and triangles, that may come to their limits on the straight way from x to y,
-        (n, 4) [m] both, positions with a column more; with what they press with or without."""
+        """Return the pairs that may violate a limit on the linear displacement from x to y.
+
+        Args:
+            x: start positions (n, 4) [m]; column 3 is padding.
+            y: end positions (n, 4) [m]; column 3 is padding.
+            query: limits of the distances.
+            edges: True for edge-edge pairs, False for point-triangle pairs.
+
+        Returns:
+            Candidates; their barrier parameters may be missing.
+        """
         ...
 
 
 class Kept(NamedTuple):
-    """Pairs that are nearer than `reach` [m] at p (n, 3); far [m]: what is not near each other at rest is farther apart
-    than this, where that is known to be more."""
+    """Pairs closer than `radius` [m] at `positions` (n, 3).
+
+    far_radius [m]: lower bound of the distances of pairs not close at rest, where known to exceed `radius`.
+    """
 
     p: Positions
     reach: float
@@ -77,26 +104,35 @@ class Kept(NamedTuple):
 
     @classmethod
     def nothing(cls, surface: Surfaces, p: Positions, gaps: Gaps) -> Kept:
-        """No pairs."""
+        """Return a cache entry without pairs, with clearance bounds at p (n, 3)."""
         none = np.empty(0)
         pairs = Pairs(np.empty((0, 4), np.int64), 0, none, none, none, surface.thickness, surface.reach)
         return cls(p, min(gaps), pairs, gaps.far)
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is so near."""
+        """Whether there are no pairs within the radius."""
         return not len(self.pairs.vertices)
 
     def covers(self, p: Positions, limit: float) -> bool:
-        """Whether all pairs nearer than a limit [m] at p (n, 3) are among these."""
+        """Return whether these include all pairs closer than a limit [m] at p (n, 3)."""
         if self.p.shape != p.shape:
             return False
         moved = unevenness(self.p, p) if self.idle else 2.0 * _apart(self.p, p)
         return moved <= self.reach - limit
 
     def followed(self, surface: Surfaces, p: Positions, q: Positions, moved: tuple[float, float]) -> Kept | None:
-        """What is then known at q (n, 3), where all that is not kept stays open on the way from p and nothing is in
-        range at q; None where that is not known. moved: how uneven p and q are to where it is kept [m]."""
+        """Return the cache entry that is valid at q, if the displacement from p to q is collision-free.
+
+        Args:
+            source: the primitives.
+            p: start positions (n, 3) [m].
+            q: end positions (n, 3) [m].
+            displacements: maximum relative displacements of p and of q with respect to `positions` [m].
+
+        Returns:
+            The entry, or None if gaps may close on the way or a pair may be active at q.
+        """
         if _idle(surface, self.reach, moved):
             return self
         if self.far <= self.reach or not _idle(surface, self.far, moved):
@@ -110,25 +146,33 @@ class Kept(NamedTuple):
 
 
 def _idle(surface: Surfaces, gap: float, moved: tuple[float, float]) -> bool:
-    """Whether gaps of at least so much [m] stay open, and nothing is in range at the end, where vertices have moved so
-    far beside each other at the begin of a way and at its end."""
+    """Return whether gaps of at least `gap` [m] stay open and remain inactive at the end of a displacement.
+
+    displacements: maximum relative displacements [m] of its start and of its end with respect to the cached position.
+    """
     return moved[1] <= gap - surface.thickness - surface.reach and _open(gap - surface.thickness, moved)
 
 
 def _open(gap: float, moved: tuple[float, float]) -> bool:
-    """Whether that leaves of a gap [m] more than it has to."""
+    """Return whether these displacements leave the required fraction of a gap [m]."""
     most = (1.0 - LEFT) * gap
     return (1.0 + LEFT) * moved[0] <= most and moved[1] + LEFT * moved[0] <= most
 
 
 def idle(surface: Surfaces, kept: list[Kept], p: Positions) -> bool:
-    """Whether it is known that nothing is in range at p (n, 3)."""
+    """Return whether no pair is known to be active at p (n, 3), by the caches alone."""
     limit = surface.thickness + surface.reach
     return any(one.idle and one.covers(p, limit) for one in kept)
 
 
 def pairs(surface: Surfaces, kept: list[Kept], p: Positions) -> Pairs:
-    """Pairs that may be in range at p (n, 3): all that are, and maybe more."""
+    """Return all pairs that are active at p (n, 3), and possibly more.
+
+    Args:
+        source: the primitives.
+        caches: cached candidates, updated.
+        p: positions (n, 3) [m].
+    """
     limit = surface.thickness + surface.reach
     for one in kept:
         if one.covers(p, limit):
@@ -143,7 +187,17 @@ def pairs(surface: Surfaces, kept: list[Kept], p: Positions) -> Pairs:
 
 
 def largest_step(surface: Surfaces, kept: list[Kept], p: Positions, way: Positions) -> float:
-    """The largest t up to 1 by which p may go along a way, (n, 3) both, with all gaps open; 0 where one is closed."""
+    """Return the largest step size up to 1 that keeps all gaps open.
+
+    Args:
+        source: the primitives.
+        caches: cached candidates, updated.
+        p: positions (n, 3) [m].
+        displacement: displacements (n, 3) [m].
+
+    Returns:
+        Step size in [0, 1]; 0 if a gap is closed at p, or if the displacement is not finite.
+    """
     q, closed, free = p + way, surface.thickness, False
     alone = bool(kept) and all(one.idle for one in kept)
     for one in kept:
@@ -178,17 +232,17 @@ def largest_step(surface: Surfaces, kept: list[Kept], p: Positions, way: Positio
 
 
 def _keep(before: list[Kept], found: Kept, kept: list[Kept]) -> None:
-    """Keep what was found, before what was before."""
+    """Store a new entry in front of the previous ones."""
     kept[:] = [found, *before[: _MANY - 1]]
 
 
 def _round(p: Positions) -> float:
-    """By how much boxes are made wider [m]."""
+    """Return the inflation of bounding boxes [m]."""
     return ROUND * float(np.abs(p).max(initial=0.0))
 
 
 def _apart(p: Positions, q: Positions) -> float:
-    """How far vertices have moved from p to q, (n, 3) each, at most, but for their mean [m]."""
+    """Return the largest displacement [m] of a vertex from p to q, (n, 3) each, relative to the mean displacement."""
     way = q - p
     way -= way.mean(axis=0)
     return float(np.sqrt(np.einsum("ij,ij->i", way, way)).max(initial=0.0))

@@ -1,8 +1,8 @@
-"""The law of one half-space that keeps one vertex out (see `solvers.contact.energy`), at the vertex's position z.
+"""Element energy of one vertex at z in contact with one half-space (see `half_space_potential`).
 
-    phi(z) = k/2 min(0, n.z - d)^2 + F h(|u|),   u = (I - nn')(z - a),   h(u) = u^2/(2 slip), or u - slip/2 beyond
+    phi(z) = k/2 min(0, n.z - d)^2 + F h(|u|),   u = (I - nn')(z - a),   h(u) = u^2/(2 s), or u - s/2 beyond
 
-Numbers: n (3), d, a (3), k, F, slip.
+Parameters: n (3), d, a (3), k, F, s, the smoothing length.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from solvers.energies.elements import Law, line
 
 @inner
 def _depth(numbers, e, z0, z1, z2):
-    """min(0, n.z - d)."""
+    """Return the penetration min(0, n.z - d)."""
     return min(0.0, numbers[e, 0] * z0 + numbers[e, 1] * z1 + numbers[e, 2] * z2 - numbers[e, 3])
 
 
 @inner
 def _slipped(numbers, e, z0, z1, z2):
-    """u."""
+    """Return the tangential displacement u."""
     n0, n1, n2 = numbers[e, 0], numbers[e, 1], numbers[e, 2]
     u0, u1, u2 = z0 - numbers[e, 4], z1 - numbers[e, 5], z2 - numbers[e, 6]
     along = n0 * u0 + n1 * u1 + n2 * u2
@@ -30,7 +30,7 @@ def _slipped(numbers, e, z0, z1, z2):
 
 @inner
 def _rounded(length, slip):
-    """h."""
+    """Return h of a length."""
     return 0.5 * length * length / slip if length <= slip else length - 0.5 * slip
 
 

@@ -1,12 +1,12 @@
-"""Contact for the prefactored methods: what presses and grips is a small change W of Q, and Q stays factorised.
+"""Vertex contact for prefactored methods: contact and friction are a low-rank change W of Q, which stays factorised.
 
-    p <- p + x,   x = -(Q + W)^-1 (grad g(p) + U w gap),   W = U diag(w) U',  one column of U a row of contact
+    p <- p + x,   x = -(Q + W)^-1 (grad g(p) + U w gap),   W = U diag(w) U',  one column of U per contact row
 
-by Woodbury's formula while there are few rows, with the columns of Q^-1 that belong to their vertices, else by
-conjugate gradients that Q^-1 preconditions (a few of them: they descend in the model wherever they are stopped). Which
-vertices begin to press is found by a few repetitions, each from the last one's end. Then x minimises a majorant of the
-objective, friction aside, whose second derivatives are exact first; a step that raises the objective nevertheless is
-repeated with all of the majorant, and shortened.
+The system is solved by Woodbury's formula while there are few rows, with the columns of Q^-1 of their vertices. Else it
+is solved by conjugate gradients preconditioned by Q^-1; a few iterations suffice, since each iterate decreases the
+model. A few active-set passes, each started at the last one's result, find which contacts become active. x then
+minimises a majorant of the objective, except for friction, whose exact second derivatives are tried first. A step that
+increases the objective nevertheless is repeated with the full majorant, and then shortened.
 """
 
 from __future__ import annotations
@@ -29,35 +29,43 @@ from solvers.linear.krylov import Iteration
 from solvers.problem import Positions, Prepared, ResidualOf, Solver, StepProblem, System
 
 _FEW = 900
-"""Rows up to which their matrix is factorised: 300 vertices that stick. It takes as long as conjugate gradients do."""
+"""Maximum number of rows for Woodbury's formula, of 300 sticking vertices; beyond it conjugate gradients are faster."""
 
 _PASSES = 4
 _HALVINGS = 12
 _ITERATIONS, _TOLERANCE = 60, 1e-3
-"""Of conjugate gradients, in the norm of Q^-1."""
+"""Of conjugate gradients: maximum number of iterations, and relative tolerance in the norm of Q^-1."""
 
 
 class Idle(Prepared, Protocol):
-    """A local-global method, ready for a system without contact."""
+    """A prepared local-global method of a system without contact."""
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative."""
+        """Return the initial state of the iteration of a step."""
         ...
 
     def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
-        """See Iterative."""
+        """Return the function that computes the residual of positions."""
         ...
 
 
 def local_global(solver: Solver, system: System) -> PreparedContact:
-    """A local-global method with contact; raises what the solver raises for the system without it."""
+    """Prepare a local-global method with vertex contact.
+
+    Args:
+        solver: the method without contact.
+        system: the system, with contact.
+
+    Raises:
+        Unsupported: if the solver does not support the system without contact.
+    """
     idle: Any = solver.prepare(without_contact(system))
     base = idle if isinstance(idle, PreparedLocalGlobal) else idle.base
     return PreparedContact(replace(base, system=system), idle, Objective(system), Corrections(base))
 
 
 class Corrections:
-    """Minimisers of quadratic models with Q + W, over a factor of Q."""
+    """Minimisers of quadratic models with Q + W, using a factorisation of Q."""
 
     def __init__(self, base: PreparedLocalGlobal) -> None:
         self._base = base
@@ -66,8 +74,10 @@ class Corrections:
         self._columns: dict[int, NDArray[np.float64]] = {}
 
     def plain(self, gradient: Positions) -> Positions:
-        """Q^-1 gradient, (n, 3), zero at exactly pinned vertices; of a rounded factor refined once, for which vertices
-        touch is decided by the last digits."""
+        """Return Q^-1 gradient (n, 3), zero at exactly pinned vertices.
+
+        A rounded factor is refined once, since the active set depends on the last digits.
+        """
         out = np.zeros_like(gradient)
         self._base.correction(gradient, out)
         if self._base.rounded is not None:
@@ -75,13 +85,21 @@ class Corrections:
         return out
 
     def residual(self, plain: Positions) -> float:
-        """|plain|_Q [J^(1/2)] over the unpinned vertices."""
+        """Return the residual |plain|_Q [J^(1/2)] over the unpinned vertices."""
         return self._base.residual(plain.copy())
 
     def around(
         self, contacts: list[ContactEnergy], p: Positions, gradient: Positions, plain: Positions, *, cautious: bool
     ) -> tuple[Positions, ContactRows]:
-        """The displacement from p, and the rows that were found for it; plain: Q^-1 gradient."""
+        """Return the displacement from p, and the contact rows found for it.
+
+        Args:
+            contacts: active vertex contacts.
+            p: positions (n, 3) [m].
+            gradient: gradient at p (n, 3) [N].
+            contact_free_correction: Q^-1 gradient (n, 3).
+            majorise: whether friction majorises the energy.
+        """
         x, rows = -plain, None
         for _ in range(_PASSES):
             found = self._joined([contact.rows(p, p + x, cautious=cautious) for contact in contacts])
@@ -93,13 +111,13 @@ class Corrections:
         return x, rows
 
     def displacement(self, rows: ContactRows, gradient: Positions, plain: Positions) -> Positions:
-        """x of the model with these rows."""
+        """Return the minimiser x of the model with the given rows."""
         if not len(rows.vertices):
             return -plain
         return (self._woodbury if len(rows.vertices) <= _FEW else self._iterated)(rows, gradient, plain)
 
     def _joined(self, parts: list[ContactRows]) -> ContactRows:
-        """All rows of free vertices that resist."""
+        """Return all rows of free vertices with positive stiffness."""
         vertices, direction, weight, gap = (np.concatenate(field) for field in zip(*parts, strict=True))
         kept = self._free[vertices] & (weight > 0.0)
         return ContactRows(vertices[kept], direction[kept], weight[kept], gap[kept])
@@ -116,7 +134,7 @@ class Corrections:
         return -plain - columns @ pushed
 
     def _inverse(self, vertices: NDArray[np.int64]) -> NDArray[np.float64]:
-        """The columns (n, k) of Q^-1 of some vertices, three a solve; they are kept, for they press again."""
+        """Return the columns (n, k) of Q^-1 of vertices, cached since contacts recur; each solve gives three."""
         missing = [v for v in vertices.tolist() if v not in self._columns]
         if len(self._columns) > 4 * _FEW:
             self._columns, missing = {}, vertices.tolist()
@@ -128,7 +146,7 @@ class Corrections:
         return np.array([self._columns[v] for v in vertices.tolist()]).T
 
     def _iterated(self, rows: ContactRows, gradient: Positions, plain: Positions) -> Positions:
-        """Conjugate gradients; Q times a direction follows from the residuals that Q^-1 was asked for."""
+        """Solve by conjugate gradients; Q times a direction follows from the residuals that Q^-1 is applied to."""
         U = _columns(rows, len(plain))
         pulls = csr_array(U * rows.weight) @ U.T
         model = Model(self.plain, pulls, -gradient - (U @ (rows.weight * rows.gap)).reshape(-1, 3))
@@ -137,7 +155,10 @@ class Corrections:
 
 
 class Model(Iteration):
-    """(Q + W) x = b, preconditioned by Q^-1; solve: Q^-1 of it; pulls: W (3n, 3n)."""
+    """Conjugate gradients for (Q + W) x = b, preconditioned by Q^-1.
+
+    solve: product with Q^-1; contact_matrix: W (3n, 3n).
+    """
 
     def __init__(self, solve: Callable[[Positions], Positions], pulls: csr_array, b: Positions) -> None:
         self._solve, self._pulls, self._residual = solve, pulls, b
@@ -151,33 +172,40 @@ class Model(Iteration):
         return float(np.vdot(self._residual, self._z))
 
     def turn(self, product: float, before: float) -> float:
-        """See Iteration."""
+        """Update the search direction; return its curvature."""
         scale = product / before
         self._along, self._image = self._z + scale * self._along, self._residual + scale * self._image
         self._product = self._image + (self._pulls @ self._along.ravel()).reshape(-1, 3)
         return float(np.vdot(self._along, self._product))
 
     def go(self, product: float, curvature: float) -> float:
-        """See Iteration."""
+        """Update the iterate; return the preconditioned residual product."""
         length = product / curvature
         self.x += length * self._along
         self._residual -= length * self._product
         return self._preconditioned()
 
     def near(self, product: float) -> bool:
-        """See Iteration."""
+        """Return whether the residual product has reached the tolerance."""
         return product <= self._enough
 
 
 def _columns(rows: ContactRows, n: int) -> csr_array:
-    """U (3n, r): the direction of each row, at its vertex."""
+    """Return U (3n, r): the direction of each row, at its vertex."""
     places = (3 * rows.vertices[:, None] + np.arange(3)).ravel(), np.repeat(np.arange(len(rows.vertices)), 3)
     return csr_array(coo_array((rows.direction.ravel(), places), shape=(3 * n, len(rows.vertices))))
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedContact(Iterative):
-    """Local-global iterations with contact. base: the prefactored Q; idle: the method while nothing is touched."""
+    """Local-global iterations with vertex contact.
+
+    Attributes:
+        base: the prefactored Q.
+        contact_free: the method used while no contact is active.
+        fixed_objective: objective of the system.
+        corrections: minimisers with contact.
+    """
 
     residual_of: ClassVar[ResidualOf] = "previous"
 
@@ -188,16 +216,16 @@ class PreparedContact(Iterative):
 
     @property
     def facts(self) -> dict[str, float]:
-        """Exact counts of what was built."""
+        """Exact counts of the prepared data."""
         return self.idle.facts
 
     @property
     def choice(self) -> str:
-        """The linear solver in words."""
+        """Description of the linear solver."""
         return f"{self.idle.choice}; contact by Woodbury's formula, beyond {_FEW} rows by conjugate gradients"
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative."""
+        """Return the initial state of a step; that of the contact-free method without active contact."""
         contacts = touching(problem)
         if not contacts:
             return self.idle.begin(problem, guess)
@@ -205,19 +233,19 @@ class PreparedContact(Iterative):
         return _Iterating(self.corrections, step, contacts, step.placed(guess))
 
     def scale(self, problem: StepProblem) -> float:
-        """See Iterative."""
+        """Return the scale of the residual."""
         return largest(problem) * self.base.trace**0.5
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """See Iterative; it takes no iteration where something is touched."""
+        """Return the residual at p; no iteration is needed while contacts are active."""
         return self.gauge(problem)(p)
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """Those of the method while nothing is touched; with contact an iteration has no parts that stand alone."""
+        """Return the contact-free method's phases; with contact an iteration has no separable phases."""
         return {} if touching(problem) else self.idle.phases(problem)
 
     def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
-        """See Iterative."""
+        """Return the function that computes the residual of positions."""
         if not touching(problem):
             return self.idle.gauge(problem)
         step = StepObjective(self.objective, problem)
@@ -225,7 +253,7 @@ class PreparedContact(Iterative):
 
 
 class _Iterating(Iterating):
-    """Each position is no higher than the one before."""
+    """Iteration state; no position has a higher objective than the previous one."""
 
     def __init__(
         self, corrections: Corrections, step: StepObjective, contacts: list[ContactEnergy], p: Positions
@@ -235,18 +263,18 @@ class _Iterating(Iterating):
         self._plain: Positions | None = None
 
     def advance(self) -> bool:
-        """See Iterating."""
+        """Perform one iteration."""
         gradient = self._step.gradient(self.positions)
         self._plain = self._corrections.plain(gradient)
         self.positions = self._following(self.positions, gradient, self._plain)
         return True
 
     def residual(self) -> float:
-        """That of the previous positions."""
+        """Return the residual of the previous positions."""
         return float("nan") if self._plain is None else self._corrections.residual(self._plain)
 
     def _following(self, p: Positions, gradient: Positions, plain: Positions) -> Positions:
-        """A position that is no higher than p: p itself where round-off lets nothing descend."""
+        """Return a position with an objective not above that of p; p itself if round-off prevents any descent."""
         x, length = np.zeros_like(p), 1.0
         for attempt in range(2 + _HALVINGS):
             if attempt < 2:

@@ -1,5 +1,6 @@
-"""What takes away the kink that the distance of two edges has where they are parallel (Li et al. 2020, "Incremental
-potential contact"): a factor of their energy, with e = 1e-3 |u|^2 |v|^2 at rest,
+"""Mollifier of the edge-edge energy, which removes the kink of the distance of parallel edges.
+
+The factor is, with e = 1e-3 |u|^2 |v|^2 at rest (Li et al. 2020, "Incremental potential contact"),
 
     m(c) = (2 - c/e) c/e  for c < e, else 1;     c = |u x v|^2
 """
@@ -14,10 +15,10 @@ from solvers.compiling import inner
 from solvers.contact.blocks import row
 
 MOLLIFIED = 1e-3
-"""Of |u|^2 |v|^2 at rest, the |u x v|^2 up to which edges count as nearly parallel (Li et al. 2020)."""
+"""Threshold of |u x v|^2 relative to |u|^2 |v|^2 at rest, below which edges are nearly parallel (Li et al. 2020)."""
 
 _LEAST = 1e-200
-"""A smaller m leaves no force."""
+"""Values of m below this exert no force."""
 
 
 class Crossed(NamedTuple):
@@ -33,7 +34,7 @@ class Crossed(NamedTuple):
 
 @inner
 def crossed(p, x):
-    """Two edges x (4,)."""
+    """Return the cross product data of two edges with the vertices x (4,)."""
     a, b, c, d = x[0], x[1], x[2], x[3]
     u0, u1, u2 = p[b, 0] - p[a, 0], p[b, 1] - p[a, 1], p[b, 2] - p[a, 2]
     v0, v1, v2 = p[d, 0] - p[c, 0], p[d, 1] - p[c, 1], p[d, 2] - p[c, 2]
@@ -44,7 +45,7 @@ def crossed(p, x):
 
 @inner
 def mollifier(c, e):
-    """m and its first two derivatives by c."""
+    """Return m and its first two derivatives with respect to c."""
     if not c < e:
         return 1.0, 0.0, 0.0
     return (2.0 - c / e) * c / e, 2.0 * (1.0 - c / e) / e, -2.0 / (e * e)
@@ -52,18 +53,24 @@ def mollifier(c, e):
 
 @inner
 def bending(edges, factor, energy, keep, dc):
-    """Of what the mollifier's derivatives bring, all but how its own edges turn: writes c' to dc (12,), and returns x,
-    y and s of x (g c' + c' g) + y c' c' + s g g.
+    """Write c' to dc (12,), and return the mollifier's Hessian weights without the rotation of its own edges.
 
-    factor, energy: m, m', m'' and f, f', f''; keep: of what bends downwards, f m'' and, with a = grad f, b = grad m,
+    Args:
+        edges: cross product data of both edges.
+        factor: m, m' and m''.
+        energy: f, f' and f''.
+        negative_fraction: included fraction of the negative curvature: of f m'' and, with a = grad f, b = grad m, of
+            a b' + b a' <= s a a' + b b'/s
+        dc: output (12,).
 
-    a b' + b a' <= s a a' + b b'/s
+    Returns:
+        x, y and s of x (g c' + c' g) + y c' c' + s g g.
     """
     u, v, _, _, _, _ = edges
     m, m1, m2 = factor
     f, f1, f2 = energy
     for a in range(3):
-        # As 2 v x (u x v) and 2 u x (v x u): what is divided by m below has to vanish as the square root of m does.
+        # As 2 v x (u x v) and 2 u x (v x u): the numerator of the division by m must vanish as the square root of m.
         i, j = (a + 1) % 3, (a + 2) % 3
         wi, wj = u[j] * v[a] - u[a] * v[j], u[a] * v[i] - u[i] * v[a]
         bu, bv = 2.0 * (v[i] * wj - v[j] * wi), 2.0 * (u[j] * wi - u[i] * wj)
@@ -79,9 +86,14 @@ def bending(edges, factor, energy, keep, dc):
 
 @inner
 def add_turning(edges, weight, keep, H):
-    """Add what the turning of edges brings to rows H (`contact.blocks`); weight: 2 f m'; keep: of what bends downwards,
+    """Add the Hessian of the rotation of edges to packed rows H (`contact.potentials.hessian_blocks`).
 
-    4 w (du x dv) <= 2 |w| (|du|^2 |v|/|u| + |dv|^2 |u|/|v|),     w = u x v.
+    Args:
+        edges: cross product data of both edges.
+        weight: 2 f m'.
+        negative_fraction: included fraction of the negative curvature, which is bounded by
+            4 w (du x dv) <= 2 |w| (|du|^2 |v|/|u| + |dv|^2 |u|/|v|),     w = u x v.
+        H: packed block, updated.
     """
     u, v, _, uv, _, _ = edges
     for a in range(3):
@@ -98,7 +110,7 @@ def add_turning(edges, weight, keep, H):
 
 @inner
 def turned(edges, weight, keep, a, b):
-    """Of the same, entry (a, b) of the blocks of the first edge's ends, each with itself, and of the second's."""
+    """Return entry (a, b) of the diagonal blocks of the first edge's ends, and of the second edge's ends."""
     u, v, uu, _, vv, c = edges
     w, rest, same = np.sqrt(c), 1.0 - keep, 1.0 if a == b else 0.0
     more_u, more_v = rest * w * np.sqrt(vv / uu), rest * w * np.sqrt(uu / vv)

@@ -1,4 +1,4 @@
-"""What of a mesh may touch obstacles: points against triangles both ways, and edges against edges."""
+"""Obstacle collision mesh: points against triangles of both sides, and edges against edges."""
 
 from __future__ import annotations
 
@@ -21,7 +21,12 @@ Indices = NDArray[np.int64]
 
 
 class Side(NamedTuple):
-    """points (q, 1), edges and triangles of one of both, by vertices of all; length: of its edges (m,) [m]."""
+    """Primitives of one side, by global vertex indices.
+
+    Attributes:
+        points, edges, triangles: trees over the primitives.
+        edge_lengths: at rest [m], (m,).
+    """
 
     points: Tree
     edges: Tree
@@ -30,7 +35,14 @@ class Side(NamedTuple):
 
     @classmethod
     def of(cls, rest: Positions, edges: Indices, triangles: Indices, first: int = 0) -> Self:
-        """The side of a shape (n, 3) [m] whose vertices are counted from `first`."""
+        """Build the primitives of a shape.
+
+        Args:
+            rest: rest shape (n, 3) [m].
+            edges: vertex indices (m, 2).
+            triangles: vertex indices (f, 3).
+            first_vertex: global index of the first vertex.
+        """
         points = np.unique(np.append(edges.ravel(), triangles.ravel())).astype(np.int64)
         trees = Tree.of(rest, points[:, None]), Tree.of(rest, edges), Tree.of(rest, triangles)
         length = np.linalg.norm(rest[trees[1].corners[:, 0]] - rest[trees[1].corners[:, 1]], axis=1)
@@ -40,8 +52,15 @@ class Side(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Against:
-    """A mesh and obstacles, whose vertices follow those of the mesh; they keep a thickness [m] from each other and feel
-    each other within a range [m] beyond it. stiffness (n,): of the mesh's vertices [N/m]."""
+    """A mesh and obstacles, whose vertices follow those of the mesh.
+
+    Attributes:
+        mesh: primitives of the mesh.
+        obstacles: primitives of the obstacles.
+        stiffness: barrier stiffness of the mesh's vertices [N/m], (n,).
+        min_distance: minimum distance between both [m].
+        dhat: barrier activation distance beyond the minimum distance [m].
+    """
 
     mesh: Side
     others: Side
@@ -50,16 +69,16 @@ class Against:
     reach: float
 
     def clear(self, p: Positions, q: Positions, limits: Limits) -> Gaps | None:
-        """See `solvers.contact.known.Surfaces`; by one box around each of both."""
+        """Return clearance bounds at q from one box around each side, or None."""
         n = len(self.stiffness)
         return Gaps(limits.reach, limits.reach) if boxes.apart((0, n), (n, len(p)), p, q, limits) else None
 
     def unevenness(self, p: Positions, q: Positions) -> float:
-        """See `solvers.contact.known.Surfaces`; of all."""
+        """Return the largest relative displacement [m] of any two vertices."""
         return ways.unevenness(p, q)
 
     def within(self, p: Positions, reach: float) -> Pairs:
-        """See `solvers.contact.known.Surfaces`."""
+        """Return the pairs closer than `inflation_radius` [m] at p (n, 3) [m]."""
         x, limits = padded(p), Limits(reach, reach, 0.0, 0.0)
         one, two = (self.on_way(x, x, limits, edges) for edges in (False, True))
         pairs = one._replace(
@@ -78,7 +97,7 @@ class Against:
         )
 
     def on_way(self, x: Array, y: Array, limits: Limits, edges: bool) -> Pairs:
-        """See `solvers.contact.known.Surfaces`."""
+        """Return the pairs that may violate a limit on the displacement from x to y."""
         a, b = self.mesh, self.others
         if edges:
             e, f = found(a.edges, b.edges, x, y, limits).T

@@ -1,4 +1,4 @@
-"""Which primitives patches of a surface own, and which of those of two patches may come near each other."""
+"""Primitives owned by clusters of a surface, and candidate pairs among those of two clusters."""
 
 from __future__ import annotations
 
@@ -12,29 +12,46 @@ from solvers.vectors.eights import lowest
 
 
 class Owned(NamedTuple):
-    """Primitives (m, k) in the order of the patches that own them, and where those of each begin (patches + 1,)."""
+    """Primitives (m, k) in the order of their clusters, and the first one of each cluster (clusters + 1,)."""
 
     corners: Indices
     starts: Indices
 
     @classmethod
     def of(cls, corners: Indices, rank: Indices, many: int) -> Owned:
-        """Primitives of which each belongs to the patch of lowest rank (n,) among its vertices."""
+        """Assign each primitive to the lowest cluster among its vertices.
+
+        Args:
+            corners: vertices of each primitive (m, k).
+            vertex_cluster: cluster of each vertex (n,).
+            num_clusters: number of clusters.
+        """
         owner = rank[corners].min(axis=1)
         starts = np.append(0, np.cumsum(np.bincount(owner, minlength=many)))
         return cls(np.ascontiguousarray(corners[np.argsort(owner, kind="stable")]), starts)
 
     def members(self) -> Indices:
-        """Patches and the vertices of their primitives (k, 2)."""
+        """Return pairs (k, 2) of a cluster and a vertex of one of its primitives."""
         patch = np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
         return np.column_stack([np.repeat(patch, self.corners.shape[1]), self.corners.ravel()])
 
 
 @kernel
 def among(owned, patches, x, y, limits, here, there, out):
-    """Write the vertices of primitives of pairs of patches (k, 2) that may come to their limits, by their boxes on the
-    way from x to y, (n, 4) both, to `out` (room, 4): points and triangles, then edges. How many are of the first
-    kind, and of both; more than there is room for where that does not suffice. here, there: scratch."""
+    """Write the primitive pairs of cluster pairs whose boxes may violate the limits on a linear motion.
+
+    Args:
+        cluster_primitives: points, edges and triangles of the clusters.
+        patches: cluster pairs (k, 2).
+        x: start positions (n, 4) [m]; column 3 is padding.
+        y: end positions (n, 4) [m]; column 3 is padding.
+        query: limits of the distances.
+        start_aabbs, end_aabbs: scratch boxes (nodes, 6, 8).
+        out: vertices (capacity, 4) of point-triangle pairs, then of edge pairs; overwritten.
+
+    Returns:
+        Number of point-triangle pairs, and of all pairs; more than the capacity if that does not suffice.
+    """
     points, edges, triangles = owned
     count = 0
     for k in range(len(patches)):
@@ -54,8 +71,7 @@ def among(owned, patches, x, y, limits, here, there, out):
 
 @inner
 def _against(one, a, other, b, x, y, limits, here, there, out, count):
-    """Those of a kind of patch a, eight by eight in the last node of the scratch, with another kind of patch b; how
-    many there are then."""
+    """Add pairs of primitives of clusters a and b, in 8-lane packets; return the new count."""
     begin, end, last = other.starts[b], other.starts[b + 1], one.starts[a + 1]
     for first in range(begin, end, 8):
         _around(other.corners, first, end, x, here, (first - begin) // 8)
@@ -75,8 +91,7 @@ def _against(one, a, other, b, x, y, limits, here, there, out, count):
 
 @inner
 def _of_one(one, e, slot, other, begin, end, same, limits, here, there, out, count):
-    """Those of primitive e, of a slot of the last node, with others from a first to a last one; same: whether both are
-    of one patch, of which each pair of edges is wanted once."""
+    """Add pairs of primitive e with a range of others; within one cluster each edge pair is added once."""
     eights, wide, own = (end - begin + 7) // 8, one.corners.shape[1], len(here) - 1
     low, high = one_of(here[own], slot)
     lower, upper = one_of(there[own], slot)
@@ -105,13 +120,13 @@ def _of_one(one, e, slot, other, begin, end, same, limits, here, there, out, cou
 
 @inner
 def _around(corners, first, end, x, boxes, node):
-    """Write the boxes at x of eight primitives from `first` on to a node; beyond the end, of the last one."""
+    """Store the boxes at x of eight primitives in a node; lanes beyond the end repeat the last one."""
     put_boxes(*hulls(corners, first, end - 1, x), boxes, node)
 
 
 @inner
 def _above(boxes, eights):
-    """Write the boxes of so many eights, eight by eight, after them; the box around all of them."""
+    """Store the boxes of the first nodes, eight per node, after them; return the box of all."""
     l0, l1, l2, h0, h1, h2 = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf
     for node in range(eights):
         low, high = hull(boxes[node], 8)

@@ -1,15 +1,15 @@
-"""Contact by pairs for the local-global methods: a change W of Q, and Q stays factorised.
+"""Barrier contact for local-global methods: the barrier Hessian is a change W of Q, which stays factorised.
 
-    p <- p + t x,   x = -(Q + W)^-1 grad g(p),   W = the barriers' and their friction's second derivatives at p, clamped
+    p <- p + t x,   x = -(Q + W)^-1 grad g(p),   W = the Hessian of barriers and their friction at p, clamped
 
-Q is not less than all other second derivatives, so that x is Newton's step for a majorant of the model at p. It is
-found by conjugate gradients that Q^-1 preconditions, as a few numbers of Q^-1 W are large: no more than there are pairs
-(a few iterations descend wherever they are stopped). A barrier has no constant majorant: t is the first of 1, 1/2, ...
-that is no longer than is safe, and descends enough. Ly, Jouve, Boissieux and Bertails-Descoubes (2020, "Projective
-dynamics with dry frictional contact") put contact into the local step instead, vertex by vertex, and let it be violated
-until that has converged; here no iterate may be.
+Q is not less than all other second derivatives, so that x is Newton's step for a majorant of the model at p. The system
+is solved by conjugate gradients preconditioned by Q^-1. Only as many eigenvalues of Q^-1 W are large as there are
+pairs, and each iterate is a descent direction. A barrier has no constant majorant. The step size t is therefore the
+first of 1, 1/2, ... that is collision-free and gives sufficient decrease. Ly, Jouve, Boissieux and Bertails-Descoubes
+(2020, "Projective dynamics with dry frictional contact") treat contact in the local step instead, vertex by vertex, and
+allow violations until that has converged. Here every iterate is intersection-free.
 
-While nothing is in range an iteration is that of the method without contact, to the bit; the way to it is looked at.
+While no pair is active, an iteration is bitwise identical to that of the method without contact; CCD checks its step.
 """
 
 from __future__ import annotations
@@ -33,15 +33,22 @@ from solvers.core.prefactored import PreparedLocalGlobal
 from solvers.problem import Positions, Solver, StepProblem, System, Unsupported
 
 _ITERATIONS = 60
-"""Of conjugate gradients."""
+"""Maximum number of conjugate gradient iterations."""
 
 
 def local_global(solver: Solver, system: System) -> PreparedPairs:
-    """A local-global method with contact by pairs; raises what the solver raises for the system without it, and
-    Unsupported beside contact of single vertices."""
+    """Prepare a local-global method with barrier contact.
+
+    Args:
+        solver: the method without contact.
+        system: the system, with barriers.
+
+    Raises:
+        Unsupported: if the system also has vertex contact, or if the solver does not support it without contact.
+    """
     if without_contact(system) is not system:
         raise Unsupported(
-            "local-global: contact of single vertices (Contact) is no part of W beside barriers of pairs; state "
+            "local-global: vertex contact (Contact) and barrier contact of pairs are not supported together; use "
             "surface-contact"
         )
     idle: Any = solver.prepare(without_bounded(system))
@@ -51,30 +58,32 @@ def local_global(solver: Solver, system: System) -> PreparedPairs:
 
 @dataclass(frozen=True, eq=False)
 class PreparedPairs(PreparedContact):
-    """Local-global iterations with contact by pairs."""
+    """Local-global iterations with barrier contact."""
 
     @property
     def choice(self) -> str:
-        """The linear solver in words."""
+        """Description of the linear solver."""
         return f"{self.idle.choice}; where pairs touch, by conjugate gradients"
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative."""
+        """Return the initial state of the iteration of a step."""
         return _Iterating(self, problem, guess)
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """None: an iteration has no parts that stand alone."""
+        """Return no phases: those of an iteration are not separable."""
         return {}
 
     def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
-        """See Iterative."""
+        """Return the function that computes the residual of positions."""
         step = StepObjective(self.objective, problem)
         return lambda p: self.corrections.residual(self.corrections.plain(step.gradient(p)))
 
 
 class _Iterating(Iterating):
-    """Each position is no higher than the one before, and the way to it is free. far: the method without contact, while
-    it goes on from here."""
+    """Iteration state; each step is collision-free and does not increase the objective.
+
+    The state of the method without contact is reused as long as its iterates are accepted.
+    """
 
     def __init__(self, prepared: PreparedPairs, problem: StepProblem, guess: Positions) -> None:
         self._prepared, self._problem = prepared, problem
@@ -84,21 +93,21 @@ class _Iterating(Iterating):
         self._residual: Callable[[], float] = lambda: float("nan")
 
     def advance(self) -> bool:
-        """See Iterating."""
+        """Perform one iteration."""
         blocks = self._blocks(self.positions)
         return self._near(blocks) if blocks else self._alone()
 
     def residual(self) -> float:
-        """That of the previous positions."""
+        """Return the residual of the previous positions."""
         return self._residual()
 
     def _blocks(self, p: Positions) -> list[PairBlocks]:
-        """What is in range at p."""
+        """Return the Hessian blocks of the pairs active at p."""
         found = (energy.blocks(p, 0.0) for energy in self._step.bounded)
         return [blocks for blocks in found if len(blocks.vertices)]
 
     def _alone(self) -> bool:
-        """An iteration without contact, as far as its way is free."""
+        """Perform an iteration without contact, as far as its step is collision-free."""
         if self._far is None:
             self._far = self._prepared.idle.begin(self._problem, self.positions)
         far, p = self._far, self.positions
@@ -111,7 +120,7 @@ class _Iterating(Iterating):
         return self._along(Point(p, self._step.gradient(p)), q - p)
 
     def _near(self, blocks: list[PairBlocks]) -> bool:
-        """An iteration over Q + W."""
+        """Perform an iteration with Q + W."""
         self._far, corrections, p = None, self._prepared.corrections, self.positions
         at = Point(p, self._step.gradient(p))
         plain = corrections.plain(at.gradient)
@@ -127,7 +136,7 @@ class _Iterating(Iterating):
 
 
 def _matrix(blocks: list[PairBlocks], n: int) -> csr_array:
-    """W (3n, 3n); what does not move has no part in it."""
+    """Return W (3n, 3n), without vertices that do not move."""
     at: NDArray[np.int64] = np.concatenate([one.vertices for one in blocks])
     values = np.concatenate([one.values for one in blocks])
     rows = (3 * at[:, :, None] + np.arange(3)).reshape(len(at), -1)

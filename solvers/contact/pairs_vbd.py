@@ -1,17 +1,17 @@
-"""Contact by pairs for vertex block descent: each sweep goes by a model in which vertices know nothing of each other.
+"""Barrier contact for vertex block descent (VBD): each sweep uses a contact model that is separable by vertex.
 
     g_i.(x_i - p_i) + 4/2 (x_i - p_i)' H_ii (x_i - p_i)      for each vertex i of a pair, at the positions p of a sweep
 
-g: the gradient of the barriers and their friction; H_ii: the diagonal blocks of a pair's second derivatives, clamped. A
-positive semidefinite H of four vertices is not more than four times the diagonal of its blocks, so that this is not
-less than the quadratic model, whatever colours the four have. A sweep leads from p to q; gone is t (q - p), where t is
-the first of 1, 1/2, ... that is no longer than is safe and lowers the objective enough. Where none does, each vertex
-goes along its own block instead, which descends.
+g: gradient of the barriers and their friction; H_ii: diagonal blocks of a pair's clamped Hessian. A positive
+semidefinite H of four vertices is at most four times the diagonal of its blocks. The model therefore majorises the
+quadratic model, whatever colours the four vertices have. A sweep gives q from p, and the step is t (q - p). t is the
+first of 1, 1/2, ... that is collision-free and decreases the objective sufficiently. If there is none, each vertex
+moves along its own block's Newton direction instead, which is a descent direction.
 
-(Chen, Liu, Yang and Yuksel 2024 put contact into the vertices' own blocks: their energy ends where they touch, and
-vertices may pass through each other.) Steps are extrapolated by Chebyshev's factors, as sweeps without contact are,
-where the way to that is free and the objective does not rise. While nothing is in range sweeps are those without
-contact, to the bit.
+Chen, Liu, Yang and Yuksel 2024 add contact to the vertices' own blocks. Their energy is not a barrier, so that vertices
+may interpenetrate. Steps are extrapolated by Chebyshev's factors, as in sweeps without contact, where the extrapolation
+is collision-free and does not increase the objective. While no pair is active, sweeps are bitwise identical to those
+without contact.
 """
 
 from __future__ import annotations
@@ -32,20 +32,29 @@ from solvers.problem import Positions
 Array = NDArray[np.float64]
 
 LEAST = 1e-6
-"""Of what holds a vertex: so much more resists it in every direction."""
+"""Stiffness added in every direction, relative to the majorant of a vertex."""
 
 
 class Separable(NamedTuple):
-    """The model at a point: of vertices (v,) the gradient (v, 3) [N] and four times the diagonal blocks (v, 3, 3)
-    [N/m]."""
+    """Separable contact model at a point.
+
+    Attributes:
+        vertices: (v,).
+        gradient: gradient of contact (v, 3) [N].
+        diagonal_blocks: four times the diagonal Hessian blocks (v, 3, 3) [N/m].
+    """
 
     vertices: NDArray[np.int64]
     gradient: Positions
     block: Array
 
     def planes(self, p: Positions, held: Array) -> Planes:
-        """The same as planes across each of three axes, which hold from both sides; p (n, 3) [m]: where it was made;
-        held (n,) [N/m]: what holds the vertices."""
+        """Express the model as two-sided planes normal to three axes per vertex.
+
+        Args:
+            p: positions of the model (n, 3) [m].
+            majorant: stiffness of each vertex without contact (n,) [N/m].
+        """
         curve, axes = np.linalg.eigh(self.block)
         k = np.maximum(curve, 0.0) + LEAST * held[self.vertices, None]
         normal = np.swapaxes(axes, 1, 2)
@@ -55,20 +64,25 @@ class Separable(NamedTuple):
 
 
 class Sweeps(Protocol):
-    """Vertex block descent without contact, in one step."""
+    """Vertex block descent sweeps of one step."""
 
     def alone(self, p: Positions) -> Positions:
-        """Where a sweep leads from p, both (n, 3), and what is extrapolated from sweeps before: all since the last
-        `pushed` were alone."""
+        """Return the positions after a sweep from p without contact, (n, 3) each.
+
+        Chebyshev extrapolation uses the preceding sweeps since the last `sweep_with_planes`.
+        """
         ...
 
     def pushed(self, p: Positions, planes: Planes) -> Positions:
-        """Where a sweep leads from p with planes, extrapolated by nothing."""
+        """Return the positions after a sweep from p with contact planes, without extrapolation."""
         ...
 
 
 class Guarded(Iterating):
-    """See the module. majorant (n,) [N/m]: of all but contact; gauge: tells the residual of positions."""
+    """Iteration state of VBD with barriers.
+
+    majorant (n,) [N/m]: of all energies but contact; compute_residual: returns the residual of positions.
+    """
 
     def __init__(
         self,
@@ -85,11 +99,11 @@ class Guarded(Iterating):
         self._older = self.positions
 
     def residual(self) -> float:
-        """See Iterating."""
+        """Return the residual of the current positions."""
         return self._gauge(self.positions)
 
     def advance(self) -> bool:
-        """See Iterating."""
+        """Perform one iteration."""
         p, blocks = self.positions, self._blocks(self.positions)
         if not blocks:
             q = self._sweeps.alone(p)
@@ -122,13 +136,13 @@ class Guarded(Iterating):
         return Separable(vertices, gradient[vertices], total[vertices])
 
     def _each(self, gradient: Positions, model: Separable) -> Positions:
-        """Each vertex along its own block."""
+        """Return the Newton direction of each vertex with its own block."""
         block = self._majorant[:, None, None] * np.eye(3)
         block[model.vertices] += model.block
         return np.asarray(-np.linalg.solve(block, gradient[:, :, None])[:, :, 0], np.float64)
 
     def _further(self, q: Positions) -> Positions:
-        """Extrapolated from where the iteration before began, where that is free and no higher; else q."""
+        """Extrapolate q from the previous start if that is collision-free and does not increase the objective."""
         if not self._squared:
             return q
         before = self._factor

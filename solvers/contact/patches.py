@@ -1,9 +1,10 @@
-"""Whether nothing of a surface comes near anything else of it on a way, told without looking at its primitives.
+"""Cluster culling: prove that no primitives of a surface come close during a motion, without testing each of them.
 
-The surface is cut into patches of some vertices each, which own the points, edges and triangles whose first vertex
-along the curve is theirs. Patches that are near each other at rest are told by how they lie (`solvers.contact.flat`),
-all others by boxes around them; primitives are looked at only where neither tells. What is told is by how much all
-stays apart at the end of a way: boxes are looked at again only once vertices have moved beside each other by as much.
+The surface is divided into clusters of a few vertices each. A cluster owns the points, edges and triangles whose first
+vertex along the Morton curve belongs to it. Cluster pairs that are close at rest are tested by their affine poses
+(`solvers.contact.broad_phase.cluster_bounds`), all others by bounding boxes. Primitives are tested only where both
+fail. The result is a lower bound of all distances at the end of the motion. Boxes are tested again only after vertices
+have moved relative to each other by as much.
 """
 
 from __future__ import annotations
@@ -29,25 +30,34 @@ from solvers.problem import Positions
 Array = NDArray[np.float64]
 
 _PATCH = 16
-"""Vertices of a patch, beside those of its neighbours that its primitives have."""
+"""Vertices of a cluster, in addition to those of its neighbours that its primitives have."""
 
 _WIDER = 1.5
-"""Of the distance that is asked for: so far apart primitives are looked at, for what is kept lasts the longer."""
+"""Query distance relative to the required one: a larger clearance stays valid for longer."""
 
 _FAR = 4.0
-"""Of that: so far patches that are not near each other at rest are asked to be apart, where they are."""
+"""Factor on that distance for clusters not close at rest, tried first."""
 
 _SAME = 1e-12
-"""Of that distance: by so much positions that count as one may differ."""
+"""Tolerance, relative to the query distance, within which two positions count as the same."""
 
 _FEW = 4096
-"""Primitives that are looked at; where more may come near, something is."""
+"""Maximum number of primitive pairs; beyond it, some pair is assumed to come close."""
 
 
 class Scratch(NamedTuple):
-    """Memory of a look: tile (3 k, 8); stack; sight; doubtful (k, 2): pairs of patches that nothing tells apart; here,
-    there (k, 6, 8): boxes of a patch's primitives; found (k, 4): pairs of primitives; way (n, 4), low, high (m, 4): of
-    vertices and the boxes of those of patches."""
+    """Scratch memory of a query.
+
+    Attributes:
+        tile: (3 k, 8).
+        stack: of the tree traversal.
+        projection: of the clusters.
+        unresolved_pairs: cluster pairs that are not proved to be separated (k, 2).
+        start_aabbs, end_aabbs: boxes of a cluster's primitives (k, 6, 8).
+        primitive_pairs: (k, 4).
+        displacement: of vertices (n, 4).
+        displacement_min, displacement_max: boxes of the displacements of each cluster (m, 4).
+    """
 
     tile: Array
     stack: Indices
@@ -63,10 +73,20 @@ class Scratch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Those of a surface. pairs: first all that are near each other at rest, sorted, then room for more; looked [m]:
-    all others are farther apart there; starts (patches + 1,): where the pairs of each patch begin; seen: how patches
-    lay at the last two positions; apart: where was looked the last time, and how far all others are apart there [m];
-    crowded: whether so many are near each other at rest, as in a stack of sheets, that patches tell nothing."""
+    """Clusters of a surface.
+
+    Attributes:
+        rest_clusters: clusters at rest.
+        bvh: tree over the clusters.
+        points, edges, triangles: primitives of the clusters.
+        rest_query_distance: lower bound of the rest distance of all pairs that are not stored [m].
+        cluster_pairs: first all pairs that are close at rest, sorted, then memory for more.
+        scratch: scratch memory.
+        pair_starts: first pair of each cluster (clusters + 1,).
+        recent_poses: poses at the last two positions.
+        remote_clearances: position of the last query, and the clearance there of clusters not close at rest [m].
+        is_dense: whether so many clusters are close at rest, as in a stack of sheets, that culling is useless.
+    """
 
     rest: Rest
     tree: Tree
@@ -83,7 +103,13 @@ class Patches:
 
     @classmethod
     def of(cls, rest: Positions, points: Tree, edges: Tree, triangles: Tree, looked: float) -> Patches:
-        """Those of a rest shape (n, 3) [m]."""
+        """Divide a rest shape into clusters.
+
+        Args:
+            rest: rest shape (n, 3) [m].
+            points, edges, triangles: trees over the primitives.
+            rest_query_distance: distance up to which cluster pairs count as close at rest [m].
+        """
         many = max(1, -(-len(points.corners) // _PATCH))
         rank = np.zeros(len(rest), np.int64)
         rank[points.corners[:, 0]] = np.arange(len(points.corners)) // _PATCH
@@ -112,8 +138,16 @@ class Patches:
         return made._knowing(rest)
 
     def clear(self, p: Positions, q: Positions, limits: Limits) -> Gaps | None:
-        """How far primitives that share no vertex are apart at q, where no two of them come to their limits on the
-        straight way from p to q, (n, 3) both. None does not say that some do."""
+        """Return clearance bounds at q of primitives without common vertices, if the motion violates no limit.
+
+        Args:
+            p: start positions (n, 3) [m].
+            q: end positions (n, 3) [m].
+            query: limits of the distances.
+
+        Returns:
+            Clearance bounds; None if the test is inconclusive.
+        """
         if self.crowded:
             return None
         limits = limits._replace(moved=unevenness(p, q))
@@ -144,8 +178,8 @@ class Patches:
         return Gaps(near, near if others else far)
 
     def _far(self, p: Positions, q: Positions, limits: Limits) -> float:
-        """How far patches that are not near each other at rest are apart at q, where it is known that they come to no
-        limits on the way from p to q, (n, 3) both [m]; else 0."""
+        """Return the known clearance [m] at q of clusters not close at rest, if the motion violates no limit; else
+        0."""
         for at, far in self.apart:
             before, after = unevenness(at, p), unevenness(at, q)
             if max(limits.reach, limits.closed + limits.share * (far + before)) <= far - max(before, after):
@@ -153,8 +187,15 @@ class Patches:
         return 0.0
 
     def unevenness(self, p: Positions, q: Positions) -> float:
-        """How far any two vertices of patches that are near each other at rest have moved from p to q, contiguous
-        (n, 3) both, beside each other, at most [m]."""
+        """Return the largest relative displacement of two vertices of clusters that are close at rest.
+
+        Args:
+            p: start positions, contiguous (n, 3) [m].
+            q: end positions, contiguous (n, 3) [m].
+
+        Returns:
+            Upper bound [m].
+        """
         memory = self.scratch
         return affine.spread(
             self.rest.vertices, self.pairs.patches, self.known, p, q, memory.way, memory.tile, memory.low, memory.high
@@ -173,7 +214,7 @@ class Patches:
         return one
 
     def _met(self, begin: _Seen, end: _Seen, limits: Limits) -> int:
-        """How many pairs of patches have to be looked at beside those that are known; -1 where there is no room."""
+        """Find cluster pairs to test in addition to those close at rest; return their number, -1 if out of memory."""
         known, pairs = self.known, self.pairs
         here, there = begin.boxes, end.boxes
         for around in (here, there):
@@ -189,8 +230,7 @@ class Patches:
         return count
 
     def _pairs(self, patches: Indices, x: Array, y: Array, limits: Limits) -> Pairs | None:
-        """Pairs of primitives of pairs of patches (k, 2) that may come to their limits on the way from x to y, (n, 4)
-        both, by their boxes; None where there are many."""
+        """Return the primitive pairs of cluster pairs (k, 2) whose boxes may violate the limits; None if too many."""
         memory = self.scratch
         owned = self.points, self.edges, self.triangles
         first, many = among(owned, patches, x, y, limits, memory.here, memory.there, memory.found)
@@ -200,7 +240,7 @@ class Patches:
         return Pairs(memory.found[:many], first, np.ones(many), nothing, nothing, limits.reach, 0.0)
 
     def _knowing(self, rest: Positions) -> Patches:
-        """The same with pairs known that are near each other at rest (n, 3)."""
+        """Return the clusters with the pairs that are close at rest (n, 3)."""
         limits = Limits(self.looked, self.looked, 0.0, 0.0)
         many, at, pairs = len(self.tree.corners), self._lies(rest, limits), self.pairs
         others = self._met(at, at, limits)
@@ -219,12 +259,12 @@ class Patches:
 
     @property
     def known(self) -> int:
-        """How many pairs are."""
+        """Number of cluster pairs that are close at rest."""
         return int(self.starts[-1])
 
 
 class _Seen(NamedTuple):
-    """How patches lie at x (n, 4), positions with a column more; boxes: around them."""
+    """Poses and bounding boxes of clusters at x (n, 4), padded positions."""
 
     x: Array
     lie: Lie
@@ -232,7 +272,7 @@ class _Seen(NamedTuple):
 
     @classmethod
     def of(cls, rest: Rest, tree: Tree, vertices: int) -> _Seen:
-        """Space for it."""
+        """Allocate a snapshot."""
         many = len(rest.centre)
         around = np.empty((tree.nodes, 6, 8))
         around[:, :3], around[:, 3:] = np.inf, -np.inf
@@ -242,8 +282,16 @@ class _Seen(NamedTuple):
 
 @kernel
 def strange(pairs, starts, many):
-    """Leave those of many pairs of patches (k, 2) after the known ones that are none of these, of which those of each
-    patch begin at `starts`; how many."""
+    """Remove the last pairs that are close at rest, which are stored already, and compact the others.
+
+    Args:
+        pairs: cluster pairs (k, 2), those close at rest first; updated.
+        starts: first pair of each cluster (clusters + 1,).
+        num_new_pairs: number of pairs after those close at rest.
+
+    Returns:
+        Number of remaining new pairs.
+    """
     known = starts[-1]
     count = known
     for e in range(known, known + many):

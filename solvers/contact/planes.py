@@ -1,11 +1,11 @@
-"""Which half-space keeps each vertex out of a convex obstacle during one step.
+"""Separating planes: the half-space that contains each vertex outside a convex obstacle during one step.
 
-An obstacle is a box of its own frame with a radius around it: all points within R of the box. A sphere is a box
-without extent, a capsule one along an axis, a plane the top of one that has no other end. In the obstacle's frame a
-vertex goes from a straight to b, where it would end by its velocity alone. The distance f to the box along that way
-is convex, and so Newton's method for f = R, from a on, never passes the first contact. At each of its iterates the
-plane through the nearest point, R outwards, has the obstacle on the one side and a on the other; the last one touches
-the first contact, or does not cut the way at all. A vertex that ends on the outer side of it has not been inside the
+An obstacle is a box in its own frame, rounded by a radius R: all points within R of the box. A sphere is a box without
+extent, a capsule a box along one axis, and a plane the top of a box that is unbounded below. In the obstacle's frame a
+vertex moves linearly from a to b, where it would end by its velocity alone. The distance f to the box along this line
+is convex. Newton's method for f = R, started at a, therefore never passes the time of impact. At each iterate, the
+plane through the closest point, displaced outwards by R, separates the obstacle from a. The last one touches the first
+point of contact, or does not intersect the line at all. A vertex that ends on its outer side has not been inside the
 obstacle on the way, wherever it ends.
 """
 
@@ -20,11 +20,11 @@ from solvers.compiling import inner, kernel
 
 _ITERATIONS = 40
 _CONTACT = 1e-6
-"""Of R: so near to the obstacle a way has reached it."""
+"""Tolerance relative to R within which a vertex has reached the obstacle."""
 
 
 class Rounded(NamedTuple):
-    """A box from low to high (3,) [m], and a radius R [m] around it."""
+    """A box from low to high (3,) [m], rounded by a radius R [m]."""
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]
@@ -32,8 +32,14 @@ class Rounded(NamedTuple):
 
 
 class HalfSpaces(NamedTuple):
-    """n.x >= d of vertices (k,), in the world at the step's end: normal (k, 3), offset d (k,) [m], and carried (k, 3)
-    [m]: where the vertex would be had it moved with the obstacle."""
+    """Half-spaces n.x >= d in world coordinates at the step's end.
+
+    Attributes:
+        vertices: (k,).
+        normal: unit normals n (k, 3).
+        offset: d [m], (k,).
+        comoving_position: position of the vertex if it moved with the obstacle [m], (k, 3).
+    """
 
     vertices: NDArray[np.int64]
     normal: NDArray[np.float64]
@@ -43,11 +49,18 @@ class HalfSpaces(NamedTuple):
 
 @kernel
 def near(p, v, dt, frames, low, high, out):
-    """Whether vertices could come near obstacles, by a box around all of them, to `out` (o,).
+    """Find which obstacles any vertex could reach, by the bounding box of all vertices.
 
-    p (n, 3) [m], v (n, 3) [m/s]; frames (o, 2, 4, 3): origin and axes of each obstacle's frame at the step's start and
-    end; low, high (o, 3) [m]: corners, in its frame, of what is near an obstacle. Returns the largest displacement
-    dt |v| [m], and -1 where no obstacle is near.
+    Args:
+        p: positions (n, 3) [m].
+        v: velocities (n, 3) [m/s].
+        dt: time step [s].
+        frames: origin and axes of each obstacle's frame at the step's start and end, (o, 2, 4, 3).
+        low, high: corners of each obstacle's activation region in its frame [m], (o, 3).
+        out: whether each obstacle can be reached, (o,); overwritten.
+
+    Returns:
+        The largest displacement dt |v| [m]; -1 if no obstacle can be reached.
     """
     x0, x1, x2, y0, y1, y2, square = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf, 0.0
     for i in range(len(p)):
@@ -68,7 +81,7 @@ def near(p, v, dt, frames, low, high, out):
 
 @inner
 def _extent(frame, c, x0, x1, x2, y0, y1, y2):
-    """The least and the largest coordinate c in a frame of a box from x to y."""
+    """Return the smallest and largest coordinate c, in a frame, of the box from x to y."""
     e0, e1, e2, o = frame[1 + c, 0], frame[1 + c, 1], frame[1 + c, 2], frame[0]
     middle = e0 * (0.5 * (x0 + y0) - o[0]) + e1 * (0.5 * (x1 + y1) - o[1]) + e2 * (0.5 * (x2 + y2) - o[2])
     half = 0.5 * (abs(e0) * (y0 - x0) + abs(e1) * (y1 - x1) + abs(e2) * (y2 - x2))
@@ -77,10 +90,20 @@ def _extent(frame, c, x0, x1, x2, y0, y1, y2):
 
 @kernel
 def planes(p, v, dt, frames, obstacle, margin, out, work):
-    """Write the half-spaces of the vertices that may come near one obstacle to the first k rows of `out`; returns k.
+    """Write the half-spaces of the vertices that may reach one obstacle to the first k rows of `out`.
 
-    frames (2, 4, 3) as in `near`; obstacle: Rounded, in its frame; margin [m]: a vertex farther away than that and
-    twice its way has none; out: HalfSpaces of n rows; work: (5, 3).
+    Args:
+        p: positions (n, 3) [m].
+        v: velocities (n, 3) [m/s].
+        dt: time step [s].
+        frames: frame at the step's start and end, (2, 4, 3).
+        obstacle: rounded box in its frame.
+        margin: distance [m], in addition to twice its displacement, beyond which a vertex gets no half-space.
+        out: separating planes of n rows.
+        work: scratch (5, 3).
+
+    Returns:
+        The number of half-spaces k.
     """
     count = 0
     for i in range(len(p)):
@@ -92,7 +115,8 @@ def planes(p, v, dt, frames, obstacle, margin, out, work):
 
 @inner
 def plane(p, v, i, dt, frames, obstacle, margin, out, at, work):
-    """Whether a vertex may come near an obstacle; then its half-space is in the row `at` of `out`. See `planes`."""
+    """Write the half-space of vertex i to row `row_index` of `out`; return whether the vertex may reach the
+    obstacle."""
     _, normal, offset, carried = out
     a, b, x, c, n = work[0], work[1], work[2], work[3], work[4]
     first, second, way = frames[0], frames[1], 0.0
@@ -119,8 +143,11 @@ def plane(p, v, i, dt, frames, obstacle, margin, out, at, work):
 
 @inner
 def _separate(a, b, obstacle, far, x, c, n):
-    """Newton's method along the way from a to b; c and n, the nearest point and the normal, are those at a, and then
-    those of the half-space; x: scratch."""
+    """Find the separating plane by Newton's method along the line from a to b.
+
+    c and n, the closest point and the normal, are those of a on entry and those of the half-space on return; x:
+    scratch.
+    """
     begin, end, slope, radius = 0.0, np.inf, _slope(a, b, n), obstacle.radius
     for _ in range(_ITERATIONS):
         if far <= (1.0 + _CONTACT) * radius or slope >= 0.0:
@@ -150,7 +177,7 @@ def _slope(a, b, n):
 
 @inner
 def _nearest(x, obstacle, c, n):
-    """The distance from x to the box, negative inside, the nearest point of its surface to c, the normal there to n."""
+    """Return the signed distance of x from the box; write the closest surface point to c, and the normal to n."""
     low, high, _ = obstacle
     square, least, axis, side = 0.0, np.inf, 0, 1.0
     for k in range(3):

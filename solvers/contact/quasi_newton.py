@@ -1,7 +1,7 @@
-"""Contact for the accelerated methods: their plain correction is that of `contact.local_global`, with Q + W for Q.
+"""Vertex contact for accelerated methods: corrections use Q + W instead of Q, as in `half_space_contact`.
 
-A window's pairs belong to one W. It is kept while the same vertices press and grip, about as hard; where that
-changes, the window begins anew with another W. While nothing is touched the method is what it is without contact.
+All pairs of a window belong to one W. W is reused while the same vertices are in contact with about the same stiffness;
+when that changes, the window restarts with another W. Without active contact the method is unchanged.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from solvers.kernels import accelerate
 from solvers.problem import Positions, StepProblem, System
 
 _ALIKE = 2.0
-"""Weights that differ by no more than this factor may stand for each other."""
+"""Factor up to which contact stiffnesses may differ for W to be reused."""
 
 
 class Touching:
-    """See Engine. idle: the engine while nothing is touched."""
+    """Acceleration engine with vertex contact; contact_free: the engine used while no contact is active."""
 
     def __init__(self, scheme: Scheme, system: System, base: PreparedLocalGlobal, idle: Engine) -> None:
         self._scheme, self._base, self._idle = scheme, base, idle
         self._objective, self._corrections = Objective(system), Corrections(base)
 
     def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
-        """See Engine."""
+        """Return the initial state of a step."""
         contacts = touching(problem)
         if not contacts:
             return self._idle.begin(problem, guess)
@@ -54,7 +54,7 @@ class _Touching(Interpreted):
         super().__init__(base, scheme, step, guess)
 
     def _solved(self) -> NDArray[np.float64]:
-        """The correction at the trial point, by the rows of before where they will do."""
+        """Return the correction at the trial point, with the previous rows if they are compatible."""
         super()._solved()
         self._plain = -self._image
         gradient, at = -self._there, (self._contacts, self._trial)
@@ -72,12 +72,12 @@ class _Touching(Interpreted):
         (accelerate.begin if self._begun else accelerate.accept)(self._window, correction)
 
     def residual(self) -> float:
-        """See Iterating."""
+        """Return the residual of the trial point."""
         return self._corrections.residual(self._plain)
 
 
 def _alike(one: ContactRows, other: ContactRows) -> bool:
-    """Whether the rows of one point serve another as well: what begins to press belongs to one point alone."""
+    """Return whether the rows of one point can be reused at another; rows with a gap belong to one point alone."""
     if not np.array_equal(one.vertices, other.vertices) or one.gap.any() or other.gap.any():
         return False
     return bool((np.maximum(one.weight, other.weight) <= _ALIKE * np.minimum(one.weight, other.weight)).all())

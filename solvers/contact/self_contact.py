@@ -1,10 +1,10 @@
-"""Contact by pairs: an energy of positions alone (`solvers.contact.barrier`), and the largest safe step.
+"""Barrier contact of primitive pairs: an energy of positions (`solvers.contact.potentials.barrier`) with a step limit.
 
-Which pairs may be near, and how far a step may go, `solvers.contact.known` tells.
+`solvers.contact.broad_phase.candidate_cache` finds the candidates and the collision-free step size.
 
-`SelfContact` is a mesh against itself, `ObstacleContact` a mesh against the surfaces of obstacles. The vertices of
-these follow those of the mesh in all that is computed; in a step they are where they are at its end, and go there from
-where they are at its start, evenly.
+`SelfContact` is contact of a mesh with itself, `ObstacleContact` that of a mesh with the surfaces of obstacles. Their
+vertices follow those of the mesh in all arrays. In a step they are at their end positions; they move there linearly
+from their start positions.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from solvers.problem import Positions, Start
 Array = NDArray[np.float64]
 
 _NEAR = 1.25
-"""Of the range: pairs so far apart may come into it during a solve."""
+"""Query radius relative to the activation distance: pairs this close may become active during a solve."""
 
 
 Place = Callable[[float], Positions]
@@ -37,7 +37,7 @@ Carry = Callable[[float, float, Positions], list[Positions]]
 
 
 class _Met(NamedTuple):
-    """What is in range at p (n, 3), its energy [J] and gradient (n, 3) [N]; space: where the contacts are written."""
+    """Active collisions at p (n, 3), with energy [J] and gradient (n, 3) [N]; buffer: memory of the collisions."""
 
     p: Positions
     contacts: Contacts
@@ -48,10 +48,18 @@ class _Met(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PairContact:
-    """A barrier of pairs, and their friction. kept: what was found, the last first; met: at the last two positions that
-    were asked about, for value, slopes and second derivatives are asked for in turn; room: for the latter; grip: of a
-    step that has begun; friction: mu; slip [m/s]: below it a pair counts as sticking; friction_rounds: solves of a step
-    at most, each with the normal forces of the one before."""
+    """Barrier energy of primitive pairs, with lagged friction.
+
+    Attributes:
+        collision_mesh: source of the candidates.
+        friction: friction coefficient mu.
+        eps_v: speed [m/s] below which a pair counts as sticking.
+        friction_iterations: maximum number of solves of a step, each with the normal forces of the previous one.
+        candidate_caches: cached candidates, the most recent one first.
+        recent_states: collisions at the last two positions; energies, gradients and Hessians are queried alternately.
+        block_buffer: memory of the Hessian blocks.
+        tangential_collisions: friction of the current step.
+    """
 
     surface: Surfaces
     friction: float = 0.0
@@ -64,11 +72,11 @@ class PairContact:
 
     @property
     def range(self) -> float:
-        """From this distance on [m] nothing is felt."""
+        """Distance [m] beyond which the barrier vanishes."""
         return self.surface.thickness + self.surface.reach
 
     def begin_step(self, start: Start) -> Self:
-        """The energy of a step: what is in range where it is pressed grips."""
+        """Return the energy of a step; pairs active at `start.pressed` have friction."""
         if not self.friction:
             return self
         begun = self.whole(start.positions)
@@ -76,25 +84,25 @@ class PairContact:
         return self if grip is self.grip else replace(self, grip=grip)
 
     def _gripping(self, p: Positions, begun: Positions, start: Start) -> Grip:
-        """p: all vertices where contacts and their normal forces are taken; begun: at the step's start."""
+        """Build friction. p: all vertices where normal forces are evaluated; start_positions: at the step's start."""
         if known.idle(self.surface, self.kept, p):
             return NO_GRIP
         return Grip.of(self._at(p).contacts, begun, self.friction, self.slip * (start.until - start.time))
 
     def whole(self, p: Positions) -> Positions:
-        """Positions of all vertices that pairs name, those of the mesh (n, 3) first."""
+        """Return the positions of all vertices, those of the mesh (n, 3) first."""
         return p if p.flags.carray else np.array(p, order="C")
 
     def toward(self, direction: Positions) -> Positions:
-        """The ways of all vertices, those of the mesh (n, 3) first."""
+        """Return the displacements of all vertices, those of the mesh (n, 3) first."""
         return direction if direction.flags.carray else np.array(direction, order="C")
 
     def pairs(self, p: Positions) -> Pairs:
-        """Pairs that may be in range at p, all vertices' (N, 3): all that are, and maybe more."""
+        """Return all pairs active at p, positions (N, 3) of all vertices, and possibly more."""
         return known.pairs(self.surface, self.kept, p)
 
     def value(self, p: Positions) -> float:
-        """The energy [J] at p, shape (n, 3); infinite where a pair is nearer than the thickness."""
+        """Return the energy [J] at p (n, 3); infinite if a pair is closer than the minimum distance."""
         p = self.whole(p)
         if not known.idle(self.surface, self.kept, p):
             if not np.isfinite(p).all():
@@ -105,7 +113,7 @@ class PairContact:
         return pressed + self.grip.value(p) if len(self.grip.vertices) else pressed
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
-        """Add the gradient [N], shape (n, 3), to `out`."""
+        """Add the gradient [N] at p (n, 3) to `out` (n, 3)."""
         n, p = len(p), self.whole(p)
         if not known.idle(self.surface, self.kept, p):
             if not np.isfinite(p).all():
@@ -118,7 +126,7 @@ class PairContact:
             out += friction
 
     def friction_gradient(self, p: Positions) -> Positions | None:
-        """The gradient of friction alone [N], shape (n, 3); None where nothing is in contact."""
+        """Return the gradient of friction alone [N], (n, 3); None without contact."""
         if not len(self.grip.vertices):
             return None
         n, p = len(p), self.whole(p)
@@ -127,25 +135,37 @@ class PairContact:
         return out[:n]
 
     def blocks(self, p: Positions, keep: float = 1.0) -> Blocks:
-        """The second derivatives of each contact in range at p (n, 3); keep: of what bends downwards."""
+        """Return the Hessian blocks [N/m] of all active collisions.
+
+        Args:
+            p: positions (n, 3) [m].
+            negative_fraction: fraction of the negative curvature to include; 0 gives positive semidefinite blocks.
+        """
         n, p = len(p), self.whole(p)
         return curvature(self._at(p).contacts, self.grip, p, n, keep, self.room)
 
     def coupled(self, p: Positions) -> NDArray[np.int64]:
-        """See `solvers.core.bounds.Bounded`."""
+        """Return the vertices (a, 4) of all Hessian blocks at p (n, 3); -1 for none."""
         return coupled(self._at(self.whole(p)).contacts, self.grip, len(p))
 
     def neighbours(self, p: Positions) -> NDArray[np.int64]:
-        """See `solvers.core.bounds.Bounded`. What was found before has no say in it."""
+        """Return the vertices (k, 4) of pairs near p (n, 3); -1 for none. The result is independent of the caches."""
         return moving(self.surface.within(self.whole(p), _NEAR * self.range).vertices, self.grip, len(p))
 
     def add_curvature(self, p: Positions, keep: float, places: NDArray[np.int64], values: Array) -> None:
-        """See `solvers.core.bounds.Bounded`."""
+        """Add the Hessian blocks [N/m] at p to existing 3x3 blocks.
+
+        Args:
+            p: positions (n, 3) [m].
+            negative_fraction: fraction of the negative curvature to include.
+            block_indices: target block of each vertex pair, (a, 16); -1 for none.
+            values: blocks (b, 3, 3) [N/m], updated.
+        """
         p = self.whole(p)
         add_curvature(self._at(p).contacts, self.grip, p, keep, places, values)
 
     def _at(self, p: Positions) -> _Met:
-        """What is in range at p, all vertices' (N, 3)."""
+        """Return the collisions at p, positions (N, 3) of all vertices."""
         for met in self.met:
             if np.array_equal(met.p, p):
                 return met
@@ -163,30 +183,48 @@ class PairContact:
         return self.met[-1]
 
     def hessian(self, p: Positions) -> csr_array:
-        """The Hessian [N/m], shape (3n, 3n)."""
+        """Return the Hessian [N/m], (3n, 3n)."""
         return self.blocks(p).matrix(len(p))
 
     def largest_step(self, p: Positions, direction: Positions) -> float:
-        """The largest t up to 1 by which p may go along a direction, both (n, 3), with all gaps open; 0 where one is
-        closed at p. Nothing touches at any smaller t either."""
+        """Return the largest step size up to 1 that keeps all gaps open.
+
+        Args:
+            p: positions (n, 3) [m].
+            direction: displacements (n, 3) [m].
+
+        Returns:
+            Step size in [0, 1]; 0 if a gap is closed at p. All smaller step sizes are collision-free too.
+        """
         return known.largest_step(self.surface, self.kept, self.whole(p), self.toward(direction))
 
     def carried(self, p: Positions, direction: Positions, begin: float) -> float:
-        """The largest part t of what is left of the step by which p may go along a direction, both (n, 3), while
-        obstacles go on from the part `begin` of theirs."""
+        """Return the largest collision-free step size while the obstacles move as well.
+
+        Args:
+            p: positions (n, 3) [m].
+            direction: displacements (n, 3) [m] over the remainder of the step.
+            start_fraction: fraction of their motion at which the obstacles start.
+
+        Returns:
+            Fraction of the remaining displacements, in [0, 1].
+        """
         return self.largest_step(p, direction)
 
     def at_part(self, part: float) -> Self:
-        """The same with obstacles at a part of their way in the step, 1 at its end."""
+        """Return this energy with obstacles at a fraction of their motion in the step, 1 at its end."""
         return self
 
     def with_obstacles(self, p: Positions) -> list[Positions]:
-        """Where p (n, 3) would be at the step's end, were it to move with each of the obstacles that move."""
+        """Return the end positions that p (n, 3) would have if it moved with each of the moving obstacles."""
         return []
 
     def closed(self, p: Positions) -> list[tuple[NDArray[np.int64], bool, float]]:
-        """Pairs that are not farther apart than their thickness at p (n, 3): their vertices (4,), whether they are
-        edges, and their distance [m], the nearest first."""
+        """Return the pairs that violate their minimum distance at p (n, 3), the closest first.
+
+        Returns:
+            For each pair its vertices (4,), whether it is one of edges, and its distance [m].
+        """
         p = self.whole(p)
         pairs = self.pairs(p)
         apart = barrier.distances(pairs, p)
@@ -204,9 +242,13 @@ class SelfContact(PairContact):
 class ObstacleContact(PairContact):
     """Contact of a surface with obstacles.
 
-    place: a time [s] -> where their vertices are, (o, 3) [m], the same array at all times where none moves; carry: two
-    times and positions (n, 3) -> where these would be, were they to move with each of the moving ones in turn; begun,
-    placed: (o, 3) [m] at the step's start, and where they are now; left: vertices' ways to the step's end.
+    Attributes:
+        obstacle_positions_at: time [s] -> obstacle vertices (o, 3) [m]; the same array at all times if none moves.
+        comoving_map: two times and positions (n, 3) -> these positions moved with each moving obstacle.
+        start_positions: obstacle vertices (o, 3) [m] at the step's start.
+        current_positions: obstacle vertices (o, 3) [m] of the evaluation.
+        end_positions: obstacle vertices (o, 3) [m] at the step's end.
+        step_times: start and end of the step [s].
     """
 
     place: Place
@@ -220,12 +262,21 @@ class ObstacleContact(PairContact):
     def of(
         cls, surface: Surfaces, place: Place, carry: Carry, friction: float, slip: float, friction_rounds: int = ROUNDS
     ) -> Self:
-        """The contact at the time 0, before any step."""
+        """Build the contact at time 0, before any step.
+
+        Args:
+            collision_mesh: source of the candidates.
+            obstacle_positions_at: time [s] -> obstacle vertices (o, 3) [m].
+            comoving_map: two times and positions (n, 3) -> these positions moved with each moving obstacle.
+            friction: friction coefficient mu.
+            eps_v: speed [m/s] below which a pair counts as sticking.
+            friction_iterations: maximum number of solves of a step.
+        """
         now = place(0.0)
         return cls(surface, friction, slip, friction_rounds, place=place, carry=carry, begun=now, placed=now, end=now)
 
     def begin_step(self, start: Start) -> Self:
-        """The energy of a step, with obstacles where they are at its end."""
+        """Return the energy of a step, with obstacles at their end positions."""
         begun, end = self.place(start.time), self.place(start.until)
         step = replace(self, begun=begun, placed=end, end=end, times=(start.time, start.until))
         if self.friction:
@@ -235,23 +286,23 @@ class ObstacleContact(PairContact):
         return step
 
     def whole(self, p: Positions) -> Positions:
-        """See PairContact."""
+        """Return the positions of all vertices, those of the mesh (n, 3) first."""
         return np.concatenate([p, self.placed])
 
     def toward(self, direction: Positions) -> Positions:
-        """See PairContact."""
+        """Return the displacements of all vertices, with zeros for the obstacles."""
         return np.concatenate([direction, np.zeros_like(self.placed)])
 
     def carried(self, p: Positions, direction: Positions, begin: float) -> float:
-        """See PairContact."""
+        """Return the largest collision-free step size while the obstacles move to their end positions."""
         there = self.at_part(begin).placed
         way = np.concatenate([direction, self.end - there])
         return known.largest_step(self.surface, self.kept, np.concatenate([p, there]), way)
 
     def at_part(self, part: float) -> Self:
-        """See PairContact."""
+        """Return this energy with obstacles at a fraction of their motion in the step."""
         return self if self.begun is self.end else replace(self, placed=self.begun + part * (self.end - self.begun))
 
     def with_obstacles(self, p: Positions) -> list[Positions]:
-        """See PairContact."""
+        """Return the end positions that p (n, 3) would have if it moved with each of the moving obstacles."""
         return self.carry(*self.times, p)

@@ -1,17 +1,19 @@
-"""What Newton's methods do about contact between their steps: it is no quadratic model's business.
+"""Friction and contact of Newton's methods between their steps, where a quadratic model is inaccurate.
 
-A half-space acts from its surface on, and what sticks slips after a hundred-millionth of a metre. Two remedies:
+A half-space acts from its surface on, and a sticking vertex begins to slip after 1e-8 m. There are two remedies:
 
-Friction is settled at each trial point, by nonlinear Gauss-Seidel sweeps over the vertices that it holds (the smoother
-of the truncated nonsmooth Newton method, Gräser and Sander 2019), as exactly as h can be minimised (`contact.energy`):
+Friction is relaxed at each trial point, by nonlinear Gauss-Seidel sweeps over the vertices with friction. This is the
+smoother of the truncated nonsmooth Newton method (Gräser and Sander 2019). It minimises h as exactly as possible
+(`contact.half_space.half_space_potential`):
 
-    u <- argmin F h(|u|) + Q_ii/2 |u - v|^2,   v = u - r/Q_ii across the normal,   r <- r + Q (u - u before)
+    u <- argmin F h(|u|) + Q_ii/2 |u - v|^2,   v = u - r/Q_ii tangentially,   r <- r + Q (u - previous u)
 
-r is the gradient less friction's own. Q majorises all else, so that no sweep raises the objective.
+r is the gradient without friction's own part. Q majorises all else, so that no sweep increases the objective.
 
-A step that ends in half-spaces which it did not know of may rise. It is not shortened before them, one after the other,
-but stands for a few more steps that do know them, until they end below where the first began (the watchdog technique,
-Chamberlain, Powell, Lemarechal and Pedersen 1982; as an active set, Hintermüller, Ito and Kunisch 2003).
+A step that ends in half-spaces which were inactive at its start may increase the objective. It is not shortened to end
+before them, one after the other. Instead a few more steps with them active follow, until one ends below the start of
+the first (watchdog technique, Chamberlain, Powell, Lemarechal and Pedersen 1982; as an active set method, Hintermüller,
+Ito and Kunisch 2003).
 """
 
 from __future__ import annotations
@@ -30,15 +32,20 @@ from solvers.problem import Positions
 
 _SWEEPS = 4
 _AHEAD = 4
-"""Steps that a step may stand for, beside itself."""
+"""Number of additional steps in the watchdog technique."""
 
 Newton = Callable[[Point], Positions | None]
-"""The direction from a point, None where there is none without a change of the Hessian."""
+"""Function that returns the Newton direction at a point; None if the Hessian would have to be modified."""
 
 
 class Matrix(NamedTuple):
-    """Q over the free vertices. number (n,): of each vertex among them, or -1; starts, columns, entries: its rows by
-    those numbers, its columns by vertices; diagonal: of Q."""
+    """Q over the free vertices.
+
+    Attributes:
+        free_index: index of each vertex among the free ones, or -1, (n,).
+        row_starts, columns, entries: rows by free index, columns by vertex.
+        diagonal: diagonal of Q.
+    """
 
     number: NDArray[np.int64]
     starts: NDArray[np.int64]
@@ -48,7 +55,7 @@ class Matrix(NamedTuple):
 
 
 class Settling:
-    """Newton's methods with contact, for one system."""
+    """Friction relaxation and watchdog search of Newton's methods, for one system."""
 
     def __init__(self, metric: Metric) -> None:
         Q, free = metric.inner, metric.system.free
@@ -57,7 +64,7 @@ class Settling:
         self._matrix = Matrix(number, Q.indptr.astype(np.int64), free[Q.indices], Q.data, metric.diagonal)
 
     def settled(self, step: StepObjective, p: Positions) -> Positions:
-        """p (n, 3) with what grips where friction has it; p itself where nothing grips."""
+        """Return p (n, 3) with friction relaxed; p itself without friction."""
         out = p
         for one in _contacts(step):
             planes = one.planes
@@ -67,20 +74,26 @@ class Settling:
         return out
 
     def start(self, step: StepObjective, at: Point) -> Point:
-        """A point, settled."""
+        """Relax friction at the initial point, if that decreases the objective."""
         p = self.settled(step, at.positions)
         return at if p is at.positions or step.rise(at.positions, p)[0] >= 0.0 else Point(p, step.gradient(p))
 
     def search(self, step: StepObjective, at: Point, direction: Positions, newton: Newton) -> Point | None:
-        """A lower point by a direction, and by what it leads to; None for none."""
+        """Return a lower point along a direction, or after the watchdog steps; None if there is none.
+
+        Args:
+            step: objective of the step.
+            at: current point.
+            direction: Newton direction at the point (n, 3) [m].
+            newton_direction: returns the direction at later points.
+        """
         return self._ahead(step, at, direction, newton) or self._along(step, at, direction)
 
     def _along(self, step: StepObjective, at: Point, direction: Positions) -> Point | None:
         return search(step, at, direction, settled=lambda p: self.settled(step, p))
 
     def _ahead(self, step: StepObjective, origin: Point, direction: Positions, newton: Newton) -> Point | None:
-        """Where full steps lead, each the one of Newton's method where the one before ended, as long as each presses on
-        what the one before did not; None where it is not lower than the origin."""
+        """Take full Newton steps while each activates further half-spaces; return a point lower than the origin."""
         at, enough = origin, DECREASE * dot(origin.gradient, direction)
         for _ in range(_AHEAD):
             p = self.settled(step, step.placed(at.positions + direction))
@@ -102,14 +115,22 @@ def _contacts(step: StepObjective) -> list[Contact]:
 
 
 def _pressed(step: StepObjective, p: Positions) -> NDArray[np.bool_]:
-    """Which half-spaces press at p."""
+    """Return a mask of the half-spaces that are active at p."""
     return np.concatenate([one.gap(p) < 0.0 for one in _contacts(step)])
 
 
 @kernel
 def settle(planes, slip, matrix, p, gradient, sweeps):
-    """Sweeps over the vertices of half-spaces (`contact.energy`) with grip F > 0, moved in p (n, 3) across their
-    normals. slip [m]; matrix: Q; gradient (n, 3): at p, friction's own part included; overwritten."""
+    """Relax friction by Gauss-Seidel sweeps over the vertices of half-spaces with friction limit F > 0.
+
+    Args:
+        planes: contact planes.
+        smoothing_length: of friction [m].
+        matrix: Q over the free vertices.
+        p: positions (n, 3) [m], moved tangentially to the normals.
+        gradient: gradient at p (n, 3) [N] including friction's own part; updated.
+        sweeps: number of sweeps.
+    """
     vertices, normal, _, anchor, _, grip = planes
     number, starts, columns, entries, diagonal = matrix
     for _ in range(sweeps):

@@ -1,4 +1,4 @@
-"""What a mesh has that may touch itself: points, edges and triangles, and which of their pairs are near at rest."""
+"""Collision mesh: the points, edges and triangles of a mesh that may collide, with scaled distances of close pairs."""
 
 from __future__ import annotations
 
@@ -22,22 +22,29 @@ from solvers.vectors.eights import bits, lowest, rows
 Array = NDArray[np.float64]
 
 _LESS = 1.0 - 1e-12
-"""Of a proportion: round-off at rest is no force."""
+"""Factor on the scale of distances: without it, round-off would produce forces at rest."""
 
 _LOOKED = 4.0
-"""Of the range: pairs that are farther apart at rest are not looked at one by one."""
+"""Distance, relative to the activation distance, up to which pairs are tested one by one at rest."""
 
 _NOTHING = np.empty(0)
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Points (q, 1), edges (m, 2) and triangles (f, 3) of a mesh at rest, that keep a thickness [m] from each other and
-    feel each other within a range [m] beyond it.
+    """Points (q, 1), edges (m, 2) and triangles (f, 3) of a mesh, in contact with each other.
 
-    Pairs that share a vertex are none. Those that are nearer at rest than thickness and range have both in proportion
-    to their distance there: they are free of force at rest, and do not pass through each other either.
-    stiffness (n,): [N/m]; near: the keys of such pairs, sorted, and that proportion.
+    Pairs that share a vertex are excluded. Pairs that are closer at rest than the activation distance have both
+    distances scaled in proportion. They exert no force at rest, and still cannot interpenetrate.
+
+    Attributes:
+        rest_positions: rest shape (n, 3) [m].
+        points, edges, triangles: trees over the primitives.
+        edge_lengths: at rest [m], (m,).
+        stiffness: barrier stiffness of each vertex [N/m], (n,).
+        min_distance: minimum distance [m].
+        dhat: barrier activation distance beyond the minimum distance [m].
+        rest_close_pairs: sorted keys of the pairs with scaled distances, and their scales.
     """
 
     rest: Positions
@@ -54,7 +61,16 @@ class Surface:
     def of(
         cls, rest: Positions, edges: Indices, triangles: Indices, stiffness: Array, thickness: float, reach: float
     ) -> Surface:
-        """The surface of a rest shape (n, 3) [m]."""
+        """Build the collision mesh of a rest shape.
+
+        Args:
+            rest: rest shape (n, 3) [m].
+            edges: vertex indices (m, 2).
+            triangles: vertex indices (f, 3).
+            stiffness: barrier stiffness of each vertex [N/m], (n,).
+            min_distance: minimum distance [m].
+            dhat: barrier activation distance beyond the minimum distance [m].
+        """
         points = np.unique(np.append(edges.ravel(), triangles.ravel())).astype(np.int64)
         rest = np.array(rest, order="C")
         none = np.empty(0, np.int64), np.empty(0)
@@ -70,8 +86,7 @@ class Surface:
         return cls(rest, *trees, lengths, np.array(stiffness), thickness, reach, near)
 
     def _near(self, x: Array, reach: float) -> tuple[Indices, int]:
-        """Pairs that may be nearer than `reach` [m] at x (n, 4), by their numbers (k, 2): of points and triangles, so
-        many, then of edges."""
+        """Return index pairs (k, 2) that may be closer than a radius at x (n, 4), and how many are point-triangle."""
         limits = Limits(reach, reach, 0.0, 0.0)
         one = found(self.points, self.triangles, x, x, limits)
         return np.concatenate([one, found(self.edges, self.edges, x, x, limits)]), len(one)
@@ -81,15 +96,15 @@ class Surface:
         return Patches.of(self.rest, self.points, self.edges, self.triangles, _LOOKED * (self.thickness + self.reach))
 
     def clear(self, p: Positions, q: Positions, limits: Limits) -> Gaps | None:
-        """See `solvers.contact.known.Surfaces`."""
+        """Return lower bounds of the distances at q, if the displacement from p to q violates no limit."""
         return self._patches.clear(p, q, limits)
 
     def unevenness(self, p: Positions, q: Positions) -> float:
-        """See `solvers.contact.known.Surfaces`."""
+        """Return the largest relative displacement [m] of two vertices that are close to each other at rest."""
         return self._patches.unevenness(p, q)
 
     def within(self, p: Positions, reach: float) -> Pairs:
-        """Pairs that are nearer than `reach` [m] at p (n, 3) [m]."""
+        """Return the pairs closer than `inflation_radius` [m] at p (n, 3) [m]."""
         x = padded(p)
         met, first = self._near(x, reach)
         many = len(met)
@@ -110,20 +125,20 @@ class Surface:
         return self.points.corners, self.triangles.corners, self.edges.corners
 
     def on_way(self, x: Array, y: Array, limits: Limits, edges: bool) -> Pairs:
-        """See `solvers.contact.known.Surfaces`; without what they press with."""
+        """Return the pairs that may violate a limit on the displacement from x to y, without barrier parameters."""
         one, other = (self.edges, self.edges) if edges else (self.points, self.triangles)
         met = found(one, other, x, y, limits)
         first = 0 if edges else len(met)
         return self._bare(met, first)._replace(scale=self._scale(met, first))
 
     def _bare(self, met: Indices, first: int) -> Pairs:
-        """Pairs by their numbers (k, 2), the first ones of points and triangles; no more than where they are."""
+        """Return candidates of index pairs (k, 2), the first ones point-triangle, without scales and stiffnesses."""
         vertices = np.empty((len(met), 4), np.int64)
         name(met, first, self._parts, vertices)
         return Pairs(vertices, first, _NOTHING, _NOTHING, _NOTHING, self.thickness, self.reach)
 
     def _scale(self, met: Indices, first: int) -> Array:
-        """The proportion (k,) in which pairs keep thickness and range."""
+        """Return the factors (k,) on the distances of pairs."""
         keys, share = self.near
         if not (len(keys) and len(met)):
             return np.ones(len(met))
@@ -132,7 +147,7 @@ class Surface:
         return np.where(keys[at] == wanted, share[at], 1.0)
 
     def _keys(self, met: Indices, first: int) -> Indices:
-        """A number of each pair."""
+        """Return a unique key of each pair."""
         many = max(len(self.triangles.corners), len(self.edges.corners), 1)
         key = met[:, 0] * many + met[:, 1]
         key[first:] += len(self.points.corners) * many
@@ -162,16 +177,34 @@ def _name(found, e, edges, parts, vertices, k):
 
 @kernel
 def name(found, first, parts, vertices):
-    """Write the vertices (k, 4) of pairs (k, 2), the first ones of points and triangles; parts: points, triangles and
-    edges."""
+    """Write the vertices (k, 4) of index pairs.
+
+    Args:
+        pair_indices: primitive indices (k, 2).
+        first: number of point-triangle pairs, which come first.
+        parts: points, triangles and edges.
+        vertices: output (k, 4).
+    """
     for e in range(len(found)):
         _name(found, e, e >= first, parts, vertices, e)
 
 
 @kernel
 def nearer(pairs, found, parts, lengths, stiffness, x, reach):
-    """Leave those of found pairs (k, 2) that are nearer than `reach` at x (n, 4), and write their vertices, stiffness
-    and e to `pairs`; how many are of points and triangles, and of both kinds."""
+    """Remove the pairs that are not closer than a radius, and write the others to `candidates`.
+
+    Args:
+        candidates: vertices, stiffness and mollifier threshold are overwritten.
+        pair_indices: primitive indices (k, 2), compacted in place.
+        parts: points, triangles and edges.
+        lengths: edge lengths at rest [m], (m,).
+        stiffness: stiffness of each vertex [N/m], (n,).
+        x: positions (n, 4) [m].
+        inflation_radius: radius [m].
+
+    Returns:
+        Number of point-triangle pairs, and of all pairs.
+    """
     count, points, begin, limit = 0, 0, 0, reach * reach
     for edges in (False, True):
         end = len(found) if edges else pairs.points
@@ -201,7 +234,7 @@ def nearer(pairs, found, parts, lengths, stiffness, x, reach):
 
 @inner
 def _near(vertices, x, first, last, edges, limit):
-    """Which of eight pairs are nearer than the root of a limit, as bits."""
+    """Return as bits which of eight pairs have a squared distance below a limit."""
     a, b = rows(x, vertices, first, last, 0), rows(x, vertices, first, last, 1)
     c, d = rows(x, vertices, first, last, 2), rows(x, vertices, first, last, 3)
     z = edge_edge_way(a, b, c, d)[4] if edges else point_triangle_way(a, b, c, d)[4]

@@ -1,8 +1,8 @@
-"""The interface of contact to the prefactored methods.
+"""Interface of vertex contact to prefactored methods.
 
-Contact presses on single vertices with forces that come and go, far stiffer than anything in Q. No Q holds it, so it
-is no projective energy; it tells its stiffness as rows instead, which `solvers.contact.local_global` adds to Q from
-case to case.
+Contact acts on single vertices with forces that appear and vanish, and is far stiffer than anything in Q. No constant Q
+contains it, so that it is no projective energy. It provides its stiffness as rows instead, which
+`solvers.methods.local_global.half_space_contact` adds to Q in each iteration.
 """
 
 from __future__ import annotations
@@ -18,10 +18,13 @@ from solvers.problem import Energy, LaggedEnergy, Positions, StepProblem, System
 
 
 class ContactRows(NamedTuple):
-    """Terms w/2 (direction.x_v + gap)^2 of the displacements x of vertices v (r,).
+    """Penalty terms w/2 (direction.x_v + gap)^2 of the displacements x of vertices v (r,).
 
-    direction: (r, 3), unit vectors; weight: w (r,) [N/m]; gap (r,) [m]: zero where the contact's force at p is part of
-    the gradient, the distance where nothing touches at p.
+    Attributes:
+        vertices: v (r,).
+        direction: unit vectors (r, 3).
+        stiffness: w [N/m], (r,).
+        gap: [m], (r,); zero where the gradient includes the contact force at p, the distance where there is none at p.
     """
 
     vertices: NDArray[np.int64]
@@ -35,21 +38,22 @@ class ContactEnergy(LaggedEnergy, Protocol):
     """An energy of single vertices, convex and once differentiable."""
 
     def idle(self) -> bool:
-        """Whether nothing can be touched in the step that has begun."""
+        """Return whether no vertex can collide in the current step."""
         ...
 
     def rows(self, p: Positions, trial: Positions, *, cautious: bool) -> ContactRows:
-        """The rows that resist a displacement from p to `trial`, both (n, 3) [m]: contacts that press at p, and those
-        that begin to press on the way.
+        """Return the rows of contacts active at p, and of those that become active on the way to `trial`.
 
-        Their stiffness is the energy's exact second derivative; where `cautious`, a larger one that majorises the
-        energy.
+        Args:
+            p: positions (n, 3) [m].
+            trial: trial positions (n, 3) [m].
+            majorise: whether the stiffness majorises the energy; it is the exact second derivative otherwise.
         """
         ...
 
 
 def is_contact(energy: Energy) -> TypeGuard[ContactEnergy]:
-    """Whether an energy is one of contact."""
+    """Return whether an energy is one of vertex contact."""
     return _is_contact(type(energy))
 
 
@@ -59,12 +63,12 @@ def _is_contact(kind: type) -> bool:
 
 
 def touching(problem: StepProblem) -> list[ContactEnergy]:
-    """The step's contacts, less those that are idle; begun apart from the other energies, which may not be needed."""
+    """Return the active contacts of a step, begun separately from energies that may not be needed."""
     begun = [energy.begin_step(problem.start) for energy in problem.system.energies if is_contact(energy)]
     return [energy for energy in begun if is_contact(energy) and not energy.idle()]
 
 
 def without_contact(system: System) -> System:
-    """The same system without contact; itself where it has none."""
+    """Return the system without vertex contact; the same object if it has none."""
     kept = tuple(energy for energy in system.energies if not is_contact(energy))
     return system if len(kept) == len(system.energies) else replace(system, energies=kept)

@@ -1,10 +1,10 @@
-"""What may be near: trees of boxes around points, edges or triangles, made once and refitted at each look.
+"""Broad phase: bounding volume hierarchies (BVH) over points, edges or triangles, built once and refitted per query.
 
-A node has eight boxes, tested at once in vector registers (`solvers.vectors.eights`). Primitives are numbered along a
-Morton curve through the rest shape, so that eight that follow each other are a patch of the surface however it folds,
-and a tree is implicit: below box b of node k is the node 8 k + 1 + b. Eight primitives go down another tree together,
-and are told apart where it ends. What is found comes in the order of these eights, of those that they meet, and of
-primitives: it depends on nothing else, so that sums over more candidates than are near are the same to the bit.
+A node has eight boxes, tested at once in vector registers (`solvers.simd.float64x8`). Primitives are numbered along a
+Morton curve through the rest shape, so that eight consecutive ones form a patch of the surface however it folds. The
+tree is implicit: the child of box b of node k is node 8 k + 1 + b. Eight primitives traverse the other tree together
+and are separated at its leaves. Candidates are ordered by these packets, by the leaves, and by primitives. The order
+depends on nothing else, so that sums over a superset of the active pairs are bitwise identical.
 """
 
 from __future__ import annotations
@@ -32,14 +32,19 @@ from solvers.vectors.eights import lowest
 
 _BITS = 10
 _DEPTH = 8 * 22
-"""Of a stack: eight times the levels of any tree that memory holds."""
+"""Stack entries: eight times the number of levels of any tree that fits in memory."""
 _ROOM = 24
-"""For pairs of each primitive; where more are found, all are looked for again. Four layers that touch have some 14."""
+"""Initial capacity for pairs of each primitive; beyond it the query is repeated. Four touching layers have some 14."""
 
 
 class Tree(NamedTuple):
-    """corners (m, k): vertices of each primitive, along the curve; levels: of nodes, with the root's; size [m]: of
-    primitives at rest, in the mean."""
+    """Implicit tree of eight-box nodes.
+
+    Attributes:
+        primitives: vertices of each primitive in Morton order, (m, k).
+        num_levels: number of levels, including the root.
+        mean_primitive_size: mean diagonal of the primitives at rest [m].
+    """
 
     corners: Indices
     levels: int
@@ -47,7 +52,7 @@ class Tree(NamedTuple):
 
     @classmethod
     def of(cls, rest: Positions, corners: Indices) -> Tree:
-        """A tree over primitives of a rest shape (n, 3) [m]."""
+        """Build a tree over primitives (m, k) of a rest shape (n, 3) [m]."""
         order, size = along_curve(rest[corners].mean(axis=1)), 0.0
         if len(corners):
             size = float(np.linalg.norm(np.ptp(rest[corners], axis=1), axis=1).mean())
@@ -55,7 +60,7 @@ class Tree(NamedTuple):
 
     @classmethod
     def over(cls, many: int) -> Tree:
-        """A tree over so many things that follow each other along the curve already."""
+        """Build a tree over items that are in Morton order already."""
         levels = 1
         while 8**levels < many:
             levels += 1
@@ -63,17 +68,17 @@ class Tree(NamedTuple):
 
     @property
     def nodes(self) -> int:
-        """How many there are, those of the last level as far as primitives go."""
+        """Number of nodes; the last level ends with the last primitive."""
         return _first(self.levels - 1) + max(1, -(-len(self.corners) // 8))
 
 
 def _first(level: int) -> int:
-    """The number of a level's first node."""
+    """Return the index of a level's first node."""
     return (8**level - 1) // 7
 
 
 def along_curve(x: Positions) -> Indices:
-    """The order of points (m, 3) [m] along a Morton curve."""
+    """Return the order of points (m, 3) [m] along a Morton curve."""
     if not len(x):
         return np.empty(0, np.int64)
     size = float(np.ptp(x, axis=0).max()) or 1.0
@@ -86,10 +91,20 @@ def along_curve(x: Positions) -> Indices:
 
 
 def found(one: Tree, other: Tree, x: Array, y: Array, limits: Limits) -> Indices:
-    """What of two trees may come to its limits on the straight way from x to y, (n, 4) both, positions with a column
-    more, by their numbers, (k, 2); of a tree and itself each pair once, the lower number first. What shares a vertex is
-    left out. Where vertices move beside each other by less than primitives are long, and not all alike by more, boxes
-    around their ways say as much as boxes at the begin and at the end, and take half the time."""
+    """Return the pairs of two trees that may violate the limits on a linear motion.
+
+    Pairs that share a vertex are excluded. If vertices move relative to each other by less than the primitive size,
+    boxes around the whole motion are as tight as separate start and end boxes, and take half the time.
+
+    Args:
+        one, other: the trees; if both are the same, each pair is found once, the lower index first.
+        x: start positions (n, 4) [m]; column 3 is padding.
+        y: end positions (n, 4) [m]; column 3 is padding.
+        query: limits of the distances.
+
+    Returns:
+        Primitive indices (k, 2).
+    """
     if not (len(one.corners) and len(other.corners)):
         return np.empty((0, 2), np.int64)
     if limits.moved <= max(one.size, other.size):
@@ -106,12 +121,12 @@ def found(one: Tree, other: Tree, x: Array, y: Array, limits: Limits) -> Indices
 
 
 def stack() -> Indices:
-    """Scratch of a look."""
+    """Allocate the scratch of a traversal."""
     return np.empty((_DEPTH, 3), np.int64)
 
 
 def _boxes(one: Tree, other: Tree, x: Array, y: Array) -> tuple[Array, Array]:
-    """The boxes of both around the ways from x to y, (n, 4) both."""
+    """Build the boxes of both trees around the linear motion from x to y, (n, 4) each."""
     boxes = [np.empty((tree.nodes, 6, 8)) for tree in ((one,) if one is other else (one, other))]
     for tree, around in zip((one, other), boxes, strict=False):
         refit(tree, x, y, around)
@@ -120,7 +135,14 @@ def _boxes(one: Tree, other: Tree, x: Array, y: Array) -> tuple[Array, Array]:
 
 @kernel
 def refit(tree, x, y, boxes):
-    """Write the boxes (nodes, 6, 8) around the ways from x to y, (n, 4) both; those of nothing are nowhere."""
+    """Refit the boxes of a tree to a linear motion.
+
+    Args:
+        tree: the tree.
+        x: start positions (n, 4) [m].
+        y: end positions (n, 4) [m].
+        boxes: boxes (nodes, 6, 8) [m], overwritten; unused lanes get empty boxes at infinity.
+    """
     many = len(tree.corners)
     leaf = len(boxes) - (many + 7) // 8
     for first in range(0, many, 8):
@@ -134,7 +156,7 @@ def refit(tree, x, y, boxes):
 
 @kernel
 def lift(boxes, many):
-    """Write the boxes (nodes, 6, 8) above those of so many things, of which those of the last level are written."""
+    """Compute the boxes (nodes, 6, 8) of all inner nodes from those of the last level."""
     last = len(boxes) - (many + 7) // 8
     boxes[:last, :3], boxes[:last, 3:] = np.inf, -np.inf
     for k in range(many, 8 * ((many + 7) // 8)):
@@ -150,16 +172,23 @@ def lift(boxes, many):
 
 @kernel
 def look(one, other, begin, end, limits, same, stack, out):
-    """Write the pairs of two trees that may come to their limits, with their boxes at the begin of a way and at its
-    end, to `out`, as far as there is room; how many there are. same: whether both are one tree, of which each pair is
-    wanted once; stack: scratch."""
+    """Write the pairs of two trees that may violate the limits, and return their number.
+
+    Args:
+        one, other: the trees.
+        begin, end: boxes of both trees at the start and at the end of the motion.
+        query: limits of the distances.
+        is_same_tree: whether both trees are the same; each pair is then found once.
+        stack: scratch, (s, 3).
+        out: primitive indices (k, 2); pairs beyond its capacity are counted only.
+    """
     (mine, boxes), (yours, there) = begin, end
     count, leaf = 0, len(mine) - (len(one.corners) + 7) // 8
     for first_of_eight in range(0, len(one.corners), 8):
         around, after = mine[leaf + first_of_eight // 8], yours[leaf + first_of_eight // 8]
         low, high = hull(around, 8)
         lower, upper = hull(after, 8)
-        # A node, its first primitive, and how many lie in each of its boxes.
+        # Stack entries: a node, its first primitive, and the number of primitives in each of its boxes.
         stack[0, 0], stack[0, 1], stack[0, 2], top = 0, 0, 8 ** (other.levels - 1), 1
         while top > 0:
             top -= 1

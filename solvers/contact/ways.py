@@ -1,10 +1,10 @@
-"""The largest safe step along a direction: additive continuous collision detection (Li et al. 2021).
+"""Additive continuous collision detection (CCD): the largest collision-free step size along a displacement.
 
-    t <- t + .9 (d(t) - thickness)/l,     l = the fastest that the distance of the pair can shrink
+    t <- t + .9 (d(t) - min_distance)/l,     l = upper bound of the speed at which the distance d of the pair shrinks
 
-(Li, Kaufman and Jiang 2021, "Codimensional incremental potential contact", section 5). A pair's common motion is taken
-away first. Pairs that their distance keeps free, whatever they do, are told eight at a time. No pair ends with less
-than a twentieth of the gap that it began with: all gaps stay open, by far more than round-off.
+Source: Li, Kaufman and Jiang 2021, "Codimensional incremental potential contact", section 5. The common translation of
+a pair is removed first, which gives a tighter bound l. Pairs that are farther apart than they can move are discarded in
+8-lane packets. Each pair retains at least a twentieth of its initial gap, which is far more than round-off.
 """
 
 from __future__ import annotations
@@ -19,24 +19,34 @@ from solvers.problem import Positions
 from solvers.vectors.eights import bits, loaded, lowest, root, rows, stored, where
 
 LEFT = 0.1
-"""Of a gap, what ends the search for a longer step; half of it is what a step leaves at least."""
+"""Fraction of the initial gap at which the CCD of a pair stops; each step leaves at least half of it."""
 
 _WIDER = 1.0 + 1e-12
-"""Of a way: round-off lets no pair go unseen."""
+"""Factor on displacements, so that round-off discards no pair."""
 
 _LOOKS = 500
-"""Of one pair; where they do not suffice the last one is taken, which is safe."""
+"""Maximum number of CCD iterations of one pair; if they do not suffice, the last iterate is used, which is safe."""
 
 
 def scratch() -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """That of `largest`."""
+    """Allocate the scratch arrays `local_indices`, `corners` and `relative_displacement` of the CCD."""
     return np.empty(4, np.int64), np.empty((4, 3)), np.empty((4, 3))
 
 
 @kernel
 def largest(pairs, p, direction, most, four, corners, way):
-    """The largest t up to `most` by which all pairs may go from p along t times the direction, both (n, 4), the last
-    column of no account; four (4,), corners, way (4, 3): scratch. 0 where a gap is closed at the start."""
+    """Return the largest step size that keeps all candidate pairs separated, on linear trajectories.
+
+    Args:
+        candidates: point-triangle pairs, then edge-edge pairs.
+        p: positions (n, 4) [m]; column 3 is padding.
+        displacement: displacements (n, 4) [m]; column 3 is padding.
+        max_step: upper bound of the step size.
+        local_indices, corners, relative_displacement: scratch, (4,), (4, 3) and (4, 3).
+
+    Returns:
+        Step size in [0, max_step]; 0 if a pair starts closer than its minimum distance.
+    """
     for k in range(4):
         four[k] = k
     end, edges = pairs.points, False
@@ -57,7 +67,7 @@ def largest(pairs, p, direction, most, four, corners, way):
 
 @inner
 def _reached(pairs, p, direction, most, first, last, edges):
-    """Which of eight pairs are not free by their distances and lengths of ways alone, as bits."""
+    """Return as bits which of eight pairs can reach each other, by distances and displacement lengths alone."""
     x = pairs.vertices
     a, b, c, d = (rows(p, x, first, last, 0), rows(p, x, first, last, 1), rows(p, x, first, last, 2),
                   rows(p, x, first, last, 3))  # fmt: skip
@@ -88,7 +98,17 @@ def _more(a, b):
 
 @inner
 def free(pairs, e, p, direction, most, edges, four, corners, way):
-    """The same of one pair."""
+    """Return the largest step size in [0, max_step] that keeps one pair separated.
+
+    Args:
+        candidates: the candidate pairs.
+        e: index of the pair.
+        p: positions (n, 4) [m].
+        displacement: displacements (n, 4) [m].
+        max_step: upper bound of the step size.
+        edges: whether the pair is one of edges.
+        local_indices, corners, relative_displacement: scratch, (4,), (4, 3) and (4, 3).
+    """
     x = pairs.vertices[e]
     speed = _relative(p, direction, x, edges, corners, way)
     closed = pairs.scale[e] * pairs.thickness
@@ -118,7 +138,7 @@ def _one(corners, way, four, edges, gap, closed, speed, most):
 
 @inner
 def _relative(p, direction, x, edges, corners, way):
-    """The corners (4, 3) about the first, their ways less the mean, and how fast their distance may shrink."""
+    """Write corners (4, 3) relative to the first one and displacements without their mean; return the closing speed."""
     for a in range(3):
         mean = 0.25 * (direction[x[0], a] + direction[x[1], a] + direction[x[2], a] + direction[x[3], a])
         for k in range(4):
@@ -134,18 +154,25 @@ def _length(way, k):
 
 
 def unevenness(p: Positions, q: Positions) -> float:
-    """How far any two vertices have moved from p to q, contiguous (n, 3) both, beside each other, at most [m]; infinite
-    where something is not finite."""
+    """Return the largest displacement of any two vertices relative to each other.
+
+    Args:
+        p: start positions, contiguous (n, 3) [m].
+        q: end positions, contiguous (n, 3) [m].
+
+    Returns:
+        Upper bound [m]; infinite if a coordinate is not finite.
+    """
     return _unevenness(p, q, np.empty((9, 8)))
 
 
 @kernel
 def _unevenness(p, q, tile):
-    """The diagonal of the box of all q - p; tile (9, 8): scratch."""
+    """Return the diagonal [m] of the bounding box of all q - p; tile (9, 8): scratch."""
     whole = len(p) // 8
     tile[:3], tile[3:6], tile[6:] = np.inf, -np.inf, 0.0
     if whole > 0:
-        # Lanes of three registers after each other are x y z x y z ... of eight vertices.
+        # Three consecutive registers contain x y z x y z ... of eight vertices.
         x, y, z = loaded(q, 0) - loaded(p, 0), loaded(q, 8) - loaded(p, 8), loaded(q, 16) - loaded(p, 16)
         low, high, nothing = (x, y, z), (x, y, z), (0.0 * x, 0.0 * y, 0.0 * z)
         for k in range(24, 24 * whole, 24):
@@ -175,7 +202,13 @@ def _unevenness(p, q, tile):
 
 @kernel
 def alike(x, p, most):
-    """Whether all vertices are moved alike from x (n, 4) to p (n, 3), but for so much along each axis [m]."""
+    """Return whether all vertices are translated equally, up to a tolerance.
+
+    Args:
+        x: start positions (n, 4) [m]; column 3 is padding.
+        p: end positions (n, 3) [m].
+        max_step: tolerance along each axis [m].
+    """
     a, b, c = p[0, 0] - x[0, 0], p[0, 1] - x[0, 1], p[0, 2] - x[0, 2]
     for i in range(len(p)):
         d, e, f = p[i, 0] - x[i, 0] - a, p[i, 1] - x[i, 1] - b, p[i, 2] - x[i, 2] - c
