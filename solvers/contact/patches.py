@@ -1,4 +1,4 @@
-"""Cluster culling: prove that no primitives of a surface come close during a motion, without testing each of them.
+"""Cluster culling: prove that no primitives of a surface come close, without testing each of them.
 
 The surface is divided into clusters of a few vertices each. A cluster owns the points, edges and triangles whose first
 vertex along the Morton curve belongs to it. Cluster pairs that are close at rest are tested by their affine poses
@@ -85,7 +85,7 @@ class Patches:
         pair_starts: first pair of each cluster (clusters + 1,).
         recent_poses: poses at the last two positions.
         remote_clearances: position of the last query, and the clearance there of clusters not close at rest [m].
-        is_dense: whether so many clusters are close at rest, as in a stack of sheets, that culling is useless.
+        is_dense: whether too many clusters are close at rest, as in a stack of sheets, for culling to be useful.
     """
 
     rest: Rest
@@ -178,8 +178,10 @@ class Patches:
         return Gaps(near, near if others else far)
 
     def _far(self, p: Positions, q: Positions, limits: Limits) -> float:
-        """Return the known clearance [m] at q of clusters not close at rest, if the motion violates no limit; else
-        0."""
+        """Return the known clearance [m] at q of clusters not close at rest.
+
+        The result is 0 unless the known clearances prove that the motion from p to q violates no limit.
+        """
         for at, far in self.apart:
             before, after = unevenness(at, p), unevenness(at, q)
             if max(limits.reach, limits.closed + limits.share * (far + before)) <= far - max(before, after):

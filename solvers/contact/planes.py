@@ -115,8 +115,7 @@ def planes(p, v, dt, frames, obstacle, margin, out, work):
 
 @inner
 def plane(p, v, i, dt, frames, obstacle, margin, out, at, work):
-    """Write the half-space of vertex i to row `row_index` of `out`; return whether the vertex may reach the
-    obstacle."""
+    """Return whether vertex i may reach an obstacle; if so, write its half-space to row `row_index` of `out`."""
     _, normal, offset, carried = out
     a, b, x, c, n = work[0], work[1], work[2], work[3], work[4]
     first, second, way = frames[0], frames[1], 0.0

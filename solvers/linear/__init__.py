@@ -1,1 +1,1 @@
-"""Factorisations of the constant matrix Q, one a file."""
+"""Linear solvers for symmetric positive definite systems: factorisations, conjugate gradients and preconditioners."""

@@ -1,9 +1,9 @@
-"""A sparse Cholesky factorisation of a matrix of 3 x 3 blocks, analysed once and factorised again and again.
+"""Sparse Cholesky factorisation of a matrix of 3 x 3 blocks, analysed once and factorised repeatedly.
 
-    H x = b,   H symmetric, 3n x 3n, its blocks where a graph of n vertices has entries
+    H x = b,   H symmetric, 3n x 3n, with a block for each entry of a graph of n vertices
 
-The order of elimination and the supernodes are those of the graph. A failure is an answer here and no error: it says
-that H is not positive definite.
+The elimination order and the supernodes are those of the graph. A failed factorisation is a regular result and no
+error: H is not positive definite.
 """
 
 from __future__ import annotations
@@ -23,16 +23,23 @@ _NOTHING = np.empty((0, 3))
 
 
 class BlockCholesky:
-    """The factorisation of H for one pattern of blocks.
+    """Cholesky factorisation of H for one pattern of blocks.
 
-    nonzeros: entries of L, the diagonal's included; flops: multiplications and additions of a factorisation, padding
-    left out. Factorisations and solves share their arrays: one at a time.
+    Factorisations and solves share their arrays, so that they cannot run concurrently.
+
+    Attributes:
+        nonzeros: entries of L, including the diagonal.
+        flops: multiplications and additions of a factorisation, without padding.
     """
 
     def __init__(self, graph: csr_array) -> None:
-        """graph: (n, n), symmetric in its pattern, an entry for each block, the diagonal's included.
+        """Analyse a graph.
 
-        Raises Unsupported where the factor does not fit in memory.
+        Args:
+            graph: pattern (n, n), symmetric, with an entry for each block including the diagonal.
+
+        Raises:
+            Unsupported: if the factor does not fit in memory.
         """
         pointers, neighbours = np.asarray(graph.indptr, np.int64), np.asarray(graph.indices, np.int32)
         symbolic = structure(pointers, neighbours)
@@ -57,18 +64,25 @@ class BlockCholesky:
         self._scratch = Scratch(front, stacks, waiting, filled, np.zeros(TILE), triangles, runs)
 
     def factorise(self, values: NDArray[np.float64]) -> bool:
-        """Factorise H with these blocks (b, 3, 3), in the order of the graph; False if it is not positive definite."""
+        """Factorise H with blocks (b, 3, 3) in the graph's order; return False if it is not positive definite."""
         return factorise(self._fronts, values, self._panels, _NOTHING, self._scratch)
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
-        """H^-1 b, both (n, 3), by what was factorised last."""
+        """Return H^-1 b, both (n, 3), with the last factorisation."""
         x = np.array(b, order="C")
         solve(self._fronts, self._panels, x, self._scratch.front, False)
         return x
 
     def solve_anew(self, values: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """H^-1 b, H factorised with these blocks: sooner than one after the other. None if it is not positive
-        definite."""
+        """Factorise H and return H^-1 b, faster than in two calls.
+
+        Args:
+            values: blocks (b, 3, 3) in the graph's order.
+            b: right-hand sides (n, 3).
+
+        Returns:
+            Solution (n, 3); None if H is not positive definite.
+        """
         x = np.array(b, order="C")
         if not factorise(self._fronts, values, self._panels, x, self._scratch):
             return None
@@ -77,7 +91,7 @@ class BlockCholesky:
 
 
 def _fronts(pointers: NDArray[np.int64], neighbours: NDArray[np.int32], symbolic: Symbolic) -> Fronts:
-    """The fronts of a structure, its supernodes numbered anew in the order in which they are done."""
+    """Build the fronts of a symbolic factor, with supernodes renumbered in the order of their elimination."""
     s, sequence = symbolic, symbolic.sequence
     number = np.empty(len(sequence) + 1, np.int64)
     number[sequence] = np.arange(len(sequence))
@@ -118,9 +132,9 @@ def _entered(
     heights: NDArray[np.int64],
     panel: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], ...]:
-    """`entered`, `block`, `entry` and `diagonal` of fronts.
+    """Return `block_start`, `block_index`, `entry_offset` and `diagonal_block` of the fronts.
 
-    A block (v, u), with u not eliminated before v, goes to the column of v in its supernode's panel, to the row of u.
+    A block (v, u), with u not eliminated before v, is stored in the column of v in its supernode's panel, in row u.
     """
     n = len(pointers) - 1
     v = np.repeat(np.arange(n), np.diff(pointers))
@@ -141,7 +155,7 @@ def _entered(
 
 
 def _room(fronts: Fronts, sizes: NDArray[np.int64]) -> int:
-    """What each stack must hold at most, for updates of these sizes."""
+    """Return the required size of each stack for updates of the given sizes."""
     top, most = [0, 0], 0
     waiting: dict[int, int] = {}  # what waits for a supernode
     for k, (above, side, size) in enumerate(zip(fronts.parent, fronts.stack, sizes, strict=True)):

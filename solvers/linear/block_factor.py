@@ -1,11 +1,12 @@
-"""The multifrontal Cholesky factorisation (Duff and Reid 1983) of a matrix of 3 x 3 blocks, and a solve with it.
+"""Multifrontal Cholesky factorisation (Duff and Reid 1983) of a matrix of 3 x 3 blocks, and its triangular solves.
 
-A front is the dense matrix of a supernode's columns and of the rows below. Its columns are a panel of L in the end, the
-rest is an update of its parent (`solvers.linear.block_front`). Updates wait on two stacks that take turns from level to
-level of the tree, so that each is made where it waits, while those of its children are read.
+A front is the dense matrix of a supernode's columns and of the rows below. Its columns become a panel of L; the
+remainder is an update of its parent (`solvers.linalg.cholesky.block_front`). Updates are stored on two stacks that
+alternate between the levels of the tree. Each update is thus computed in its place, while those of its children are
+read.
 
-Rows begin at whole vectors: those of a panel's columns, and those below, which is all the padding there is. What lies
-above the diagonal is never read; on it are the inverses of L's entries.
+Two ranges of rows are aligned to whole vectors: those of a panel's columns, and those below. There is no other padding.
+Entries above the diagonal are never read; the diagonal contains the inverses of L's entries.
 """
 
 from __future__ import annotations
@@ -21,12 +22,20 @@ from solvers.vectors.block import ROWS, TILE, add, solve_columns, solve_rows
 
 
 class Fronts(NamedTuple):
-    """The structure of a factor over n vertices, s supernodes in a postorder.
+    """Structure of a factor with n vertices and s supernodes in postorder.
 
-    start (s + 1,), members: of each supernode the vertices of its columns, and then of the rows below; own (s,): how
-    many are columns; within: of each member below its place among the parent's; parent (s,), -1 for a root;
-    stack (s,): which of the two its update waits on; panel (s + 1,): where its panel begins; entered (s + 1,): the
-    first of its matrix's blocks in `block` (b,), which go to `entry` (b,); diagonal (n,): that of each vertex.
+    Attributes:
+        member_start: first member of each supernode, (s + 1,).
+        member_vertices: vertices of each supernode's columns, followed by those of the rows below.
+        num_columns: number of columns in vertices, (s,).
+        parent_position: of each member below, its position among the parent's members.
+        parent: (s,), -1 for a root.
+        stack_index: stack of each update, 0 or 1, (s,).
+        panel_start: first entry of each panel, (s + 1,).
+        block_start: first matrix block of each supernode, (s + 1,).
+        block_index: matrix blocks in the order of supernodes, (b,).
+        entry_offset: target of each of them in the panels, (b,).
+        diagonal_block: diagonal block of each vertex, (n,).
     """
 
     start: NDArray[np.int64]
@@ -43,11 +52,16 @@ class Fronts(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """What a factorisation writes to beside its panels, for n vertices and s supernodes.
+    """Scratch memory of a factorisation with n vertices and s supernodes.
 
-    front: a vector longer than the largest front; stacks (2, room): of updates, the numbers in use counted in filled
-    (2,); waiting (2, s + 1): supernodes on each, their count first; least (TILE,), triangles (., TILE, TILE) of so many
-    columns as are multiplied together, runs (2, n + 1).
+    Attributes:
+        front: one vector longer than the largest front.
+        stacks: updates, (2, size).
+        pending_supernodes: supernodes on each stack, preceded by their number, (2, s + 1).
+        stack_sizes: number of entries in use on each stack, (2,).
+        min_pivots: thresholds, (TILE_COLUMNS,).
+        triangles: factors of the tiles of a panel block, (., TILE_COLUMNS, TILE_COLUMNS).
+        runs: (2, n + 1).
     """
 
     front: NDArray[np.float64]
@@ -61,9 +75,17 @@ class Scratch(NamedTuple):
 
 @kernel
 def factorise(fronts, values, panels, x, scratch):
-    """Write L to `panels` from the blocks of the matrix, values (b, 3, 3); returns whether it is positive definite.
+    """Factorise a matrix of blocks, and write L to the panels.
 
-    x (n, 3), or nothing: overwritten with L^-1 x while each panel is at hand.
+    Args:
+        fronts: structure of the factor.
+        values: blocks (b, 3, 3).
+        panels: output.
+        x: right-hand sides (n, 3), or empty; overwritten with L^-1 x while each panel is in cache.
+        scratch: scratch memory.
+
+    Returns:
+        Whether the matrix is positive definite.
     """
     stacks, waiting, filled = scratch.stacks, scratch.waiting, scratch.filled
     filled[:] = 0
@@ -96,7 +118,7 @@ def factorise(fronts, values, panels, x, scratch):
 
 @inner
 def _enter(fronts, s, values, panels, stride):
-    """Put the matrix's blocks below the diagonal into the panel of a supernode."""
+    """Copy the matrix blocks below the diagonal to the panel of a supernode."""
     for k in range(fronts.entered[s], fronts.entered[s + 1]):
         e, at = fronts.block[k], fronts.entry[k]
         for j in range(3):
@@ -106,8 +128,7 @@ def _enter(fronts, s, values, panels, stride):
 
 @inner
 def _extend(fronts, c, source, at, to, runs):
-    """Add the update of a child c, which waits in `source`, to its parent's front, in runs of members that are
-    neighbours in both."""
+    """Add the update of a child, stored in `source`, to its parent's front, in runs of consecutive members."""
     own, first = to.own, fronts.start[c] + fronts.own[c]
     rows = fronts.start[c + 1] - first
     height = rows_of(3 * rows)
@@ -135,7 +156,7 @@ def _extend(fronts, c, source, at, to, runs):
 
 @inner
 def _add_runs(runs, run, count, b, source, start, target, column):
-    """Add the rows from member b on of a column."""
+    """Add the rows of a column, from member b on."""
     for k in range(run, count):
         a = max(b, runs[0, k])
         to = column + runs[1, k] + 3 * (a - runs[0, k])
@@ -144,7 +165,7 @@ def _add_runs(runs, run, count, b, source, start, target, column):
 
 @inner
 def _forwards(fronts, s, panels, x, front):
-    """The solve's pass over the panel of a supernode, children first."""
+    """Perform the forward substitution with the panel of a supernode; children precede parents."""
     first, own, below, head, stride = _sizes(fronts, s)
     front[: stride + ROWS] = 0.0
     _gather(x, fronts.members, first, own, front, 0)
@@ -163,9 +184,14 @@ def _forwards(fronts, s, panels, x, front):
 
 @kernel
 def solve(fronts, panels, x, front, begun):
-    """Overwrite x (n, 3) with H^-1 x; front: scratch, a vector longer than the largest front.
+    """Overwrite x with H^-1 x.
 
-    begun: whether `factorise` has done the first half.
+    Args:
+        fronts: structure of the factor.
+        panels: factor L.
+        x: right-hand sides (n, 3), overwritten.
+        front: scratch, one vector longer than the largest front.
+        forward_done: whether `factorise_blocks` has performed the forward substitution.
     """
     if not begun:
         for s in range(len(fronts.own)):
@@ -187,7 +213,7 @@ def solve(fronts, panels, x, front, begun):
 
 @inner
 def _sizes(fronts, s):
-    """The first member of a supernode, its columns and rows below in vertices, and where those rows begin and end."""
+    """Return first member, columns and rows below in vertices, and begin and end of those rows in the panel."""
     first, own = fronts.start[s], fronts.own[s]
     below, head = fronts.start[s + 1] - first - own, rows_of(3 * own)
     return first, own, below, head, head + rows_of(3 * below)

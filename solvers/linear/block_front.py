@@ -1,10 +1,10 @@
-"""A front of a multifrontal factorisation by itself: the elimination of its columns, and the update that is left.
+"""Partial factorisation of a frontal matrix: elimination of its columns, and the remaining update.
 
     L_JJ L_JJ' = F_JJ,   L_BJ = F_BJ L_JJ^-T,   update: F_BB - L_BJ L_BJ'
 
-Columns go from left to right, a tile at a time: the product of the columns to the left is subtracted, then the tile is
-divided by its own triangle. They are taken DEPTH at a time and rows HEIGHT at a time, so that what is multiplied again
-and again stays in the caches; an entry's products are subtracted in the order of columns, whatever these two are.
+Columns are processed from left to right, one tile at a time. The product of the columns to the left is subtracted, then
+the tile is divided by its own triangle. Blocks of PANEL_DEPTH columns and ROW_BLOCK_HEIGHT rows keep the factors of the
+products in cache. The products of an entry are subtracted in the order of columns, whatever these two sizes are.
 """
 
 from __future__ import annotations
@@ -18,15 +18,25 @@ from solvers.compiling import inner
 from solvers.vectors.block import ROWS, TILE, divide, factorise_corner, subtract_product
 
 DEPTH, HEIGHT = 192, 128
-"""Columns and rows of a panel that are multiplied together: whole tiles, and whole vectors; 192 KiB."""
+"""Columns and rows of a panel that are multiplied together: whole tiles and whole vectors, 192 KiB."""
 
 _NO_DIGITS = 4.0 * np.finfo(np.float64).eps
-"""A pivot this small beside its entry of the matrix is round-off."""
+"""Pivots below this fraction of the matrix entry are round-off."""
 
 
 class Dense(NamedTuple):
-    """The front of a supernode: own columns of vertices in panels, from base on, `stride` numbers each, rows below from
-    `head` on; the update of its parent, from begin on, in columns of `size`."""
+    """Frontal matrix of a supernode.
+
+    Attributes:
+        num_columns: number of columns in vertices.
+        below_offset: offset of the rows below in a panel column.
+        stride: entries from one panel column to the next.
+        panels: memory of the panels.
+        panel_offset: first entry of the panel.
+        update_buffer: memory of the parent's update.
+        update_offset: first entry of the update.
+        update_stride: entries from one update column to the next.
+    """
 
     own: int
     head: int
@@ -39,7 +49,7 @@ class Dense(NamedTuple):
 
 
 def whole(rows: Any) -> Any:
-    """The rows of so many whole vectors as hold these."""
+    """Return the number of rows, rounded up to whole vectors."""
     return (rows + ROWS - 1) // ROWS * ROWS
 
 
@@ -48,7 +58,16 @@ rows_of = inner(whole)
 
 @inner
 def eliminate(fronts, s, values, panels, stride, least, triangles):
-    """Factorise the panel of a supernode; False at a pivot that is not positive."""
+    """Factorise the panel of a supernode; return False if a pivot is not positive.
+
+    Args:
+        fronts: structure of the factor.
+        supernode: index of the supernode.
+        values: matrix blocks (b, 3, 3), for the scale of the pivots.
+        panels: panels, updated.
+        stride: entries from one panel column to the next.
+        min_pivots, triangles: scratch.
+    """
     base, width = fronts.panel[s], 3 * fronts.own[s]
     for first in range(0, width, DEPTH):
         end = min(first + DEPTH, width)
@@ -95,8 +114,10 @@ def update(to, columns):
 
 @inner
 def _product(panels, left, stride, depth, head, target, to, size, first, end):
-    """Subtract from columns of a matrix, from a first one to an end, what is on and below its diagonal of the product
-    of so many columns of a panel with themselves, whose rows begin at `head`."""
+    """Subtract the lower triangle of the product of panel columns with themselves from columns of a matrix.
+
+    head: offset of the rows that are multiplied; first, end: range of the matrix columns.
+    """
     for row in range(first // ROWS * ROWS, size, HEIGHT):
         stop = min(row + HEIGHT, size)
         for tile in range(first, min(end, stop), TILE):
@@ -109,7 +130,7 @@ def _product(panels, left, stride, depth, head, target, to, size, first, end):
 
 @inner
 def _subtract(panels, left, row, top, stride, depth, target, to, size, strips, columns):
-    """`subtract_product`, for six columns or three."""
+    """Call `subtract_tile_product` for six or three columns."""
     if columns == 6:
         subtract_product(panels, left + row, left + top, stride, depth, target, to, size, strips, 6)
     else:

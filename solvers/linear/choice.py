@@ -1,11 +1,11 @@
-"""Which linear solver for which Q: from exact counts of what each would need, before anything is factorised.
+"""Selection of the linear solver for Q, from exact operation counts before any factorisation.
 
-    inverse      n^2 entries, one product              up to SMALL vertices
-    supernodal   2 x panels read a solve, flops once   while that is less than what conjugate gradients read
-    cg           ITERATIONS x (matrix and vectors)     beyond, and where the factor does not fit
+    inverse      n^2 entries, one product              up to MAX_DENSE_VERTICES vertices
+    supernodal   2 x panels read per solve, flops once  while cheaper than the bytes that conjugate gradients read
+    cg           iterations x (matrix and vectors)     beyond, and where the factor does not fit
 
-The counts follow from the graph of Q, the limits were measured once: no clock is asked, so that the same Q gives the
-same choice wherever both fit. A system that fits nowhere is refused with the numbers.
+The counts follow from the graph of Q, and the constants were measured once. No timing takes place at run time, so that
+equal Q give equal choices wherever both solvers fit. If none fits in memory, the error states the counts.
 """
 
 from __future__ import annotations
@@ -31,40 +31,45 @@ Linear = Literal["auto", "inverse", "cholespy", "supernodal", "cg"]
 Precision = Literal["float64", "float32", "float16"]
 
 SMALL = 25
-"""Up to so many vertices the inverse is no slower: a whole step of 50 iterations takes as long at 9 and 25 vertices
-of a sheet, and 1.15 times as long as with the supernodal factor at 49, 1.5 times at 100."""
+"""Number of vertices up to which the inverse is no slower. A step of 50 iterations takes as long at 9 and 25 vertices
+of a sheet, 1.15 times as long as with the supernodal factor at 49, and 1.5 times at 100."""
 
 _SOLVES = 200
-"""In how many solves a factor has to pay for itself: 4 steps of 50 iterations. Sheets get a factor at any size, solids
-up to about 80 vertices a side; there it would take minutes, and its solve as long as conjugate gradients."""
+"""Solves within which a factor has to pay off: 4 steps of 50 iterations. Sheets get a factor at any size, solids up to
+about 80 vertices a side. Beyond, it would take minutes, and a solve would take as long as conjugate gradients."""
 
 _BYTES_PER_FLOP = 0.4
-"""A flop of the factorisation in bytes read by a solve: 35 Gflop/s beside 13 GB/s, on a solid of 60 vertices a side."""
+"""Bytes read by a solve that take as long as a flop: 35 Gflop/s and 13 GB/s, on a solid of 60 vertices a side."""
 
 _ITERATIONS = 10
-"""Of conjugate gradients to their tolerance: 9 to 11 on sheets and solids of 1e4 to 1e6 vertices."""
+"""Conjugate gradient iterations to the tolerance: 9 to 11 on sheets and solids of 1e4 to 1e6 vertices."""
 
 _LEFT, _POWERS = 0.9, 4
-"""The part of an error that a correction by a rounded factor may leave (at 1 corrections no longer converge); and by
-how many corrections it is estimated."""
+"""Fraction of an error that a correction by a rounded factor may leave (at 1 corrections no longer converge), and
+number of corrections by which it is estimated."""
 
 _ROUNDING: dict[Precision, float] = {"float64": 0.0, "float32": 0.5, "float16": 1.25}
-"""Memory for the rounded copy of a factor, in parts of its panels in float64, which are kept while it is made."""
+"""Memory of the rounded copy of a factor, relative to its float64 panels, which exist while the copy is made."""
 
 _BYTES_PER_VERTEX = 200
-"""Of the structure of a factor: 180 on a sheet of 512 vertices a side."""
+"""Bytes of the symbolic factor: 180 per vertex on a sheet of 512 vertices a side."""
 
 _BYTES_READ, _BYTES_KEPT = 70, 60
-"""Bytes for each entry of Q: what one iteration of multigrid reads, coarse levels included, and the most that is
-allocated while the levels are made. A vertex counts as four entries, for its vectors. The first is within a tenth of
-what sheets and solids of 1e6 vertices read; the second is above what was measured: 38 for sheets, 31 for solids, 50
-for chains and for stiffnesses over six decades."""
+"""Bytes per entry of Q: read by one multigrid iteration, coarse levels included, and allocated at most during setup. A
+vertex counts as four entries, for its vectors. The first is within a tenth of the measured value on sheets and solids
+of 1e6 vertices. The second is above the measured ones: 38 for sheets, 31 for solids, 50 for chains and for stiffnesses
+over six decades."""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What a solver needs: `memory` [bytes] at most while it is made; `traffic` [bytes] read by a solve, or the equal
-    of its share in the factorisation's flops; `words`: the counts behind them."""
+    """Estimated cost of a solver.
+
+    Attributes:
+        memory_bytes: peak memory during setup.
+        traffic_bytes: bytes read by a solve, plus its share of the factorisation's flops converted to bytes.
+        description: the underlying counts.
+    """
 
     memory: float
     traffic: float
@@ -72,7 +77,7 @@ class Estimate:
 
 
 class Choice(NamedTuple):
-    """A solver's name, why it was taken, and the structure of its factor where that was found on the way."""
+    """A solver's name, the reason for its selection, and its symbolic factor if that was computed."""
 
     name: str
     why: str
@@ -82,12 +87,24 @@ class Choice(NamedTuple):
 def factorise(
     Q: csr_array, linear: Linear = "auto", precision: Precision = "float64", *, memory: float | None = None
 ) -> tuple[Factor, str]:
-    """A solver of Q out = b and, in words, which one it is and why.
+    """Build a solver of Q x = b.
 
-    With a precision below float64 a solve is only that accurate, and is meant for corrections p - Q^-1 grad; cg is
-    accurate to float64 always. A factor whose rounding would lead such corrections uphill, because stiffnesses lie too
-    far apart, is made in float64. memory [bytes]: what the solver may take beside Q, by `solvers.memory` if left out.
-    Raises Unsupported where nothing fits, NotPositiveDefinite.
+    Below float64, a solve has only the accuracy of the precision and is meant for corrections p - Q^-1 grad; cg always
+    has float64 accuracy. If stiffnesses differ so much that rounded corrections would diverge, the factor is in
+    float64.
+
+    Args:
+        Q: symmetric positive definite matrix (n, n).
+        linear: name of the solver, or "auto".
+        precision: precision of the factor.
+        memory_limit: bytes that the solver may allocate in addition to Q; default by `solvers.memory`.
+
+    Returns:
+        The solver, and a description with the reason for its selection.
+
+    Raises:
+        Unsupported: if no solver fits in memory.
+        NotPositiveDefinite: if the matrix is not positive definite.
     """
     name, why, symbolic = choose(Q, linear, precision, memory=memory)
     found = _MAKERS[name](Q, precision, symbolic)
@@ -98,10 +115,10 @@ def factorise(
 
 
 def _left(Q: csr_array, factor: Factor) -> float:
-    """What a correction by a rounded factor R leaves of an error e at most, |e - R^-1 Q e|_Q / |e|_Q.
+    """Estimate the largest |e - R^-1 Q e|_Q / |e|_Q of corrections of an error e by a rounded factor R.
 
-    Below 1 each descends. A few powers of a random vector find what is more: then what is soft hides what is stiff in
-    the rounded numbers, or the rounding of what is stiff spills over into what is soft.
+    Below 1 each correction is a descent step. A few power iterations from a random vector detect larger values. They
+    occur if soft modes hide stiff ones in the rounded numbers, or if rounding of stiff modes perturbs soft ones.
     """
     e = np.random.default_rng(0).standard_normal((len(Q.indptr) - 1, 3))
     most, corrected, before = 0.0, np.empty_like(e), energy_norm(Q, e)
@@ -120,7 +137,17 @@ def _left(Q: csr_array, factor: Factor) -> float:
 def choose(
     Q: csr_array, linear: Linear = "auto", precision: Precision = "float64", *, memory: float | None = None
 ) -> Choice:
-    """The solver for Q; `linear` forces one. Raises Unsupported where it does not fit in `memory` [bytes]."""
+    """Select the solver for Q.
+
+    Args:
+        Q: symmetric positive definite matrix (n, n).
+        linear: name of the solver, or "auto".
+        precision: precision of the factor.
+        memory_limit: bytes that the solver may allocate; default by `solvers.memory`.
+
+    Raises:
+        Unsupported: if the solver is unknown, does not support the precision, or does not fit in memory.
+    """
     if linear not in get_args(Linear):
         raise Unsupported(f"linear: {linear!r} is not known; it is one of {', '.join(get_args(Linear))}")
     if linear == "cholespy" and precision != "float64":
@@ -153,7 +180,7 @@ def choose(
 
 
 def estimate(s: Symbolic, precision: Precision = "float64") -> Estimate:
-    """What a supernodal factor of this structure needs: its panels, and fronts and updates while it is made."""
+    """Estimate the cost of a supernodal factor: its panels, and fronts and updates during factorisation."""
     squares, entered = stored(s)
     half = 2 if precision == "float16" else 4
     panels = 8 * (squares + entered)
@@ -188,7 +215,7 @@ def _refuse(room: float, needs: dict[str, Estimate]) -> Choice:
 
 @kept()
 def _factorisation(parent, first, row_start, sequence):
-    """The most numbers in fronts and waiting updates at a time, and the flops of a multifrontal factorisation."""
+    """Return the peak number of entries in fronts and pending updates, and the flops, of the factorisation."""
     nodes = len(parent)
     waiting = np.zeros(nodes + 1, np.int64)  # of each supernode's children; the last is the roots'
     most, now, largest, flops = 0, 0, 0, 0.0

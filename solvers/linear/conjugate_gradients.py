@@ -1,9 +1,10 @@
-"""Conjugate gradients (Hestenes and Stiefel 1952) preconditioned by multigrid: for what no factor fits.
+"""Conjugate gradients (Hestenes and Stiefel 1952) preconditioned by multigrid, for systems whose factor does not fit.
 
     z = V-cycle(r),  p = z + beta p,  x += alpha p,  r -= alpha Q p
 
-Three right-hand sides are three iterations that share each pass over the matrices. z is near the error of x itself,
-whatever the stiffness of a row: the iteration ends when no entry of z is above TOLERANCE times the largest of x.
+Three right-hand sides are solved in lockstep and share each pass over the matrices. z approximates the error of x
+itself, whatever the stiffness of a row. The iteration ends when no entry of z exceeds CG_RTOL times the largest one of
+x.
 """
 
 from __future__ import annotations
@@ -20,22 +21,25 @@ from solvers.linear.multigrid import Multigrid
 from solvers.problem import NotPositiveDefinite, Positions, Unsupported
 
 TOLERANCE = 1e-12
-"""Positions that are told apart at 1e-9 of a scene's size stay so at a hundred sizes' distance from the origin, and
-after some iterations: each multiplies the number of digits by a constant, so that two more cost two in ten."""
+"""Positions distinct at 1e-9 of a scene's size remain so at a distance of a hundred sizes from the origin, and after
+some iterations. Each iteration gains a constant number of digits, so that two more digits cost two iterations in
+ten."""
 
 _LIMIT = 200
-"""Sheets and solids take about ten iterations at any size, springs over six decades thirty."""
+"""Sheets and solids take about ten iterations at any size, springs over six decades of stiffness thirty."""
 
 
 class ConjugateGradients:
-    """Q out = b by iteration from zero: the result depends on b alone, and on no thread count.
+    """Iterative solver of Q x = b that starts at zero: the result depends on b alone, and on no thread count.
 
-    nonzeros: entries of the matrices of all levels and of the coarsest one's factor; iterations: of the last solve;
-    changes: the largest entry of z before each of them, over that of x (iterations + 1, 3).
+    Attributes:
+        nonzeros: entries of the matrices of all levels and of the coarsest level's factor.
+        num_iterations: of the last solve.
+        correction_ratios: largest entry of z before each iteration, relative to that of x, (iterations + 1, 3).
     """
 
     def __init__(self, Q: csr_array) -> None:
-        """Raises NotPositiveDefinite, with the vertex at fault where one can be told."""
+        """Set up the preconditioner; raise NotPositiveDefinite, with the vertex at fault where it is known."""
         if not np.isfinite(Q.data).all():
             v = np.repeat(np.arange(len(Q.indptr) - 1), np.diff(Q.indptr))[~np.isfinite(Q.data)][0]
             raise NotPositiveDefinite(f"Q is not finite in row {v}: a stiffness, a mass or a pin weight there is not")
@@ -55,9 +59,15 @@ class ConjugateGradients:
         self._parts = np.zeros((-(-len(diagonal) // kernels.BLOCK), 9))
 
     def solve(self, b: Positions, out: Positions) -> None:
-        """Write Q^-1 b, shape (n, 3), to `out`; b is left as it is and must not be `out`.
+        """Write Q^-1 b to `out`.
 
-        Raises NotPositiveDefinite, with the vertex at fault, and Unsupported where the iteration does not end.
+        Args:
+            b: right-hand sides (n, 3), not modified.
+            out: solution (n, 3), not `b` itself.
+
+        Raises:
+            NotPositiveDefinite: with the vertex at fault.
+            Unsupported: if the iteration does not converge.
         """
         columns = _Columns(self._Q, self._multigrid, self._vectors, self._parts, b)
         self.iterations, ended = columns.iterate(columns.precondition(), _LIMIT)
@@ -76,10 +86,10 @@ class ConjugateGradients:
 
 
 class _Columns(Iteration):
-    """One iteration a column of b, (n, 3): x, r, p and the image of p, (n, 4), in float64; z in float32.
+    """State of the iteration, one per column of b (n, 3): x, r, p and Q p, (n, 4) in float64; z in float32.
 
-    changes: the largest entry of z before each iteration, over that of x; at_fault: the vertex that moves most where
-    a curvature is negative.
+    correction_ratios: largest entry of z before each iteration, relative to that of x; failing_vertex: the vertex with
+    the largest component where a curvature is negative.
     """
 
     def __init__(
@@ -93,7 +103,7 @@ class _Columns(Iteration):
         self._size, self.changes, self.at_fault = 0.0, list[NDArray[np.float64]](), -1
 
     def precondition(self) -> NDArray[np.float64]:
-        """z, and r'z."""
+        """Compute z, and return r'z."""
         self._z, parts = self._multigrid.apply(), self._parts
         kernels.compare(self._r, self._z, parts)
         self._change = parts[:, 3:6].max(axis=0, initial=0.0)
@@ -101,34 +111,34 @@ class _Columns(Iteration):
         return parts[:, :3].sum(axis=0)
 
     def turn(self, product: NDArray[np.float64], before: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See Iteration."""
+        """Update the search direction p; return p'Qp."""
         kernels.turn(_ratio(product, before), self._z, self._p)
         kernels.multiply_and_dot(*self._Q, self._p, self._image, self._parts)
         return self._parts[:, :3].sum(axis=0)
 
     def go(self, product: NDArray[np.float64], curvature: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See Iteration."""
+        """Update x and r, and apply the preconditioner; return r'z."""
         parts, rounded = self._parts, self._multigrid.right_hand_side
         kernels.advance(_ratio(product, curvature), self._p, self._image, self.x, self._r, rounded, parts)
         self._size = float(parts[:, :3].max(initial=0.0))
         return self.precondition()
 
     def convex(self, curvature: NDArray[np.float64]) -> bool:
-        """See Iteration."""
+        """Return whether no curvature is negative."""
         wrong = curvature < 0.0
         if wrong.any():
             self.at_fault = int(np.abs(self._p[:, :3][:, wrong]).max(axis=1).argmax())
         return not wrong.any()
 
     def near(self, product: NDArray[np.float64]) -> bool:
-        """See Iteration; nor does it go on from what is not finite."""
+        """Return whether the iteration ends: converged, or not finite."""
         return self.settled() or not np.isfinite(product).all()
 
     def settled(self) -> bool:
-        """Whether no entry of x changes any more."""
+        """Return whether the corrections of all entries of x are within the tolerance."""
         return bool((self._change <= TOLERANCE * self._size).all())
 
 
 def _ratio(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """a / b, and 0 where b is: a right-hand side that is done, or zero, stays as it is."""
+    """Return a / b, and 0 where b is 0: a converged or zero right-hand side remains constant."""
     return np.divide(a, b, out=np.zeros(3), where=b > 0.0)

@@ -1,7 +1,7 @@
-"""Factorisations of the constant matrix Q, done once and then solved with three right-hand sides at a time.
+"""Direct solvers of the constant matrix Q, factorised once and solved with three right-hand sides at a time.
 
-Each is a class made from Q, with `solve(b, out)` (Q out = b, both (n, 3), C-contiguous) and `nonzeros`, the stored
-entries of its factor (None where the library does not tell).
+Each class is constructed from Q. `solve(b, out)` solves Q out = b, both (n, 3) and C-contiguous; `nonzeros` is the
+number of stored entries of the factor, None where the library does not provide it.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ _REASON = (
 
 
 class Factor(Protocol):
-    """A factorised matrix."""
+    """Interface of a linear solver of a fixed matrix."""
 
     nonzeros: int | None
 
     def solve(self, b: Positions, out: Positions) -> None:
-        """Write Q^-1 b, shape (n, 3), to `out`; b is left as it is and must not be `out`."""
+        """Write Q^-1 b to `out`, (n, 3) each; b is not modified and must not be `out`."""
         ...
 
 
 class DenseCholesky:
-    """LAPACK's Cholesky factorisation of a dense Q."""
+    """Dense Cholesky factorisation of Q by LAPACK."""
 
     def __init__(self, Q: np.ndarray) -> None:
-        """Raises NotPositiveDefinite."""
+        """Factorise Q (n, n); raise NotPositiveDefinite if a pivot is not positive."""
         try:
             self._factor = cho_factor(Q, lower=True)
         except (LinAlgError, ValueError) as error:
@@ -43,15 +43,15 @@ class DenseCholesky:
         self.nonzeros: int | None = len(Q) * (len(Q) + 1) // 2
 
     def solve(self, b: Positions, out: Positions) -> None:
-        """Q out = b."""
+        """Write Q^-1 b to `out`, (n, 3) each."""
         out[:] = cho_solve(self._factor, b, check_finite=False)
 
 
 class SparseLU:
-    """SuperLU on a symmetric matrix: a minimum degree order of Q'+Q, pivots on the diagonal."""
+    """SuperLU factorisation of a symmetric Q: minimum degree order of Q'+Q, diagonal pivots."""
 
     def __init__(self, Q: csr_array) -> None:
-        """Raises NotPositiveDefinite."""
+        """Factorise Q (n, n); raise NotPositiveDefinite if a pivot is not positive."""
         try:
             self._factor = splu(
                 csc_array(Q),
@@ -61,23 +61,23 @@ class SparseLU:
             )
         except RuntimeError as error:
             raise NotPositiveDefinite(_REASON) from error
-        # With pivots on the diagonal Q = P'LUP is L D L', so Q is positive definite if D is positive.
+        # With diagonal pivots Q = P'LUP is L D L', so that Q is positive definite if D is positive.
         if not (self._factor.U.diagonal() > 0.0).all():
             raise NotPositiveDefinite(_REASON)
         self.nonzeros: int | None = self._factor.L.nnz
 
     def solve(self, b: Positions, out: Positions) -> None:
-        """Q out = b."""
+        """Write Q^-1 b to `out`, (n, 3) each."""
         out[:] = self._factor.solve(b)
 
 
 class SimplicialCholesky:
-    """CHOLMOD's simplicial Cholesky factorisation, through cholespy, which has wheels for x86-64 alone."""
+    """Simplicial Cholesky factorisation by CHOLMOD through cholespy, which has wheels for x86-64 only."""
 
     nonzeros: int | None = None
 
     def __init__(self, Q: csr_array) -> None:
-        """Raises Unsupported where cholespy is not installed, NotPositiveDefinite."""
+        """Factorise Q (n, n); raise Unsupported without cholespy, NotPositiveDefinite if a pivot is not positive."""
         try:
             from cholespy import CholeskySolverD, MatrixType  # pyright: ignore[reportAttributeAccessIssue]
         except ImportError as error:
@@ -93,5 +93,5 @@ class SimplicialCholesky:
             raise NotPositiveDefinite(_REASON) from error
 
     def solve(self, b: Positions, out: Positions) -> None:
-        """Q out = b."""
+        """Write Q^-1 b to `out`, (n, 3) each."""
         self._factor.solve(b, out)

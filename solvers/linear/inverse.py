@@ -1,9 +1,9 @@
-"""The inverse of a small Q, kept whole: a solve is then one dense product, without a chain of dependent steps.
+"""Dense inverse of a small Q: a solve is one dense product, without a chain of dependent operations.
 
     x = Q^-1 b,   Q^-1 = L^-T L^-1
 
-For springs Q is an M-matrix, so that its inverse has no negative entry and the product of two roundings is all that
-is lost.
+For springs Q is an M-matrix. Its inverse has no negative entry, so that the product loses accuracy by two roundings
+only.
 """
 
 from __future__ import annotations
@@ -18,19 +18,29 @@ from solvers.compiling import kept
 from solvers.problem import NotPositiveDefinite, Positions
 
 _ROWS = 4
-"""Rows of the inverse that are done together: 12 sums side by side hide the latency of an addition."""
+"""Rows of the inverse that are processed together: 12 independent sums hide the latency of an addition."""
 
 
 class Inverse:
-    """The dense inverse of a symmetric positive definite Q; n^2 entries, so for small n.
+    """Dense inverse of a symmetric positive definite Q, with n^2 entries and therefore for small n.
 
-    nonzeros: entries of one triangle; panel_bytes: what a solve reads of the inverse; flops: a solve's additions and
-    multiplications, padding included; inverse: padded with zeros. `precision` is that of the stored inverse and of
-    the product.
+    Attributes:
+        nonzeros: entries of one triangle.
+        factor_bytes: bytes of the inverse that a solve reads.
+        flops: additions and multiplications of a solve, including padding.
+        inverse_matrix: padded with zeros.
     """
 
     def __init__(self, Q: csr_array, *, precision: Literal["float64", "float32"] = "float64") -> None:
-        """Raises NotPositiveDefinite, with the vertex at fault."""
+        """Invert Q.
+
+        Args:
+            Q: symmetric positive definite matrix (n, n).
+            precision: of the stored inverse and of the product.
+
+        Raises:
+            NotPositiveDefinite: with the vertex at fault.
+        """
         n = len(Q.indptr) - 1
         dense = np.asfortranarray(Q.toarray())
         if not np.isfinite(dense).all():
@@ -56,14 +66,21 @@ class Inverse:
         self.inverse, self._columns = stored, np.zeros((3, padded), precision)
 
     def solve(self, b: Positions, out: Positions) -> None:
-        """Write Q^-1 b, shape (n, 3), to `out`; b is left as it is and must not be `out`."""
+        """Write Q^-1 b to `out`, (n, 3) each; b is not modified and must not be `out`."""
         multiply(self.inverse, self._columns, b, out)
 
 
-# Sums may be reordered, which vectors need; NaN and infinity keep their meaning.
+# Reordering of sums permits vectorisation; NaN and infinity keep their meaning.
 @kept(fastmath={"contract", "reassoc", "nsz"})
 def multiply(inverse, columns, b, out):
-    """out = inverse b; `columns` (3, padded n) is scratch whose padding is zero."""
+    """Compute out = inverse b.
+
+    Args:
+        inverse: padded inverse matrix.
+        columns: scratch (3, padded n) whose padding is zero.
+        b: right-hand sides (n, 3).
+        out: product (n, 3).
+    """
     n = len(b)
     for i in range(n):
         columns[0, i], columns[1, i], columns[2, i] = b[i, 0], b[i, 1], b[i, 2]

@@ -1,10 +1,10 @@
-"""Preconditioned conjugate gradients (Hestenes and Stiefel 1952), once: as Python, and compiled into kernels.
+"""Preconditioned conjugate gradients (Hestenes and Stiefel 1952), written once for Python and for compiled kernels.
 
-    p = z + (r'z / r'z before) p      x += t p,   r -= t A p,   t = r'z / p'Ap      z = M^-1 r
+    p = z + (r'z / previous r'z) p      x += t p,   r -= t A p,   t = r'z / p'Ap      z = M^-1 r
 
-`over` makes the iteration of what is done to a state, which knows A and M^-1; `compiled_over` the same one for kernels,
-and `Iteration` is one whose state is an object of Python. Several right-hand sides are several iterations side by side:
-then the scalar products are arrays.
+`make_cg_loop` builds the iteration from operations on a state, which contains A and M^-1. `compile_cg_loop` builds it
+for kernels. `ConjugateGradientIteration` is a base class for states that are Python objects. Several right-hand sides
+are iterated in lockstep; the scalar products are then arrays.
 """
 
 from __future__ import annotations
@@ -18,18 +18,23 @@ import numpy as np
 from solvers.compiling import inner_closure
 
 ITERATIONS, NEAR, CURVED = range(3)
-"""What ended an iteration: the limit, that x is near enough, or a curvature p'Ap that A should not have."""
+"""Reasons for the end of an iteration: the limit, convergence, or a curvature p'Ap that a definite A cannot have."""
 
 
 def over(
     turn: Callable[..., Any], go: Callable[..., Any], convex: Callable[..., Any], near: Callable[..., Any]
 ) -> Callable[..., Any]:
-    """The iteration over what is done to a state of which r and z are known.
+    """Build the iteration from operations on a state with known r and z.
 
-    turn(state, product, before): p = z + product/before p, and p'Ap; at first `before` is infinite, and p finite.
-    go(state, product, curvature): x and r by product/curvature p and A p, then z; r'z. convex(state, curvature):
-    whether it goes on along p. near(state, product): whether x will do.
-    iterate(state, product, most): from r'z, how many iterations were done, at most so many, and what ended them.
+    Args:
+        update_direction: (state, product, previous_product) -> p'Ap; sets p = z + product/previous_product p. At first
+            the previous product is infinite, and p finite.
+        update_iterate: (state, product, curvature) -> r'z; changes x and r by product/curvature times p and A p, then
+        z. is_convex: (state, curvature) -> whether the iteration may continue along p.
+        is_converged: (state, product) -> whether x is accurate enough.
+
+    Returns:
+        Function (state, product, max_iterations) -> number of iterations and the reason for their end; product is r'z.
     """
 
     def iterate(state: Any, product: Any, most: int) -> tuple[int, int]:
@@ -48,31 +53,31 @@ def over(
 
 
 def compiled_over(*functions: Callable[..., Any]) -> Any:
-    """The same for kernels, over inner ones."""
+    """Build the iteration for kernels, from inlined kernels."""
     return inner_closure(over(*functions))
 
 
 class Iteration(ABC):
-    """A state of which r and z are known; see `over`."""
+    """Base class of a state with known r and z (see `make_cg_loop`)."""
 
     @abstractmethod
     def turn(self, product: Any, before: Any) -> Any:
-        """p, and p'Ap."""
+        """Update p, and return p'Ap."""
 
     @abstractmethod
     def go(self, product: Any, curvature: Any) -> Any:
-        """x, r and z, and r'z."""
+        """Update x, r and z, and return r'z."""
 
     def convex(self, curvature: Any) -> bool:
-        """Whether it goes on along p; always where A is known to be positive definite."""
+        """Return whether the iteration may continue along p; always if A is known to be positive definite."""
         return True
 
     @abstractmethod
     def near(self, product: Any) -> bool:
-        """Whether x will do."""
+        """Return whether x is accurate enough."""
 
     def iterate(self, product: Any, most: int) -> tuple[int, int]:
-        """See `over`."""
+        """Iterate from the product r'z; return the number of iterations and the reason for their end."""
         return _iterate(self, product, most)
 
 

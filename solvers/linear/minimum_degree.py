@@ -1,7 +1,7 @@
-"""Minimum degree on a small piece of a graph, the vertices around it (its halo) counted but not eliminated.
+"""Minimum degree ordering of a small piece of a graph; its surrounding vertices (halo) count but are not eliminated.
 
-The elimination graph is kept as a matrix of bits, a row a vertex of the piece: eliminating v joins v's row to those of
-its neighbours. Exact degrees, no quotient graph: at a hundred vertices that is the faster way.
+The elimination graph is stored as a bit matrix with one row per vertex of the piece. Eliminating v merges v's row into
+those of its neighbours. Degrees are exact, without a quotient graph, which is faster at a hundred vertices.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from solvers.compiling import kept, part
 
 @part
 def _bits(word):
-    """The number of ones in a 64-bit word (Warren, Hacker's Delight, section 5-1)."""
+    """Return the number of ones in a 64-bit word (Warren, Hacker's Delight, section 5-1)."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
     word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
@@ -22,7 +22,13 @@ def _bits(word):
 
 @part
 def of_piece(pointers, neighbours, piece, local):
-    """Sort `piece` into minimum degree order. `local` (n,) is -1 on entry and on return."""
+    """Sort a piece of a graph into minimum degree order.
+
+    Args:
+        pointers, neighbours: graph in CSR form.
+        piece: vertices of the piece, reordered in place.
+        local: scratch (n,), -1 on entry and on return.
+    """
     size = len(piece)
     members = size
     halo = []
@@ -78,5 +84,5 @@ def of_piece(pointers, neighbours, piece, local):
 
 @kept()
 def minimum_degree(pointers, neighbours, order):
-    """Sort `order`, all vertices of a graph, into minimum degree order."""
+    """Sort `order`, all vertices of a graph in CSR form, into minimum degree order."""
     of_piece(pointers, neighbours, order, np.full(len(order), -1, np.int32))

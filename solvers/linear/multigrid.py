@@ -1,11 +1,11 @@
-"""Multigrid by smoothed aggregation (Vanek, Mandel and Brezina 1996), as a preconditioner for scalar networks.
+"""Smoothed aggregation multigrid (Vanek, Mandel and Brezina 1996), as a preconditioner for scalar networks.
 
-    T  vertices to their aggregates, constant in each      P = (I - 4/(3 l) D^-1 A) T,  l the largest of D^-1 A
+    T  vertices to their aggregates, constant in each      P = (I - 4/(3 l) D^-1 A) T,  l = lambda_max(D^-1 A)
     A_coarse = P'AP                                        z = V-cycle(r), a fixed symmetric operator near Q^-1
 
-Smoothing is a Chebyshev polynomial in D^-1 A (Adams et al. 2003), the same before and after the coarse correction:
-matrix products alone, so that the order of summation never depends on threads. The cycle is kept and done in float32,
-which its bytes pay for; accuracy is the business of the iteration around it.
+The smoother is a Chebyshev polynomial in D^-1 A (Adams et al. 2003), the same before and after the coarse correction.
+It consists of matrix products only, so that the order of summation never depends on threads. The cycle is stored and
+evaluated in float32, since memory traffic limits it; the surrounding iteration provides the accuracy.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from solvers.linear.supernodal import Supernodal
 from solvers.problem import NotPositiveDefinite
 
 _COARSEST = 1500
-"""A level of so few vertices is factorised: its solve then costs less than 2 % of a cycle."""
+"""Size up to which a level is factorised: its solve then costs less than 2 % of a cycle."""
 
 _STRENGTH, _DOMINANCE = 0.25, 10.0
 _DEGREE = 2
 _LOWEST = 0.25
-"""Smoothing damps the part of the spectrum of D^-1 A above this share of its largest eigenvalue."""
+"""The smoother damps the eigenvalues of D^-1 A above this fraction of the largest one."""
 
 
 class CompressedRows(NamedTuple):
-    """A sparse matrix in compressed rows, entries in float32."""
+    """A sparse matrix in compressed rows, with float32 entries."""
 
     pointers: NDArray[np.int64]
     columns: NDArray[np.int32]
@@ -40,7 +40,7 @@ class CompressedRows(NamedTuple):
 
     @classmethod
     def of(cls, matrix: csr_array) -> CompressedRows:
-        """The same matrix, rounded."""
+        """Convert a matrix, with its entries rounded."""
         return cls(
             np.asarray(matrix.indptr, np.int64), np.asarray(matrix.indices, np.int32), matrix.data.astype(np.float32)
         )
@@ -48,7 +48,7 @@ class CompressedRows(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """A level above the coarsest: its matrix, how it is smoothed, how it leads to the next, and its vectors (n, 4)."""
+    """A level above the coarsest: matrix, prolongation P, restriction R, smoother, and vectors (n, 4)."""
 
     A: CompressedRows
     P: CompressedRows
@@ -62,13 +62,15 @@ class Level:
 
 
 class Multigrid:
-    """A V-cycle for Q; `apply(r)` is linear, symmetric and positive definite in r up to rounding.
+    """A V-cycle for Q; z is linear, symmetric and positive definite in r up to rounding.
 
-    nonzeros: entries of all levels' matrices, the coarsest's factor included; sizes: vertices of each level.
+    Attributes:
+        nonzeros: entries of all levels' matrices, including the coarsest level's factor.
+        level_sizes: vertices of each level.
     """
 
     def __init__(self, Q: csr_array) -> None:
-        """Raises NotPositiveDefinite where the coarsest level is not."""
+        """Build all levels; raise NotPositiveDefinite if the coarsest one is not positive definite."""
         self._levels: list[Level] = []
         self.sizes = [len(Q.indptr) - 1]
         self.nonzeros = 0
@@ -95,11 +97,11 @@ class Multigrid:
 
     @property
     def right_hand_side(self) -> NDArray[np.float32]:
-        """Where `apply` reads r from, (n, 4), the last column zero."""
+        """Input r of `apply_cycle`, (n, 4), with a zero last column."""
         return self._levels[0].b if self._levels else self._coarsest[0]
 
     def apply(self) -> NDArray[np.float32]:
-        """z near Q^-1 r, (n, 4); it is overwritten by the next."""
+        """Return z near Q^-1 r, (n, 4); the next call overwrites it."""
         return self._cycle(0)
 
     def _cycle(self, depth: int) -> NDArray[np.float32]:
@@ -127,7 +129,7 @@ class Multigrid:
 
 
 def _coarsen(A: csr_array) -> tuple[Level, csr_array]:
-    """A level and the matrix of the next."""
+    """Return a level and the matrix of the next one."""
     n = len(A.indptr) - 1
     of, count = kernels.aggregate(A.indptr, A.indices, A.data, _STRENGTH, _DOMINANCE)
     diagonal = np.asarray(A.diagonal(), np.float64)
@@ -136,7 +138,7 @@ def _coarsen(A: csr_array) -> tuple[Level, csr_array]:
     start = np.concatenate([[0], np.cumsum(of >= 0)])
     T = csr_array((np.ones(len(inside)), of[inside], start.astype(A.indptr.dtype)), shape=(n, count))
     F = csr_array((kernels.filtered(A.indptr, A.indices, A.data, _STRENGTH), A.indices, A.indptr), shape=A.shape)
-    # Lumping leaves a positive diagonal to springs; to other matrices, this does.
+    # For springs, lumping leaves a positive diagonal; this bound ensures it for other matrices.
     D = dia_array((1.0 / np.maximum(F.diagonal(), 0.05 * diagonal)[None, :], np.array([0])), shape=(n, n))
     P = matrices.without_zeros(csr_array(T - (4.0 / 3.0 / largest) * (D @ (F @ T))))
     R = csr_array(P.T)
@@ -154,7 +156,15 @@ def _coarsen(A: csr_array) -> tuple[Level, csr_array]:
 
 
 def largest_eigenvalue(A: csr_array, diagonal: NDArray[np.float64]) -> float:
-    """The largest eigenvalue of D^-1 A: the power method's, and no more than Gershgorin's bound; 0 without rows."""
+    """Estimate the largest eigenvalue of D^-1 A.
+
+    Args:
+        A: matrix (n, n).
+        diagonal: D, (n,).
+
+    Returns:
+        Estimate by the power method, at most Gershgorin's bound; 0 without rows.
+    """
     if not len(diagonal):
         return 0.0
     bound = float(((abs(A) @ np.ones(len(diagonal))) / diagonal).max())
@@ -166,7 +176,7 @@ def largest_eigenvalue(A: csr_array, diagonal: NDArray[np.float64]) -> float:
 
 
 def chebyshev_weights(largest: float) -> list[tuple[np.float32, np.float32]]:
-    """(keep, scale) of each step of the Chebyshev iteration for eigenvalues of _LOWEST to 1 times `largest`."""
+    """Return (momentum, scale) of each Chebyshev step, for eigenvalues from _SMOOTHED_FRACTION to 1 times `largest`."""
     centre, half = 0.5 * (1.0 + _LOWEST) * largest, 0.5 * (1.0 - _LOWEST) * largest
     rho = half / centre
     weights = [(0.0, 1.0 / centre)]

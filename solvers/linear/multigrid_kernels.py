@@ -1,8 +1,8 @@
-"""The passes of multigrid and of conjugate gradients over sparse rows and vectors of four numbers a vertex.
+"""Kernels of multigrid and conjugate gradients, for sparse rows and vectors of four numbers per vertex.
 
-Each row is summed by itself, and sums over all rows go by blocks of a fixed size whose parts are added in order: the
-bits do not depend on the number of threads. Vectors are (n, 4), three coordinates and a zero, so that what a matrix
-entry multiplies is one load.
+Each row is summed separately. Sums over all rows are taken in blocks of a fixed size, whose partial sums are added in
+order, so that the result is bitwise independent of the number of threads. Vectors are (n, 4), three coordinates and a
+zero, so that one load gives the operand of a matrix entry.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from solvers.compiling import kept
 from solvers.vectors.rows import gather
 
 BLOCK = 512
-"""Rows that a thread does at a time."""
+"""Rows that a thread processes at a time."""
 
 
 @kept(parallel=True)
 def multiply(pointers, columns, values, x, out):
-    """out = A x."""
+    """Compute out = A x; A in compressed rows, x and out (n, 4)."""
     rows = len(out)
     for block in prange((rows + BLOCK - 1) // BLOCK):
         for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
@@ -29,7 +29,7 @@ def multiply(pointers, columns, values, x, out):
 
 @kept(parallel=True)
 def add_product(pointers, columns, values, x, out):
-    """out += A x."""
+    """Compute out += A x; A in compressed rows, x and out (n, 4)."""
     rows = len(out)
     for block in prange((rows + BLOCK - 1) // BLOCK):
         for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
@@ -40,7 +40,7 @@ def add_product(pointers, columns, values, x, out):
 
 @kept(parallel=True)
 def residual(pointers, columns, values, b, x, out):
-    """out = b - A x."""
+    """Compute out = b - A x; A in compressed rows, vectors (n, 4)."""
     rows = len(out)
     for block in prange((rows + BLOCK - 1) // BLOCK):
         for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
@@ -51,7 +51,7 @@ def residual(pointers, columns, values, b, x, out):
 
 @kept(parallel=True)
 def smooth_first(inverse_diagonal, scale, b, step, x):
-    """step = x = scale D^-1 b: the first step of smoothing from x = 0."""
+    """Compute step = x = scale D^-1 b, the first Chebyshev step from x = 0."""
     rows = len(x)
     for block in prange((rows + BLOCK - 1) // BLOCK):
         for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
@@ -63,7 +63,7 @@ def smooth_first(inverse_diagonal, scale, b, step, x):
 
 @kept(parallel=True)
 def smooth(pointers, columns, values, inverse_diagonal, keep, scale, b, step, x, out):
-    """step = keep step + scale D^-1 (b - A x);  out = x + step."""
+    """Compute step = momentum step + scale D^-1 (b - A x) and out = x + step."""
     rows = len(out)
     for block in prange((rows + BLOCK - 1) // BLOCK):
         for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
@@ -77,7 +77,7 @@ def smooth(pointers, columns, values, inverse_diagonal, keep, scale, b, step, x,
 
 @kept(parallel=True)
 def multiply_and_dot(pointers, columns, values, p, out, parts):
-    """out = A p; parts[:, :3]: p'out of each block of rows."""
+    """Compute out = A p, and partial_sums[:, :3] = p'out of each block of rows."""
     rows = len(out)
     for block in prange((rows + BLOCK - 1) // BLOCK):
         t0, t1, t2 = 0.0, 0.0, 0.0
@@ -92,7 +92,15 @@ def multiply_and_dot(pointers, columns, values, p, out, parts):
 
 @kept(parallel=True)
 def advance(alpha, p, image, x, r, rounded, parts):
-    """x += alpha p;  r -= alpha image;  rounded = r, in float32;  parts[:, :3]: the largest |x| of each block."""
+    """Update x += alpha p and r -= alpha image; write r in float32, and the largest |x| of each block of rows.
+
+    Args:
+        alpha: step sizes (3,).
+        p, image: search direction and A p, (n, 4).
+        x, r: iterate and residual, (n, 4), updated.
+        rounded: r in float32, (n, 4), overwritten.
+        partial_sums: columns 0 to 2 get the largest |x| of each block.
+    """
     rows = len(x)
     for block in prange((rows + BLOCK - 1) // BLOCK):
         for c in range(3):
@@ -107,7 +115,7 @@ def advance(alpha, p, image, x, r, rounded, parts):
 
 @kept(parallel=True)
 def compare(r, z, parts):
-    """parts[:, :6]: r'z of each block of rows, and its largest |z|, by column."""
+    """Write r'z of each block of rows, and its largest |z|, to partial_sums[:, :6], by column."""
     rows = len(r)
     for block in prange((rows + BLOCK - 1) // BLOCK):
         for c in range(3):
@@ -120,7 +128,7 @@ def compare(r, z, parts):
 
 @kept(parallel=True)
 def turn(beta, z, p):
-    """p = z + beta p."""
+    """Compute p = z + beta p."""
     rows = len(p)
     for block in prange((rows + BLOCK - 1) // BLOCK):
         for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
@@ -130,10 +138,16 @@ def turn(beta, z, p):
 
 @kept()
 def aggregate(pointers, columns, values, strength, dominance):
-    """The aggregate of each vertex, -1 for none, and their number (Vanek, Mandel and Brezina 1996).
+    """Build the aggregates of a graph (Vanek, Mandel and Brezina 1996).
 
-    Neighbours are strong whose entry is at least `strength` times the largest of the row; a vertex whose diagonal is
-    over `dominance` times the sum of its other entries is in no aggregate: smoothing alone determines it.
+    Args:
+        pointers, columns, values: matrix in compressed rows.
+        strength: an entry is a strong connection from this fraction of the largest one in its row.
+        dominance: a vertex whose diagonal exceeds this times the sum of its other entries is in no aggregate, since
+            smoothing alone determines it.
+
+    Returns:
+        The aggregate of each vertex, -1 for none, and their number.
     """
     n = len(pointers) - 1
     largest = np.zeros(n)
@@ -190,7 +204,12 @@ def aggregate(pointers, columns, values, strength, dominance):
 
 @kept()
 def filtered(pointers, columns, values, strength):
-    """The entries of A (nnz,) with those off the diagonal that are not strong in their row added to the diagonal."""
+    """Return the entries of A (nnz,), with weak off-diagonal ones lumped into the diagonal.
+
+    Args:
+        pointers, columns, values: matrix in compressed rows.
+        strength: entries below this fraction of the largest one in their row are weak.
+    """
     out = values.copy()
     for i in range(len(pointers) - 1):
         largest, lumped, own = 0.0, 0.0, -1
@@ -209,7 +228,13 @@ def filtered(pointers, columns, values, strength):
 
 @kept()
 def gauss_seidel(pointers, columns, values, x, sweeps):
-    """So many sweeps of Gauss-Seidel's method for A x = 0 from x (n, q), which takes the result."""
+    """Perform Gauss-Seidel sweeps for A x = 0 on x (n, q) in place.
+
+    Args:
+        pointers, columns, values: matrix in compressed rows.
+        x: initial vectors (n, q), overwritten with the result.
+        num_sweeps: number of sweeps.
+    """
     n, count = x.shape
     for _ in range(sweeps):
         for i in range(n):

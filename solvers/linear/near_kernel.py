@@ -1,12 +1,13 @@
-"""Multigrid by aggregation of several near-kernel components, as a preconditioner (MGPBD: Li et al. 2025).
+"""Aggregation multigrid with several near-null-space vectors, as a preconditioner (MGPBD: Li et al. 2025).
 
-    B  near-kernel components (n, q): what sweeps of Gauss-Seidel's method for A x = 0 leave of random ones
-    P  B over each aggregate, made orthonormal: B = P B_coarse (Vanek, Mandel and Brezina 1996)
+    B  near null space (n, q): random vectors after sweeps of Gauss-Seidel's method for A x = 0
+    P  B over each aggregate, orthonormalised: B = P B_coarse (Vanek, Mandel and Brezina 1996)
     A_coarse = P'AP            z = V-cycle(r), a fixed symmetric operator near A^-1
 
-P is not smoothed, so that coarse matrices stay sparse. It depends on how A's entries lie and on what A hardly resists,
-which change little as A does: so it serves many matrices of one pattern (`Prolongation`), each by its own V-cycle
-(`Cycle`). It helps where few vectors are hardly resisted. Sums are taken in one order, whatever the number of threads.
+P is not smoothed, so that coarse matrices stay sparse. It depends on the pattern of A and on its slow-to-converge
+modes, which change little as A does. One `ProlongationHierarchy` therefore serves many matrices of one pattern, each
+with its own `VCycle`. The method helps if few modes converge slowly. Sums are taken in one order, whatever the number
+of threads.
 """
 
 from __future__ import annotations
@@ -25,43 +26,52 @@ from solvers.linear.multigrid_kernels import aggregate, gauss_seidel
 Vector = NDArray[np.float64]
 
 _COARSEST, _FULL = 400, 4000
-"""A level of so few unknowns is factorised, densely; so is one of at most _FULL whose matrix is full to a quarter."""
+"""Sizes up to which a level is factorised densely; the second one if its matrix has a quarter of all entries."""
 
 _SLOW = 0.7
-"""A level that would be larger than this part of the one above is not worth making."""
+"""Size relative to the level above, beyond which a coarser level is not worthwhile."""
 
 _WIDE = 0.5
-"""Aggregates are made until each, with its components, has no more than this part of its unknowns left."""
+"""Aggregates are merged until their vectors number at most this fraction of the unknowns."""
 
 _STRENGTH, _DOMINANCE = 0.25, 10.0
 _SHIFT = 1e-12
-"""Of its diagonal, what the coarsest matrix is raised by: then round-off leaves it a factor."""
+"""Shift of the coarsest matrix, relative to its diagonal, which makes its factorisation robust to round-off."""
 
 
 def near_kernel(A: csr_array, components: int, sweeps: int) -> NDArray[np.float64]:
-    """What so many sweeps leave of `components` random vectors, (n, components), the largest entry of each one."""
+    """Compute near-null-space vectors by Gauss-Seidel sweeps on random ones.
+
+    Args:
+        A: matrix (n, n).
+        num_components: number of vectors q.
+        num_sweeps: number of sweeps.
+
+    Returns:
+        Vectors (n, q), each scaled to a largest entry of 1.
+    """
     B = np.random.default_rng(0).uniform(size=(A.shape[0], components))  # always the same
     gauss_seidel(A.indptr, A.indices, A.data, B, sweeps)
     return scaled(B)
 
 
 def coarsest(A: csr_array) -> bool:
-    """Whether A is factorised as it is."""
+    """Return whether A is factorised directly."""
     n = A.shape[0]
     return n <= _COARSEST or (n <= _FULL and 4 * A.nnz >= n * n)
 
 
 def scaled(B: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The columns of B (n, q) over their largest entries; zero ones stay."""
+    """Return the columns of B (n, q) divided by their largest entries; zero columns remain."""
     largest = np.abs(B).max(axis=0, initial=0.0)
     return B / np.where(largest > 0.0, largest, 1.0)
 
 
 class Prolongation:
-    """The matrices P that lead from each level to the one above, for A and for others of its pattern.
+    """Prolongation matrices P of all levels, for A and for others with its pattern.
 
-    B: near-kernel components (n, q) of A; smoothed: whether each P is multiplied by I - 4/(3 l) D^-1 A, l the largest
-    eigenvalue of D^-1 A (smoothed aggregation). levels: P (n, its coarse unknowns) of each level, the finest first.
+    Attributes:
+        prolongators: P (n, coarse unknowns) of each level, the finest first.
     """
 
     def __init__(self, A: csr_array, B: NDArray[np.float64], smoothed: bool = False) -> None:
@@ -82,7 +92,7 @@ class Prolongation:
 def _prolonged(
     A: csr_array, B: NDArray[np.float64], nodes: NDArray[np.int64]
 ) -> tuple[csr_array, NDArray[np.float64], NDArray[np.int64]]:
-    """P, B_coarse and the coarse nodes, of unknowns that go by nodes (n,), which are aggregated as a whole."""
+    """Return P, B_coarse and the coarse nodes; unknowns are grouped by nodes (n,), which are aggregated as a whole."""
     owner = _aggregates(A, nodes, _WIDE * len(nodes) / max(1, B.shape[1]))
     count = int(owner.max(initial=-1)) + 1
     inside = np.flatnonzero(owner >= 0)
@@ -111,7 +121,7 @@ def _prolonged(
 
 
 def _aggregates(A: csr_array, nodes: NDArray[np.int64], most: float) -> NDArray[np.int64]:
-    """The aggregate of each unknown (n,), -1 for none; aggregates of aggregates where they are more than `most`."""
+    """Return the aggregate of each unknown (n,), -1 for none; they are aggregated again while there are too many."""
     owner, before = nodes, -1
     while True:
         condensed = _condensed(A, owner)
@@ -123,7 +133,7 @@ def _aggregates(A: csr_array, nodes: NDArray[np.int64], most: float) -> NDArray[
 
 
 def _condensed(A: csr_array, nodes: NDArray[np.int64]) -> csr_array:
-    """The Frobenius norms of A's blocks, by nodes, -1 for none; A itself where each unknown is one."""
+    """Return the Frobenius norms of A's blocks by nodes, -1 for none; A itself if each unknown is a node."""
     n, count = len(nodes), int(nodes.max(initial=-1)) + 1
     if count == n:
         return A
@@ -137,7 +147,7 @@ def _condensed(A: csr_array, nodes: NDArray[np.int64]) -> csr_array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Level:
-    """A level above the coarsest: its matrix, how it is smoothed, and how it leads to the next."""
+    """A level above the coarsest: matrix, prolongation, restriction and smoother."""
 
     A: csr_array
     P: csr_array
@@ -151,7 +161,7 @@ class _Level:
         return cls(A, P, csr_array(P.T), 1.0 / diagonal, chebyshev_weights(largest_eigenvalue(A, diagonal)))
 
     def smoothed(self, b: Vector, x: Vector | None = None) -> Vector:
-        """A Chebyshev polynomial's steps toward A x = b, from x or from zero."""
+        """Apply the Chebyshev smoother to A x = b, starting at x or at zero."""
         step = np.zeros_like(b)
         for keep, scale in self.weights:
             left = b if x is None else b - self.A @ x
@@ -162,9 +172,11 @@ class _Level:
 
 
 class Cycle:
-    """A V-cycle for A, by a prolongation that may be that of an earlier matrix.
+    """V-cycle for A, with the prolongations of this or an earlier matrix.
 
-    sizes: unknowns of each level; bytes: of matrices that `apply` goes through.
+    Attributes:
+        level_sizes: unknowns of each level.
+        matrix_bytes: bytes of the matrices that a cycle reads.
     """
 
     def __init__(self, A: csr_array, prolongation: Prolongation) -> None:
@@ -184,7 +196,7 @@ class Cycle:
             self.bytes += 12 * A.nnz
 
     def apply(self, r: Vector) -> Vector:
-        """z near A^-1 r, (n,)."""
+        """Return z near A^-1 r, (n,)."""
         return self._cycled(0, r)
 
     def _cycled(self, depth: int, b: Vector) -> Vector:
@@ -197,7 +209,7 @@ class Cycle:
 
 
 class Solving(Iteration):
-    """Conjugate gradients for A x = b from zero, preconditioned, until |b - A x| is at most `tolerance` |b|."""
+    """Preconditioned conjugate gradients for A x = b from zero, until |b - A x| is at most rtol |b|."""
 
     def __init__(self, A: csr_array, cycle: Cycle, b: Vector, tolerance: float) -> None:
         self._A, self._cycle, self._limit = A, cycle, tolerance * norm(b)
@@ -205,7 +217,14 @@ class Solving(Iteration):
         self._p = np.zeros_like(b)
 
     def solve(self, most: int) -> int:
-        """How many iterations were done, at most so many; `x` holds the answer."""
+        """Iterate; `x` contains the solution.
+
+        Args:
+            max_iterations: maximum number of iterations.
+
+        Returns:
+            Number of iterations.
+        """
         return self.iterate(self._preconditioned(), most)[0]
 
     def _preconditioned(self) -> float:
@@ -213,28 +232,28 @@ class Solving(Iteration):
         return _dot(self._r, self._z)
 
     def turn(self, product: float, before: float) -> float:
-        """See Iteration."""
+        """Update the search direction p; return p'Ap."""
         self._p = self._z + (product / before) * self._p
         self._image = self._A @ self._p
         return _dot(self._p, self._image)
 
     def go(self, product: float, curvature: float) -> float:
-        """See Iteration."""
+        """Update x and r, and apply the preconditioner; return r'z."""
         self.x += (product / curvature) * self._p
         self._r -= (product / curvature) * self._image
         return self._preconditioned()
 
     def convex(self, curvature: float) -> bool:
-        """See Iteration; round-off may leave no curvature."""
+        """Return whether the curvature is positive; round-off may make it zero."""
         return curvature > 0.0
 
     def near(self, product: float) -> bool:
-        """See Iteration."""
+        """Return whether the residual norm is within the tolerance."""
         return norm(self._r) <= self._limit or not product > 0.0
 
 
 def norm(x: Vector) -> float:
-    """|x|, added up in one order."""
+    """Return |x|, summed in a fixed order."""
     return float(np.sqrt(_dot(x, x)))
 
 

@@ -1,11 +1,11 @@
-"""A fill-reducing order by nested dissection (George 1973) of the graph of a sparse symmetric matrix.
+"""Fill-reducing ordering of a sparse symmetric matrix by nested dissection (George 1973) of its graph.
 
-A separator is found from graph distances alone: breadth-first distances from far-apart vertices a, b, c, ...
-(a farthest-point choice, as in Harel and Koren's high-dimensional embedding 2002) stand for coordinates. The fields
-a - b, (a + c) - (b + d), ... are cut where their vertex boundary is smallest for the balance it gives,
-and the separator is then refined by moves of single vertices (Fiduccia and Mattheyses 1982; for separators: Ashcraft
-and Liu 1996). Small pieces are ordered by minimum degree, the separators around them counted (Pellegrini,
-Roman and Amestoy 2000: halo minimum degree).
+A separator is found from graph distances alone. Breadth-first distances from distant vertices a, b, c, ... serve as
+coordinates (farthest-point choice, as in Harel and Koren's high-dimensional embedding 2002). The fields a - b,
+(a + c) - (b + d), ... are cut where their vertex boundary is smallest relative to the balance of the cut. The separator
+is then refined by moves of single vertices (Fiduccia and Mattheyses 1982; for separators: Ashcraft and Liu 1996). Small
+pieces are ordered by minimum degree, counting the surrounding separators (halo minimum degree: Pellegrini, Roman and
+Amestoy 2000).
 """
 
 from __future__ import annotations
@@ -19,13 +19,18 @@ from solvers.linear.refinement import refine
 from solvers.linear.separator import LANDMARKS, TOGETHER, separate
 
 _LEAF = 96
-"""Pieces up to this size are not cut further: below it a separator saves less than minimum degree does."""
+"""Pieces up to this size are not dissected: below it a separator saves less than minimum degree does."""
 
 
 def nested_dissection(pointers: NDArray[np.int64], neighbours: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The order of elimination of a graph's vertices, shape (n,): entry i is the vertex that goes i-th.
+    """Return the elimination order of a graph's vertices.
 
-    pointers (n + 1,), neighbours: the graph in CSR form, symmetric, loops allowed.
+    Args:
+        pointers: row pointers (n + 1,) of the graph in CSR form; symmetric, loops allowed.
+        neighbours: column indices.
+
+    Returns:
+        Order (n,): entry i is the i-th vertex to eliminate.
     """
     n = len(pointers) - 1
     order = np.arange(n, dtype=np.int32)
@@ -38,7 +43,7 @@ def nested_dissection(pointers: NDArray[np.int64], neighbours: NDArray[np.int32]
 
 @kept()
 def _dissect(pointers, neighbours, order, leaf):
-    """Sort `order` into the order of elimination: of every piece, its parts first and its separator last."""
+    """Sort `order` into elimination order: of every piece, its parts first and its separator last."""
     n = len(order)
     owner = np.zeros(n, np.int32)  # the piece that a vertex is in; -1 once it is in a separator
     dist = np.zeros((n, LANDMARKS), np.int32)
@@ -81,7 +86,7 @@ def _dissect(pointers, neighbours, order, leaf):
 
 @part
 def _split_components(pointers, neighbours, owner, piece, order, first, end, leaf, queue, stack):
-    """Gather the piece's components and push each; those that are small together, as many as fill a leaf."""
+    """Push the components of a piece to the stack; small ones are combined up to the leaf size."""
     at, begun = first, first
     for i in range(first, end):
         root = order[i]

@@ -1,4 +1,4 @@
-"""A vertex separator, refined by moves of single vertices.
+"""Refinement of a vertex separator by moves of single vertices.
 
 Fiduccia and Mattheyses 1982; for separators: Ashcraft and Liu 1996.
 """
@@ -15,16 +15,22 @@ from solvers.linear.separator import SMALLEST_SIDE
 
 _PASSES = 4
 _PATIENCE = 60
-"""How many moves in a row may leave the separator no better before a pass of refinement ends."""
+"""Number of consecutive moves without improvement after which a refinement pass ends."""
 
 
 class _Cut(NamedTuple):
-    """A piece, cut in two, that is being refined; its vertices go by their places in it.
+    """State of a bisected piece during refinement; its vertices have local indices.
 
-    graph: pointers and neighbours; piece: vertices by place; local: places by vertex, -1 for none; side: of each;
-    counts (3,): how many are on each side; pull (size, 2): how many neighbours on the other side a move of a separator
-    vertex to this side pulls in; moved: whether a vertex was in this pass; separator: places, those that may move
-    first; trail: (place, side that it had) of each change.
+    Attributes:
+        pointers, neighbours: graph in CSR form.
+        piece: vertex of each local index.
+        local_index: local index of each vertex, -1 outside the piece.
+        side: side of each vertex, 2 for the separator.
+        side_counts: number of vertices on each side, (3,).
+        pulled_neighbours: neighbours that a move of a separator vertex to a side pulls into the separator, (size, 2).
+        is_locked: whether a vertex has moved in this pass.
+        separator: local indices; those that may move come first.
+        move_log: (local index, previous side) of each change.
     """
 
     pointers: NDArray[np.int64]
@@ -41,10 +47,16 @@ class _Cut(NamedTuple):
 
 @part
 def refine(pointers, neighbours, piece, side, local):
-    """Shrink the separator in `side` by moving its vertices to a side, which pulls their neighbours there in.
+    """Shrink a separator by moving its vertices to a side, which pulls their neighbours on the other side in.
 
-    A pass moves each vertex once at most, always the one that shrinks the separator most (ties to the smaller side),
-    and then goes back to the best state it saw. `local` (n,) is -1 on entry and on return.
+    A pass moves each vertex at most once, always the one that shrinks the separator most (ties: to the smaller side),
+    and then restores the best state encountered.
+
+    Args:
+        pointers, neighbours: graph in CSR form.
+        piece: vertices of the piece.
+        side: side of each vertex, 2 for the separator; updated.
+        local: scratch (n,), -1 on entry and on return.
     """
     size = len(piece)
     counts = np.zeros(3, np.int64)
@@ -72,7 +84,7 @@ def refine(pointers, neighbours, piece, side, local):
 
 @inner
 def _improve(cut):
-    """A pass; whether it shrank the separator, or left the sides more alike."""
+    """Run one pass; return whether it shrank the separator or improved the balance."""
     counts, side, piece, moved, pointers = cut.counts, cut.side, cut.piece, cut.moved, cut.pointers
     moved[:] = False
     listed = 0
@@ -109,7 +121,7 @@ def _improve(cut):
 
 @inner
 def _choose(cut, listed):
-    """Which of the listed vertices shrinks the separator most, -1 for none that may move, and to which side."""
+    """Return the listed vertex whose move shrinks the separator most, -1 for none, and its target side."""
     counts, pull, limit = cut.counts, cut.pull, (1.0 - SMALLEST_SIDE) * len(cut.piece)
     choice, best, to = -1, -(1 << 60), 0
     for k in range(listed):
@@ -124,7 +136,7 @@ def _choose(cut, listed):
 
 @inner
 def _move(cut, i, to, at, listed):
-    """Move i out of the separator, and its neighbours on the other side into it; where trail and list end then."""
+    """Move i out of the separator, and its neighbours on the other side in; return the ends of log and list."""
     side, pull, local = cut.side, cut.pull, cut.local
     at = _put(cut, i, to, at)
     v = cut.piece[i]
@@ -150,7 +162,7 @@ def _move(cut, i, to, at, listed):
 
 @inner
 def _put(cut, i, side, at):
-    """Put a vertex on a side, and note it; where the trail ends then."""
+    """Assign a vertex to a side and log the change; return the end of the log."""
     was = cut.side[i]
     cut.trail[at, 0], cut.trail[at, 1] = i, was
     cut.counts[was] -= 1

@@ -1,10 +1,11 @@
-"""A multilevel additive Schwarz preconditioner: dense inverses of small patches (Wu, Wang and Wang 2022).
+"""Multilevel additive Schwarz preconditioner: dense inverses of small subdomains (Wu, Wang and Wang 2022).
 
-    S = sum over levels l of P_l diag(B_l^-1) P_l'        B_l: the diagonal blocks, PATCH nodes each, of P_l'A P_l
+    S = sum over levels l of P_l diag(B_l^-1) P_l'        B_l: diagonal blocks of SUBDOMAIN_SIZE nodes of P_l'A P_l
 
-A is of 3 x 3 blocks. The nodes of level 0 are its rows of them, in an order in which neighbours make patches. A patch
-of one level moves as one and is a node of the next, so that node i of a level is part of node i // PATCH of the next
-one, and no lists are needed. S is symmetric, and positive definite where A is; it costs products with dense matrices.
+A consists of 3 x 3 blocks. The nodes of level 0 are its block rows, ordered so that neighbours form subdomains. A
+subdomain of one level moves rigidly and is a node of the next. Node i of a level therefore belongs to node
+i // SUBDOMAIN_SIZE of the next one, and no lists are needed. S is symmetric, and positive definite if A is; its
+application consists of products with dense matrices.
 """
 
 from __future__ import annotations
@@ -17,14 +18,19 @@ from solvers.compiling import kernel
 from solvers.problem import Positions
 
 PATCH = 32
-"""Nodes of a patch: as many as threads of a device go together."""
+"""Nodes of a subdomain: the number of threads of a device that run in lockstep."""
 
 
 class Patches:
-    """Where in patches the blocks of a matrix lie. order (f,): its rows, in patches."""
+    """Positions of the blocks of a matrix in subdomains; subdomain_order (f,): its rows, grouped by subdomain."""
 
     def __init__(self, graph: csr_array, order: NDArray[np.int64]) -> None:
-        """graph (f, f): the pattern of blocks."""
+        """Build the hierarchy.
+
+        Args:
+            graph: pattern of blocks (f, f).
+            order: rows grouped by subdomain, (f,).
+        """
         self.order, n, entries = order, len(order), graph.nnz
         place = np.empty(n, np.int64)
         place[order] = np.arange(n)
@@ -40,7 +46,7 @@ class Patches:
             i, j, n = i // PATCH, j // PATCH, patches
 
     def inverted(self, blocks: NDArray[np.float64]) -> Schwarz:
-        """S of the matrix with these blocks (b, 3, 3), positive definite."""
+        """Return S of the positive definite matrix with blocks (b, 3, 3)."""
         inverses = list[NDArray[np.float64]]()
         for n, places in self._levels:
             dense = (places @ blocks.reshape(-1, 9)).reshape(-1, PATCH, PATCH, 3, 3)
@@ -55,13 +61,16 @@ class Patches:
 
 
 class Schwarz:
-    """S. inverses: of each level, (patches, 3 PATCH, 3 PATCH), zero beyond its last node."""
+    """Preconditioner S; subdomain_inverses: (subdomains, 3 SUBDOMAIN_SIZE, 3 SUBDOMAIN_SIZE) of each level.
+
+    Rows and columns beyond a level's last node are zero.
+    """
 
     def __init__(self, order: NDArray[np.int64], inverses: list[NDArray[np.float64]]) -> None:
         self._order, self.inverses = order, inverses
 
     def solve(self, b: Positions) -> Positions:
-        """S b, (f, 3)."""
+        """Return S b, (f, 3)."""
         n, r = len(b), b[self._order]
         x, out = np.zeros_like(r), np.empty_like(r)
         for level, inverses in enumerate(self.inverses):
@@ -75,8 +84,10 @@ class Schwarz:
 
 
 def ordered(Q: csr_array) -> NDArray[np.int64]:
-    """The vertices (f,), such that each PATCH of them that follow each other are neighbours, and so are each PATCH of
-    such patches, and so on."""
+    """Return the vertices (f,) in an order that forms subdomains on all levels.
+
+    Each SUBDOMAIN_SIZE consecutive vertices are neighbours, and so are as many consecutive subdomains, and so on.
+    """
     orders, graph = list[NDArray[np.int64]](), csr_array(Q)
     while (n := len(graph.indptr) - 1) > PATCH:
         order = np.empty(n, np.int64)
@@ -94,16 +105,19 @@ def ordered(Q: csr_array) -> NDArray[np.int64]:
 
 
 def _merging(of: NDArray[np.int64]) -> csr_array:
-    """P (n, N) that moves each node as the one `of` (n,) that it is part of."""
+    """Return the matrix P (n, N) that maps each node to the values of its aggregate `of` (n,)."""
     return csr_array((np.ones(len(of)), (np.arange(len(of)), of)))
 
 
 @kernel
 def grow(pointers, neighbours, order, state, queue, border):
-    """Write an order (n,) of the nodes of a graph in which patches grow outwards from where others ended.
+    """Write an order of the nodes of a graph in which subdomains grow outwards from the border of earlier ones.
 
-    state, queue, border (n,): scratch, zero at first. state: 0 for a node that is not reached, 1 in the queue of this
-    patch, 2 at the border of one before, 3 in the order.
+    Args:
+        pointers, neighbours: graph in CSR form.
+        order: output (n,).
+        state, queue, border: scratch (n,), zero initially. state is 0 for an unvisited node, 1 in the queue of the
+            current subdomain, 2 at the border of an earlier one, 3 in the order.
     """
     n, done, first, left, right = len(order), 0, 0, 0, 0
     while done < n:

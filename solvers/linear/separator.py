@@ -1,6 +1,6 @@
-"""A small vertex separator of a connected piece of a graph: where a field of distances is cut.
+"""Small vertex separator of a connected piece of a graph, as a level set of a field of distances.
 
-`piece` lists the vertices; `owner[v] == number` tells that v is one of them. A side is 0 or 1, or 2 for the separator.
+`piece` lists the vertices; `owner[v] == number` marks v as one of them. A side is 0 or 1, or 2 for the separator.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from solvers.compiling import part
 
 LANDMARKS = 8
 _FEW = 4
-"""A sheet shows its directions in the distances from its corners, four of the landmarks; a solid needs all eight."""
+"""The distances from four landmarks, its corners, resolve the directions of a sheet; a solid needs all eight."""
 
 TOGETHER = 8
-"""Fields are swept so many at a time, as a vector."""
+"""Fields that are processed at a time, as a vector."""
 
 
 def _fields() -> NDArray[np.int32]:
-    """The sums of distances from the landmarks that are tried as coordinates, (blocks, landmarks, TOGETHER).
+    """Return the weights of the distance sums used as coordinates, (blocks, landmarks, FIELDS_PER_BLOCK).
 
-    The eight corners of a box are its landmarks: of the 35 ways to set four of them against four, three are its
-    directions. The first block, for pieces that are flat or long, is content with the first four landmarks.
+    The landmarks of a box are its eight corners. Of the 35 partitions into four and four of them, three correspond to
+    its directions. The first block, for flat or long pieces, uses only the first four landmarks.
     """
     few = [[1, -1, 1, -1], [1, -1, -1, 1], [1, 1, -1, -1], [1, -1, 0, 0], [0, 0, 1, -1]]
     few += [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
@@ -37,15 +37,15 @@ def _fields() -> NDArray[np.int32]:
 _FIELDS = _fields()
 
 _SHEET = 1.5
-"""A square sheet is cut by the square root of its vertices; more fields are tried where it takes this much more."""
+"""Further fields are tried if a separator exceeds this times the square root of the size, that of a square sheet."""
 
 SMALLEST_SIDE = 0.25
-"""The least share of the vertices that a side may have."""
+"""Minimum fraction of the vertices on a side."""
 
 
 @part
 def _breadth_first(pointers, neighbours, owner, number, root, dist, queue):
-    """Graph distances from `root` within its piece into `dist`, which is -1 there; returns the count of vertices."""
+    """Write graph distances from `root` within its piece to `dist`, initially -1; return the number of vertices."""
     queue[0] = root
     dist[root] = 0
     head, tail = 0, 1
@@ -63,7 +63,7 @@ def _breadth_first(pointers, neighbours, owner, number, root, dist, queue):
 
 @part
 def _distances(pointers, neighbours, owner, number, piece, begin, end, dist, queue):
-    """Distances of the piece's vertices from landmarks `begin` to `end`, as far apart as may be, into `dist`."""
+    """Write distances from landmarks `begin` to `end`, which are chosen as far apart as possible, to `dist`."""
     far = piece[0]
     if begin == 0:  # the first is where a search from anywhere ends
         for v in piece:
@@ -85,10 +85,19 @@ def _distances(pointers, neighbours, owner, number, piece, begin, end, dist, que
 
 @part
 def separate(pointers, neighbours, owner, number, piece, dist, field, queue):
-    """The sides (len(piece),) of the best cut of any field, or an empty array where there is none.
+    """Return the sides of the best cut of any field.
 
-    A cut at t parts {field <= t} from the rest; its separator is the boundary of the lower side. Scratch: `dist`
-    (n, LANDMARKS), `field` (n, TOGETHER), `queue` (n,).
+    A cut at t separates {field <= t} from the rest; its separator is the boundary of the lower side.
+
+    Args:
+        pointers, neighbours: graph in CSR form.
+        owner: piece of each vertex (n,).
+        number: number of this piece.
+        piece: its vertices.
+        dist, field, queue: scratch, (n, NUM_LANDMARKS), (n, FIELDS_PER_BLOCK) and (n,).
+
+    Returns:
+        Sides (len(piece),); empty if there is no suitable cut.
     """
     size = len(piece)
     best = np.inf
@@ -138,7 +147,7 @@ def separate(pointers, neighbours, owner, number, piece, dist, field, queue):
 
 @part
 def _sides(pointers, neighbours, owner, number, piece, field, cut):
-    """Of each vertex 0 where its field is at most `cut`, 1 where it is more, 2 on the separator."""
+    """Return the side of each vertex: 0 up to the cut, 1 above, 2 on the separator."""
     side = np.empty(len(piece), np.int8)
     for i in range(len(piece)):
         v = piece[i]
@@ -153,7 +162,7 @@ def _sides(pointers, neighbours, owner, number, piece, field, cut):
 
 @part
 def _combine(dist, weights, piece, field, low, high):
-    """Write weighted sums of distances to `field`, and their least and greatest values to `low` and `high`."""
+    """Write weighted sums of distances to `field`, and their minima and maxima to `low` and `high`."""
     low[:] = 2**31 - 1
     high[:] = -(2**31)
     total = np.empty(TOGETHER, np.int32)

@@ -1,12 +1,12 @@
-"""A sparse Cholesky factorisation made to be solved with thousands of times, three right-hand sides at a time.
+"""Sparse Cholesky factorisation optimised for thousands of solves, with three right-hand sides at a time.
 
     Q = L L';  supernode J with rows B below:  S = L_JJ^-T L_JJ^-1,  W = -L_BJ L_JJ^-1
-    Q x = b:   forwards b_B += W b_J;  backwards x_J = S b_J + W' x_B
+    Q x = b:   forward b_B += W b_J;  backward x_J = S b_J + W' x_B
 
-A solve is then multiply-adds alone, over panels W that lie in the order in which they are read, upwards and then
-downwards. Whatever W is rounded to, a solve applies (I + W)' S (I + W), which is symmetric and positive definite as
-long as S is: so W may be float16, and S is not less than float32. For springs W has no entry above 1: it says what
-part of a vertex's force each neighbour takes on.
+A solve thus consists of multiply-adds only, with panels W stored in the order of access, upwards and then downwards.
+However W is rounded, a solve applies (I + W)' S (I + W), which is symmetric and positive definite as long as S is. W
+may therefore be float16, while S is at least float32. For springs no entry of W exceeds 1: it is the fraction of a
+vertex's force that each neighbour takes on.
 """
 
 from __future__ import annotations
@@ -30,21 +30,27 @@ from solvers.problem import NotPositiveDefinite, Positions
 Precision = Literal["float64", "float32", "float16"]
 
 _SPARE = LANES - 1
-"""Names that a supernode's list of rows has behind the last one, copies of that: for rows of zeros that fill a tile."""
+"""Number of copies of the last row at the end of a supernode's row list, for zero rows that complete a tile."""
 
 _WORTH_THREADS = 4e6
-"""Bytes of panels from which a single solve gains by waking a second thread (a sheet of 110 vertices a side)."""
+"""Bytes of panels beyond which a second thread speeds up a single solve (a sheet of 110 vertices a side)."""
 
 
 class Layout(NamedTuple):
-    """Where the panels of a factor lie. A supernode is cut into chunks of at most WIDTH columns, a panel each.
+    """Memory layout of the panels of a factor; a supernode is divided into chunks of at most MAX_PANEL_WIDTH columns.
 
-    chunks (c, 7): of each the offsets of its S, of its W and of the slots of its rows in `places`, its columns
-    without padding, its rows below with padding, its padded columns in LANES, its first slot; chunk_of (s + 1,): the
-    first chunk of each supernode; places: of each supernode the slots of its columns, of the rows below, in a group's
-    own copy where they are in the top, and the last one again for rows that fill up a tile; by_slot, by_vertex, spans:
-    see `supernodal_solve` (unsigned: no test of the sign when indexing); squares, panels: entries in all S and in all
-    W, which lie as `supernodal_vectors` reads them; rows: of four numbers, of the work vector.
+    Attributes:
+        chunks: of each chunk the offsets of its S, of its W and of its rows in `row_slots`, its columns without
+        padding,
+            its rows below with padding, its padded columns divided by COLUMN_LANES, and its first slot, (c, 7).
+        first_chunk: first chunk of each supernode, (s + 1,).
+        row_slots: of each supernode the slots of its columns and of the rows below, then copies of the last one for
+        rows
+            that complete a tile; slots of the top refer to the group's own copy.
+        order_by_slot, order_by_vertex, group_spans: see `triangular_solve`; unsigned, so that indexing needs no test of
+            the sign.
+        num_inverse_entries, num_panel_entries: entries of all S and of all W, stored as `panel_products` reads them.
+        num_work_rows: rows of four numbers in the work vector.
     """
 
     chunks: NDArray[np.int64]
@@ -59,7 +65,7 @@ class Layout(NamedTuple):
 
     @classmethod
     def of(cls, s: Symbolic) -> Layout:
-        """The layout of a factor of this structure."""
+        """Build the layout of a symbolic factor."""
         width, below = s.width.astype(np.int64), np.diff(s.row_start)
         chunk_of, node, done, own, rows, quads = _chunks(width, below)
         squares, panels = LANES**2 * quads**2, rows * quads * LANES
@@ -108,7 +114,7 @@ class Layout(NamedTuple):
 
 
 def _chunks(width: NDArray[np.int64], below: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
-    """`chunk_of`, and of each chunk its supernode, the columns before it there, its own, its rows below, its quads."""
+    """Return `first_chunk`, and per chunk: supernode, preceding columns, own columns, rows below, column quads."""
     many = -(-width // WIDTH)
     chunk_of = np.concatenate([[0], np.cumsum(many)])
     node = np.repeat(np.arange(len(width)), many)
@@ -119,13 +125,13 @@ def _chunks(width: NDArray[np.int64], below: NDArray[np.int64]) -> tuple[NDArray
 
 
 def stored(s: Symbolic) -> tuple[int, int]:
-    """The entries in all S and in all W of a factor of this structure."""
+    """Return the number of entries of all S and of all W."""
     *_, rows, quads = _chunks(s.width.astype(np.int64), np.diff(s.row_start))
     return int(LANES**2 * quads @ quads), int(LANES * rows @ quads)
 
 
 def _rounded(entries: NDArray[Any], dtype: np.dtype) -> NDArray[Any]:
-    """The same where they are of this type already."""
+    """Return the entries in a type; the same array if they have it already."""
     if entries.dtype == dtype:
         return entries
     out = aligned(len(entries), dtype)
@@ -134,18 +140,31 @@ def _rounded(entries: NDArray[Any], dtype: np.dtype) -> NDArray[Any]:
 
 
 class Supernodal:
-    """A supernodal Cholesky factorisation of a sparse symmetric positive definite Q.
+    """Supernodal Cholesky factorisation of a sparse symmetric positive definite Q.
 
-    nonzeros: entries of L, diagonal included, before supernodes are padded; panel_bytes: of all S and W; flops:
-    additions and multiplications a solve, padding included; shares: the part of the entries in each group of
-    subtrees that a thread may do, and last in the top that one does alone; squares, panels,
-    layout: all S, all W (float16 seen as uint16), and where they lie. `precision` is that of the panels; the
-    factorisation is in float64, the solve in float64 for panels in that and in float32 for others. Solves of one
-    factor share its work vector: they are done one at a time.
+    The factorisation is in float64. Solves are in float64 for float64 panels, and in float32 for others. Solves of one
+    factor share its work vector, so that they cannot run concurrently.
+
+    Attributes:
+        nonzeros: entries of L including the diagonal, before padding of supernodes.
+        factor_bytes: bytes of all S and W.
+        flops: additions and multiplications of a solve, including padding.
+        work_shares: fraction of the entries in each group of subtrees, which threads process in parallel, and last in
+            the top, which one thread processes.
+        inverse_blocks, panels, layout: all S, all W (float16 viewed as uint16), and their layout.
     """
 
     def __init__(self, Q: csr_array, *, precision: Precision = "float64", symbolic: Symbolic | None = None) -> None:
-        """symbolic: the factor's structure, where it is known. Raises NotPositiveDefinite, with a vertex at fault."""
+        """Factorise a matrix.
+
+        Args:
+            Q: symmetric positive definite matrix (n, n).
+            precision: precision of the panels.
+            symbolic_factor: the symbolic factor, if it is known.
+
+        Raises:
+            NotPositiveDefinite: with a vertex at fault.
+        """
         if not np.isfinite(Q.data).all():
             rows = np.repeat(np.arange(len(Q.indptr) - 1), np.diff(Q.indptr))
             v = rows[~np.isfinite(Q.data)][0]
@@ -179,10 +198,10 @@ class Supernodal:
         self._factor = Factor(squares, panels, *lists, work, Team.of(len(self.shares) - 1))
 
     def solve(self, b: Positions, out: Positions) -> None:
-        """Write Q^-1 b, shape (n, 3), to `out`; b is left as it is and must not be `out`."""
+        """Write Q^-1 b to `out`, (n, 3) each; b is not modified and must not be `out`."""
         solve_by(*self._factor, b, out, self.threads())
 
     def threads(self) -> int | None:
-        """Of a solve, None for one."""
+        """Return the number of threads of a solve, None for one."""
         threads = min(numba.get_num_threads(), len(self.shares) - 1)
         return threads if threads > 1 and self.panel_bytes >= _WORTH_THREADS else None

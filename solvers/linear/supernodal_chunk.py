@@ -1,11 +1,11 @@
-"""Taking a chunk of columns out of a front, and its panel (see `solvers.linear.supernodal_factor`).
+"""Elimination of a chunk of columns from a front, and its panel (see `numeric_factorisation`).
 
     S = L11^-T L11^-1       the inverse of the chunk's Schur complement
-    W = -L21 L11^-1         what its unknowns add to the rows below
+    W = -L21 L11^-1         contributions of its unknowns to the rows below
 
 with the chunk's Cholesky factor [L11; L21]. For springs S and W are sums of terms of one sign (Q is an M-matrix), so
-inverting loses no digits. What is left of the front, less L21 L21', is the same product, strip by strip, as a pass
-forwards of the solve.
+that the inversion loses no digits. The remaining front, minus L21 L21', is computed strip by strip by the same product
+as a forward substitution.
 """
 
 from __future__ import annotations
@@ -16,20 +16,32 @@ from solvers.compiling import inner
 from solvers.vectors.supernodal import add_forward
 
 _NO_DIGITS = 4.0 * np.finfo(np.float64).eps
-"""A pivot this small beside its entry of the matrix is round-off."""
+"""Pivots below this fraction of the matrix entry are round-off."""
 
 
 @inner
 def in_tile(row, col, width):
-    """Where a panel of a width has an entry: by tiles of four rows, each column by column."""
+    """Return the offset of an entry in a panel, stored by tiles of four rows, each column by column."""
     return (row >> 2) * 4 * width + 4 * col + (row & 3)
 
 
 @inner
 def eliminate(front, size, start, own, below, vertex, matrix, into, k):
-    """Take chunk k, the columns that begin at `start`, out of a front, and write its panel; vertex (own,): of columns.
+    """Eliminate chunk k from a front, and write its panel.
 
-    Returns the vertex whose pivot is not positive, or -1.
+    Args:
+        front: frontal matrix and scratch.
+        size: number of rows of the front.
+        start: first column of the chunk.
+        num_columns: columns of the supernode.
+        below: rows below the supernode.
+        vertex: vertices of the columns (num_columns,).
+        matrix: sparse matrix, for the scale of the pivots.
+        factor_panels: output.
+        k: index of the chunk.
+
+    Returns:
+        The vertex whose pivot is not positive, or -1.
     """
     square, at, real, width = into.chunks[k, 0], into.chunks[k, 1], into.chunks[k, 3], 4 * into.chunks[k, 5]
     panel, count = front.panel, size - start
@@ -51,7 +63,7 @@ def eliminate(front, size, start, own, below, vertex, matrix, into, k):
 
 @inner
 def _cholesky(panel, width, vertex, matrix):
-    """L11, in place; returns the vertex whose pivot is not positive, or -1."""
+    """Compute L11 in place; return the vertex whose pivot is not positive, or -1."""
     for j in range(width):
         pivot = panel[j, j]
         v = vertex[j]
@@ -74,7 +86,7 @@ def _cholesky(panel, width, vertex, matrix):
 
 @inner
 def _invert(panel, width, inverse):
-    """L11^-1, column by column."""
+    """Compute L11^-1, column by column."""
     for j in range(width):
         for i in range(width):
             inverse[i, j] = 0.0
@@ -88,7 +100,7 @@ def _invert(panel, width, inverse):
 
 @inner
 def _write_square(inverse, real, width, squares, begin):
-    """S = L11^-T L11^-1."""
+    """Compute S = L11^-T L11^-1."""
     for i in range(real):
         for j in range(real):
             total = 0.0
@@ -99,7 +111,7 @@ def _write_square(inverse, real, width, squares, begin):
 
 @inner
 def _divide(front, width, count):
-    """L21 = A21 L11^-T, to `tiles`."""
+    """Compute L21 = A21 L11^-T into `tiles`."""
     panel, inverse, row = front.panel, front.inverse, front.row
     for r in range(width, count):
         for j in range(width):
@@ -114,7 +126,7 @@ def _divide(front, width, count):
 
 @inner
 def _write_panel(front, width, start, own, below, vertex, panels, begin):
-    """W = -L21 L11^-1, of the rows that are vertices."""
+    """Compute W = -L21 L11^-1, for the rows that are vertices."""
     tiles, inverse, row = front.tiles, front.inverse, front.row
     done = 0
     for local in range(start + width, own + below):
@@ -133,7 +145,7 @@ def _write_panel(front, width, start, own, below, vertex, panels, begin):
 
 @inner
 def _subtract(front, size, start, width):
-    """The front less L21 L21', strip by strip: the product of a pass forwards of the solve."""
+    """Subtract L21 L21' from the front, strip by strip, by the product of a forward substitution."""
     tiles, index, entries = front.tiles, front.numbers, front.entries
     flat = front.block
     for strip in range((start + width) // 4, size // 4):

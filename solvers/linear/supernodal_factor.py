@@ -1,8 +1,8 @@
-"""The multifrontal Cholesky factorisation (Duff and Reid 1983) into the panels that a solve multiplies by.
+"""Multifrontal Cholesky factorisation (Duff and Reid 1983), which produces the panels used by a solve.
 
-A front is the dense matrix of a supernode's columns and rows. It is kept as strips of four columns, each with its
-rows one after the other. Its columns are taken out in chunks (`solvers.linear.supernodal_chunk`); what is left is an
-update of its parent's front, and waits on a stack.
+A front is the dense matrix of a supernode's columns and rows. It is stored in strips of four columns, each row by row.
+Its columns are eliminated in chunks (`solvers.linalg.cholesky.panel_factorisation`). The remainder is an update of its
+parent's front, which is pushed on a stack.
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ class Matrix(NamedTuple):
 
 
 class Panels(NamedTuple):
-    """What is filled: all S and all W, and where they lie. chunk_of (s + 1,): the first chunk of each supernode; chunks
-    (c, 7): see `solvers.linear.supernodal.Layout`."""
+    """Output of the factorisation: all S and W, and their layout.
+
+    first_chunk (s + 1,) and chunks (c, 7): see `solvers.linalg.cholesky.supernodal_cholesky.PanelLayout`.
+    """
 
     chunk_of: NDArray[np.int64]
     chunks: NDArray[np.int64]
@@ -38,9 +40,14 @@ class Panels(NamedTuple):
 class _Front(NamedTuple):
     """A front, and scratch for a chunk of its columns.
 
-    entries: strips of four columns; place: of a slot in the front; panel (., WIDTH): the chunk's columns, then their
-    Cholesky factor; inverse (WIDTH, WIDTH): L11^-1; tiles: L21, by tiles of four rows; row (WIDTH,), block (4 WIDTH,):
-    a row and four of them; numbers: 0, 1, 2, ...
+    Attributes:
+        entries: strips of four columns.
+        slot_row: row of each slot in the front.
+        panel: columns of the chunk, then their Cholesky factor, (., MAX_PANEL_WIDTH).
+        inverse: L11^-1, (MAX_PANEL_WIDTH, MAX_PANEL_WIDTH).
+        tiles: L21, by tiles of four rows.
+        row_scratch, block_scratch: one row and four rows, (MAX_PANEL_WIDTH,) and (4 MAX_PANEL_WIDTH,).
+        row_numbers: 0, 1, 2, ...
     """
 
     entries: NDArray[np.float64]
@@ -55,9 +62,15 @@ class _Front(NamedTuple):
 
 @kept()
 def factorise(matrix, structure, into):
-    """Fill `into`, Panels, from a Matrix in the supernodes' sequence, a postorder of their tree; structure: Symbolic.
+    """Factorise a matrix in the postorder of its supernodes.
 
-    Returns the vertex whose pivot is not positive, or -1.
+    Args:
+        matrix: sparse matrix.
+        symbolic_factor: its symbolic factor.
+        factor_panels: output.
+
+    Returns:
+        The vertex whose pivot is not positive, or -1.
     """
     child, sibling, largest, room = _plan(structure)
     first, row_start, rows, vertex = structure.first, structure.row_start, structure.rows, structure.vertex
@@ -96,8 +109,11 @@ def factorise(matrix, structure, into):
 
 @part
 def _plan(structure):
-    """The children of each supernode, as a list that begins with `child` and goes on with `sibling`, the size of the
-    largest front, and what the stack of update matrices needs at most."""
+    """Plan the stack of update matrices.
+
+    Returns the children of each supernode as linked lists (`child`, `sibling`), the largest front size, and the stack
+    size.
+    """
     nodes = len(structure.parent)
     child = np.full(nodes, -1, np.int64)
     sibling = np.full(nodes, -1, np.int64)
@@ -120,7 +136,7 @@ def _plan(structure):
 
 @inner
 def _assemble(front, matrix, structure, s, size):
-    """Write the matrix's entries of a supernode's columns to the front, zero elsewhere, and the places of its slots."""
+    """Assemble the matrix entries of a supernode's columns in the front, zero elsewhere; write the rows of slots."""
     entries, place = front.entries, front.place
     first, end = structure.first[s], structure.first[s + 1]
     row, row_end = structure.row_start[s], structure.row_start[s + 1]
@@ -143,7 +159,7 @@ def _assemble(front, matrix, structure, s, size):
 
 @inner
 def _push(entries, size, own, stack, top):
-    """Put what is left of a front on the stack; returns where that ends."""
+    """Push the remainder of a front on the stack; return the new end of the stack."""
     rest = size - own
     for strip in range(rest // 4):
         source = 4 * ((strip + own // 4) * size + own)
@@ -155,13 +171,13 @@ def _push(entries, size, own, stack, top):
 
 @inner
 def _padded(count):
-    """The count, rounded up to whole strips."""
+    """Return the count rounded up to whole strips."""
     return (count + 3) // 4 * 4
 
 
 @inner
 def _at(size, row, col):
-    """Where a front of a size has an entry."""
+    """Return the offset of an entry in a front."""
     return 4 * ((col >> 2) * size + row) + (col & 3)
 
 
@@ -180,13 +196,17 @@ def _extend_add(front, size, stack, begin, rows, start, end, place):
 
 @kept()
 def keep_sums(panels, rounding, chunks):
-    """Add what rounding takes from a column of W as a whole to its smallest entry, where it is rounded the least.
+    """Add the total rounding error of each column of W to its smallest entry, which has the smallest rounding error.
 
-    A column holds the weights with which a vertex follows those below. Noise in their sum would part vertices that
-    ought to move together, against stiff springs: the largest eigenvalue of what a solve makes of Q, 1 for no rounding,
-    was 1.028 on a sheet of 128 x 128 vertices and grew with their number; with the sums kept it is 1.0002 at any.
-    A row that fills up a tile will do as well: it names the last one.
-    rounding: each entry less what it is rounded to.
+    A column contains the weights with which a vertex follows those below. Errors of their sum would separate vertices
+    that should move together, against stiff springs. The largest eigenvalue of the preconditioned matrix, 1 without
+    rounding, was 1.028 on a sheet of 128 x 128 vertices and grew with their number. With the sums preserved it is
+    1.0002 at any size. The smallest entry may be in a row that completes a tile, since that row refers to the last one.
+
+    Args:
+        panels: entries of all W, updated.
+        rounding: each entry minus its rounded value.
+        chunks: layout of the panels (c, 7).
     """
     for k in range(len(chunks)):
         offset, below, width = chunks[k, 1], chunks[k, 4], 4 * chunks[k, 5]

@@ -1,17 +1,17 @@
-"""The two passes of a solve over the panels of a factor.
+"""Triangular solves with the panels of a supernodal factor.
 
-    forwards, children first:   y_below += W y_own
-    backwards, parents first:   y_own = S y_own + W' y_below
+    forward, children first:    y_below += W y_own
+    backward, parents first:    y_own = S y_own + W' y_below
 
-The supernodes come in groups of subtrees and a top above them. Each group has a copy of the top's rows of its own:
-forwards it adds to that, and backwards it reads from it, so that groups may be done side by side; copies are added up
-in the order of the groups. The bits of the result are therefore the same whatever the number of threads.
+The supernodes form groups of subtrees and a top above them. Each group has its own copy of the top's rows. The forward
+pass adds to this copy and the backward pass reads from it, so that groups can be processed in parallel. Copies are
+added in the order of the groups. The result is therefore bitwise independent of the number of threads.
 
-`spans` (groups + 1, 6) holds of each group, and in its last row of the top, the first and last chunk, the first and
-last of its vertices in either order, and its first and last slot. `by_slot` and `by_vertex` (n, 2) list vertices and
-their slots group by group, so that writing is in one direction both on the way in and on the way out. `work` has 4
-numbers a slot, and behind them the groups' copies. Slots that no vertex has are zero and stay so. (Entries of a table
-are read one by one: unpacking a row makes an array of it first, which costs 20 ns.)
+`group_spans` (groups + 1, 6) has for each group, and in its last row for the top, the first and last chunk, the first
+and last vertex in either order, and the first and last slot. `order_by_slot` and `order_by_vertex` (n, 2) list vertices
+and their slots group by group, so that both input and output are written sequentially. `work` has 4 numbers per slot,
+followed by the groups' copies. Slots without a vertex remain zero. (Table entries are read one by one: unpacking a row
+would create an array first, which costs 20 ns.)
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from solvers.vectors.intrinsics import ask_for
 from solvers.vectors.supernodal import add_forward, set_backward
 
 _AHEAD = 64
-"""How many vertices ahead memory is asked for what lies in another order."""
+"""Prefetch distance, in vertices, for data in another order."""
 
 
 @inner
 def _load(b, order, begin, end, work):
-    """The right-hand sides b (n, 3) to rows of `work`."""
+    """Copy the right-hand sides b (n, 3) to rows of `work`."""
     rows = work.reshape(-1, 4)
     for i in range(begin, end):
         ask_for(b, 3 * order[min(i + _AHEAD, end - 1), 0])
@@ -44,7 +44,7 @@ def _load(b, order, begin, end, work):
 
 @inner
 def _store(work, order, begin, end, out):
-    """The solution in rows of `work` to out (n, 3)."""
+    """Copy the solution from rows of `work` to out (n, 3)."""
     rows = work.reshape(-1, 4)
     for i in range(begin, end):
         ask_for(work, 4 * order[min(i + _AHEAD, end - 1), 1])
@@ -55,7 +55,7 @@ def _store(work, order, begin, end, out):
 
 @inner
 def forwards(panels, index, chunks, begin, end, work):
-    """The pass forwards over the chunks from `begin` to `end`."""
+    """Perform the forward substitution with the chunks from `begin` to `end`."""
     for k in range(begin, end):
         offset, at, below, quads, first = chunks[k, 1], chunks[k, 2], chunks[k, 4], chunks[k, 5], chunks[k, 6]
         if quads == 4:
@@ -70,7 +70,7 @@ def forwards(panels, index, chunks, begin, end, work):
 
 @inner
 def backwards(squares, panels, index, chunks, begin, end, work):
-    """The pass backwards over the chunks from `end` down to `begin`."""
+    """Perform the backward substitution with the chunks from `end` down to `begin`."""
     for k in range(end - 1, begin - 1, -1):
         start, offset, at, own = chunks[k, 0], chunks[k, 1], chunks[k, 2], chunks[k, 3]
         below, quads, first = chunks[k, 4], chunks[k, 5], chunks[k, 6]
@@ -85,7 +85,10 @@ def backwards(squares, panels, index, chunks, begin, end, work):
 
 
 class Factor(NamedTuple):
-    """What a solve needs, with its work vector; see above, and `solvers.linear.supernodal.Layout`. team: of threads."""
+    """Arrays of a solve, with its work vector (see the module and `PanelLayout`).
+
+    thread_team: shared state of the threads.
+    """
 
     squares: NDArray[Any]
     panels: NDArray[Any]
@@ -100,7 +103,7 @@ class Factor(NamedTuple):
 
 @inner
 def _ascend(factor, b, group):
-    """The pass forwards over a group."""
+    """Perform the forward substitution of a group."""
     spans, work = factor.spans, factor.work
     chunk, chunk_end, begin, end = spans[group, :4]
     top, top_end = spans[-1, 4:]
@@ -113,7 +116,7 @@ def _ascend(factor, b, group):
 
 @inner
 def _turn(factor, b, out):
-    """Both passes over the top."""
+    """Perform both substitutions of the top."""
     spans, work = factor.spans, factor.work
     chunk, chunk_end, begin, end, top, top_end = spans[-1]
     _load(b, factor.by_slot, begin, end, work)
@@ -129,7 +132,7 @@ def _turn(factor, b, out):
 
 @inner
 def _descend(factor, out, group):
-    """The pass backwards over a group."""
+    """Perform the backward substitution of a group."""
     spans, work = factor.spans, factor.work
     chunk, chunk_end, begin, end = spans[group, :4]
     top, top_end = spans[-1, 4:]
@@ -143,7 +146,7 @@ def _descend(factor, out, group):
 
 @inner
 def _share(factor, b, out, first):
-    """A thread's share: the groups from `first` on that no other thread does, upwards, and then downwards."""
+    """Process groups from `first` on that no other thread has claimed, forward and then backward."""
     groups, team = len(factor.spans) - 1, factor.team
     phase = 0
     while phase >= 0:
@@ -172,7 +175,14 @@ def _side_by_side(squares, panels, places, chunks, spans, by_slot, by_vertex, wo
 
 @inner
 def solve(factor, b, out, threads):
-    """Q out = b; factor: a Factor; threads: None for one."""
+    """Solve Q out = b.
+
+    Args:
+        factor: the supernodal factor.
+        b: right-hand sides (n, 3).
+        out: solution (n, 3).
+        threads: number of threads, None for one.
+    """
     start(factor.team)
     if threads is None:
         _share(factor, b, out, 0)
@@ -183,6 +193,8 @@ def solve(factor, b, out, threads):
 
 @kernel
 def solve_by(squares, panels, places, chunks, spans, by_slot, by_vertex, work, team, b, out, threads):
-    """The same from Python, which passes on arrays faster than a Factor: that takes a seventh of a solve of 100
-    vertices."""
+    """Solve Q out = b from Python with the fields of a `SupernodalFactor` as separate arguments.
+
+    Arrays are passed faster than a named tuple, which would take a seventh of a solve of 100 vertices.
+    """
     solve(Factor(squares, panels, places, chunks, spans, by_slot, by_vertex, work, team), b, out, threads)

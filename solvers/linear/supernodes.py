@@ -1,7 +1,7 @@
-"""Supernodes: which columns of L are kept together, and which supernodes a thread does.
+"""Supernodes: columns of L with a common structure, and groups of supernodes for threads.
 
-Columns of one structure are a supernode. Relaxed amalgamation (Ashcraft and Grimes 1989): a supernode joins its parent
-where the solve gets cheaper by a model of its cost, although zeros are stored then.
+Consecutive columns of one structure form a supernode. Relaxed amalgamation (Ashcraft and Grimes 1989) merges a
+supernode with its parent if the solve becomes cheaper by a cost model, although explicit zeros are stored then.
 """
 
 from __future__ import annotations
@@ -14,25 +14,26 @@ from numpy.typing import NDArray
 from solvers.compiling import inner, kept, part
 
 WIDTH = 16
-"""The most columns that a panel has."""
+"""Maximum number of columns of a panel."""
 
 LANES = 4
-"""Columns of a supernode are padded to a multiple of this."""
+"""Columns of a supernode are padded to a multiple of this number."""
 
 _PER_PANEL, _PER_ROW = 30.0, 3.0
-"""The cost of a panel and of a row of it, in that of one entry: both measured, neither critical."""
+"""Cost of a panel and of a panel row, in units of an entry: both measured, neither critical."""
 
 GROUPS = 4
-"""Subtrees are gathered into so many groups of about equal cost, which threads can do side by side."""
+"""Number of groups of subtrees, of about equal cost, that threads can process in parallel."""
 
 _WORTH_GROUPS = 3e4
-"""Below this cost of a solve (a sheet of 28 x 28 vertices) one group is faster by 1 to 7 % on one thread, and waking a
-second one eats up most of what it gains: 1.1 times as fast at 16 x 16, 1.3 at 20 x 20, 1.6 at 32 x 32."""
+"""Cost of a solve below which a single group is used (a sheet of 28 x 28 vertices). One group is then faster by 1 to 7
+% on one thread, and waking a second thread consumes most of its gain: speedup 1.1 at 16 x 16, 1.3 at 20 x 20, 1.6 at
+32 x 32."""
 
 
 @inner
 def _cost(width, rows):
-    """What a supernode costs a solve, in the cost of an entry."""
+    """Return the cost of a supernode in a solve, in units of an entry."""
     total = 0.0
     while width > 0:
         chunk = min(width, WIDTH)
@@ -44,7 +45,15 @@ def _cost(width, rows):
 
 @kept()
 def amalgamate(parent, count):
-    """The tree of supernodes after amalgamation, the supernode of each column, and the cost of each supernode."""
+    """Amalgamate supernodes.
+
+    Args:
+        parent: elimination tree (n,), -1 for roots.
+        count: entries of each column of L (n,).
+
+    Returns:
+        The tree of supernodes, the supernode of each column, and the cost of each supernode.
+    """
     tree, of_column, width, rows = _fundamental(parent, count)
     into = _absorb(tree, width, rows)
     name = np.full(len(tree), -1, np.int32)
@@ -69,7 +78,7 @@ def amalgamate(parent, count):
 
 @part
 def _fundamental(parent, count):
-    """Columns of one structure as nodes: their tree, each column's node, and each node's columns and rows below."""
+    """Find columns of one structure; return the tree of these nodes, each column's node, and node widths and rows."""
     n = len(parent)
     of_column = np.empty(n, np.int32)
     nodes = 0
@@ -92,7 +101,7 @@ def _fundamental(parent, count):
 
 @part
 def _absorb(tree, width, rows):
-    """The node that each goes into, itself where it stays; `width` grows by what a node takes in."""
+    """Return the node that each node is merged into, itself if it remains; `width` is updated."""
     nodes = len(tree)
     child = np.full(nodes, -1, np.int32)
     sibling = np.full(nodes, -1, np.int32)
@@ -123,7 +132,7 @@ def _absorb(tree, width, rows):
 
 @inner
 def _gain_most(s, child, sibling, width, rows):
-    """The child that a node had best take in, -1 for none, and the one before it in the list of children."""
+    """Return the child whose merge gains most, -1 for none, and the child before it in the list."""
     best, best_gain, before_best, before = -1, 0.0, -1, -1
     c = child[s]
     while c >= 0:
@@ -137,10 +146,14 @@ def _gain_most(s, child, sibling, width, rows):
 
 
 def groups(parent: NDArray[np.int32], cost: NDArray[np.float64]) -> NDArray[np.int32]:
-    """The group of each node of a forest: whole subtrees, and GROUPS for the top; parents come after children.
+    """Assign each node of a forest to a group of whole subtrees, NUM_SUBTREE_GROUPS for the top.
 
-    The heaviest subtree is opened, its root put in the top, until none has more than a group's share; the lightest
-    group then takes the heaviest subtree that is left. It follows from the tree alone, never from threads.
+    The heaviest subtree is split, with its root assigned to the top, until none exceeds a group's share. The lightest
+    group then repeatedly gets the heaviest remaining subtree. The result depends on the tree alone, never on threads.
+
+    Args:
+        parent: parent of each node, after its children; -1 for roots.
+        cost: cost of each node.
     """
     total = cost.copy()
     children: dict[int, list[int]] = {}

@@ -1,4 +1,4 @@
-"""What the factor of a sparse symmetric matrix will look like, found from its graph alone.
+"""Symbolic Cholesky factorisation: the structure of the factor of a sparse symmetric matrix, from its graph alone.
 
 Elimination tree and column counts (Liu 1990; Davis 2006, chapter 4), and the rows of each supernode.
 """
@@ -19,15 +19,21 @@ from solvers.linear.supernodes import GROUPS, LANES, amalgamate, groups
 
 
 class Symbolic(NamedTuple):
-    """The structure of L, over slots: the places of the work vector, padded so that each supernode begins at a lane.
+    """Structure of L over slots: positions in the work vector, padded so that each supernode starts at a multiple of 4.
 
-    Supernodes are numbered group by group, and then those above all groups, the top; children before parents.
+    Supernodes are numbered group by group, followed by those above all groups, the top; children precede parents.
 
-    slot: the slot of each vertex (n,); vertex: the vertex of each slot, -1 for padding (slots,);
-    parent: each supernode's in the tree, -1 for a root (s,); first: its first slot (s + 1,);
-    width: its columns that are not padding (s,); row_start (s + 1,), rows: the slots of its rows below, sorted;
-    sequence: the supernodes in a postorder of their tree (s,); group_start: the first supernode of each group and of
-    the top (GROUPS + 2,); nonzeros: those of L before amalgamation, diagonal included.
+    Attributes:
+        slot_of_vertex: (n,).
+        vertex_of_slot: -1 for padding, (slots,).
+        parent: parent of each supernode, -1 for a root, (s,).
+        first_slot: first slot of each supernode, (s + 1,).
+        num_columns: columns of each supernode without padding, (s,).
+        row_start: first entry of each supernode in `rows`, (s + 1,).
+        rows: sorted slots of the rows below each supernode.
+        postorder: the supernodes in a postorder of their tree, (s,).
+        group_start: first supernode of each group and of the top, (NUM_SUBTREE_GROUPS + 2,).
+        nonzeros: entries of L before amalgamation, including the diagonal.
     """
 
     slot: NDArray[np.int32]
@@ -49,7 +55,7 @@ _known: ContextVar[_Known | None] = ContextVar("_known", default=None)
 
 @contextmanager
 def analysed_once() -> Iterator[None]:
-    """Within this, `structure` orders and analyses a graph once, however many matrices have it."""
+    """Within this context, `analyse_graph` analyses each graph once, however many matrices share it."""
     token = _known.set([])
     try:
         yield
@@ -58,7 +64,12 @@ def analysed_once() -> Iterator[None]:
 
 
 def structure(pointers: NDArray[np.int64], neighbours: NDArray[np.int32]) -> Symbolic:
-    """The structure of the factor of a graph in CSR form, in the order of nested dissection; not to be written to."""
+    """Analyse a graph with the nested dissection order; the result must not be modified.
+
+    Args:
+        pointers: row pointers (n + 1,) of the graph in CSR form.
+        neighbours: column indices.
+    """
     known = _known.get()
     for p, n, found in known or ():
         if np.array_equal(p, pointers) and np.array_equal(n, neighbours):
@@ -70,7 +81,13 @@ def structure(pointers: NDArray[np.int64], neighbours: NDArray[np.int32]) -> Sym
 
 
 def analyse(pointers: NDArray[np.int64], neighbours: NDArray[np.int32], order: NDArray[np.int32]) -> Symbolic:
-    """The structure of the factor when vertices are eliminated in `order` (n,), up to a postorder of its tree."""
+    """Analyse a graph with a given elimination order, up to a postorder of its tree.
+
+    Args:
+        pointers: row pointers (n + 1,) of the graph in CSR form.
+        neighbours: column indices.
+        order: vertices in the order of elimination (n,).
+    """
     place = _inverse(order)
     post = _postorder(_elimination_tree(pointers, neighbours, order, place))
     order = order[post]
@@ -106,7 +123,7 @@ def analyse(pointers: NDArray[np.int64], neighbours: NDArray[np.int32], order: N
 
 
 def _inverse(order: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The place of each entry of a permutation."""
+    """Return the inverse of a permutation."""
     place = np.empty(len(order), np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
     return place
@@ -114,7 +131,7 @@ def _inverse(order: NDArray[np.int32]) -> NDArray[np.int32]:
 
 @kept()
 def _elimination_tree(pointers, neighbours, order, place):
-    """The parent of each column, -1 for a root (Davis 2006, section 4.1)."""
+    """Return the parent of each column, -1 for a root (Davis 2006, section 4.1)."""
     n = len(order)
     parent = np.full(n, -1, np.int32)
     ancestor = np.full(n, -1, np.int32)
@@ -133,7 +150,7 @@ def _elimination_tree(pointers, neighbours, order, place):
 
 @kept()
 def _postorder(parent):
-    """The nodes of a forest, children before parents, each subtree together; children in ascending order."""
+    """Return the nodes of a forest in postorder, with children in ascending order."""
     n = len(parent)
     child = np.full(n, -1, np.int32)
     sibling = np.full(n, -1, np.int32)
@@ -162,7 +179,7 @@ def _postorder(parent):
 
 @kept()
 def _column_counts(pointers, neighbours, order, place, parent):
-    """The entries of each column of L, diagonal included: row i has those on the paths from its entries up to i."""
+    """Return the entries of each column of L with its diagonal: row i has those on the paths from its entries to i."""
     n = len(order)
     count = np.ones(n, np.int64)
     mark = np.full(n, -1, np.int32)
@@ -180,7 +197,7 @@ def _column_counts(pointers, neighbours, order, place, parent):
 
 @kept()
 def _structure(pointers, neighbours, slot, vertex, parent, node_of_slot, nodes):
-    """The rows below each supernode, by slot: row i belongs to those on the paths from its entries up to i's own."""
+    """Return the rows below each supernode, by slot: row i belongs to those on the paths from its entries to i."""
     start = np.zeros(nodes + 1, np.int64)
     rows = np.empty(0, np.int32)
     for fill in range(2):

@@ -1,8 +1,8 @@
-"""How threads share the tasks of a step: who does which, and when all are done. A few atomic integers, no lock.
+"""Thread team: lock-free work sharing among threads within a step, by a few atomic integers.
 
-Tasks are claimed, never handed out, and whoever finishes the last one of a phase goes on to the next phase. So nobody
-waits for a thread that has not come, only for one that is at a task. A thread with nothing to do looks for the next
-phase without a pause, which takes it up at once, and after some microseconds gives its core to whoever wants it.
+Threads claim tasks; none are assigned. The thread that completes the last task of a phase starts the next phase. A
+thread thus never waits for one that has not started, only for one that is processing a task. An idle thread spins until
+the next phase begins, and after some microseconds yields its core to other programs.
 """
 
 from __future__ import annotations
@@ -18,21 +18,23 @@ from numpy.typing import NDArray
 from solvers.compiling import inner
 
 _PHASE, _DONE, _CLAIMS = 0, 8, 16
-"""Places in `signals`; the first two have a cache line each."""
+"""Indices into `signals`; the first two have separate cache lines."""
 
 _OVER = -1
 _SPINS = 2000
-"""A waiting thread asks so often whether the next phase has begun; after that it lets other programs have its core
-between two questions. They take about as long as an iteration on the smallest mesh on which a second thread pays."""
+"""Number of polls before a waiting thread yields its core between polls. They take about as long as an iteration on the
+smallest mesh on which a second thread pays off."""
 
 _offer_core: Any = types.ExternalFunction("sched_yield", types.intc())
 
 
 class Team(NamedTuple):
-    """What threads tell each other.
+    """Shared state of the threads.
 
-    signals: the phase, how many of its tasks are done, and the last phase in which each task was claimed; sums: what
-    the tasks found; found (2,): what the step ended with.
+    Attributes:
+        signals: the phase, the number of its completed tasks, and the last phase in which each task was claimed.
+        task_sums: results of the tasks.
+        results: final results of the step, (2,).
     """
 
     signals: NDArray[np.int64]
@@ -41,7 +43,7 @@ class Team(NamedTuple):
 
     @classmethod
     def of(cls, tasks: int) -> Team:
-        """For so many tasks a phase."""
+        """Allocate the state for a number of tasks per phase."""
         return cls(np.zeros(_CLAIMS + tasks, np.int64), np.zeros(tasks), np.zeros(2))
 
 
@@ -50,7 +52,7 @@ def _place(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any
 
 
 def _swap(typingctx: Any, signals: Any, place: Any, before: Any, after: Any) -> Any:
-    """Whether signals[place] was `before`, and now is `after`."""
+    """Replace signals[place] by `after` if it equals `before`; return whether it did."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         at = _place(context, builder, signature.args[0], args[0], args[1])
@@ -60,7 +62,7 @@ def _swap(typingctx: Any, signals: Any, place: Any, before: Any, after: Any) -> 
 
 
 def _add_one(typingctx: Any, signals: Any, place: Any) -> Any:
-    """Add one to signals[place], and return what it was."""
+    """Add one to signals[place], and return its previous value."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         at = _place(context, builder, signature.args[0], args[0], args[1])
@@ -70,7 +72,7 @@ def _add_one(typingctx: Any, signals: Any, place: Any) -> Any:
 
 
 def _read(typingctx: Any, signals: Any, place: Any) -> Any:
-    """signals[place], and sight of all that was written before it."""
+    """Return signals[place] with acquire ordering."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.load_atomic(_place(context, builder, signature.args[0], args[0], args[1]), "acquire", 8)
@@ -79,7 +81,7 @@ def _read(typingctx: Any, signals: Any, place: Any) -> Any:
 
 
 def _write(typingctx: Any, signals: Any, place: Any, value: Any) -> Any:
-    """Write signals[place], after all that was written before."""
+    """Write signals[place] with release ordering."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         builder.store_atomic(args[2], _place(context, builder, signature.args[0], args[0], args[1]), "release", 8)
@@ -88,7 +90,7 @@ def _write(typingctx: Any, signals: Any, place: Any, value: Any) -> Any:
     return types.void(signals, types.int64, types.int64), generate
 
 
-# Numba passes the first argument itself, which type checkers do not know.
+# Numba passes the first argument itself, which type checkers cannot see.
 _swap_in: Any = intrinsic(_swap)
 _count: Any = intrinsic(_add_one)
 _look: Any = intrinsic(_read)
@@ -97,21 +99,21 @@ _tell: Any = intrinsic(_write)
 
 @inner
 def start(team):
-    """Before the threads come: phase 0, no task of it claimed."""
+    """Reset the state before the threads start: phase 0, with no task claimed."""
     team.signals[:_CLAIMS] = 0
     team.signals[_CLAIMS:] = -1
 
 
 @inner
 def claim(team, task, phase):
-    """Whether this thread is to do the task in this phase."""
+    """Return whether this thread has claimed the task of a phase."""
     before = _look(team.signals, _CLAIMS + task)
     return before < phase and _swap_in(team.signals, _CLAIMS + task, before, phase)
 
 
 @inner
 def last(team):
-    """A task is done: whether it was the last one of its phase, so that this thread is to end the phase."""
+    """Mark a task as completed; return whether it was the last one of its phase, which this thread must then end."""
     if _count(team.signals, _DONE) < len(team.sums) - 1:
         return False
     team.signals[_DONE] = 0
@@ -120,7 +122,7 @@ def last(team):
 
 @inner
 def go_on(team, phase):
-    """End a phase with a later one."""
+    """Release a later phase."""
     _tell(team.signals, _PHASE, phase)
 
 
@@ -132,7 +134,7 @@ def finish(team):
 
 @inner
 def following(team, phase):
-    """Wait for the end of a phase; the next one, negative where there is none."""
+    """Wait for the end of a phase; return the next one, negative if there is none."""
     looks = 0
     now = _look(team.signals, _PHASE)
     while now == phase:

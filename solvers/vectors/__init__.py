@@ -1,1 +1,1 @@
-"""All code that is written for vector registers, beyond what a compiler finds by itself."""
+"""Kernels written explicitly for SIMD registers, where compilers do not vectorise by themselves."""

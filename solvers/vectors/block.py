@@ -1,7 +1,7 @@
-"""Products of tall narrow pieces of a front, in LLVM vectors that a compiler does not find by itself.
+"""Products of tiles of a frontal matrix, in explicit LLVM vectors that compilers do not generate by themselves.
 
-A front is kept column by column, `stride` numbers from one to the next. A tile is eight rows of six columns, or of
-three: its sums stay in registers while the columns to the left pass by, eight rows of each in a vector.
+A front is stored by columns, with `stride` entries from one to the next. A tile has eight rows and six or three
+columns. Its sums stay in registers during the loop over the columns to the left, of which eight rows form a vector.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from numba.extending import intrinsic
 from solvers.vectors.intrinsics import F64, I32, I64, Vectors, ask, signature, unpacked
 
 ROWS, TILE = 8, 6
-"""Of a tile, rows and columns (two vertices): its sums and a factor fit the registers of AVX2, two tiles' AVX-512's."""
+"""Rows and columns (two vertices) of a tile: its sums and a factor fit the registers of AVX2, two tiles' AVX-512's."""
 
 _WIDE = ir.VectorType(F64, ROWS)
 
 
 class _Strips(Vectors):
-    """Vectors of eight rows of a column."""
+    """Builder for vectors of eight rows of a column."""
 
     def rows(self, pointer: Any) -> Any:
-        """Eight rows."""
+        """Load eight rows."""
         return self.load(pointer, _WIDE)
 
     def everywhere(self, pointer: Any) -> Any:
-        """A number in memory, in all lanes."""
+        """Load a number into all lanes."""
         return self.spread(self.builder.load(pointer), ROWS)
 
     def masked(self, pointer: Any, mask: Any, value: Any = None) -> Any:
-        """Load the lanes that a mask has, zero for the others; or store those of a value."""
+        """Load the lanes of a mask, with zero in the others; or store those lanes of a value."""
         builder = self.builder
         place = builder.bitcast(pointer, _WIDE.as_pointer())
         kinds = [_WIDE.as_pointer(), I32, mask.type]
@@ -48,8 +48,10 @@ class _Strips(Vectors):
 
 def _subtract_product(typingctx: Any, L: Any, at: Any, top: Any, stride: Any, depth: Any, C: Any, to: Any, step: Any,
                       strips: Any, columns: Any) -> Any:  # fmt: skip
-    """C[to + r + step j] -= sum over k < depth of L[at + r + stride k] L[top + j + stride k] for j < columns, and r in
-    as many strips of eight."""
+    """Compute C[to + r + step j] -= sum over k < depth of L[at + r + stride k] L[top + j + stride k].
+
+    j < columns, and r covers `strips` strips of eight rows.
+    """
     declared = signature(L, at, top, stride, depth, C, to, step, strips, columns)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -58,7 +60,7 @@ def _subtract_product(typingctx: Any, L: Any, at: Any, top: Any, stride: Any, de
         left, above = builder.gep(L, [at]), builder.gep(L, [top])
 
         def tile(row: Any, vectors: int) -> None:
-            """So many vectors of rows from `row` on."""
+            """Process a number of vectors of rows, from `row` on."""
             begins = [builder.add(row, I64(ROWS * n)) for n in range(vectors)]
             targets = [
                 builder.gep(C, [builder.add(builder.add(to, builder.mul(step, I64(j))), begin)])
@@ -91,8 +93,10 @@ def _subtract_product(typingctx: Any, L: Any, at: Any, top: Any, stride: Any, de
 
 
 def _divide(typingctx: Any, L: Any, at: Any, stride: Any, triangle: Any, strips: Any, columns: Any) -> Any:
-    """The rows X of a tile, in as many strips of eight from `at` on, become X T^-T; triangle (TILE, TILE): T, its
-    diagonal inverted."""
+    """Replace the rows X of a tile, in strips of eight from `at` on, by X T^-T.
+
+    triangle (TILE_COLUMNS, TILE_COLUMNS): T with inverted diagonal.
+    """
     declared = signature(L, at, stride, triangle, strips, columns)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -119,8 +123,10 @@ def _divide(typingctx: Any, L: Any, at: Any, stride: Any, triangle: Any, strips:
 
 
 def _factorise_corner(typingctx: Any, L: Any, at: Any, stride: Any, least: Any, triangle: Any, columns: Any) -> Any:
-    """Write the Cholesky factor of a tile's corner, at `at`, to triangle (TILE, TILE), its diagonal inverted; returns
-    whether each pivot is above its entry of `least` (TILE,)."""
+    """Write the Cholesky factor of a tile's diagonal block to `triangle`, with inverted diagonal.
+
+    triangle: (TILE_COLUMNS, TILE_COLUMNS). Returns whether each pivot exceeds its threshold.
+    """
     declared = types.boolean(*signature(L, at, stride, least, triangle, columns).args)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -148,8 +154,10 @@ def _factorise_corner(typingctx: Any, L: Any, at: Any, stride: Any, least: Any, 
 
 
 def _solve_columns(typingctx: Any, L: Any, at: Any, stride: Any, x: Any, to: Any, strips: Any, columns: Any) -> Any:
-    """A tile's pass forwards: x[to + j] for j < columns, by its corner at `at`; what is below, in as many strips of
-    eight, less by what that brings."""
+    """Perform a tile's forward substitution: solve for x[to + j], j < columns, with its diagonal block at `at`.
+
+    The contributions are subtracted from the rows below, in strips of eight.
+    """
     declared = signature(L, at, stride, x, to, strips, columns)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -179,8 +187,10 @@ def _solve_columns(typingctx: Any, L: Any, at: Any, stride: Any, x: Any, to: Any
 
 
 def _solve_rows(typingctx: Any, L: Any, at: Any, stride: Any, x: Any, to: Any, strips: Any, columns: Any) -> Any:
-    """A tile's pass backwards: x[to + j] for j < columns, less by what as many strips of eight below bring, by its
-    corner at `at`."""
+    """Perform a tile's backward substitution for x[to + j], j < columns, with its diagonal block at `at`.
+
+    The contributions of the rows below, in strips of eight, are subtracted first.
+    """
     declared = signature(L, at, stride, x, to, strips, columns)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -213,7 +223,7 @@ def _solve_rows(typingctx: Any, L: Any, at: Any, stride: Any, x: Any, to: Any, s
 
 
 def _add(typingctx: Any, source: Any, at: Any, target: Any, to: Any, count: Any) -> Any:
-    """target[to + r] += source[at + r] for r < count; the lanes behind are neither read nor written."""
+    """Compute target[to + r] += source[at + r] for r < count; lanes beyond are neither read nor written."""
     declared = types.void(source, at, target, to, count)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -234,7 +244,7 @@ def _add(typingctx: Any, source: Any, at: Any, target: Any, to: Any, count: Any)
     return declared, generate
 
 
-# Numba passes the first argument itself, which type checkers do not know.
+# Numba passes the first argument itself, which type checkers cannot see.
 subtract_product: Any = intrinsic(_subtract_product)
 add: Any = intrinsic(_add)
 divide: Any = intrinsic(_divide)

@@ -1,5 +1,7 @@
-"""The objective of eight vertices and their springs, and minus its gradient, in LLVM vectors (see
-`solvers.kernels.accelerate_springs` for the formula, and `solvers.vectors.springs` for the lanes)."""
+"""Objective of eight vertices and their springs, and its negative gradient, in explicit LLVM vectors.
+
+See `solvers.kernels.accelerate_springs` for the formula, and `solvers.simd.spring_packets` for the lanes.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ from solvers.vectors.springs import LANES, MOST, WIDE, Bundle, Eights, constant
 
 
 def _bundle(typingctx: Any, bundles: Any, shares: Any, number: Any, x: Any, right: Any, out: Any) -> Any:
-    """A bundle's code: writes its rows of `out`, returns its energy; -1, and writes none, if a spring is short."""
+    """Write a packet's rows of `out` and return its energy; return -1 without writing if a spring is too short."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bundles, shares, number, x, right, out = unpacked(context, builder, signature, args)
@@ -23,7 +25,7 @@ def _bundle(typingctx: Any, bundles: Any, shares: Any, number: Any, x: Any, righ
         sums, shortest = v.sums(4), cgutils.alloca_once_value(builder, constant(MOST))
 
         def read(entry: Any) -> list[Any]:
-            """What an entry's springs need: k r, k, 1/(4 k), and the vector from their other ends."""
+            """Load the data of an entry's springs: k r, k, 1/(4 k), and the vector from their other ends."""
             numbers = [*v.eights(springs.weights, springs.kind, entry), *v.eights(shares.shares, shares.kind, entry, 1)]
             return [*numbers, *v.arrow(x, centre, springs.neighbour, entry)]
 

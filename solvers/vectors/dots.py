@@ -1,9 +1,10 @@
-"""Scalar products that add up in one order, whoever compiles them.
+"""Dot products with a fixed order of summation, independent of the compilation.
 
-A sum that may be reordered becomes vectors, but in an order that the compiler chooses anew wherever it puts the code:
-the process that compiles a kernel and later ones, which load it, would differ in the last bits. So the vectors are
-written here: of four vectors of eight, which hide how long an addition takes, lane l adds the terms l, l + 32, ...; the
-vectors and then the lanes are added pairwise, and what is left over one by one. Arrays may be float32; sums are not.
+A compiler that may reorder a sum vectorises it, but in an order that depends on where the code is inlined. The process
+that compiles a kernel, and later ones that load it from the cache, would then differ in the last bits. The vectors are
+therefore explicit. Four vectors of eight lanes hide the latency of an addition, and lane l adds the terms l, l + 32,
+... The vectors and then the lanes are added pairwise, and the remaining terms one by one. Arrays may be float32; sums
+are float64.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from solvers.vectors.intrinsics import F64, I64, Vectors, unpacked
 from solvers.vectors.springs import LANES, WIDE, constant
 
 _TOGETHER = 4
-"""Vectors that are added to side by side."""
+"""Number of vectors that accumulate in parallel."""
 
 
 def _sums(*pairs: tuple[int, int]) -> Callable[..., Any]:
-    """The code for the scalar products of these pairs of arrays, over their first `count` entries."""
+    """Return the code of the dot products of pairs of arrays, over their first `count` entries."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         *arrays, count = unpacked(context, builder, signature, args)
@@ -61,15 +62,15 @@ def _sums(*pairs: tuple[int, int]) -> Callable[..., Any]:
 
 
 def _dot(typingctx: Any, a: Any, b: Any, count: Any) -> Any:
-    """a b."""
+    """Return the dot product of a and b."""
     return types.float64(a, b, count), _sums((0, 1))
 
 
 def _dots(typingctx: Any, s: Any, w: Any, g: Any, count: Any) -> Any:
-    """s g and w g."""
+    """Return the dot products of s and g, and of w and g."""
     return types.UniTuple(types.float64, 2)(s, w, g, count), _sums((0, 2), (1, 2))
 
 
-# Numba passes the first argument itself, which type checkers do not know.
+# Numba passes the first argument itself, which type checkers cannot see.
 dot: Any = intrinsic(_dot)
 dots: Any = intrinsic(_dots)

@@ -1,9 +1,9 @@
-"""Eight float64 as one number of a kernel: the same source computes with one, and with eight in a vector register.
+"""SIMD packets of eight float64 for kernels: the same source computes with scalars and with vector registers.
 
-`+`, `-`, `*` and comparisons take two of them, or one and a float, lane by lane; comparisons of eight give eight flags,
-which `&` and `|` join. What a kernel would branch on it chooses with `where`. No product is fused with a sum, so that
-each lane has the bits that a float would have. `ratio` divides without asking what by: what it makes of zero, `where`
-leaves out.
+`+`, `-`, `*` and comparisons act lane by lane on two packets, or on a packet and a float. Comparisons of packets give
+masks, which `&` and `|` combine. `where` replaces branches. No product is fused with a sum, so that each lane is
+bitwise identical to a scalar computation. `divide_packet` divides without a test for zero; `where` discards such
+results.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from solvers.vectors.springs import LANES, MASK, WIDE, Eights
 
 
 class _Eight(types.Type):
-    """Eight float64."""
+    """Numba type of a packet of eight float64."""
 
     def can_convert_from(self, typingctx: Any, other: Any) -> Any:
-        """A float is eight times itself."""
+        """Permit the promotion of a float, which is broadcast to all lanes."""
         return Conversion.promote if isinstance(other, types.Float) else None
 
 
 class _Flags(types.Type):
-    """Eight truth values."""
+    """Numba type of a mask of eight lanes."""
 
 
 EIGHT, FLAGS = _Eight("eight float64"), _Flags("eight flags")
@@ -56,7 +56,7 @@ def _spread(context: Any, builder: Any, kind: Any, wanted: Any, value: Any) -> A
 
 
 def _state(symbol: Any, kind: Any, result: Any, emit: Callable[[Any, Any, Any], Any]) -> None:
-    """What an operator of two makes of two eights, or of flags."""
+    """Register a binary operator of two packets, or of two masks."""
 
     class Template(AbstractTemplate):
         def generic(self, args: Any, kws: Any) -> Any:
@@ -80,7 +80,7 @@ _state(operator.or_, FLAGS, FLAGS, lambda b, x, y: b.or_(x, y))
 
 
 def _choose(typingctx: Any, flag: Any, x: Any, y: Any) -> Any:
-    """x where the flag is set, else y, of floats or of eights."""
+    """Return x where the flag is set, else y, for floats or packets."""
     kind = EIGHT if flag is FLAGS else types.float64
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -90,7 +90,7 @@ def _choose(typingctx: Any, flag: Any, x: Any, y: Any) -> Any:
 
 
 def _divide(typingctx: Any, x: Any, y: Any) -> Any:
-    """x/y of floats or of eights."""
+    """Return x/y of floats or packets."""
     kind = EIGHT if EIGHT in (x, y) else types.float64
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -100,7 +100,7 @@ def _divide(typingctx: Any, x: Any, y: Any) -> Any:
 
 
 def _square_root(typingctx: Any, x: Any) -> Any:
-    """The square root of a float or of eight."""
+    """Return the square root of a float or a packet."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         name, kind = "llvm.sqrt.v8f64" if x is EIGHT else "llvm.sqrt.f64", args[0].type
@@ -111,8 +111,10 @@ def _square_root(typingctx: Any, x: Any) -> Any:
 
 
 def _rows(typingctx: Any, x: Any, vertices: Any, first: Any, last: Any, column: Any) -> Any:
-    """x, y and z of the rows of x (n, 4) that vertices (m, k), contiguous, have in a column, of eight from `first` on;
-    beyond `last`, of that one."""
+    """Gather x, y and z of eight rows of x (n, 4) as packets.
+
+    The rows are those in a column of vertices (m, k), contiguous, from `first` on; lanes beyond `last` repeat that one.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         (kind, known, *_), (rows, named, *numbers), v = signature.args, args, Eights(context, builder)
@@ -131,7 +133,7 @@ def _rows(typingctx: Any, x: Any, vertices: Any, first: Any, last: Any, column: 
 
 
 def _loaded(typingctx: Any, array: Any, place: Any) -> Any:
-    """Eight numbers of a contiguous array from a place on, counted through all its axes."""
+    """Load eight numbers of a contiguous array from a flat index on."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, args[0]).data
@@ -141,7 +143,7 @@ def _loaded(typingctx: Any, array: Any, place: Any) -> Any:
 
 
 def _stored(typingctx: Any, value: Any, array: Any, place: Any) -> Any:
-    """Write eight numbers to a contiguous array from a place on."""
+    """Store eight numbers in a contiguous array from a flat index on."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = context.make_array(signature.args[1])(context, builder, args[1]).data
@@ -152,7 +154,7 @@ def _stored(typingctx: Any, value: Any, array: Any, place: Any) -> Any:
 
 
 def _as_bits(typingctx: Any, flags: Any) -> Any:
-    """Flags as the bits of a number, that of the first lane the lowest."""
+    """Return a mask as the bits of an integer, with the first lane as the lowest bit."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.zext(builder.bitcast(args[0], I8), I64)
@@ -161,7 +163,7 @@ def _as_bits(typingctx: Any, flags: Any) -> Any:
 
 
 def _lowest_bit(typingctx: Any, bits: Any) -> Any:
-    """Which bit of a number that is not zero is the lowest."""
+    """Return the index of the lowest set bit of a nonzero integer."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.IntType(1)(1))
@@ -169,7 +171,7 @@ def _lowest_bit(typingctx: Any, bits: Any) -> Any:
     return types.int64(types.int64), generate
 
 
-# Numba passes the first argument itself, which type checkers do not know.
+# Numba passes the first argument itself, which type checkers cannot see.
 where: Any = intrinsic(_choose)
 ratio: Any = intrinsic(_divide)
 root: Any = intrinsic(_square_root)

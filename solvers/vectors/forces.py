@@ -1,4 +1,4 @@
-"""The forces of the springs of eight vertices, and their norm, in LLVM vectors (see `solvers.vectors.springs`)."""
+"""Forces of the springs of eight vertices, and their norm, in LLVM vectors (see `solvers.simd.spring_packets`)."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from solvers.vectors.springs import LANES, MOST, WIDE, Bundle, Eights, constant
 
 
 def _over_bundle(correct: bool) -> Callable[..., Any]:
-    """The code that adds a bundle's forces to rows of `out`, or none if a spring is short, which it returns.
+    """Return the code that adds a packet's forces to rows of `out`, or none if a spring is too short, which it returns.
 
-    correct: minus the gradient; else the constant right-hand side and the springs' projections.
+    subtract_position: whether to add the negative gradient; else the constant right-hand side and the spring
+    projections.
     """
 
     def declare(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, out: Any) -> Any:
@@ -43,17 +44,17 @@ def _over_bundle(correct: bool) -> Callable[..., Any]:
 
 
 def _sums(v: Eights, springs: Bundle, x: Any, centre: list[Any], correct: bool) -> tuple[list[Any], Any]:
-    """What the springs of eight vertices add up to, (k r/|v| - k) v, or k r/|v| v; and whether one is short."""
+    """Return the sums of a packet's springs, (k r/|v| - k) v or k r/|v| v, and whether a spring is too short."""
     builder: Any = v.builder
     sums, shortest = v.sums(3), cgutils.alloca_once_value(builder, constant(MOST))
 
     def read(entry: Any) -> list[Any]:
-        """What an entry's springs need: k r, k, and the vector from their other ends with its square."""
+        """Load the data of an entry's springs: k r, k, and the vector from their other ends with its square."""
         arrow = v.arrow(x, centre, springs.neighbour, entry)
         return [*v.eights(springs.weights, springs.kind, entry), v.dot(arrow), *arrow]
 
     def scale(values: list[Any]) -> list[Any]:
-        """What the vectors are multiplied by, as a guess and what is to be added to it."""
+        """Return the factor of the vectors, as an estimate and its correction terms."""
         pull, stiffness, squared, *arrow = values
         v.note_least(squared, shortest)
         y, e = v.guess(squared)
@@ -71,7 +72,7 @@ def _sums(v: Eights, springs: Bundle, x: Any, centre: list[Any], correct: bool) 
 
 
 def _energy(typingctx: Any, bundles: Any, number: Any, x: Any, measure: Any) -> Any:
-    """A bundle's share of the squared norm of x: half of its springs', and what `measure` holds each vertex with."""
+    """Return a packet's share of the squared norm of x: half of its springs', and `measure` times squared positions."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bundles, number, x, measure = unpacked(context, builder, signature, args)
@@ -92,7 +93,7 @@ def _energy(typingctx: Any, bundles: Any, number: Any, x: Any, measure: Any) -> 
     return types.float64(bundles, number, x, measure), generate
 
 
-# Numba passes the first argument itself, which type checkers do not know.
+# Numba passes the first argument itself, which type checkers cannot see.
 project: Any = intrinsic(_over_bundle(correct=False))
 correct: Any = intrinsic(_over_bundle(correct=True))
 energy: Any = intrinsic(_energy)

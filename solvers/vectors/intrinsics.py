@@ -1,6 +1,6 @@
-"""What kernels share that are written with an LLVM builder, and a prefetch for those that are not.
+"""Shared tools of kernels written with an LLVM builder, and a prefetch for all other kernels.
 
-`contract` lets the target fuse a product with a sum where it can.
+`contract` permits the target to fuse a product with a sum.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _BYTES = {ir.HalfType(): 2, ir.FloatType(): 4}
 
 
 def signature(*kinds: Any, compiled_in: int = 1) -> Any:
-    """Nothing returned; so many of the last arguments, integers, are compiled in. Raises TypingError."""
+    """Return a void signature whose last `compiled_in` arguments are literal integers; raise TypingError otherwise."""
     usual, literal = map(types.unliteral, kinds[:-compiled_in]), kinds[-compiled_in:]
     if not all(isinstance(kind, types.IntegerLiteral) for kind in literal):
         raise TypingError(f"the last {compiled_in} arguments must be literal integers")
@@ -26,8 +26,10 @@ def signature(*kinds: Any, compiled_in: int = 1) -> Any:
 
 
 def unpacked(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
-    """A kernel's arguments: of arrays where they begin, of numbers int64, of what is compiled in Python's int, of named
-    tuples the same of each field."""
+    """Return a kernel's arguments as LLVM values.
+
+    Arrays become pointers to their data, numbers int64, literals Python integers, and named tuples are unpacked alike.
+    """
     return [_unpacked(context, builder, *both) for both in zip(signature.args, args, strict=True)]
 
 
@@ -43,59 +45,59 @@ def _unpacked(context: Any, builder: Any, kind: Any, value: Any) -> Any:
 
 
 class Vectors:
-    """Vectors of numbers, written with a builder. wide: whether registers hold 512 bits."""
+    """Builder of vector code; has_avx512: whether registers have 512 bits."""
 
     def __init__(self, context: Any, builder: Any) -> None:
         self.builder = builder
         self.wide = "+avx512f" in context.codegen().magic_tuple()[2]
 
     def load(self, pointer: Any, kind: Any) -> Any:
-        """A number or a vector; NumPy promises no more than its items' alignment."""
+        """Load a number or a vector, with the alignment of its items, the only one that NumPy guarantees."""
         return self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()), align=_alignment(kind))
 
     def store(self, value: Any, pointer: Any) -> None:
-        """The same, the other way."""
+        """Store a number or a vector, with the alignment of its items."""
         place = self.builder.bitcast(pointer, value.type.as_pointer())
         self.builder.store(value, place, align=_alignment(value.type))
 
     def shuffle(self, a: Any, b: Any, lanes: Any) -> Any:
-        """These lanes of two vectors, counted through both."""
+        """Return lanes of two vectors, numbered through both."""
         lanes = list(lanes)
         return self.builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, len(lanes)), lanes))
 
     def spread(self, value: Any, lanes: int) -> Any:
-        """A number in all lanes."""
+        """Return a vector with a number in all lanes."""
         kind = ir.VectorType(value.type, lanes)
         single = self.builder.insert_element(ir.Constant(kind, ir.Undefined), value, I32(0))
         return self.shuffle(single, single, [0] * lanes)
 
     def multiply_add(self, a: Any, b: Any, c: Any) -> Any:
-        """a b + c; a b for no c."""
+        """Return a b + c, or a b if c is None."""
         product = self.builder.fmul(a, b, flags=("contract",))
         return product if c is None else self.builder.fadd(product, c, flags=("contract",))
 
     def subtract_product(self, c: Any, a: Any, b: Any) -> Any:
-        """c - a b."""
+        """Return c - a b."""
         return self.builder.fsub(c, self.builder.fmul(a, b, flags=("contract",)), flags=("contract",))
 
     def total(self, a: Any) -> Any:
-        """The sum of the lanes, taken pairwise."""
+        """Return the sum of the lanes, taken pairwise."""
         return self.paired([self.builder.extract_element(a, I32(lane)) for lane in range(a.type.count)])
 
     def paired(self, terms: list[Any]) -> Any:
-        """The sum of as many terms as a power of two, taken pairwise."""
+        """Return the sum of a power of two of terms, taken pairwise."""
         while len(terms) > 1:
             terms = [self.builder.fadd(p, q) for p, q in zip(terms[::2], terms[1::2], strict=True)]
         return terms[0]
 
     def folded(self, a: Any) -> Any:
-        """The sum of the lanes, half of them added to the other half."""
+        """Return the sum of the lanes by repeatedly adding one half to the other."""
         while (count := a.type.count // 2) > 0:
             a = self.builder.fadd(*(self.shuffle(a, a, range(k, k + count)) for k in (0, count)))
         return self.builder.extract_element(a, I32(0))
 
     def any(self, mask: Any) -> Any:
-        """Whether one of eight is true."""
+        """Return whether any of eight lanes is true."""
         return self.builder.icmp_unsigned("!=", self.builder.bitcast(mask, I8), I8(0))
 
 
@@ -104,7 +106,7 @@ def _alignment(kind: Any) -> int:
 
 
 def ask(builder: Any, pointer: Any, distance: int = 0) -> None:
-    """Ask memory for the cache line that lies so many bytes behind a pointer."""
+    """Prefetch the cache line at a distance in bytes from a pointer."""
     byte = I8.as_pointer()
     kind = ir.FunctionType(ir.VoidType(), [byte, I32, I32, I32])
     at = builder.gep(builder.bitcast(pointer, byte), [I64(distance)])
@@ -112,7 +114,7 @@ def ask(builder: Any, pointer: Any, distance: int = 0) -> None:
 
 
 def _ask_for(typingctx: Any, array: Any, place: Any) -> Any:
-    """Ask memory for the entry of a contiguous array at a place, counted through all its axes."""
+    """Prefetch the entry of a contiguous array at a flat index."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         start, at = unpacked(context, builder, signature, args)

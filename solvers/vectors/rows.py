@@ -1,4 +1,4 @@
-"""Rows of a sparse matrix times vectors of four numbers a vertex, in LLVM vectors: an entry multiplies a whole load."""
+"""Sparse matrix rows times vectors of four numbers per vertex, in LLVM vectors: an entry multiplies a whole load."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from solvers.vectors.intrinsics import I32, I64, Vectors, unpacked
 
 
 def _gather(typingctx: Any, values: Any, columns: Any, begin: Any, end: Any, x: Any) -> Any:
-    """sum over begin <= e < end of values[e] x[columns[e]], as four numbers of x's type."""
+    """Return the sum over begin <= e < end of values[e] x[columns[e]], as four numbers of x's type."""
     number = x.dtype
     declared = types.UniTuple(number, 4)(values, columns, types.int64, types.int64, x)
 

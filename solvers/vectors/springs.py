@@ -1,13 +1,13 @@
-"""The springs of eight vertices at a time, in LLVM vectors that a compiler does not find by itself.
+"""Springs of eight vertices at a time, in explicit LLVM vectors that compilers do not generate by themselves.
 
-Positions have rows of four numbers, x, y, z and padding: one load brings a vertex, and eight loaded rows are transposed
-into vectors of x, y and z. Lane l holds a spring of vertex l, so that no two lanes add to one place. A row is named by
-the place of its first number: processors add that to an address for nothing, and instructions are what these loops
-take time for.
+Position rows have four numbers, x, y, z and padding. One load fetches a vertex, and eight loaded rows are transposed to
+vectors of x, y and z. Lane l contains a spring of vertex l, so that no two lanes add to one address. Rows are
+identified by the offset of their first number. Processors add that to an address at no cost, and these loops are
+limited by their number of instructions.
 
-    1/|v|   from a guess, e = 1 - s y^2, y <- y (1 - e)^(-1/2) by its series, to about one unit in the last place:
-            from AVX-512's estimate, 2^-14 off, by a step of degree 3;
-            from one by Lomont's trick (2003), 3.4 % off, by a step of degree 4 and one of degree 2
+    1/|v|   from an estimate, e = 1 - s y^2, y <- y (1 - e)^(-1/2) by its series, to about one unit in the last place:
+            AVX-512's estimate, with an error of 2^-14, and a step of degree 3;
+            or Lomont's integer trick (2003), with an error of 3.4 %, and steps of degree 4 and 2
 """
 
 from __future__ import annotations
@@ -23,25 +23,27 @@ from solvers.vectors.intrinsics import F64, I8, I64, Vectors, ask
 
 LANES = 8
 RIGHT = 4 * LANES
-"""Numbers of a bundle's constant right-hand side: x, y and z of eight vertices, and what holds each [N/m]."""
+"""Numbers in a packet's constant right-hand side: x, y and z of eight vertices, and their stiffnesses [N/m]."""
 ROW, WIDE, MASK = ir.VectorType(F64, 4), ir.VectorType(F64, LANES), ir.VectorType(ir.IntType(1), LANES)
 BITS = ir.VectorType(I64, LANES)
 _GUESS, _ESTIMATE = 0x5FE6EB50C7B537A9, "llvm.x86.avx512.rsqrt14.pd.512"
 LEAST, MOST = TINY * TINY, 1.7e308
-"""Between these, a squared length has a guess that is finite."""
+"""Bounds of squared lengths between which the estimate is finite."""
 
 AHEAD = 128
-"""How many rows ahead memory is asked for what is read once an iteration: of large meshes it is in no cache by then."""
+"""Prefetch distance in rows for data read once per iteration, which large meshes evict from the caches."""
 
 
 def constant(value: float) -> ir.Constant:
-    """Eight times one number."""
+    """Return a packet with one number in all lanes."""
     return ir.Constant(WIDE, [value] * LANES)
 
 
 class Bundle(NamedTuple):
-    """The springs of eight vertices in memory: where the arrays of `solvers.kernels.springs.Bundles` begin, the
-    bundle's number, and its first entry and the one behind its last."""
+    """Springs of eight vertices in memory.
+
+    Offsets of the arrays of `solvers.kernels.springs.Bundles`, the packet's index, and its first and end entry.
+    """
 
     own: Any
     neighbour: Any
@@ -53,22 +55,22 @@ class Bundle(NamedTuple):
 
     @classmethod
     def of(cls, builder: Any, bundles: Any, number: Any) -> Bundle:
-        """The bundle of this number."""
+        """Load the packet with a given index."""
         begin, end = (builder.load(builder.gep(bundles.start, [builder.add(number, I64(k))])) for k in (0, 1))
         return cls(bundles.own, bundles.neighbour, bundles.kind, bundles.weights, number, begin, end)
 
 
 class Eights(Vectors):
-    """Vectors of eight float64: of the springs that end at eight vertices, one each."""
+    """Builder for packets of eight float64, one for each spring that ends at eight vertices."""
 
     def places(self, indices: Any, bundle: Any) -> list[Any]:
-        """The places of eight rows, the bundle's of those that are listed, int32."""
+        """Load the offsets of eight rows, those of a packet in a list of int32."""
         b = self.builder
         first = b.mul(bundle, I64(LANES))
         return [b.zext(b.load(b.gep(indices, [b.add(first, I64(lane))])), I64) for lane in range(LANES)]
 
     def gather(self, array: Any, places: list[Any]) -> list[Any]:
-        """x, y and z of eight rows."""
+        """Gather x, y and z of eight rows."""
         rows = [self.load(self.builder.gep(array, [place]), ROW) for place in places]
         pairs = [self.shuffle(rows[lane], rows[lane + 2], list(range(8))) for lane in (0, 1, 4, 5)]
         low = [0, 8, 2, 10, 4, 12, 6, 14]
@@ -78,38 +80,40 @@ class Eights(Vectors):
         return [self.shuffle(a[0], a[1], lanes) for a, lanes in ((xz, first), (y, first), (xz, second))]
 
     def eights(self, table: Any, kind: Any, entry: Any, many: int = 2) -> list[Any]:
-        """The vectors of an entry's kind (see `kinds`)."""
+        """Load the vectors of an entry's kind (see `kinds`)."""
         b = self.builder
         begin = b.zext(b.load(b.gep(kind, [entry])), I64)
         return [self.load(b.gep(table, [b.add(begin, I64(LANES * k))]), WIDE) for k in range(many)]
 
     def sums(self, many: int) -> list[Any]:
-        """So many vectors to add up in, of zeros."""
+        """Allocate accumulators initialised with zero."""
         return [cgutils.alloca_once_value(self.builder, constant(0.0)) for _ in range(many)]
 
     def arrow(self, x: Any, centre: list[Any], neighbour: Any, entry: Any) -> list[Any]:
-        """The vectors to eight vertices from the other ends of an entry's springs."""
+        """Return the vectors to eight vertices from the other ends of an entry's springs."""
         others = self.gather(x, self.places(neighbour, entry))
         return [self.builder.fsub(a, b) for a, b in zip(centre, others, strict=True)]
 
     def add_products(self, factors: list[Any], terms: list[Any], sums: list[Any]) -> None:
-        """Add a factor times a term to each sum."""
+        """Add factor times term to each accumulator."""
         for factor, term, total in zip(factors, terms, sums, strict=True):
             self.builder.store(self.multiply_add(factor, term, self.builder.load(total)), total)
 
     def note_least(self, value: Any, least: Any) -> None:
-        """Keep the lesser of a vector's numbers and those in memory."""
+        """Update the lane-wise minimum in memory."""
         self.builder.store(self.least(self.builder.load(least), value), least)
 
     def short(self, least: Any) -> Any:
-        """Whether one of the least squares in memory is too small for an inverse root."""
+        """Return whether a minimum in memory is too small for an inverse square root."""
         return self.any(self.builder.fcmp_ordered("<=", self.builder.load(least), constant(LEAST)))
 
     def over_entries(
         self, begin: Any, end: Any, read: Callable[[Any], list[Any]], *stages: Callable[[list[Any]], Any]
     ) -> None:
-        """Read one entry while each stage is at one of those before it: none waits long for what it needs. There are
-        as many entries as stages at least."""
+        """Process all entries in a software pipeline: one entry is read while each stage processes an earlier one.
+
+        This hides latencies. There must be at least as many entries as stages.
+        """
         b, depth = self.builder, len(stages)
         waiting: list[list[Any]] = []  # for each stage, the last one first
         for k in range(depth):
@@ -132,7 +136,7 @@ class Eights(Vectors):
                 values = stage(values)
 
     def rows(self, vectors: list[Any], element: ir.Type = F64) -> list[Any]:
-        """Eight rows of x, y, z and zero, rounded to float32 where that is the element."""
+        """Transpose vectors to eight rows of x, y, z and zero, rounded to float32 if that is the element type."""
         zero, pairs = ir.Constant(ir.VectorType(element, LANES), [0.0] * LANES), [0, 2, 4, 6]
         if element != F64:
             vectors = [self.builder.fptrunc(a, zero.type) for a in vectors]
@@ -150,7 +154,7 @@ class Eights(Vectors):
         return out
 
     def dot(self, a: list[Any]) -> Any:
-        """|a|^2 of eight vectors."""
+        """Return |a|^2 of eight vectors."""
         squared = self.builder.fmul(a[0], a[0], flags=("contract",))
         for component in a[1:]:
             squared = self.multiply_add(component, component, squared)
@@ -161,20 +165,20 @@ class Eights(Vectors):
         self.store(self.builder.fadd(self.load(pointer, row.type), row), pointer)
 
     def clamped(self, s: Any) -> Any:
-        """s, between LEAST and MOST."""
+        """Return s clamped to MIN_SQUARED_LENGTH and MAX_SQUARED_LENGTH."""
         return self.least(self.least(s, constant(LEAST), ">="), constant(MOST))
 
     def least(self, a: Any, b: Any, order: str = "<=") -> Any:
-        """The lesser of two vectors' numbers, or the greater with the order ">="; a, where that is not a number."""
+        """Return the lane-wise minimum, or the maximum with order ">="; a where the comparison involves NaN."""
         return self.builder.select(self.builder.fcmp_ordered(order, b, a), b, a)
 
     def right(self, array: Any, bundle: Any) -> list[Any]:
-        """The constant right-hand side of a bundle, and what holds its vertices."""
+        """Load the constant right-hand side of a packet, and the stiffness of its vertices."""
         at = self.builder.gep(array, [self.builder.mul(bundle, I64(RIGHT))])
         return [self.load(self.builder.gep(at, [I64(LANES * k)]), WIDE) for k in range(4)]
 
     def ask_ahead(self, springs: Bundle, places: list[Any], right: Any, out: Any) -> None:
-        """Ask for what a bundle reads AHEAD rows on."""
+        """Prefetch the data that a packet PREFETCH_ROWS rows ahead will read."""
         b = self.builder
         first = b.mul(b.add(springs.number, I64(AHEAD // LANES)), I64(RIGHT))
         for k in range(4):
@@ -186,7 +190,7 @@ class Eights(Vectors):
             ask(b, b.gep(springs.neighbour, [b.add(first, I64(2 * LANES * k))]))
 
     def guess(self, s: Any) -> tuple[Any, Any]:
-        """y, nearly 1/sqrt(s), and 1 - s y^2, for s between LEAST and MOST; `correction` does the rest."""
+        """Return y, an estimate of 1/sqrt(s), and 1 - s y^2, for clamped s; `inverse_sqrt_correction` completes it."""
         b = self.builder
         if self.wide:
             kind = ir.FunctionType(WIDE, [WIDE, WIDE, I8])
@@ -200,17 +204,17 @@ class Eights(Vectors):
         return y, self.subtract_product(constant(1.0), b.fmul(s, y), y)
 
     def correction(self, e: Any) -> Any:
-        """((1 - e)^(-1/2) - 1)/e, as far as a guess needs it."""
+        """Return ((1 - e)^(-1/2) - 1)/e to the accuracy that the estimate requires."""
         return self.series(e, *(5 / 16, 3 / 8, 1 / 2) if self.wide else (3 / 8, 1 / 2))
 
     def series(self, e: Any, *coefficients: float) -> Any:
-        """The polynomial in e with these coefficients, the highest power's first."""
+        """Evaluate a polynomial in e, with coefficients from the highest power down."""
         first, *others = map(constant, coefficients)
         for c in others:
             first = self.multiply_add(first, e, c)
         return first
 
     def inverse_root(self, s: Any) -> Any:
-        """1/sqrt(s), for s between LEAST and MOST."""
+        """Return 1/sqrt(s), for s between MIN_SQUARED_LENGTH and MAX_SQUARED_LENGTH."""
         y, e = self.guess(s)
         return self.multiply_add(self.builder.fmul(y, e), self.correction(e), y)

@@ -1,16 +1,18 @@
-"""A panel times four interleaved right-hand sides, both ways, in LLVM vectors that a compiler does not find by itself.
+"""Products of a panel with four interleaved right-hand sides, and of its transpose, in explicit LLVM vectors.
 
-A panel W has 4 m columns (m = 1 to 4), and its rows by fours, tiles, each of them column by column: a lane of four
-numbers is a column of a tile. A work vector has rows of 4: x, y, z and zero. What an entry of W is multiplied by is the
-same in all of a lane's places or in all lanes, so that W is loaded as it lies, and no padding is multiplied:
+A panel W has 4 m columns (m = 1 to 4). Its rows are grouped in tiles of four, stored by columns: a lane of four numbers
+is a column of a tile. A work vector has rows of 4: x, y, z and zero. The factor of an entry of W is equal either within
+a lane or across all lanes. W is therefore loaded as it is stored, and no padding is multiplied:
 
-    forwards    x, y and z of a column's row, four times each, are held for all tiles; the lanes of the products are
-                summed, transposed, and added to the rows of y that `index` names
-    backwards   x, y and z of the four rows of y that `index` names, transposed, are the same for all lanes; sums over
-                all tiles are held, and in the end those of a lane are added up
+    forward     x, y and z of a column's row, each repeated four times, stay in registers for all tiles; the lanes of
+    the
+                products are summed, transposed, and added to the rows of y in `index`
+    backward    x, y and z of the four rows of y in `index`, transposed, are equal for all lanes; sums over all tiles
+    stay
+                in registers, and in the end those of a lane are added
 
-What fills up the last tile is zero, and names a row of its own panel. Panels have the work vector's type, or are
-float16, seen as uint16, beside float32.
+Rows that complete the last tile are zero, and refer to a row of their own panel. Panels have the work vector's type, or
+are float16, viewed as uint16, with a float32 work vector.
 """
 
 from __future__ import annotations
@@ -25,11 +27,11 @@ from numba.extending import intrinsic
 from solvers.vectors.intrinsics import I64, Vectors, ask, signature, unpacked
 
 _AHEAD = 4096
-"""How many bytes ahead a panel is asked for on the way down, which the hardware's own guess follows less well."""
+"""Prefetch distance in bytes of the downward pass, which the hardware prefetcher predicts less well."""
 
 
 class _Tiles(Vectors):
-    """Tiles of 4 m columns in vectors of 512 bits, written with a builder; `element` is the work vector's type."""
+    """Builder for tiles of 4 m columns in 512-bit vectors; `element_type` is the work vector's type."""
 
     def __init__(self, context: Any, builder: Any, element: types.Float, m: int) -> None:
         super().__init__(context, builder)
@@ -43,11 +45,11 @@ class _Tiles(Vectors):
         return ir.Constant(ir.VectorType(self.element, 4 * lanes), [0.0] * (4 * lanes))
 
     def lane(self, pointer: Any, lanes: int = 1) -> Any:
-        """So many lanes of four numbers."""
+        """Load a number of lanes of four numbers."""
         return self.load(pointer, ir.VectorType(self.element, 4 * lanes))
 
     def panel(self, tile: Any, kind: types.Array, z: int) -> Any:
-        """Vector z of a tile of a panel of this kind; float16 is widened."""
+        """Load vector z of a tile of a panel; float16 is widened."""
         at = self.builder.gep(tile, [I64(4 * self.lanes * z)])
         if kind.dtype != types.uint16:
             return self.lane(at, self.lanes)
@@ -55,30 +57,30 @@ class _Tiles(Vectors):
         return self.builder.fpext(self.load(at, half), wide)
 
     def picked(self, a: Any, b: Any, lanes: list[int]) -> Any:
-        """These lanes of two vectors, counted through both."""
+        """Return lanes of two vectors, numbered through both."""
         return self.shuffle(a, b, [4 * lane + i for lane in lanes for i in range(4)])
 
     def mixed(self, a: Any, b: Any, places: tuple[int, ...]) -> Any:
-        """Lane by lane the numbers in these places, counted through both vectors' lanes."""
+        """Permute numbers within each lane; places are numbered through both vectors' lanes."""
         n = a.type.count
         return self.shuffle(a, b, [n * (i // 4) + lane + i % 4 for lane in range(0, n, 4) for i in places])
 
     def joined(self, rows: list[Any]) -> Any:
-        """One vector of one, two or four."""
+        """Concatenate one, two or four vectors."""
         while len(rows) > 1:
             many = rows[0].type.count // 4
             rows = [self.picked(a, b, list(range(2 * many))) for a, b in zip(rows[::2], rows[1::2], strict=True)]
         return rows[0]
 
     def repeated(self, vector: Any, c: int) -> Any:
-        """Of each lane its number c, four times."""
+        """Return number c of each lane, repeated four times."""
         return self.shuffle(vector, vector, [i // 4 * 4 + c for i in range(vector.type.count)])
 
     def add(self, a: Any, b: Any) -> Any:
         return self.builder.fadd(a, b)
 
     def rows(self, totals: list[Any]) -> list[Any]:
-        """The lanes of each of three or four vectors summed, and the four rows, filled up with zero, that they are."""
+        """Sum the lanes of three or four vectors; return them as four rows, padded with zero."""
         vectors, even = [*totals, self.zero(self.lanes)][:4], list(range(0, 2 * self.lanes, 2))
         for _ in range(self.lanes // 2):  # until a lane is a sum
             vectors = [
@@ -90,7 +92,7 @@ class _Tiles(Vectors):
         return [self.picked(turned, turned, [r]) for r in range(4)]
 
     def transposed(self, rows: list[Any]) -> list[Any]:
-        """x, y and z of four rows, in each lane of a vector."""
+        """Return x, y and z of four rows, repeated in each lane of a vector."""
         if self.lanes == 2:
             whole = self.joined(rows)
             return [self.shuffle(whole, whole, [4 * r + c for r in range(4)] * 2) for c in range(3)]
@@ -102,7 +104,7 @@ class _Tiles(Vectors):
         return [x, y, self.mixed(z01, z23, (0, 1, 4, 5))]
 
     def summed(self, x: Any, y: Any, z: Any) -> Any:
-        """Each lane's sums of x, y and z, and zero."""
+        """Return each lane's sums of x, y and z, and zero."""
         xy, z0 = (
             self.add(self.mixed(a, b, (0, 4, 1, 5)), self.mixed(a, b, (2, 6, 3, 7)))
             for a, b in ((x, y), (z, self.zero(self.lanes)))
@@ -110,13 +112,13 @@ class _Tiles(Vectors):
         return self.add(self.mixed(xy, z0, (0, 1, 4, 5)), self.mixed(xy, z0, (2, 3, 6, 7)))
 
     def ask(self, tile: Any, kind: Any) -> None:
-        """Ask for the cache lines that lie _AHEAD bytes before those of a tile of a panel of this kind."""
+        """Prefetch the cache lines _PREFETCH_BYTES before those of a tile."""
         for line in reversed(range(0, self.entries * kind.dtype.bitwidth // 8, 64)):
             ask(self.builder, tile, line - _AHEAD)
 
 
 def _named(builder: Any, index: Any, first: Any, rows: Any) -> list[Any]:
-    """Where the four rows are that `index` names from `first` on."""
+    """Return pointers to the four rows in `index` from `first` on."""
     names = [builder.zext(builder.load(builder.gep(index, [builder.add(first, I64(r))])), I64) for r in range(4)]
     return [builder.gep(rows, [builder.mul(name, I64(4))]) for name in names]
 
@@ -125,9 +127,10 @@ def _add_forward(
     typingctx: Any, panel: Any, offset: Any, index: Any, at: Any, count: Any, x: Any, x_row: Any, y: Any, y_row: Any,
     numbers: Any, quads: Any,
 ) -> Any:  # fmt: skip
-    """y[y_row + index[at + r]] += sum_j W[r, j] x[x_row + j] for r < count, a multiple of four; W from `offset` on.
+    """Compute y[y_row + index[at + r]] += sum_j W[r, j] x[x_row + j] for r < count, a multiple of four.
 
-    numbers: how many of a row of x are not zero, 3 or 4."""
+    W starts at `offset`. numbers: how many numbers of a row of x are not zero, 3 or 4.
+    """
     declared = signature(panel, offset, index, at, count, x, x_row, y, y_row, numbers, quads, compiled_in=2)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -157,8 +160,11 @@ def _set_backward(
     typingctx: Any, square: Any, start: Any, own: Any, panel: Any, offset: Any, index: Any, at: Any, below: Any, y: Any,
     x_row: Any, quads: Any,
 ) -> Any:  # fmt: skip
-    """y[x_row + j] = sum over r < 4 quads of S[r, j] y[x_row + r] + sum over r < below of W[r, j] y[index[at + r]];
-    S from `start` on, and none where `own` is zero; W from `offset` on, `below` a multiple of four."""
+    """Compute y[x_row + j] = sum_r S[r, j] y[x_row + r] + sum_r W[r, j] y[index[at + r]].
+
+    The first sum is over r < 4 quads, with S from `start` on; it is omitted if `own` is zero. The second one is over
+    r < below, a multiple of four, with W from `offset` on.
+    """
     declared = signature(square, start, own, panel, offset, index, at, below, y, x_row, quads)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -178,8 +184,8 @@ def _set_backward(
                 for factor, total in zip(factors, three, strict=True):
                     builder.store(t.multiply_add(w, factor, builder.load(total)), total)
 
-        # From the last row to the first: the panels are then read strictly downwards, as they were read upwards before,
-        # so that what is still in the cache is read first.
+        # From the last row to the first: panels are then read strictly downwards, after the upward forward pass, so
+        # that data that is still in cache is read first.
         tiles = builder.lshr(below, I64(2))
         with cgutils.for_range(builder, tiles) as loop:
             k = builder.sub(builder.sub(tiles, I64(1)), loop.index)
@@ -197,6 +203,6 @@ def _set_backward(
     return declared, generate
 
 
-# Numba passes the first argument itself, which type checkers do not know.
+# Numba passes the first argument itself, which type checkers cannot see.
 add_forward: Any = intrinsic(_add_forward)
 set_backward: Any = intrinsic(_set_backward)

@@ -1,4 +1,4 @@
-"""The Newton steps of eight vertices of one colour, in LLVM vectors (see `solvers.vectors.springs`)."""
+"""Newton steps of eight vertices of one colour, in explicit LLVM vectors (see `solvers.simd.spring_packets`)."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from solvers.vectors.intrinsics import I64, unpacked
 from solvers.vectors.springs import LANES, LEAST, MASK, WIDE, Bundle, Eights, constant
 
 NUMBERS = 4
-"""What is kept of each spring between the two passes: its vector and its length."""
+"""Numbers stored for each spring between the two passes: its vector and its length."""
 
 _ROUND_OFF = 1e-14
-"""Pivots up to this share of the diagonal's sum are round-off, of some ten springs."""
+"""Pivots up to this fraction of the trace are round-off, of some ten springs."""
 
 _ZERO, _HALF, _ONE = constant(0.0), constant(0.5), constant(1.0)
 
 
 def _newton(v: Eights, block: list[Any], g: list[Any]) -> tuple[list[Any], Any]:
-    """-B^-1 g for B = [[a, b, c], [b, d, e], [c, e, f]] by its factors L D L', and where B is positive definite."""
+    """Return -B^-1 g for B = [[a, b, c], [b, d, e], [c, e, f]] by L D L', and where B is positive definite."""
     builder: Any = v.builder
     a, b, c, d, e, f = block
     by_a = builder.fdiv(_ONE, a)
@@ -44,7 +44,7 @@ def _newton(v: Eights, block: list[Any], g: list[Any]) -> tuple[list[Any], Any]:
 
 
 def _kept(builder: Any, springs: Bundle, near: Any, entry: Any) -> list[Any]:
-    """Where the vector and the length of an entry's springs are kept for the second pass."""
+    """Return pointers to the stored vector and length of an entry's springs."""
     begins = builder.mul(builder.sub(entry, springs.begin), I64(LANES * NUMBERS))
     return [builder.gep(near, [builder.add(begins, I64(LANES * k))]) for k in range(NUMBERS)]
 
@@ -52,9 +52,9 @@ def _kept(builder: Any, springs: Bundle, near: Any, entry: Any) -> list[Any]:
 def _model(
     v: Eights, springs: Bundle, near: Any, x: Any, centre: list[Any], load: list[Any], weight: Any
 ) -> tuple[list[Any], list[Any], Any]:
-    """Minus the gradients, the upper triangles of the blocks, row by row, and whether a spring is too short.
+    """Return the negative gradients, the upper triangles of the blocks by rows, and whether a spring is too short.
 
-    load: what inertia, forces and pins pull with; weight: what they hold with.
+    load: force of inertia, external forces and pins; weight: their stiffness.
     """
     builder: Any = v.builder
     sums = [cgutils.alloca_once_value(builder, one) for one in (*load, weight, _ZERO, _ZERO, weight, _ZERO, weight)]
@@ -71,7 +71,7 @@ def _model(
         pull, k = v.eights(springs.weights, springs.kind, entry)
         inward = builder.fmul(pull, root)
         tension = builder.fsub(inward, k)
-        # A spring whose k is negative is a form's, has no rest length and is never compressed.
+        # Springs with negative k belong to an energy's spring form, have no rest length and are never compressed.
         compressed = [builder.fcmp_ordered(">", force, _ZERO) for force in (tension, inward)]
         lateral = builder.select(builder.and_(*compressed), _ZERO, builder.fsub(_ZERO, tension))
         axial = builder.fsub(k, lateral)
@@ -87,7 +87,7 @@ def _model(
 
 
 def _rise(v: Eights, springs: Bundle, near: Any, load: list[Any], weight: Any, d: list[Any]) -> Any:
-    """By how much steps d raise the energy, from differences of lengths, which do not cancel."""
+    """Return the energy change of steps d, from differences of lengths, which do not cancel."""
     builder: Any = v.builder
     rise = builder.fmul(builder.fmul(_HALF, weight), v.dot(d))
     for component, own_force in zip(d, load, strict=True):
@@ -108,7 +108,7 @@ def _rise(v: Eights, springs: Bundle, near: Any, load: list[Any], weight: Any, d
 
 
 def _given(v: Eights, springs: Bundle, number: Any, x: Any, right: Any) -> tuple[list[Any], list[Any], list[Any], Any]:
-    """The places of a bundle's vertices, where they are, what pulls at them beside springs, and what holds them."""
+    """Return the row offsets and positions of a packet's vertices, the load without springs, and its stiffness."""
     places = v.places(springs.own, number)
     centre = v.gather(x, places)
     *constants, weight = v.right(right, number)
@@ -116,7 +116,7 @@ def _given(v: Eights, springs: Bundle, number: Any, x: Any, right: Any) -> tuple
 
 
 def _bundle(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, majorant: Any, near: Any) -> Any:
-    """A bundle's code: moves its vertices in x, and returns whether a spring is too short, when it moves none."""
+    """Move a packet's vertices in x; return whether a spring is too short, in which case none is moved."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bundles, number, x, right, majorant, near = unpacked(context, builder, signature, args)
@@ -138,8 +138,10 @@ def _bundle(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, major
 
 
 def _modelled(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, near: Any, sums: Any) -> Any:
-    """A bundle's code: writes minus the gradients (3) and the blocks (6) of its vertices to `sums`, eight numbers each,
-    and returns whether a spring is too short."""
+    """Write a packet's negative gradients (3) and blocks (6) to `sums`, eight numbers each.
+
+    Returns whether a spring is too short.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bundles, number, x, right, near, sums = unpacked(context, builder, signature, args)
@@ -154,8 +156,10 @@ def _modelled(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, nea
 
 
 def _stepped(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, near: Any, sums: Any) -> Any:
-    """A bundle's code: writes the Newton steps (3) by what `sums` tell behind the gradients there, and behind them by
-    how much those steps raise the energy of all that `_modelled` knew, infinite where a block is not definite."""
+    """Write the Newton steps (3) of the model in `sums` after its gradients, followed by their energy changes.
+
+    The changes are those of all energies in the vertex model, infinite where a block is not positive definite.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bundles, number, x, right, near, sums = unpacked(context, builder, signature, args)
@@ -172,7 +176,7 @@ def _stepped(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, near
     return types.void(bundles, number, x, right, near, sums), generate
 
 
-# Numba passes the first argument itself, which type checkers do not know.
+# Numba passes the first argument itself, which type checkers cannot see.
 descend: Any = intrinsic(_bundle)
 model: Any = intrinsic(_modelled)
 step: Any = intrinsic(_stepped)
