@@ -3,8 +3,8 @@
 A half-space acts from its surface on, and a sticking vertex begins to slip after 1e-8 m. There are two remedies:
 
 Friction is relaxed at each trial point, by nonlinear Gauss-Seidel sweeps over the vertices with friction. This is the
-smoother of the truncated nonsmooth Newton method (Gräser and Sander 2019). It minimises h as exactly as possible
-(`contact.half_space.half_space_potential`):
+smoother of the truncated nonsmooth Newton method (Gräser and Sander 2019). The local problems are solved exactly,
+since h (`contact.half_space.half_space_potential`) permits a closed form:
 
     u <- argmin F h(|u|) + Q_ii/2 |u - v|^2,   v = u - r/Q_ii tangentially,   r <- r + Q (u - previous u)
 

@@ -29,8 +29,9 @@ def over(
     Args:
         update_direction: (state, product, previous_product) -> p'Ap; sets p = z + product/previous_product p. At first
             the previous product is infinite, and p finite.
-        update_iterate: (state, product, curvature) -> r'z; changes x and r by product/curvature times p and A p, then
-        z. is_convex: (state, curvature) -> whether the iteration may continue along p.
+        update_iterate: (state, product, curvature) -> r'z; changes x and r by product/curvature times p and A p,
+            then z.
+        is_convex: (state, curvature) -> whether the iteration may continue along p.
         is_converged: (state, product) -> whether x is accurate enough.
 
     Returns:

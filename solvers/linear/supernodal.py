@@ -37,16 +37,16 @@ _WORTH_THREADS = 4e6
 
 
 class Layout(NamedTuple):
-    """Memory layout of the panels of a factor; a supernode is divided into chunks of at most MAX_PANEL_WIDTH columns.
+    """Memory layout of the panels of a factor.
+
+    A supernode is divided into chunks of at most MAX_PANEL_WIDTH columns, with a panel each.
 
     Attributes:
-        chunks: of each chunk the offsets of its S, of its W and of its rows in `row_slots`, its columns without
-        padding,
-            its rows below with padding, its padded columns divided by COLUMN_LANES, and its first slot, (c, 7).
+        chunks: (c, 7), of each chunk the offsets of its S, of its W and of its rows in `row_slots`, its columns without
+            padding, its rows below with padding, its padded columns divided by COLUMN_LANES, and its first slot.
         first_chunk: first chunk of each supernode, (s + 1,).
         row_slots: of each supernode the slots of its columns and of the rows below, then copies of the last one for
-        rows
-            that complete a tile; slots of the top refer to the group's own copy.
+            rows that complete a tile; slots of the top refer to the group's own copy.
         order_by_slot, order_by_vertex, group_spans: see `triangular_solve`; unsigned, so that indexing needs no test of
             the sign.
         num_inverse_entries, num_panel_entries: entries of all S and of all W, stored as `panel_products` reads them.

@@ -5,11 +5,9 @@ is a column of a tile. A work vector has rows of 4: x, y, z and zero. The factor
 a lane or across all lanes. W is therefore loaded as it is stored, and no padding is multiplied:
 
     forward     x, y and z of a column's row, each repeated four times, stay in registers for all tiles; the lanes of
-    the
-                products are summed, transposed, and added to the rows of y in `index`
+                the products are summed, transposed, and added to the rows of y in `index`
     backward    x, y and z of the four rows of y in `index`, transposed, are equal for all lanes; sums over all tiles
-    stay
-                in registers, and in the end those of a lane are added
+                stay in registers, and in the end those of a lane are added
 
 Rows that complete the last tile are zero, and refer to a row of their own panel. Panels have the work vector's type, or
 are float16, viewed as uint16, with a float32 work vector.
