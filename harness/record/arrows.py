@@ -29,7 +29,7 @@ Times = Callable[[NDArray[np.int64]], Iterable[rr.TimeColumn]]
 
 
 class Arrows:
-    """Arrows of the forces on a mesh of a given size [m], in an open recording."""
+    """Force arrows on a mesh of a given size [m], in an open recording."""
 
     def __init__(self, stream: rr.RecordingStream, size: float) -> None:
         self._stream, self._size = stream, size

@@ -110,7 +110,7 @@ class Recorder(Protocol):
 
 
 class FrameSamples:
-    """Copies of the positions of some random frames of a run and of its last frame."""
+    """Copies of the positions of random frames of a run and of its last frame."""
 
     def __init__(self, last: int) -> None:
         before = range(1, last)

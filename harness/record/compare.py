@@ -113,7 +113,7 @@ class _Run:
         self.ranges: dict[str, tuple[float, float]] = {}  # the smallest and the largest of what is compared
 
     def seen_in(self, source: Source, box: Extent | None, aspect: float) -> Extent | None:
-        """Return the extent, widened to the recording's positions, for a view of the given aspect ratio."""
+        """Return the extent, widened to the recording's positions, for a given aspect ratio."""
         for frame, _, p in positions(source):
             box = box or Extent(p, aspect)
             box.add(p)

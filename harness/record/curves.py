@@ -104,13 +104,13 @@ def _across(iterations: NDArray[np.int64], last: int) -> NDArray[np.float64]:
 
 
 def _round(last: int) -> int:
-    """Return a round tick step (1, 2 or 5 times a power of ten) for about five ticks."""
+    """Return 1, 2 or 5 times a power of ten, for about five ticks."""
     power = 10 ** math.floor(math.log10(max(1.0, last / 5)))
     return int(next(f * power for f in (1, 2, 5, 10) if f * power * 5 >= last))
 
 
 def _apart(wanted: list[float]) -> list[float]:
-    """Return label heights in the given order, at least one line apart and none below the drawing."""
+    """Spread label heights at least one line apart, within the drawing and in order."""
     order, placed = sorted(range(len(wanted)), key=wanted.__getitem__), dict[int, float]()
     height = -math.inf
     for k in order:

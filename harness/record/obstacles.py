@@ -115,7 +115,7 @@ def _plane(one: Plane, rest: Array, origin: Array) -> rr.Mesh3D:
 
 
 def _mesh(one: Solid, rest: Array, origin: Array) -> rr.Mesh3D:
-    """Build a mesh in which each triangle has its own vertices, so that edges stay sharp."""
+    """Build a mesh with separate vertices for each triangle, so that edges stay sharp."""
     points, triangles = one.shape()
     return _faces(points - origin, triangles)
 

@@ -134,7 +134,7 @@ def read_replay(path: Path, frames: Collection[int] | None = None) -> Replay:
 
 
 def summary(path: Path) -> Summary:
-    """Read the contents of a recording of one run or of several side by side, without positions.
+    """Read the contents of a recording, of one or several runs, without positions.
 
     Raises:
       InputError: the file is not a Rerun recording.
@@ -165,7 +165,7 @@ def summary(path: Path) -> Summary:
 
 
 def _try(path: Path) -> None:
-    """Read all of a recording in every supported form; damage raises an exception or ends the process."""
+    """Read all of a recording; damage raises an exception or ends the process."""
     trust(path, noted=False)
     with open_recording(path) as source:
         for chunk in source.chunks(content="/**"):
@@ -228,13 +228,13 @@ def network(source: Source) -> dict[str, NDArray[Any]]:
 def positions(
     source: Source, wanted: Collection[int] | None = None
 ) -> Iterator[tuple[int, float, NDArray[np.float32]]]:
-    """Iterate over frame, time [s] and positions (n, 3) [m] of the selected frames, in file order.
+    """Iterate over the positions (n, 3) [m] of the selected frames, in file order.
 
     Args:
       source: open recording.
       frames: indices of the frames; all if omitted.
 
-    Returns: tuples whose positions are relative to the origin.
+    Returns: tuples of frame, time [s] and positions, which are relative to the origin.
     """
     for chunk in source.chunks(content="/scene/mesh", components=_POSITIONS):
         batch = chunk.to_record_batch()
@@ -299,7 +299,7 @@ def _scalars(source: Source) -> pa.Table:
 
 
 def looked_at(source: Source, entity: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the frames with recorded convergence and their times [s], in the order of the values."""
+    """Return the frames with recorded convergence, and their times [s], in stored order."""
     for chunk in source.chunks(content=entity.rpartition("/")[0]):
         batch = chunk.to_record_batch()
         return cell(batch, "frames").astype(np.int64), cell(batch, "times").astype(float)

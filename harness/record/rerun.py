@@ -125,7 +125,7 @@ class RerunRecorder:
             self._file.flush()
 
     def convergence(self, frame: int, residuals: Sequence[float], objective: Sequence[float]) -> None:
-        """Record the residual [J^(1/2)] and the objective [J] after each iteration of one frame, from the first."""
+        """Record the residual [J^(1/2)] and the objective [J] after each iteration of a frame."""
         self._curves[frame] = residuals, objective
 
     def solve(self, numbers: Sequence[int], curves: Mapping[str, Sequence[float]]) -> None:

@@ -39,7 +39,7 @@ NEUTRAL = (128, 128, 128, 255)
 
 
 def palette() -> NDArray[np.uint8]:
-    """Return the colours of the levels (NUM_LEVELS + 1, 4), most compressed first, with NEUTRAL_COLOUR last."""
+    """Return the colours of the levels, most compressed first, then NEUTRAL_COLOUR: (NUM_LEVELS + 1, 4)."""
     stops = np.array([[int(colour[k : k + 2], 16) for k in (1, 3, 5)] + [255] for colour in STRAIN_COLOURS])
     at = np.linspace(0, len(stops) - 1, LEVELS)
     channels: list[NDArray[np.float64]] = [np.interp(at, range(len(stops)), channel) for channel in stops.T]
@@ -64,7 +64,7 @@ def strain_range(
 
 
 def scale_end(strain: NDArray[np.float64]) -> float:
-    """Return the round number above 99 % of the vertex strains, as the end of their scale.
+    """Return the end of a scale: the round number above 99 % of the strains.
 
     A few large strains at a pin thus do not leave all others grey. The result is DEFAULT_STRAIN_RANGE where none is
     finite.
@@ -83,7 +83,7 @@ def percent(strain: float, digits: int = 3) -> str:
 
 
 def colours(strain: NDArray[np.float64], end: float) -> NDArray[np.uint32]:
-    """Return the colour of each strain as 0xRRGGBBAA, shape (len(strain),), on the scale from -end to end."""
+    """Return the colours 0xRRGGBBAA (m,) of strains (m,) on the scale from -end to end."""
     with np.errstate(invalid="ignore"):
         level = np.rint((np.clip(strain / end, -1, 1) + 1) * (LEVELS - 1) / 2)
     return _packed()[np.where(np.isnan(level), LEVELS, level).astype(np.intp)]
@@ -120,7 +120,7 @@ class Shading:
         return colours(strain, self._range)
 
     def normals(self, p: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the unit normal of each vertex (n, 3), rounded to 1/32; zero where it is undefined."""
+        """Return the unit vertex normals (n, 3), rounded to 1/32; zero where undefined."""
         normals = np.zeros(p.shape)  # areas of tiny or huge triangles leave the range of single precision
         _normals(p.astype(np.float64), self._triangles, normals)
         return normals.astype(np.float32)

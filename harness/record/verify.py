@@ -86,7 +86,7 @@ class _Recorded(NamedTuple):
 
 
 def _read(path: Path, wanted: Collection[int]) -> tuple[NDArray[np.float64], int, dict[int, _Recorded]]:
-    """Read the origin, the number of the last frame (-1 for none), and the selected frames."""
+    """Read the origin, the last frame's number (-1 for none), and the selected frames."""
     end, found = -1, dict[int, _Recorded]()
     with open_recording(path) as source:
         origin = read_origin(properties(source)[1])
@@ -119,7 +119,7 @@ def _beyond_rounding(
 
 
 def _are_of(colours: NDArray[np.uint32], info: RecordingInfo, p: Positions) -> bool:
-    """Return whether the vertices at p have the colours of the largest of their springs' strains."""
+    """Return whether the vertices at p have the colours of their largest strains."""
     rest, high, low = info.rest_lengths, np.zeros(len(p)), np.zeros(len(p))
     with np.errstate(all="ignore"):
         length = np.linalg.norm(np.diff(p[info.springs], axis=1)[:, 0], axis=1)

@@ -108,7 +108,7 @@ class Curvature:
 
 
 def curvature(problem: StepProblem, p: Positions) -> Curvature:
-    """Compute the curvature at p (n, 3) [m], where exactly pinned vertices are at their targets."""
+    """Compute the curvature at p (n, 3) [m], with exact pins at their targets."""
     free, direction = problem.system.free, np.zeros_like(p)
     if not len(free):
         return Curvature(np.inf, 0.0, direction, np.copy)
@@ -193,7 +193,7 @@ def _softest(H: SplitHessian) -> tuple[NDArray[np.float64], Solve]:
 
 
 def definite(H: SplitHessian) -> Solve | None:
-    """Factorise a symmetric matrix of 3 x 3 blocks; return None where it is not positive definite.
+    """Factorise a symmetric 3 x 3 block matrix; None where not positive definite.
 
     The result is the product with its inverse. Not positive definite means that in floating point some pivot of the
     factor is not positive. For S + V V', the number of negative eigenvalues is that of S less that of I + V'S^-1 V

@@ -102,7 +102,7 @@ class Stationarity:
         self._exact: dict[float, Exact] = {}
 
     def __call__(self, problem: StepProblem, p: Positions) -> Reading:
-        """Evaluate the stationarity at p; with exact lengths, that of the Lagrangian with the tensions at p."""
+        """Evaluate the stationarity at p, of the Lagrangian where lengths are exact."""
         exact = self.exact(problem.system)
         if exact is None:
             return self._oracle(problem.system).stationarity(problem, p)

@@ -153,7 +153,7 @@ def freeze(step: Step, origin: str) -> tuple[Frozen, Arrays]:
 
 
 def thaw(arrays: Arrays, scene: Scene) -> Frozen | None:
-    """Restore a snapshot from saved arrays for a scene; None where the scene now states another problem."""
+    """Restore a saved snapshot for a scene; None where the problem has changed."""
     if any(f"start_{name}" not in arrays for name in _START):
         return None
     system = replace(scene.system, factor=float(arrays["factor"]))
@@ -173,7 +173,7 @@ def thaw(arrays: Arrays, scene: Scene) -> Frozen | None:
 
 
 def agree(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool:
-    """Return whether two arrays are equal up to the order of summation, which differs between processors."""
+    """Return whether two arrays are equal up to processor-dependent summation order."""
     if found.shape != wanted.shape:
         return False
     return bool(np.abs(found - wanted).max(initial=0.0) <= 1e-9 * np.abs(wanted).max(initial=0.0))

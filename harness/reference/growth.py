@@ -77,9 +77,9 @@ class Growth:
         return np.interp(times, self.times, self.grown)
 
     def longest(self, error: float) -> float:
-        """Return the longest horizon [s] at which a relative error can reliably be reached and measured.
+        """Return the longest horizon [s] at which a relative error can reliably be measured.
 
-        It is rounded down to three digits, and 0 where there is none.
+        The error can also be reached there. The result is rounded down to three digits, and 0 where there is none.
         """
         fine = self.times[self.grown <= _SURE * MARGIN * error]
         return _rounded(floor, float(fine[-1]), 3) if len(fine) and error >= LEAST else 0.0

@@ -65,13 +65,13 @@ class Judge:
         return self._stationarity(problem, p)
 
     def curvature(self, problem: StepProblem, p: Positions) -> Curvature:
-        """Compute the curvature of the objective, or of a Lagrangian with large penalties where lengths are exact."""
+        """Compute the curvature of the objective, or of a Lagrangian with large penalties."""
         exact = self._stationarity.exact(problem.system)
         return curvature(exact.lagrangian(problem, exact.tensions(problem, p), FIRM) if exact else problem, p)
 
 
 def reference(scene: Scene, solver: Solver, *, first_guess: str, frames: int) -> NDArray[np.float64]:
-    """Compute the positions (frames, n, 3) [m] of a run whose steps are solved to round-off.
+    """Compute positions (frames, n, 3) [m] of a run with steps solved to round-off.
 
     Positions are nan from the first step on that does not end at a stationary point.
     """

@@ -111,14 +111,14 @@ class KnownMinima:
         return next(i for i, known in enumerate(self.minima) if _same(known, minimum))
 
     def joined(self, found: Minimum) -> KnownMinima:
-        """Return the known minima with one more; unchanged if it is already known or is not certified."""
+        """Return the known minima with another, if it is new and certified."""
         if not found.certified or any(_same(known, found) for known in self.minima):
             return self
         return KnownMinima(tuple(sorted((*self.minima, found), key=lambda minimum: minimum.g)))
 
 
 def find_minima(problem: StepProblem, solver: Solver) -> KnownMinima:
-    """Find the minima that Newton's method reaches from the current positions and from the inertial target."""
+    """Find the minima that Newton's method reaches from current positions and inertial target."""
     guesses = (guessed(problem, name).first_guess for name in ("current", "inertial"))
     return reference(polish(problem, guess, solver) for guess in guesses)
 
@@ -133,13 +133,13 @@ def reference(found: Iterable[Minimum]) -> KnownMinima:
 
 
 def polish(problem: StepProblem, p: Positions, solver: Solver) -> Minimum:
-    """Run Newton's method from p (n, 3) [m] to the minimum of its basin, and certify it."""
+    """Find and certify the minimum of the basin of p (n, 3) [m]."""
     solution = solver.prepare(problem.system).solve(replace(problem, first_guess=p), TO_THE_END)
     return certify(problem, solution.positions)
 
 
 def certify(problem: StepProblem, p: Positions) -> Minimum:
-    """Refine p (n, 3) [m], close to a minimum, by Newton steps, and certify the result.
+    """Refine p (n, 3) [m], near a minimum, by Newton steps, and certify it.
 
     The steps continue to round-off. The certificate contains the curvature, the objective and the length of one more
     step at the final point.
@@ -161,7 +161,7 @@ def certify(problem: StepProblem, p: Positions) -> Minimum:
 
 
 def _descend(problem: StepProblem, p: Positions, near: NDArray[np.float64]) -> None:
-    """Apply Newton steps to p in place while each is shorter than half of the one before."""
+    """Apply Newton steps to p in place while each halves the previous length."""
     free = problem.system.free
     for _ in range(REFACTORISATIONS):
         solve = definite(free_hessian(problem, p))

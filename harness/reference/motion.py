@@ -77,7 +77,7 @@ class Field:
         return np.concatenate([part[self._free].ravel() for part in start(self._scene).now])
 
     def motion(self, t: float, y: State) -> tuple[Positions, Positions]:
-        """Return positions [m] and velocities [m/s] of all vertices, each (n, 3), overwritten by the next call."""
+        """Return positions [m] and velocities [m/s] of all vertices, overwritten by the next call."""
         self._p[self._free], self._v[self._free] = y.reshape(2, -1, 3)
         if self._scene.moving:
             held, h = self._system.pins.vertices, TICK
@@ -110,7 +110,10 @@ class Field:
 
 
 def moving(spec: SceneSpec, size: int) -> Scene:
-    """Build a scene with equations of motion, with filters converted to forces where needed; raises NotIntegrable."""
+    """Build a scene with equations of motion; raises NotIntegrable.
+
+    Velocity filters without an equation of motion are converted to forces.
+    """
     scene = bind(spec, size)
     try:
         Field(scene)

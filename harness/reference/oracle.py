@@ -82,7 +82,7 @@ class Oracle:
         return Multigrid(self._free)
 
     def _solve(self, right: Positions) -> Positions:
-        """Return Q^-1 of a right-hand side (f, 3) [N] over the free vertices, (f, 3) [m]."""
+        """Return Q^-1 (f, 3) [m] of a right-hand side (f, 3) [N] of free vertices."""
         Q = self._free
         if Q.nnz <= LARGEST:
             return self._factor.solve(right)
@@ -104,7 +104,10 @@ class Oracle:
         return self.length(problem.gradient(p))
 
     def length(self, gradient: Positions) -> float:
-        """Compute |Q^-1 g|_Q [J^(1/2)] of a gradient (n, 3) [N] over the unpinned vertices; infinite on overflow."""
+        """Compute |Q^-1 g|_Q [J^(1/2)] of a gradient (n, 3) [N]; infinite on overflow.
+
+        The norm is over the unpinned vertices.
+        """
         free, e = self._system.free, np.zeros_like(gradient)
         if len(free):
             e[free] = self._solve(gradient[free])
@@ -124,7 +127,7 @@ class Oracle:
             return FACTOR * float(np.sqrt(np.sum(bound[loose] ** 2 / self._Q.diagonal()[loose])))
 
     def yardstick(self, problem: StepProblem) -> float:
-        """Compute the initial residual [J^(1/2)]: that at the current positions, or its round-off bound if larger."""
+        """Compute the initial residual [J^(1/2)], or its round-off bound if larger."""
         if self._known is None or self._known[0] is not problem:
             floor = max(self.floor(problem, problem.current), np.finfo(float).tiny)
             self._known = problem, max(self.residual(problem, problem.current), floor)
@@ -176,6 +179,6 @@ def component_sizes(graph: csr_array, p: Positions) -> NDArray[np.float64]:
 
 
 def symmetric_lu(matrix: csr_array) -> Any:
-    """Factorise a symmetric matrix by SuperLU with pivots on the diagonal; raises RuntimeError where one is zero."""
+    """Factorise a symmetric matrix by SuperLU with diagonal pivots; raises RuntimeError for zero ones."""
     settings: Any = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
     return splu(matrix.tocsc(), **settings)

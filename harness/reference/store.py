@@ -162,7 +162,7 @@ class Store:
         return found
 
     def growth(self, spec: SceneSpec, size: int, horizon: float) -> Growth:
-        """Load or estimate the growth of a perturbation of the start up to an end time [s].
+        """Load or estimate the growth of a perturbation up to an end time [s].
 
         Args:
           spec: specification of the scene.

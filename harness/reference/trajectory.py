@@ -28,7 +28,7 @@ MARGIN = 0.1
 
 
 class Unpredictable(RunFailed):
-    """The reference would be as uncertain as the error that is to be measured with it."""
+    """The reference would be as uncertain as the error to be measured."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +61,7 @@ class Trajectory:
         return "integrated"
 
     def error(self, k: int, p: Positions) -> float:
-        """Measure the error of p (n, 3) [m] at times[k], relative to the displacement from the start."""
+        """Measure the error of p (n, 3) [m] at times[k], relative to the displacement."""
         return float(np.linalg.norm((p - self.positions[k])[self.free])) / float(self.moved[k])
 
     def require(self, error: float) -> None:
@@ -80,7 +80,7 @@ Told = Callable[[int, float], None]
 
 
 class _Telling:
-    """A field that reports progress; an integration that restarts at time 0 is the second one."""
+    """A field that reports progress; a restart at time 0 is the second integration."""
 
     def __init__(self, field: Field, told: Told) -> None:
         self._field, self._told, self._motion, self._until = field, told, 1, 0.0
@@ -127,7 +127,7 @@ def _apart(path: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.
 
 
 def _dop853(field: Callable[[float, State], State], y: State, times: Sequence[float], atol: float) -> State:
-    """Integrate the states (k, 6 f); each time ends a step, since interpolation would be less accurate."""
+    """Integrate the states (k, 6 f); steps end at each time, without interpolation."""
     path, begin = list[State](), 0.0
     for end in times:
         solved = solve_ivp(field, (begin, end), y, "DOP853", [end], rtol=RTOL, atol=atol)

@@ -112,7 +112,7 @@ class Watch:
 
 
 class Clock:
-    """Stopwatch for successive pieces of work, which its watch times as well; `seconds` is the last time."""
+    """Stopwatch for successive pieces of work, also timed by a watch; `seconds` is the last time."""
 
     def __init__(self, watch: Watch) -> None:
         self.watch, self.seconds, self._began = watch, 0.0, 0.0

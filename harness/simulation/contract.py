@@ -36,7 +36,7 @@ class Contract:
         self._before = {name: array.copy() for name, array in _of_system(system).items()}
 
     def checked(self, prepared: Any) -> Checked:
-        """Wrap the prepared solver with a check of each solve; raises RunFailed if preparing modified the system."""
+        """Wrap the prepared solver with checks; raises RunFailed if preparing modified the system."""
         line = _line(type(self._solver), "prepare")
         self.require_untouched(line)
         lacks = [name for name in _METHODS if not callable(getattr(prepared, name, None))]

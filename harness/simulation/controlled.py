@@ -133,7 +133,7 @@ class Follower(Protocol):
 
 
 class _Ladder:
-    """A scene and a prepared solver for each step size; factors beyond MAX_FACTOR_BYTES are discarded, oldest first."""
+    """Scenes and prepared solvers by step size; the oldest beyond MAX_FACTOR_BYTES are discarded."""
 
     def __init__(self, bound: Callable[[float], Scene], solver: Solver, horizon: float) -> None:
         self._bound, self._solver, self._horizon = bound, solver, horizon
@@ -302,7 +302,7 @@ def _solved(solution: Solution, within: float) -> bool:
 
 
 def shares(reached: Sequence[float]) -> tuple[float, ...]:
-    """Return the wall time [s] of each frame from the times at which frames were reached.
+    """Return the wall time [s] of each frame from the cumulative times.
 
     Frames of one step share its time equally.
     """

@@ -143,7 +143,7 @@ class EnergyBalance:
         return 0.5 * float(self._mass @ np.einsum("ij,ij->i", v, v))
 
     def _of_each(self, stated: StepProblem, x: Positions, p: Positions, time: float) -> NDArray[np.float64]:
-        """Return the potentials [J] of the energies, of penalty pins, of the load and of exact lengths.
+        """Return the potentials [J] of energies, penalty pins, load and exact lengths.
 
         Evaluated for a step's solution x and end p, both (n, 3) [m], at a time [s].
         """
@@ -196,7 +196,7 @@ class EnergyBalance:
 
     @staticmethod
     def _pull(stated: StepProblem, x: Positions) -> Positions:
-        """Return the gradient (n, 3) [N] at x of the energies that are constant over all steps."""
+        """Return the gradient (n, 3) [N] at x of the energies without lag."""
         gradient = np.zeros_like(x)
         for made, energy in _pairs(stated):
             if not is_lagged(made):
@@ -225,7 +225,7 @@ def _largest_strain(scene: Scene, p: Positions) -> float:
 
 
 def _round_off(stated: StepProblem, x: Positions, steps: int) -> float:
-    """Return a bound on the accumulated round-off [J] of a number of steps, 0 where it overflows.
+    """Return a bound on the accumulated round-off [J]; 0 where it overflows.
 
     In each step, (FACTOR delta_i)^2 / Q_ii is the energy of the round-off at vertex i.
     """

@@ -74,7 +74,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Settings:
-    """Settings of a run's time stepping: stop criterion, initial guess, number of frames and of rounds."""
+    """Settings of time stepping: stop criterion, initial guess, numbers of frames and rounds."""
 
     stop: Stop
     first_guess: str

@@ -60,7 +60,7 @@ class Replayed(Passing):
 
 
 def on_device(prepared: Prepared) -> OnDevice | None:
-    """Wrap a prepared solver for replay on its device; None for one that runs on the processor."""
+    """Wrap a prepared solver for replay on its device; None on the processor."""
     usual = prepared.usual if isinstance(prepared, Turns) else prepared
     return OnDevice(prepared, usual) if isinstance(usual, Remote) else None
 

@@ -43,7 +43,7 @@ class Stages:
     """The stages of one step of a scene, from a filtered motion at a time."""
 
     def __init__(self, scene: Scene, now: Motion, acceleration: Positions | None, time: float) -> None:
-        """Start a step; `acceleration` (n, 3) [m/s^2] is that at the start, None where it is unknown."""
+        """Start a step; `acceleration` (n, 3) [m/s^2] may be unknown (None)."""
         method = scene.integrator
         assert isinstance(method, Staged)
         self.scene, self.time, pins = scene, time, scene.system.pins
@@ -130,7 +130,7 @@ class Stages:
         return Motion(p, v)
 
     def _acceleration(self) -> Positions:
-        """Compute M^-1 of all forces at the start, (n, 3) [m/s^2], zero at exact pins; raises Unsupported."""
+        """Compute the initial acceleration (n, 3) [m/s^2], zero at exact pins; raises Unsupported."""
         (p, v), system = self.now, self.scene.system
         require_mass(self.scene)
         begun = Start(p, v, self.time, p - v / system.rate, system.rate, self.time)

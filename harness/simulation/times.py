@@ -35,7 +35,7 @@ def rows(measured: Measured) -> list[dict[str, Any]]:
 
 
 def _adds_up(timings: list[Timing]) -> dict[str, bool]:
-    """Check, by phase, whether all phases together take as long as an iteration; empty without phases."""
+    """Check whether all phases together take as long as an iteration; empty without phases."""
     by_frame: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for t in timings:
         if t.frame is not None and t.phase != "step":

@@ -25,7 +25,7 @@ _SETTLED = 1e-3
 
 
 class Finding(NamedTuple):
-    """Name of a term that differs between the implementations, and the difference relative to the reference value."""
+    """Name of a term that differs, and the difference relative to the reference value."""
 
     name: str
     by: float
@@ -128,7 +128,7 @@ def steps(at: Place) -> Iterator[Finding]:
 
 
 def energies(at: Place) -> Iterator[Finding]:
-    """Compare the energies of each effect, and the objective, which is the sum of all terms."""
+    """Compare the energies of each effect, and the objective, their sum."""
     side, stated, reach = at.side, at.stated, at.reach
     free = at.direction.copy()
     free[[i for i, w in zip(stated.vertices, stated.weights, strict=True) if np.isinf(w)]] = 0.0

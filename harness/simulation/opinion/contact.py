@@ -28,7 +28,7 @@ _THERE = 1e-6
 
 
 def contact(effect: Any, declared: Declared) -> Opinion:
-    """Build contact with every obstacle of the effect; its stiffness depends on the diagonal of Q."""
+    """Build contact with every obstacle, with stiffness from the diagonal of Q."""
     depth = effect.thickness / 10 if effect.tolerance is None else effect.tolerance
 
     def needs(resists: Array) -> Begin:
@@ -145,7 +145,7 @@ def _nearest_of_box(low: Wide, high: Wide, x: Wide) -> tuple[Wide, Wide, Wide]:
 
 
 def _reach(one: Any) -> float:
-    """Return the largest coordinate [m] with which an obstacle is declared; infinite planes by their point."""
+    """Return the largest declared coordinate [m] of an obstacle; of planes, that of their point."""
     sizes = [np.abs(getattr(one, name)).max() for name in _SIZES[one.kind]]
     moves = [np.abs(key.offset).max() for key in one.motion.keys] if one.motion else [0.0]
     return float(max(sizes) + max(moves))

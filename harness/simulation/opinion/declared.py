@@ -123,7 +123,7 @@ class Opinion:
 
 
 def counts(edges: NDArray[np.int64], weight: Array, n: int) -> Array:
-    """Sum the weights of the edges at each vertex; edges from a vertex to itself are ignored.
+    """Sum the weights of the edges at each vertex, without loops.
 
     Args:
       edges: vertex pairs (m, 2).

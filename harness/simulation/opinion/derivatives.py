@@ -43,7 +43,7 @@ def wide(x: Any) -> Wide:
 
 
 def length(v: Wide) -> Wide:
-    """Return the norm of each row (m, 3), (m,), as an analytic function of complex rows."""
+    """Return the norms (m,) of rows (m, 3), analytic for complex rows."""
     return np.sqrt((v * v).sum(axis=1))
 
 

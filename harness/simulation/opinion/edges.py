@@ -43,7 +43,7 @@ def stiffness(mesh: Mesh, effect: Any, stretch: Any, shear: Any, bend: float) ->
 
 
 def _woven(mesh: Mesh, weave: Any, i: int, j: int) -> float:
-    """Return the constant of one spring of a woven cloth from its angle to the warp."""
+    """Return the constant of a woven cloth's spring from its angle to the warp."""
     normal = np.zeros(3)
     for a, b, c in mesh.triangles:
         area = np.cross(mesh.rest[b] - mesh.rest[a], mesh.rest[c] - mesh.rest[a])

@@ -82,7 +82,7 @@ def speed(motion: Any, q: Wide, time: float) -> Wide:
 
 
 def blur(motion: Any, size: float, time: float) -> float:
-    """Bound the round-off [m] of moved points within `size` [m] of zero at a time [s]."""
+    """Bound the round-off [m] of moved points within `size` [m] of zero."""
     if motion is None:
         return EPS * size
     keys: list[Any] = list(motion.keys)

@@ -43,7 +43,7 @@ def _each(pin: Pin) -> list[tuple[int, Any]]:
 
 
 def resistance(energies: Sequence[Energy], n: int, time_step: float) -> Array:
-    """Sum the energies' own shares of the diagonal of Q (n,) [N/m] at the rate 1/dt."""
+    """Sum the energies' shares of the diagonal of Q (n,) [N/m]."""
     zero, total = np.zeros((n, 3)), np.zeros(n)
     start = Start(zero, zero, 0.0, zero, 1.0 / time_step, 0.0)
     for energy in energies:

@@ -102,7 +102,7 @@ def _compared(sides: list[Side], scene: Scene, integrator: str, point: SamplePoi
 
 
 def _staged(own: Side, scene: Scene, integrator: str, point: SamplePoint, time: float) -> Iterator[Finding]:
-    """Compare all terms for an integrator with several stages, each solved by extrapolation with the velocity."""
+    """Compare all terms of an integrator with several stages, solved by extrapolation."""
     now, dt = point.state.now, own.declared.time_step
 
     def x(until: float) -> Array:

@@ -94,7 +94,7 @@ class Touching:
         return x
 
     def near(self, x: Array, reach: float) -> tuple[Indices, Indices]:
-        """Find point-triangle and edge-edge pairs, (k, 4) each, closer than a distance [m] at x (N, 3)."""
+        """Find point-triangle and edge-edge pairs, (k, 4) each, closer than `reach` [m]."""
         return near(x, self.points, self.triangles, reach), near(x, self.edges, self.edges, reach)
 
     def apart(self, rows: Indices, edges: bool) -> Wide:
@@ -138,7 +138,7 @@ class Touching:
         return np.where(closed, np.inf, m * np.where(feels, stiff * (scale * r) ** 2 * b, 0))
 
     def _of(self, rows: Indices, x: Wide, t: float, r: float, k: Array, edges: bool) -> tuple[Wide, Wide, Wide]:
-        """Return the scale factor of t and r, the mollifier and the stiffness [N/m], (k,) each."""
+        """Return the scale of t and r, the mollifier and the stiffness [N/m]."""
         share = self.apart(rows, edges) / (wide(t) + wide(r))
         scale, m = np.where(share < 1, (1 - wide(1e-12)) * share, 1), wide(np.ones(len(rows)))
         if edges:
@@ -221,7 +221,7 @@ def rubbed(x: Wide, rows: Indices, weights: Wide, n: Wide, anchor: Wide, force: 
 
 
 def _between(rows: Indices, x: Wide, edges: bool) -> Wide:
-    """Compute the vectors (k, 3) between nearest points of each pair; cases are selected by real parts."""
+    """Compute the vectors (k, 3) between nearest points, selected by real parts."""
     a, b, c, d = (x[rows[:, i]] for i in range(4))
     found = [_inside(a, b, c, d, edges)]
     if edges:
@@ -276,7 +276,7 @@ def _sides(rows: Indices, rest: Wide) -> Wide:
 
 
 def gathered(effect: Any, declared: Declared, p: Array) -> Array:
-    """Contract positions (n, 3) [m] until the nearest pairs are well within range, half of it."""
+    """Contract positions (n, 3) [m] until the nearest pairs are in mid-range."""
     mesh, r = Touching(declared), effect.thickness if effect.range is None else effect.range
     wanted = effect.thickness + r
     reach = max(wanted, 2.0 * declared.mesh.spacing)

@@ -60,7 +60,7 @@ class Side:
         return f"effects[{k}] {self.declared.effects[k].kind}"
 
     def shortest(self, k: int | None = None) -> float:
-        """Return the smallest length [m] that effect k depends on; without k, that of springs at rest."""
+        """Return the smallest length [m] of effect k, or of springs at rest."""
         lengths = self.declared.mesh.rest_lengths
         springs = float(lengths[lengths > 0.0].min(initial=self.declared.mesh.spacing))
         return springs if k is None else min(springs, self.opinions[k].shortest)

@@ -94,7 +94,7 @@ STAGED = (*_TABLEAUX, *_ALPHAS)
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """The reference stages of a step, their solutions (n, 3) [m], and the end of the step."""
+    """Reference stages of a step, their solutions (n, 3) [m], and its end."""
 
     stated: list[Stated]
     answers: list[Array]
