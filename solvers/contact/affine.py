@@ -145,7 +145,9 @@ def lie(known, x, leaf, boxes, tile, out):
 
 @kernel
 def spread(vertices, pairs, known, p, q, way, tile, low, high):
-    """Return the largest relative displacement [m] of two vertices of the first cluster pairs, as a box diagonal.
+    """Return the largest relative displacement [m] of two vertices in any cluster pair.
+
+    The bound is the diagonal of the box of their displacements.
 
     Args:
         vertices: vertices of each cluster (m, k).

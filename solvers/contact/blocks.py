@@ -148,7 +148,15 @@ def spread(starts, packed, out):
 
 @kernel
 def multiply(vertices, starts, packed, x, out):
-    """Add the product of packed blocks with x (n, 3) to `out`; vertices are -1 where they do not move."""
+    """Add the product of packed blocks with x to `out`.
+
+    Args:
+        vertices: vertices of each block (a, 4); -1 where they do not move.
+        starts: first entry of each block (a + 1,).
+        packed: entries of the blocks.
+        x: vectors (n, 3).
+        out: product (n, 3), updated.
+    """
     for k in range(len(vertices)):
         H = packed[starts[k] : starts[k + 1]]
         for i in range(count(len(H))):

@@ -1,4 +1,6 @@
-"""Closest points of a point and a triangle, and of two edges: inlined kernels for floats or 8-lane packets.
+"""Closest points of point-triangle and edge-edge pairs.
+
+The functions are inlined kernels, for floats or 8-lane packets.
 
     z = sum_i c_i x_i        from the closest point of one to that of the other, over four vertices x_0 .. x_3
 
@@ -72,7 +74,7 @@ def point_triangle(x, a, b, c):
 
 @inner
 def edge_edge(a, b, c, d):
-    """Return the edge coordinates s and t of the closest points of two edges, and |u x v|^2."""
+    """Return s and t of the closest points of two edges, and |u x v|^2."""
     u, v, w = minus(b, a), minus(d, c), minus(a, c)
     n = cross(u, v)
     area = dot(n, n)

@@ -142,7 +142,10 @@ def gather(pairs, x, tile, slots, out):
 
 @inner
 def eight(vertices, x, first, last, edges, limit, tile):
-    """Return as bits which of eight pairs have |z|^2 below a limit; tile (9, 8) gets c, z, |z|^2, |u x v|^2."""
+    """Return as bits which of eight pairs have |z|^2 below a limit.
+
+    The rows of the tile (9, 8) get c, z, |z|^2 and |u x v|^2. Lanes beyond `last` repeat that pair.
+    """
     a, b = rows(x, vertices, first, last, 0), rows(x, vertices, first, last, 1)
     c, d = rows(x, vertices, first, last, 2), rows(x, vertices, first, last, 3)
     if edges:
@@ -227,6 +230,9 @@ def padded(p: Array) -> Array:
 
 @kernel
 def pad(p, x):
-    """Copy positions (n, 3) to x (n, 4); NumPy takes seven times as long for such short rows."""
+    """Copy positions p (n, 3) to x (n, 4), with a zero last column.
+
+    NumPy takes seven times as long for such short rows.
+    """
     for i in range(len(p)):
         x[i, 0], x[i, 1], x[i, 2], x[i, 3] = p[i, 0], p[i, 1], p[i, 2], 0.0

@@ -1,6 +1,6 @@
 """Hessian of the barrier potential in closed form.
 
-With z = sum_i c_i x_i, its local coordinates, the directions w_a in which c changes along them
+With z = sum_i c_i x_i, the directions w_a in which c changes with each free local coordinate
 (`contact.geometry.distance`), and D = |z|^2/2,
 
     D'' = c c' (x) I - B G^-1 B',     B_ia = c_i z_a + w_ia z,     z_a = sum_i w_ia x_i,     G_ab = z_a z_b
@@ -60,7 +60,10 @@ def curvature(contacts: Contacts, grip: Grip, p: Array, n: int, keep: float, roo
 
 
 def coupled(contacts: Contacts, grip: Grip, n: int) -> NDArray[np.int64]:
-    """Return the vertices (a, 4) of collisions and friction; -1 for none and for those beyond the first n."""
+    """Return the block vertices (a, 4) of collisions and friction.
+
+    Missing vertices, and those beyond the first n, are -1.
+    """
     met = np.where(np.arange(4) < contacts.kind[:, None], contacts.vertices, -1)
     return moving(met, grip, n)
 
@@ -92,7 +95,10 @@ def add_curvature(
 
 @kernel
 def curve(contacts, p, keep, starts, work, out):
-    """Write the Hessian block of each collision at p (n, 3) to `out`, at its start; scratch (4, 16): zero initially."""
+    """Write the Hessian block of each collision at p (n, 3) to `out`.
+
+    starts: first entry of each block; scratch (4, 16): zero initially.
+    """
     for k in range(len(contacts.vertices)):
         _curve(contacts, k, p, keep, work, out[starts[k] :])
 
@@ -117,7 +123,9 @@ def enter(contacts, p, keep, places, work, block, values):
 
 
 class Terms(NamedTuple):
-    """Weights of the terms of a Hessian block, with m = grad |u x v|^2 of edges and the G-orthogonal columns b of B.
+    """Weights of the terms of a Hessian block.
+
+    With m = grad |u x v|^2 of edges and the G-orthogonal columns b1, b2 of B, the block is
 
     normal g g' + mollifier_cross (g m' + m g') + mollifier_outer m m' - first_tangent b1 b1' - second_tangent b2 b2'
     + isotropic c c' (x) I, and edge_rotation, that of the rotation of edges (`contact.potentials.edge_edge_mollifier`).
@@ -134,7 +142,10 @@ class Terms(NamedTuple):
 
 @inner
 def terms(contacts, k, p, keep, work):
-    """Return the weights of collision k at p (n, 3), and write g, m, b1 and b2 to the rows of scratch (12 or more)."""
+    """Return the Hessian weights of collision k at p (n, 3).
+
+    The vectors g, m, b1 and b2 are written to the rows of scratch, of 12 numbers or more.
+    """
     x, kind = contacts.vertices[k], contacts.kind[k]
     many = min(kind, 4)
     z0, z1, z2 = contacts.between[k, 0], contacts.between[k, 1], contacts.between[k, 2]

@@ -149,7 +149,10 @@ class Contact:
         return self.frames(0.0) if rest else None
 
     def begin_step(self, start: Start) -> Contact:
-        """Return the energy of a step; while nothing is near, a single box test finds that it is inactive."""
+        """Return the energy of a step.
+
+        While no obstacle is near, a single box test finds that the energy is inactive.
+        """
         p, v = (x if x.flags.carray else np.array(x, order="C") for x in (start.positions, start.velocity))
         frames = self.frames(start.time) if self._resting is None else self._resting
         touched = np.empty(len(frames), np.bool_)
@@ -230,7 +233,10 @@ class Contact:
         np.add.at(out, planes.vertices[grips], (planes.grip[grips] / np.maximum(self.slip, length))[:, None] * u)
 
     def add_absolute_terms(self, p: Positions, out: Array) -> None:
-        """Add k (|x| + |d|) [N] of penalties that are or may be active, and F/max(s, |u|) (|x| + |a|) of friction.
+        """Add the absolute values of the gradient's terms, for the rounding-error bound.
+
+        These are k (|x| + |d|) of penalties that are active, or may be by round-off, and F/max(s, |u|) (|x| + |a|) of
+        friction.
 
         Args:
             p: positions (n, 3) [m].

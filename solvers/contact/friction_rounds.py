@@ -43,7 +43,7 @@ class FrictionEnergy(Energy, Protocol):
     friction_rounds: int
 
     def friction_gradient(self, p: Positions) -> Positions | None:
-        """Return the gradient of friction alone [N] at p (n, 3), in the current step; None where it is zero."""
+        """Return the gradient of friction alone [N] at p (n, 3); None where it is zero."""
         ...
 
 

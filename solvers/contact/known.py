@@ -48,7 +48,9 @@ class Surfaces(Protocol):
         ...
 
     def clear(self, p: Positions, q: Positions, limits: Limits) -> Gaps | None:
-        """Return lower bounds of the distances at q, if the linear displacement from p to q violates no limit.
+        """Return lower bounds of the distances at q, if no pair violates a limit.
+
+        The limits apply to the linear displacement from p to q.
 
         Args:
             p: start positions (n, 3) [m].
@@ -122,7 +124,7 @@ class Kept(NamedTuple):
         return moved <= self.reach - limit
 
     def followed(self, surface: Surfaces, p: Positions, q: Positions, moved: tuple[float, float]) -> Kept | None:
-        """Return the cache entry that is valid at q, if the displacement from p to q is collision-free.
+        """Return the entry valid at q, if the displacement from p is collision-free.
 
         Args:
             source: the primitives.

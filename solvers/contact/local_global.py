@@ -1,4 +1,6 @@
-"""Vertex contact for prefactored methods: contact and friction are a low-rank change W of Q, which stays factorised.
+"""Vertex contact for prefactored local-global methods.
+
+Contact and friction are a low-rank change W of Q, which stays factorised:
 
     p <- p + x,   x = -(Q + W)^-1 (grad g(p) + U w gap),   W = U diag(w) U',  one column of U per contact row
 

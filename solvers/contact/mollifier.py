@@ -53,7 +53,9 @@ def mollifier(c, e):
 
 @inner
 def bending(edges, factor, energy, keep, dc):
-    """Write c' to dc (12,), and return the mollifier's Hessian weights without the rotation of its own edges.
+    """Return the mollifier's Hessian weights, and write c' to dc (12,).
+
+    The rotation of its own edges is excluded; see `add_edge_rotation_hessian`.
 
     Args:
         edges: cross product data of both edges.
@@ -110,7 +112,7 @@ def add_turning(edges, weight, keep, H):
 
 @inner
 def turned(edges, weight, keep, a, b):
-    """Return entry (a, b) of the diagonal blocks of the first edge's ends, and of the second edge's ends."""
+    """Return entry (a, b) of the diagonal blocks of both edges' ends."""
     u, v, uu, _, vv, c = edges
     w, rest, same = np.sqrt(c), 1.0 - keep, 1.0 if a == b else 0.0
     more_u, more_v = rest * w * np.sqrt(vv / uu), rest * w * np.sqrt(uu / vv)

@@ -12,7 +12,10 @@ from solvers.vectors.eights import lowest
 
 
 class Owned(NamedTuple):
-    """Primitives (m, k) in the order of their clusters, and the first one of each cluster (clusters + 1,)."""
+    """Primitives grouped by cluster.
+
+    primitives (m, k): vertices of each; cluster_starts (clusters + 1,): first primitive of each cluster.
+    """
 
     corners: Indices
     starts: Indices

@@ -1,4 +1,6 @@
-"""Barrier contact for local-global methods: the barrier Hessian is a change W of Q, which stays factorised.
+"""Barrier contact for local-global methods.
+
+The barrier Hessian is a change W of Q, which stays factorised:
 
     p <- p + t x,   x = -(Q + W)^-1 grad g(p),   W = the Hessian of barriers and their friction at p, clamped
 

@@ -1,4 +1,6 @@
-"""Barrier contact for vertex block descent (VBD): each sweep uses a contact model that is separable by vertex.
+"""Barrier contact for vertex block descent (VBD).
+
+Each sweep uses a contact model that is separable by vertex:
 
     g_i.(x_i - p_i) + 4/2 (x_i - p_i)' H_ii (x_i - p_i)      for each vertex i of a pair, at the positions p of a sweep
 

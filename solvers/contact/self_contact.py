@@ -149,7 +149,10 @@ class PairContact:
         return coupled(self._at(self.whole(p)).contacts, self.grip, len(p))
 
     def neighbours(self, p: Positions) -> NDArray[np.int64]:
-        """Return the vertices (k, 4) of pairs near p (n, 3); -1 for none. The result is independent of the caches."""
+        """Return the vertices (k, 4) of pairs near p (n, 3); -1 for none.
+
+        The result is independent of the caches.
+        """
         return moving(self.surface.within(self.whole(p), _NEAR * self.range).vertices, self.grip, len(p))
 
     def add_curvature(self, p: Positions, keep: float, places: NDArray[np.int64], values: Array) -> None:
@@ -212,7 +215,7 @@ class PairContact:
         return self.largest_step(p, direction)
 
     def at_part(self, part: float) -> Self:
-        """Return this energy with obstacles at a fraction of their motion in the step, 1 at its end."""
+        """Return the energy with obstacles at a fraction of their motion, 1 at its end."""
         return self
 
     def with_obstacles(self, p: Positions) -> list[Positions]:

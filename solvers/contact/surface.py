@@ -1,4 +1,7 @@
-"""Collision mesh: the points, edges and triangles of a mesh that may collide, with scaled distances of close pairs."""
+"""Collision mesh: the points, edges and triangles of a mesh that may collide.
+
+Pairs that are close at rest have scaled distances.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ _NOTHING = np.empty(0)
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Points (q, 1), edges (m, 2) and triangles (f, 3) of a mesh, in contact with each other.
+    """Points, edges and triangles of a mesh, in contact with each other.
 
     Pairs that share a vertex are excluded. Pairs that are closer at rest than the activation distance have both
     distances scaled in proportion. They exert no force at rest, and still cannot interpenetrate.
@@ -125,7 +128,7 @@ class Surface:
         return self.points.corners, self.triangles.corners, self.edges.corners
 
     def on_way(self, x: Array, y: Array, limits: Limits, edges: bool) -> Pairs:
-        """Return the pairs that may violate a limit on the displacement from x to y, without barrier parameters."""
+        """Return the pairs that may violate a limit between x and y, without barrier parameters."""
         one, other = (self.edges, self.edges) if edges else (self.points, self.triangles)
         met = found(one, other, x, y, limits)
         first = 0 if edges else len(met)

@@ -42,7 +42,7 @@ class ContactEnergy(LaggedEnergy, Protocol):
         ...
 
     def rows(self, p: Positions, trial: Positions, *, cautious: bool) -> ContactRows:
-        """Return the rows of contacts active at p, and of those that become active on the way to `trial`.
+        """Return the rows of contacts active at p or between p and `trial`.
 
         Args:
             p: positions (n, 3) [m].

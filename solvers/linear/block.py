@@ -64,7 +64,11 @@ class BlockCholesky:
         self._scratch = Scratch(front, stacks, waiting, filled, np.zeros(TILE), triangles, runs)
 
     def factorise(self, values: NDArray[np.float64]) -> bool:
-        """Factorise H with blocks (b, 3, 3) in the graph's order; return False if it is not positive definite."""
+        """Factorise H, with blocks (b, 3, 3) in the graph's order.
+
+        Returns:
+            Whether H is positive definite.
+        """
         return factorise(self._fronts, values, self._panels, _NOTHING, self._scratch)
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:

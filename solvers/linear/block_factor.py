@@ -1,4 +1,4 @@
-"""Multifrontal Cholesky factorisation (Duff and Reid 1983) of a matrix of 3 x 3 blocks, and its triangular solves.
+"""Multifrontal Cholesky factorisation of a matrix of 3 x 3 blocks (Duff and Reid 1983).
 
 A front is the dense matrix of a supernode's columns and of the rows below. Its columns become a panel of L; the
 remainder is an update of its parent (`solvers.linalg.cholesky.block_front`). Updates are stored on two stacks that

@@ -30,7 +30,9 @@ _LIMIT = 200
 
 
 class ConjugateGradients:
-    """Iterative solver of Q x = b that starts at zero: the result depends on b alone, and on no thread count.
+    """Iterative solver of Q x = b that starts at zero.
+
+    The result depends on b alone, not on the number of threads.
 
     Attributes:
         nonzeros: entries of the matrices of all levels and of the coarsest level's factor.
@@ -86,7 +88,9 @@ class ConjugateGradients:
 
 
 class _Columns(Iteration):
-    """State of the iteration, one per column of b (n, 3): x, r, p and Q p, (n, 4) in float64; z in float32.
+    """State of the iterations, one per column of b (n, 3).
+
+    x, r, p and Q p are (n, 4) in float64, z in float32.
 
     correction_ratios: largest entry of z before each iteration, relative to that of x; failing_vertex: the vertex with
     the largest component where a curvature is negative.

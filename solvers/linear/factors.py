@@ -1,4 +1,4 @@
-"""Direct solvers of the constant matrix Q, factorised once and solved with three right-hand sides at a time.
+"""Direct solvers of the constant matrix Q, with three right-hand sides at a time.
 
 Each class is constructed from Q. `solve(b, out)` solves Q out = b, both (n, 3) and C-contiguous; `nonzeros` is the
 number of stored entries of the factor, None where the library does not provide it.

@@ -1,4 +1,6 @@
-"""Dense inverse of a small Q: a solve is one dense product, without a chain of dependent operations.
+"""Dense inverse of a small Q.
+
+A solve is one dense product, without a chain of dependent operations:
 
     x = Q^-1 b,   Q^-1 = L^-T L^-1
 

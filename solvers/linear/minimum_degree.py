@@ -1,4 +1,6 @@
-"""Minimum degree ordering of a small piece of a graph; its surrounding vertices (halo) count but are not eliminated.
+"""Halo minimum degree ordering of a small piece of a graph.
+
+The vertices around the piece (its halo) count in degrees but are not eliminated.
 
 The elimination graph is stored as a bit matrix with one row per vertex of the piece. Eliminating v merges v's row into
 those of its neighbours. Degrees are exact, without a quotient graph, which is faster at a hundred vertices.

@@ -92,7 +92,7 @@ def multiply_and_dot(pointers, columns, values, p, out, parts):
 
 @kept(parallel=True)
 def advance(alpha, p, image, x, r, rounded, parts):
-    """Update x += alpha p and r -= alpha image; write r in float32, and the largest |x| of each block of rows.
+    """Update x += alpha p and r -= alpha image.
 
     Args:
         alpha: step sizes (3,).

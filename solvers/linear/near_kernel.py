@@ -209,7 +209,10 @@ class Cycle:
 
 
 class Solving(Iteration):
-    """Preconditioned conjugate gradients for A x = b from zero, until |b - A x| is at most rtol |b|."""
+    """Preconditioned conjugate gradients for A x = b from zero.
+
+    The iteration ends once |b - A x| is at most rtol |b|.
+    """
 
     def __init__(self, A: csr_array, cycle: Cycle, b: Vector, tolerance: float) -> None:
         self._A, self._cycle, self._limit = A, cycle, tolerance * norm(b)

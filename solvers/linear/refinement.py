@@ -47,10 +47,10 @@ class _Cut(NamedTuple):
 
 @part
 def refine(pointers, neighbours, piece, side, local):
-    """Shrink a separator by moving its vertices to a side, which pulls their neighbours on the other side in.
+    """Shrink a separator by moving its vertices to a side.
 
-    A pass moves each vertex at most once, always the one that shrinks the separator most (ties: to the smaller side),
-    and then restores the best state encountered.
+    A move pulls the neighbours on the other side into the separator. A pass moves each vertex at most once, always the
+    one that shrinks the separator most (ties: to the smaller side), and then restores the best state encountered.
 
     Args:
         pointers, neighbours: graph in CSR form.

@@ -111,7 +111,7 @@ def _merging(of: NDArray[np.int64]) -> csr_array:
 
 @kernel
 def grow(pointers, neighbours, order, state, queue, border):
-    """Write an order of the nodes of a graph in which subdomains grow outwards from the border of earlier ones.
+    """Order the nodes of a graph so that subdomains grow from the border of earlier ones.
 
     Args:
         pointers, neighbours: graph in CSR form.

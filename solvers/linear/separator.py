@@ -1,4 +1,4 @@
-"""Small vertex separator of a connected piece of a graph, as a level set of a field of distances.
+"""Small vertex separator of a connected piece, as a level set of graph distances.
 
 `piece` lists the vertices; `owner[v] == number` marks v as one of them. A side is 0 or 1, or 2 for the separator.
 """

@@ -21,7 +21,7 @@ _NO_DIGITS = 4.0 * np.finfo(np.float64).eps
 
 @inner
 def in_tile(row, col, width):
-    """Return the offset of an entry in a panel, stored by tiles of four rows, each column by column."""
+    """Return the offset of an entry in a panel of tiles of four rows, stored by columns."""
     return (row >> 2) * 4 * width + 4 * col + (row & 3)
 
 

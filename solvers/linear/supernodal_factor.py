@@ -196,7 +196,9 @@ def _extend_add(front, size, stack, begin, rows, start, end, place):
 
 @kept()
 def keep_sums(panels, rounding, chunks):
-    """Add the total rounding error of each column of W to its smallest entry, which has the smallest rounding error.
+    """Add the total rounding error of each column of W to its smallest entry.
+
+    That entry has the smallest rounding error.
 
     A column contains the weights with which a vertex follows those below. Errors of their sum would separate vertices
     that should move together, against stiff springs. The largest eigenvalue of the preconditioned matrix, 1 without

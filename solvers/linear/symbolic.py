@@ -19,7 +19,9 @@ from solvers.linear.supernodes import GROUPS, LANES, amalgamate, groups
 
 
 class Symbolic(NamedTuple):
-    """Structure of L over slots: positions in the work vector, padded so that each supernode starts at a multiple of 4.
+    """Structure of L over slots, the positions in the work vector.
+
+    Slots are padded so that each supernode starts at a multiple of COLUMN_LANES.
 
     Supernodes are numbered group by group, followed by those above all groups, the top; children precede parents.
 

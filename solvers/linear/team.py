@@ -113,7 +113,10 @@ def claim(team, task, phase):
 
 @inner
 def last(team):
-    """Mark a task as completed; return whether it was the last one of its phase, which this thread must then end."""
+    """Mark a task as completed; return whether it was the last one of its phase.
+
+    The thread that gets True must end the phase.
+    """
     if _count(team.signals, _DONE) < len(team.sums) - 1:
         return False
     team.signals[_DONE] = 0

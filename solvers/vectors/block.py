@@ -1,4 +1,4 @@
-"""Products of tiles of a frontal matrix, in explicit LLVM vectors that compilers do not generate by themselves.
+"""Products of tiles of a frontal matrix, in explicit LLVM vectors.
 
 A front is stored by columns, with `stride` entries from one to the next. A tile has eight rows and six or three
 columns. Its sums stay in registers during the loop over the columns to the left, of which eight rows form a vector.

@@ -1,4 +1,7 @@
-"""Sparse matrix rows times vectors of four numbers per vertex, in LLVM vectors: an entry multiplies a whole load."""
+"""Products of sparse matrix rows with vectors of four numbers per vertex, in LLVM vectors.
+
+An entry multiplies one vector load.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Springs of eight vertices at a time, in explicit LLVM vectors that compilers do not generate by themselves.
+"""Springs of eight vertices at a time, in explicit LLVM vectors.
 
 Position rows have four numbers, x, y, z and padding. One load fetches a vertex, and eight loaded rows are transposed to
 vectors of x, y and z. Lane l contains a spring of vertex l, so that no two lanes add to one address. Rows are
@@ -110,9 +110,10 @@ class Eights(Vectors):
     def over_entries(
         self, begin: Any, end: Any, read: Callable[[Any], list[Any]], *stages: Callable[[list[Any]], Any]
     ) -> None:
-        """Process all entries in a software pipeline: one entry is read while each stage processes an earlier one.
+        """Process all entries in a software pipeline.
 
-        This hides latencies. There must be at least as many entries as stages.
+        One entry is read while each stage processes an earlier one, which hides latencies. There must be at
+        least as many entries as stages.
         """
         b, depth = self.builder, len(stages)
         waiting: list[list[Any]] = []  # for each stage, the last one first
