@@ -1,20 +1,26 @@
-"""What a solver may tell of itself, as a class variable `about`, for tables and pictures."""
+"""The metadata of a solver, given as its class variable `about`, for tables and figures."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 LOCAL_GLOBAL = "local-global"
-"""The family of the method of Liu et al. 2013, by whose iterations others are measured."""
+"""The family of the method of Liu et al. 2013, whose iterations are the unit for other methods."""
 
 ENGINE = "engine"
-"""The family of other people's programs."""
+"""The family of external programs."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Where a method comes from. authors: as BibTeX has them, family names first, joined by `and`; doi: without the
-    address of its registry, empty where there is none."""
+    """The publication of a method.
+
+    Attributes:
+        authors: names in BibTeX form, family names first, joined by `and`.
+        year: year of publication.
+        title: title of the publication.
+        doi: identifier without the address of the registry; empty if there is none.
+    """
 
     authors: str
     year: int
@@ -24,14 +30,17 @@ class Reference:
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What tables and pictures tell of a method.
+    """The metadata of a method for tables and figures.
 
-    family: methods of one family share a colour; those of LOCAL_GLOBAL do the same iterations. own_steps: whether it
-    integrates a frame in substeps of its own, whatever the integrator of the run. first: whether it is the one of its
-    family to take first. to_error: whether it is tried where an error is asked for: one with steps of its own chooses
-    them by their error (`within`), others minimise what an integrator with an error states. even: whether its own steps
-    have one length instead, and can be had shorter (`refined`). package: the distribution that it is an interface to,
-    whose version its rows tell.
+    Attributes:
+        family: methods of one family share a colour; those of LOCAL_GLOBAL_FAMILY perform the same iterations.
+        reference: the publication of the method.
+        own_steps: whether the method integrates a frame in its own substeps, independent of the run's integrator.
+        first: whether the method is the default of its family.
+        to_error: whether runs with an error target try the method. A substepping method then chooses its steps by
+            their error (`within`); other methods minimise the objective of an integrator with an error estimate.
+        even: whether the substeps have a fixed size, which can be reduced (`refined`).
+        package: the distribution that the method is an interface to, whose version is part of its rows.
     """
 
     family: str

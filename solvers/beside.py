@@ -1,6 +1,6 @@
-"""Files of Python beside a config as modules: `solvers.beside.m<the path, in hexadecimal>` is the file at that path.
+"""Import hook for Python files next to a config: `<this module>.m<path in hexadecimal>` is the file at that path.
 
-So what is defined there has a module that every process can import, and travels between processes like anything else.
+Definitions in such a file have a module that every process can import, so they can be pickled between processes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ sys.meta_path.append(_Files())
 
 
 def module(path: Path) -> ModuleType:
-    """The module in a file, which is run, again where the file is another one than when it was last."""
+    """Return the module in a file; the file is executed again if its content has changed since the last call."""
     name, content = f"{_PREFIX}{str(path).encode().hex()}", path.read_bytes()
     if _READ.get(name, content) != content:
         sys.modules.pop(name, None)

@@ -1,8 +1,8 @@
-"""How kernels are compiled: kept on disk, and without counting references to arrays.
+"""Numba options of the kernels: compiled code is cached on disk, and arrays are not reference-counted.
 
-Kernels neither make arrays nor keep them, so there is nothing to count; counting took half of a step of a hundred
-vertices. They let Python's other threads run meanwhile. Inner ones are called by kernels alone: they need no wrappers
-for Python, and no machine code of their own (`solvers.linking`).
+Kernels neither create nor store arrays, so there is nothing to count. Counting took half of a step of a hundred
+vertices. Kernels release the GIL. Inner functions are called by kernels only: they need no Python wrapper and no
+machine code of their own (`solvers.jit.inline_linking`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from solvers.linking import LinkedCompiler
 
 
 def kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Numba's `njit` with these options; what it compiles is kept on disk by all that it depends on."""
+    """Return a decorator like Numba's `njit` whose disk cache depends on all that the function depends on."""
 
     def compiling(function: Callable[..., Any]) -> Any:
         dispatcher: Any = njit(**options)(function)

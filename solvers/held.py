@@ -1,4 +1,4 @@
-"""What a system holds by no energy: vertices that are pinned, and lengths that do not change."""
+"""Constraints of a system that are not energies: Dirichlet conditions of vertices, and fixed lengths."""
 
 from __future__ import annotations
 
@@ -10,23 +10,25 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pins:
-    """Pinned vertices: `vertices` (q,), sorted and unique; `weight` (q,) [N/m], infinite for an exact pin."""
+    """Dirichlet conditions: `vertices` (q,), sorted and unique; `weight` (q,) [N/m], infinite for an exact pin."""
 
     vertices: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     weight: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
     @property
     def exact(self) -> NDArray[np.bool_]:
-        """Which pins are eliminated rows instead of penalties, shape (q,)."""
+        """Mask of the pins that are eliminated instead of penalised, shape (q,)."""
         return np.isinf(self.weight)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lengths:
-    """Distances that are kept exactly: what springs and strain limits of infinite stiffness are.
+    """Length constraints that hold exactly, from springs and strain limits of infinite stiffness.
 
-    edges: (m, 2); low, high: the lengths allowed (m,) [m], 0 <= low <= high, 0 < high; equal where a spring is
-    inextensible; rest_direction: (m, 3), unit vectors that edges of zero length take.
+    Attributes:
+        edges: (m, 2).
+        low, high: bounds of the lengths (m,) [m], 0 <= low <= high, 0 < high; equal for an inextensible spring.
+        rest_direction: (m, 3), unit directions of edges of zero length.
     """
 
     edges: NDArray[np.int64]

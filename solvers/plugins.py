@@ -1,12 +1,12 @@
-"""Whose code a name leads to: what is shipped, what an installed package brings, what a config names.
+"""Resolution of names in a config to code: built-in, of an installed package, or named by the config.
 
-    hybrid                        shipped: it stands in one of our tables
+    hybrid                        built-in: an entry of one of our tables
     my-method                     installed: an entry point of the table's group, such as `springbench.solvers`
     my_package.module:MyMethod    named: in a module that Python finds
-    ./mine.py:MyMethod            named: in a file beside the config, or in a folder below it
+    ./mine.py:MyMethod            named: in a file in the config's folder, or in a folder below it
 
-Of the last three nothing is imported until `load`. Until then a name is a `Plugin`, which knows the module and its
-version: that of the installed distribution, and 12 hexadecimal digits over the sources.
+The last three are imported by `load_target` only. Until then such a name is a `PluginName`, which states the module
+and its version: that of the installed distribution, and 12 hexadecimal digits of a digest of the sources.
 """
 
 from __future__ import annotations
@@ -24,18 +24,21 @@ from typing import Any
 from solvers import beside, sources
 
 PATTERN = r"^(\./[^:]+\.py|[A-Za-z_][\w.]*):[A-Za-z_]\w*$"
-"""How a config names code."""
+"""The pattern of names by which a config refers to code."""
 
 
 class Refused(ValueError):
-    """A name that leads to no code, or to code that a config must not name."""
+    """An error for a name without code, or with code that a config must not name."""
 
 
 class Plugin(str):
-    """A name as a config writes it, that leads to somebody's own code.
+    """A name in a config that refers to third-party code.
 
-    target: "module:name", or "path.py:name" with an absolute path; module: for people; version: of its code;
-    source: its file.
+    Attributes:
+        target: "module:name", or "path.py:name" with an absolute path.
+        module: the module, for display.
+        version: version of the code.
+        source: source file.
     """
 
     target: str
@@ -49,15 +52,15 @@ class Plugin(str):
         return made
 
     def identity(self) -> list[str]:
-        """What tells this code from other code of the name."""
+        """Return what distinguishes this code from other code of the same name."""
         return [str(self), self.module, self.version]
 
 
 class Table(Mapping[str, Any]):
-    """Names and what they lead to: shipped ones, those of installed packages, and every `Plugin`."""
+    """A mapping from names to import targets: built-in ones, installed ones, and every `PluginName`."""
 
     def __init__(self, group: str, *shipped: Mapping[str, Any]) -> None:
-        """group: of entry points; shipped: tables of "module:name", or of the things themselves."""
+        """Create a table from an entry-point group and tables of "module:name" or of the objects themselves."""
         self._group, self.shipped = group, shipped
 
     def __getitem__(self, name: str) -> Any:
@@ -78,9 +81,16 @@ class Table(Mapping[str, Any]):
         return sum(1 for _ in self)
 
     def named(self, name: str, folder: Path) -> str:
-        """The name, as a Plugin where it is not shipped; one that is not known as it is. folder: of the config.
+        """Return the name, as a PluginName if it is not built-in; an unknown name is returned unchanged.
 
-        Imports nothing. Raises Refused.
+        Imports nothing.
+
+        Args:
+            name: the name in the config.
+            folder: the folder of the config.
+
+        Raises:
+            InvalidPluginName: the name refers to no code, or to code that a config must not name.
         """
         if any(name in table for table in self.shipped):
             return name
@@ -96,19 +106,19 @@ class Table(Mapping[str, Any]):
 
 
 def load(target: str) -> Any:
-    """What "module:name" or "path.py:name" names; the module is imported, or the file run, now and no sooner."""
+    """Import the module, or run the file, of "module:name" or "path.py:name" and return the named object."""
     place, _, name = target.rpartition(":")
     module = beside.module(Path(place)) if place.endswith(".py") else import_module(place)
     return getattr(module, name)
 
 
 def identity(name: str) -> str | list[str]:
-    """What tells the code of a name from other code of that name: a shipped one is told by its name."""
+    """Return what distinguishes the code of a name from other code; a built-in is identified by its name."""
     return name.identity() if isinstance(name, Plugin) else name
 
 
 def found(names: Iterable[str]) -> list[Plugin]:
-    """Those of the names that lead to somebody's own code."""
+    """Return the names that refer to third-party code."""
     return [name for name in names if isinstance(name, Plugin)]
 
 
@@ -132,7 +142,7 @@ def _written(name: str, folder: Path) -> Plugin:
 
 
 def _of_module(name: str, target: str, distribution: str | None) -> Plugin:
-    """distribution: its version; None to look for it."""
+    """Build the PluginName of a module; `distribution_version` is looked up if it is None."""
     module = target.partition(":")[0]
     source = source_of(module)
     if source is None:
@@ -145,7 +155,7 @@ def _of_module(name: str, target: str, distribution: str | None) -> Plugin:
 
 
 def source_of(module: str) -> str | None:
-    """The file of a module, found without importing what it lies in; None where there is none."""
+    """Return the file of a module without importing its parents; None if there is none."""
     first, *rest = module.split(".")
     try:
         spec = find_spec(first)

@@ -4,8 +4,9 @@ A step of implicit Euler minimises the incremental potential (Liu et al. 2013, e
 
     g(p) = sum of energies(p) + c/(2 dt^2) |p - target|_M^2 - tr(p' f) + sum_pins w/2 |p_i - pin_i|^2
 
-over the positions p that keep all exact lengths, with c = 1 and target = 2 p^t - p^(t-dt); other integrators have
-others (see `solvers.integrators`). `StepProblem` states g in plain NumPy: every accuracy figure is taken from it.
+over the positions p that satisfy all length constraints, with c = 1 and target = 2 p^t - p^(t-dt). Other integrators
+have other values of c and target (see `solvers.model.integrators`). `StepProblem` evaluates g in plain NumPy; every
+accuracy figure is computed from it.
 """
 
 from __future__ import annotations
@@ -24,21 +25,24 @@ from solvers.held import Lengths, Pins
 Positions = NDArray[np.float64]
 """Positions [m], shape (n, 3), float64, C-contiguous."""
 ResidualOf = Literal["returned", "previous", "none"]
-"""The iterate that a residual belongs to: what a solve returns, or the one before; none where there is no residual."""
+"""The iterate that a residual belongs to: the returned one, or its predecessor; "none" if there is no residual."""
 
 
 class WrongAnswer(Exception):
-    """A part of a solver of somebody's own gave something else than was asked; the message begins with its line."""
+    """An error in a user-supplied solver component; the message begins with the source line."""
 
 
 class Unsupported(Exception):
-    """A solver cannot minimise this system; the message says which part of it and why."""
+    """An error for a system that a solver cannot minimise; the message states the part and the reason."""
 
 
 class NotPositiveDefinite(Exception):
-    """The system matrix has no Cholesky factor: some vertex is loose, or round-off or the input spoils it.
+    """An error for a system matrix without a Cholesky factor.
 
-    vertices: those that the message names.
+    Causes are a vertex without mass, spring or pin, rounding errors, and invalid input.
+
+    Attributes:
+        vertices: the vertices that the message names.
     """
 
     def __init__(self, message: str = "", vertices: Sequence[int] = ()) -> None:
@@ -47,10 +51,10 @@ class NotPositiveDefinite(Exception):
 
 
 class Energy(Protocol):
-    """A potential [J] of positions [m]."""
+    """A potential energy [J] as a function of the positions [m]."""
 
     def value(self, p: Positions) -> float:
-        """The energy [J] at p, shape (n, 3)."""
+        """Return the energy [J] at p, shape (n, 3)."""
         ...
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
@@ -58,30 +62,35 @@ class Energy(Protocol):
         ...
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
-        """The Hessian [N/m], shape (3n, 3n), the coordinates of a vertex side by side."""
+        """Return the Hessian [N/m], shape (3n, 3n), with the coordinates of a vertex contiguous."""
         ...
 
 
 @runtime_checkable
 class ProjectiveEnergy(Energy, Protocol):
-    """min over d of sum_e w_e/2 |(A p)_e - d_e|^2 with each d_e on a manifold (Bouaziz et al. 2014)."""
+    """A projective energy min over d of sum_e w_e/2 |(A p)_e - d_e|^2, each d_e on a manifold (Bouaziz et al. 2014)."""
 
     def stiffness_matrix(self, n: int) -> scipy.sparse.csr_array:
-        """The energy's share A'KA [N/m] of the system matrix, shape (n, n)."""
+        """Return the contribution A'KA [N/m] of the energy to the system matrix, shape (n, n)."""
         ...
 
     def add_projection(self, p: Positions, out: Positions) -> None:
-        """Add A'K d(p) [N], shape (n, 3), its share of the right-hand side, to `out`."""
+        """Add A'K d(p) [N], shape (n, 3), the contribution to the right-hand side, to `out`."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """What stays fixed in a run, and so is factorised once.
+    """The data that stay constant in a run, so that they are factorised once.
 
-    mass: (n,) [kg], zero is allowed where springs or pins hold the vertex; time_step: dt [s];
-    energies: potentials of the positions; pins: which vertices are pinned, and how; factor, speed: of the integrator,
-    c and the unknown's velocity over its change in 1/dt, None for sqrt(c); lengths: what is kept exactly.
+    Attributes:
+        mass: (n,) [kg]; zero is allowed at vertices with a spring or a pin.
+        time_step: dt [s].
+        energies: potentials of the positions.
+        pins: the pinned vertices and their weights.
+        factor: the integrator's c.
+        speed: the integrator's ratio of the velocity to the change of the stage, in units of 1/dt; None for sqrt(c).
+        lengths: length constraints that hold exactly.
     """
 
     mass: NDArray[np.float64]
@@ -94,47 +103,54 @@ class System:
 
     @property
     def rate(self) -> float:
-        """sqrt(c)/dt, or speed/dt [1/s], as `Start` has it."""
+        """Velocity per displacement of the stage, sqrt(c)/dt or velocity_factor/dt [1/s]."""
         return (self.factor**0.5 if self.speed is None else self.speed) / self.time_step
 
     @cached_property
     def inertia(self) -> NDArray[np.float64]:
-        """c m/dt^2 (n,) [N/m], the inertia's share of Q."""
+        """Diagonal c m/dt^2 (n,) [N/m] of the inertia term in the system matrix Q."""
         return self.factor * self.mass / self.time_step**2
 
     @property
     def vertices(self) -> int:
-        """n, the number of vertices."""
+        """Number of vertices n."""
         return len(self.mass)
 
     @cached_property
     def free(self) -> NDArray[np.int64]:
-        """The vertices that are unknowns: all but the exactly pinned, shape (f,)."""
+        """Vertices that are degrees of freedom, i.e. all except the exactly pinned ones, shape (f,)."""
         return np.setdiff1d(np.arange(self.vertices), self.pins.vertices[self.pins.exact])
 
     @cached_property
     def unpinned(self) -> NDArray[np.bool_]:
-        """Which vertices no pin holds, exact or penalty, shape (n,)."""
+        """Mask of the vertices without any pin, exact or by penalty, shape (n,)."""
         mask = np.ones(self.vertices, bool)
         mask[self.pins.vertices] = False
         return mask
 
     @cached_property
     def penalty(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.float64]]:
-        """The pins by penalty: which of `pins` they are (q,), their vertices and their weights [N/m]."""
+        """Penalty pins: their mask within `pins` (q,), their vertices and their weights [N/m]."""
         soft = ~self.pins.exact
         return soft, self.pins.vertices[soft], self.pins.weight[soft]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Start:
-    """Where a step starts, for energies that depend on it and for methods that do not minimise.
+    """The state at the start of a step, for lagged energies and for methods that do not minimise.
 
-    positions: p^t (n, 3) [m]; velocity: v^t, filters included, (n, 3) [m/s]; time: t [s]; origin (n, 3) [m] and rate
-    [1/s]: the unknown x moves with the velocity rate (x - origin); until: the time of x [s] (nan, which spoils all that
-    depends on it, where it is not told); ahead: how far [s] to extrapolate what is lagged; lagged: where it is taken
-    instead, (n, 3) [m]; acceleration: what the motion so far leads to expect, (n, 3) [m/s^2]; kept: by the last solve;
-    pressed: an iterate of x, (n, 3) [m], whose normal forces friction takes; None: those of the step's start.
+    Attributes:
+        positions: p^t (n, 3) [m].
+        velocity: v^t (n, 3) [m/s], after the velocity filters.
+        time: t [s].
+        origin: (n, 3) [m]; the stage x has the velocity velocity_rate * (x - velocity_origin).
+        rate: velocity per displacement [1/s].
+        until: time of the stage x [s]; the default nan propagates into all results that depend on it.
+        ahead: time [s] by which lagged positions are extrapolated.
+        lagged: positions (n, 3) [m] that replace p^t as the lagged ones.
+        acceleration: acceleration (n, 3) [m/s^2] predicted from the previous motion.
+        kept: warm start from the previous solve.
+        pressed: an iterate of x (n, 3) [m] at which friction evaluates normal forces; None for the start of the step.
     """
 
     positions: Positions
@@ -151,37 +167,43 @@ class Start:
 
     @property
     def expected(self) -> Positions:
-        """The positions that an energy is lagged at, (n, 3) [m]: p^t, or extrapolated by `ahead`, or `lagged`."""
+        """Positions (n, 3) [m] of lagged energies: p^t or `lag_override`, extrapolated by `lag_extrapolation`."""
         p = self.positions if self.lagged is None else self.lagged
         return p + self.ahead * self.velocity if self.ahead else p
 
     def velocity_at(self, x: Positions) -> Positions:
-        """The velocity [m/s] of the unknown x, both (n, 3)."""
+        """Return the velocity [m/s] of the stage x, both (n, 3)."""
         return self.rate * (x - self.origin)
 
 
 class LaggedEnergy(Energy, Protocol):
-    """An energy that depends on where the step starts: damping, friction, obstacles that move. Of that, the stiffness
-    of a projective one may depend on the rate alone, for Q is made once."""
+    """An energy that depends on the start of the step, such as damping, friction or moving obstacles.
+
+    The stiffness of a projective energy may depend on nothing of that start but its rate, because Q is built once.
+    """
 
     def begin_step(self, start: Start) -> Energy:
-        """The energy of this one step."""
+        """Return the energy of this step."""
         ...
 
 
 def is_lagged(energy: Energy) -> TypeGuard[LaggedEnergy]:
-    """Whether it does; to ask the protocol itself takes a hundredth of a small step."""
+    """Return whether an energy is lagged; isinstance on the protocol would cost a hundredth of a small step."""
     return hasattr(energy, "begin_step")
 
 
 @dataclass(frozen=True, eq=False)
 class StepProblem:
-    """What one step minimises. All arrays are float64 and are never written to.
+    """The objective of one step. All arrays are float64 and never modified.
 
-    target: where inertia alone would bring the unknown, velocity filters included, (n, 3) [m]; force: (n, 3) [N];
-    pin_targets: where the pins want their vertices, (q, 3) [m], in the order of `system.pins`;
-    current: p^t with its pinned vertices on their targets, (n, 3) [m], the yardstick of the stop rule;
-    first_guess: where the iteration starts, (n, 3) [m]; start: of the step.
+    Attributes:
+        system: the data that stay constant in a run.
+        target: positions of the stage under inertia alone (n, 3) [m], velocity filters included.
+        force: external force (n, 3) [N].
+        pin_targets: target positions of the pins (q, 3) [m], in the order of `system.pins`.
+        current: p^t with pinned vertices on their targets (n, 3) [m]; the stop rule takes the initial residual here.
+        first_guess: initial guess of the iteration (n, 3) [m].
+        start: state at the start of the step.
     """
 
     system: System
@@ -194,11 +216,11 @@ class StepProblem:
 
     @cached_property
     def energies(self) -> tuple[Energy, ...]:
-        """The system's energies, as they are in this step, in their order."""
+        """Energies of the system in their order, with the lagged ones evaluated for this step."""
         return tuple(e.begin_step(self.start) if is_lagged(e) else e for e in self.system.energies)
 
     def terms(self, p: Positions) -> dict[str, float]:
-        """The terms [J] of the objective at p by name: inertia, force, pins, and energies by their class."""
+        """Return the terms [J] of the objective at p by name: inertia, force, pins, and energies by their class."""
         s, values, away = self.system, dict[str, float](), p - self.target
         for energy in self.energies:
             name = type(energy).__name__.lower()  # which may be that of one of the three
@@ -212,15 +234,15 @@ class StepProblem:
         return values
 
     def value(self, p: Positions) -> float:
-        """The objective g(p) [J]; exact pins are taken to be on their targets."""
+        """Return the objective g(p) [J]; exactly pinned vertices must be on their targets."""
         return sum(self.terms(p).values())
 
     def magnitude(self, p: Positions) -> float:
-        """The sum of the terms' absolute values [J]: the scale of round-off in `value`."""
+        """Return the sum of the absolute terms [J], which is the scale of rounding errors in `value`."""
         return sum(abs(term) for term in self.terms(p).values())
 
     def gradient(self, p: Positions) -> Positions:
-        """The gradient of g at p [N], shape (n, 3); zero rows at exactly pinned vertices."""
+        """Return the gradient of g at p [N], shape (n, 3), with zero rows at exactly pinned vertices."""
         s = self.system
         out = s.inertia[:, None] * (p - self.target) - self.force
         for energy in self.energies:
@@ -233,11 +255,20 @@ class StepProblem:
 
 @dataclass(frozen=True, slots=True)
 class StopRule:
-    """When a solve ends: after `iterations`; once the residual is at most `within` [J^(1/2)], or `tolerance` times that
-    at the current positions; or once the gradient is no more than round-off, so that a scene at rest stops at once.
+    """The criteria that terminate a solve.
 
-    The residual is |Q^-1 grad g(p)|_Q = |p - LG(p)|_Q over the unpinned vertices. A gradient counts as round-off where
-    at each of them it is at most `floor` times the bound of `solvers.round_off`; a floor of 0 turns this off."""
+    A solve ends after `max_iterations`, or if the residual is at most max(atol, rtol * initial residual), or if the
+    gradient is no larger than rounding errors, so that a scene at rest stops immediately. The residual is
+    |Q^-1 grad g(p)|_Q = |p - LG(p)|_Q over the unpinned vertices. The initial residual is the one at the current
+    positions.
+
+    Attributes:
+        iterations: maximum number of iterations.
+        tolerance: relative tolerance; None for none.
+        floor: a gradient is round-off if at each unpinned vertex it is at most this factor times the bound of
+            `solvers.model.rounding_bound`; 0 disables the criterion.
+        within: absolute tolerance [J^(1/2)].
+    """
 
     iterations: int = 50
     tolerance: float | None = None
@@ -247,11 +278,19 @@ class StopRule:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Where a solve ended. positions: (n, 3) [m]; iterations: how many were done; residual: |Q^-1 grad g|_Q [J^(1/2)]
-    over the unpinned vertices, by which the rule judged (nan for a method that does not minimise), of the iterate that
-    residual_of names; yardstick: the same at the current positions (nan without a tolerance); stopped: "iterations",
-    "tolerance", "floor", or "stalled" where nothing descends any more; velocity: (n, 3) [m/s], of a method's own; kept
-    (of any shape): what it begins the next step with."""
+    """The result of a solve.
+
+    Attributes:
+        positions: (n, 3) [m].
+        iterations: number of iterations.
+        residual: |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices that the stop rule tested, at the iterate that
+            `residual_iterate` names; nan for a method that does not minimise.
+        yardstick: residual at the current positions; nan without a tolerance.
+        stopped: "iterations", "tolerance", "floor" (round-off), or "stalled" if no step decreases the objective.
+        velocity: (n, 3) [m/s], for a method that computes its own.
+        residual_of: the iterate of the residual.
+        kept: warm start of the next solve, of any shape.
+    """
 
     positions: Positions
     iterations: int
@@ -264,43 +303,54 @@ class Solution:
 
 
 class Prepared(Protocol):
-    """A solver that has factorised, coloured and compiled what one system needs."""
+    """A solver after the setup for one system: factorisation, colouring and compilation."""
 
     @property
     def choice(self) -> str:
-        """What the solver chose by itself, and why, in words; empty where it had nothing to choose."""
+        """Automatic decisions of the solver and their reasons in words; empty if there were none."""
         ...
 
     @property
     def facts(self) -> dict[str, float]:
-        """Exact counts of what was built, by name (for example `nnz_system`, `nnz_factor`)."""
+        """Exact counts of the setup by name, for example `nnz_system` and `nnz_factor`."""
         ...
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        """The iterates, one more each time it is asked; a yielded array may be reused (copy to keep)."""
+        """Yield one iterate after another; a yielded array may be overwritten, so copy it to store it."""
         ...
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """The same iterates on the fast path, up to where `stop` ends them."""
+        """Compute the iterates on the fast path until `stop` terminates them."""
         ...
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """|Q^-1 grad g|_Q [J^(1/2)] at p (n, 3) [m], which may take an iteration; nan where none is known."""
+        """Return |Q^-1 grad g|_Q [J^(1/2)] at p (n, 3) [m], or nan if it is not defined; may cost an iteration."""
         ...
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """The parts of an iteration by name, if any; each returns the array (or what else) that it has computed."""
+        """Return the phases of an iteration by name, if any, as callables that return what they compute."""
         ...
 
 
 class Solver(Protocol):
-    """A frozen dataclass of a method's parameters. minimises: whether its iterates tend to a minimum of the step's
-    objective; others are graded on their trajectories. descends: whether it rises in no iteration, round-off apart.
-    One that keeps exact lengths has `keeps_lengths` as well, True."""
+    """The parameters of a method, as a frozen dataclass.
+
+    A method that supports exact length constraints also has `keeps_lengths = True`.
+
+    Attributes:
+        minimises: whether the iterates converge to a minimum of the step's objective; other methods are scored by
+            their trajectories.
+        descends: whether the objective increases in no iteration, except by round-off.
+    """
 
     minimises: ClassVar[bool]
     descends: ClassVar[bool]
 
     def prepare(self, system: System) -> Prepared:
-        """Raises Unsupported, before any work, for what the method cannot do, and NotPositiveDefinite."""
+        """Return the solver set up for a system.
+
+        Raises:
+            Unsupported: the method does not support part of the system; raised before any work.
+            NotPositiveDefinite: the system matrix has no Cholesky factor.
+        """
         ...

@@ -1,4 +1,4 @@
-"""The solvers by name. One of ours is a file and a line here; other people's need no line, see `solvers.plugins`."""
+"""The solvers by name. A built-in solver has a line here; a third-party one needs none, see `solvers.plugins`."""
 
 from __future__ import annotations
 
@@ -49,24 +49,24 @@ OPTIONAL = {
     "taichi": "solvers.engines.taichi_newton:TaichiNewton",
     "newton-physics": "solvers.engines.newton_physics:NewtonPhysics",
 }
-"""Those that need what is not everywhere, and refuse with the reason where it is missing."""
+"""Solvers with optional dependencies; they raise an error with the reason if one is missing."""
 
 EVERY = Table("springbench.solvers", SOLVERS, OPTIONAL)
-"""All that a config can name."""
+"""All solvers that a config can name."""
 
 
 def minimises(solver: Any) -> bool:
-    """Whether a solver's iterates tend to a minimum; one that does not say counts as one whose do, and is graded so."""
+    """Return whether the iterates converge to a minimum; a solver without `minimises` is scored as if they do."""
     return getattr(solver, "minimises", True)
 
 
 def name_of(solver: Any) -> str:
-    """The name of a solver of the registry, and of another that of its class."""
+    """Return the name of a solver: the registered one, or else the name of its class."""
     kind: type = solver if isinstance(solver, type) else solver.__class__
     named = {target: name for name, target in (SOLVERS | OPTIONAL).items()}
     return named.get(f"{kind.__module__}:{kind.__qualname__}", kind.__name__)
 
 
 def about(solver: Any, name: str) -> About:
-    """What a solver of this name tells of itself; one that tells nothing is a family of its own."""
+    """Return the metadata of a solver of this name; without any, the solver is a family of its own."""
     return getattr(solver, "about", About(name))

@@ -1,9 +1,10 @@
-"""The driver: it owns the iteration loop, the stop rule, its limits and what a solve answers.
+"""The iteration loop of all methods, with the stop rule, its limits and the solution.
 
-    run = begin(problem, guess);    advance(run), advance(run), ...    while residual(run) > tolerance * yardstick
+    run = init_state(problem, guess);  step_state(run), step_state(run), ...  while residual(run) > rtol * residual_0
 
-A method is these three: `Iterative` makes a prepared solver of its `begin`, and `Iterating` a solve of its `advance`
-and `residual`. A method whose loop is compiled overrides `iterate`, with what `solvers.kernels.loop` has for kernels.
+A method supplies these three functions: an `IterativeSolver` has `init_state`, and a `SolverState` has `step_state` and
+`residual`. A method with a compiled loop overrides `run_iterations` and uses the kernel version in
+`solvers.kernels.iteration_loop`.
 """
 
 from __future__ import annotations
@@ -29,31 +30,32 @@ _STOPPED = {
 }
 
 _NEAR = 1e-12
-"""Of `Iterative.scale`: what no round-off exceeds, by far. It is thousands of the last digits of all that is added up,
-whatever has most of them."""
+"""Fraction of `IterativeSolver.residual_scale` that no rounding error reaches. It is thousands of units in the last
+place of any sum involved."""
 
 _DISTANT = 1e5
-"""Of the extent: from coordinates so large on, round-off at rest is told by what iterations still gain."""
+"""Ratio of coordinates to extent beyond which round-off at rest is detected by the decrease of the residual."""
 
 _CLOSE = 1e-5
-"""A tolerance from which on the last point should be a minimum; a greater one asks for less than that."""
+"""Largest rtol for which the last iterate is checked for a minimum; looser tolerances do not justify the check."""
 
 
 EXACT = (
     "minimises what is finite, and the scene has lengths that are kept exactly (a stiffness that is `exact`): take "
     "avbd, which keeps them, or give springs and strain limits a stiffness in figures"
 )
-"""Why a method that does not keep lengths refuses them, after its name."""
+"""Reason, after the method's name, why a method without length constraints does not support the scene."""
 
 
 _loop = loop.over(methodcaller("advance"), methodcaller("residual"))
 
 
 class Iterating(ABC):
-    """A solve that has begun.
+    """The state of a solve.
 
-    positions: where it is (n, 3) [m]; the next iteration may overwrite them. velocity: at the step's end (n, 3) [m/s],
-    of a method that keeps its own.
+    Attributes:
+        positions: the iterate (n, 3) [m], which the next iteration may overwrite.
+        velocity: velocity at the end of the step (n, 3) [m/s], for a method that computes its own.
     """
 
     positions: Positions
@@ -61,33 +63,38 @@ class Iterating(ABC):
 
     @property
     def kept(self) -> NDArray[np.float64] | None:
-        """See `solvers.problem.Solution`."""
+        """Data for the next solve, see `solvers.model.step_problem.Solution`."""
         return None
 
     @abstractmethod
     def advance(self) -> bool:
-        """Do one iteration; False where round-off lets nothing descend, and the positions stay."""
+        """Do one iteration; return False if round-off prevents descent and the positions do not change."""
 
     def residual(self) -> float:
-        """|Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices, at the iterate that the method's `residual_of` names;
-        nan of a method that does not minimise, and before the first iteration where it belongs to the previous one."""
+        """Return |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices, at the iterate of `residual_iterate`.
+
+        It is nan for a method that does not minimise, and before the first iteration if it belongs to the previous
+        iterate.
+        """
         return float("nan")
 
     def certifies(self) -> bool:
-        """Whether a stationary point where it is may be the last: whether it is a minimum, for all the method knows."""
+        """Return whether the iterate may be a minimum if it is stationary; a saddle point returns False."""
         return True
 
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """As many iterations as the limits allow; see `solvers.kernels.loop`."""
+        """Iterate up to the limits; return count, residual and reason, see `solvers.kernels.iteration_loop`."""
         return _loop(self, limits)
 
 
 class Iterative(ABC):
-    """A method that is ready for a system; with `choice` and `facts` a `solvers.problem.Prepared`.
+    """A method after the setup for a system; with `description` and `stats` it is a `PreparedSolver`.
 
-    residual_of: the iterate that its residuals belong to. It is the previous one of a method that tells them by its
-    iteration, |p - LG(p)|; "none" of a method that does not minimise, and does all iterations. keeps_lengths: whether
-    it keeps those of a system that are exact; `iterates` and `solve` of others raise Unsupported where there are any.
+    Attributes:
+        residual_of: the iterate of the residuals. It is "previous" for a method that computes them in its iteration as
+            |p - LG(p)|, and "none" for a method that does not minimise, which does all iterations.
+        keeps_lengths: whether length constraints are supported; if not, `iterates` and `solve` raise Unsupported for a
+            system that has any.
     """
 
     residual_of: ClassVar[ResidualOf] = "returned"
@@ -95,18 +102,20 @@ class Iterative(ABC):
 
     @abstractmethod
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """A solve from a first guess (n, 3) [m], which is not written to."""
+        """Start a solve from an initial guess (n, 3) [m], which is not modified."""
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        """The iterates from `problem.first_guess`; a yielded array may be overwritten by the next one."""
+        """Yield the iterates from the initial guess; the next one may overwrite a yielded array."""
         run = self._begun(problem)
         while True:
             run.advance()
             yield run.positions
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """Iterate until `stop` says so, or until nothing descends; without a tolerance only the last residual is
-        computed."""
+        """Iterate until `stop` terminates the solve or no step decreases the objective.
+
+        Without a tolerance only the last residual is computed.
+        """
         run = self._begun(problem)
         limits, yardstick, close = at_most(stop.iterations), float("nan"), False
         if (stop.tolerance is not None or stop.within > 0.0) and self.residual_of != "none":
@@ -132,11 +141,12 @@ class Iterative(ABC):
 
     @staticmethod
     def _iterated(run: Iterating, problem: StepProblem, limits: Limits, floor: float) -> tuple[int, float, int]:
-        """As `run.iterate`, but FLOOR only where the gradient is round-off, vertex by vertex.
+        """Call `run.run_iterations`, and return FLOOR only if the gradient is round-off at each vertex.
 
-        That is looked at where the residual is near to it, and then again after one more iteration, and whenever half
-        as many have been done since as at the last look. Far from the origin that bound is mostly the rounding of
-        coordinates whose differences are exact: there iterations go on while each halves the residual.
+        The gradient is checked once the residual is near round-off, then after one more iteration, and then whenever
+        the iterations since the first check have grown by half. Far from the origin the bound consists mostly of the
+        rounding of coordinates whose differences are exact; there the iterations continue while each halves the
+        residual.
         """
         count, residual, ended = run.iterate(limits)
         since, gains = 0, True
@@ -155,52 +165,54 @@ class Iterative(ABC):
         return count, residual, ended
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """The residual [J^(1/2)] at positions p (n, 3) [m]: an iteration's work for one of the previous iterate."""
+        """Return the residual [J^(1/2)] at p (n, 3) [m]; costs one iteration if it belongs to the previous iterate."""
         if self.residual_of == "none":
             return float("nan")
         return self.begin(problem, p).iterate(at_most(int(self.residual_of == "previous")))[1]
 
     def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
-        """What tells `residual_at` of many positions of one step."""
+        """Build a function that returns `residual_at` for many positions of one step."""
         return lambda p: self.residual_at(problem, p)
 
     def scale(self, problem: StepProblem) -> float:
-        """The residual [J^(1/2)] that a mean displacement of the first guess's largest coordinate would cause: a small
-        part of it is where round-off begins to be looked for, and 0 where it never is."""
+        """Return the residual [J^(1/2)] of a mean displacement as large as the initial guess's largest coordinate.
+
+        The check for round-off begins at a small fraction of it; 0 disables the check.
+        """
         return 0.0
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """The parts of an iteration; none, where a method does not say."""
+        """Return the phases of an iteration; none by default."""
         return {}
 
 
 class Substeps(Iterating):
-    """The whole step in one substep, in two, and so on, each from the start; what nobody looks at is left out."""
+    """The whole step in 1, 2, ... substeps, each time from its start; iterates that are not needed are skipped."""
 
     def __init__(self, step: Callable[[StepProblem, int], tuple[Positions, Positions]], problem: StepProblem) -> None:
-        """step: positions [m] and velocity [m/s] after the step of a problem in so many substeps."""
+        """Create the state; `step_in_substeps(problem, n)` returns positions [m] and velocity [m/s] after n substeps."""
         self._step, self._problem, self._substeps = step, problem, 0
         self.positions = problem.start.positions
 
     def advance(self) -> bool:
-        """See Iterating."""
+        """Integrate the step with one more substep."""
         self.iterate(loop.ONE)
         return True
 
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """See Iterating."""
+        """Integrate the step once, with as many more substeps as the limit has iterations."""
         self._substeps += limits.iterations
         self.positions, self.velocity = self._step(self._problem, self._substeps)
         return limits.iterations, float("nan"), loop.ITERATIONS
 
 
 def is_distant(p: Positions) -> bool:
-    """Whether positions (n, 3) [m] are so far from the origin that their rounding exceeds that of their differences."""
+    """Return whether coordinates (n, 3) [m] are so large that their rounding dominates that of their differences."""
     return bool(np.abs(p).max(initial=0.0) > _DISTANT * np.ptp(p, axis=0).max(initial=0.0)) if len(p) else False
 
 
 def largest(problem: StepProblem) -> float:
-    """The first guess's largest coordinate [m], exactly pinned vertices on their targets."""
+    """Return the largest coordinate [m] of the initial guess, with exactly pinned vertices on their targets."""
     s, p = problem.system, problem.first_guess
     if len(s.free) < s.vertices:
         p = p.copy()

@@ -1,9 +1,10 @@
-"""The objective of a step, its gradient and its Hessian, evaluated fast; `StepProblem` stays the oracle.
+"""The objective of a step, its gradient and its Hessian, evaluated fast; `StepProblem` is the reference evaluator.
 
-All springs are one compiled pass, all constant quadratic forms another, and so is each energy that states the law of
-its elements (`solvers.energies.elements`); what states none brings its own value, gradient and Hessian. The unknowns
-are the free vertices: exactly pinned ones stay on their targets. The Hessian's blocks lie in a matrix that is analysed
-once, or once a step (`core.pattern`, `core.pairs_matrix`); what does not change in a run or a step is added up once.
+One compiled pass evaluates all springs, another all constant quadratic forms, and one each energy with an element-wise
+form (`solvers.model.energies.element_energies`). Other energies supply their own value, gradient and Hessian. The
+degrees of freedom are the free vertices: exactly pinned ones stay on their targets. The matrix of the Hessian is
+analysed once, or once per step (`hessian_pattern`, `step_matrix`). Terms that are constant in a run or a step are
+summed once.
 """
 
 from __future__ import annotations
@@ -29,21 +30,24 @@ from solvers.problem import Energy, Positions, StepProblem
 Values = NDArray[np.float64]
 
 ROUND_OFF = 4.0 * np.finfo(np.float64).eps
-"""Of an energy's value, beside its size."""
+"""Relative rounding error of an energy's value."""
 
 NEAR = 1e-10
-"""Of that size, the change from which on its values tell less than its slopes do."""
+"""Relative change of an energy below which the mean slope is more accurate than the difference of values."""
 
 
 class StepObjective:
-    """The objective g of one step: all positions are (n, 3) [m], exactly pinned vertices on their targets.
+    """The objective g of one step. All positions are (n, 3) [m], with exactly pinned vertices on their targets.
 
-    stated: energies by their elements, less those that have none in this step; own: those that state nothing; bounded:
-    of these, what no step may pass through; matrix: that of its Hessians.
+    Attributes:
+        stated: energies with an element-wise form, except those without elements in this step.
+        own: energies without an element-wise form.
+        bounded: barrier energies among these, which limit the step size.
+        matrix: the matrix of the Hessians.
     """
 
     def __init__(self, whole: Objective, problem: StepProblem) -> None:
-        """problem: of a system that has the whole's energies, in their order. Raises ValueError for others."""
+        """Build the objective of a problem; raise ValueError if its system has another number of energies."""
         if len(problem.system.energies) != len(whole.system.energies):
             raise ValueError("the objective was made for a system of other energies than the step's")
         self.whole, self.problem = whole, problem
@@ -66,30 +70,30 @@ class StepObjective:
 
     @property
     def touched(self) -> bool:
-        """Whether elements act that are in no Q: those of contact, where something may be touched in this step."""
+        """Whether elements act that are not part of Q, i.e. those of contact that may become active in this step."""
         return any(not one.projective for one in self.stated)
 
     def reach(self, p: Positions, direction: Positions, first: float = 1.0) -> float:
-        """The largest t up to `first` by which p may go along a direction, both (n, 3); see `solvers.core.bounds`."""
+        """Return the largest step size up to `initial_step` from p along a direction (n, 3); see `barrier_energy`."""
         return (
             first * reach(self.bounded, p, direction if first == 1.0 else first * direction) if self.bounded else first
         )
 
     def placed(self, p: Positions) -> Positions:
-        """A copy of p with the exactly pinned vertices on their targets."""
+        """Return a copy of p with the exactly pinned vertices on their targets."""
         out = np.array(p, np.float64, order="C")
         out[self._exact] = self._held
         return out
 
     def fall(self) -> Positions:
-        """Free fall (n, 3): where inertia and forces alone would lead, pinned vertices on their targets."""
+        """Return the positions (n, 3) under inertia and external force alone, pinned vertices on their targets."""
         problem, h = self.problem, self.problem.system.inertia[:, None]
         p = problem.target + np.divide(problem.force, h, out=np.zeros_like(problem.force), where=h > 0.0)
         p[problem.system.pins.vertices] = problem.pin_targets
         return p
 
     def gradient(self, p: Positions) -> Positions:
-        """The gradient [N], (n, 3), zero at exactly pinned vertices."""
+        """Return the gradient [N], (n, 3), zero at exactly pinned vertices."""
         out = np.empty_like(p)
         objective.gradient(self.whole.terms, self.given, p, out)
         if self.whole.form is not None:
@@ -102,9 +106,9 @@ class StepObjective:
         return out
 
     def rise(self, p: Positions, q: Positions) -> tuple[float, float]:
-        """g(q) - g(p) [J], and what of it may be round-off of the energies that state nothing.
+        """Return g(q) - g(p) [J], and the part that may be round-off of energies without an element-wise form.
 
-        Theirs is the difference of their values, or the mean slope where that difference has lost its digits.
+        Such an energy contributes the difference of its values, or the mean slope if that difference is cancelled.
         """
         change, noise = objective.rise(self.whole.terms, self.given, p, q), 0.0
         if self.whole.form is not None:
@@ -127,17 +131,17 @@ class StepObjective:
         return change, noise
 
     def tensions(self, p: Positions, d: Positions) -> Values:
-        """The springs' tensions [N], (m,), at p, linearised for a step d."""
+        """Return the springs' tensions [N], (m,), at p, linearised for a displacement d."""
         out = np.empty(len(self.whole.terms.stiffness))
         hessian.tensions(self.whole.terms, p, d, out)
         return out
 
     def hessian(self, p: Positions) -> Hessian:
-        """The Hessian at p, to be factorised."""
+        """Build the Hessian at p for a factorisation."""
         return Hessian(self, p)
 
     def curvature(self, p: Positions) -> list[Values]:
-        """The second derivatives of the elements at p, of each energy (m, 6) [N/m]."""
+        """Return the second derivatives of the elements at p, (m, 6) [N/m] for each energy."""
         return [self._curve(one, p) for one in self.stated]
 
     @staticmethod
@@ -147,7 +151,7 @@ class StepObjective:
         return out
 
     def constant(self, matrix: Matrix, p: Positions) -> Values | None:
-        """The blocks of a matrix that are the same at all points p of this step; None for springs alone."""
+        """Return the matrix blocks that do not depend on the point p of this step; None for springs alone."""
         steady = [one for one in self.stated if one.law.constant]
         if not steady:
             return matrix.constant if self.whole.form is not None else None
@@ -161,12 +165,12 @@ class StepObjective:
 
     @cached_property
     def joined(self) -> Joined | None:
-        """The elements of all energies, None for none."""
+        """The elements of all energies in one set; None if there are none."""
         return Joined.of([one.elements for one in self.stated]) if self.stated else None
 
 
 class Hessian:
-    """The Hessian [N/m] at a point, over the free vertices (f,). curvature, met: those of elements, and of pairs."""
+    """The Hessian [N/m] at a point, over the free vertices (f,), with the blocks of elements and of collisions."""
 
     def __init__(self, step: StepObjective, p: Positions) -> None:
         self._step, self._p = step, p
@@ -179,7 +183,7 @@ class Hessian:
 
     @cached_property
     def _placed(self) -> tuple[Matrix, Indices, Values]:
-        """The matrix, and where in it which entries of the energies that state nothing go."""
+        """The matrix, and the places and values in it of energies without an element-wise form."""
         step, whole = self._step, self._step.whole
         rows, columns, entries = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
         if self._others is not None:
@@ -191,14 +195,20 @@ class Hessian:
         return matrix, matrix.entries(rows, columns), entries
 
     def factorise(self, keep: float = 1.0, shift: Values | float = 0.0, tension: Values | None = None) -> bool:
-        """Whether it is positive definite, and then ready for `solve`; without arguments it is the exact Hessian.
+        """Factorise the Hessian and return whether it is positive definite; the defaults give the exact Hessian.
 
-        keep: of the negative lateral part of springs; shift: added to the diagonal [N/m]; tension (m,): of springs [N].
+        Args:
+            keep: fraction of the negative transverse part of springs to include.
+            shift: value added to the diagonal [N/m].
+            tension: tensions of the springs (m,) [N]; None for those at the point.
+
+        Returns:
+            True if it is positive definite, so that `solve` can be called.
         """
         return self._factor.factorise(self._assembled(keep, shift, tension).values)
 
     def filtered(self, by: Filtering) -> Filtered:
-        """The same with its elements filtered by their eigenvalues; constant forms have none below zero."""
+        """Return the Hessian with projected elements; constant forms have no negative eigenvalue."""
         keep, tension = by.springs(self._terms.edges, self._tension)
         stated = zip(self._step.stated, self.curvature, strict=True)
         curvature = [c if one.law.constant else by.packed(one.elements.vertices, c) for one, c in stated]
@@ -206,18 +216,18 @@ class Hessian:
         return Filtered(keep, tension, curvature, pairs, by.looked, by.changed)
 
     def convex(self) -> Matrix:
-        """The Hessian with its elements' negative eigenvalues clamped, until it is assembled again."""
+        """Assemble the Hessian with negative eigenvalues of elements clamped; valid until the next assembly."""
         clamped = self.filtered(Filtering())
         return self._assembled(clamped.keep, 0.0, clamped.tension, clamped)
 
     def factorise_filtered(self, filtered: Filtered, shift: Values | float = 0.0) -> bool:
-        """Whether what was filtered, and `shift` added to its diagonal [N/m], is positive definite; see `factorise`."""
+        """Factorise a projected Hessian plus `shift` [N/m] on its diagonal; return whether it is positive definite."""
         return self._factor.factorise(self._assembled(filtered.keep, shift, filtered.tension, filtered).values)
 
     def solve_anew(
         self, b: Positions, keep: float = 1.0, shift: Values | float = 0.0, tension: Values | None = None
     ) -> Positions | None:
-        """Both at once, sooner than one after the other; None if it is not positive definite."""
+        """Factorise and solve in one pass, faster than both calls; return None if it is not positive definite."""
         out = np.zeros_like(b)
         x = self._factor.solve_anew(self._assembled(keep, shift, tension).values, b[self.free])
         if x is None:
@@ -247,7 +257,7 @@ class Hessian:
         return matrix
 
     def solve(self, b: Positions) -> Positions:
-        """Its inverse, as it was factorised last, times b (n, 3); zero at vertices that are not free."""
+        """Solve with the last factor for b (n, 3); the result is zero at vertices that are not free."""
         out = np.zeros_like(b)
         out[self.free] = self._factor.solve(b[self.free])
         return out
@@ -269,13 +279,13 @@ class Hessian:
 
     @cached_property
     def compiled(self) -> tuple[Any, ...]:
-        """What `solvers.kernels.hessian.multiply` needs of it: all but the energies that state nothing."""
+        """Arguments of `solvers.kernels.spring_hessian.multiply`: all terms with an element-wise form."""
         step = self._step
         curvature = np.concatenate(self.curvature) if self.curvature else None
         return self._terms, self._linear, step.whole.form, step.joined, curvature
 
     def multiply(self, x: Positions) -> Positions:
-        """The exact Hessian times x (n, 3), which is zero at vertices that are not free; so is the product."""
+        """Return the exact Hessian times x (n, 3); x and the product are zero at vertices that are not free."""
         product, out = np.empty_like(x), np.zeros_like(x)
         hessian.multiply(*self.compiled, x, product)
         if self._others is not None:
