@@ -1,14 +1,15 @@
-"""Compiled kernels on disk, by all that they depend on.
+"""On-disk cache of compiled kernels, keyed by everything that they depend on.
 
-Numba's own cache knows the file that a kernel stands in, and neither the kernels in other files that it calls, nor the
-constants from there, nor the options that it was compiled with; two processes that compile for one index may also leave
-one's code under the other's signature. So a kernel is kept here by the digest of all sources that its module imports
-(`solvers.sources`), with its options and signature, the processor and the versions in the key, one file a signature.
-What is found is what would be compiled, whoever imports it and in whatever order.
+Numba's own cache considers the kernel's file only. It ignores kernels in other files that the kernel calls, constants
+from there, and the compile options. Two processes that compile for one index may also leave the code of one under the
+signature of the other. So a kernel is cached here by the digest of all sources that its module imports
+(`solvers.jit.source_digest`). The key also has the options, the signature, the processor and the versions; each
+signature has its own file. A cache entry is therefore what a compilation would produce, whichever module imports the
+kernel and in whatever order.
 
     <folder>/<module>-<digest>/<kernel>-<digest of the key>.nbc
 
-The folder is `NUMBA_CACHE_DIR` where that is set, else `__pycache__` beside the source, else the user's own.
+The folder is `NUMBA_CACHE_DIR` if that is set, else `__pycache__` next to the source, else the user's cache folder.
 """
 
 from __future__ import annotations
@@ -38,25 +39,25 @@ from solvers import sources
 from solvers.linking import rebuilt
 
 _UNUSED = 3600.0
-"""Seconds for which no process has looked into a folder of other sources before it goes; what a process that still runs
-then compiles is kept anew."""
+"""Age [s] of the last use after which the cache folder of other sources is removed; a process that still runs with such
+sources compiles and stores its kernels again."""
 
 _SETTINGS = ("OPT", "BOUNDSCHECK", "LOOP_VECTORIZE", "SLP_VECTORIZE", "DEBUGINFO_DEFAULT", "ENABLE_AVX")
-"""Of Numba's environment, what alters the code."""
+"""Settings in Numba's environment that change the generated code."""
 
 
 _CONFIG: Any = config
-"""Its names come from the environment."""
+"""Untyped, because the names are defined from the environment."""
 
 _CACHE: Any = _Cache
-"""Its signatures tell what its subclasses do not do."""
+"""Untyped, because the declared signatures differ from those of its subclasses."""
 
 
 class KernelCache(_CACHE):
-    """What one kernel was compiled to, by signature."""
+    """The compiled code of one kernel, by signature."""
 
     def __init__(self, function: Any, options: Mapping[str, Any]) -> None:
-        """function: of Python; options: of its compilation."""
+        """Create the cache of a Python function with its compile options."""
         self._source = function.__code__.co_filename
         self._module, self._name = function.__module__, function.__qualname__
         cells = tuple(_told(cell.cell_contents) for cell in function.__closure__ or ())
@@ -71,11 +72,11 @@ class KernelCache(_CACHE):
 
     @property
     def cache_path(self) -> str:
-        """The folder for the code that today's sources compile to."""
+        """Folder of the code compiled from the current sources."""
         return str(_folder(_home(os.path.dirname(self._source)), self._module, sources.digest([self._source])))
 
     def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
-        """What is kept for a signature, None for nothing."""
+        """Return the cached code of a signature, or None if there is none."""
         target_context.refresh()
         key = (sig, target_context.codegen().magic_tuple(), self._fixed)
         path = self._path(key)
@@ -88,7 +89,7 @@ class KernelCache(_CACHE):
         return rebuilt(target_context, kept) if there == key else None
 
     def save_overload(self, sig: Any, data: CompileResult) -> None:
-        """Keep what was compiled for a signature, where it can be kept and there is room."""
+        """Store the code compiled for a signature, if it is cacheable and the disk has space."""
         if data.library.has_dynamic_globals or not all(lifted.can_cache for lifted in data.lifted):
             return
         for env in data._find_referenced_environments():  # of what it links in
@@ -102,13 +103,13 @@ class KernelCache(_CACHE):
             _write(path, dumps((key, data._reduce())))
 
     def enable(self) -> None:
-        """It always is."""
+        """Do nothing: the cache is always enabled."""
 
     def disable(self) -> None:
-        """Nothing asks for that."""
+        """Do nothing: the cache cannot be disabled."""
 
     def flush(self) -> None:
-        """Forget what is kept; `recompile` of a kernel asks for that."""
+        """Remove the cached code; `recompile` of a kernel calls this."""
         shutil.rmtree(self.cache_path, ignore_errors=True)
 
     def _path(self, key: Any) -> Path:
@@ -117,7 +118,7 @@ class KernelCache(_CACHE):
 
 
 def _told(value: Any) -> Any:
-    """What a kernel closes over: other kernels by their names and all that they depend on, what they close over too."""
+    """Return the cache key of a closed-over value: for a kernel its names, its sources and its own closure."""
     function = getattr(value, "py_func", None)
     if function is None:
         return value
@@ -131,7 +132,7 @@ def _folder(home: Path, module: str, digest: str) -> Path:
 
 @cache
 def _home(source: str) -> Path:
-    """The first folder that can be written to; source: the folder of the source."""
+    """Return the first writable cache folder; `source` is the folder of the source file."""
     users = Path(AppDirs("springbench", appauthor=False).user_cache_dir)
     for folder in (Path(_CONFIG.CACHE_DIR or os.path.join(source, "__pycache__")), users):
         with suppress(OSError):
@@ -142,7 +143,7 @@ def _home(source: str) -> Path:
 
 
 def _clear(made: Path, module: str) -> None:
-    """Remove what other sources of a module compiled to, where no process has used it of late."""
+    """Remove the code compiled from other sources of a module unless a process has used it recently."""
     for other in made.parent.glob(f"{module}-*"):
         with suppress(OSError):
             if made.stat().st_mtime - other.stat().st_mtime > _UNUSED:
@@ -150,7 +151,7 @@ def _clear(made: Path, module: str) -> None:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """All of the content or nothing."""
+    """Write the whole content or nothing."""
     number, partial = tempfile.mkstemp(dir=path.parent, prefix=".")
     try:
         with os.fdopen(number, "wb") as file:

@@ -1,8 +1,8 @@
-"""Kernels that are compiled as parts of those that call them, and not by themselves as well.
+"""Inner kernels that are compiled into their callers only, not on their own as well.
 
-Numba optimises what an inner kernel calls and makes machine code of it, then does the same again in whatever calls
-that, level by level. What only other kernels call needs neither: here it stays as it was lowered, and the kernel that
-Python calls is optimised as a whole, once.
+Numba optimises an inner kernel and generates its machine code, then repeats this in each caller, level by level. A
+kernel that only other kernels call needs neither. Here it stays as lowered, and the kernel that Python calls is
+optimised once as a whole.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult, compile_result
 
 LINKED = "linked"
-"""Tells what `Linked` makes of itself from what Numba's libraries do."""
+"""Mark that distinguishes the reduced form of `LinkedLibrary` from that of Numba's libraries."""
 
 _LIBRARY: Any = JITCodeLibrary
 _COMPILER: Any = Compiler
-"""Their signatures tell what their subclasses do not do."""
+"""Untyped, because the declared signatures differ from those of their subclasses."""
 
 
 class Linked(_LIBRARY):
-    """Code that is there for linking alone: lowered, with all that it calls, and without an address."""
+    """Code for linking only: lowered, with everything that it calls, and without an address."""
 
     def finalize(self) -> None:
-        """Take in what it calls."""
+        """Link the modules of the called functions into this one."""
         for library in dict.fromkeys(self._linking_libraries):
             self._reload_init.update(library._reload_init)
             self._final_module.link_in(library._get_module_for_linking(), preserve=True)
@@ -33,35 +33,35 @@ class Linked(_LIBRARY):
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
-        """None."""
+        """Return 0, because the code has no address."""
         return 0
 
     def serialize_using_object_code(self) -> tuple[str, str, bytes]:
-        """There is no object code."""
+        """Return the code as bitcode, because there is no object code."""
         return self.name, LINKED, self._get_module_for_linking().as_bitcode()
 
     @property
     def codegen(self) -> _Nowhere:
-        """Who is told the environment of its functions: those who link them in tell theirs."""
+        """A null object for environments of functions; the libraries that link this code set their own."""
         return _Nowhere()
 
 
 class _Nowhere:
     def set_env(self, name: str, env: Any) -> None:
-        """Nothing to set."""
+        """Do nothing."""
 
 
 class LinkedCompiler(_COMPILER):
-    """Numba's, for kernels that are linked."""
+    """Numba's compiler for kernels that are only linked."""
 
     def compile_extra(self, function: Any) -> Any:
-        """See Numba's."""
+        """Compile a function into a `LinkedLibrary`."""
         self.state.library = Linked(self.state.targetctx.codegen(), function.__qualname__)
         return super().compile_extra(function)
 
 
 def rebuilt(context: Any, told: Any) -> CompileResult:
-    """What was compiled, from what `_reduce` of it told."""
+    """Rebuild a compile result from the output of its `_reduce`."""
     (name, kind, content), fndesc, env, signature, objectmode, lifted, annotation, reload_init, envs = told
     if kind != LINKED:
         return CompileResult._rebuild(context, *told)

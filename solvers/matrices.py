@@ -1,11 +1,11 @@
-"""The matrices of the method, dense and sparse (Liu et al. 2013, section 4.1; the assignment's functions).
+"""The matrices of the local-global method, dense and sparse (Liu et al. 2013, section 4.1).
 
     A  signed incidence (m x n): +1 at i, -1 at j of spring (i, j)
     M  masses (n x n), diagonal            C  selection of the pinned vertices (q x n)
     Q = A'KA + M/dt^2 + C'WC               K, W: diagonal stiffnesses and pin weights
 
-The sparse ones are built from triplets once, hold no explicit zeros and never pass through a dense matrix.
-A self-loop (i = j) stretches nothing, so its row of A is empty.
+The sparse matrices are built from triplets once, store no explicit zeros and are never converted from dense ones.
+A self-loop (i = j) has no extension, so its row of A is empty.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Dense = NDArray[np.float64]
 
 
 def signed_incidence_matrix_dense(springs: NDArray[np.int64], n: int) -> Dense:
-    """A for springs (m, 2) over n vertices, shape (m, n)."""
+    """Return the dense A of springs (m, 2) over n vertices, shape (m, n)."""
     A = np.zeros((len(springs), n))
     rows, (i, j) = np.arange(len(springs)), springs.T
     A[rows, i] += 1.0
@@ -32,7 +32,7 @@ def signed_incidence_matrix_dense(springs: NDArray[np.int64], n: int) -> Dense:
 
 
 def signed_incidence_matrix_sparse(springs: NDArray[np.int64], n: int) -> scipy.sparse.csr_array:
-    """A for springs (m, 2) over n vertices, shape (m, n), with 2 entries a row."""
+    """Return the sparse A of springs (m, 2) over n vertices, shape (m, n), with 2 entries per row."""
     i, j = springs.T
     rows = np.flatnonzero(i != j)
     values = np.concatenate([np.ones(len(rows)), -np.ones(len(rows))])
@@ -41,30 +41,30 @@ def signed_incidence_matrix_sparse(springs: NDArray[np.int64], n: int) -> scipy.
 
 
 def mass_matrix_dense(mass: ArrayLike) -> Dense:
-    """M from masses (n,) [kg], shape (n, n)."""
+    """Return the dense M of masses (n,) [kg], shape (n, n)."""
     return np.diag(np.asarray(mass, float))
 
 
 def mass_matrix_sparse(mass: ArrayLike) -> scipy.sparse.csr_array:
-    """M from masses (n,) [kg], shape (n, n), with one entry for each vertex that has mass."""
+    """Return the sparse M of masses (n,) [kg], shape (n, n), with one entry for each vertex that has mass."""
     return diagonal(np.asarray(mass, float))
 
 
 def selection_matrix_dense(pinned: NDArray[np.int64], n: int) -> Dense:
-    """C for pinned vertices (q,), shape (q, n)."""
+    """Return the dense C of pinned vertices (q,), shape (q, n)."""
     C = np.zeros((len(pinned), n))
     C[np.arange(len(pinned)), pinned] = 1.0
     return C
 
 
 def selection_matrix_sparse(pinned: NDArray[np.int64], n: int) -> scipy.sparse.csr_array:
-    """C for pinned vertices (q,), shape (q, n), with one entry a row."""
+    """Return the sparse C of pinned vertices (q,), shape (q, n), with one entry per row."""
     q = len(pinned)
     return scipy.sparse.csr_array(scipy.sparse.coo_array((np.ones(q), (np.arange(q), pinned)), shape=(q, n)))
 
 
 def rest_lengths(rest: Dense, springs: NDArray[np.int64]) -> Dense:
-    """r, the length of each spring [m] at the rest positions (n, 3), shape (m,)."""
+    """Return the length r of each spring [m] at the rest positions (n, 3), shape (m,)."""
     i, j = springs.T
     return np.linalg.norm(rest[i] - rest[j], axis=1)
 
@@ -72,7 +72,16 @@ def rest_lengths(rest: Dense, springs: NDArray[np.int64]) -> Dense:
 def system_matrix_dense(
     A: Dense, stiffness: ArrayLike, M: Dense, time_step: float, C: Dense, weight: ArrayLike
 ) -> Dense:
-    """Q [N/m], shape (n, n), from stiffnesses (m,) [N/m] and pin weights (q,) [N/m]; either may be one number."""
+    """Return the dense Q [N/m], shape (n, n).
+
+    Args:
+        A: signed incidence matrix (m, n).
+        stiffness: (m,) [N/m], or one number.
+        M: mass matrix (n, n) [kg].
+        time_step: dt [s].
+        C: selection matrix of the pins (q, n).
+        weight: pin weights (q,) [N/m], or one number.
+    """
     k, w = (np.reshape(np.asarray(x, float), (-1, 1)) for x in (stiffness, weight))
     return A.T @ (k * A) + M / time_step**2 + C.T @ (w * C)
 
@@ -85,16 +94,26 @@ def system_matrix_sparse(
     C: scipy.sparse.csr_array,
     weight: ArrayLike,
 ) -> scipy.sparse.csr_array:
-    """Q [N/m], shape (n, n), as `system_matrix_dense`, with an entry for each vertex and two for each spring."""
+    """Return the sparse Q [N/m], shape (n, n), with one entry per vertex and two per spring.
+
+    The arguments are those of `system_matrix_dense`.
+    """
     K = diagonal(np.broadcast_to(np.asarray(stiffness, float), len(A.indptr) - 1))
     W = diagonal(np.broadcast_to(np.asarray(weight, float), len(C.indptr) - 1))
     return without_zeros(A.T @ K @ A + M / time_step**2 + C.T @ W @ C)
 
 
 def assemble(system: System, energies: Iterable[ProjectiveEnergy]) -> scipy.sparse.csr_array:
-    """Q of a system, shape (n, n): the energies' stiffness, masses and penalty pins.
+    """Return Q of a system, shape (n, n): stiffness of the energies, inertia and penalty pins.
 
-    Exact pins put nothing into Q; the caller takes the rows of `system.free`. Raises NotPositiveDefinite.
+    Exact pins do not contribute to Q; the caller selects the rows of `system.free_vertices`.
+
+    Args:
+        system: the system.
+        energies: its projective energies.
+
+    Raises:
+        NotPositiveDefinite: the positions of some vertices are not determined.
     """
     n = system.vertices
     _, vertices, weight = system.penalty
@@ -105,7 +124,7 @@ def assemble(system: System, energies: Iterable[ProjectiveEnergy]) -> scipy.spar
 
 
 def shares(system: System, energies: Iterable[ProjectiveEnergy]) -> Iterator[scipy.sparse.csr_array]:
-    """Each energy's share A'KA [N/m] of Q, (n, n): lagged ones know it from the rate of the steps alone."""
+    """Yield each energy's contribution A'KA [N/m] to Q, (n, n); that of a lagged one depends on velocity_rate alone."""
     nowhere = np.zeros((system.vertices, 3))
     start = Start(nowhere, nowhere, 0.0, nowhere, system.rate, 0.0)
     for energy in energies:
@@ -115,9 +134,9 @@ def shares(system: System, energies: Iterable[ProjectiveEnergy]) -> Iterator[sci
 
 
 def require_determined(system: System, Q: scipy.sparse.csr_array) -> None:
-    """Raise NotPositiveDefinite, with the vertices at fault, where nothing determines their positions.
+    """Raise NotPositiveDefinite, with the vertices concerned, if some positions are not determined.
 
-    Every component of the graph of Q needs a mass or a pin.
+    Every connected component of the graph of Q needs a mass or a pin.
     """
     from scipy.sparse.csgraph import connected_components  # brings scipy.linalg along
 
@@ -136,19 +155,19 @@ def require_determined(system: System, Q: scipy.sparse.csr_array) -> None:
 
 
 def energy_norm(Q: Dense | scipy.sparse.csr_array, e: Dense) -> float:
-    """|e|_Q = sqrt(tr(e'Qe)) [J^(1/2)] of a displacement (n, 3) [m]."""
-    # Where stiffness outweighs inertia by all of float64's digits, round-off can make a sum of zero negative.
+    """Return the energy norm |e|_Q = sqrt(tr(e'Qe)) [J^(1/2)] of a displacement (n, 3) [m]."""
+    # If stiffness exceeds inertia by all digits of float64, round-off can make a sum of zero negative.
     return float(np.sqrt(np.maximum(0.0, np.einsum("ij,ij->", e, Q @ e))))
 
 
 def diagonal(values: Dense) -> scipy.sparse.csr_array:
-    """A diagonal matrix [any unit], shape (n, n), without entries for zeros."""
+    """Return a diagonal matrix [any unit], shape (n, n), without entries for zeros."""
     n = len(values)
     return without_zeros(scipy.sparse.csr_array(scipy.sparse.dia_array((values[None, :], np.array([0])), shape=(n, n))))
 
 
 def without_zeros(matrix: scipy.sparse.csr_array | scipy.sparse.csc_array) -> scipy.sparse.csr_array:
-    """The matrix with duplicates summed, columns sorted and explicit zeros dropped."""
+    """Return the matrix with duplicates summed, columns sorted and explicit zeros dropped."""
     matrix = scipy.sparse.csr_array(matrix)
     matrix.sum_duplicates()
     matrix.eliminate_zeros()

@@ -1,4 +1,4 @@
-"""Memory: arrays that begin at a cache line, and what fits, so that what does not is refused before it is begun."""
+"""Cache-aligned arrays, and the memory limit by which too large problems are rejected in advance."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 def aligned(size: int, dtype: Any = np.float64) -> NDArray[Any]:
-    """Zeros that begin at a cache line, so that no vector of its size or less lies in two."""
+    """Return zeros that start at a cache line, so that no vector of that size or less crosses two lines."""
     bytes_ = np.dtype(dtype).itemsize * size
     raw = np.zeros(bytes_ + 64, np.uint8)
     begin = -raw.ctypes.data % 64
@@ -18,12 +18,12 @@ def aligned(size: int, dtype: Any = np.float64) -> NDArray[Any]:
 
 
 def of_machine() -> float:
-    """Three quarters of the machine's memory [bytes]: the rest is for what else a run has."""
+    """Return three quarters of the machine's memory [bytes]; the remainder is for other data of a run."""
     return 0.75 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def in_words(count: float) -> str:
-    """Bytes in words."""
+    """Return a number of bytes as text with a binary unit."""
     for unit in ("bytes", "KiB", "MiB", "GiB"):
         if count < 1024 or unit == "GiB":
             break

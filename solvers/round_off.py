@@ -1,17 +1,18 @@
-"""How much of a gradient may be round-off, vertex by vertex: a running bound.
+"""A running bound of the rounding error of a gradient at each vertex.
 
-    delta_i = eps * (the absolute values of all that is added up at vertex i)
+    delta_i = eps * (sum of the absolute values of all terms that are added up at vertex i)
 
     inertia  h (|p| + |target|)        force  |f|        pins  w (|p| + |pin|)
     springs  k (max(1, r/l - 1) (|p_i| + |p_j|) + l + r)   at both ends
 
-A spring's share has the rounding of the positions themselves, which its Hessian multiplies (1 along the spring,
-|1 - r/l| across), and that of its own length. Other energies state their absolute terms in the same way (`Rounded`);
-for one that does not, the rounding of the positions is multiplied by its Hessian, and its gradient is off by its own
-last digit (Higham 2002, Accuracy and Stability of Numerical Algorithms, section 3.3: running error analysis).
+The term of a spring includes the rounding of the positions, which its Hessian multiplies (1 along the spring,
+|1 - r/l| across), and that of its own length. Other energies provide their absolute terms in the same form
+(`RoundingBoundEnergy`). For an energy that does not, the rounding of the positions is multiplied by its Hessian, and
+the gradient itself is assumed to be rounded once (Higham 2002, Accuracy and Stability of Numerical Algorithms, section
+3.3: running error analysis).
 
-What is added up elsewhere has no part in it: a stiff or a far-away component leaves the bound at all others as it was,
-and a limit that is not reached, however stiff, adds nothing.
+The bound at a vertex includes only terms at that vertex. A stiff or a distant component does not change the bound at
+the other vertices, and an inactive strain limit adds nothing, however stiff it is.
 """
 
 from __future__ import annotations
@@ -26,26 +27,30 @@ from solvers.problem import Energy, Positions, StepProblem, StopRule
 EPS = float(np.finfo(np.float64).eps)
 
 FACTOR = StopRule().floor
-"""Of the bound, up to which a gradient is round-off: 8. Where solvers are left to go on for ever, it ends at .1 to .9
-of the bound at the worst vertex of most hard scenes, at 2 in the worst; what has not converged is at a hundred or
-more."""
+"""Multiple of the bound up to which a gradient counts as round-off, 8. Solvers that iterate without a limit end at 0.1
+to 0.9 of the bound at the worst vertex of most hard scenes, and at 2 in the worst scene; iterates that have not
+converged are at a hundred or more."""
 
 Terms = NDArray[np.float64]
 
 
 @runtime_checkable
 class Rounded(Energy, Protocol):
-    """An energy that knows the absolute terms of its gradient."""
+    """An energy that provides the absolute terms of its gradient."""
 
     def add_absolute_terms(self, p: Positions, out: Terms) -> None:
-        """Add the absolute terms [N] of the gradient at p (n, 3) [m] to `out` (n,): eps times them bounds its rounding
-        error at each vertex, that of the positions included."""
+        """Add the absolute terms [N] of the gradient at p (n, 3) [m] to `out` (n,).
+
+        Multiplied by eps they bound its rounding error at each vertex, including that of the positions.
+        """
         ...
 
 
 def gradient_round_off(problem: StepProblem, p: Positions) -> Terms:
-    """The bound delta (n,) [N] on the round-off in `problem.gradient(p)` at each vertex, p (n, 3) [m]; zero at exactly
-    pinned vertices. Infinite where a term overflows."""
+    """Return the bound delta (n,) [N] of the rounding error of `problem.gradient(p)` at each vertex.
+
+    It is zero at exactly pinned vertices and infinite where a term overflows. The positions p are (n, 3) [m].
+    """
     s, size = problem.system, lengths(p)
     with np.errstate(over="ignore", invalid="ignore"):
         out = s.inertia * (size + lengths(problem.target)) + lengths(problem.force)
@@ -60,17 +65,19 @@ def gradient_round_off(problem: StepProblem, p: Positions) -> Terms:
 
 
 def at_rest(problem: StepProblem, p: Positions, factor: float = FACTOR) -> bool:
-    """Whether the gradient at p (n, 3) [m] is round-off at every free vertex: at most `factor` times the bound, where
-    that is finite. A sum over vertices would let one part's round-off hide another's gradient, and a vertex that a
-    penalty holds is one that others hang on."""
+    """Return whether the gradient at p (n, 3) [m] is round-off at every free vertex.
+
+    It is if it is at most `factor` times the bound, and the bound is finite. A sum over vertices would let the
+    round-off of one part hide the gradient of another. Vertices with a penalty pin are included, because others depend on them.
+    """
     bound, size = gradient_round_off(problem, p), lengths(problem.gradient(p))
     return bool(((size <= factor * bound) & np.isfinite(bound))[problem.system.free].all())
 
 
 def within(gradient: Positions, bound: Terms) -> Positions:
-    """The part of a gradient (n, 3) [N] that is no longer than the bound (n,) [N]; the rest of it is beyond doubt.
+    """Return the part of a gradient (n, 3) [N] that is no longer than the bound (n,) [N].
 
-    A bound that is infinite explains nothing.
+    The remainder exceeds round-off. An infinite bound explains no part of the gradient.
     """
     size = lengths(gradient)
     share = np.divide(np.minimum(size, bound), size, out=np.zeros_like(size), where=(size > 0.0) & np.isfinite(bound))
@@ -78,12 +85,12 @@ def within(gradient: Positions, bound: Terms) -> Positions:
 
 
 def lengths(x: Positions) -> Terms:
-    """|x| of each row (n, 3), (n,), of rows whose squares may overflow."""
+    """Return the norm of each row (n, 3), shape (n,), also for rows whose squares overflow."""
     return np.hypot(np.hypot(x[:, 0], x[:, 1]), x[:, 2])
 
 
 class _Unstated:
-    """An energy that does not state its terms: its Hessian tells what the rounding of the positions does."""
+    """The rounding bound of an energy without absolute terms, estimated with its Hessian."""
 
     def __init__(self, energy: Energy) -> None:
         self._energy = energy

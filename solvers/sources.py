@@ -1,12 +1,13 @@
-"""Which sources code depends on, and their digest: what tells kernels, and measurements, of other code apart.
+"""The sources that code depends on, and their digest, which identifies the code of kernels and measurements.
 
-A source depends on itself and on those that its imports lead to, wherever in it they stand: within this project, and
-within its own folder or package where it lies elsewhere. It depends as well on what lies beside it under its own name
-in a language that is compiled, as `eigen.cpp` and `eigen.hpp` do beside `eigen.py`. Installed libraries are told by
-their versions.
+A source depends on itself and on the sources that its imports lead to, wherever in the file the imports stand. Imports
+are followed within this project, and within its own folder or package if the source lies elsewhere. A source also
+depends on compiled-language files of the same name next to it, as `eigen.py` does on `eigen.cpp` and `eigen.hpp`.
+Installed libraries are identified by their versions.
 
-A process keeps what it has imported, whatever becomes of the files. So each source counts as it was when this module
-was imported, or when it was first asked for: one that was changed since has a digest that no other process has.
+A process continues to run the code that it has imported, even if the files change. So each source is identified by its
+state when this module was imported, or when its digest was first needed. A source that has changed since then gets a
+digest that no other process has.
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ PACKAGES = ("solvers", "harness")
 _STARTS = tuple(f"{ROOT / package}{os.sep}" for package in PACKAGES)
 
 COMPILED = (".c", ".cc", ".cpp", ".cu", ".cuh", ".f90", ".h", ".hpp")
-"""Names of sources that a Python source of the same name compiles end so."""
+"""Suffixes of sources that a Python source of the same name compiles."""
 
 _INSTALLED = {str(Path(sysconfig.get_path(name)).resolve()) for name in ("stdlib", "purelib", "platlib")}
 _TYPES_ALONE = re.compile(r"^if TYPE_CHECKING:\n(?:[ \t]+\S.*\n|\n)+", re.M)
-"""What is imported for the types and never run."""
+"""Imports for type checkers, which are never executed."""
 
 _IMPORT = re.compile(
     r"^[ \t]*(?:from[ \t]+(?P<base>\.*[\w.]*)[ \t]+import[ \t]+(?P<names>\([^)]*\)|.*)|import[ \t]+(?P<whole>.+))", re.M
@@ -59,11 +60,11 @@ def _stamps(folder: str) -> Iterator[tuple[str, Stamp]]:
 _FIRST: dict[str, Stamp] = {
     path: stamp for package in PACKAGES if (ROOT / package).is_dir() for path, stamp in _stamps(str(ROOT / package))
 }
-"""Each source's stamp when it was first seen."""
+"""Stamp of each source when it was first read."""
 
 
 def digest(sources: Iterable[str | Path]) -> str:
-    """SHA-256, in hexadecimal digits, of all that the sources depend on."""
+    """Return the SHA-256 digest, in hexadecimal digits, of all sources that these depend on."""
     told = hashlib.sha256()
     for name, path in _reached_by(frozenset(os.path.abspath(source) for source in sources)):
         told.update(f"{name}\0".encode() + _content(path))
@@ -72,14 +73,14 @@ def digest(sources: Iterable[str | Path]) -> str:
 
 @cache
 def _reached_by(sources: frozenset[str]) -> list[tuple[str, str]]:
-    """All that sources at absolute paths depend on, by name: a sweep asks the same for each of its runs."""
+    """Return the dependencies of sources at absolute paths, sorted by name; cached for the runs of a sweep."""
     paths = {path for source in sources for path in reached(str(Path(source).resolve()))}
     return sorted((_name(path), path) for path in paths)
 
 
 @cache
 def reached(source: str) -> frozenset[str]:
-    """The paths of all sources that the one at an absolute path depends on, itself among them."""
+    """Return the paths of all sources that the one at an absolute path depends on, including itself."""
     found, todo = {source}, [source]
     while todo:
         new = _imported(todo.pop()) - found
@@ -89,7 +90,7 @@ def reached(source: str) -> frozenset[str]:
 
 
 def everything(package: str) -> str:
-    """SHA-256, in hexadecimal digits, of all sources of one of PACKAGES, whatever imports them."""
+    """Return the SHA-256 digest, in hexadecimal digits, of all sources of a package in PACKAGE_NAMES."""
     start, told = f"{ROOT / package}{os.sep}", hashlib.sha256()
     for path in sorted(path for path in _FIRST if path.startswith(start)):
         told.update(f"{_name(path)}\0".encode() + _content(path))
@@ -98,10 +99,10 @@ def everything(package: str) -> str:
 
 @cache
 def of_class(made: type) -> frozenset[Path]:
-    """The files that a class is written in, wherever they lie, and those of what it inherits, libraries apart."""
+    """Return the source files of a class and of its base classes, without those of libraries."""
     own = {getattr(sys.modules.get(made.__module__), "__file__", None)}
     for base in made.__mro__:
-        # A module that was loaded by hand may be known by its functions alone.
+        # A module that was loaded manually may be identifiable by its functions only.
         codes = (getattr(value, "__code__", None) for value in vars(base).values())
         files = {code.co_filename for code in codes if code}
         files.add(getattr(sys.modules.get(base.__module__), "__file__", None))
@@ -110,7 +111,7 @@ def of_class(made: type) -> frozenset[Path]:
 
 
 def known(path: str) -> bool:
-    """Whether a file is of this project or of an installed library, and not somebody's own."""
+    """Return whether a file is part of this project or of an installed library, not third-party code."""
     return _own(path) or _library(path) or path.startswith("<")
 
 
@@ -121,7 +122,7 @@ def _library(path: str) -> bool:
 
 @cache
 def _name(path: str) -> str:
-    """The path as it is in every checkout."""
+    """Return the path in a form that is the same in every checkout."""
     return os.path.relpath(path, ROOT) if _own(path) else os.path.basename(path)
 
 
@@ -130,7 +131,7 @@ def _own(path: str) -> bool:
 
 
 def _content(path: str) -> bytes:
-    """What a source holds, as a digest; one that only this process has where it was changed since it was first seen."""
+    """Return the digest of a source; it is unique to this process if the file has changed since the first read."""
     try:
         first = _FIRST.get(path) or _FIRST.setdefault(path, _stamp(path))
         held = _held(path)
@@ -148,7 +149,7 @@ def _held(path: str) -> bytes:
 
 @cache
 def _imported(source: str) -> set[str]:
-    """The paths of the sources that a source imports or compiles, and of the packages that they lie in."""
+    """Return the sources that a source imports or compiles, and the `__init__` files of their packages."""
     if not source.endswith(".py"):
         return set()
     compiled = {path for path in (f"{source.removesuffix('.py')}{ending}" for ending in COMPILED) if _exists(path)}
@@ -161,7 +162,7 @@ def _imported(source: str) -> set[str]:
 
 
 def _names(text: str) -> Iterator[tuple[str, str]]:
-    """Each imported name, in front of it the module that it comes from, "" where it is itself a module."""
+    """Yield each imported name as a pair (module, name); the module is "" if the name is a module itself."""
     for found in _IMPORT.finditer(text):
         listed = re.sub(r"#.*|[()\\]", "", found["names"] or found["whole"])
         for entry in listed.split(","):
@@ -190,13 +191,13 @@ def _found(source: str, base: str, name: str) -> Iterator[str]:
 
 
 def _exists(path: str) -> bool:
-    """Whether there is a source, or was one of ours when this module was imported."""
+    """Return whether there is a source, or was one of ours when this module was imported."""
     return path in _FIRST or (not _own(path) and os.path.isfile(path))
 
 
 @cache
 def _home(source: str) -> tuple[str, list[str]]:
-    """The folder that imports of a source start from, and the packages on the way to it."""
+    """Return the folder from which imports of a source are resolved, and the packages between it and the source."""
     folder, packages = os.path.dirname(source), list[str]()
     while os.path.isfile(os.path.join(folder, "__init__.py")):
         folder, package = os.path.split(folder)

@@ -1,10 +1,10 @@
-"""Factors of H = S + V V' for a sparse S and a few columns V (Woodbury 1950; Sherman and Morrison 1950).
+"""Factorisation of H = S + V V' for a sparse S and a few columns V (Woodbury 1950; Sherman and Morrison 1950).
 
     H^-1 = S^-1 - W C^-1 W',   W = S^-1 V,   C = I + V'W
 
-S may be indefinite where H is not, as that of gas is without the stiffness of its volume. By Sylvester's law of
-inertia, for both ways to eliminate [[S, V], [V', -I]], H has as many negative eigenvalues as S has, less those of C. So
-where S has no Cholesky factor one with negative pivots takes its place.
+S may be indefinite although H is not, as that of gas is without the stiffness of its volume. By Sylvester's law of
+inertia, applied to both elimination orders of [[S, V], [V', -I]], the number of negative eigenvalues of H is that of S
+minus that of C. So if S has no Cholesky factor, a factorisation with negative pivots replaces it.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ Solve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def sparse_part(energy: Energy, p: Positions) -> csr_array:
-    """What of an energy's Hessian is not V V'."""
+    """Return the Hessian of an energy without its low-rank part V V'."""
     return csr_array(energy.sparse_hessian(p) if isinstance(energy, Coupled) else energy.hessian(p))
 
 
 def columns(energies: Sequence[Energy], p: Positions) -> NDArray[np.float64] | None:
-    """V of all energies (n, 3, r), None without any."""
+    """Return V of all energies (n, 3, r), or None if there is none."""
     found = [energy.columns(p) for energy in energies if isinstance(energy, Coupled)]
     return np.concatenate(found, axis=2) if found else None
 
 
 class Woodbury:
-    """H = S + V V', with S in a matrix of blocks; see `solvers.linear.block.BlockCholesky` for the functions."""
+    """The factorisation of H = S + V V' with S in a block matrix; same interface as `BlockCholesky`."""
 
     def __init__(self, matrix: Matrix, V: NDArray[np.float64]) -> None:
-        """V: (f, 3, r), over the free vertices."""
+        """Create the factorisation for columns V (f, 3, r), over the free vertices."""
         self._matrix, self._V = matrix, V
 
     def factorise(self, values: NDArray[np.float64]) -> bool:
-        """Factorise H by the blocks of S; False if it is not positive definite."""
+        """Factorise H from the blocks of S; return False if H is not positive definite."""
         cholesky, negative = self._matrix.factor, 0
         self._inner: Solve = cholesky.solve
         if not cholesky.factorise(values):
@@ -61,19 +61,21 @@ class Woodbury:
         return bool(size.all()) and negative == np.count_nonzero(size < 0.0)
 
     def solve(self, b: Positions) -> Positions:
-        """H^-1 b, both (f, 3)."""
+        """Return H^-1 b, both (f, 3)."""
         x = self._inner(b)
         along = self._axes @ ((self._axes.T @ np.einsum("fik,fi->k", self._V, x)) / self._size)
         return x - self._W @ along
 
     def solve_anew(self, values: NDArray[np.float64], b: Positions) -> Positions | None:
-        """H^-1 b by the blocks of S; None if H is not positive definite."""
+        """Factorise H from the blocks of S and return H^-1 b; None if H is not positive definite."""
         return self.solve(b) if self.factorise(values) else None
 
 
 def _indefinite(graph: csr_array, values: NDArray[np.float64]) -> tuple[Solve, int] | None:
-    """The product with S^-1 and how many of its eigenvalues are negative, by pivots on the diagonal alone; None where
-    one of them is zero, or has to be looked for elsewhere."""
+    """Return the product with S^-1 and the number of negative eigenvalues, from pivots on the diagonal.
+
+    It is None if a pivot is zero or would have to be chosen off the diagonal.
+    """
     S: Any = csc_array(bsr_array((values, graph.indices, graph.indptr), shape=(3 * graph.shape[0], 3 * graph.shape[1])))
     settings: Any = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
     try:

@@ -1,4 +1,4 @@
-"""Time integrators by name: `single` has those of one unknown a step, the others are tableaux of unknowns (`base`)."""
+"""Time integrators by name: `single_stage` has those with one stage per step, the others have tableaux of stages."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ __all__ = [
 ]
 
 Staged = RungeKutta | GeneralisedAlpha
-"""Those of one step and one unknown or more, with all forces where the unknown is.
+"""The one-step integrators with one or more stages that evaluate all forces at the stage.
 
-order: of the error; unknowns: in a step; factor: c; speed: rate dt; starts: whether the acceleration at the
-step's start is needed; embedded: the order of the method that the error is told by, 0 for none; step: the unknowns,
-one by one.
+Common attributes are order (of the error), num_stages (per step), inertia_factor (c), velocity_factor (velocity_rate
+times dt), needs_start_acceleration (whether the acceleration at the start of the step is needed), embedded_order (order
+of the embedded method for the error estimate, 0 for none) and iterate_stages (a generator of the stages).
 """
 
 AnyIntegrator = Integrator | Staged
@@ -51,17 +51,17 @@ INTEGRATORS: dict[str, AnyIntegrator] = {
     "esdirk-4": ESDIRK4,
     "own": OWN,
 }
-"""The shipped integrators by name."""
+"""The built-in integrators by name."""
 
 EVERY = Table("springbench.integrators", INTEGRATORS)
-"""All that a config can name."""
+"""All integrators that a config can name."""
 
 
 def splits(method: AnyIntegrator) -> bool:
-    """Whether filters of the velocity act before a step; an integrator that takes forces where they act has none."""
+    """Return whether velocity filters act before a step; an integrator that evaluates forces at the stage has none."""
     return isinstance(method, Integrator) and method.splits
 
 
 def find(name: str) -> AnyIntegrator:
-    """The integrator of a name, which may be somebody's own."""
+    """Return the integrator of a name, which may be a third-party one."""
     return INTEGRATORS[name] if name in INTEGRATORS else load(EVERY[name])

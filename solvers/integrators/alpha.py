@@ -1,16 +1,17 @@
-"""The generalised-alpha method (Chung and Hulbert 1993), with the forces where the unknown is.
+"""The generalised-alpha method (Chung and Hulbert 1993), with the forces evaluated at the stage.
 
     d' = d + dt v + dt^2 ((1/2 - beta) a + beta a'),    v' = v + dt ((1 - gamma) a + gamma a')
     M ((1 - am) a' + am a) = f(x, (1 - af) v' + af v, t + (1 - af) dt),     x = (1 - af) d' + af d
 
-for the motion d, v, a at the step's start and d', v', a' at its end. The mean acceleration is c/dt^2 (x - target) with
+for the motion d, v, a at the start of the step and d', v', a' at its end. The mean acceleration is
+c/dt^2 (x - target) with
 
     c = (1 - am) / ((1 - af) beta),     target = d + (1 - af) (dt v + (1/2 - beta/(1 - am)) dt^2 a)
 
-Of order 2 where gamma = 1/2 - am + af. A spectral radius r in the limit of high frequencies gives am =
-(2 r - 1)/(r + 1) and af = r/(r + 1); Hilber, Hughes and Taylor (1977) have am = 0, Newmark's mean acceleration (1959)
-am = af = 0. All are stable without condition for linear problems; beta = (1 - am + af)^2/4 damps high frequencies
-most.
+The order is 2 if gamma = 1/2 - am + af. A spectral radius r in the limit of high frequencies gives am =
+(2 r - 1)/(r + 1) and af = r/(r + 1). Hilber, Hughes and Taylor (1977) have am = 0; Newmark's average acceleration
+method (1959) has am = af = 0. All are unconditionally stable for linear problems; beta = (1 - am + af)^2/4 maximises
+the damping of high frequencies.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from solvers.problem import Positions
 
 @dataclass(frozen=True)
 class GeneralisedAlpha:
-    """The method for am, of the masses, and af, of the forces."""
+    """The method with parameters am, of the masses, and af, of the forces."""
 
     mass: float
     force: float
@@ -36,31 +37,31 @@ class GeneralisedAlpha:
 
     @classmethod
     def damping(cls, radius: float) -> GeneralisedAlpha:
-        """The method that multiplies the highest frequencies by `radius` a step, from 0 to 1."""
+        """Return the method that multiplies the highest frequencies by `spectral_radius`, in [0, 1], per step."""
         return cls((2.0 * radius - 1.0) / (radius + 1.0), radius / (radius + 1.0))
 
     @property
     def gamma(self) -> float:
-        """gamma of order 2."""
+        """The gamma of order 2."""
         return 0.5 - self.mass + self.force
 
     @property
     def beta(self) -> float:
-        """beta of the greatest damping."""
+        """The beta of maximum damping."""
         return 0.25 * (1.0 - self.mass + self.force) ** 2
 
     @property
     def factor(self) -> float:
-        """c."""
+        """The factor c."""
         return (1.0 - self.mass) / ((1.0 - self.force) * self.beta)
 
     @property
     def speed(self) -> float:
-        """gamma/beta: what v' gains with the unknown, in 1/dt."""
+        """Ratio gamma/beta of the change of v' to that of the stage, in units of 1/dt."""
         return self.gamma / self.beta
 
     def step(self, now: Motion, acceleration: Positions | None, dt: float) -> Unknowns:
-        """The unknown of a step of dt [s]. Raises ValueError without an acceleration."""
+        """Yield the stage of a step of dt [s]; raise ValueError without a start acceleration."""
         if acceleration is None:
             raise ValueError("the method needs the acceleration at the step's start")
         (p, v), a = now, acceleration

@@ -1,11 +1,12 @@
-"""What time integrators of more than one unknown a step share: they state one after the other, and are told of each.
+"""The interface of integrators with several stages per step, which they yield one after the other.
 
-An unknown x minimises energies(x) + c/(2 dt^2) |x - target|_M^2 - tr(x' f), as that of implicit Euler does, with the
-same c for all: Q is factorised once, and every minimiser serves. At the minimum M c/dt^2 (x - target) is the force, so
+A stage x minimises energies(x) + c/(2 dt^2) |x - target|_M^2 - tr(x' f), like the step of implicit Euler, with the same
+c for all stages. So Q is factorised once, and every minimiser can be used. At the minimum M c/dt^2 (x - target) is the
+force, so
 
-    acceleration = c/dt^2 (x - target),     velocity = rate (x - origin)
+    acceleration = c/dt^2 (x - target),     velocity = velocity_rate (x - velocity_origin)
 
-and no force is evaluated besides.
+and no further evaluation of the force is needed.
 """
 
 from __future__ import annotations
@@ -17,15 +18,20 @@ from solvers.problem import Positions
 
 
 class Motion(NamedTuple):
-    """positions (n, 3) [m] and velocity (n, 3) [m/s] at one time."""
+    """The motion at one time: positions (n, 3) [m] and velocity (n, 3) [m/s]."""
 
     positions: Positions
     velocity: Positions
 
 
 class Unknown(NamedTuple):
-    """when: the time of x within the step, 1 at its end; target and origin (n, 3) [m], which whoever asks may write to;
-    acceleration: what the motion so far leads to expect at x, (n, 3) [m/s^2], None where nothing does."""
+    """A stage of a step.
+
+    Attributes:
+        when: time of x as a fraction of the step, 1 at its end.
+        target, origin: (n, 3) [m]; the caller may modify them.
+        acceleration: acceleration (n, 3) [m/s^2] at x predicted from the previous motion; None for none.
+    """
 
     when: float
     target: Positions
@@ -34,7 +40,7 @@ class Unknown(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """positions [m], velocity [m/s] and acceleration [m/s^2] of an unknown, each (n, 3)."""
+    """The solution of a stage: positions [m], velocity [m/s] and acceleration [m/s^2], each (n, 3)."""
 
     positions: Positions
     velocity: Positions
@@ -42,8 +48,13 @@ class Solved(NamedTuple):
 
 
 class End(NamedTuple):
-    """motion and acceleration (n, 3) [m/s^2] at the step's end; error: of the motion, by an embedded method of lower
-    order, None without one."""
+    """The result of a step.
+
+    Attributes:
+        motion: motion at the end of the step.
+        acceleration: (n, 3) [m/s^2] at the end of the step.
+        error: error estimate of the motion by an embedded method of lower order; None without one.
+    """
 
     motion: Motion
     acceleration: Positions
@@ -51,4 +62,4 @@ class End(NamedTuple):
 
 
 Unknowns = Generator[Unknown, Solved, End]
-"""Yields the unknowns of a step, each after it was sent the solution of the one before."""
+"""A generator of the stages of a step; it is sent the solution of each stage before it yields the next."""

@@ -1,12 +1,12 @@
-"""Diagonally implicit Runge-Kutta methods with one diagonal element gamma, which end in their last stage.
+"""Diagonally implicit Runge-Kutta methods with one diagonal element gamma, whose last stage is the end of the step.
 
     P_i = x^ + gamma dt V_i,    x^ = p + dt sum_(j<i) a_ij V_j
     V_i = v^ + gamma dt A_i,    v^ = v + dt sum_(j<i) a_ij A_j,     M A_i = f(P_i, V_i, t + c_i dt)
 
-So P_i minimises energies + 1/(2 gamma^2 dt^2) |x - target|_M^2 with target = x^ + gamma dt v^, it moves with the
-velocity (x - x^)/(gamma dt), and the acceleration is (x - target)/(gamma dt)^2: a step problem with c = 1/gamma^2 and
-origin = x^. All of them are L-stable and stiffly accurate. Those whose first stage is explicit (a_11 = 0) have stage
-order 2, and their first acceleration is the last one of the step before.
+So P_i minimises energies + 1/(2 gamma^2 dt^2) |x - target|_M^2 with target = x^ + gamma dt v^. It moves with the
+velocity (x - x^)/(gamma dt), and the acceleration is (x - target)/(gamma dt)^2. This is a step problem with
+c = 1/gamma^2 and velocity_origin = x^. All of them are L-stable and stiffly accurate. Those with an explicit first
+stage (a_11 = 0) have stage order 2, and their first acceleration is the last one of the previous step.
 
     SDIRK 2 and 3      Alexander 1977, "Diagonally implicit Runge-Kutta methods for stiff O.D.E.'s"
     SDIRK 4            Hairer and Wanner, Solving Ordinary Differential Equations II, table IV.6.5
@@ -32,8 +32,14 @@ Row = tuple[float, ...]
 
 @dataclass(frozen=True)
 class RungeKutta:
-    """order: of the method; a: its rows, (s, 1 to s); lower: the weights (s,) of the embedded method, if any, and
-    embedded: its order."""
+    """A diagonally implicit Runge-Kutta method.
+
+    Attributes:
+        order: order of the method.
+        a: rows of the tableau, of lengths 1 to s.
+        lower: weights (s,) of the embedded method, if any.
+        embedded: order of the embedded method.
+    """
 
     order: int
     a: tuple[Row, ...]
@@ -41,39 +47,46 @@ class RungeKutta:
     embedded: int = 0
 
     def __post_init__(self) -> None:
-        """Raises ValueError where the stages would not share one matrix."""
+        """Raise ValueError if the stages do not share one system matrix."""
         diagonal = {row[-1] for row in self.a[self.starts :]}
         if len(diagonal) != 1 or [len(row) for row in self.a] != list(range(1, len(self.a) + 1)):
             raise ValueError("wanted a lower triangular tableau with one diagonal element, explicit first stages apart")
 
     @cached_property
     def starts(self) -> bool:
-        """Whether the first stage is explicit."""
+        """Whether the first stage is explicit, so that the start acceleration is needed."""
         return self.a[0] == (0.0,)
 
     @property
     def unknowns(self) -> int:
-        """Implicit stages."""
+        """Number of implicit stages."""
         return len(self.a) - self.starts
 
     @cached_property
     def times(self) -> Row:
-        """c_i."""
+        """Times c_i of the stages."""
         return tuple(float(sum(row)) for row in self.a)
 
     @property
     def speed(self) -> float:
-        """1/gamma."""
+        """Ratio 1/gamma of the velocity to the displacement of a stage, in units of 1/dt."""
         return 1.0 / self.a[-1][-1]
 
     @property
     def factor(self) -> float:
-        """1/gamma^2."""
+        """The factor c = 1/gamma^2."""
         return self.speed**2
 
     def step(self, now: Motion, acceleration: Positions | None, dt: float) -> Unknowns:
-        """The unknowns of a step of dt [s] from a motion and its acceleration (n, 3) [m/s^2]; what is expected of a
-        stage is the known acceleration nearest in time."""
+        """Yield the stages of a step.
+
+        The predicted acceleration of a stage is the known one that is nearest in time.
+
+        Args:
+            now: motion at the start of the step.
+            acceleration: acceleration (n, 3) [m/s^2] at the start of the step, or None.
+            dt: step size [s].
+        """
         v: list[Positions] = [now.velocity] if self.starts else []
         a: list[Positions] = [acceleration] if self.starts and acceleration is not None else []
         h = dt * self.a[-1][-1]
@@ -96,7 +109,7 @@ class RungeKutta:
 
 
 def _combined(x: Positions, dt: float, weights: Sequence[float], parts: Sequence[Positions]) -> Positions:
-    """x + dt sum_j weights_j parts_j, as an array of its own."""
+    """Return x + dt sum_j weights_j parts_j as a new array."""
     out = x.copy()
     for weight, part in zip(weights, parts, strict=False):
         if weight:
@@ -105,13 +118,13 @@ def _combined(x: Positions, dt: float, weights: Sequence[float], parts: Sequence
 
 
 def _rows(*rows: str) -> tuple[Row, ...]:
-    """Rows of fractions, written out."""
+    """Parse tableau rows of fractions."""
     return tuple(tuple(float(Fraction(number)) for number in row.split()) for row in rows)
 
 
 _TWO = 1.0 - 0.5**0.5
 _THREE = 0.43586652150845899942
-"""The root of x^3 - 3 x^2 + 3/2 x - 1/6 in (1/6, 1/2)."""
+"""Root of x^3 - 3 x^2 + 3/2 x - 1/6 in (1/6, 1/2)."""
 
 _ALEXANDER = (
     (_THREE,),

@@ -1,19 +1,19 @@
-"""Time integrators of one unknown a step, each a step problem of the same form: minimise over the unknown x
+"""Time integrators with one stage per step, each a step problem of the same form: minimise over the stage x
 
     energies(x) + c/(2 dt^2) |x - target|_M^2 - tr(x' f),       Q = A'KA + c M/dt^2
 
-                     c     x             target                                    the velocity of x
+                     c     x             target                                    velocity of x
     implicit Euler   1     p^(t+dt)      p + dt v                                  (x - p)/dt
     BDF2             9/4   p^(t+dt)      (4 p - p')/3 + 2 dt/9 (4 v - v')          3/(2 dt) (x - (4 p - p')/3)
     midpoint         4     p^(t+dt/2)    p + dt/2 v                                2/dt (x - p)
 
-with p, v at the step's start and p', v' one step before it: the velocity is sqrt(c)/dt (x - origin) for all three.
-Implicit Euler is of order 1 and damps, the others of order 2; midpoint conserves quadratic energies (Hairer and
-Wanner, Solving Ordinary Differential Equations II, sections IV.12 and V.1; Hairer, Lubich and Wanner, Geometric
-Numerical Integration, section IV.2). External forces are those of the step's start for implicit Euler, as in Liu et
-al. 2013; for the others they are taken where extrapolation puts the motion at the time of x. Filters of the velocity
-act before a step, half a step early for midpoint: its positions keep order 2 from a start at rest, and have order 1
-from a moving one.
+with p, v at the start of the step and p', v' one step earlier. The velocity is sqrt(c)/dt (x - velocity_origin) for all
+three. Implicit Euler has order 1 and numerical damping, the others have order 2; midpoint conserves quadratic energies
+(Hairer and Wanner, Solving Ordinary Differential Equations II, sections IV.12 and V.1; Hairer, Lubich and Wanner,
+Geometric Numerical Integration, section IV.2). Implicit Euler evaluates external forces at the start of the step, as
+Liu et al. 2013 do; the others evaluate them at the motion extrapolated to the time of x. Velocity filters act before a
+step, for midpoint half a step early: its positions then have order 2 from a start at rest, and order 1 from a moving
+one.
 """
 
 from __future__ import annotations
@@ -28,17 +28,23 @@ from solvers.problem import Positions, Solution, Start, Unsupported
 
 @dataclass(frozen=True, slots=True)
 class Integrator:
-    """factor: c; when: the time of x within the step, 1 at its end; ahead: that of the external forces;
-    history: whether it needs the motion one step before, so that implicit Euler makes the first step;
-    predict: from the motions now and one step before, and dt [s], to target and origin, each (n, 3) [m]; order: of its
-    error.
+    """An integrator with one stage per step.
+
+    Attributes:
+        factor: c.
+        when: time of the stage as a fraction of the step, 1 at its end.
+        ahead: time of the external forces, as such a fraction.
+        history: whether the motion of the previous step is needed; implicit Euler then makes the first step.
+        predict: function of the motions now and one step earlier, and of dt [s], that returns target and
+            velocity_origin, each (n, 3) [m].
+        order: order of the error.
     """
 
     speed: ClassVar[None] = None
-    """The unknown's velocity follows from c."""
+    """None: the velocity of the stage follows from c."""
     unknowns: ClassVar[int] = 1
     splits: ClassVar[bool] = True
-    """Whether filters of the velocity act before a step."""
+    """Whether velocity filters act before a step."""
 
     factor: float
     when: float
@@ -48,7 +54,7 @@ class Integrator:
     order: int = 1
 
     def advance(self, start: Start, solution: Solution) -> Motion:
-        """The motion at the step's end; a method that has a velocity of its own brings it in the solution."""
+        """Return the motion at the end of the step, with the solver's own velocity if the solution has one."""
         x = solution.positions
         if solution.velocity is not None:
             return Motion(x, solution.velocity)
@@ -73,12 +79,12 @@ def _midpoint(now: Motion, before: Motion, dt: float) -> tuple[Positions, Positi
 
 @dataclass(frozen=True, slots=True)
 class Own(Integrator):
-    """For solvers that integrate a step by themselves, and tell the velocity at its end: drag is a force to them."""
+    """The integrator for solvers that integrate a step themselves and return the velocity; drag is then a force."""
 
     splits: ClassVar[bool] = False
 
     def advance(self, start: Start, solution: Solution) -> Motion:
-        """The solver's motion. Raises Unsupported for one that has no velocity."""
+        """Return the solver's motion; raise Unsupported for a solver without a velocity."""
         if solution.velocity is None:
             raise Unsupported(
                 "the integrator `own` leaves it to the solver to integrate a step, and this one minimises what another "
