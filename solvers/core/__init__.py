@@ -1,1 +1,1 @@
-"""What methods share: the objective, descent and line search, saddle points, spring forms, vertex terms."""
+"""Shared parts of the methods: objective, descent, line search, saddle points, spring forms, vertex terms."""

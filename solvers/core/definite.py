@@ -1,18 +1,19 @@
-"""A Hessian that has a Cholesky factor, where the exact one may have none.
+"""Regularised Hessians, which have a Cholesky factor even if the exact Hessian is indefinite.
 
-graded: the exact Hessian, else the nearest of a few that are more and more convex; where pairs touch, of more that
-differ less, and one less convex than that of the point before is tried first. The others change elements by their
-eigenvalues (`solvers.core.eigenvalues`), whether the whole is indefinite or not:
+graded: the exact Hessian, or else the first positive definite one in a schedule of increasingly convex ones. With
+active collisions the schedule is finer, and each iterate starts one level below that of the previous iterate. The
+other strategies project the eigenvalues of elements (`solvers.objective.psd_projection`), whether the Hessian is indefinite
+or not:
 
     clamp          all, lambda -> max(lambda, 0)                                     Teran et al. 2005
     absolute       all, lambda -> |lambda|                                           Chen, Liu, Levin et al. 2024
-    trust-region   clamp where |rho - 1| < 0.01, else absolute, which comes first    Chen, Liu, Jacobson et al. 2024
-                   rho = (g(p) - g(p + s))/-(s grad g + s H s/2) of the step s before, H exact
-    progressive    clamp, of elements at vertices with |grad g| >= tau alone         Fernandez-Fernandez et al. 2025
+    trust-region   clamp if |rho - 1| < 0.01, else absolute, which is used first     Chen, Liu, Jacobson et al. 2024
+                   rho = (g(p) - g(p + s))/-(s grad g + s H s/2) of the previous step s, H exact
+    progressive    clamp, only elements at vertices with |grad g| >= tau             Fernandez-Fernandez et al. 2025
 
-The threshold tau of `progressive` is infinite at first. Where there is no factor it is halved, at first from the
-largest |grad g|, and after each step doubled. What still has no factor (a vertex that nothing holds) gets multiples of
-a diagonal.
+The threshold tau of `progressive` starts at infinity. It is halved if there is no factor, the first time from the
+largest |grad g|, and doubled after each step. If there is still no factor (a vertex without a constraint or a spring),
+multiples of a diagonal are added.
 """
 
 from __future__ import annotations
@@ -29,19 +30,20 @@ from solvers.core.objective import Hessian, StepObjective
 
 SHIFTS = tuple(10.0**k for k in range(-4, 9, 2))
 LEVELS = ((1.0, 0.0), (0.9, 0.0), (0.5, 0.0), (0.0, 0.0), *((0.0, by) for by in SHIFTS))
-"""What is kept of negative lateral parts, and what multiple of a diagonal is added: the first that factorises."""
+"""Pairs of the negative fraction (of the springs' transverse part) and the multiple of a diagonal; the first that has a
+factor is used."""
 
 _CLOSE = (*((keep, 0.0) for keep in (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.25)), *LEVELS[3:])
-"""The same where pairs touch."""
+"""The schedule with active collisions."""
 
 Indefinite = Literal["graded", "clamp", "absolute", "trust-region", "progressive"]
 
 _TRUSTED = 0.01
-"""How near to 1 the ratio of the descent to that of the quadratic model is where eigenvalues are clamped, as in the
+"""Largest deviation from 1 of the ratio of actual to predicted decrease for which eigenvalues are clamped, as in the
 paper."""
 
 _HALVINGS = 60
-"""Of the threshold; then all elements are filtered."""
+"""Maximum number of halvings of the threshold; then all elements are projected."""
 
 
 def factorised(
@@ -51,54 +53,71 @@ def factorised(
     levels: Sequence[tuple[float, float]] = LEVELS,
     first: int = 0,
 ) -> int | None:
-    """The level at which a Hessian with `shift` on its diagonal [N/m] was factorised, from the first one that is tried
-    on, 0 for the exact one; None for none. diagonal: what is added multiples of, (3 f,) [N/m]."""
+    """Factorise the first positive definite Hessian of a schedule and return its level, or None.
+
+    Args:
+        hessian: the Hessian at a point.
+        diagonal: diagonal whose multiples are added (3 f,) [N/m].
+        shift: added to the diagonal at all levels [N/m].
+        levels: pairs of the negative fraction and the multiple of `diagonal`.
+        first: first level to try.
+
+    Returns:
+        The level; 0 is the exact Hessian; None if no level has a factor.
+    """
     tried = enumerate(levels[first:], first)
     return next((k for k, (keep, by) in tried if hessian.factorise(keep, shift + by * diagonal)), None)
 
 
 class Rule(Protocol):
-    """What is done in one solve."""
+    """The regularisation in one solve."""
 
     def factorised(self, hessian: Hessian, at: Point, diagonal: NDArray[np.float64]) -> int | None:
-        """0 where the exact Hessian was factorised, more where another one was, None where none was. See `factorised`
-        for diagonal."""
+        """Factorise a Hessian and return its level: 0 for the exact one, more for others, None for no factor.
+
+        The diagonal is that of `factorise_shifted`.
+        """
         ...
 
     def took(self, step: StepObjective, hessian: Hessian, at: Point, to: Point) -> None:
-        """A step was taken from a point, whose Hessian is given, to another."""
+        """Record a step from a point with the given Hessian to another point."""
         ...
 
 
 class Graded:
-    """The least change of a few. The only one that takes energies which state no elements."""
+    """The smallest change of a schedule; the only rule that supports energies without an element-wise form."""
 
     def factorised(self, hessian: Hessian, at: Point, diagonal: NDArray[np.float64]) -> int | None:
-        """See Rule."""
+        """Factorise at the first level of the schedule that has a factor."""
         return factorised(hessian, diagonal)
 
     def took(self, step: StepObjective, hessian: Hessian, at: Point, to: Point) -> None:
-        """See Rule."""
+        """Record nothing."""
 
 
 class Close(Graded):
-    """Smaller changes in one solve, where pairs touch: a compressed stack is indefinite for many iterations, and gets
-    convex by and by; all of them would factorise the exact Hessian in vain."""
+    """A finer schedule for active collisions, with a warm start from the level of the previous iterate.
+
+    A compressed stack is indefinite for many iterations and becomes convex gradually; each of them would otherwise
+    factorise the exact Hessian without success.
+    """
 
     def __init__(self) -> None:
         self._level = 0
 
     def factorised(self, hessian: Hessian, at: Point, diagonal: NDArray[np.float64]) -> int | None:
-        """See Rule."""
+        """Factorise, starting one level below the previous one."""
         level = factorised(hessian, diagonal, levels=_CLOSE, first=max(0, self._level - 1))
         self._level = self._level if level is None else level
         return level
 
 
 class Clamped(Graded):
-    """Eigenvalues of all elements clamped; absolute: or turned round.
+    """Eigenvalues of all elements clamped, or replaced by their absolute values.
 
-    looked, changed: how many elements were looked at in the solve so far, and how many changed.
+    Attributes:
+        absolute: whether absolute values are used.
+        looked, changed: numbers of elements examined and of elements projected in the solve so far.
     """
 
     def __init__(self, *, absolute: bool = False) -> None:
@@ -106,7 +125,7 @@ class Clamped(Graded):
         self.looked = self.changed = 0
 
     def factorised(self, hessian: Hessian, at: Point, diagonal: NDArray[np.float64]) -> int | None:
-        """See Rule."""
+        """Factorise the projected Hessian, with a shift if necessary."""
         return self._filtered(hessian, None, (0.0, *SHIFTS), diagonal)
 
     def _filtered(
@@ -116,7 +135,7 @@ class Clamped(Graded):
         shifts: tuple[float, ...],
         diagonal: NDArray[np.float64],
     ) -> int | None:
-        """The level, 0 where no element changed and nothing was added."""
+        """Return the level; it is 0 if no element changed and nothing was added."""
         found = hessian.filtered(Filtering(absolute=self.absolute, among=among))
         self.looked, self.changed = self.looked + found.looked, self.changed + found.changed
         first = int(found.changed > 0)
@@ -125,13 +144,13 @@ class Clamped(Graded):
 
 
 class Trusted(Clamped):
-    """Absolute eigenvalues where the quadratic model of the step before was wrong, else clamped ones."""
+    """Absolute eigenvalues if the quadratic model of the previous step was inaccurate, else clamped ones."""
 
     def __init__(self) -> None:
         super().__init__(absolute=True)
 
     def took(self, step: StepObjective, hessian: Hessian, at: Point, to: Point) -> None:
-        """See Rule."""
+        """Compare the decrease in the step with the quadratic model."""
         s = to.positions - at.positions
         model = dot(at.gradient, s) + 0.5 * dot(s, hessian.multiply(s))
         rise, _ = step.rise(at.positions, to.positions)
@@ -139,14 +158,14 @@ class Trusted(Clamped):
 
 
 class Progressive(Clamped):
-    """Eigenvalues of as few elements clamped as a factor needs, those where the gradient is largest."""
+    """Eigenvalues clamped for as few elements as a factor needs, those with the largest gradient."""
 
     def __init__(self) -> None:
         super().__init__()
         self._threshold = np.inf
 
     def factorised(self, hessian: Hessian, at: Point, diagonal: NDArray[np.float64]) -> int | None:
-        """See Rule."""
+        """Factorise with the current threshold, halving it until there is a factor."""
         force = np.abs(at.gradient).max(axis=1, initial=0.0)
         for _ in range(_HALVINGS):
             level = self._filtered(hessian, force >= self._threshold, (0.0,), diagonal)
@@ -156,7 +175,7 @@ class Progressive(Clamped):
         return self._filtered(hessian, None, SHIFTS, diagonal)
 
     def took(self, step: StepObjective, hessian: Hessian, at: Point, to: Point) -> None:
-        """See Rule."""
+        """Double the threshold."""
         self._threshold *= 2.0
 
 
@@ -167,4 +186,4 @@ RULES: dict[Indefinite, Callable[[], Rule]] = {
     "trust-region": Trusted,
     "progressive": Progressive,
 }
-"""A rule for a solve, by name."""
+"""A factory of the rule for a solve, by the name of the strategy."""

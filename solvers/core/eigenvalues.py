@@ -1,9 +1,10 @@
-"""Second derivatives of single elements, made positive semidefinite by their eigenvalues.
+"""Projection of element Hessians to positive semidefinite matrices by their eigenvalues.
 
     clamped:  lambda -> max(lambda, 0)      Teran, Sifakis, Irving and Fedkiw 2005
     absolute: lambda -> |lambda|            Chen, Liu, Levin, Zheng and Jacobson 2024
 
-A sum of positive semidefinite blocks is so too. An element without a negative eigenvalue stays as it is, to the bit.
+A sum of positive semidefinite blocks is positive semidefinite. An element without a negative eigenvalue is returned
+unchanged, bitwise.
 """
 
 from __future__ import annotations
@@ -18,16 +19,23 @@ from solvers.core.bounds import PairBlocks
 Array = NDArray[np.float64]
 
 _ROUND_OFF = 16.0 * np.finfo(np.float64).eps
-"""Of a block's largest eigenvalue, what of a negative one is round-off."""
+"""Ratio to a block's largest eigenvalue up to which a negative one counts as round-off."""
 
 _PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-"""Where xx, xy, xz, yy, yz, zz stand in a block."""
+"""Position of xx, xy, xz, yy, yz, zz within a block."""
 
 
 class Filtered(NamedTuple):
-    """A Hessian whose elements were filtered. keep: of springs' negative lateral parts; tension (m,) [N]; curvature: of
-    the elements of each energy (m, 6) [N/m]; pairs: of each bounded energy; looked: how many elements were looked at;
-    changed: how many of them had a negative eigenvalue."""
+    """The parts of a Hessian with projected elements.
+
+    Attributes:
+        keep: fraction of the springs' negative transverse parts.
+        tension: tensions of the springs (m,) [N].
+        curvature: Hessians of the elements of each energy (m, 6) [N/m].
+        pairs: blocks of each barrier energy.
+        looked: number of elements examined.
+        changed: number of elements with a negative eigenvalue.
+    """
 
     keep: float
     tension: Array
@@ -38,15 +46,19 @@ class Filtered(NamedTuple):
 
 
 class Filtering:
-    """One filter, and what it met. absolute: whether eigenvalues are clamped or turned round; among: the vertices
-    (n,) whose elements are filtered, None for all."""
+    """A projection and the counts of its elements.
+
+    Attributes:
+        absolute: whether eigenvalues are replaced by absolute values instead of clamped.
+        among: mask of the vertices (n,) whose elements are projected; None for all.
+    """
 
     def __init__(self, *, absolute: bool = False, among: NDArray[np.bool_] | None = None) -> None:
         self.absolute, self._among = absolute, among
         self.looked = self.changed = 0
 
     def meets(self, vertices: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which elements (m, k) have a vertex that is filtered; -1 is no vertex."""
+        """Return the mask of the elements (m, k) with a selected vertex; -1 is no vertex."""
         if self._among is None:
             met = np.ones(len(vertices), np.bool_)
         else:
@@ -55,24 +67,26 @@ class Filtering:
         return met
 
     def springs(self, edges: NDArray[np.int64], tension: Array) -> tuple[float, Array]:
-        """What to keep of negative lateral parts, and the tensions (m,) [N] of springs (m, 2): their lateral eigenvalue
-        is t/l."""
+        """Return the negative fraction and the tensions (m,) [N] of projected springs (m, 2).
+
+        The transverse eigenvalue of a spring is t/l.
+        """
         bent = self.meets(edges) & (tension < 0.0)
         self.changed += int(bent.sum())
         return (-1.0, tension) if self.absolute else (1.0, np.where(bent, 0.0, tension))
 
     def packed(self, vertices: NDArray[np.int64], curvature: Array) -> Array:
-        """Second derivatives (m, 6) [N/m] of elements of vertices (m, k)."""
+        """Project packed Hessians (m, 6) [N/m] of elements with vertices (m, k)."""
         blocks = self.blocks(vertices, curvature[:, _PLACE])
         return curvature if blocks is None else np.ascontiguousarray(blocks.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
 
     def pairs(self, pairs: PairBlocks) -> PairBlocks:
-        """Second derivatives of pairs."""
+        """Project the blocks of pairs."""
         blocks = self.blocks(pairs.vertices, pairs.values) if len(pairs.vertices) else None
         return pairs if blocks is None else pairs.of(blocks)
 
     def blocks(self, vertices: NDArray[np.int64], blocks: Array) -> Array | None:
-        """Symmetric blocks (m, k, k) of elements; None where none of them has a negative eigenvalue."""
+        """Project symmetric blocks (m, k, k) of elements; return None if no eigenvalue is negative."""
         met = np.flatnonzero(self.meets(vertices))
         size, axes = np.linalg.eigh(blocks[met])
         bent = size[:, 0] < -_ROUND_OFF * np.abs(size).max(axis=1, initial=0.0)

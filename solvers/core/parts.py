@@ -1,9 +1,10 @@
-"""What the compiled methods make of a system's energies: springs, and what may be computed as springs.
+"""Decomposition of a system's energies into springs and terms that the compiled methods compute like springs.
 
-A constant quadratic form (bending, attachments, linear drag) is springs without length between the vertices that it
-couples, and what holds each vertex by itself (see `solvers.kernels.forms`). So the kernels of springs add up its forces
-and its value. Its force at the origin, A'W d, is constant in a step: one more external force. Strain limits and
-dashpots are edges of a kernel of their own (see `solvers.kernels.edges`); in Q they too are springs without length.
+A constant quadratic form (bending, attachments, linear drag) is equivalent to springs of zero rest length between the
+vertices that it couples, and a weight of each single vertex (see `solvers.kernels.quadratic_form_kernels`). So the
+kernels of springs compute its forces and its value. Its force at the origin, A'W d, is constant in a step and is added
+to the external force. Strain limits and dashpots are edges with their own kernel (see
+`solvers.kernels.edge_elements`); in Q they too are springs of zero rest length.
 """
 
 from __future__ import annotations
@@ -29,10 +30,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """springs: those of the system; whole: those, and the forms' pairs; pairs: those, and the edges', of Q; held: h of
-    all forms (n,) [N/m]; forms: each in a step; limits, dashpots: the edges, with k [N/m] of both; unknown: the names
-    of energies that are in none of these; cancel: whether the pairs and the springs of some vertices cancel, so that Q
-    does not tell that they meet."""
+    """The decomposition of a system's energies.
+
+    Attributes:
+        springs: springs of the system.
+        whole: these and the pairs of the forms.
+        pairs: all pairs in Q: these and the edges.
+        held: weight h of all forms at each vertex (n,) [N/m].
+        forms: builders of each form for a step.
+        limits, dashpots: edge energies, with k [N/m] of both.
+        unknown: names of unsupported energies.
+        cancel: whether pairs and springs of some vertices cancel, so that the pattern of Q omits their coupling.
+    """
 
     springs: Springs
     whole: Springs
@@ -45,7 +54,7 @@ class Parts:
     cancel: bool = False
 
     def force(self, problem: StepProblem) -> Positions:
-        """The external force and what is constant of the forms', (n, 3) [N]; the problem's own array without forms."""
+        """Return the external force plus the constant one of the forms, (n, 3) [N]; not a copy without forms."""
         if not self.forms:
             return problem.force
         out = problem.force.copy()
@@ -54,7 +63,7 @@ class Parts:
         return out
 
     def negative(self, p: Positions) -> float:
-        """What pairs of negative stiffness take from the value of the others at p (n, 3) [J], not negative."""
+        """Return the absolute energy [J] of the pairs with negative stiffness at p (n, 3) [m]."""
         return 0.5 * abs(float(np.einsum("ij,ij->", p, self._negative @ p))) if self.forms else 0.0
 
     @cached_property
@@ -63,8 +72,12 @@ class Parts:
         return _pairs(self.whole.edges[below], -self.whole.stiffness[below]).stiffness_matrix(len(self.held))
 
     def edges(self, row: NDArray[np.int64], rows: int) -> Edges | None:
-        """The limits and dashpots as they are before a step, between vertices in rows `row` (n,), of so many; None
-        without any."""
+        """Build the strain limits and dashpots as they are before a step; None if there are none.
+
+        Args:
+            row: row of each vertex (n,).
+            rows: number of rows.
+        """
         if not (self.limits or self.dashpots):
             return None
         from solvers.kernels.edges import Edges
@@ -78,7 +91,7 @@ class Parts:
         return edges
 
     def begun(self, edges: Edges | None, problem: StepProblem) -> Edges | None:
-        """The edges in a step."""
+        """Return the edges updated to a step."""
         if edges is not None and any(map(is_lagged, self.limits)):
             from solvers.energies.strain_limits import StrainLimits
 
@@ -96,12 +109,12 @@ class Parts:
         return edges._replace(axis=axis, offset=offset)
 
     def size(self, p: Positions) -> float:
-        """The sum of k |v|^2 [J] over limits and dashpots at p (n, 3): what cancels in their energy."""
+        """Return the sum of k |v|^2 [J] over strain limits and dashpots at p (n, 3), the scale of cancellation."""
         return sum(float(e.stiffness @ e.lengths(p) ** 2) for e in (*self.limits, *self.dashpots))
 
 
 def split(system: System) -> Parts:
-    """The parts of a system's energies."""
+    """Decompose the energies of a system."""
     n = system.vertices
     springs = Springs.joined([energy for energy in system.energies if isinstance(energy, Springs)])
     others = [energy for energy in system.energies if not isinstance(energy, Springs)]
@@ -139,7 +152,7 @@ def split(system: System) -> Parts:
 
 
 def _pairs(edges: NDArray[np.int64], stiffness: NDArray[np.float64]) -> Springs:
-    """Springs without length."""
+    """Return springs of zero rest length."""
     flat = np.zeros(len(stiffness))
     return Springs(edges, stiffness, flat, flat[:, None] + [1.0, 0.0, 0.0])
 

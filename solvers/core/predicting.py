@@ -3,10 +3,10 @@
     H(t) = M/dt^2 + sum_e k nn' + t_e/l_e (I - nn'),   (H(t) + s M/dt^2) d = -grad g(p)
     t_e <- k_e (l_e + n (A d)_e - r_e)
 
-`solvers.methods.hybrid` tells why. Where H(t) is not positive definite, a step along what is unstable is the longer the
-nearer s is to the least that leaves a factor (More and Sorensen 1983). So after each step that may be bolder a smaller
-s is tried. How many times smaller it is, is squared where there was a factor, and where not its root is taken, so that
-s comes near to the least in a few steps, and follows it.
+`solvers.methods.newton.hybrid_newton` gives the motivation. If H(t) is not positive definite, a step along unstable
+modes is longer the closer s is to the smallest value that has a factor (More and Sorensen 1983). So a smaller s is
+tried after each step that allows it. The ratio of reduction is squared if there was a factor; otherwise its square root is
+taken. So s approaches the smallest value in a few steps, and then tracks it.
 """
 
 from __future__ import annotations
@@ -23,40 +23,40 @@ from solvers.kernels.line_search import falls
 from solvers.problem import Positions
 
 _KEPT = 0.25
-"""The quadratic model counts as right where a full step lowers the objective by this part of what the slope alone
-promises; of a quadratic function it is one half."""
+"""The quadratic model counts as accurate if a full step decreases the objective by this fraction of the linear
+prediction; for a quadratic function the fraction is one half."""
 
 _QUADRATIC = 0.1
-"""Near a minimum a step of Newton's method leaves at most this part of the slope."""
+"""Near a minimum a Newton step leaves at most this fraction of the slope."""
 
 _LEAST, _MOST, _APART = 0.1, 10.0, 4.0
-"""The multiples of inertia that are added, if any, and how many times smaller the next one is at first."""
+"""Smallest and largest multiple of the inertia that is added, if any, and the initial ratio of its reduction."""
 
 
 class Relaxing(Protocol):
-    """What a system's method knows. inertia, diagonal: of that and of Q, (3f,) [N/m]."""
+    """The data of the method for one system: diagonals of the inertia and of Q, (3f,) [N/m]."""
 
     metric: Metric
     inertia: NDArray[np.float64]
     diagonal: NDArray[np.float64]
 
     def relaxed(self, step: StepObjective, p: Positions) -> Point:
-        """Where what is local leads from p: what a step stretches at second order is taken back."""
+        """Return the point after local relaxation of p, which removes the second-order stretch of a step."""
         ...
 
 
 class Predicting:
-    """Newton's method with predicted tensions, in one solve."""
+    """Newton's method with predicted tensions in one solve."""
 
     def __init__(self, method: Relaxing, step: StepObjective, origin: Point) -> None:
-        """origin: where the first step starts."""
+        """Create the state with the point from which the first step starts."""
         self._method, self._step = method, step
         self._origin: Point | None = origin
         self._tension = np.zeros(len(step.whole.springs.stiffness))
         self._shift, self._apart, self._slope, self._bold = np.inf, _APART, -np.inf, False
 
     def begin(self, at: Point) -> tuple[Point, float, bool]:
-        """A point that is lower, if there is one, by the true tensions; by how much [J]; whether it lies aside."""
+        """Return a lower point by the true tensions, the decrease [J], and whether it lies off a saddle point."""
         step = self._step
         hessian = step.hessian(at.positions)
         descent = hessian.solve_anew(at.gradient, 0.0)
@@ -72,7 +72,7 @@ class Predicting:
         return following, gained(step, at, following), beside is not None
 
     def next(self, point: Point) -> tuple[Point, float, bool]:
-        """A lower point, or the same one; by how much [J]; whether the exact method does better from there."""
+        """Return a lower point or the same one, the decrease [J], and whether to continue with the exact Hessian."""
         step, at = self._step, self._origin or point
         self._origin = None
         hessian = step.hessian(at.positions)
@@ -96,8 +96,10 @@ class Predicting:
         return following, gain, self._shift == 0.0 and kept and slope >= _QUADRATIC * before
 
     def _solved(self, hessian: Hessian, b: Positions) -> Positions | None:
-        """The product of b and the inverse, with less added than the last time where the model was right then, and
-        more where there is no factor."""
+        """Solve with the regularised Hessian.
+
+        The shift is reduced if the model was accurate in the previous step, and increased while there is no factor.
+        """
         if self._bold and self._shift > 0.0:
             less = min(self._shift / self._apart, _MOST)
             less = less if less >= _LEAST else 0.0
@@ -112,12 +114,12 @@ class Predicting:
         return solution
 
     def _shifted(self, hessian: Hessian, b: Positions, shift: float) -> Positions | None:
-        """The same with a multiple of inertia; with negative lateral parts left out where that is infinite."""
+        """Solve with a multiple of the inertia added; an infinite one drops negative transverse parts instead."""
         keep, by = (1.0, shift) if shift < np.inf else (0.0, 0.0)
         return hessian.solve_anew(b, keep, by * self._method.inertia, self._tension)
 
     def _along(self, at: Point, direction: Positions, slope: float) -> tuple[float, Point | None, bool]:
-        """How much of the direction is gone, to where, and whether the objective falls as its model promises."""
+        """Return the step size, the new point, and whether the decrease agrees with the model."""
         step = self._step
         p = step.placed(at.positions + direction)
         if step.rise(at.positions, p)[0] <= _KEPT * slope:
@@ -133,6 +135,6 @@ class Predicting:
 
 
 def gained(step: StepObjective, before: Point, after: Point) -> float:
-    """By how much the objective falls [J], 0 where it rises or round-off hides it."""
+    """Return the decrease of the objective [J]; 0 if it increases or the decrease is below round-off."""
     rise, noise = step.rise(before.positions, after.positions)
     return -rise if -rise > noise else 0.0

@@ -1,11 +1,11 @@
-"""Saddles: points where the gradient vanishes, or nearly, and the Hessian H is not positive definite.
+"""Escape from saddle points, where the gradient (nearly) vanishes and the Hessian H is not positive definite.
 
-    x' H x < 0:   g falls along x and along -x, by x' H x / 2 at second order
+    x' H x < 0:   g decreases along x and along -x, by x' H x / 2 at second order
 
-Symmetric starts lead to them, and a residual does not tell them from minima: a factor of H does. Such a point is left
-for free fall, where that is lower (what is stiff turns over slowly), or along a direction of negative curvature (More
-and Sorensen 1979), found by power iterations on (H + E)^-1 E, with an E that makes H positive definite. The same point
-always gives the same direction.
+Symmetric initial states lead to saddle points. The residual does not distinguish them from minima; a factorisation of H
+does. The next point is the inertial prediction, if it is lower (a stiff system is slow to leave the saddle), or lies
+along a direction of negative curvature (More and Sorensen 1979). Such a direction is computed by power iterations with
+(H + E)^-1 E, where E makes H + E positive definite. It is deterministic for a given point.
 """
 
 from __future__ import annotations
@@ -20,26 +20,32 @@ from solvers.core.objective import Hessian, StepObjective
 from solvers.problem import Positions
 
 _POWERS = 60
-"""Power iterations for a direction of negative curvature. Each widens its lead, however narrow, over the rest."""
+"""Number of power iterations for a direction of negative curvature. Each increases its dominance, however slowly."""
 
 _FEW = 2
-"""The same, to find out on the way whether there is any: an E that leaves springs' negative lateral parts out has no
-share in what is stable, so that a power or two are left with what is not."""
+"""Number of power iterations to detect negative curvature before a saddle point is reached. If E only removes the
+negative transverse parts of springs, stable modes have no component in it, so one or two iterations suffice."""
 
 _NO_DIGITS = 16.0 * np.finfo(np.float64).eps
-"""Curvature this small beside that of Q is round-off: that of a vertex which nothing holds sideways."""
+"""Ratio to the curvature of Q below which curvature is round-off, as at a vertex without transverse stiffness."""
 
 
 def certified(step: StepObjective, p: Positions) -> bool:
-    """Whether the exact Hessian at p (n, 3) is positive definite in floating point."""
+    """Return whether the exact Hessian at p (n, 3) is positive definite in floating point."""
     return step.hessian(p).factorise()
 
 
 def leave(step: StepObjective, at: Point, hessian: Hessian, diagonal: NDArray[np.float64]) -> Point | None:
-    """A lower point than a saddle, None where no curvature is negative but by round-off.
+    """Return a point lower than a saddle point, or None if negative curvature is only round-off.
 
-    hessian: factorised as H + E; diagonal (3f,): that of Q [N/m]. H x = s (H + E) x has an s below zero for such a
-    direction x, and all s are at most 1: the power iteration on 1 - (H + E)^-1 H tends to it.
+    H x = s (H + E) x has a negative s for a direction x of negative curvature, and all s are at most 1. So the power
+    iteration with 1 - (H + E)^-1 H converges to it.
+
+    Args:
+        step: the objective.
+        at: the saddle point.
+        hessian: the Hessian there, factorised as H + E.
+        diagonal: diagonal of Q (3f,) [N/m].
     """
     found = _curved(at, hessian, diagonal, _POWERS)
     if found is None:
@@ -55,9 +61,10 @@ def leave(step: StepObjective, at: Point, hessian: Hessian, diagonal: NDArray[np
 
 
 def aside(step: StepObjective, at: Point, hessian: Hessian, diagonal: NDArray[np.float64]) -> Point | None:
-    """A lower point beside one on the way to a saddle, None where so few powers find no negative curvature.
+    """Return a lower point next to one that approaches a saddle point, or None.
 
-    hessian: at a point near `at`, as in `leave`; so is diagonal.
+    It is None if a few power iterations find no negative curvature. The arguments are those of `escape_saddle`; the
+    Hessian is that of a point near `at`.
     """
     found = _curved(at, hessian, diagonal, _FEW)
     if found is None:
@@ -69,14 +76,14 @@ def aside(step: StepObjective, at: Point, hessian: Hessian, diagonal: NDArray[np
 
 @lru_cache(maxsize=1)
 def _random(count: int) -> Positions:
-    """The same directions (count, 3) each time, without any order or symmetry."""
+    """Return pseudorandom directions (count, 3), identical in each call and without symmetry."""
     x = np.random.default_rng(0).normal(size=(count, 3))
     x.flags.writeable = False
     return x
 
 
 def _curved(at: Point, hessian: Hessian, diagonal: NDArray[np.float64], powers: int) -> tuple[Positions, float] | None:
-    """A direction of negative curvature that does not rise, its largest entry 1, and that curvature [N/m]."""
+    """Return a non-ascending direction of negative curvature, scaled to maximum 1, and its curvature [N/m]."""
     free = hessian.free
     x = np.zeros_like(at.positions)
     x[free] = _random(len(free))

@@ -1,1 +1,1 @@
-"""Potentials of the positions, one a file."""
+"""Potential energies of the positions, one per file."""

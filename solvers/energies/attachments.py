@@ -1,4 +1,4 @@
-"""Attachments: springs of zero rest length from vertices to points that may move.
+"""Attachments: springs of zero rest length from vertices to anchor points that may move.
 
 E(p) = sum_i k_i/2 |p_i - q_i(t)|^2
 """
@@ -18,7 +18,7 @@ from solvers.problem import Positions, Start
 
 @dataclass(frozen=True, eq=False)
 class Attachments(Quadratic):
-    """Attachments of vertices; points: where their other ends are at a time [s], (m, 3) [m]."""
+    """Attachments of vertices; anchor_positions_at: anchor points (m, 3) [m] as a function of time [s]."""
 
     points: Callable[[float], Positions]
 
@@ -26,9 +26,9 @@ class Attachments(Quadratic):
     def of(
         cls, vertices: NDArray[np.int64], stiffness: NDArray[np.float64], points: Callable[[float], Positions], n: int
     ) -> Attachments:
-        """Attachments of vertices (m,) out of n with stiffness k (m,) [N/m], as they are at the time zero."""
+        """Return attachments of vertices (m,) of n with stiffness k (m,) [N/m], at time zero."""
         return cls(selection_matrix_sparse(vertices, n), stiffness, points(0.0), points)
 
     def begin_step(self, start: Start) -> Attachments:
-        """The energy of a step: the points are where they will be at the time of the unknown."""
+        """Return the energy of a step, with the anchor points at the time of the stage."""
         return replace(self, d=self.points(start.until))

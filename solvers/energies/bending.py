@@ -1,16 +1,16 @@
-"""Quadratic bending of surfaces that hardly stretch and are flat at rest (Bergou et al. 2006; Wardetzky et al. 2007).
+"""Quadratic bending of nearly inextensible surfaces that are flat at rest (Bergou et al. 2006; Wardetzky et al. 2007).
 
     E(x) = B/2 sum over inner edges of |K x|^2 / (A0 + A1),   K = (c03 + c04, c01 + c02, -c01 - c03, -c02 - c04)
 
-over the flap of an inner edge x0 x1 and the two corners x2, x3 across, with the cotangents c of the flap's angles at
-the edge and the areas A0, A1 of its triangles, all at rest: 3 K x / (A0 + A1) is the Laplacian's mean over the flap,
-and the matrix is constant. Two things differ from the paper:
+over the flap of an inner edge x0 x1 and the two opposite corners x2, x3, with the cotangents c of the flap's angles at
+the edge and the areas A0, A1 of its triangles, all at rest. 3 K x / (A0 + A1) is the mean Laplacian over the flap, and
+the matrix is constant. There are two differences from the paper:
 
-* It has 3/(A0 + A1). On lattices of right or of equilateral triangles the sum is then the integral of the squared
-  curvature for a sphere, and three times that for a cylinder, into which cloth bends; here a cylinder gets B/2 k^2 a
-  unit of area, as a beam of flexural rigidity B a unit of width.
+* It has the factor 3/(A0 + A1). On lattices of right or of equilateral triangles the sum is then the integral of the
+  squared curvature for a sphere, and three times that for a cylinder, which is the usual shape of bent cloth. Here a
+  cylinder has the energy B/2 k^2 per unit area, like a beam of flexural rigidity B per unit width.
 * A rectangle cut by one diagonal couples bending with twist, so that a strip under its weight would curl sideways and
-  give way by a quarter more. Rectangles count as cut by either diagonal, half each; a lattice of squares then resists
+  sag by a quarter more. Here rectangles count as cut by either diagonal, half each. A lattice of squares then resists
   twice as much along its diagonals as along its lines.
 """
 
@@ -28,17 +28,20 @@ from solvers.problem import Positions
 Indices = NDArray[np.int64]
 
 _SQUARE = 1e-6
-"""Diagonals that differ by no more than this fraction are equally long."""
+"""Diagonals whose lengths differ by no more than this fraction count as equal."""
 
 
 class Bending(Quadratic):
-    """The bending of a surface."""
+    """The bending energy of a surface."""
 
     @classmethod
     def of(cls, rest: Positions, triangles: Indices, stiffness: float) -> Bending:
-        """Bending of triangles (f, 3) of a rest shape (n, 3) [m] with the flexural rigidity B [N m].
+        """Return the bending energy of triangles with areas, of which at most two share an edge.
 
-        The triangles have areas, and at most two of them share an edge.
+        Args:
+            rest: rest positions (n, 3) [m].
+            triangles: (f, 3).
+            stiffness: flexural rigidity B [N m].
         """
         parts = [_stencils(rest, flaps(cut)) for cut in _cuts(rest, triangles)]
         A = scipy.sparse.csr_array(scipy.sparse.vstack([K for K, _ in parts]))
@@ -47,7 +50,7 @@ class Bending(Quadratic):
 
 
 def flaps(triangles: Indices) -> Indices:
-    """The edges that two triangles share, with the corners across, (h, 4)."""
+    """Return the edges that two triangles share, with the opposite corners, (h, 4)."""
     edges = np.concatenate([triangles[:, [k, (k + 1) % 3, (k + 2) % 3]] for k in range(3)])
     edges[:, :2].sort(axis=1)
     edges = edges[np.lexsort((edges[:, 1], edges[:, 0]))]
@@ -56,7 +59,7 @@ def flaps(triangles: Indices) -> Indices:
 
 
 def _cuts(rest: Positions, triangles: Indices) -> Iterator[Indices]:
-    """The triangles, and those that cut all rectangles by the other diagonal, where there are rectangles."""
+    """Yield the triangles, and the triangulation with the other diagonal of all rectangles if there are any."""
     yield triangles
     a, b, c, d = flaps(triangles).T
     diagonal, other = (np.linalg.norm(rest[i] - rest[j], axis=1) for i, j in ((a, b), (c, d)))
@@ -72,7 +75,7 @@ def _cuts(rest: Positions, triangles: Indices) -> Iterator[Indices]:
 
 
 def _stencils(rest: Positions, flap: Indices) -> tuple[scipy.sparse.csr_array, NDArray[np.float64]]:
-    """K of each flap (h, 4) as rows (h, n), and the areas A0 + A1 (h,) [m^2]."""
+    """Return K of each flap (h, 4) as rows (h, n), and the areas A0 + A1 (h,) [m^2]."""
     x0, x1, x2, x3 = (rest[corner] for corner in flap.T)
     c01, c02 = _cotangent(x1 - x0, x2 - x0), _cotangent(x1 - x0, x3 - x0)
     c03, c04 = _cotangent(x0 - x1, x2 - x1), _cotangent(x0 - x1, x3 - x1)

@@ -1,13 +1,13 @@
-"""Dashpots: an edge resists the speed at which its length changes, by f = -c n n'(v_i - v_j).
+"""Dashpots: the force f = -c n n'(v_i - v_j) opposes the rate of change of an edge's length.
 
-The direction n is that at the step's start, so the force is linear. Integrators of order 2 take it from where the
-velocity would bring the edges by the time of the unknown, and keep their order. Since the unknown moves with the
-velocity rate (x - origin), the force is the gradient of
+The direction n is that at the start of the step, so the force is linear. Integrators of order 2 evaluate n at positions
+that are extrapolated to the time of the stage, and preserve their order. Since the stage moves with the velocity
+velocity_rate (x - velocity_origin), the force is the gradient of
 
-    E(x) = sum_e c_e rate/2 (n_e'(A x - A origin)_e)^2
+    E(x) = sum_e c_e velocity_rate/2 (n_e'(A x - A velocity_origin)_e)^2
 
-a projective energy (Bouaziz et al. 2014): the nearest vectors d_e without a speed along n_e make a plane. Equal and
-opposite forces along the edge as it was conserve linear and, by implicit Euler, angular momentum.
+This is a projective energy (Bouaziz et al. 2014): the vectors d_e without a velocity along n_e form a plane. Equal and
+opposite forces along the lagged edge conserve linear momentum and, for implicit Euler, angular momentum.
 """
 
 from __future__ import annotations
@@ -57,8 +57,10 @@ def _rise(numbers, e, z0, z1, z2, s0, s1, s2):
 class Dashpots(Edges):
     """Dashpots along edges.
 
-    stiffness: c (m,) [N s/m] as made, which is c rate [N/m] at a rate of 1/s, and c rate once a step has begun;
-    direction: n (m, 3), that of the rest shape as made; offset: n'A origin (m,) [m], 0 as made.
+    Attributes:
+        stiffness: c (m,) [N s/m] initially, i.e. c velocity_rate [N/m] at a rate of 1/s; c velocity_rate in a step.
+        direction: n (m, 3), initially that of the rest shape.
+        offset: n'A velocity_origin (m,) [m], initially 0.
     """
 
     direction: Positions
@@ -69,27 +71,27 @@ class Dashpots(Edges):
 
     @cached_property
     def elements(self) -> Elements:
-        """The edges, with their damping, directions and offsets."""
+        """The edges with their damping, directions and offsets."""
         return Elements.along(self.edges, self.stiffness, self.direction, self.offset)
 
     @classmethod
     def along(cls, rest: Positions, edges: NDArray[np.int64], damping: NDArray[np.float64]) -> Dashpots:
-        """Dashpots along edges (m, 2) of a rest shape (n, 3) [m] with coefficients c (m,) [N s/m]."""
+        """Return dashpots along edges (m, 2) of a rest shape (n, 3) [m] with coefficients c (m,) [N s/m]."""
         _, direction = rest_directions(rest, edges)
         return cls(edges, damping, direction, np.zeros(len(edges)))
 
     def begin_step(self, start: Start) -> Dashpots:
-        """The energy of a step."""
+        """Return the energy of a step."""
         _, n = directions(self._along(start.expected), self.direction)
         offset = _dot(n, self._along(start.origin))
         return replace(self, stiffness=start.rate * self.stiffness, direction=n, offset=offset)
 
     def _closing(self, p: Positions) -> NDArray[np.float64]:
-        """n'(A p - A origin), (m,) [m]."""
+        """Return n'(A p - A velocity_origin), (m,) [m]."""
         return _dot(self.direction, self._along(p)) - self.offset
 
     def value(self, p: Positions) -> float:
-        """The energy [J] at p, shape (n, 3): half of what the dashpots take in the time 1/rate."""
+        """Return the energy [J] at p, shape (n, 3): half the energy dissipated in the time 1/velocity_rate."""
         return 0.5 * float(self.stiffness @ self._closing(p) ** 2)
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
@@ -97,20 +99,20 @@ class Dashpots(Edges):
         self._add(self._closing(p)[:, None] * self.direction, out)
 
     def add_projection(self, p: Positions, out: Positions) -> None:
-        """The local step: add A'K d(p) [N], shape (n, 3), to `out`."""
+        """Add A'K d(p) [N], shape (n, 3), to `out` (the local step)."""
         self._add(self._along(p) - self._closing(p)[:, None] * self.direction, out)
 
     def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
-        """Add k (|p_i| + |p_j| + |offset|) [N] to `out` (n,) at both ends (`solvers.round_off`)."""
+        """Add k (|p_i| + |p_j| + |offset|) [N] to `out` (n,) at both ends (`rounding_bound`)."""
         self._add_absolute(self._reach(p) + np.abs(self.offset), out)
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
-        """The Hessian [N/m], shape (3n, 3n): k nn' an edge."""
+        """Return the Hessian [N/m], shape (3n, 3n), with k nn' per edge."""
         return self._blocks(np.zeros(len(self.edges)), self.direction, len(p))
 
 
 class RayleighDashpots(Dashpots):
-    """The part of Rayleigh damping that is in proportion to the stiffness of springs."""
+    """The stiffness-proportional part of Rayleigh damping of springs."""
 
 
 def _dot(a: Positions, b: Positions) -> NDArray[np.float64]:

@@ -1,11 +1,11 @@
-"""Energies of many like elements, compiled from what each states of a single one.
+"""Energies of many equal elements, compiled from the functions of a single element.
 
     E(p) = sum_e phi_e(z_e),   z = A p,   grad E = A' grad phi,   Hess E = A' (Hess phi) A
 
-A row of A has a few coefficients: one at an obstacle, +1 and -1 along an edge. An energy states a law: phi(z) of one
-element, its first and second derivatives, and its rise from z to z + s in differences that keep their digits. From
-that it has its passes over all elements here, and its places in the matrices of blocks, its products and its share of
-a vertex's block, which need no more than the second derivatives.
+A row of A has a few coefficients: one at an obstacle, +1 and -1 along an edge. An energy provides the law of one
+element: phi(z), its first and second derivatives, and its change from z to z + s in a form that avoids cancellation.
+From these functions this module builds the passes over all elements. It also builds the entries in block matrices, the
+products and the contributions to vertex blocks, which need only the second derivatives.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from solvers.compiling import inner, kernel
 
 
 class Elements(NamedTuple):
-    """Rows of A, all of one width: vertices (m, k) and their coefficients (m, k); numbers (m, q): what phi reads."""
+    """Rows of A of one width: vertices (m, k), coefficients (m, k), and parameters of phi (m, q)."""
 
     vertices: NDArray[np.int64]
     coefficients: NDArray[np.float64]
@@ -28,13 +28,16 @@ class Elements(NamedTuple):
 
     @classmethod
     def along(cls, edges: NDArray[np.int64], *numbers: NDArray[np.float64]) -> Elements:
-        """Edges (m, 2), z from their second end to their first; numbers: columns, (m,) or (m, c)."""
+        """Return elements of edges (m, 2), z from second to first end, with columns of parameters, (m,) or (m, c)."""
         return cls(edges, np.tile([1.0, -1.0], (len(edges), 1)), np.column_stack(numbers))
 
 
 class One(NamedTuple):
-    """phi of one element: `inner` functions of the numbers (m, q), the element e and z0, z1, z2; `rise` has s0, s1, s2
-    too. They return phi, its first derivatives (3), its second (6), and phi(z + s) - phi(z)."""
+    """The functions of one element, compiled as inner functions.
+
+    Their arguments are the parameters (m, q), the element e and z0, z1, z2; that of the change also has s0, s1, s2.
+    They return phi, its first derivatives (3), its second derivatives (6), and phi(z + s) - phi(z).
+    """
 
     value: Any
     gradient: Any
@@ -43,11 +46,16 @@ class One(NamedTuple):
 
 
 class Law(NamedTuple):
-    """phi of one element, as passes over all of them.
+    """The law of one element as passes over all elements.
 
-    value(elements, p) [J]; add_gradient(elements, p, out): adds it [N] to `out`, (n, 3); rise(elements, p, q): from p
-    to q [J]; curve(elements, p, out): writes the second derivatives, xx, xy, xz, yy, yz, zz of each element [N/m], to
-    `out` (m, 6); constant: whether they do not depend on p; one: the functions that it is made of.
+    Attributes:
+        value: function (elements, p) that returns the energy [J].
+        add_gradient: function (elements, p, out) that adds the gradient [N] to `out`, (n, 3).
+        rise: function (elements, p, q) that returns the change from p to q [J].
+        curve: function (elements, p, out) that writes the second derivatives xx, xy, xz, yy, yz, zz of each element
+            [N/m] to `out` (m, 6).
+        constant: whether the second derivatives do not depend on p.
+        one: functions of a single element.
     """
 
     value: Callable[..., float]
@@ -59,7 +67,7 @@ class Law(NamedTuple):
 
     @classmethod
     def of(cls, value: Any, gradient: Any, curvature: Any, rise: Any, *, constant: bool = False) -> Law:
-        """The passes of the functions of `One`."""
+        """Build the passes from the functions of a single element (see `ElementFunctions`)."""
 
         @kernel
         def values(elements, p):
@@ -106,7 +114,7 @@ class Law(NamedTuple):
 
 @inner
 def seen(elements, e, p):
-    """z of element e at p (n, 3)."""
+    """Return z of element e at p (n, 3)."""
     z0 = z1 = z2 = 0.0
     for a in range(elements.vertices.shape[1]):
         i, c = elements.vertices[e, a], elements.coefficients[e, a]
@@ -116,7 +124,7 @@ def seen(elements, e, p):
 
 @inner
 def line(along, across, n0, n1, n2):
-    """The second derivatives of what resists by `along` along n, a unit vector, and by `across` across it."""
+    """Return the Hessian with stiffness `along` the unit vector n and stiffness `across` perpendicular to it."""
     more = along - across
     return (
         more * n0 * n0 + across, more * n0 * n1, more * n0 * n2,
@@ -127,7 +135,9 @@ def line(along, across, n0, n1, n2):
 class Joined(NamedTuple):
     """The rows of A of many energies.
 
-    first (m + 1,): the first entry of each row; vertices, coefficients: of the entries.
+    Attributes:
+        first: index of the first entry of each row (m + 1,).
+        vertices, coefficients: of the entries.
     """
 
     first: NDArray[np.int64]
@@ -136,7 +146,7 @@ class Joined(NamedTuple):
 
     @classmethod
     def of(cls, parts: list[Elements]) -> Joined:
-        """The rows of some energies, in their order."""
+        """Concatenate the rows of several energies."""
         widths = [np.full(len(x.vertices), x.vertices.shape[1]) for x in parts]
         return cls(
             np.append(0, np.cumsum(np.concatenate(widths))),
@@ -147,9 +157,13 @@ class Joined(NamedTuple):
 
 @kernel
 def add_blocks(elements, places, curvature, values):
-    """Add the second derivatives (m, 6) of elements to the blocks `values`, (b, 3, 3).
+    """Add the second derivatives (m, 6) of elements to matrix blocks (b, 3, 3).
 
-    places (m, k^2): of the blocks of every vertex with every one, -1 for none.
+    Args:
+        elements: the elements.
+        places: block of each pair of an element's vertices (m, k^2), -1 for none.
+        curvature: second derivatives (m, 6) [N/m].
+        values: blocks (b, 3, 3) [N/m].
     """
     width = elements.vertices.shape[1]
     for e in range(len(curvature)):
@@ -175,7 +189,7 @@ def add_blocks(elements, places, curvature, values):
 
 @inner
 def add_products(joined, curvature, x, out):
-    """Add the product [N] of all second derivatives with x [m], (n, 3), to `out`; nothing without elements."""
+    """Add the product [N] of all second derivatives with x [m], (n, 3), to `out`; do nothing without elements."""
     if joined is None:
         return
     for e in range(len(curvature)):

@@ -3,8 +3,8 @@
     E(x) = -p0 V0 ln(V/V0),   V = sum over triangles of a.(b x c)/6,   grad E = -(p0 V0/V) grad V
     Hess E = p/V grad V grad V' - p Hess V,   p = p0 V0/V
 
-Without springs that hold it together the gas would expand for ever. A surface turned inside out has no such energy: it
-is infinite there, so that a line search turns back. The energy is not projective.
+The gas needs springs that enclose it, or it expands without limit. The energy is infinite for an inverted surface, so
+that a line search rejects it. The energy is not projective.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from solvers.matrices import without_zeros
 from solvers.problem import Positions
 
 _INSIDE_OUT = 1e-3
-"""Where the volume is not positive, the gradient is taken as if it were this fraction of that at rest."""
+"""Fraction of the rest volume that replaces a non-positive volume in the gradient."""
 
 _LEVI_CIVITA = np.array([np.cross(np.eye(3), e) for e in np.eye(3)])
 """[a]x = sum_k a_k LC[k] is the matrix of the cross product, [a]x b = a x b."""
@@ -29,7 +29,10 @@ _LEVI_CIVITA = np.array([np.cross(np.eye(3), e) for e in np.eye(3)])
 class Gas:
     """Gas in a closed surface.
 
-    triangles: (f, 3), outwards; pressure: p0 [Pa] at the volume: V0 [m^3].
+    Attributes:
+        triangles: (f, 3), oriented outwards.
+        pressure: p0 [Pa] at the rest volume.
+        volume: rest volume V0 [m^3].
     """
 
     triangles: NDArray[np.int64]
@@ -37,7 +40,7 @@ class Gas:
     volume: float
 
     def volume_at(self, p: Positions) -> float:
-        """V [m^3] at p, shape (n, 3); negative inside out."""
+        """Return V [m^3] at p, shape (n, 3); negative if the surface is inverted."""
         a, b, c = self._corners(p)
         return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6.0
 
@@ -46,18 +49,18 @@ class Gas:
         return [x[corner] for corner in self.triangles.T]
 
     def value(self, p: Positions) -> float:
-        """The energy [J] at p, shape (n, 3), zero at rest; infinite where the volume is not positive."""
+        """Return the energy [J] at p, shape (n, 3), zero at rest; infinite if the volume is not positive."""
         volume = self.volume_at(p)
         return -self.pressure * self.volume * float(np.log(volume / self.volume)) if volume > 0.0 else np.inf
 
     def _pressure_at(self, p: Positions) -> tuple[float, float]:
-        """The pressure [Pa] and the volume [m^3] that it is taken at."""
+        """Return the pressure [Pa] and the volume [m^3] at which it is evaluated."""
         volume = self.volume_at(p)
         volume = volume if volume > 0.0 else _INSIDE_OUT * self.volume
         return self.pressure * self.volume / volume, volume
 
     def _volume_gradient(self, p: Positions) -> Positions:
-        """grad V, (n, 3) [m^2]."""
+        """Return grad V, (n, 3) [m^2]."""
         a, b, c = self._corners(p)
         out = np.zeros_like(p)
         for corner, area in zip(self.triangles.T, (np.cross(b, c), np.cross(c, a), np.cross(a, b)), strict=True):
@@ -69,8 +72,11 @@ class Gas:
         out -= self._pressure_at(p)[0] * self._volume_gradient(p)
 
     def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
-        """Add p |b||c|/6 and what the rounding of b and c makes of it at each corner of each triangle a b c, and p/V
-        |grad V| times what V is off by, [N], to `out` (n,) (`solvers.round_off`)."""
+        """Add the absolute terms [N] of the gradient to `out` (n,) (`rounding_bound`).
+
+        They are p |b||c|/6 plus the effect of the rounding of b and c at each corner of each triangle a b c, and
+        p/V |grad V| times the error of V.
+        """
         pressure, volume = self._pressure_at(p)
         size, relative = (np.linalg.norm(x, axis=1) for x in (p, p - p.mean(axis=0)))
         size = size + np.abs(p).mean(axis=0).sum()  # the mean is rounded too
@@ -85,16 +91,16 @@ class Gas:
         out += pressure * (areas + off / volume * slope)
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
-        """The Hessian [N/m], shape (3n, 3n), all of whose entries differ from zero: see `sparse_hessian`."""
+        """Return the Hessian [N/m], shape (3n, 3n), which has no zero entries; see `sparse_hessian`."""
         column = self.columns(p).ravel()
         return without_zeros(scipy.sparse.csr_array(self.sparse_hessian(p) + np.outer(column, column)))
 
     def sparse_hessian(self, p: Positions) -> scipy.sparse.csr_array:
-        """-p Hess V [N/m], shape (3n, 3n), sparse and indefinite."""
+        """Return -p Hess V [N/m], shape (3n, 3n), sparse and indefinite."""
         return without_zeros(scipy.sparse.csr_array(-self._pressure_at(p)[0] * self._volume_hessian(p)))
 
     def columns(self, p: Positions) -> NDArray[np.float64]:
-        """(p/V)^(1/2) grad V [(N/m)^(1/2)], shape (n, 3, 1): its square is the rest of the Hessian."""
+        """Return V = (p/V)^(1/2) grad V [(N/m)^(1/2)], shape (n, 3, 1); V V' is the rest of the Hessian."""
         pressure, volume = self._pressure_at(p)
         return (np.sqrt(pressure / volume) * self._volume_gradient(p))[:, :, None]
 

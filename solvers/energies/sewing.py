@@ -1,9 +1,9 @@
-"""Sewing springs: threads from vertex to vertex that are drawn in over time.
+"""Sewing springs: threads between vertices that shorten over time.
 
     E(p) = sum_e k_e/2 max(0, |p_i - p_j| - l_e(t))^2
 
-A thread pulls where it is longer than it may be at the time of the unknown, and never pushes: strain limits whose
-longest length shrinks.
+A thread pulls if it is longer than its limit at the time of the stage, and never pushes. So these are strain limits
+whose maximum length decreases.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from solvers.problem import Positions, Start
 
 @dataclass(frozen=True, eq=False)
 class Sewing(StrainLimits):
-    """Threads; longest: their lengths at a time [s], (m,) [m]."""
+    """Threads; max_length_at: their maximum lengths (m,) [m] as a function of time [s]."""
 
     longest: Callable[[float], NDArray[np.float64]]
 
@@ -33,9 +33,9 @@ class Sewing(StrainLimits):
         stiffness: NDArray[np.float64],
         longest: Callable[[float], NDArray[np.float64]],
     ) -> Sewing:
-        """Threads between pairs (m, 2) of a rest shape (n, 3) [m] with stiffness k (m,) [N/m], as at the time zero."""
+        """Return threads between pairs (m, 2) of a rest shape (n, 3) [m] with stiffness k (m,) [N/m], at time zero."""
         return cls(pairs, stiffness, np.zeros(len(pairs)), longest(0.0), rest_directions(rest, pairs)[1], longest)
 
     def begin_step(self, start: Start) -> Sewing:
-        """The energy of a step: threads are as long as they will be at the time of the unknown."""
+        """Return the energy of a step, with the maximum lengths at the time of the stage."""
         return replace(self, high=self.longest(start.until))

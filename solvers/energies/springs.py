@@ -2,8 +2,8 @@
 
     E(p) = sum_e k_e/2 (|v_e| - r_e)^2,   v = A p,   grad E = A'K (v - d),   d_e = r_e v_e / |v_e|
 
-A spring of zero length has no direction. It takes that of its rest shape, and a fixed one if that has none
-either: one convention in the energy's gradient and in every solver, so the same step follows from both.
+A spring of zero length has no direction. It is assigned that of its rest shape, or a fixed direction if the rest length
+is zero too. The gradient of the energy and all solvers use this convention, so that they compute the same step.
 """
 
 from __future__ import annotations
@@ -24,8 +24,11 @@ from solvers.round_off import EPS
 class Springs(Edges):
     """Springs between pairs of vertices.
 
-    edges: (m, 2); stiffness: k (m,) [N/m], not negative; rest_length: r (m,) [m], not negative;
-    rest_direction: (m, 3), unit vectors that springs of zero length take.
+    Attributes:
+        edges: (m, 2).
+        stiffness: k (m,) [N/m], not negative.
+        rest_length: r (m,) [m], not negative.
+        rest_direction: (m, 3), unit directions of springs of zero length.
     """
 
     rest_length: NDArray[np.float64]
@@ -33,9 +36,14 @@ class Springs(Edges):
 
     @classmethod
     def at_rest(cls, rest: Positions, edges: NDArray[np.int64], stiffness: NDArray[np.float64]) -> Springs:
-        """Springs whose rest shape is `rest`, (n, 3) [m], with stiffness (m,) [N/m].
+        """Return springs whose rest shape is `rest`.
 
-        Rest lengths that differ by the round-off of positions alone are made equal.
+        Rest lengths that differ only by the round-off of positions are made equal.
+
+        Args:
+            rest: rest positions (n, 3) [m].
+            edges: (m, 2).
+            stiffness: (m,) [N/m].
         """
         length, direction = rest_directions(rest, edges)
         round_off = 4.0 * np.finfo(float).eps * float(np.abs(rest).max(initial=0.0))
@@ -43,7 +51,7 @@ class Springs(Edges):
 
     @classmethod
     def joined(cls, parts: Sequence[Springs]) -> Springs:
-        """All springs of the parts as one energy, in their order; none at all for no parts."""
+        """Concatenate the springs of all parts in their order; an empty set for no parts."""
         if len(parts) == 1:
             return parts[0]
         none = cls(np.empty((0, 2), np.int64), np.empty(0), np.empty(0), np.empty((0, 3)))
@@ -51,11 +59,11 @@ class Springs(Edges):
         return cls(*(np.concatenate(arrays) for arrays in fields))
 
     def value(self, p: Positions) -> float:
-        """The elastic energy [J] at p, shape (n, 3)."""
+        """Return the elastic energy [J] at p, shape (n, 3)."""
         return 0.5 * float(self.stiffness @ (self.lengths(p) - self.rest_length) ** 2)
 
     def hessian_at_rest(self, lateral: float, n: int) -> scipy.sparse.csr_array:
-        """The Hessian [N/m], (3n, 3n), of the rest shape, did springs resist by `lateral` k across their length."""
+        """Return the Hessian [N/m], (3n, 3n), of the rest shape with a transverse stiffness of `lateral_ratio` k."""
         across = np.where(self.rest_length == 0.0, 1.0, lateral)
         return self._blocks(across, self.rest_direction, n)
 
@@ -66,14 +74,14 @@ class Springs(Edges):
         self._add(v - self.rest_length[:, None] * unit, out)
 
     def add_projection(self, p: Positions, out: Positions) -> None:
-        """The local step: add A'K d(p) [N], shape (n, 3), to `out`."""
+        """Add A'K d(p) [N], shape (n, 3), to `out` (the local step)."""
         _, unit = directions(self._along(p), self.rest_direction)
         self._add(self.rest_length[:, None] * unit, out)
 
     def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
-        """Add k (max(1, r/l - 1) (|p_i| + |p_j|) + l + r) [N] to `out` (n,) at both ends (`solvers.round_off`).
+        """Add k (max(1, r/l - 1) (|p_i| + |p_j|) + l + r) [N] to `out` (n,) at both ends (`rounding_bound`).
 
-        A direction is off by no more than its own length, so that a spring of nearly no length adds 2 k r / eps.
+        The error of a unit direction is at most of order 1, so that a spring of nearly zero length adds 2 k r / eps.
         """
         length, r = self.lengths(p), self.rest_length
         lateral = np.divide(r, length, out=np.full_like(length, np.inf), where=length > TINY) - 1.0
@@ -82,9 +90,10 @@ class Springs(Edges):
         self._add_absolute(turned + length + r, out)
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
-        """The Hessian [N/m], shape (3n, 3n): k (nn' + (1 - r/l)(I - nn')) a spring, n its direction, l its length.
+        """Return the Hessian [N/m], shape (3n, 3n).
 
-        A spring of zero length and positive rest length has no lateral curvature; it is given none.
+        It is k (nn' + (1 - r/l)(I - nn')) per spring, n its direction, l its length. A spring of zero length and
+        positive rest length has no defined transverse stiffness; it is set to zero.
         """
         length, unit = directions(self._along(p), self.rest_direction)
         ratio = np.divide(self.rest_length, length, out=np.ones_like(length), where=length > TINY)
@@ -92,7 +101,7 @@ class Springs(Edges):
 
 
 def _levelled(lengths: NDArray[np.float64], round_off: float) -> NDArray[np.float64]:
-    """The lengths (m,) [m], each the least of those that it can be told from by no more than `round_off` [m]."""
+    """Return the lengths (m,) [m], each replaced by the smallest of its group with gaps up to `round_off` [m]."""
     order = np.argsort(lengths, kind="stable")
     ascending = lengths[order]
     first = np.diff(ascending, prepend=-np.inf) > round_off

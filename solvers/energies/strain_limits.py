@@ -1,9 +1,9 @@
-"""Strain limits: an edge resists only where it is longer or shorter than it may be (Bouaziz et al. 2014, section 5.1).
+"""Strain limits: an edge resists only beyond its minimum or maximum length (Bouaziz et al. 2014, section 5.1).
 
     E(p) = sum_e k_e/2 (|v_e| - t_e)^2,   v = A p,   t_e = min(max(|v_e|, low_e), high_e)
 
-The nearest vector of an allowed length is d_e = t_e v_e/|v_e|: a projective energy, whose A'KA is in Q even while no
-limit is reached.
+The nearest vector of an allowed length is d_e = t_e v_e/|v_e|. So this is a projective energy, whose A'KA is part of Q
+even while no limit is active.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from solvers.problem import Positions
 from solvers.round_off import EPS
 
 _SURE = 1.0 + 4.0 * EPS
-"""By so much a squared length is within squared limits for the length to be within the limits, rounded as they are."""
+"""Margin of the squared limits within which a rounded length is certainly within the limits."""
 
 
 @inner
 def _within(numbers, e, squared):
-    """Whether the limits say nothing for sure, known without a root."""
+    """Return whether a squared length is certainly within the limits, without a square root."""
     low, high = numbers[e, 1], numbers[e, 2]
     return low * low * _SURE <= squared and squared * _SURE <= high * high
 
 
 @inner
 def excess(numbers, e, length):
-    """By how much a length is beyond the limits."""
+    """Return the length beyond the limits, negative below the minimum."""
     return length - min(max(length, numbers[e, 1]), numbers[e, 2])
 
 
 @inner
 def direction(numbers, e, length, z0, z1, z2):
-    """Of an element, from its second end to its first; one of no length takes that of its rest shape."""
+    """Return the unit vector from second to first end; that of the rest shape for zero length."""
     if length <= TINY:
         return numbers[e, 3], numbers[e, 4], numbers[e, 5]
     return z0 / length, z1 / length, z2 / length
@@ -95,10 +95,11 @@ def _rise(numbers, e, z0, z1, z2, s0, s1, s2):
 
 @dataclass(frozen=True, eq=False)
 class StrainLimits(Edges):
-    """Edges whose lengths are limited.
+    """Edges with limited lengths.
 
-    low, high: the lengths allowed (m,) [m], 0 <= low <= high; rest_direction: (m, 3), unit vectors that edges of zero
-    length take.
+    Attributes:
+        low, high: minimum and maximum lengths (m,) [m], 0 <= low <= high.
+        rest_direction: (m, 3), unit directions of edges of zero length.
     """
 
     low: NDArray[np.float64]
@@ -109,17 +110,17 @@ class StrainLimits(Edges):
 
     @cached_property
     def elements(self) -> Elements:
-        """The edges, with their stiffness, limits and directions."""
+        """The edges with their stiffness, limits and directions."""
         return Elements.along(self.edges, self.stiffness, self.low, self.high, self.rest_direction)
 
     def _beyond(self, p: Positions) -> tuple[Positions, NDArray[np.float64], NDArray[np.float64], Positions]:
-        """v (m, 3), the length |v| and by how much it is beyond the limits (m,), the directions (m, 3)."""
+        """Return v (m, 3), the length |v| (m,), its excess beyond the limits (m,) and the directions (m, 3)."""
         v = self._along(p)
         length, unit = directions(v, self.rest_direction)
         return v, length, length - np.clip(length, self.low, self.high), unit
 
     def value(self, p: Positions) -> float:
-        """The energy [J] at p, shape (n, 3); zero within the limits."""
+        """Return the energy [J] at p, shape (n, 3); zero within the limits."""
         _, _, beyond, _ = self._beyond(p)
         return 0.5 * float(self.stiffness @ beyond**2)
 
@@ -129,13 +130,15 @@ class StrainLimits(Edges):
         self._add(beyond[:, None] * unit, out)
 
     def add_projection(self, p: Positions, out: Positions) -> None:
-        """The local step: add A'K d(p) [N], shape (n, 3), to `out`."""
+        """Add A'K d(p) [N], shape (n, 3), to `out` (the local step)."""
         v, _, beyond, unit = self._beyond(p)
         self._add(v - beyond[:, None] * unit, out)
 
     def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
-        """Add k (max(1, |l - t|/l) (|p_i| + |p_j|) + 2 l) [N] to `out` (n,) at both ends of edges that are beyond
-        their limits, or that round-off may take there; all others add nothing (`solvers.round_off`)."""
+        """Add k (max(1, |l - t|/l) (|p_i| + |p_j|) + 2 l) [N] to `out` (n,) at both ends (`rounding_bound`).
+
+        Only edges that exceed their limits, or may do so by round-off, contribute.
+        """
         _, length, beyond, _ = self._beyond(p)
         reach = self._reach(p)
         near = np.maximum(length - self.high, self.low - length) >= -EPS * (reach + length)
@@ -144,7 +147,7 @@ class StrainLimits(Edges):
         self._add_absolute(np.where(near, turned + 2.0 * length, 0.0), out)
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
-        """The Hessian [N/m], shape (3n, 3n): that of springs beyond the limits, nothing within."""
+        """Return the Hessian [N/m], shape (3n, 3n): that of springs beyond the limits, zero within them."""
         _, length, beyond, unit = self._beyond(p)
         lateral = np.divide(beyond, length, out=np.zeros_like(length), where=length > TINY)
         return self._blocks(lateral, unit, len(p), ((beyond != 0.0) | (self.low == self.high)).astype(float))
