@@ -1,7 +1,7 @@
-"""Where a method computes: on the processor, or on a device.
+"""Options and interfaces for methods that run on the processor or on a device.
 
-A method that can do both inherits `OnDevice`, or `Precise`, and hands its `prepare` over to its file of `solvers.cuda`,
-which nobody imports who does not ask for a device.
+A method that supports both inherits `DeviceOptions` or `PrecisionOptions`, and delegates its `prepare` to its file in
+`solvers.cuda`, which is imported only if a device is requested.
 """
 
 from __future__ import annotations
@@ -16,15 +16,17 @@ from solvers.problem import Positions, Solution, StepProblem
 
 Device = Literal["cpu", "cuda"]
 SIMULATED = "Numba's simulator, no device"
-"""What rows call Numba's simulator."""
+"""Name of Numba's simulator in rows."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OnDevice:
-    """device: where it computes.
+    """The option where to compute.
 
-    unstated: parameters that rows and hashes leave out where they have their default, which is what was before there
-    was another.
+    Attributes:
+        device: processor or device.
+        unstated: parameters that rows and hashes omit at their default, so that they equal those from before the
+            parameter existed.
     """
 
     unstated: ClassVar[frozenset[str]] = frozenset({"device", "precision"})
@@ -34,18 +36,18 @@ class OnDevice:
 
 @dataclass(frozen=True, kw_only=True)
 class Precise(OnDevice):
-    """precision: of kernels on a device, float32 if left out, with residuals in float64; the processor has float64."""
+    """The precision of device kernels, float32 by default, with residuals in float64; the processor uses float64."""
 
     precision: Literal["float32", "float64"] | None = None
 
     def __post_init__(self) -> None:
-        """Raises ValueError."""
+        """Raise ValueError for float32 on the processor."""
         if self.precision == "float32" and self.device == "cpu":
             raise ValueError("precision: float32 is for `device: cuda`; the processor computes in float64 here")
 
     @property
     def real(self) -> type[np.float32] | type[np.float64]:
-        """What kernels on a device compute in."""
+        """Floating-point type of device kernels."""
         return np.float64 if self.precision == "float64" else np.float32
 
 
@@ -53,12 +55,12 @@ class Event(Protocol):
     """A point on a device's stream."""
 
     def elapsed_time(self, event: Any) -> float:
-        """Milliseconds from here to an event that is later on the stream."""
+        """Return the milliseconds from this event to a later one on the stream."""
         ...
 
 
 class Marks(NamedTuple):
-    """What a solve put on the stream: it began, its data are there (up), kernels are done, its end is copied (down)."""
+    """The events of a solve: start, data uploaded (up), kernels finished (done), result downloaded (down)."""
 
     began: Event
     up: Event
@@ -68,30 +70,34 @@ class Marks(NamedTuple):
 
 @runtime_checkable
 class Remote(Protocol):
-    """A prepared solver that computes on a device. Its iterates are copied where somebody asks for them; its times are
-    taken of the same iterates where nobody does."""
+    """A prepared solver on a device.
+
+    Its iterates are copied on request only; timings are taken of the same iterates without copies.
+    """
 
     @property
     def columns(self) -> Mapping[str, Any]:
-        """What rows tell of the device."""
+        """Columns of rows that describe the device."""
         ...
 
     def state(self) -> dict[str, float | None]:
-        """Columns of the device's clocks, power and temperature now; None for what it does not tell."""
+        """Return columns of the device's current clocks, power and temperature; None for unavailable ones."""
         ...
 
     def replay(self, problem: StepProblem, iterations: int) -> tuple[Solution, Marks | None]:
-        """The solution of a host's problem after so many iterations, without a residual; None for marks of a device
-        that has no clock."""
+        """Return the solution of a host problem after n iterations, without residual, and its events.
+
+        The events are None for a device without a clock.
+        """
         ...
 
     def uncopied(self, problem: StepProblem) -> Iterator[Callable[[], Positions]]:
-        """The iterates of `iterates`, each done when it is yielded, and copied where it is called."""
+        """Yield the iterates of `iterates` when computed, as callables that copy them."""
         ...
 
 
 def told(prepared: object) -> dict[str, Any]:
-    """The columns of rows that tell of a prepared solver's device; none of one that computes on the processor."""
+    """Return the columns that describe a prepared solver's device; empty for one on the processor."""
     usual = getattr(prepared, "usual", prepared)  # of two systems
     return dict(usual.columns) if isinstance(usual, Remote) else {}
 
@@ -100,7 +106,7 @@ _BROKEN: list[str] = []
 
 
 def broken(reason: str = "") -> bool:
-    """Whether this process lost its device, and cannot have it back; with a reason it has."""
+    """Return whether this process has lost its device permanently; a reason records such a loss."""
     if reason:
         _BROKEN.append(reason)
     return bool(_BROKEN)

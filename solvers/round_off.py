@@ -68,7 +68,8 @@ def at_rest(problem: StepProblem, p: Positions, factor: float = FACTOR) -> bool:
     """Return whether the gradient at p (n, 3) [m] is round-off at every free vertex.
 
     It is if it is at most `factor` times the bound, and the bound is finite. A sum over vertices would let the
-    round-off of one part hide the gradient of another. Vertices with a penalty pin are included, because others depend on them.
+    round-off of one part hide the gradient of another. Vertices with a penalty pin are included, because
+    others depend on them.
     """
     bound, size = gradient_round_off(problem, p), lengths(problem.gradient(p))
     return bool(((size <= factor * bound) & np.isfinite(bound))[problem.system.free].all())

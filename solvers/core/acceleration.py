@@ -1,5 +1,7 @@
-"""What accelerated first-order methods iterate on, whatever the energies and the factor of Q: kernels of
-`solvers.kernels.accelerate` take turns with the energies' own values and gradients, and with the factor's own solve.
+"""Accelerated first-order methods with any energies and any factor of Q.
+
+Kernels of `solvers.kernels.accelerated_descent` alternate with the energies' own values and gradients and with the
+factor's solve.
 """
 
 from __future__ import annotations
@@ -22,8 +24,15 @@ from solvers.problem import Positions, StepProblem
 
 @dataclass(frozen=True)
 class Scheme:
-    """name: in the registry; coefficients: which, see `accelerate_coefficients`; pairs: kept in the window; retries:
-    shorter steps along a direction before the plain correction; projective: whether other energies are refused."""
+    """An acceleration scheme.
+
+    Attributes:
+        name: name in the registry.
+        coefficients: rule of the coefficients, see `acceleration_coefficients`.
+        pairs: number of pairs in the history.
+        retries: shorter steps along a direction before the plain correction.
+        projective: whether energies must be projective.
+    """
 
     name: str
     coefficients: int
@@ -33,28 +42,28 @@ class Scheme:
 
 
 class Accelerating(Iterating):
-    """A solve that has begun, and knows more of where it is."""
+    """The state of a solve that also provides the gradient and the total decrease of the objective."""
 
     @property
     @abstractmethod
     def fallen(self) -> float:
-        """By how much the objective fell so far [J], where round-off does not hide it."""
+        """Decrease of the objective so far [J], as far as it exceeds round-off."""
 
     @abstractmethod
     def gradient(self) -> Positions:
-        """That of the objective [N], (n, 3), where it is."""
+        """Return the gradient of the objective [N], (n, 3), at the iterate."""
 
 
 class Engine(Protocol):
-    """Begins solves."""
+    """A factory of solves."""
 
     def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
-        """A solve from a first guess (n, 3)."""
+        """Start a solve from an initial guess (n, 3)."""
         ...
 
 
 def window_for(scheme: Scheme, entries: int, whole: int, precision: Any = np.float64) -> Window:
-    """Memory for the unknowns' entries, in vectors that have `whole` of them; precision: the factor's."""
+    """Allocate vectors of `vector_size`, of which `num_entries` are unknown; `precision` is that of the factor."""
     m = scheme.pairs
     now = np.zeros(1, accelerate.NOW)
     now["method"], now["retries"] = scheme.coefficients, scheme.retries
@@ -69,7 +78,7 @@ def window_for(scheme: Scheme, entries: int, whole: int, precision: Any = np.flo
 
 
 class Interpreted(Accelerating):
-    """Any energies, and any factor."""
+    """A solve with any energies and any factor."""
 
     def __init__(self, base: PreparedLocalGlobal, scheme: Scheme, objective: StepObjective, guess: Positions) -> None:
         window = window_for(scheme, guess.size, guess.size)
@@ -83,7 +92,7 @@ class Interpreted(Accelerating):
         accelerate.begin(window, self._solved())
 
     def advance(self) -> bool:
-        """See Iterating."""
+        """Do one iteration; return False if round-off prevents descent."""
         window, now = self._window, self._window.now
         accelerate.propose(window)
         verdict = accelerate.AGAIN
@@ -99,20 +108,20 @@ class Interpreted(Accelerating):
         return True
 
     def residual(self) -> float:
-        """See Iterating."""
+        """Return the residual [J^(1/2)] at the iterate."""
         return self._base.residual(self._window.correction.reshape(-1, 3).copy())
 
     @property
     def fallen(self) -> float:
-        """See Accelerating."""
+        """Decrease of the objective so far [J]."""
         return float(self._window.now["fallen"][0])
 
     def gradient(self) -> Positions:
-        """See Accelerating."""
+        """Return the gradient of the objective [N], (n, 3)."""
         return -self._window.descent.reshape(-1, 3)
 
     def _free(self) -> bool:
-        """Shorten the trial to where the way to it is free; whether any of it is."""
+        """Shorten the trial to the collision-free step size; return whether that is positive."""
         if self._objective.bounded:
             most = self._objective.reach(self.positions, self._trial - self.positions)
             if most < 1.0:

@@ -1,14 +1,15 @@
-"""How a mesh makes way for obstacles that move within a step, so that the step starts free where they then are.
+"""An intersection-free start of a step in which obstacles move.
 
-The start of a step is free where obstacles were; the minimiser has to start where it is free of obstacles as they are
-at the step's end. Tried first, each along the straight way while the obstacles go theirs: to rest, to go on as before,
-to move with an obstacle as if it were fixed to it. Where none is free all the way, the one that leads farthest is gone
-so far, and what is near is pushed apart by the barriers themselves, at obstacles that wait:
+The mesh is intersection-free at the start of the step for the obstacles' old positions. The minimiser needs a start
+that is intersection-free for their positions at the end of the step. These motions are tried first, each on a straight
+path while the obstacles move: no motion, motion with the current velocity, and rigid motion with an obstacle. If none is free
+of collisions to the end, the one with the largest fraction is followed, and then the barriers themselves push
+nearby vertices away from obstacles at rest:
 
     p <- p + t d,     d_i = -1/2 B_i^-1 g_i,     B_i = 3 x 3 blocks of the barriers' Hessian, plus inertia
 
-g is the gradient of the barriers alone; t is the largest that is safe. Then obstacles go on. What is found is a start
-and no solution: it has no share in what the step ends at, but for which of several minima is near.
+Here g is the gradient of the barriers only, and t is the collision-free step size. Then the obstacles advance. The
+result is a start, not a solution: it affects the end of the step only by the choice among several minima.
 """
 
 from __future__ import annotations
@@ -22,20 +23,26 @@ from solvers.core.bounds import Bounded, is_bounded, reach
 from solvers.problem import Positions, StepProblem
 
 _ROUNDS, _PUSHES = 400, 6
-"""Of obstacles that go on, and of pushes between."""
+"""Maximum number of rounds in which obstacles advance, and pushes per round."""
 
 _OPEN = 0.9
-"""Of a way that is safe: so much of it is gone, which leaves room to be pushed apart."""
+"""Fraction of a collision-free displacement that is used, which leaves a gap for the pushes."""
 
 
 class Blocked(Exception):
-    """What moves within a step leaves the mesh no way to where the step could start; the message says how far."""
+    """An error for obstacles that leave no intersection-free start; the message states the fraction reached."""
 
 
 def begun_free(problem: StepProblem) -> StepProblem:
-    """The same problem, its current positions and its first guess where the step starts unless the straight way from
-    there to them is free; itself without such energies. Where obstacles move, the way leads past them, and where the
-    step starts may have to make way. Raises Blocked where it cannot."""
+    """Return the problem with intersection-free current positions and initial guess.
+
+    Each is replaced by the start of the step unless the straight path from there to it is free of collisions. If
+    obstacles move, the path must avoid them, and the start itself may be pushed away. A problem without barrier
+    energies is returned unchanged.
+
+    Raises:
+        NoClearance: no intersection-free start was found.
+    """
     energies = [energy for energy in problem.energies if is_bounded(energy)]
     if not energies:
         return problem
@@ -55,8 +62,10 @@ def begun_free(problem: StepProblem) -> StepProblem:
 
 
 def _cleared(problem: StepProblem, energies: Sequence[Bounded]) -> Positions:
-    """Positions (n, 3) [m] that are free of intersections with obstacles at the step's end, by a way from the step's
-    start that is free at all times. Raises Blocked where none is found."""
+    """Return positions (n, 3) [m] without intersections at the end of the step, by a path without collisions.
+
+    Raises NoClearance if none is found.
+    """
     p, part = problem.start.positions, 0.0
     exact = problem.system.pins.vertices[problem.system.pins.exact]
     ends = [p, p + problem.system.time_step * problem.start.velocity]
@@ -81,7 +90,7 @@ def _cleared(problem: StepProblem, energies: Sequence[Bounded]) -> Positions:
 
 
 def _pushed(problem: StepProblem, energies: Sequence[Bounded], p: Positions) -> Positions:
-    """p (n, 3) after one push."""
+    """Return p (n, 3) after one push."""
     system = problem.system
     gradient, curvature = np.zeros_like(p), np.zeros((len(p), 3, 3))
     for energy in energies:

@@ -1,8 +1,8 @@
-"""Colours for Gauss-Seidel methods: what has one colour does not touch, so its order does not matter.
+"""Colourings for Gauss-Seidel methods: items of one colour are independent, so their order is irrelevant.
 
-Springs touch where they share a vertex, vertices where they share a spring. Each takes the first colour that is free
-(greedy, by number): of springs no more than twice the largest degree, of vertices no more than the most neighbours
-and one. All that depends on the colours alone, and not on the order within one, can be done at the same time.
+Springs are adjacent if they share a vertex, vertices if they share a spring. Each item gets the first free colour
+(greedy, in order of its index). Springs need at most twice the largest degree of colours, vertices at most the largest
+number of neighbours plus one. Items of one colour can be processed in parallel.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ from solvers.matrices import signed_incidence_matrix_sparse
 
 @dataclass(frozen=True, eq=False)
 class Colouring:
-    """order: the items by colour, and by number within one; start (colours + 1,): where each colour begins in it."""
+    """The items by colour and index (order), and the start of each colour in that order (colours + 1,)."""
 
     order: NDArray[np.int64]
     start: NDArray[np.int64]
 
     @property
     def colours(self) -> int:
-        """How many there are."""
+        """Number of colours."""
         return len(self.start) - 1
 
 
 def of_springs(edges: NDArray[np.int64], n: int) -> Colouring:
-    """Colours of springs (m, 2) over n vertices; no two of a colour share a vertex."""
+    """Colour springs (m, 2) over n vertices; no two of a colour share a vertex."""
     A = signed_incidence_matrix_sparse(edges, n)
     return _coloured(A, csr_array(A.T))
 
 
 def of_vertices(edges: NDArray[np.int64], n: int) -> Colouring:
-    """Colours of n vertices; no two of a colour share one of the springs (m, 2)."""
+    """Colour n vertices; no two of a colour share one of the springs (m, 2)."""
     A = signed_incidence_matrix_sparse(edges, n)
     return _coloured(csr_array(A.T), A)
 
 
 def _coloured(groups: csr_array, items: csr_array) -> Colouring:
-    """Colours of the rows of `groups`; those with an entry in one column touch. items: the transpose."""
+    """Colour the rows of `groups`, adjacent if they have an entry in one column; `items` is the transpose."""
     for matrix in (groups, items):
         matrix.sort_indices()
     count = len(groups.indptr) - 1

@@ -1,9 +1,10 @@
-"""The local-global iteration of `solvers.core.prefactored` as compiled steps: no Python between a step's beginning and
-its end (see `solvers.kernels.step`), where the factor's panels are ones that the kernels go through.
+"""The local-global iteration as compiled steps, without Python within a step.
 
-The factors are kept as inverses of blocks, whose products round to eps cond(Q) |p| (Higham 2002, section 14.1), where
-cond(Q) <= 2 max_i Q_ii / (Q 1)_i, scaled by Q 1. Where that is more than a small part of a spring's length, because
-stiffnesses lie far apart or vertices far away, corrections are solved for in float64 too.
+It uses `solvers.kernels.local_global_iteration` for factors whose panels the kernels can traverse.
+
+The factors are stored as inverses of blocks, whose products have rounding errors of eps cond(Q) |p| (Higham 2002,
+section 14.1), where cond(Q) <= 2 max_i Q_ii / (Q 1)_i, scaled by Q 1. If that exceeds a small fraction of a spring's
+length, because of large stiffness ratios or distant vertices, corrections are solved for, in float64 too.
 """
 
 from __future__ import annotations
@@ -38,23 +39,23 @@ Ints = NDArray[np.int64]
 Reals = NDArray[np.float64]
 
 _LOST = 1e-3
-"""Of the median rest length, what positions may lose by the bound, which is some 20 times what they do lose. Sheets of
-256 vertices a side and 1e5 N/m keep a hundredfold distance from it; scenes whose stiffnesses lie 1e12 apart do not."""
+"""Largest position error by the bound, relative to the median rest length; the bound is about 20 times the error.
+Sheets of 256 vertices a side and 1e5 N/m stay below it by a factor of 100; scenes with stiffness ratios of 1e12 do not."""
 
 _NEAR = 100.0
-"""Metres from the origin within which most scenes stay."""
+"""Distance [m] from the origin within which most scenes stay."""
 
 FAR = 1e100
-"""Where the springs end that fill up bundles: at no vertex, whatever the unit of length."""
+"""Coordinate of the ends of padding springs, far from any vertex in any unit of length."""
 
 ORDERS: dict[type, Callable[[Any], Order]] = {Supernodal: of_supernodal, Inverse: of_inverse}
-"""The linear solvers whose panels the kernels go through; the others are called in between."""
+"""Linear solvers whose panels the kernels traverse; others are called between compiled parts."""
 
 
 def compiled(base: PreparedLocalGlobal, *, corrects: bool = False) -> PreparedCompiled | str:
-    """The iterations over the factor's own rows; where there are none, in words that they go through Python, and why.
+    """Return the compiled iterations over the factor's rows, or the reason in words why they run through Python.
 
-    corrects: whether corrections are wanted whatever the factor's precision.
+    `use_corrections` selects corrections for any precision of the factor.
     """
     order = _order(base)
     if order is None:
@@ -68,25 +69,25 @@ def compiled(base: PreparedLocalGlobal, *, corrects: bool = False) -> PreparedCo
 
 
 def _order(base: PreparedLocalGlobal) -> Order | None:
-    """A factor's rows in the kernels' order; None of one that they do not know."""
+    """Return a factor's elimination schedule; None for a factor that the kernels do not support."""
     return next((order(base.factor) for kind, order in ORDERS.items() if isinstance(base.factor, kind)), None)
 
 
 def _reach(base: PreparedLocalGlobal, springs: Springs) -> float:
-    """The largest coordinate [m] of which a solve for positions loses at most _LOST of the median rest length."""
+    """Return the largest coordinate [m] for which a direct solve keeps the position error below the limit."""
     lengths = springs.rest_length[springs.rest_length > 0.0]
     return _LOST * float(np.median(lengths)) / (2.0 * EPS * base.spread) if len(lengths) else np.inf
 
 
 def _plan(order: Order, first: Ints, held: Reals, measure: Reals, loose: Reals) -> step.Plan:
-    """The plan over a factor's spans, with the bundles (groups + 1,) that each begins with."""
+    """Build the plan over a factor's spans, with the first packet of each (groups + 1,)."""
     spans = np.ascontiguousarray(np.column_stack([order.spans[:, :2], first[:-1], first[1:], order.spans[:, 2:]]))
     factor = order.squares, order.panels, order.places, order.chunks, order.top
     return step.Plan(*factor, spans, order.of_group, order.visits, order.visits_of, held, measure, loose, order.shift)
 
 
 def _rows(base: PreparedLocalGlobal, row: Ints, right: Ints, corrects: bool) -> step_ends.VertexRows:
-    """What is constant of the vertices' right-hand side; corrections have none of Q's coupling to exact pins."""
+    """Build the constant data of the right-hand side; corrections omit Q's coupling to exact pins."""
     s, pins = base.system, base.system.pins
     coupling = csr_array((0, 0)).tocoo() if corrects else base.coupling.tocoo()
     ends = s.free[coupling.coords[0]], np.flatnonzero(pins.exact)[coupling.coords[1]]
@@ -95,7 +96,7 @@ def _rows(base: PreparedLocalGlobal, row: Ints, right: Ints, corrects: bool) -> 
 
 
 class StepScratch(NamedTuple):
-    """What the kernels write to: three vectors and scratch, the right-hand side, positions to be corrected or None."""
+    """The arrays that kernels overwrite: vectors, right-hand side, and positions for corrections or None."""
 
     vectors: tuple[NDArray[Any], ...]
     right: NDArray[np.float64]
@@ -104,12 +105,19 @@ class StepScratch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PreparedCompiled(Iterative):
-    """The iterations over a factor's own rows (see `solvers.kernels.step`).
+    """The iterations over a factor's own rows (see `solvers.kernels.local_global_iteration`).
 
-    base: the same, step by step; parts: of the energies; plan: of an iteration; bundles: of the springs
-    in its local step; edges: beside them; form: of
-    |e|_Q^2; rows: of the vertices; far: the last row; corrects: whether it solves for corrections; reach: the
-    largest coordinate [m] up to which it may solve for positions.
+    Attributes:
+        base: the uncompiled iteration.
+        parts: decomposition of the energies.
+        plan: plan of an iteration.
+        bundles: packets of the springs in the local step.
+        edges: strain limits and dashpots, or None.
+        form: packets of |e|_Q^2.
+        rows: rows of the vertices.
+        far: last row.
+        corrects: whether it solves for corrections.
+        reach: largest coordinate [m] up to which it may solve for positions.
     """
 
     residual_of: ClassVar[ResidualOf] = "previous"
@@ -127,7 +135,7 @@ class PreparedCompiled(Iterative):
 
     @classmethod
     def of(cls, base: PreparedLocalGlobal, parts: Parts, order: Order, corrects: bool) -> PreparedCompiled:
-        """The iterations over a factor that is cut into blocks; corrects: for corrections in any case."""
+        """Build the iterations over a factor in blocks; use_corrections selects corrections in any case."""
         s, pins = base.system, base.system.pins
         exact = pins.vertices[pins.exact]
         nobody = order.rows + len(exact)
@@ -165,20 +173,19 @@ class PreparedCompiled(Iterative):
 
     @cached_property
     def corrected(self) -> PreparedCompiled:
-        """The same for corrections."""
+        """The iterations that solve for corrections."""
         order = _order(self.base)
         assert order is not None  # `of` was given one
         return self.of(self.base, self.parts, order, True)
 
     @property
     def facts(self) -> dict[str, float]:
-        """Exact counts of what was built."""
+        """Exact counts of the setup."""
         return self.base.facts
 
     @property
     def choice(self) -> str:
-        """The linear solver in words, from which distance on it solves for corrections where scenes may reach that far,
-        and how many of the allowed threads a step uses where that is not all."""
+        """The linear solver, the distance for corrections if scenes may reach it, and the threads used if not all."""
         beyond = f"; corrections beyond {self.reach:.1g} m of the origin" if self.reach < _NEAR else ""
         allowed, used = numba.get_num_threads(), self.threads() or 1
         if used == allowed:
@@ -187,22 +194,22 @@ class PreparedCompiled(Iterative):
         return f"{self.base.choice}{beyond}; {used} of {allowed} threads: {why}"
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative."""
+        """Start a solve from an initial guess (n, 3) [m]."""
         return _Iterating(self if largest(problem) <= self.reach else self.corrected, problem, guess)
 
     def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
-        """See Iterative; what the step's energies are is asked once."""
+        """Build a residual function that evaluates the energies of the step once."""
         made = self if largest(problem) <= self.reach else self.corrected
         return _Iterating(made, problem, problem.current).residual_from
 
     def scale(self, problem: StepProblem) -> float:
-        """See Iterative."""
+        """Return the residual scale [J^(1/2)] for the round-off check."""
         return largest(problem) * self.base.trace**0.5
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """The local step over all springs at the first guess, and a solve with the factor as it is, once.
+        """Return the local step over all springs at the initial guess, and one solve with the unrefined factor.
 
-        Within a step neither is done alone: blocks take turns at both.
+        Within a step neither runs alone, because blocks alternate between both.
         """
         (a, b, _, _), right, p = work = self.memory()
         target, force, pins, guess = self.arrays(problem, problem.first_guess)
@@ -219,23 +226,25 @@ class PreparedCompiled(Iterative):
         return {"local": local, "global": lambda: self.base.correction(y, out)}
 
     def arrays(self, problem: StepProblem, guess: Positions) -> list[Positions]:
-        """The problem's target, force and pin targets, and the guess. The kernels are compiled for arrays that may be
-        written to: what may not is copied."""
+        """Return target, force, pin targets and guess; read-only arrays are copied.
+
+        The kernels are compiled for writable arrays.
+        """
         given = (problem.target, self.parts.force(problem), problem.pin_targets, guess)
         return [x if x.flags.carray else np.array(x, np.float64, order="C") for x in given]
 
     @cached_property
     def team(self) -> Team:
-        """The threads of whole solves."""
+        """The thread team of whole solves."""
         return Team.of(int(self.plan.top[2]))
 
     @cached_property
     def work(self) -> StepScratch:
-        """The memory of whole solves, one after the other."""
+        """The scratch memory that whole solves share."""
         return self.memory()
 
     def memory(self) -> StepScratch:
-        """Memory for one solve."""
+        """Allocate the scratch memory of one solve."""
         rows, dtype = len(self.plan.held), self.plan.squares.dtype
         arrays = vectors(dtype, rows)
         p = aligned(4 * rows) if self.corrects else None
@@ -244,15 +253,14 @@ class PreparedCompiled(Iterative):
         return StepScratch(arrays, self.bundles.right(self.plan.held), p)
 
     def threads(self) -> int | None:
-        """As many as are allowed and as there are groups of subtrees; None for one."""
+        """Return the smaller of the allowed threads and the groups of subtrees; None for one thread."""
         groups = int(self.plan.top[2])
         threads = min(numba.get_num_threads(), groups) if groups > 1 else 1
         return threads if threads > 1 else None
 
 
 class _Iterating(Iterating):
-    """As many iterations as are wanted are one call, in memory that all solves share; who advances by hand instead has
-    memory of his own."""
+    """A solve whose iterations are one call, in memory that all solves share; single iterations use their own."""
 
     def __init__(self, prepared: PreparedCompiled, problem: StepProblem, guess: Positions) -> None:
         self._prepared, self._problem, self._guess = prepared, problem, guess
@@ -260,7 +268,7 @@ class _Iterating(Iterating):
         self.positions = np.empty_like(problem.target)
 
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """See Iterating."""
+        """Iterate up to the limits; return count, residual and reason."""
         made = self._prepared
         fixed = made.plan, made.bundles, self._edges, made.form, made.rows, *made.work, tuple(self._arrays)
         answer = step_ends.solve(*fixed, limits, made.threads(), made.team, self.positions)
@@ -268,12 +276,12 @@ class _Iterating(Iterating):
         return answer
 
     def residual_from(self, p: Positions) -> float:
-        """|p - LG(p)|_Q of positions p (n, 3), by one iteration from there."""
+        """Return |p - LG(p)|_Q of positions p (n, 3), by one iteration from there."""
         self._arrays[-1] = p if p.flags.carray else np.array(p, np.float64, order="C")
         return self.iterate(at_most(1))[1]
 
     def advance(self) -> bool:
-        """See Iterating."""
+        """Do one iteration; return False if round-off prevents descent."""
         made = self._prepared
         (a, b, c, e), right, p = self._own
         fixed = made.plan, made.bundles, self._edges, made.form, (a, b, c, e), right, p
@@ -283,7 +291,7 @@ class _Iterating(Iterating):
         return True
 
     def residual(self) -> float:
-        """|p - LG(p)|_Q of the previous positions p."""
+        """Return |p - LG(p)|_Q of the previous positions p."""
         (a, b, _, e), _, p = self._own
         return step.length(self._prepared.plan, self._prepared.form, a, b, p, e)
 

@@ -2,8 +2,8 @@
 
 graded: the exact Hessian, or else the first positive definite one in a schedule of increasingly convex ones. With
 active collisions the schedule is finer, and each iterate starts one level below that of the previous iterate. The
-other strategies project the eigenvalues of elements (`solvers.objective.psd_projection`), whether the Hessian is indefinite
-or not:
+other strategies project the eigenvalues of elements (`solvers.objective.psd_projection`), whether the Hessian is
+indefinite or not:
 
     clamp          all, lambda -> max(lambda, 0)                                     Teran et al. 2005
     absolute       all, lambda -> |lambda|                                           Chen, Liu, Levin et al. 2024

@@ -1,8 +1,9 @@
-"""What methods with exact gradients share: their points, and a line search that tells a descent from round-off.
+"""The base of methods with exact gradients: points, and a line search that distinguishes descent from round-off.
 
-The line search halves a step until the objective falls enough (`solvers.kernels.line_search`). The rise is computed
-from differences (see `solvers.kernels.objective`), so that this works until the gradient itself is round-off. What
-other energies' values lose to round-off is allowed for; there the slope has to shrink instead.
+The line search halves a step until the objective decreases enough (`solvers.kernels.line_search_conditions`). The
+change of the objective is computed from differences (see `solvers.kernels.objective_kernels`), so that the search works
+until the gradient itself is round-off. The rounding error of other energies' values is taken into account; within it
+the slope must decrease instead.
 """
 
 from __future__ import annotations
@@ -25,12 +26,15 @@ from solvers.linear.factors import DenseCholesky
 from solvers.problem import Positions, ProjectiveEnergy, StepProblem, System
 
 HALVINGS = 60
-"""A step so often halved has no digit left."""
+"""Maximum number of halvings; after it a step has no significant digit left."""
 
 
 class Point(NamedTuple):
-    """Where a method is: positions and gradient, (n, 3); stalled: whether round-off lets nothing descend from here;
-    left: whether the point before was a saddle.
+    """An iterate: positions and gradient, (n, 3).
+
+    Attributes:
+        stalled: whether round-off prevents descent from here.
+        left: whether the previous point was a saddle point.
     """
 
     positions: Positions
@@ -40,18 +44,18 @@ class Point(NamedTuple):
 
 
 class Method(Protocol):
-    """One iteration after another from a point; the last point, at which the method stalls, is its last."""
+    """A method that yields one point after another; it ends with a stalled one."""
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
-        """The points after `start`."""
+        """Yield the points after `start`."""
         ...
 
     def certifies(self, step: StepObjective, at: Point) -> bool:
-        """Whether a stationary point is a minimum, for all that the method can tell: it may be the last."""
+        """Return whether a stationary point may be a minimum, as far as the method can determine."""
         ...
 
     def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
-        """What its iterations are made of, by name, at a point."""
+        """Return the phases of an iteration at a point, by name."""
         ...
 
 
@@ -64,11 +68,17 @@ def search(
     curvature: float = 0.0,
     settled: Callable[[Positions], Positions] | None = None,
 ) -> Point | None:
-    """The first point of those at `first`, first/2, first/4, ... of a direction that descends enough; None for none.
+    """Return the first point at initial_step, initial_step/2, ... with sufficient decrease, or None.
 
-    No point is beyond what the step may pass through (`solvers.core.bounds`). curvature [J]: the second derivative
-    along the direction, where it is what promises a descent; settled: what else lowers the objective from positions on,
-    tried first at each point.
+    No point is beyond the step size limit of the barrier energies (`solvers.model.barrier_energy`).
+
+    Args:
+        step: the objective.
+        at: current point.
+        direction: search direction (n, 3) [m].
+        first: first step size.
+        curvature: second derivative along the direction [J], if a decrease is expected from it.
+        settled: relaxation that lowers the objective from given positions; its result is tried first at each point.
     """
     slope = dot(at.gradient, direction)
     t = step.reach(at.positions, direction, first)
@@ -89,7 +99,7 @@ def search(
 
 
 def lower(step: StepObjective, start: Point) -> Point:
-    """The lower one of a point and of free fall, where nothing is in the way there."""
+    """Return the lower one of a point and the inertial prediction, if the path to the latter is free of collisions."""
     fall = step.fall()
     if step.bounded and step.reach(start.positions, fall - start.positions) < 1.0:
         return start
@@ -97,25 +107,34 @@ def lower(step: StepObjective, start: Point) -> Point:
 
 
 def near(step: StepObjective, p: Positions) -> bool:
-    """Whether something is in range at p that a step may not pass through."""
+    """Return whether a barrier energy is active at p."""
     return any(energy.value(p) > 0.0 for energy in step.bounded)
 
 
 def dot(a: Positions, b: Positions) -> float:
-    """The scalar product of two fields, (n, 3)."""
+    """Return the inner product of two fields, (n, 3)."""
     return float(np.einsum("ij,ij->", a, b))
 
 
 class Metric:
-    """Q of a system's projective energies, factorised: what residuals are measured by.
+    """Q of a system's projective energies, factorised, which defines the norm of residuals.
 
-    trace: of its unpinned part [N/m]; inner: its free part (f, f); diagonal: of that (f,) [N/m]; factor: of the free
-    part; choice: the linear solver in words; facts: counts.
+    Attributes:
+        trace: trace of its unpinned part [N/m].
+        inner: its free part (f, f).
+        diagonal: diagonal of the free part (f,) [N/m].
+        factor: factor of the free part.
+        choice: description of the linear solver.
+        facts: exact counts.
     """
 
     def __init__(self, system: System) -> None:
-        """Raises NotPositiveDefinite where nothing determines some positions, and Unsupported where no linear solver
-        fits in memory."""
+        """Assemble and factorise Q.
+
+        Raises:
+            NotPositiveDefinite: the positions of some vertices are not determined.
+            Unsupported: no linear solver fits in memory.
+        """
         self.system = system
         self._Q = matrices.assemble(system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)])
         self.inner = csr_array(csr_array(self._Q[system.free])[:, system.free])
@@ -128,11 +147,11 @@ class Metric:
             self.facts["nnz_factor"] = float(self.factor.nonzeros)
 
     def round_off(self, p: Positions) -> float:
-        """g H^-1 g [J] of a gradient that is round-off of the positions p (n, 3), at most."""
+        """Return a bound of g H^-1 g [J] for a gradient g due to rounding of the positions p (n, 3)."""
         return float(np.finfo(np.float64).eps * np.abs(p).max(initial=0.0)) ** 2 * self.trace
 
     def solve(self, b: Positions) -> Positions:
-        """Q^-1 b, (n, 3), zero at exactly pinned vertices."""
+        """Return Q^-1 b, (n, 3), zero at exactly pinned vertices."""
         out, free = np.zeros_like(b), self.system.free
         x = np.empty((len(free), 3))
         self.factor.solve(np.ascontiguousarray(b[free]), x)
@@ -140,11 +159,11 @@ class Metric:
         return out
 
     def residual(self, gradient: Positions) -> float:
-        """|Q^-1 g|_Q [J^(1/2)] over the unpinned vertices, of a gradient g (n, 3)."""
+        """Return |Q^-1 g|_Q [J^(1/2)] over the unpinned vertices, of a gradient g (n, 3)."""
         return self.norm(self.solve(gradient), gradient)
 
     def norm(self, e: Positions, gradient: Positions) -> float:
-        """The same of e = Q^-1 g, which is overwritten."""
+        """Return that residual for e = Q^-1 g, which is overwritten."""
         pins = self.system.pins
         if pins.exact.all():  # then |Q^-1 g|_Q is what g does along it
             return max(dot(e, gradient), 0.0) ** 0.5  # in this order, which keeps NaN
@@ -154,11 +173,11 @@ class Metric:
 
 @dataclass(frozen=True, eq=False)
 class PreparedDescent(Iterative):
-    """A method, ready for a system.
+    """A descent method after the setup for a system.
 
-    Where something is in range that may not be passed through, it begins with free fall if that is lower. A gap that
-    all but closes makes a Hessian so stiff that the direction of a common motion keeps no digits for the gap, which
-    bounds the step.
+    If a barrier is active at the initial guess, the solve starts at the inertial prediction, if that is lower. A nearly
+    closed gap makes the Hessian so stiff that the direction of a common motion has no significant digits for the gap,
+    which limits the step size.
     """
 
     objective: Objective
@@ -168,20 +187,20 @@ class PreparedDescent(Iterative):
     facts: dict[str, float]
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative."""
+        """Start a solve from an initial guess (n, 3) [m]."""
         step, start = self._begin(problem, guess)
         return _Iterating(self, step, lower(step, start) if near(step, start.positions) else start)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """See Iterative."""
+        """Return the residual [J^(1/2)] at p (n, 3) [m]."""
         return self.metric.residual(StepObjective(self.objective, problem).gradient(p))
 
     def scale(self, problem: StepProblem) -> float:
-        """See Iterative."""
+        """Return the residual scale [J^(1/2)] for the round-off check."""
         return largest(problem) * self.metric.trace**0.5
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """What iterations are made of, at the first guess."""
+        """Return the phases of an iteration at the initial guess."""
         return self.method.phases(*self._begin(problem, problem.first_guess))
 
     def _begin(self, problem: StepProblem, guess: Positions) -> tuple[StepObjective, Point]:
@@ -191,22 +210,22 @@ class PreparedDescent(Iterative):
 
 
 class _Iterating(Iterating):
-    """From point to point; one at which the method stalls is the one before."""
+    """The state of a solve; a stalled point keeps the previous positions."""
 
     def __init__(self, prepared: PreparedDescent, step: StepObjective, start: Point) -> None:
         self._metric, self._method, self._step = prepared.metric, prepared.method, step
         self._points, self._point, self.positions = prepared.method.points(step, start), start, start.positions
 
     def advance(self) -> bool:
-        """See Iterating."""
+        """Do one iteration; return False if round-off prevents descent."""
         before, self._point = self._point, next(self._points, self._point)
         self.positions = self._point.positions
         return not self._point.stalled or self.positions is not before.positions
 
     def residual(self) -> float:
-        """See Iterating."""
+        """Return the residual [J^(1/2)] at the iterate."""
         return self._metric.residual(self._point.gradient)
 
     def certifies(self) -> bool:
-        """See Iterating."""
+        """Return whether the iterate may be a minimum if it is stationary."""
         return self._method.certifies(self._step, self._point)

@@ -190,7 +190,7 @@ class Substeps(Iterating):
     """The whole step in 1, 2, ... substeps, each time from its start; iterates that are not needed are skipped."""
 
     def __init__(self, step: Callable[[StepProblem, int], tuple[Positions, Positions]], problem: StepProblem) -> None:
-        """Create the state; `step_in_substeps(problem, n)` returns positions [m] and velocity [m/s] after n substeps."""
+        """Create the state; `step_in_substeps(problem, n)` returns positions [m] and velocity [m/s]."""
         self._step, self._problem, self._substeps = step, problem, 0
         self.positions = problem.start.positions
 

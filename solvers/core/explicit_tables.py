@@ -1,10 +1,10 @@
-"""Coefficients of explicit methods, and what follows from them alone.
+"""Coefficients of explicit methods, and properties that follow from them.
 
-Compositions: drifts a and kicks b in turns, a_0 b_0 a_1 ... b_(k-1) a_k, the same backwards as forwards (Blanes and
-Moan 2002, "Practical symplectic partitioned Runge-Kutta and Runge-Kutta-Nystrom methods", S6 of order 4 and S10 of
-order 6). Runge-Kutta methods: Kutta's of order 4; Tsitouras 2011, "Runge-Kutta pairs of order 5(4) satisfying only the
-first column simplifying assumption"; Dormand and Prince's of order 8, with errors of order 5 and 3 (Hairer, Norsett and
-Wanner, Solving Ordinary Differential Equations I, section II.5), whose coefficients SciPy has.
+Splitting methods alternate drifts a and kicks b, a_0 b_0 a_1 ... b_(k-1) a_k, and are symmetric (Blanes and Moan 2002,
+"Practical symplectic partitioned Runge-Kutta and Runge-Kutta-Nystrom methods", S6 of order 4 and S10 of order 6). The
+Runge-Kutta methods are Kutta's of order 4; Tsitouras 2011, "Runge-Kutta pairs of order 5(4) satisfying only the first
+column simplifying assumption"; and Dormand and Prince's of order 8, with errors of order 5 and 3 (Hairer, Norsett and
+Wanner, Solving Ordinary Differential Equations I, section II.5), whose coefficients are those of SciPy.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Composition:
-    """order; drifts (k + 1,) and kicks (k,), parts of a step."""
+    """A splitting method: its order, drifts (k + 1,) and kicks (k,), as fractions of a step."""
 
     order: int
     drifts: Array
@@ -28,18 +28,18 @@ class Composition:
 
     @classmethod
     def symmetric(cls, order: int, drifts: list[float], kicks: list[float]) -> Composition:
-        """By the first of both; what is left of a step lies in the middle."""
+        """Build a symmetric method from its first half; the middle coefficients complete the sums."""
         middle = 1.0 - 2.0 * sum(drifts)
         kicks = [*kicks, 0.5 - sum(kicks)]
         return cls(order, np.array([*drifts, middle, *drifts[::-1]]), np.array([*kicks, *kicks[::-1]]))
 
     @property
     def evaluations(self) -> int:
-        """Of the forces, in a step: a first drift of no length needs none anew."""
+        """Evaluations of the forces per step; a first drift of zero reuses the last evaluation."""
         return len(self.kicks) - (self.drifts[0] == 0.0)
 
     def power(self, y: float) -> complex:
-        """The eigenvalue of a step's matrix that is largest, for an oscillator with omega h = y."""
+        """Return the largest eigenvalue of a step's matrix for an oscillator with omega h = y."""
         step = np.eye(2)
         for k, drift in enumerate(self.drifts):
             step = np.array([[1.0, drift * y], [0.0, 1.0]]) @ step
@@ -49,14 +49,20 @@ class Composition:
 
     @cached_property
     def limit(self) -> float:
-        """omega h up to which steps are stable."""
+        """Stability limit of omega h."""
         return _limit(self)
 
 
 @dataclass(frozen=True, eq=False)
 class Tableau:
-    """order; a (s, s): rows, the last of which ends the step; errors (0 to 2, s): weights of its error, and power:
-    by which power of the step that falls."""
+    """An explicit Runge-Kutta method.
+
+    Attributes:
+        order: order of the method.
+        a: rows of the tableau (s, s); the last one ends the step.
+        errors: weights of the error estimates (0 to 2, s).
+        power: exponent of the step size in the error.
+    """
 
     order: int
     a: Array
@@ -65,11 +71,19 @@ class Tableau:
 
     @property
     def evaluations(self) -> int:
-        """Of the forces, in a step."""
+        """Evaluations of the forces per step."""
         return len(self.a) - 1
 
     def unfinished(self, tried: float, h: float, reached: float, frame: float, tolerance: float) -> str:
-        """What to say where so many steps, the last of h [s], led only so far into a frame [s]; tolerance: [m]."""
+        """Format the error message of a frame that was not finished.
+
+        Args:
+            tried: number of steps.
+            h: size of the last step [s].
+            reached: time reached in the frame [s].
+            frame: length of the frame [s].
+            tolerance: error tolerance [m].
+        """
         return (
             f"the error of {tolerance:.3g} m was not kept within {tried:.0f} steps, the last of {h:.3g} s: after "
             f"{reached:.6g} of {frame:.6g} s of the frame the forces are too sudden, or round-off is larger; ask for a "
@@ -77,34 +91,41 @@ class Tableau:
         )
 
     def power_of(self, y: float) -> complex:
-        """R(i y)."""
+        """Return the stability function R(i y)."""
         s = len(self.a)
         stages = np.linalg.solve(np.eye(s) - 1j * y * self.a, np.ones(s))
         return stages[-1]
 
     @cached_property
     def times(self) -> Array:
-        """c (s,)."""
+        """Times c of the stages (s,)."""
         return self.a.sum(axis=1)
 
     @cached_property
     def limit(self) -> float:
-        """omega h up to which steps are stable."""
+        """Stability limit of omega h."""
         return _limit(self)
 
 
 _TRIED = 20
-"""Steps that may be tried to keep to an error, for each that is stable."""
+"""Maximum ratio of tried steps to the stable number with an error tolerance."""
 
 
 def most_steps(count: int, tolerance: float) -> int:
-    """How many may be tried where `count` are stable; as many where none has to keep to a tolerance."""
+    """Return the maximum number of steps to try if `count` are stable; exactly `count` without a tolerance."""
     return _TRIED * count + 10_000 if tolerance else count
 
 
 def in_time(kicks: Array, h: float, drag: Array) -> tuple[Array, Array]:
-    """What each kick (k,) of a step of h [s] leaves of a velocity, and what that gains of the acceleration [s], both
-    exact for drag (r,) [1/s], (k, r)."""
+    """Return the decay of a velocity by each kick, and its gain per acceleration [s], both (k, r).
+
+    They are exact for linear drag.
+
+    Args:
+        kicks: fractions of a step (k,).
+        h: step size [s].
+        drag: (r,) [1/s].
+    """
     gone = h * kicks[:, None] * drag
     gained = np.divide(-np.expm1(-gone), drag, out=h * kicks[:, None] + 0.0 * gone, where=drag > 0)
     return np.exp(-gone), gained
@@ -117,7 +138,7 @@ def _limit(method: Composition | Tableau) -> float:
 
 
 def _lower(*rows: list[float]) -> Array:
-    """A square array of rows that fill up with zeros."""
+    """Build a square array from rows padded with zeros."""
     out = np.zeros((len(rows), len(rows)))
     for k, row in enumerate(rows):
         out[k, : len(row)] = row
@@ -164,7 +185,7 @@ TSITOURAS_5 = Tableau(
 
 @cache
 def dormand_prince_8() -> Tableau:
-    """The method of order 8."""
+    """Return the method of order 8."""
     from scipy.integrate import DOP853  # for those who ask for it
 
     a = np.zeros((13, 13))

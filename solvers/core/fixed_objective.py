@@ -1,7 +1,7 @@
-"""What of the objective stays the same from step to step: springs, constant quadratic forms, the Hessian's pattern.
+"""The terms of the objective that do not change from step to step: springs, constant forms, Hessian pattern.
 
-The unknowns are the free vertices. The Hessian's blocks lie in a matrix that is analysed once (`solvers.core.pattern`);
-what does not change in a run is added up once.
+The degrees of freedom are the free vertices. The matrix of the Hessian is analysed once
+(`solvers.objective.hessian_pattern`), and terms that are constant in a run are summed once.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ from solvers.problem import Energy, ProjectiveEnergy, System, is_lagged
 
 
 class Stated(NamedTuple):
-    """What a step knows of an energy that states a law: which of the system's it is, whether it is projective, its law,
-    and its elements."""
+    """An energy with an element-wise form in one step: its index in the system, its law and its elements."""
 
     number: int
     projective: bool
@@ -33,10 +32,13 @@ class Stated(NamedTuple):
 
 
 class Objective:
-    """The objective of a system's steps: what does not change from step to step.
+    """The parts of a system's objective that do not change from step to step.
 
-    stated: which of the system's energies state the law of their elements; own: which state nothing; moving: which
-    forms have another force in each step, or any at all; projective: which energies other than springs are.
+    Attributes:
+        stated: indices of energies with an element-wise form.
+        own: indices of energies without one.
+        moving: indices of quadratic forms with a force, or with one that changes from step to step.
+        projective: indices of projective energies other than springs.
     """
 
     def __init__(self, system: System) -> None:
@@ -54,7 +56,7 @@ class Objective:
         self._grown: Matrix | None = None
 
     def _sort(self, others: dict[int, Energy]) -> None:
-        """The energies that are not springs, by what is known of them."""
+        """Classify the energies that are not springs."""
         from solvers.energies.quadratic import Quadratic  # for those who need it
 
         quadratic = {k: e for k, e in others.items() if isinstance(e, Quadratic)}
@@ -70,14 +72,16 @@ class Objective:
 
     @property
     def interpreted(self) -> str:
-        """Which energies state no law, so that each iteration evaluates them through Python, as words that follow a
-        choice; empty for none."""
+        """Energies without an element-wise form, which run through Python, as words to append to a description.
+
+        It is empty if there are none.
+        """
         names = sorted({type(self.system.energies[k]).__name__ for k in self.own})
         return f"; each iteration goes through Python for {', '.join(names)}" if names else ""
 
     @cached_property
     def matrix(self) -> Matrix:
-        """The Hessian's matrix for the pattern of springs, projective energies and elements."""
+        """The Hessian's matrix, for the pattern of springs, projective energies and elements."""
         n, s = self.system.vertices, self.system
         shares = (e.stiffness_matrix(n) for e in s.energies if isinstance(e, ProjectiveEnergy))
         pattern = reduce(lambda total, share: total + abs(share), shares, matrices.diagonal(np.ones(n)))
@@ -91,14 +95,16 @@ class Objective:
 
     @cached_property
     def number(self) -> NDArray[np.int64]:
-        """The number of each vertex among the free ones, -1 for the others, and for the vertex -1, which is none of the
-        mesh's, (n + 1,)."""
+        """Index of each vertex among the free ones, -1 for the others, (n + 1,).
+
+        The last entry is that of the vertex -1, which means none.
+        """
         number = np.full(self.system.vertices + 1, -1)
         number[self.system.free] = np.arange(len(self.system.free))
         return number
 
     def between(self, vertices: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Every two different vertices of each row (a, k), as numbers of free ones, each pair once, the lower first."""
+        """Return all pairs of different free vertices within each row (a, k), by free index, unique and ascending."""
         (a, k), size = vertices.shape, len(self.system.free)
         keys = np.empty(a * k * (k - 1) // 2, np.int64)
         return np.divmod(np.unique(keys[: hessian.meetings(self.number, size, vertices, keys)]), size)
@@ -107,7 +113,7 @@ class Objective:
         return Matrix.of(self.system, self.terms, self.form, self.number, graph, i, j)
 
     def matrix_for(self, i: NDArray[np.int64], j: NDArray[np.int64]) -> Matrix:
-        """A matrix with places for blocks (i, j) of free vertices too."""
+        """Return a matrix that also has blocks (i, j) of free vertices."""
         for known in (self.matrix, self._grown):
             if known is not None and known.has(i, j) and (known is self.matrix or known.needs(i, j, self.matrix)):
                 return known
@@ -116,6 +122,6 @@ class Objective:
 
 
 def pairs(vertices: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Every two vertices of each element (m, k), as rows (m k^2, 2)."""
+    """Return all vertex pairs of each element (m, k), as rows (m k^2, 2)."""
     k = vertices.shape[1]
     return np.column_stack([np.repeat(vertices, k, axis=1).ravel(), np.tile(vertices, k).ravel()])

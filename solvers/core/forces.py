@@ -107,9 +107,9 @@ class Whole(Iterating):
         self.positions, self.velocity = p, v
 
     def advance(self) -> bool:
-        """See Iterating."""
+        """Do one iteration; return False if round-off prevents descent."""
         return True
 
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """See Iterating."""
+        """Iterate up to the limits; return count, residual and reason."""
         return 1, float("nan"), ITERATIONS

@@ -1,8 +1,8 @@
-"""A solver that is one formula: the next iterate from the positions, those before them, and Q^-1 grad g.
+"""A solver defined by one formula for the next iterate.
 
-    p' = formula(p, p_before, Q^-1 grad g(p))
+    p' = next_iterate(p, p_before, Q^-1 grad g(p))
 
-Local-global is p - Q^-1 grad g(p). Q is assembled of the projective energies and factorised by SuperLU.
+Local-global is p - Q^-1 grad g(p). Q is assembled from the projective energies and factorised by SuperLU.
 """
 
 from __future__ import annotations
@@ -29,11 +29,18 @@ class Formula(ABC):
 
     @abstractmethod
     def formula(self, p: Positions, before: Positions, correction: Positions) -> Positions:
-        """The next iterate (n, 3) [m] from that of p, of the positions before them, p itself at first, and of
-        Q^-1 grad g(p), all (n, 3) [m]; none of these may be written to."""
+        """Return the next iterate (n, 3) [m].
+
+        No argument may be modified.
+
+        Args:
+            p: current positions (n, 3) [m].
+            before: positions of the previous iterate (n, 3) [m]; p itself in the first iteration.
+            correction: Q^-1 grad g(p) (n, 3) [m].
+        """
 
     def prepare(self, system: System) -> Ready:
-        """Raises Unsupported for energies that are not projective, NotPositiveDefinite."""
+        """Return the prepared solver; raise Unsupported for other than projective energies, or NotPositiveDefinite."""
         name = type(self).__name__
         try:
             inspect.signature(self.formula).bind(None, None, None)
@@ -43,7 +50,7 @@ class Formula(ABC):
 
 
 class Ready(Iterative):
-    """The formula over a factor of one system's Q."""
+    """The formula with a factor of one system's Q."""
 
     residual_of: ClassVar[ResidualOf] = "previous"
 
@@ -52,11 +59,11 @@ class Ready(Iterative):
         self.choice, self.facts = base.choice, base.facts
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative."""
+        """Start a solve from an initial guess (n, 3) [m]."""
         return _Running(self, problem, guess)
 
     def scale(self, problem: StepProblem) -> float:
-        """See Iterative."""
+        """Return the residual scale [J^(1/2)] for the round-off check."""
         return self.base.scale(problem)
 
 
@@ -67,7 +74,7 @@ class _Running(Iterating):
         self._correction = np.full_like(guess, np.nan)
 
     def advance(self) -> bool:
-        """See Iterating."""
+        """Do one iteration; return False if round-off prevents descent."""
         p, base = self.positions, self._ready.base
         self._correction = base.correction(self._problem.gradient(p), np.zeros_like(p))
         self.positions, self._before = self._checked(self._ready.formula(p, self._before, self._correction)), p
@@ -81,11 +88,11 @@ class _Running(Iterating):
         raise WrongAnswer(f"{line_of(self._ready.formula)}: `formula` gave {came}; wanted float64 of shape {wanted}")
 
     def residual(self) -> float:
-        """|Q^-1 grad g|_Q of the previous iterate."""
+        """Return |Q^-1 grad g|_Q of the previous iterate."""
         return self._ready.base.residual(self._correction.copy())
 
 
 def line_of(function: Callable[..., Any]) -> str:
-    """`file:line` where a function or a method begins; its name where it is not written in Python."""
+    """Return `file:line` of the definition of a function, or its name if it is not written in Python."""
     code = getattr(function, "__code__", None)
     return f"{Path(code.co_filename).name}:{code.co_firstlineno}" if code else getattr(function, "__qualname__", "")

@@ -1,15 +1,16 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # SciPy's stubs say little of sparse matrices.
-"""The multipliers of exact lengths at a point, by least squares: they say how far it is from a minimum of the step.
+"""The Lagrange multipliers of length constraints at a point, by least squares, for the residual of a step.
 
     minimise grad g . d + |d|_Q^2 / 2   such that   low <= l + n . A d <= high
 
     [ Q    J' ] [d]   [ -grad g   ]
-    [ J  -eps ] [t] = [ bound - l ]       of the lengths that a limit holds, J = n A
+    [ J  -eps ] [t] = [ bound - l ]       for the active lengths, J = n A
 
-(Nocedal and Wright 2006, section 18.1.) The multipliers t [N] leave the least gradient, in the norm of Q^-1, once the
-lengths are mended. A method's own multipliers may cancel the gradient while lengths are still wrong: a residual by them
-is not one of the step. Which limits hold, a primal-dual active set finds (Hintermueller, Ito and Kunisch 2002).
+(Nocedal and Wright 2006, section 18.1.) The multipliers t [N] minimise the gradient in the norm of Q^-1, once the
+lengths are corrected. A method's own multipliers may cancel the gradient while constraints are still violated, so that a
+residual with them is not one of the step. A primal-dual active set method selects the active limits (Hintermueller,
+Ito and Kunisch 2002).
 """
 
 from __future__ import annotations
@@ -25,18 +26,23 @@ from solvers.matrices import assemble
 from solvers.problem import Positions, ProjectiveEnergy, StepProblem, System
 
 _COMPLIANCE = 1e-10
-"""Of 1/k, eps: lengths that follow from others make nothing singular. Refinement takes its effect out again."""
+"""The value eps relative to 1/k, which keeps redundant constraints nonsingular. Refinement removes its effect."""
 _REFINEMENTS = 4
 _CHANGES = 50
-"""Of the active set, at most."""
+"""Maximum number of changes of the active set."""
 
 
 class Multipliers:
-    """The multipliers of a system's lengths."""
+    """The multipliers of a system's length constraints."""
 
     def __init__(self, augmented: System, lengths: Lengths, stiffness: NDArray[np.float64]) -> None:
-        """augmented: the system with penalties of these stiffnesses (m,) [N/m], which are in Q, and no exact lengths.
-        Raises NotPositiveDefinite."""
+        """Assemble the matrices; raise NotPositiveDefinite.
+
+        Args:
+            augmented: the system without constraints, with their penalties in Q.
+            lengths: the constraints.
+            stiffness: stiffnesses of the penalties (m,) [N/m].
+        """
         Q = assemble(augmented, [e for e in augmented.energies if isinstance(e, ProjectiveEnergy)])
         free = augmented.free
         self._lengths, self._stiffness = lengths, stiffness
@@ -46,7 +52,7 @@ class Multipliers:
         self._free = free
 
     def at(self, problem: StepProblem, p: Positions) -> NDArray[np.float64]:
-        """The multipliers (m,) [N] of a step at p (n, 3) [m], zero where a length is within its limits."""
+        """Return the multipliers (m,) [N] of a step at p (n, 3) [m], zero for lengths within their limits."""
         x, k = self._lengths, self._stiffness
         length, n = directions(p[x.edges[:, 0]] - p[x.edges[:, 1]], x.rest_direction)
         J, downhill = self._jacobian(n), -problem.gradient(p)[self._free].ravel()
@@ -64,12 +70,12 @@ class Multipliers:
         return tension
 
     def _active(self, length: NDArray[np.float64], tension: NDArray[np.float64]) -> NDArray[np.int64]:
-        """The limit that holds each length: 1 the longest, -1 the shortest, 0 none."""
+        """Return the active limit of each length: 1 the maximum, -1 the minimum, 0 none."""
         x, trial = self._lengths, length + tension / self._stiffness
         return np.where((trial > x.high) | (x.low == x.high), 1, np.where(trial < x.low, -1, 0))
 
     def _jacobian(self, n: Positions) -> csr_array:
-        """The derivatives of lengths (m, 3 f) by the coordinates of free vertices."""
+        """Return the derivatives of the lengths (m, 3 f) by the coordinates of free vertices."""
         columns = self._column[self._lengths.edges].reshape(len(n), 6)
         rows = np.repeat(np.arange(len(n)), 6).reshape(-1, 6)
         values, there = np.hstack([n, -n]), columns >= 0
@@ -79,7 +85,7 @@ class Multipliers:
     def _solved(
         self, J: csr_array, k: NDArray[np.float64], downhill: NDArray[np.float64], open: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """d [m] and t [N]."""
+        """Solve the linear system for d [m] and t [N]."""
         if not len(k):
             return np.asarray(splu(csc_array(self._Q)).solve(downhill)), np.empty(0)
         K = csc_array(block_array([[self._Q, J.T], [J, None]]))

@@ -1,7 +1,8 @@
-"""Local-global steps in C++: compiled on the spot where a compiler is, kept in the user's cache, called by ctypes.
+"""Local-global steps in C++: compiled on demand, cached in the user's cache folder, called by ctypes.
 
-A source has `prepare`, `local`, `global_` and `release`, as `solvers/methods/eigen.cpp` shows. Where it does not
-compile its solver refuses with the reason. Springs of length zero, whose direction the formula leaves open, get none.
+A source has `prepare`, `local`, `global_` and `release`, see `solvers/methods/local_global/eigen.cpp`. If it does not
+compile, its solver raises an error with the reason. Springs of length zero, for which the formula defines no direction,
+get none.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from solvers.problem import NotPositiveDefinite, Positions, System, Unsupported
 HEADERS = Path(__file__).parent.parent / "methods"
 FLAGS = ("-O3", "-march=native", "-DNDEBUG", "-std=c++17")
 SYSTEM = ("/usr/include/eigen3", "/usr/include/suitesparse")
-"""Where Debian's libraries have their headers; those that the compiler finds by itself (CPATH) will do as well."""
+"""Header folders of Debian's libraries; those in the compiler's own search path (CPATH) are used as well."""
 
 LIBRARY = ("-shared", "-fPIC")
 
@@ -36,9 +37,17 @@ LIBRARY = ("-shared", "-fPIC")
 def compile_cpp(
     source: Path, folder: Path, needs: str, options: Sequence[str] = (), libraries: Sequence[str] = ()
 ) -> Path:
-    """The compiled source in `folder`, made anew when it or the solvers' headers have changed.
+    """Return the program or library compiled in `folder`; recompile it after a change of the sources or headers.
 
-    needs: what it takes, in words. Raises Unsupported: why not.
+    Args:
+        source: C++ source.
+        folder: folder of the result.
+        needs: requirements, in words, for the error message.
+        options: further compiler options.
+        libraries: linker arguments.
+
+    Raises:
+        Unsupported: there is no compiler, or the source does not compile.
     """
     compiler = next(filter(None, map(shutil.which, (os.environ.get("CXX", ""), "c++", "g++", "clang++"))), None)
     if compiler is None:
@@ -60,7 +69,7 @@ def compile_cpp(
 
 
 def library(source: Path, needs: str, libraries: Sequence[str] = ()) -> ctypes.CDLL:
-    """The compiled source, loaded. Raises Unsupported."""
+    """Compile a source and load the library; raise Unsupported if that fails."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "springbench"
     made = ctypes.CDLL(str(compile_cpp(source, cache, needs, LIBRARY, libraries)))
     made.prepare.restype = ctypes.c_void_p
@@ -73,7 +82,7 @@ class Native:
     nonzeros: int | None = None
 
     def __init__(self, library: ctypes.CDLL, system: System, springs: Springs) -> None:
-        """Raises NotPositiveDefinite."""
+        """Prepare a system; raise NotPositiveDefinite if Q has no factor."""
         _, pinned, weight = system.penalty
         self.library, self._n, self._free = library, system.vertices, len(system.free)
         given = [np.ascontiguousarray(part, np.int64) for part in (springs.edges, pinned, system.free)]
@@ -98,7 +107,7 @@ class Native:
 
 
 def address(array: np.ndarray) -> ctypes.c_void_p:
-    """Where an array without gaps is."""
+    """Return the address of a contiguous array."""
     assert array.flags.c_contiguous
     return ctypes.c_void_p(array.ctypes.data)
 
@@ -107,20 +116,20 @@ Made = TypeVar("Made", bound=PreparedLocalGlobal)
 
 
 def prepared(kind: type[Made], system: System, springs: Springs, native: Native, choice: str) -> Made:
-    """The iteration over compiled steps; what is asked of Q besides is answered by our own matrices."""
+    """Prepare the iteration over compiled steps; the norm and the coupling use our own matrices."""
     norm = _Norm(system, springs)
     coupling = norm.coupling if system.pins.exact.any() else csr_array((len(system.free), 0))
     return kind(system, native.project, native, coupling, norm, norm.trace, {}, choice)
 
 
 class _Norm:
-    """What is asked of Q besides its factor, by our own matrices, and only when it is asked."""
+    """The norm, coupling and trace of Q, computed by our own matrices on demand."""
 
     def __init__(self, system: System, springs: Springs) -> None:
         self._system, self._springs = system, springs
 
     def __call__(self, e: Positions) -> float:
-        """|e|_Q [J^(1/2)]."""
+        """Return |e|_Q [J^(1/2)]."""
         return matrices.energy_norm(self._Q, e)
 
     @cached_property
@@ -135,7 +144,7 @@ class _Norm:
 
     @property
     def trace(self) -> float:
-        """Of the unpinned part of Q [N/m]."""
+        """Trace of the unpinned part of Q [N/m]."""
         diagonal = self._system.inertia.copy()
         np.add.at(diagonal, self._springs.edges, self._springs.stiffness[:, None])
         return float(diagonal[self._system.unpinned].sum())

@@ -1,4 +1,4 @@
-"""How a step's matrix takes energies that no step may pass through, whose blocks change with the positions."""
+"""The matrix of a step with barrier energies, whose blocks change with the positions."""
 
 from __future__ import annotations
 
@@ -14,16 +14,21 @@ from solvers.problem import Positions
 
 
 class StepMatrix:
-    """The matrix of a step's Hessians. What energies need beyond the pattern that all steps have, and may need near the
-    positions where they first do, is analysed once: for as long as that suffices, most often to the end of the step."""
+    """The matrix of a step's Hessians.
+
+    Blocks outside the common pattern, and those that may be needed near the positions where this first occurs, are
+    analysed once. The result is valid as long as it suffices, usually to the end of the step.
+    """
 
     def __init__(self, whole: Objective, bounded: list[Bounded]) -> None:
         self._whole, self._bounded = whole, bounded
         self._known: Matrix | None = None
 
     def at(self, p: Positions, i: Indices, j: Indices, met: list[Indices]) -> Matrix:
-        """With places for blocks (i, j) of free vertices, and for those that each bounded energy has at p, between
-        vertices `met` (a, k)."""
+        """Return the matrix at p with blocks (i, j) of free vertices and the blocks of each barrier energy.
+
+        The latter are between the vertices `block_vertices` (a, k).
+        """
         known = self._known or self._whole.matrix
         if not (known.has(i, j) and all(known.holds(-1 - k, vertices) for k, vertices in enumerate(met))):
             near = (self._whole.between(energy.neighbours(p)) for energy in self._bounded)
@@ -33,7 +38,7 @@ class StepMatrix:
 
 
 class PairsAt:
-    """Second derivatives of bounded energies at a point."""
+    """The Hessian blocks of barrier energies at a point."""
 
     def __init__(self, energies: list[Bounded], p: Positions) -> None:
         self._energies, self._p = energies, p
@@ -41,16 +46,16 @@ class PairsAt:
 
     @cached_property
     def blocks(self) -> list[PairBlocks]:
-        """The exact ones of each energy."""
+        """Exact blocks of each energy."""
         return [energy.blocks(self._p) for energy in self._energies]
 
     @cached_property
     def coupled(self) -> list[Indices]:
-        """The vertices (a, k) of each energy's."""
+        """Vertices (a, k) of the blocks of each energy."""
         return [energy.coupled(self._p) for energy in self._energies]
 
     def add(self, keep: float, matrix: Matrix) -> None:
-        """Add them to the matrix; keep: of what bends downwards, in which they are linear."""
+        """Add the blocks to the matrix; they are linear in the fraction of their negative part."""
         if any(map(len, self.coupled)):
             for end, share in ((1.0, keep), (0.0, 1.0 - keep)):
                 if share:

@@ -1,8 +1,8 @@
-"""The matrix of a Hessian: 3 x 3 blocks between free vertices, where each energy's go, and its factorisation.
+"""The matrix of a Hessian: 3 x 3 blocks between free vertices, their positions per energy, and the factorisation.
 
-The blocks lie where springs, projective energies and elements have theirs, known before the first step. Where another
-energy needs more, a step takes a pattern with those (`core.pairs_matrix`), and the last one is kept for a step
-that needs the same: so a result depends on its problem alone and not on what came before.
+The pattern covers springs, projective energies and elements, which are known before the first step. If another energy
+needs more blocks, a step extends the pattern (`solvers.objective.step_matrix`). The last extended one is cached for
+steps that need exactly that pattern, so that a result depends on its problem only, not on earlier ones.
 """
 
 from __future__ import annotations
@@ -27,8 +27,15 @@ class Matrix:
     """A matrix of 3 x 3 blocks between free vertices."""
 
     def __init__(self, system: System, terms: Terms, form: Form | None, number: Indices, graph: csr_array) -> None:
-        """form: of the system, None for none; number (n,): of each vertex among the free ones, or -1; graph: the
-        pattern of blocks (f, f), sorted, with a diagonal."""
+        """Analyse a block pattern.
+
+        Args:
+            system: the system.
+            terms: objective terms.
+            form: quadratic form of the system, or None.
+            number: index of each vertex among the free ones (n,), or -1.
+            graph: pattern of the blocks (f, f), sorted, with a diagonal.
+        """
         self.graph, self._number, self._size = graph, number, len(system.free)
         self._terms, self._form = terms, form
         self.values = np.empty((graph.nnz, 3, 3))
@@ -50,7 +57,7 @@ class Matrix:
         i: Indices,
         j: Indices,
     ) -> Matrix:
-        """A matrix with the blocks of a graph and those between vertices i and j, both ways, where both are free."""
+        """Return a matrix with the blocks of a graph and those between free vertices i and j in both directions."""
         i, j = i[(i >= 0) & (j >= 0)], j[(i >= 0) & (j >= 0)]
         ones = np.ones(2 * len(i))
         more = csr_array(coo_array((ones, (np.append(i, j), np.append(j, i))), shape=graph.shape))
@@ -58,35 +65,36 @@ class Matrix:
 
     @property
     def blocks(self) -> tuple[Indices, Indices]:
-        """Which blocks it has: the rows and the columns of all."""
+        """Rows and columns of all blocks."""
         return self._keys // self._size, self._keys % self._size
 
     def has(self, i: Indices, j: Indices) -> bool:
-        """Whether it has the blocks (i, j)."""
+        """Return whether the matrix has the blocks (i, j)."""
         keys = i * self._size + j
         at = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
         return bool((self._keys[at] == keys).all())
 
     def needs(self, i: Indices, j: Indices, base: Matrix) -> bool:
-        """Whether it has no blocks but those of another, and (i, j) or (j, i)."""
+        """Return whether the matrix has exactly the blocks of another one, (i, j) and (j, i)."""
         size = self._size
         return len(np.unique(np.concatenate([base._keys, i * size + j, j * size + i]))) == len(self._keys)
 
     def entries(self, rows: Indices, columns: Indices) -> Indices:
-        """Where the entries (rows, columns) lie among its values."""
+        """Return the indices of the entries (rows, columns) within the flat values."""
         block = np.searchsorted(self._keys, rows // 3 * self._size + columns // 3)
         return 9 * block + 3 * (rows % 3) + columns % 3
 
     def of_elements(self, energy: int, vertices: Indices) -> Indices:
-        """Where the blocks of an energy's elements lie, every vertex of (m, k) with every one, (m, k^2); -1 where one
-        is not free. They are found once for the same array of vertices. Raises LookupError where a block is missing.
+        """Return the block index of each vertex pair of an energy's elements (m, k), as (m, k^2); -1 if not free.
+
+        They are cached for the same array of vertices. Raises LookupError if a block is missing.
         """
         if not self.holds(energy, vertices):
             raise LookupError("the matrix has no place for some blocks of these elements")
         return self._elements[energy][1]
 
     def holds(self, energy: int, vertices: Indices) -> bool:
-        """Whether it has all blocks of an energy's elements."""
+        """Return whether the matrix has all blocks of an energy's elements."""
         known = self._elements.get(energy)
         if known is not None and known[0] is vertices:
             return True
@@ -101,13 +109,13 @@ class Matrix:
         return True
 
     def _between(self, i: Indices, j: Indices) -> Indices:
-        """The blocks between vertices i and j, of one shape; -1 where one is not free."""
+        """Return the blocks between vertices i and j, of one shape; -1 if one is not free."""
         i, j = self._number[i], self._number[j]
         return np.where((i >= 0) & (j >= 0), np.searchsorted(self._keys, i * self._size + j), -1)
 
     @cached_property
     def constant(self) -> NDArray[np.float64]:
-        """The blocks of inertia, penalty pins and the form, (b, 3, 3) [N/m]."""
+        """Blocks of inertia, penalty pins and the form, (b, 3, 3) [N/m]."""
         out = np.empty_like(self.values)
         hessian.hold(self._terms, self.places, out)
         if self._form is not None:

@@ -1,14 +1,14 @@
-"""What conjugate gradients are preconditioned by, in Newton's methods and in nonlinear ones.
+"""Preconditioners of conjugate gradients, in Newton's methods and in nonlinear ones.
 
     factor          Q^-1                                               a solve with the prefactored matrix
-    schwarz         dense inverses of patches of H+, on levels         see `solvers.linear.schwarz`
-    block-jacobi    inverses of the 3 x 3 blocks on H+'s diagonal
+    schwarz         dense inverses of patches of H+, on levels         see `solvers.linalg.additive_schwarz`
+    block-jacobi    inverses of the 3 x 3 blocks on the diagonal of H+
 
-H+ is the Hessian at each point, of elements whose negative eigenvalues are clamped: what the last two are of. They are
-products alone, as suit a graphics processor; they leave Q's factor to what measures residuals.
+H+ is the Hessian at each point, with the negative eigenvalues of its elements clamped; the last two are built from it.
+Both consist of products only, which suits a graphics processor. They use Q's factor for residuals only.
 
-Contact is far stiffer than Q, on a few vertices. There P = S Q S takes the place of Q, with S_i = (I + W_i/Q_ii)^(1/2)
-of the blocks W_i that it adds to H: on these vertices P is Q + W but for what couples them, and it is Q on all others.
+Contact is much stiffer than Q, at a few vertices. With contact P = S Q S replaces Q, where S_i = (I + W_i/Q_ii)^(1/2)
+and W_i is the block that contact adds to H. At these vertices P equals Q + W except for couplings; elsewhere it equals Q.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from solvers.linear.schwarz import Patches, ordered
 from solvers.problem import Positions, Unsupported
 
 Preconditioning = Literal["factor", "schwarz", "block-jacobi"]
-"""Their names."""
+"""The names of the preconditioners."""
 
 Preconditioner = Callable[[Positions], Positions]
-"""Gradients [N] to displacements [m], both (n, 3)."""
+"""A map from gradients [N] to displacements [m], both (n, 3)."""
 
 At = Callable[[StepObjective, Positions], tuple[Hessian, Preconditioner]]
-"""The Hessian at p (n, 3), and what preconditions it there."""
+"""A function that returns the Hessian at p (n, 3) and its preconditioner."""
 
 LEAST = 1e-6
-"""Of Q's diagonal, what is added to blocks: a vertex without mass may hang on springs that resist in one direction."""
+"""Fraction of Q's diagonal added to blocks, because the springs at a massless vertex may act in one direction only."""
 
 
 def preconditioning(name: Preconditioning, metric: Metric, objective: Objective, solver: str) -> At:
-    """What does so in a system. Raises Unsupported where energies that state no elements would have to be clamped."""
+    """Return the builder of a preconditioner; raise Unsupported if an energy without elements must be clamped."""
     if name == "factor":
         return _Factor(metric)
     energies = objective.system.energies
@@ -59,7 +59,7 @@ def preconditioning(name: Preconditioning, metric: Metric, objective: Objective,
 
 
 class _Factor:
-    """Q^-1, or (S Q S)^-1 where something is touched."""
+    """Q^-1, or (S Q S)^-1 with active contact."""
 
     def __init__(self, metric: Metric) -> None:
         self._metric = metric
@@ -71,7 +71,7 @@ class _Factor:
 
 
 class _Blocks:
-    """The diagonal blocks of the clamped Hessian."""
+    """Block Jacobi with the diagonal blocks of the clamped Hessian."""
 
     def __init__(self, metric: Metric) -> None:
         self._free, self._least = metric.system.free, _least(metric)
@@ -83,7 +83,7 @@ class _Blocks:
 
 
 class _Schwarz:
-    """Patches of the clamped Hessian."""
+    """Additive Schwarz with patches of the clamped Hessian."""
 
     def __init__(self, metric: Metric) -> None:
         self._free, self._least = metric.system.free, _least(metric)
@@ -101,12 +101,12 @@ class _Schwarz:
 
 
 def _least(metric: Metric) -> NDArray[np.float64]:
-    """Blocks (f, 3, 3) [N/m]."""
+    """Return blocks (f, 3, 3) [N/m] to add to the diagonal."""
     return LEAST * metric.diagonal[:, None, None] * np.eye(3)
 
 
 def _among(free: NDArray[np.int64], solve: Preconditioner) -> Preconditioner:
-    """What is solved for free vertices (f,), for all (n, 3)."""
+    """Extend a solve for free vertices (f,) to all vertices (n, 3)."""
 
     def whole(b: Positions) -> Positions:
         out = np.zeros_like(b)
@@ -117,8 +117,10 @@ def _among(free: NDArray[np.int64], solve: Preconditioner) -> Preconditioner:
 
 
 def diagonal_blocks(step: StepObjective, hessian: Hessian, p: Positions) -> NDArray[np.float64]:
-    """The blocks (f, 3, 3) [N/m] on the diagonal of `hessian.convex()`, at p, without that matrix: of springs, forms,
-    elements and pairs."""
+    """Return the diagonal blocks (f, 3, 3) [N/m] of the clamped Hessian without assembling that matrix.
+
+    They include springs, forms, elements and pairs.
+    """
     whole, clamped = step.whole, hessian.filtered(Filtering())
     terms, number, form = whole.terms, whole.number, whole.form
     places = springs.Places(whole.system.free, number, np.full((len(terms.stiffness), 2), -1))
@@ -135,8 +137,10 @@ def diagonal_blocks(step: StepObjective, hessian: Hessian, p: Positions) -> NDAr
 
 
 def _on_diagonal(number: NDArray[np.int64], vertices: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Where the blocks of elements of vertices (m, k) lie, (m, k^2), where a vertex has one with itself alone: that of
-    its number (n + 1,), the last of them of the vertex -1; -1 for none."""
+    """Return the diagonal blocks of elements with vertices (m, k), as (m, k^2), -1 off the diagonal.
+
+    The block is the vertex's index (n + 1,), whose last entry is for the vertex -1.
+    """
     k = vertices.shape[1]
     places = np.full((len(vertices), k * k), -1)
     places[:, :: k + 1] = number[vertices]
@@ -144,12 +148,14 @@ def _on_diagonal(number: NDArray[np.int64], vertices: NDArray[np.int64]) -> NDAr
 
 
 class Scaled:
-    """(S Q S)^-1 with S_i = (I + W_i/Q_ii)^(1/2) for some vertices, I for all others.
+    """The preconditioner (S Q S)^-1 with S_i = (I + W_i/Q_ii)^(1/2) at some vertices, I at all others.
 
-    shrunk: these vertices (c,), and S_i^-1 (c, 3, 3)."""
+    Attributes:
+        shrunk: these vertices (c,), and S_i^-1 (c, 3, 3).
+    """
 
     def __init__(self, metric: Metric, vertices: NDArray[np.int64], blocks: NDArray[np.float64]) -> None:
-        """blocks: W (c, 3, 3) [N/m] of vertices (c,), positive semidefinite."""
+        """Create the preconditioner for positive semidefinite blocks W (c, 3, 3) [N/m] of vertices (c,)."""
         self._metric, system = metric, metric.system
         resists = np.full(system.vertices, np.inf)
         resists[system.free] = metric.diagonal
@@ -158,7 +164,7 @@ class Scaled:
         self.shrunk = vertices, (axes * shrunk[:, None, :]) @ axes.transpose(0, 2, 1)
 
     def __call__(self, b: Positions) -> Positions:
-        """(S Q S)^-1 b, (n, 3)."""
+        """Return (S Q S)^-1 b, (n, 3)."""
         scaled = b.copy()
         self._shrink(scaled)
         x = self._metric.solve(scaled)
@@ -171,7 +177,7 @@ class Scaled:
 
 
 def _beyond(step: StepObjective, hessian: Hessian, n: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """What elements that are in no Q add to the blocks of n vertices: which (c,), and the blocks (c, 3, 3) [N/m]."""
+    """Return the vertices (c,) with contact and the blocks (c, 3, 3) [N/m] of elements and pairs outside Q."""
     blocks, acted, number = np.zeros((n, 3, 3)), np.zeros(n, np.bool_), np.append(np.arange(n), -1)
     for one, curvature in zip(step.stated, hessian.curvature, strict=True):
         if not one.projective:

@@ -5,8 +5,8 @@
 
 `solvers.methods.newton.hybrid_newton` gives the motivation. If H(t) is not positive definite, a step along unstable
 modes is longer the closer s is to the smallest value that has a factor (More and Sorensen 1983). So a smaller s is
-tried after each step that allows it. The ratio of reduction is squared if there was a factor; otherwise its square root is
-taken. So s approaches the smallest value in a few steps, and then tracks it.
+tried after each step that allows it. The ratio of reduction is squared if there was a factor; otherwise its square root
+is taken. So s approaches the smallest value in a few steps, and then tracks it.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""What is prefactored: Q, its factor and its norm, with the local-global iteration over them (see
-`solvers.methods.local_global`), whatever the backend of the two steps.
+"""The local-global iteration over a prefactored Q, independent of the backend of its two steps.
+
+The method is described in `solvers.methods.local_global.reference_local_global`.
 """
 
 from __future__ import annotations
@@ -27,23 +28,30 @@ from solvers.problem import (
 )
 
 Project = Callable[[Positions, Positions, Positions], None]
-"""(p, y, out): write y + A'K d(p) to `out`."""
+"""A function (p, y, out) that writes y + A'K d(p) to `out`."""
 
 
 _COUNTS = {"nnz_factor": "nonzeros", "panel_bytes": "panel_bytes", "flops_per_solve": "flops"}
-"""What the facts tell of a factor that knows it."""
+"""Statistics of a factor, by the attribute that provides them, if any."""
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedLocalGlobal(Iterative):
-    """The iteration, over any backend's local step, factor and norm.
+    """The iteration with any backend's local step, factor and norm.
 
-    project: the local step; factor: of Q's free rows and columns; coupling: Q's free rows and exactly pinned
-    columns (f, x); norm: |e|_Q [J^(1/2)] of a displacement that vanishes at the pins; trace: of the unpinned
-    part of Q [N/m]; facts: exact counts of what was built; choice: the linear solver in words; lagged: the local step
-    of one problem, where it differs from problem to problem; rounded: Q's free rows and columns where the factor is
-    less precise: then corrections are solved for, p + Q^-1 (b - Q p), and the fixed point stays accurate to float64;
-    spread: max_i Q_ii / (Q 1)_i over its free rows and columns, half of what bounds its condition.
+    Attributes:
+        system: the system.
+        project: local step.
+        factor: factor of Q's free rows and columns.
+        coupling: Q's free rows and exactly pinned columns (f, x).
+        norm: |e|_Q [J^(1/2)] of a displacement that vanishes at the pins.
+        trace: trace of the unpinned part of Q [N/m].
+        facts: exact counts of the setup.
+        choice: description of the linear solver.
+        lagged: builder of the local step of a problem, if it depends on the problem.
+        rounded: Q's free rows and columns if the factor has low precision. The iteration then solves for corrections,
+            p + Q^-1 (b - Q p), and the fixed point stays accurate to float64.
+        spread: max_i Q_ii / (Q 1)_i over the free rows and columns, half of a bound on the condition number.
     """
 
     residual_of: ClassVar[ResidualOf] = "previous"
@@ -61,15 +69,15 @@ class PreparedLocalGlobal(Iterative):
     spread: float = 1.0
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative."""
+        """Start a solve from an initial guess (n, 3) [m]."""
         return Iterations(self, problem, guess)
 
     def scale(self, problem: StepProblem) -> float:
-        """See Iterative."""
+        """Return the residual scale [J^(1/2)] for the round-off check."""
         return largest(problem) * self.trace**0.5
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """The local and the global step at the first guess, as callables to be timed apart."""
+        """Return the local and the global step at the initial guess, as callables for separate timing."""
         constant, b = self.constant(problem), np.empty_like(problem.target)
         p = self.placed(problem.first_guess, problem)
         out, project = p.copy(), self.local(problem)
@@ -86,11 +94,11 @@ class PreparedLocalGlobal(Iterative):
         return {"local": local, "global": whole}
 
     def local(self, problem: StepProblem) -> Project:
-        """The local step of one problem."""
+        """Return the local step of a problem."""
         return self.lagged(problem) if self.lagged else self.project
 
     def constant(self, problem: StepProblem) -> Positions:
-        """y, with the exact pins' columns of Q moved to the right-hand side."""
+        """Return y, with the exact pins' columns of Q moved to the right-hand side."""
         s = self.system
         y = s.inertia[:, None] * problem.target + problem.force
         soft, vertices, weight = s.penalty
@@ -100,8 +108,10 @@ class PreparedLocalGlobal(Iterative):
         return y
 
     def correction(self, b: Positions, out: Positions) -> Positions:
-        """Write Q^-1 b, by the factor as it is, to `out`, which it returns, both (n, 3); exactly pinned vertices keep
-        what is there."""
+        """Write Q^-1 b, without refinement of the factor's precision, to `out` and return `out`, both (n, 3).
+
+        Exactly pinned vertices of `out` are not changed.
+        """
         free = self.system.free
         if len(free) == len(b):
             self.factor.solve(b, out)
@@ -112,7 +122,7 @@ class PreparedLocalGlobal(Iterative):
         return out
 
     def toward(self, b: Positions, p: Positions, out: Positions) -> None:
-        """Write where Q p = b leads from p to `out`, (n, 3) all, as `correction` does; by a rounded factor, nearer."""
+        """Write the solution of Q p = b to `out`, all (n, 3); a low-precision factor solves for the correction of p."""
         if self.rounded is None:
             self.correction(b, out)
             return
@@ -122,20 +132,20 @@ class PreparedLocalGlobal(Iterative):
         out[free] += p[free]
 
     def placed(self, p: Positions, problem: StepProblem) -> Positions:
-        """A copy of p with the exactly pinned vertices on their targets, where they stay."""
+        """Return a copy of p with the exactly pinned vertices on their targets."""
         placed = np.array(p, order="C")
         exact = self.system.pins.exact
         placed[self.system.pins.vertices[exact]] = problem.pin_targets[exact]
         return placed
 
     def residual(self, e: Positions) -> float:
-        """|e|_Q [J^(1/2)] of a displacement (n, 3) [m] over the unpinned vertices; the others' are set to zero."""
+        """Return |e|_Q [J^(1/2)] of a displacement (n, 3) [m] over the unpinned vertices; sets pinned rows to zero."""
         e[self.system.pins.vertices] = 0.0
         return self.norm(e)
 
 
 class Iterations(Iterating):
-    """Positions and those before them take turns at two arrays; constant: y (n, 3) [N]."""
+    """The state of a local-global solve with two alternating position arrays; right_hand_side: y (n, 3) [N]."""
 
     def __init__(self, base: PreparedLocalGlobal, problem: StepProblem, guess: Positions) -> None:
         self.base, self._project = base, base.local(problem)
@@ -144,7 +154,7 @@ class Iterations(Iterating):
         self._moved = False
 
     def advance(self) -> bool:
-        """See Iterating."""
+        """Do one iteration; return False if round-off prevents descent."""
         p = self.positions
         self._project(p, self.constant, self._b)
         self.base.toward(self._b, p, self._other)
@@ -152,12 +162,12 @@ class Iterations(Iterating):
         return True
 
     def residual(self) -> float:
-        """|p - LG(p)|_Q of the previous positions p."""
+        """Return |p - LG(p)|_Q of the previous positions p."""
         return self.base.residual(self._other - self.positions) if self._moved else float("nan")
 
 
 def projective(system: System, solver: str) -> list[ProjectiveEnergy]:
-    """The system's energies, all of them projective; raises Unsupported, with the names of those that are not."""
+    """Return the system's energies, all projective; raise Unsupported with the names of others."""
     energies = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
     if len(energies) < len(system.energies):
         others = {type(e).__name__ for e in system.energies if not isinstance(e, ProjectiveEnergy)}
@@ -166,7 +176,7 @@ def projective(system: System, solver: str) -> list[ProjectiveEnergy]:
 
 
 def only_springs(system: System, solver: str) -> Springs:
-    """The system's springs as one energy; raises Unsupported where it has any other energy."""
+    """Return the system's springs as one energy; raise Unsupported if it has another energy."""
     others = {type(energy).__name__ for energy in system.energies if not isinstance(energy, Springs)}
     if others:
         raise Unsupported(f"{solver}: knows springs only; the scene has {', '.join(sorted(others))} as well")
@@ -180,8 +190,14 @@ def prepared(
     *,
     rounded: bool = False,
 ) -> PreparedLocalGlobal:
-    """The energies' own local steps, over a factor of the assembled Q that comes with its `choice`; rounded: whether
-    that is less precise than float64."""
+    """Prepare the iteration with the local steps of the energies and a factor of the assembled Q.
+
+    Args:
+        system: the system.
+        energies: its projective energies.
+        factorise: function of Q's free part that returns a factor and a description.
+        rounded: whether the factor is less precise than float64.
+    """
     Q = matrices.assemble(system, energies)
     free = system.free
     rows = Q if len(free) == system.vertices else csr_array(Q[free])
@@ -205,7 +221,7 @@ def prepared(
 
 
 def _spread(Q: csr_array) -> float:
-    """max_i Q_ii / (Q 1)_i; infinite where a row's sum is nothing, or round-off."""
+    """Return max_i Q_ii / (Q 1)_i; infinite if a row sum is zero or round-off."""
     sums, diagonal = Q.sum(axis=1), Q.diagonal()
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         found = np.where(sums > 0.0, diagonal / np.maximum(sums, 0.0), np.inf)
@@ -224,6 +240,6 @@ def _projection(energies: Iterable[Energy]) -> Project:
 
 
 def facts(entries: int, factor: Factor) -> dict[str, float]:
-    """The entries of Q, and what the factor knows of itself."""
+    """Return the number of entries of Q, and the statistics that the factor provides."""
     counts = {name: getattr(factor, attribute, None) for name, attribute in _COUNTS.items()}
     return {"nnz_system": float(entries)} | {name: float(n) for name, n in counts.items() if n is not None}

@@ -1,4 +1,4 @@
-"""The substeps of an explicit method: how many a step has, or by what error they are chosen, and what follows."""
+"""The substeps of an explicit method: their fixed number or their error tolerance, and derived properties."""
 
 from __future__ import annotations
 
@@ -12,8 +12,14 @@ from solvers.problem import ResidualOf, Unsupported
 
 @dataclass(frozen=True)
 class Substeps:
-    """What the method chose. count: substeps of a step, where they have one length, else the fewest that are stable;
-    tolerance [m]: of each where they have not, else 0; rate: of the fastest motion [1/s]; choice: in words."""
+    """The choice of substeps.
+
+    Attributes:
+        count: substeps of a step for a fixed size, else the smallest stable number.
+        tolerance: error tolerance of a substep [m] for an adaptive size, else 0.
+        rate: rate of the fastest motion [1/s].
+        choice: description in words.
+    """
 
     count: int
     tolerance: float
@@ -23,7 +29,7 @@ class Substeps:
 
 @dataclass(frozen=True, eq=False)
 class Substepping:
-    """What of an explicit method is ready for a system."""
+    """The part of an explicit method that is set up for a system."""
 
     residual_of: ClassVar[ResidualOf] = "none"
     factorisations: ClassVar[int] = 0
@@ -33,21 +39,21 @@ class Substepping:
 
     @property
     def order(self) -> int:
-        """Of the error."""
+        """Order of the error."""
         return self.method.order
 
     @property
     def evaluations(self) -> int:
-        """Of the forces, in a substep."""
+        """Evaluations of the forces per substep."""
         return self.method.evaluations
 
     def within(self, tolerance: float) -> Self:
-        """The same with an error of each substep [m]. Raises Unsupported for substeps of one length."""
+        """Return the solver with another error tolerance [m] of substeps; raise Unsupported for a fixed size."""
         if not self.substeps.tolerance:
             raise Unsupported("the method chooses no steps by an error")
         return replace(self, substeps=replace(self.substeps, tolerance=tolerance))
 
     def refined(self, times: float) -> Self:
-        """The same with so many times the substeps, rounded up."""
+        """Return the solver with a multiple of the substeps, rounded up."""
         count = ceil(times * self.substeps.count)
         return replace(self, substeps=replace(self.substeps, count=count))

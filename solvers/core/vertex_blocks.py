@@ -1,7 +1,7 @@
-"""The free vertices by colour, in bundles, for methods that move one after another.
+"""The free vertices by colour, in packets, for methods that move one vertex after another.
 
-No two vertices of a colour are joined by a spring, a form or an element. Rows are the free vertices by colour, then the
-pinned ones, then two that fill up bundles.
+No two vertices of a colour share a spring, a pair of a form, or an element. Rows are the free vertices by colour, then
+the pinned ones, then two padding rows of the packets.
 """
 
 from __future__ import annotations
@@ -20,9 +20,16 @@ from solvers.vectors.springs import LANES
 
 
 class VertexBlocks(NamedTuple):
-    """row (n,): where each vertex is; free: how many rows are unknowns; bundles: of these, by colour; first (colours +
-    1,): the first bundle of each; held, majorant (n + 2,) [N/m]: of each row, what inertia and pins hold it with, and
-    that with the stiffness of its springs and elements, 1 where nothing is."""
+    """The rows, packets and majorants of a system.
+
+    Attributes:
+        row: row of each vertex (n,).
+        free: number of free rows.
+        bundles: packets of the free rows, by colour.
+        first: first packet of each colour (colours + 1,).
+        held: stiffness [N/m] of inertia and pins of each row (n + 2,).
+        majorant: that plus the stiffness of springs and elements (n + 2,) [N/m]; 1 for padding.
+    """
 
     row: NDArray[np.int64]
     free: int
@@ -33,12 +40,12 @@ class VertexBlocks(NamedTuple):
 
     @property
     def colours(self) -> int:
-        """How many there are."""
+        """Number of colours."""
         return len(self.first) - 1
 
     @classmethod
     def of(cls, system: System, parts: Parts, beside: Beside) -> VertexBlocks:
-        """Those of a system whose energies are these."""
+        """Build the rows of a system from the decomposition of its energies."""
         n = system.vertices
         coloured = colouring.of_vertices(np.concatenate([parts.whole.edges, beside.pairs()]), n)
         colour = np.empty(n, np.int64)

@@ -1,7 +1,7 @@
-"""Energies of elements for methods that go vertex by vertex: whose neighbours they make, and what bounds them.
+"""Element energies for vertex-by-vertex methods: the couplings of vertices and the majorants.
 
-Where one vertex moves, a projective energy, w_e/2 |(A p)_e - d_e|^2, rises by no more than its gradient and the
-diagonal of A'WA tell: that is its share of the vertex's majorant.
+If a single vertex moves, the change of a projective energy, w_e/2 |(A p)_e - d_e|^2, is bounded by its gradient and the
+diagonal of A'WA, which is its contribution to the majorant of the vertex.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """The projective energies of a system that state the law of their elements.
+    """The projective energies of a system with an element-wise form.
 
-    numbers: which of the system's energies they are; around: their elements by rows, one for each law, once they are
-    known.
+    Attributes:
+        numbers: their indices in the system.
+        around: their elements by rows, one set for each law, once the rows are known.
     """
 
     system: System
@@ -36,17 +37,17 @@ class Beside:
 
     @classmethod
     def of(cls, system: System) -> Beside:
-        """Those of a system."""
+        """Select those of a system."""
         known = (k for k, e in enumerate(system.energies) if hasattr(e, "law") and isinstance(e, ProjectiveEnergy))
         return cls(system, tuple(known))
 
     @property
     def energies(self) -> list[Any]:
-        """The energies."""
+        """The selected energies."""
         return [self.system.energies[k] for k in self.numbers]
 
     def pairs(self) -> NDArray[np.int64]:
-        """Every two vertices of an element, (., 2)."""
+        """Return all pairs of vertices of an element, (., 2)."""
         found = [np.empty((0, 2), np.int64)]
         for energy in self.energies:
             vertices = energy.elements.vertices
@@ -54,14 +55,14 @@ class Beside:
         return np.concatenate(found)
 
     def diagonal(self) -> NDArray[np.float64]:
-        """The diagonal of A'WA (n,) [N/m], whatever the step."""
+        """Return the diagonal of A'WA (n,) [N/m], which does not depend on the step."""
         total = np.zeros(self.system.vertices)
         for share in matrices.shares(self.system, self.energies):
             total += share.diagonal()
         return total
 
     def among(self, row: NDArray[np.int64], rows: int) -> Beside:
-        """The same, with its vertices in rows `row` (n,), of so many."""
+        """Return these energies with vertices in rows `row` (n,) of `rows`."""
         if not self.numbers:
             return self
         from solvers.kernels.stencils import Around  # for those who need it
@@ -70,7 +71,7 @@ class Beside:
         return replace(self, around=tuple(Around.of(law, one, row, rows) for law, one in joined))
 
     def begun(self, problem: StepProblem) -> tuple[Around, ...] | None:
-        """The elements by rows as they are in a step, None without any."""
+        """Return the elements by rows, updated to a step; None if there are none."""
         if not any(is_lagged(energy) for energy in self.energies):
             return self.around or None
         joined = self._joined([problem.energies[k] for k in self.numbers])
@@ -80,7 +81,7 @@ class Beside:
 
     @cached_property
     def kernel(self) -> Any:
-        """`solvers.kernels.vbd.iterate` with these energies."""
+        """The kernel `solvers.methods.vertex_block.vbd_sweeps.run_iterations` extended by these energies."""
         if not self.numbers:
             return plain.iterate
         from solvers.kernels.stencils import Kind  # for those who need it
@@ -91,10 +92,10 @@ class Beside:
 
     @cached_property
     def _laws(self) -> list[Law]:
-        """Each law once."""
+        """The distinct laws."""
         return list({id(energy.law): energy.law for energy in self.energies}.values())
 
     def _joined(self, energies: list[Any]) -> list[Elements]:
-        """The elements of the energies, by their laws."""
+        """Concatenate the elements of the energies by law."""
         of_law = [[e.elements for e in energies if e.law is law] for law in self._laws]
         return [Elements(*(np.concatenate(arrays) for arrays in zip(*some, strict=True))) for some in of_law]

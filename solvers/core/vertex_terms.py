@@ -1,9 +1,9 @@
-"""The terms of a step that act on each vertex by itself: inertia, force and pins by penalty.
+"""The terms of a step that act on single vertices: inertia, force and penalty pins.
 
-    held_i/2 |p_i|^2 - y_i . p_i,      held = c m/dt^2 + w,      y = c m/dt^2 target + f + w p_pin
+    h_i/2 |p_i|^2 - y_i . p_i,      h = c m/dt^2 + w,      y = c m/dt^2 target + f + w p_pin
 
-They are one quadratic a vertex. So methods that go vertex by vertex or spring by spring take a pin of any weight
-exactly, by more weight on the vertex, without a further constraint that converges slowly.
+They form one quadratic function per vertex. So methods that proceed vertex by vertex or spring by spring treat a pin of
+any weight exactly, by an increased weight of the vertex, without a further slowly converging constraint.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from solvers.problem import Positions, StepProblem, System, Unsupported
 
 
 def held(system: System) -> NDArray[np.float64]:
-    """What holds each vertex (n,) [N/m], infinite where a pin is exact."""
+    """Return the stiffness h (n,) [N/m] of inertia and pins, infinite for an exact pin."""
     total = system.inertia.copy()
     total[system.pins.vertices] += system.pins.weight
     return total
 
 
 def pull(problem: StepProblem) -> Positions:
-    """y (n, 3) [N]; of exact pins what inertia and force are there."""
+    """Return y (n, 3) [N]; at exact pins it is that of inertia and force."""
     s = problem.system
     y = s.inertia[:, None] * problem.target + problem.force
     soft, vertices, weight = s.penalty
@@ -31,9 +31,9 @@ def pull(problem: StepProblem) -> Positions:
 
 
 def anchors(problem: StepProblem) -> Positions:
-    """Where each vertex would go without springs, y/held (n, 3) [m]; exact pins on their targets.
+    """Return the minimum y/h (n, 3) [m] of these terms, with exact pins on their targets.
 
-    In the form target + (f + w (p_pin - target))/held, which does not round where the force is small.
+    It is computed as target + (f + w (p_pin - target))/h, which avoids rounding if the force is small.
     """
     s = problem.system
     weight, away = np.zeros(s.vertices), problem.force.copy()
@@ -44,7 +44,7 @@ def anchors(problem: StepProblem) -> Positions:
 
 
 def placed(p: Positions, problem: StepProblem) -> Positions:
-    """A copy of p (n, 3) with the exactly pinned vertices on their targets."""
+    """Return a copy of p (n, 3) with the exactly pinned vertices on their targets."""
     out = np.array(p, np.float64, order="C")
     exact = problem.system.pins.exact
     out[problem.system.pins.vertices[exact]] = problem.pin_targets[exact]
@@ -52,7 +52,7 @@ def placed(p: Positions, problem: StepProblem) -> Positions:
 
 
 def require_mass(system: System, held: NDArray[np.float64], solver: str) -> None:
-    """Raise Unsupported where a vertex has nothing that holds it by itself, with the vertices at fault."""
+    """Raise Unsupported, with the vertices concerned, if a vertex has neither mass nor a pin."""
     loose = np.flatnonzero(held <= 0.0)
     if len(loose):
         named = ", ".join(map(str, loose[:5])) + (", ..." if len(loose) > 5 else "")
@@ -63,7 +63,7 @@ def require_mass(system: System, held: NDArray[np.float64], solver: str) -> None
 
 
 def require_implicit_euler(system: System, solver: str) -> None:
-    """Raise Unsupported for a step of another integrator."""
+    """Raise Unsupported if the step is that of another integrator."""
     if system.factor != 1.0:
         raise Unsupported(
             f"{solver}: divides the step by itself and keeps its own velocity, which takes the place of an integrator; "
