@@ -2,8 +2,8 @@
 
 The mesh is intersection-free at the start of the step for the obstacles' old positions. The minimiser needs a start
 that is intersection-free for their positions at the end of the step. These motions are tried first, each on a straight
-path while the obstacles move: no motion, motion with the current velocity, and rigid motion with an obstacle. If none is free
-of collisions to the end, the one with the largest fraction is followed, and then the barriers themselves push
+path while the obstacles move: no motion, motion with the current velocity, and rigid motion with an obstacle. If none
+is free of collisions to the end, the one with the largest fraction is followed, and then the barriers themselves push
 nearby vertices away from obstacles at rest:
 
     p <- p + t d,     d_i = -1/2 B_i^-1 g_i,     B_i = 3 x 3 blocks of the barriers' Hessian, plus inertia

@@ -40,7 +40,8 @@ Reals = NDArray[np.float64]
 
 _LOST = 1e-3
 """Largest position error by the bound, relative to the median rest length; the bound is about 20 times the error.
-Sheets of 256 vertices a side and 1e5 N/m stay below it by a factor of 100; scenes with stiffness ratios of 1e12 do not."""
+Sheets of 256 vertices a side and 1e5 N/m stay below it by a factor of 100; scenes with stiffness ratios of 1e12 exceed
+it."""
 
 _NEAR = 100.0
 """Distance [m] from the origin within which most scenes stay."""

@@ -1,4 +1,4 @@
-"""What explicit methods evaluate instead of a matrix: the forces of a system, and how fast it can vibrate."""
+"""The forces of a system for explicit methods, and a bound of its frequencies."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from solvers.memory import aligned
 from solvers.problem import Positions, System, Unsupported, is_lagged
 
 _ABOVE = 1.02
-"""Of the largest eigenvalue as it is found, which is from below: to one percent."""
+"""Margin for the largest eigenvalue, which is approximated from below to one percent."""
 
 
 def frequency(system: System) -> float:
-    """A bound of the largest angular frequency [rad/s] of springs and constant quadratic forms, all pins held."""
+    """Return a bound of the largest angular frequency [rad/s] of springs and constant forms, with all pins fixed."""
     free = np.flatnonzero(system.unpinned)
     constant = [e for e in system.energies if isinstance(e, (Springs, Quadratic)) and not is_lagged(e)]
     if not len(free) or not constant:
@@ -49,8 +49,10 @@ def frequency(system: System) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ForceParts:
-    """The forces of a system: springs, their bundles; a form, as in `Forces`; drag (n,) [1/s]; load (n, 3) [N], that of
-    the form at the origin."""
+    """The forces of a system: springs and their packets, a form as in `FrameForces`, drag (n,) [1/s], load (n, 3) [N].
+
+    The load is the force of the form at the origin.
+    """
 
     springs: Springs
     bundles: Bundles
@@ -62,7 +64,7 @@ class ForceParts:
 
     @classmethod
     def of(cls, system: System, solver: str) -> ForceParts:
-        """Raises Unsupported for what it does not know."""
+        """Build the forces; raise Unsupported for energies that are not supported."""
         n = system.vertices
         springs = Springs.joined([energy for energy in system.energies if isinstance(energy, Springs)])
         drag, load, forms = np.zeros(n), np.zeros((n, 3)), list[csr_array]()
@@ -87,11 +89,11 @@ class ForceParts:
 
 
 _FAR = 1e100
-"""Where springs end that fill up bundles: at no vertex, whatever the unit of length."""
+"""Coordinate of the ends of padding springs, far from any vertex in any unit of length."""
 
 
 def rows_of_four(x: Positions, *, far: bool = False) -> NDArray[np.float64]:
-    """x (n, 3) in rows of four, and the two rows that fill up bundles; far: the last one is where no vertex is."""
+    """Return x (n, 3) in rows of four with the two padding rows; pad_far moves the last one away from all vertices."""
     out = aligned(4 * (len(x) + 2))
     out.reshape(-1, 4)[: len(x), :3] = x
     if far:
@@ -100,10 +102,10 @@ def rows_of_four(x: Positions, *, far: bool = False) -> NDArray[np.float64]:
 
 
 class Whole(Iterating):
-    """A whole step as the only iterate, again and again."""
+    """A whole step as the only iterate, repeated."""
 
     def __init__(self, p: Positions, v: Positions | None) -> None:
-        """v: at the step's end, None where it follows from the positions."""
+        """Create the state with the velocity at the end of the step, or None if it follows from the positions."""
         self.positions, self.velocity = p, v
 
     def advance(self) -> bool:

@@ -8,8 +8,8 @@
     [ J  -eps ] [t] = [ bound - l ]       for the active lengths, J = n A
 
 (Nocedal and Wright 2006, section 18.1.) The multipliers t [N] minimise the gradient in the norm of Q^-1, once the
-lengths are corrected. A method's own multipliers may cancel the gradient while constraints are still violated, so that a
-residual with them is not one of the step. A primal-dual active set method selects the active limits (Hintermueller,
+lengths are corrected. A method's own multipliers may cancel the gradient while constraints are still violated, so that
+a residual with them is not one of the step. A primal-dual active set method selects the active limits (Hintermueller,
 Ito and Kunisch 2002).
 """
 

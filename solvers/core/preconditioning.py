@@ -7,7 +7,7 @@
 H+ is the Hessian at each point, with the negative eigenvalues of its elements clamped; the last two are built from it.
 Both consist of products only, which suits a graphics processor. They use Q's factor for residuals only.
 
-Contact is much stiffer than Q, at a few vertices. With contact P = S Q S replaces Q, where S_i = (I + W_i/Q_ii)^(1/2)
+Contact is far stiffer than Q, at a few vertices. There P = S Q S replaces Q, where S_i = (I + W_i/Q_ii)^(1/2)
 and W_i is the block that contact adds to H. At these vertices P equals Q + W except for couplings; elsewhere it equals Q.
 """
 

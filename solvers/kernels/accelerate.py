@@ -1,14 +1,14 @@
-"""Accelerated descent: a direction from the last correction and earlier differences, and whether to take it.
+"""Accelerated descent: a direction from the last correction and previous differences, and its acceptance.
 
     c_k = -Q^-1 grad g(p_k) = LG(p_k) - p_k                       the plain correction, a local-global iteration
-    d   = scale c_k - sum over j of (a_j s_j + b_j w_j)           the accelerated one
+    d   = scale c_k - sum over j of (a_j s_j + b_j w_j)           the accelerated direction
     s_j = p_(j+1) - p_j,   y_j = grad g(p_(j+1)) - grad g(p_j),   w_j = Q^-1 y_j = c_j - c_(j+1)
 
-A method is nothing but its coefficients (see `accelerate_coefficients`), which it takes from scalar products of the
-window's vectors. An iteration tries p + d, then shorter steps, then the plain correction, shorter and shorter, until
-one descends enough (`solvers.kernels.line_search`). For projective energies Q majorises the Hessian, so that the plain
-correction passes at full length. Vectors are flat and know nothing of what their entries stand for; entries of vertices
-that do not move are zero.
+A method is defined by its coefficients (see `acceleration_coefficients`), which it computes from inner products of the
+window's vectors. An iteration tries p + d, then shorter steps, then the plain correction with decreasing lengths, until
+one descends enough (`solvers.kernels.line_search_conditions`). For projective energies Q majorises the Hessian, so that
+the plain correction is accepted at full length. Vectors are flat and independent of the meaning of their entries;
+entries of vertices that do not move are zero.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from solvers.vectors.dots import dot, dots
 
 _FLATTER = 0.1
 AGAIN, ACCEPTED, STALLED = 0, 1, 2
-"""What `judge` says: evaluate the next trial, go there, or that round-off lets nothing descend."""
+"""The result of `judge_trial`: evaluate the next trial, accept it, or stop because round-off prevents descent."""
 
 BLOCK = 512
-"""Entries that are gone through together, so that what all pairs need stays in the first cache."""
+"""Entries per block, so that the data of all pairs stay in the first-level cache."""
 
 _HALVINGS = 40
 
@@ -53,16 +53,24 @@ NOW = np.dtype(
         ("reference", np.float64),  # |c|_Q^2 where it began [J]
     ]
 )
-"""Where an iteration is."""
+"""The state of an iteration."""
 
 
 class Window(NamedTuple):
-    """The state of a solve. m: pairs kept; N: entries of a vector.
+    """The state of a solve with m pairs in the history and N entries per vector.
 
-    steps, images (m N,): s and w; position, trial: p and p + t d, N entries and maybe more that do not move; descent,
-    descent_there: -grad g at p and at the trial; correction, direction (N,): c and d; block: scratch; sy, wy (m, m):
-    s_i y_j for i not younger than j, and w_i y_j; sg, wg (m,): s_i grad g(p) and w_i grad g(p); a, b (m,); now: one of
-    NOW. s, w, c and d are as precise as the factor.
+    Attributes:
+        steps, images: s and w (m N,).
+        position, trial: p and p + t d, N entries and possibly more that do not move.
+        descent, descent_there: -grad g at p and at the trial.
+        correction, direction: c and d (N,).
+        block: scratch.
+        sy, wy: s_i y_j for i not younger than j, and w_i y_j (m, m).
+        sg, wg: s_i grad g(p) and w_i grad g(p) (m,).
+        a, b: coefficients (m,).
+        now: scalars of the iteration.
+
+    The arrays s, w, c and d have the precision of the factor.
     """
 
     steps: NDArray[Any]
@@ -85,7 +93,7 @@ class Window(NamedTuple):
 
 @kernel
 def begin(window, correction):
-    """Start at the trial point, where `descent_there` and the correction are known."""
+    """Initialise the window at the trial point, whose descent direction and correction are known."""
     now = window.now[0]
     now.count, now.newest, now.radius, now.degree = 0, -1, 0.0, 0
     size = len(window.correction)
@@ -98,7 +106,7 @@ def begin(window, correction):
 
 @kernel
 def propose(window):
-    """The first trial of an iteration."""
+    """Propose the first trial of an iteration."""
     now = window.now[0]
     now.plain, now.tries = coefficients(window), 0
     _combine(window)
@@ -106,13 +114,13 @@ def propose(window):
 
 @kernel
 def shorten(window, part):
-    """The trial at a part of its length."""
+    """Shorten the trial to a fraction of its length."""
     _try(window, part * window.now[0].length)
 
 
 @kernel
 def judge(window):
-    """What to do about a trial whose rise, noise and gradient are known."""
+    """Decide about a trial whose change, noise and gradient are known."""
     now = window.now[0]
     even = abs(now.rise) <= now.noise < np.inf
     if even:
@@ -129,7 +137,7 @@ def judge(window):
     if now.plain and (even or now.tries > _HALVINGS):
         return STALLED
     if now.plain or (now.tries <= now.retries and now.slope < 0.0):
-        # Where the parabola through what is known is least, kept from being too short or too long.
+        # Minimum of the interpolating parabola, safeguarded against too short or too long steps.
         least = -0.5 * now.slope * now.length / excess if excess > 0.0 else 0.5
         _try(window, now.length * min(max(least, 0.1), 0.5))
         return AGAIN
@@ -143,12 +151,12 @@ def judge(window):
 
 @kernel
 def accept(window, correction):
-    """Go to the trial point, where `correction` is the plain one, and put the pair of this step into the window."""
+    """Accept the trial point, where `correction` is the plain one, and add the pair of this step to the history."""
     now, m = window.now[0], len(window.a)
     new = (now.newest + 1) % m
     now.count = min(now.count + 1, m)
     for j in range(m):
-        # What a gradient's difference gives is the difference of what the gradients do.
+            # The product with a gradient difference is the difference of the products with the gradients.
         window.sy[j, new], window.wy[j, new] = -window.sg[j], -window.wg[j]
         window.sg[j] = window.wg[j] = 0.0
     window.sy[new, new] = window.wy[new, new] = 0.0
@@ -199,7 +207,7 @@ def _go(position, length, direction, trial):
 
 @inner
 def _combine(window):
-    """The direction by the coefficients, its slope, and a trial at its full length."""
+    """Compute the direction from the coefficients, its slope, and a trial at full length."""
     now, size, m = window.now[0], len(window.direction), len(window.a)
     slope = 0.0
     for begin in range(0, size, BLOCK):
@@ -223,7 +231,7 @@ def _combine(window):
 
 @inner
 def _replace(new, old, change, sign):
-    """The new in the place of the old, and by how much it changes, or minus that."""
+    """Replace old entries by new ones, and write the change times `sign`."""
     for k in range(len(new)):
         change[k] = sign * (new[k] - old[k])
         old[k] = new[k]

@@ -1,6 +1,6 @@
-"""The coefficients of accelerated directions d = scale c - sum over j of (a_j s_j + b_j w_j), method by method.
+"""The coefficients of accelerated directions d = scale c - sum over j of (a_j s_j + b_j w_j), for each method.
 
-See `solvers.kernels.accelerate` for the letters, and each method's own module for where it comes from.
+See `solvers.kernels.accelerated_descent` for the notation, and each method's own module for its source.
 """
 
 from __future__ import annotations
@@ -11,26 +11,26 @@ import numpy as np
 
 from solvers.compiling import inner_options, kept
 
-# At a minimum all products may be zero: then quotients are not numbers, and the trial that they make is rejected.
+# At a minimum all products may be zero. Quotients are then nan, and the resulting trial is rejected.
 inner: Any = kept(**inner_options, error_model="numpy")
 
 CHEBYSHEV, ANDERSON, LBFGS = 0, 1, 2
 
 _CURVED = 1e-2
-"""The least s y of a pair that L-BFGS keeps, over w y: where the Hessian is positive, s y is not below w y."""
+"""Smallest ratio of s y to w y of a pair that L-BFGS stores; for a positive Hessian s y is not below w y."""
 
 _DEPENDENT = 1e-12
-"""A difference that others make up to so much of its square tells Anderson nothing."""
+"""Fraction of its square below which the independent part of a difference is ignored by Anderson."""
 
 _SLOWER = 0.75
-"""Chebyshev's estimate is renewed when the residual shrinks by no more than this power of what theory promises."""
+"""Chebyshev's estimate is updated if the residual ratio exceeds this power of the predicted one."""
 
 _ROUNDEST = 1.0 - 1e-7
 
 
 @inner
 def coefficients(window):
-    """Set scale, a and b; returns 1 where that is the plain correction, else 0."""
+    """Set scale, a and b; return 1 if they give the plain correction, else 0."""
     now = window.now[0]
     for j in range(len(window.a)):
         window.a[j] = window.b[j] = 0.0
@@ -44,9 +44,9 @@ def coefficients(window):
 
 @inner
 def _lbfgs(window, now):
-    """The two loops over the pairs (Nocedal 1980), done with scalar products alone (Byrd, Nocedal, Schnabel 1994).
+    """Run the two-loop recursion over the pairs (Nocedal 1980) on inner products (Byrd, Nocedal, Schnabel 1994).
 
-    H0 = scale Q^-1 has the curvature of the newest pair along Q^-1 y: Q alone is too stiff, its steps short by half.
+    H0 = scale Q^-1 has the curvature of the newest pair along Q^-1 y. Q itself is too stiff, with steps half as long.
     """
     a, b, m = window.a, window.b, len(window.a)
     new = now.newest
@@ -80,7 +80,7 @@ def _lbfgs(window, now):
 
 @inner
 def _anderson(window, now):
-    """a = -b = argmin |c - W a|_Q by the normal equations; of differences that depend on each other later ones stay."""
+    """Set a = -b = argmin |c - W a|_Q by the normal equations; of dependent differences the newest are used."""
     a, m, L = window.a, len(window.a), window.sy
     for nth in range(now.count):
         i = (now.newest - nth + m) % m
@@ -111,7 +111,7 @@ def _anderson(window, now):
 
 @inner
 def _chebyshev(window, now):
-    """p_(k+1) - p_k = weight gamma c + (weight - 1) s."""
+    """Set the coefficients of p_(k+1) - p_k = weight gamma c + (weight - 1) s."""
     if now.degree > 0 and now.reference > 0.0:
         _estimate(now)
     sigma = now.radius / (2.0 - now.radius)
@@ -131,7 +131,7 @@ def _chebyshev(window, now):
 
 @inner
 def _estimate(now):
-    """A new radius, and a new polynomial, where the residual does not shrink as the old one promises."""
+    """Update the radius and restart the polynomial if the residual decreases less than predicted."""
     ratio = np.sqrt(now.squared / now.reference)
     if now.radius == 0.0:
         now.radius, now.degree = min(ratio, _ROUNDEST), 0
@@ -144,10 +144,10 @@ def _estimate(now):
 
 
 MOST_PAIRS = 100
-"""Each costs two vectors of the mesh and a scalar product with all others, and old ones tell of another place."""
+"""Each pair costs two vectors and an inner product with all others, and old pairs are no longer representative."""
 
 
 def require_pairs(pairs: int) -> None:
-    """Raise ValueError for a window that none is kept in, or too many."""
+    """Raise ValueError for a history size outside of the limits."""
     if not 1 <= pairs <= MOST_PAIRS:
         raise ValueError(f"pairs: should be from 1 to {MOST_PAIRS}, not {pairs}")

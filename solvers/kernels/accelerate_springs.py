@@ -1,10 +1,10 @@
-"""The objective and minus its gradient in one pass over a factor's rows, eight vertices at a time.
+"""The objective and minus its gradient in one pass over a factor's rows, in packets of eight vertices.
 
     b_i = y_i - h_i p_i + sum of s v over the springs (i, j),   s = k r / |v| - k,   v = p_i - p_j    minus the gradient
     g   = sum of s^2 |v|^2 / (2 k) + sum of |y_i - h_i p_i|^2 / (2 h_i)                          up to a constant
 
-with h = c m/dt^2 + w and y = c M target/dt^2 + f + w C'C p_pin. All terms of g are squares: it is known to some units
-in the last place of the energy that is at stake. A massless vertex that no pin holds (h = 0) adds -y_i p_i.
+with h = c m/dt^2 + w and y = c M target/dt^2 + f + w C'C p_pin. All terms of g are squares, so that g is accurate to a
+few units in the last place of its own value. A massless unpinned vertex (h = 0) adds -y_i p_i.
 """
 
 from __future__ import annotations
@@ -21,13 +21,16 @@ from solvers.vectors.springs import LANES, RIGHT
 
 
 class Shares(NamedTuple):
-    """What the objective needs beside the gradient's arrays.
+    """The data of the objective in addition to those of the gradient.
 
-    kind: where in `shares` each bundled entry has eight times 1/(4 k) [m/N], or 1/(2 k) where the other end is pinned
-    exactly and so has no entry; inverse (8 b,): 1/(2 h) [m/N] of each lane, 0 where h is; massless (., 2): the places
-    of the rows where it is, and of their x in the right-hand side; size: the sum of k r^2 [J].
+    Attributes:
+        kind: of each packet entry, the position in `shares` of eight times 1/(4 k) [m/N], or 1/(2 k) if the other end
+            is exactly pinned and so has no entry.
+        shares: these numbers.
+        inverse: 1/(2 h) [m/N] of each lane (8 b,), 0 if h is 0.
+        massless: offsets of the rows with h = 0, and of their x in the right-hand side (., 2).
+        size: sum of k r^2 [J].
     """
-
     kind: NDArray[np.int32]
     shares: NDArray[np.float64]
     inverse: NDArray[np.float64]
@@ -36,7 +39,7 @@ class Shares(NamedTuple):
 
     @classmethod
     def of(cls, bundles: Bundles, held: NDArray[np.float64], pinned: NDArray[np.int64]) -> Shares:
-        """The shares of springs in bundles, of which the rows `pinned` do not move."""
+        """Build the weights of springs in packets, of which the rows `pinned` do not move."""
         pull, k = bundles.each()
         parts = np.where(np.isin(bundles.neighbour, 4 * pinned), 0.5, 0.25)
         share = np.divide(parts, k, out=np.zeros_like(k), where=k != 0.0)
@@ -67,7 +70,7 @@ def descend(bundles, shares, p, right, out):
 
 @inner
 def _short(bundles, shares, b, p, right):
-    """The energy of a bundle in which a spring has no length."""
+    """Return the energy of a packet with a spring of zero length."""
     total = 0.0
     for lane in range(LANES):
         i, at = bundles.own[LANES * b + lane], RIGHT * b + lane

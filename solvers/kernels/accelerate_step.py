@@ -1,7 +1,7 @@
-"""A whole accelerated step over a factor's own rows, without Python; for springs, and energies that are like springs.
+"""A whole accelerated step over a factor's own rows, without Python, for springs and spring-like energies.
 
-The plan is that of `solvers.kernels.step`, in which positions are corrected; here a solve stands alone, because whether
-a trial is taken is known only when its objective is.
+The plan is that of `solvers.kernels.local_global_iteration`, which corrects positions within the solve. Here a solve is
+separate, because the acceptance of a trial depends on its objective.
 """
 
 from __future__ import annotations
@@ -22,18 +22,19 @@ from solvers.kernels.step_ends import VertexRows, fetch, place, state
 from solvers.linear.supernodal_solve import backwards, forwards
 
 NOISE = 4.0 * np.finfo(np.float64).eps
-"""A bound on the relative rounding error of one term of a sum. The bound on the whole sum adds up those of its terms;
-their true errors partly cancel, so that for n terms it is about sqrt(n) times too large."""
+"""A bound on the relative rounding error of one term of a sum. The bound on the whole sum adds up those of its terms.
+The true errors partly cancel, so that for n terms the bound is about sqrt(n) times too large."""
 
 
 class Step(NamedTuple):
-    """A system's plan, bundles, those of the norm of Q (form), shares of the objective and rows, with vectors of all
-    rows: y, the solve's (x) in the factor's type, scratch (e, zero but in unknown rows); objective (3,): at the
-    position, the size of what cancels in it, and what is negative of it where the step begins [J].
+    """The plan, packets, objective weights and rows of a system, with vectors of all rows.
 
-    The objective is a sum of squares a^2/2, where each a is a difference of two numbers of size A and so known to
-    eps A: the sum to eps (sum of a A), at most eps sqrt(2 g size), with size the sum of A^2. Where some squares count
-    as negative, g is the sum of all.
+    The vectors are y, the solution (in the factor's type) and scratch (zero except in unknown rows). The objective
+    values (3,) [J] are: the objective at the position, the scale of its cancellation, and its negative part at the start.
+
+    The objective is a sum of squares a^2/2, where each a is a difference of two numbers of size A and so has the error
+    eps A. The sum has the error eps (sum of a A), at most eps sqrt(2 g size), with size the sum of A^2. If some squares
+    have a negative sign, g is the sum of the absolute terms.
     """
 
     plan: Plan
@@ -49,7 +50,7 @@ class Step(NamedTuple):
 
 @kernel
 def start(step: Step, edges, window: Window, target, force, pin_targets, guess):
-    """Begin a step's solve; edges: strain limits and dashpots, or None."""
+    """Start the solve of a step; edges: strain limits and dashpots, or None."""
     state(step.rows, target, force, pin_targets, step.right)
     place(step.rows, guess, pin_targets, window.trial)
     step.objective[0] = _evaluate(step, edges, window)
@@ -89,7 +90,7 @@ def _evaluate(step, edges, window):
 
 @inner
 def _residual(state):
-    """|c|_Q [J^(1/2)] over the vertices that no pin holds."""
+    """Return |c|_Q [J^(1/2)] over the unpinned vertices."""
     step, _, window = state
     for i in range(len(window.correction) // 4):
         for k in range(4 * i, 4 * i + 3):
@@ -102,7 +103,7 @@ _iterate = compiled_over(_advance, _residual)
 
 @kernel
 def run(step: Step, edges, window: Window, limits, out):
-    """Iterate as `solvers.kernels.loop` does, and put the positions to `out` (n, 3)."""
+    """Run the iteration loop (see `solvers.kernels.iteration_loop`) and write the positions to `out` (n, 3)."""
     answer = _iterate((step, edges, window), limits)
     fetch(step.rows, window.position, out)
     return answer
@@ -110,7 +111,7 @@ def run(step: Step, edges, window: Window, limits, out):
 
 @inner
 def _solve(plan, b, size, x):
-    """Q x = b in rows: groups forwards, the top, groups backwards (see `solvers.linear.supernodal_solve`)."""
+    """Solve Q x = b in rows: groups forwards, the top, groups backwards (see `triangular_solve`)."""
     top, top_end, groups = plan.top
     copied = 4 * (top_end - top)
     for k in range(size):

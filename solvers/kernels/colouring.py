@@ -1,4 +1,4 @@
-"""Greedy colouring, compiled."""
+"""Compiled greedy colouring."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from solvers.compiling import kernel
 
 @kernel
 def first_fit(pointers, groups, back, items, colour, taken):
-    """Write to `colour`, for each item in turn, the first that no earlier item of its groups has.
+    """Write to `colour`, for each item in order, the first colour that no earlier item of its groups has.
 
-    groups[pointers[a]:pointers[a + 1]]: those of item a; items[back[g]:back[g + 1]]: those of group g, ascending;
-    taken: scratch, one number an item, all -1.
+    Args:
+        pointers, groups: groups[pointers[a]:pointers[a + 1]] are the groups of item a.
+        back, items: items[back[g]:back[g + 1]] are the items of group g, ascending.
+        colour: output, one number per item.
+        taken: scratch, one number per item, all -1.
     """
     for a in range(len(colour)):
         for k in range(pointers[a], pointers[a + 1]):

@@ -1,10 +1,10 @@
-"""Strain limits and dashpots, compiled: edge by edge, beside the springs.
+"""Compiled strain limits and dashpots, evaluated edge by edge in addition to the springs.
 
     E = sum_e k_e/2 |b_e|^2      b = (|v| - t) v/|v| of a limit, with t the nearest length allowed
                                  b = (n.v - o) n of a dashpot
 
-Both are projective: the gradient is A'K b, the projection d = v - b. Where rows are done block by block, each edge is
-computed at both of its ends, as springs are, so that nobody adds to another's sum; where one pass does them all, once.
+Both are projective: the gradient is A'K b, the projection d = v - b. In block-by-block passes each edge is computed at
+both of its ends, as springs are, so that no row adds to the sum of another. In a single pass it is computed once.
 """
 
 from __future__ import annotations
@@ -20,12 +20,17 @@ from solvers.problem import Positions
 
 
 class Edges(NamedTuple):
-    """Edges by the rows of their ends, limits first.
+    """Edges by the rows of their ends, strain limits first.
 
-    ends (m, 2): the rows of each edge; first (rows + 1,): the first entry of each row; of each entry the row of the
-    other end (other) and the edge, ~edge at its second end; stiffness: k (m,) [N/m];
-    low, high: the lengths allowed [m] of the limits; axis (m, 3): n of a dashpot, and what a limit without length
-    takes; offset: o (m,) [m].
+    Attributes:
+        ends: rows of each edge (m, 2).
+        first: first entry of each row (rows + 1,).
+        other: of each entry, the row of the other end.
+        edge: of each entry, the edge, ~edge at its second end.
+        stiffness: k (m,) [N/m].
+        low, high: minimum and maximum lengths [m] of the limits.
+        axis: n of a dashpot, and the direction of a limit at zero length (m, 3).
+        offset: o (m,) [m].
     """
 
     ends: NDArray[np.int64]
@@ -48,7 +53,7 @@ class Edges(NamedTuple):
         row: NDArray[np.int64],
         rows: int,
     ) -> Edges:
-        """Edges between vertices (m, 2) in rows `row` (n,)."""
+        """Build edges between vertices (m, 2) in rows `row` (n,)."""
         kept = np.flatnonzero(ends[:, 0] != ends[:, 1])
         here, there = row[ends[kept]].T.ravel(), row[ends[kept, ::-1]].T.ravel()
         order = np.argsort(here, kind="stable")
@@ -67,7 +72,7 @@ class Edges(NamedTuple):
 
 @inner
 def _at(edges, row, entry, x):
-    """An entry's v and b, from its own end, and its stiffness."""
+    """Return v and b of an entry, seen from its own end, and its stiffness."""
     j, e, sign = edges.other[entry], edges.edge[entry], 1.0
     if e < 0:
         e, sign = ~e, -1.0
@@ -86,7 +91,7 @@ def _at(edges, row, entry, x):
 
 @inner
 def add_edges(edges, begin, end, x, out, shift, correct):
-    """Add A'K d, or minus the gradient where `correct`, of the rows from `begin` to `end` to rows moved by `shift`."""
+    """Add A'K d, or minus the gradient if `correct`, of rows `begin` to `end` to rows shifted by `shift`."""
     if edges is None:
         return
     for row in range(begin, end):
@@ -103,9 +108,9 @@ def add_edges(edges, begin, end, x, out, shift, correct):
 
 @inner
 def descend_edges(edges, rows, x, out):
-    """Add minus the gradient of all edges to the first `rows` rows of `out`, those that move; returns the energy [J].
+    """Add minus the gradient of all edges to the first `rows` rows of `out`, which move; return the energy [J].
 
-    Each edge is computed once, and added at both of its ends.
+    Each edge is computed once and added at both of its ends.
     """
     if edges is None:
         return 0.0

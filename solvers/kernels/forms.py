@@ -1,10 +1,9 @@
-"""Constant quadratic forms, all of a system as one: pairs of vertices, and what holds each vertex by itself.
+"""All constant quadratic forms of a system as one: vertex pairs, and a weight of each single vertex.
 
     x'Lx/2 = sum over i < j of w_ij/2 |x_i - x_j|^2 + sum over i of h_i/2 |x_i|^2,     w_ij = -L_ij,  h = L 1
 
-Differences of positions keep their digits where products with L would lose them. Where a form couples more than
-neighbours, as bending does, some w are negative. Its force at the origin is constant in a step and part of what the
-step gives.
+Differences of positions avoid the cancellation in products with L. If a form couples more than neighbours, as bending
+does, some w are negative. Its force at the origin is constant in a step and is part of the step's external force.
 """
 
 from __future__ import annotations
@@ -18,11 +17,11 @@ from scipy.sparse import coo_array, csr_array, triu
 from solvers.compiling import inner, kernel
 
 _ROUND_OFF = 1e-13
-"""Of the sum of a row's absolute values, what its sum may be and still count as zero: a dozen terms' round-off."""
+"""Ratio of a row's sum to its absolute sum below which it counts as zero: the round-off of a dozen terms."""
 
 
 class Form(NamedTuple):
-    """pairs (k, 2): vertices; weight: w (k,) [N/m]; held: h (n,) [N/m]."""
+    """A quadratic form: pairs (k, 2) of vertices; pair_weight: w (k,) [N/m]; vertex_weight: h (n,) [N/m]."""
 
     pairs: NDArray[np.int64]
     weight: NDArray[np.float64]
@@ -30,7 +29,7 @@ class Form(NamedTuple):
 
     @classmethod
     def of(cls, L: csr_array) -> Form:
-        """The form of a symmetric matrix [N/m], (n, n)."""
+        """Build the form of a symmetric matrix [N/m], (n, n)."""
         above = coo_array(triu(L, 1))
         held, size = L.sum(axis=1), abs(L).sum(axis=1)
         return cls(
@@ -41,7 +40,7 @@ class Form(NamedTuple):
 
     @classmethod
     def none(cls) -> Form:
-        """The form of no matrix."""
+        """Build an empty form."""
         return cls(np.empty((0, 2), np.int64), np.empty(0), np.empty(0))
 
 
@@ -53,7 +52,7 @@ def add_gradient(form, p, out):
 
 @inner
 def add_product(form, x, out):
-    """Add L x [N] to `out`, both (n, 3); nothing without a form."""
+    """Add L x [N] to `out`, both (n, 3); do nothing without a form."""
     if form is None:
         return
     _add(form, x, out)
@@ -79,7 +78,7 @@ def _add(form, x, out):
 
 @kernel
 def rise(form, p, q):
-    """q'Lq/2 - p'Lp/2 [J], p and q (n, 3)."""
+    """Return q'Lq/2 - p'Lp/2 [J], p and q (n, 3)."""
     total = 0.0
     for i in range(len(form.held)):
         h = 0.5 * form.held[i]
@@ -96,8 +95,10 @@ def rise(form, p, q):
 
 @kernel
 def add_blocks(form, diagonal, across, values):
-    """Add L [N/m] to the blocks `values` (b, 3, 3): to those on the diagonal (n,) and to those of pairs, both ways,
-    (k, 2); -1 stands for none."""
+    """Add L [N/m] to the blocks `values` (b, 3, 3).
+
+    The indices are those of the diagonal (n,) and of the pairs in both directions (k, 2); -1 for none.
+    """
     for i in range(len(form.held)):
         hold(values, diagonal[i], form.held[i])
     for k in range(len(form.weight)):

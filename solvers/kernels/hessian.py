@@ -1,10 +1,10 @@
-"""The Hessian of springs, written straight into the entries of a matrix of 3 x 3 blocks, and its products.
+"""The Hessian of springs, assembled directly into a matrix of 3 x 3 blocks, and its products.
 
     H_e = k nn' + t/l (I - nn'),   t = k (l - r),   n the direction of a spring, l its length, t its tension
 
-A compressed spring (t < 0) has a negative lateral part. It is scaled by `keep`: 1 leaves the Hessian exact, 0 makes it
-positive semidefinite spring by spring (Teran et al. 2005). The tensions are given apart from the positions, for methods
-that have a better guess at what they will be (see `solvers.methods.hybrid`).
+A compressed spring (t < 0) has a negative transverse part. It is scaled by `negative_fraction`: 1 gives the exact
+Hessian, 0 makes it positive semidefinite spring by spring (Teran et al. 2005). The tensions are a separate argument,
+for methods that predict them (see `solvers.methods.newton.hybrid_newton`).
 """
 
 from __future__ import annotations
@@ -24,10 +24,12 @@ from solvers.problem import System
 
 
 class Places(NamedTuple):
-    """Which blocks of a matrix over the free vertices are whose.
+    """Block indices of vertices and springs in a matrix over the free vertices.
 
-    free (f,): vertices; diagonal (n,): their blocks, -1 for a vertex that is not free; across (m, 2): the blocks of
-    each spring from its first end to its second and back, -1 where an end is not free.
+    Attributes:
+        free: free vertices (f,).
+        diagonal: diagonal block of each vertex (n,), -1 for a vertex that is not free.
+        across: blocks of each spring from its first end to its second and back (m, 2), -1 if an end is not free.
     """
 
     free: NDArray[np.int64]
@@ -36,7 +38,7 @@ class Places(NamedTuple):
 
     @classmethod
     def of(cls, system: System, edges: NDArray[np.int64], graph: csr_array) -> Places:
-        """The places in a matrix whose pattern of blocks is `graph`, (f, f), sorted, over the free vertices."""
+        """Return the indices for a matrix with the block pattern `graph`, (f, f), sorted, over the free vertices."""
         n, f = system.vertices, len(system.free)
         key = np.repeat(np.arange(f), np.diff(graph.indptr)) * f + graph.indices
         number = np.full(n, -1)
@@ -53,9 +55,11 @@ class Places(NamedTuple):
 
 @kernel
 def locate(number, starts, columns, vertices, out):
-    """Write where the blocks of every vertex of each row (m, k) with every one lie in rows of sorted columns to `out`
-    (m, k^2); -1 where one of both is not free; False where a block is missing. number: of each vertex among the free
-    ones, or -1."""
+    """Write the block of each vertex pair within rows of vertices (m, k) to `out` (m, k^2).
+
+    It is -1 if one vertex is not free. Returns False if a block is missing. The matrix has sorted columns; `number` is
+    the index of each vertex among the free ones, or -1.
+    """
     many = vertices.shape[1]
     for e in range(len(vertices)):
         for a in range(many):
@@ -80,8 +84,10 @@ def locate(number, starts, columns, vertices, out):
 
 @kernel
 def meetings(number, size, vertices, out):
-    """Write every two different free vertices of each row (m, k) to `out`, the lower number times `size` and the higher
-    one; how many they are. number: see `locate`."""
+    """Write each pair of different free vertices of each row (m, k) to `out`, as lower index times `size` plus higher.
+
+    Returns the number of pairs; `number` is that of `locate_blocks`.
+    """
     count = 0
     for e in range(len(vertices)):
         for a in range(vertices.shape[1]):
@@ -96,7 +102,7 @@ def meetings(number, size, vertices, out):
 
 @kernel
 def tensions(terms, p, d, out):
-    """Write the springs' tensions [N] at p, linearised for a step d (both (n, 3)), to out (m,)."""
+    """Write the springs' tensions [N] at p, linearised for a displacement d (both (n, 3)), to out (m,)."""
     for e in range(len(terms.stiffness)):
         i, j = terms.edges[e, 0], terms.edges[e, 1]
         n0, n1, n2, length = along(terms, e, p)
@@ -106,7 +112,7 @@ def tensions(terms, p, d, out):
 
 @inner
 def _lateral(terms, e, length, tension, keep):
-    """The lateral stiffness [N/m] of spring e, at most its own. One of zero length that has a rest length has none."""
+    """Return the transverse stiffness [N/m] of spring e, at most k; 0 for zero length and positive rest length."""
     if terms.rest_length[e] == 0.0:
         return terms.stiffness[e]
     if length <= 0.0:
@@ -131,7 +137,7 @@ def _add(values, block, sign, xx, xy, xz, yy, yz, zz):
 
 @kernel
 def hold(terms, places, values):
-    """Write what inertia and penalty pins hold vertices with [N/m] to the blocks `values`, (b, 3, 3)."""
+    """Write the stiffness [N/m] of inertia and penalty pins to the blocks `values`, (b, 3, 3)."""
     _hold(terms, places, values)
 
 
@@ -148,8 +154,14 @@ def _hold(terms, places, values):
 def assemble(terms, places, constant, p, tension, keep, values):
     """Write the Hessian [N/m] of springs, inertia and penalty pins at p (n, 3) to the blocks `values`, (b, 3, 3).
 
-    constant: blocks of inertia, pins and what else does not depend on p, None where there is nothing else; tension
-    (m,): of each spring [N].
+    Args:
+        terms: objective terms.
+        places: block indices.
+        constant: blocks of inertia, pins and other terms independent of p; None if there are no other terms.
+        p: positions (n, 3) [m].
+        tension: tension of each spring (m,) [N].
+        keep: factor of the springs' negative transverse parts.
+        values: output (b, 3, 3) [N/m].
     """
     if constant is None:
         _hold(terms, places, values)
@@ -178,7 +190,7 @@ def assemble(terms, places, constant, p, tension, keep, values):
 
 @kernel
 def linearise(terms, p, out):
-    """Write to out (m, 4) what `multiply` needs of each spring at p (n, 3): sqrt(k - lateral) n and lateral."""
+    """Write sqrt(k - lateral) n and the transverse stiffness of each spring at p (n, 3) to out (m, 4)."""
     for e in range(len(terms.stiffness)):
         n0, n1, n2, length = along(terms, e, p)
         k = terms.stiffness[e]
@@ -189,9 +201,14 @@ def linearise(terms, p, out):
 
 @kernel
 def multiply(terms, linear, form, joined, curvature, x, out):
-    """Write to `out` the product [N] of the exact Hessian with x [m], (n, 3).
+    """Write the product [N] of the exact Hessian with x [m], (n, 3), to `out`.
 
-    linear: see `linearise`; form, joined and curvature: of the energies that are not springs, None for none.
+    Args:
+        terms: objective terms.
+        linear: output of `linearise_springs`.
+        form, joined, curvature: quadratic form, elements and their Hessians, or None.
+        x: (n, 3) [m].
+        out: output (n, 3) [N].
     """
     _multiply(terms, linear, x, out)
     add_product(form, x, out)

@@ -1,10 +1,10 @@
-"""When a step along a direction descends enough, once: as Python, and within kernels.
+"""Conditions of sufficient decrease of a line search, for Python and for kernels.
 
-    g(p + t d) - g(p) <= DECREASE t (slope + t curvature/2)       Armijo (1966); curvature for directions from a saddle
-    grad g(p + t d) d <= (2 flatter - 1) slope                    approximate Wolfe (Hager and Zhang 2005), instead of
-                                                                  it where round-off hides how far g falls
+    g(p + t d) - g(p) <= ARMIJO_FRACTION t (slope + t curvature/2)    Armijo (1966); curvature for steps from a saddle
+    grad g(p + t d) d <= (2 wolfe_fraction - 1) slope                 approximate Wolfe (Hager and Zhang 2005), if
+                                                                      round-off hides the decrease of g
 
-with slope = grad g(p) d. How the next length is found is the method's own: half of it, or where a parabola is least.
+with slope = grad g(p) d. Each method chooses the next step size itself: half of it, or the minimum of a parabola.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from numba.extending import register_jitable
 from solvers.compiling import inner_options
 
 DECREASE = 1e-4
-"""Of what the slope promises, the least that a step must bring."""
+"""Smallest decrease of a step, as a fraction of the linear prediction."""
 
 
 @register_jitable(**inner_options)
 def falls(rise: float, length: float, slope: float, curvature: float) -> bool:
-    """Whether the objective falls enough by a step of this length; rise [J]: by how much it rises."""
+    """Return whether the objective decreases enough for a step size, given its change [J]."""
     return rise <= DECREASE * length * (slope + 0.5 * length * curvature)
 
 
 @register_jitable(**inner_options)
 def flattens(there: float, slope: float, flatter: float) -> bool:
-    """Whether the slope `there` has shrunk enough from the one at the beginning [J]."""
+    """Return whether the slope [J] at the new point has decreased enough from the initial one."""
     return there <= (2.0 * flatter - 1.0) * slope

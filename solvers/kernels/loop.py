@@ -1,8 +1,8 @@
-"""The iteration loop and the stop rule, once: as Python for the driver, and compiled into kernels.
+"""The iteration loop and the stop rule, as Python for the driver and compiled into kernels.
 
-    advance until  residual <= limit  or  residual <= floor  or nothing descends any more  or all iterations are done
+    iterate until  residual <= limit  or  residual <= floor  or no step descends  or all iterations are done
 
-`over` makes the loop of what advances a state and what measures it, `compiled_over` the same loop for kernels.
+`build_loop` builds the loop from functions that advance and measure a state, `build_compiled_loop` that for kernels.
 """
 
 from __future__ import annotations
@@ -16,15 +16,21 @@ from numba.extending import register_jitable
 from solvers.compiling import inner_closure, inner_options
 
 ITERATIONS, TOLERANCE, FLOOR, STALLED = range(4)
-"""What ended a loop: the limit of iterations, a residual, round-off in it, or that nothing descends any more."""
+"""The termination reason of a loop: maximum iterations, residual limit, round-off floor, or no descent."""
 
 NEVER, LAST, EACH = range(3)
-"""Which residuals are wanted."""
+"""When residuals are computed."""
 
 
 class Limits(NamedTuple):
-    """iterations: at most; limit, floor: residuals [J^(1/2)] that end the loop where each is asked for, the latter to
-    look for round-off; wanted: which residuals are."""
+    """The limits of a loop.
+
+    Attributes:
+        iterations: maximum number of iterations.
+        limit: residual [J^(1/2)] that ends the loop, if the residual is computed in each iteration.
+        floor: residual [J^(1/2)] at which the loop ends for a check of round-off.
+        wanted: when residuals are computed.
+    """
 
     iterations: int
     limit: float
@@ -33,17 +39,17 @@ class Limits(NamedTuple):
 
 
 ONE = Limits(1, 0.0, 0.0, NEVER)
-"""One iteration, and no residual."""
+"""One iteration without a residual."""
 
 
 def at_most(iterations: int) -> Limits:
-    """So many iterations, and the last one's residual."""
+    """Return limits of n iterations with the last residual."""
     return Limits(iterations, 0.0, 0.0, LAST)
 
 
 @register_jitable(**inner_options)
 def verdict(residual, limits):
-    """What a residual ends: TOLERANCE, FLOOR, or nothing, which is ITERATIONS."""
+    """Return the termination reason of a residual; ITERATIONS if it does not end the loop."""
     if limits.wanted != EACH:
         return ITERATIONS
     if residual <= limits.limit:
@@ -52,11 +58,16 @@ def verdict(residual, limits):
 
 
 def over(advance: Callable[..., Any], residual: Callable[..., Any]) -> Callable[..., Any]:
-    """The loop over what is done to a state.
+    """Build the iteration loop of a state.
 
-    advance(state): whether it could; an iteration that could not is none. residual(state): [J^(1/2)].
-    iterate(state, limits): how many iterations were done, the last residual, nan where none was asked for, and what
-    ended them.
+    Args:
+        advance: function of the state that does an iteration and returns whether it succeeded; a failed one does not
+            count.
+        residual: function of the state that returns the residual [J^(1/2)].
+
+    Returns:
+        A function (state, limits) that returns the number of iterations, the last residual (nan if none was computed)
+        and the termination reason.
     """
 
     def iterate(state: Any, limits: Any) -> Any:
@@ -78,5 +89,5 @@ def over(advance: Callable[..., Any], residual: Callable[..., Any]) -> Callable[
 
 
 def compiled_over(advance: Callable[..., Any], residual: Callable[..., Any]) -> Any:
-    """The same for kernels, over inner ones."""
+    """Build the loop for kernels from inner functions."""
     return inner_closure(over(advance, residual))

@@ -1,10 +1,10 @@
-"""The objective's gradient and its rise from one point to another, in one pass over springs and one over vertices.
+"""The gradient of the objective and its change between two points, in one pass over springs and one over vertices.
 
     grad g = sum_e k_e (1 - r_e/l_e) v_e + h (p - target) - f + w (p - pin)              h = c m/dt^2
     g(q) - g(p) = sum_e k_e/2 (l'_e - l_e) (l'_e + l_e - 2 r_e) + ...,   l' - l = (v' - v)(v' + v) / (l' + l)
 
-The rise is a sum of differences, each of which keeps its digits, and not the difference of two sums: it tells a descent
-from round-off as long as the gradient does, where energies agree in all of their digits long before.
+The change is a sum of differences without cancellation, not the difference of two sums. It distinguishes descent from
+round-off as long as the gradient does, long after the values of the energies agree in all digits.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from solvers.round_off import EPS
 
 
 class Terms(NamedTuple):
-    """What is fixed in a run: springs as in `Springs`; inertia h (n,) [N/m]; penalty pins and their weights [N/m]."""
+    """The constant data of a run: springs, inertia h (n,) [N/m], penalty pins and their weights [N/m]."""
 
     edges: NDArray[np.int64]
     stiffness: NDArray[np.float64]
@@ -33,7 +33,7 @@ class Terms(NamedTuple):
 
     @classmethod
     def of(cls, system: System, springs: Springs) -> Terms:
-        """The terms of a system, in arrays of their own."""
+        """Copy the terms of a system into arrays."""
         _, pinned, weight = system.penalty
         s = springs
         arrays: list[Any] = [s.edges, s.stiffness, s.rest_length, s.rest_direction, system.inertia, pinned, weight]
@@ -41,7 +41,7 @@ class Terms(NamedTuple):
 
 
 class Given(NamedTuple):
-    """What a step gives: target (n, 3) [m], force (n, 3) [N], the penalty pins' targets (q, 3) [m]."""
+    """The data of a step: target (n, 3) [m], force (n, 3) [N], the penalty pins' targets (q, 3) [m]."""
 
     target: Positions
     force: Positions
@@ -49,14 +49,14 @@ class Given(NamedTuple):
 
     @classmethod
     def of(cls, problem: StepProblem) -> Given:
-        """A step's arrays, copied: kernels are compiled for arrays that may be written to."""
+        """Copy a step's arrays; the kernels are compiled for writable arrays."""
         soft, _, _ = problem.system.penalty
         return cls(*(np.array(a, order="C") for a in (problem.target, problem.force, problem.pin_targets[soft])))
 
 
 @inner
 def along(terms, e, p):
-    """The unit direction of spring e and its length [m]; a spring of zero length has that of its rest shape."""
+    """Return the unit direction of spring e and its length [m]; at zero length that of the rest shape."""
     i, j = terms.edges[e, 0], terms.edges[e, 1]
     v0, v1, v2 = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2]
     length = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
@@ -67,7 +67,7 @@ def along(terms, e, p):
 
 @kernel
 def gradient(terms, given, p, out):
-    """Write the gradient [N] at p, both (n, 3), to `out`: that of springs, inertia, force and penalty pins."""
+    """Write the gradient [N] at p, both (n, 3), of springs, inertia, force and penalty pins to `out`."""
     for v in range(len(p)):
         for c in range(3):
             out[v, c] = terms.inertia[v] * (p[v, c] - given.target[v, c]) - given.force[v, c]
@@ -91,8 +91,10 @@ def gradient(terms, given, p, out):
 
 @kernel
 def round_off(terms, given, p, out):
-    """Write the bound (n,) [N] on the round-off of `gradient` at p (n, 3) [m] to `out`, as `solvers.round_off` has it,
-    of springs, inertia, force and penalty pins."""
+    """Write the bound (n,) [N] of the rounding error of `gradient` at p (n, 3) [m] to `out`.
+
+    It is that of `solvers.model.rounding_bound` for springs, inertia, force and penalty pins.
+    """
     for v in range(len(p)):
         out[v] = terms.inertia[v] * (size(p, v) + size(given.target, v)) + size(given.force, v)
     for q in range(len(terms.pinned)):
@@ -115,13 +117,13 @@ def round_off(terms, given, p, out):
 
 @inner
 def size(x, v):
-    """The length of row v of x (n, 3)."""
+    """Return the norm of row v of x (n, 3)."""
     return np.sqrt(x[v, 0] * x[v, 0] + x[v, 1] * x[v, 1] + x[v, 2] * x[v, 2])
 
 
 @kernel
 def rise(terms, given, p, q):
-    """g(q) - g(p) [J] of springs, inertia, force and penalty pins, p and q (n, 3)."""
+    """Return g(q) - g(p) [J] of springs, inertia, force and penalty pins, p and q (n, 3)."""
     total = 0.0
     for v in range(len(p)):
         for c in range(3):

@@ -1,10 +1,10 @@
-"""The local step of springs, compiled: eight vertices at a time, each with the springs that end at it.
+"""The compiled local step of springs: packets of eight vertices, each vertex with its incident springs.
 
-    out_i += y_i + sum over springs (i, j) of k r (p_i - p_j) / |p_i - p_j|                         `project`
-    out_i += y_i - h_i p_i + sum of (k r / |p_i - p_j| - k) (p_i - p_j),   minus the gradient       `correct`
+    out_i += y_i + sum over springs (i, j) of k r (p_i - p_j) / |p_i - p_j|                         `add_projection`
+    out_i += y_i - h_i p_i + sum of (k r / |p_i - p_j| - k) (p_i - p_j),   minus the gradient       `add_descent`
 
-One pass, without A or d. Each spring is computed at both of its ends, so that nobody adds to another's sum: the bits do
-not depend on the number of threads.
+It is one pass, without A or d. Each spring is computed at both of its ends, so that no vertex adds to the sum of
+another one. The result is therefore bitwise independent of the number of threads.
 """
 
 from __future__ import annotations
@@ -22,17 +22,23 @@ from solvers.vectors.springs import LANES, RIGHT
 
 TINY_SQUARED = TINY * TINY
 WINDOW = 128
-"""Neighbouring rows of which those with equally many springs are bundled: longer ones would scatter the reading."""
+"""Number of neighbouring rows that are sorted by their springs; a larger window would scatter the memory access."""
 
 
 class Bundles(NamedTuple):
-    """Springs by their ends: bundles of eight vertices (b of them), of each as many entries as one has springs, or two.
+    """Springs by their ends, in b packets of eight vertices.
 
-    own (8 b,): the place of each vertex, four times its row; start (b + 1,): the first entry of each bundle; of each
-    entry eight times the place of the other end (neighbour) and the spring, ~spring at its second end, and once where
-    in `weights` it has eight times k r [N] and eight times k [N/m] (kind), kept once where entries have the same, as
-    nearly all of a regular mesh do. What fills up is vertex `nobody`, and springs of no strength to row `far`.
-    direction (m, 3): taken at zero length.
+    A packet has as many entries as its vertex of largest degree, at least two. Padding lanes are vertex `nobody`, and
+    padding springs have zero stiffness and end at row `far`.
+
+    Attributes:
+        own: offset of each lane's vertex (8 b,), four times its row.
+        start: first entry of each packet (b + 1,).
+        neighbour: of each entry, eight offsets of the other ends.
+        kind: of each entry, the position in `weights` of eight times k r [N] and eight times k [N/m].
+        weights: these numbers, stored once for equal entries, which are nearly all in a regular mesh.
+        spring: of each entry, eight springs, ~spring at the second end.
+        direction: unit directions at zero length (m, 3).
     """
 
     own: NDArray[np.int32]
@@ -47,10 +53,17 @@ class Bundles(NamedTuple):
     def of(
         cls, springs: Springs, row: NDArray[np.int64], part: NDArray[np.int64], parts: int, nobody: int, far: int
     ) -> tuple[Bundles, NDArray[np.int64]]:
-        """The bundles of springs between vertices in rows `row` (n,), and the first of each part (parts + 1,).
+        """Build the packets of springs, and the first packet of each part of the rows (parts + 1,).
 
-        part (n,): which part of the rows, ascending with them, each vertex is in, -1 for one that does not move.
-        Self-loops, which stretch nothing, are left out.
+        Self-loops, which have no extension, are omitted.
+
+        Args:
+            springs: the springs.
+            row: row of each vertex (n,).
+            part: part of each vertex (n,), ascending with its row; -1 for a vertex that does not move.
+            parts: number of parts.
+            nobody: row of padding lanes.
+            far: row of the ends of padding springs.
         """
         keep = np.flatnonzero(springs.edges[:, 0] != springs.edges[:, 1])
         ends = springs.edges[keep]
@@ -95,21 +108,24 @@ class Bundles(NamedTuple):
         ), first
 
     def each(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """k r and k of each entry's springs."""
+        """Return k r and k of each entry's springs."""
         pull, k = self.weights.reshape(-1, 2, LANES)[self.kind // (2 * LANES)].transpose(1, 0, 2)
         return pull.ravel(), k.ravel()
 
     def in_lanes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Of one number a row, those of the bundles' vertices (8 b,)."""
+        """Return the values of the packets' vertices (8 b,), given one number per row."""
         out = aligned(len(self.own))
         out[:] = values[self.own // 4]
         return out
 
     def right(self, held: NDArray[np.float64], y: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """The constant right-hand side y of the bundles, with what holds each row [N/m].
+        """Build the constant right-hand side y of the packets, with the anchor stiffness of each row [N/m].
 
-        A bundle has RIGHT numbers: eight x, y and z each, and eight of `held`. Those of rows in no bundle lie behind.
-        y: in rows of four; zero, to be written to, where it is not given.
+        A packet has RIGHT numbers: eight x, y and z each, and eight stiffnesses. Rows in no packet follow at the end.
+
+        Args:
+            held: anchor stiffness of each row [N/m].
+            y: in rows of four; zero, to be overwritten, if it is not given.
         """
         out = aligned(4 * len(self.own) + RIGHT)
         bundles = out[:-RIGHT].reshape(-1, 4, LANES)
@@ -119,7 +135,7 @@ class Bundles(NamedTuple):
         return out
 
     def in_right(self, rows: int) -> NDArray[np.int64]:
-        """Where x of each of so many rows is in `right`."""
+        """Return the offset of the x coordinate of each row in the right-hand side."""
         lane = np.arange(len(self.own))
         at = np.full(rows, 4 * len(lane))
         at[self.own // 4] = RIGHT * (lane // LANES) + lane % LANES
@@ -127,7 +143,7 @@ class Bundles(NamedTuple):
 
 
 def kinds(*numbers: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Where each entry's numbers begin, and the numbers: eight of each array, kept once where entries have the same."""
+    """Return the offsets of each entry's numbers, eight per array, and the numbers without duplicates."""
     rows = np.concatenate([array.reshape(-1, LANES) for array in numbers], axis=1)
     mixing = np.random.default_rng(0).integers(2**63, size=rows.shape[1], dtype=np.uint64)
     _, first, kind = np.unique(rows.view(np.uint64) @ mixing, return_index=True, return_inverse=True)
@@ -140,7 +156,7 @@ def kinds(*numbers: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.
 
 @inner
 def add_projection(bundles, begin, end, p, right, out, shift):
-    """Add y + A'K d(p) of the bundles from `begin` to `end` to rows of `out`, moved by `shift`."""
+    """Add y + A'K d(p) of the packets from `begin` to `end` to rows of `out`, moved by `shift`."""
     moved = out[4 * shift :]
     for b in range(begin, end):
         if vectors.project(bundles, b, p, right, moved):
@@ -149,7 +165,7 @@ def add_projection(bundles, begin, end, p, right, out, shift):
 
 @inner
 def add_descent(bundles, begin, end, p, right, out, shift):
-    """Add y - Q p + A'K d(p), minus the gradient, of the bundles from `begin` to `end` to rows of `out`."""
+    """Add y - Q p + A'K d(p), minus the gradient, of the packets from `begin` to `end` to rows of `out`."""
     moved = out[4 * shift :]
     for b in range(begin, end):
         if vectors.correct(bundles, b, p, right, moved):
@@ -158,7 +174,7 @@ def add_descent(bundles, begin, end, p, right, out, shift):
 
 @inner
 def add_short(bundles, b, p, right, out, correct):
-    """The same of one bundle in which a spring has no length; correct: minus the gradient."""
+    """Add either of them for a packet with a spring of zero length; `correct` selects minus the gradient."""
     one_by_one(bundles, b, p, out, correct)
     for lane in range(LANES):
         i, at = bundles.own[LANES * b + lane], RIGHT * b + lane
@@ -170,7 +186,7 @@ def add_short(bundles, b, p, right, out, correct):
 
 @inner
 def one_by_one(bundles, b, p, out, correct):
-    """Add a bundle's springs; one of no length takes the direction of its rest shape."""
+    """Add a packet's springs one by one; one of zero length has the direction of its rest shape."""
     for lane in range(LANES):
         i = bundles.own[LANES * b + lane]
         s0 = s1 = s2 = 0.0
@@ -195,7 +211,10 @@ def one_by_one(bundles, b, p, out, correct):
 
 @inner
 def squared_norm(bundles, begin, end, e, measure):
-    """|e|_Q^2 [J] of displacements in rows of four: half of each spring at each end, `measure` [N/m] of each lane."""
+    """Return |e|_Q^2 [J] of displacements in rows of four, with half of each spring at each end.
+
+    `measure` is the diagonal part [N/m] of each lane.
+    """
     total = 0.0
     for b in range(begin, end):
         total += vectors.energy(bundles, b, e, measure)
@@ -204,7 +223,7 @@ def squared_norm(bundles, begin, end, e, measure):
 
 @kernel
 def project(bundles, p, y, x, b, zero, out):
-    """Write y + A'K d(p), all (n, 3), to `out`; x, b: scratch of n + 2 rows of four; zero: `right` of the bundles."""
+    """Write y + A'K d(p), all (n, 3), to `out`; scratch: x, b (n + 2 rows of four) and a zero right-hand side."""
     n = len(p)
     for i in range(n):
         for c in range(3):

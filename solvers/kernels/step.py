@@ -1,20 +1,20 @@
-"""Local-global iterations over a factor's own rows, from a step's beginning to its end without Python.
+"""Local-global iterations over a factor's own rows, without Python within a step.
 
-An iteration turns positions p^k into p^(k+1):
+An iteration maps positions p^k to p^(k+1):
 
-    up      children first: the local step of each vertex, and the pass forwards
-    turn    the same for the top, and its pass backwards
-    down    parents first: the pass backwards
+    up      children first: the local step of each vertex, and forward substitution
+    turn    the same for the top, and its back substitution
+    down    parents first: back substitution
 
-Vertices of a subtree have springs among themselves and to their ancestors only. So once a pass backwards has left a
-subtree, all that its next local step reads is known. A group is therefore gone through subtree by subtree: down to it
-in one iteration and, once that is done with all below it, up from it in the next, while its panels are in a cache. The
-order of all sums is the same whatever the number of threads. These are started once a step, not once an iteration: a
-thread that sleeps takes longer to wake than an iteration takes.
+Vertices of a subtree have springs among themselves and to their ancestors only. So once back substitution has completed
+a subtree, all input of its next local step is available. A group is therefore processed subtree by subtree: down to it
+in one iteration and, after all subtrees below it, up from it in the next, while its panels are in a cache. The order of
+all sums is independent of the number of threads. The threads are started once per step, not once per iteration, because
+waking a thread takes longer than an iteration.
 
-A vector has rows of four numbers, `Supernodal`'s slots and behind them the groups' copies of the top, the vertices that
-do not move, and two more for what fills up bundles. With `p` None it holds positions, and its solve gives the
-next ones; else corrections of the positions p (n rows in float64), which may be rounded to less.
+A vector has rows of four numbers: the slots of `Supernodal`, the groups' copies of the top, the vertices that do not
+move, and two padding rows of the packets. With `p` None it holds positions, and a solve gives the next ones. Otherwise
+it holds corrections of the positions p (n rows in float64), which may have a lower precision.
 """
 
 from __future__ import annotations
@@ -34,17 +34,22 @@ from solvers.linear.team import claim, finish, following, go_on, last, start
 
 
 class Plan(NamedTuple):
-    """What is done in which order, and on what.
+    """The order of the operations of an iteration and their data.
 
-    squares, panels, places, chunks: a factor's (see `solvers.linear.supernodal`); top (3,): the first and last of the
-    top's rows, and the number of groups; blocks (b, 7): of each its first and last slot and bundle, its first chunk,
-    and the last for the passes forwards and backwards; of_group (groups + 2,): the first block of each group and of the
-    top; visits: what groups do, in turn: 2 b is the pass backwards over block b, 2 b + 1 its local step and its pass
-    forwards; those of group g begin at visits_of[g] (groups + 1,);
-    held: m/dt^2 + w [N/m] of each row, plus what quadratic forms add to its diagonal; measure: the diagonal part of
-    |e|_Q^2 in each lane of the bundles: `held` without the pins, and half of each spring to an exactly pinned vertex,
-    because no bundle of that vertex counts the other half; loose: 1 for the rows of vertices that no pin holds, else 0;
-    shift: by how many rows a vertex's right-hand side lies behind its position.
+    Attributes:
+        squares, panels, places, chunks: arrays of a factor (see `solvers.linalg.cholesky.supernodal_cholesky`).
+        top: first and last of the top's rows, and the number of groups (3,).
+        blocks: of each block its first and last slot, its first and last packet, its first chunk, and its last chunk
+            for forward and for back substitution (b, 7).
+        of_group: first block of each group and of the top (groups + 2,).
+        visits: operations of the groups in order; 2 b is back substitution of block b, 2 b + 1 its local step and
+            forward substitution.
+        visits_of: first visit of each group (groups + 1,).
+        held: m/dt^2 + w [N/m] of each row, plus the diagonal of quadratic forms.
+        measure: diagonal part of |e|_Q^2 in each lane of the packets: `held` without the pins, and half of each spring
+            to an exactly pinned vertex, because no packet of that vertex includes the other half.
+        loose: 1 for the rows of unpinned vertices, else 0.
+        shift: number of rows from a vertex's position to its right-hand side.
     """
 
     squares: NDArray[np.float64]
@@ -62,7 +67,7 @@ class Plan(NamedTuple):
     shift: int
 
 
-# Over slices: where a loop begins is then known to be no negative index, and it is compiled to vectors.
+# These take slices: then the compiler knows that a loop starts at no negative index, and vectorises it.
 @inner
 def _zero(a):
     for i in range(len(a)):
@@ -83,7 +88,7 @@ def _add(a, b):
 
 @inner
 def _up(plan, bundles, edges, block, x, right, p, out):
-    """The local step of a block at x (at p, where that is given), and its pass forwards."""
+    """Do the local step of a block at x (at p, if that is given) and its forward substitution."""
     slot, slot_end, bundle, bundle_end, chunk, chunk_end, _ = plan.blocks[block]
     if p is None:
         add_projection(bundles, bundle, bundle_end, x, right, out, plan.shift)
@@ -96,7 +101,7 @@ def _up(plan, bundles, edges, block, x, right, p, out):
 
 @inner
 def _down(plan, block, x, p):
-    """The pass backwards over a block, and the correction of its positions."""
+    """Do the back substitution of a block and correct its positions."""
     slot, slot_end, _, _, chunk, _, chunk_end = plan.blocks[block]
     backwards(plan.squares, plan.panels, plan.places, plan.chunks, chunk, chunk_end, x)
     if p is not None:
@@ -111,7 +116,7 @@ def _clear(plan, block, out):
 
 @inner
 def _group(plan, bundles, edges, group, x, right, p, out, down, up):
-    """A group: down with the vector x, and up again with `out`, in the order of its visits."""
+    """Process a group in the order of its visits: down with the vector x, and up with `out`."""
     top = 4 * plan.top[0]
     size = 4 * plan.top[1] - top
     copy = top + (group + 1) * size
@@ -132,7 +137,7 @@ def _group(plan, bundles, edges, group, x, right, p, out, down, up):
 
 @inner
 def _turn(plan, bundles, edges, x, right, p, out):
-    """The top: up at the positions x, and down again."""
+    """Process the top: up at the positions x, and down again."""
     top, top_end, groups = plan.top
     size = 4 * (top_end - top)
     for group in range(groups):
@@ -148,7 +153,7 @@ def _turn(plan, bundles, edges, x, right, p, out):
 
 @inner
 def _displace(plan, part, x, before, p, e):
-    """e = p^k - p^(k-1) of the vertices that no pin holds, of a group or the top."""
+    """Write e = p^k - p^(k-1) of the unpinned vertices of a group or the top."""
     begin, end = plan.of_group[part], plan.of_group[part + 1]
     if begin < end:
         for i in range(plan.blocks[begin, 0], plan.blocks[end - 1, 1]):
@@ -158,7 +163,7 @@ def _displace(plan, part, x, before, p, e):
 
 @inner
 def _squared(plan, form, part, e):
-    """|e|_Q^2 [J] of a group or the top: half of each spring's at either end."""
+    """Return |e|_Q^2 [J] of a group or the top, with half of each spring at either end."""
     begin, end = plan.of_group[part], plan.of_group[part + 1]
     if begin == end:
         return 0.0
@@ -167,7 +172,7 @@ def _squared(plan, form, part, e):
 
 @kernel
 def length(plan, form, x, before, p, e):
-    """What `iterate` calls the residual [J^(1/2)] of one iteration, from its vectors; e: scratch."""
+    """Return the residual [J^(1/2)] of an iteration from its vectors, as `run_iterations` defines it; e: scratch."""
     groups = plan.top[2]
     for part in range(groups + 1):
         _displace(plan, part, x, before, p, e)
@@ -179,7 +184,7 @@ def length(plan, form, x, before, p, e):
 
 @kernel
 def local(plan, bundles, edges, x, right, p, out):
-    """The local step alone, of all blocks."""
+    """Do the local step of all blocks without a solve."""
     for k in range(len(out)):
         out[k] = 0.0
     if p is None:
@@ -196,9 +201,9 @@ def local(plan, bundles, edges, x, right, p, out):
 
 @inner
 def _share(plan, bundles, edges, form, vectors, right, p, limits, team, first):
-    """A thread's share of the iterations: the groups from `first` on that no other thread does, and what follows them.
+    """Do a thread's part of the iterations: the groups from `first` on that no other thread has claimed.
 
-    Phase 2 k is iteration k, phase 2 k + 1 measures it where that is wanted.
+    Phase 2 k is iteration k, phase 2 k + 1 computes its residual if it is requested.
     """
     x0, x1, x2, e = vectors
     turns = x0, x1, x2
@@ -206,10 +211,10 @@ def _share(plan, bundles, edges, form, vectors, right, p, limits, team, first):
     phase = 0
     while phase >= 0:
         k, measures = phase // 2, phase % 2 == 1
-        # Positions p^k are in a, or on the way there, and those before in c.
+        # Positions p^k are in a, or being computed there, and the previous ones in c.
         a, b, c = turns[k % 3], turns[(k + 1) % 3], turns[(k + 2) % 3]
         for i in range(groups):
-            # There and back again: what was read last is in the cache still.
+            # Alternating order: the last data read are still in the cache.
             group = (first + (groups - 1 - i if k % 2 == 1 else i)) % groups
             if claim(team, group, phase):
                 if measures:
@@ -246,13 +251,23 @@ def _side_by_side(plan, bundles, edges, form, vectors, right, p, limits, team, t
 
 @kernel
 def iterate(plan, bundles, edges, form, vectors, right, p, limits, threads, team):
-    """Iterate from the positions in the first vector, or from p where that is given, which then takes the positions.
+    """Iterate from the positions in the first vector, or from p if that is given, which is then overwritten.
 
-    edges: strain limits and dashpots, or None; form: the bundles of |e|_Q^2, with pairs for all that is not a spring;
-    vectors: three that take turns, and one for scratch, of float64; right: the constant right-hand side (see
-    `Bundles.right`); limits: see `solvers.kernels.loop`; threads: None for one.
-    Returns how many were done, the last one's residual |p^k - p^(k-1)|_Q [J^(1/2)] over the vertices that no pin
-    holds (nan where none was wanted), and the last vector.
+    Args:
+        plan: the plan.
+        bundles: packets of the springs.
+        edges: strain limits and dashpots, or None.
+        form: packets of |e|_Q^2, with pairs for all energies that are not springs.
+        vectors: three vectors that rotate, and one for scratch, of float64.
+        right: constant right-hand side (see `SpringPackets.build_right_hand_side`).
+        p: positions to correct, or None.
+        limits: see `solvers.kernels.iteration_loop`.
+        threads: number of threads; None for one.
+        team: the thread team.
+
+    Returns:
+        The number of iterations, the last residual |p^k - p^(k-1)|_Q [J^(1/2)] over the unpinned vertices (nan if none
+        was requested), and the last vector.
     """
     start(team)
     team.found[1] = np.nan
