@@ -1,4 +1,4 @@
-"""The local step of ADMM: z and u of each edge, and what the right-hand side has of them (`solvers.methods.admm`)."""
+"""The local step of ADMM: z and u of each edge, and their part of the right-hand side (`local_global.admm`)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,18 @@ from solvers.energies.edges import TINY
 
 @kernel
 def project(edges, stiffness, low, high, rest_direction, weight, p, constant, u, out):
-    """Write constant + W A'K (z - u) [N] to `out`, from positions p, both (n, 3), and advance u (m, 3) [m].
+    """Write constant + W A'K (z - u) [N] to `out` and update u.
 
-    low, high (m,): the lengths [m] that cost an edge nothing; weight: W.
+    Args:
+        edges: (m, 2).
+        stiffness: (m,) [N/m].
+        low, high: minimum and maximum lengths [m] without energy (m,).
+        rest_direction: direction at zero length (m, 3).
+        weight: W.
+        p: positions (n, 3) [m].
+        constant: constant part (n, 3) [N].
+        u: scaled dual variables (m, 3) [m].
+        out: output (n, 3) [N].
     """
     share, kept = 1.0 / (1.0 + weight), weight * (weight - 1.0) / (1.0 + weight)
     for i in range(len(p)):

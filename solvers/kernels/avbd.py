@@ -1,8 +1,8 @@
-"""The dual step of augmented vertex block descent, compiled: tensions and stiffnesses after each sweep.
+"""The compiled dual step of augmented vertex block descent: tensions and stiffnesses after each sweep.
 
     t <- k (l - clip(l, low - t/k, high - t/k)),     k <- min(k + ramp |l - clip(l, low, high)|, most)
 
-Where an edge is within its limits t is zero, and k stays.
+For an edge within its limits t is zero, and k does not change.
 """
 
 from __future__ import annotations
@@ -17,10 +17,19 @@ from solvers.compiling import inner, kernel
 
 
 class Duals(NamedTuple):
-    """What is renewed after sweeps, of each edge (m,): low, high [m]: its limits in this step; exact: whether it has a
-    tension, else `most` is the stiffness that it has in truth; ramp: by how much its stiffness [N/m] grows for a metre
-    that it is off; most: the largest stiffness [N/m], firmest: the largest tension [N]; stiffness [N/m], tension [N]:
-    what it has, renewed; base (rows,): the majorant of all else, bound (rows,): with that of the edges, scratch."""
+    """The dual variables and parameters of each edge (m,), updated after sweeps.
+
+    Attributes:
+        low, high: minimum and maximum length in this step [m].
+        exact: whether the edge has a tension; otherwise `most` is its physical stiffness.
+        ramp: increase of the stiffness [N/m] per metre of constraint violation.
+        most: maximum stiffness [N/m].
+        firmest: maximum tension [N].
+        stiffness: current stiffness [N/m].
+        tension: current tension [N].
+        base: majorant of all other energies (rows,).
+        bound: scratch for the majorant with the edges (rows,).
+    """
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]
@@ -41,8 +50,10 @@ def _clipped(x, low, high):
 
 @kernel
 def place(blocks, hard, duals, p):
-    """Write the edges' stiffnesses and moved limits to the numbers of `hard`, the edges by rows, and the majorant of
-    the vertices at p to the lanes: where an edge pulls by t, no step across it rises by more than t/l says."""
+    """Write the edges' stiffnesses and shifted limits to their parameters, and the vertex majorants to the lanes.
+
+    If an edge pulls with t, the stiffness of a transverse step is at most t/l.
+    """
     for row in range(len(duals.base)):
         duals.bound[row] = duals.base[row]
     for e in range(len(duals.low)):
@@ -65,7 +76,7 @@ def _length(hard, e, p):
 
 @inner
 def _renew(hard, duals, p):
-    """The dual step at p."""
+    """Do the dual step at p."""
     for e in range(len(duals.low)):
         k, length = duals.stiffness[e], _length(hard, e, p)
         force = k * (length - _clipped(length, hard.numbers[e, 1], hard.numbers[e, 2]))
@@ -78,11 +89,11 @@ def _renew(hard, duals, p):
 
 @cache
 def augmenting(sweeps: Any) -> Any:
-    """The iteration over a kernel of sweeps, `solvers.kernels.vbd.iterate` or one for elements."""
+    """Build the iteration over a kernel of sweeps, `vbd_sweeps.run_iterations` or one for elements."""
 
     @kernel
     def iterate(blocks, spaces, beside, right, work, p, iterations, hard, duals):
-        """That many times a sweep from p, which takes the result, and a dual step; the edges are placed."""
+        """Run n sweeps from p, which is overwritten, each with a dual step; edge parameters must be current."""
         for _ in range(iterations):
             sweeps(blocks, spaces, beside, right, 0.0, work, p, 1)
             _renew(hard, duals, p)

@@ -1,6 +1,6 @@
-"""Conjugate gradients on the exact Hessian, preconditioned by a factor of Q, without Python.
+"""Compiled conjugate gradients on the exact Hessian, preconditioned by a factor of Q.
 
-H d = -g to |H d + g| <= limit,   |r|^2 = r' Q^-1 r           see `solvers.methods.newton_cg`
+H d = -g to |H d + g| <= limit,   |r|^2 = r' Q^-1 r           see `solvers.methods.newton.newton_cg`
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from solvers.linear.team import Team
 
 
 def among(factor: Supernodal, free: NDArray[np.int64]) -> Factor:
-    """A float64 factor, whose unknowns are the vertices free (f,), with solves from and to vectors of all vertices."""
+    """Embed a float64 factor over the free vertices (f,) so that it solves with vectors of all vertices."""
     at = factor.layout
     by_slot, by_vertex = (
         np.stack([free[order[:, 0]], order[:, 1]], axis=1).astype(np.uint32) for order in (at.by_slot, at.by_vertex)
@@ -29,12 +29,15 @@ def among(factor: Supernodal, free: NDArray[np.int64]) -> Factor:
 
 
 class Newton(NamedTuple):
-    """A Newton equation H d = -g that is being solved.
+    """The state of the solve of a Newton equation H d = -g.
 
-    hessian: see `hessian.multiply`; factor, threads: of a solve with Q, None for one; held: vertices that do not move;
-    shrunk: of the preconditioner (S Q S)^-1 the vertices (c,) and their blocks S^-1 (c, 3, 3), None for Q^-1;
-    d, r, p, z, product (n, 3): the iterate, its residual, its direction, what the factor makes of the residual, and
-    the Hessian of the direction.
+    Attributes:
+        hessian: arguments of `multiply_hessian`.
+        factor: factor of Q.
+        threads: threads of a solve with Q; None for one.
+        held: vertices that do not move.
+        shrunk: vertices (c,) and blocks S^-1 (c, 3, 3) of the preconditioner (S Q S)^-1; None for Q^-1.
+        d, r, p, z, product: iterate, residual, direction, preconditioned residual, and Hessian times direction (n, 3).
     """
 
     hessian: tuple[Any, ...]
@@ -79,7 +82,7 @@ def _go(state, product, curvature):
 
 @inner
 def _scaled(shrunk, r, out):
-    """S^-1 r (n, 3), written to `out`; r itself where nothing is shrunk."""
+    """Write S^-1 r (n, 3) to `out` and return it; return r itself without scaling."""
     if shrunk is None:
         return r
     for v in range(len(r)):
@@ -118,10 +121,16 @@ _iterate = compiled_over(_turn, _go, _convex, _near)
 
 @kernel
 def direction(newton, gradient, descent, eta, most):
-    """Write newton.d (n, 3) [m]: -Q^-1 g, where the Hessian is not convex along that.
+    """Write newton.d (n, 3) [m]; it is -Q^-1 g if the Hessian is not convex along that.
 
-    gradient, descent (n, 3): g [N] and Q^-1 g [m], or (S Q S)^-1 g; eta: what is left of |g|; most: products with H.
-    Vectors of `newton` are zero at the held vertices.
+    Vectors of `newton` are zero at the vertices that do not move.
+
+    Args:
+        newton: the state.
+        gradient: g (n, 3) [N].
+        descent: Q^-1 g [m], or (S Q S)^-1 g (n, 3).
+        eta: tolerance relative to |g|.
+        most: maximum number of products with H.
     """
     for i in range(len(newton.d)):
         for c in range(3):

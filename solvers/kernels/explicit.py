@@ -1,4 +1,4 @@
-"""Symplectic Euler, compiled: the force of all springs, eight vertices at a time, then velocities, then positions."""
+"""Compiled symplectic Euler: force of all springs in packets of eight vertices, then velocities, then positions."""
 
 from __future__ import annotations
 
@@ -8,10 +8,19 @@ from solvers.kernels.springs import add_descent
 
 @kernel
 def advance(bundles, pins, begin, end, force, rate, h, count, p, v, acceleration):
-    """`count` substeps of h [s] from p [m] and v [m/s], in rows of four, which take the result.
+    """Run `count` substeps of size h; p and v, in rows of four, are overwritten with the result.
 
-    pins: vertices (q,) that move evenly from `begin` to `end`, (q, 3) [m]; force [N]: as `right` of the bundles, held
-    by nothing; rate: h/m (n,) [s/kg], 0 for the pinned; acceleration: scratch in rows of four.
+    Args:
+        bundles: packets of the springs.
+        pins: vertices (q,) that move uniformly from `begin` to `end`.
+        begin, end: positions of the pins (q, 3) [m].
+        force: force [N] in the layout of the packets' right-hand side, with zero anchor stiffness.
+        rate: h/m (n,) [s/kg], 0 for pinned vertices.
+        h: step size [s].
+        count: number of substeps.
+        p: positions [m].
+        v: velocities [m/s].
+        acceleration: scratch in rows of four.
     """
     for step in range(1, count + 1):
         for k in range(len(acceleration)):

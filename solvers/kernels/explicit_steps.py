@@ -1,9 +1,8 @@
-"""Explicit integration of a frame, compiled: compositions of kicks and drifts, and Runge-Kutta methods that keep to an
-error by their step.
+"""Compiled explicit integration of a frame: splitting methods, and Runge-Kutta methods with adaptive step size.
 
     p' = v,    v' = M^-1 (f - grad E(p)) - c v
 
-All positions, velocities and accelerations are in rows of four; `Forces` has what does not change in a frame.
+Positions, velocities and accelerations are in rows of four. `FrameForces` has the data that are constant in a frame.
 """
 
 from __future__ import annotations
@@ -19,19 +18,26 @@ from solvers.memory import aligned
 from solvers.problem import Positions
 
 FEWEST, LARGEST, CAUTION = 0.2, 5.0, 0.9
-"""What a step may shrink and grow by at once, and the part taken of what the error allows."""
+"""Limits of the change of the step size, and the safety factor."""
 
 FLOOR = 1e-10
-"""Of a frame: a shorter step is given up."""
+"""Smallest step size relative to the frame; below it the integration is abandoned."""
 
 Array = NDArray[np.float64]
 
 
 class Forces(NamedTuple):
-    """bundles: of the springs at unpinned vertices; right: the constant force [N], as `Bundles.right` has it; a
-    quadratic form as `solvers.kernels.forms.Form` has it: pairs (k, 2), weight (k,), held (n,), or empty; inverse:
-    1/m [1/kg], 0 for the pinned, and drag: c [1/s], both in rows of four; pins (q,): vertices that move evenly from
-    `begin` to `end`, (q, 3) [m]."""
+    """The forces of a frame.
+
+    Attributes:
+        bundles: packets of the springs at unpinned vertices.
+        right: constant force [N], in the layout of `SpringPackets.build_right_hand_side`.
+        pairs, weight, held: quadratic form as in `QuadraticForm`, (k, 2), (k,) and (n,), or empty.
+        inverse: 1/m [1/kg] in rows of four, 0 for pinned vertices.
+        drag: c [1/s] in rows of four.
+        pins: vertices (q,) that move uniformly from `begin` to `end`.
+        begin, end: positions of the pins (q, 3) [m].
+    """
 
     bundles: Bundles
     right: Array
@@ -47,7 +53,7 @@ class Forces(NamedTuple):
 
 @inner
 def add_forces(forces, p, out):
-    """Add all forces but drag [N] at p to `out`, in rows of four."""
+    """Add all forces except drag [N] at p to `out`, in rows of four."""
     add_descent(forces.bundles, 0, len(forces.bundles.start) - 1, p, forces.right, out, 0)
     for i in range(len(forces.held)):
         for k in range(4 * i, 4 * i + 3):
@@ -62,7 +68,7 @@ def add_forces(forces, p, out):
 
 @inner
 def pull(forces, p, out):
-    """Write M^-1 of these forces [m/s^2] to `out`."""
+    """Write the acceleration [m/s^2] by these forces to `out`."""
     for k in range(len(out)):
         out[k] = 0.0
     add_forces(forces, p, out)
@@ -72,7 +78,7 @@ def pull(forces, p, out):
 
 @inner
 def carry(forces, part, p):
-    """Put the pins where they are after this part of the frame."""
+    """Move the pins to their positions at a fraction of the frame."""
     for q in range(len(forces.pins)):
         for c in range(3):
             p[4 * forces.pins[q] + c] = forces.end[q, c] + (1.0 - part) * (forces.begin[q, c] - forces.end[q, c])
@@ -80,7 +86,7 @@ def carry(forces, part, p):
 
 @inner
 def kick(inverse, kept, gained, first, second, h, p, v, force):
-    """A kick of v, a second one unless it is negative, and a drift of p for h [s]; the force [N] is used up."""
+    """Apply one kick to v, a second one unless it is negative, and a drift of p for h [s]; clear the force [N]."""
     for i in range(len(p)):
         a = force[i] * inverse[i]
         force[i] = 0.0
@@ -93,11 +99,20 @@ def kick(inverse, kept, gained, first, second, h, p, v, force):
 
 @kernel
 def compose(forces, drifts, kept, gained, count, h, p, v, force):
-    """`count` steps of h [s]: drift 0, kick 0, drift 1, ..., the last drift, of p and v, which take the result. Where a
-    step neither ends nor begins with a drift, its last kick and the next step's first have one force.
+    """Run `count` steps of size h: drift 0, kick 0, drift 1, ..., the last drift.
 
-    drifts (k + 1,): parts of h; kept and gained (k, rows): what is left of a velocity by a kick, and what it gains of
-    the acceleration [s], both exact for drag; force: scratch, of zeros.
+    If a step neither starts nor ends with a drift, its last kick and the first kick of the next step share one force.
+    The arrays p and v are overwritten with the result.
+
+    Args:
+        forces: forces of the frame.
+        drifts: fractions of h (k + 1,).
+        kept, gained: decay of a velocity by a kick, and its gain per acceleration [s] (k, rows), exact for drag.
+        count: number of steps.
+        h: step size [s].
+        p: positions [m].
+        v: velocities [m/s].
+        force: scratch, initially zero.
     """
     last = len(kept) - 1
     joined = drifts[0] == 0.0 and drifts[-1] == 0.0
@@ -118,9 +133,14 @@ def compose(forces, drifts, kept, gained, count, h, p, v, force):
 
 
 class Coefficients(NamedTuple):
-    """A Runge-Kutta method: a (s, s), rows of the tableau, the last of which ends the step; times (s,): c; errors
-    (1 or 2, s): weights of the error, the second one that of a lower order which tempers it; power: the error falls by
-    h^power, 0 keeps h."""
+    """The coefficients of a Runge-Kutta method.
+
+    Attributes:
+        a: rows of the tableau (s, s); the last one ends the step.
+        times: c (s,).
+        errors: weights of the error (1 or 2, s); the second, of lower order, moderates the first.
+        power: exponent of h in the error; 0 fixes h.
+    """
 
     a: Array
     times: Array
@@ -129,7 +149,7 @@ class Coefficients(NamedTuple):
 
 
 class Subdivision(NamedTuple):
-    """How a frame [s] is cut: tolerance [m]: of each step, root mean square; most: how many may be tried; first [s]."""
+    """The steps of a frame [s]: rms error tolerance of a step [m], maximum number of tried steps, first step [s]."""
 
     frame: float
     tolerance: float
@@ -138,7 +158,7 @@ class Subdivision(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """The motion at a stage, q [m] and w [m/s], and q' and w' at all of them, (s, rows)."""
+    """The motion at a stage, q [m] and w [m/s], and the derivatives q' and w' at all stages, (s, rows)."""
 
     q: Array
     w: Array
@@ -147,7 +167,7 @@ class Scratch(NamedTuple):
 
     @classmethod
     def of(cls, stages: int, rows: int) -> Scratch:
-        """Memory for so many numbers of positions."""
+        """Allocate the scratch for a number of stages and of coordinates."""
         return cls(aligned(rows), aligned(rows), *np.zeros((2, stages, rows)))
 
 
@@ -175,7 +195,7 @@ def _evaluate(forces, s, q, w, at):
 
 @inner
 def _squares(forces, weights, span, at):
-    """The sum of squares of an error by its weights: of positions, and of velocities by what they move in `span`."""
+    """Return the sum of squares of an error: of positions, and of velocities times `span`."""
     total = 0.0
     for i in range(0, len(forces.inverse), 4):
         if forces.inverse[i] != 0.0:
@@ -190,7 +210,7 @@ def _squares(forces, weights, span, at):
 
 @inner
 def _error(forces, errors, span, at):
-    """The sum of squares of a step's error; of two estimates the second one tempers the first."""
+    """Return the sum of squares of a step's error; a second estimate moderates the first one."""
     size = _squares(forces, errors[0], span, at)
     if len(errors) == 1:
         return size
@@ -200,11 +220,18 @@ def _error(forces, errors, span, at):
 
 @kernel
 def integrate(forces, stages, steps, p, v, at, told):
-    """A frame by a Runge-Kutta method whose steps keep to an error; an error of velocity counts by what it moves in the
-    frame.
+    """Integrate a frame by a Runge-Kutta method with adaptive step size.
 
-    p [m], v [m/s]: take the result; at: scratch; told: takes the steps accepted, those rejected, the last step [s] and
-    the time reached [s].
+    An error of the velocity is multiplied by the length of the frame.
+
+    Args:
+        forces: forces of the frame.
+        stages: coefficients of the method.
+        steps: length and tolerance of the frame.
+        p: positions [m], overwritten with the result.
+        v: velocities [m/s], overwritten with the result.
+        at: scratch.
+        told: output: accepted steps, rejected steps, last step size [s], time reached [s].
     """
     free = 0
     for i in range(0, len(forces.inverse), 4):

@@ -1,11 +1,11 @@
-"""Newton steps of vertices that half-spaces keep out of obstacles, one vertex after another.
+"""Newton steps of single vertices with half-space contact, one vertex after another.
 
-    k/2 min(0, n.x - d)^2 + F h(|u|),   u = (I - nn')(x - a)             a half-space (see `solvers.contact.energy`)
+    k/2 min(0, n.x - d)^2 + F h(|u|),   u = (I - nn')(x - a)     a half-space (see `half_space_potential`)
 
-A vertex's block and gradient are those of its springs and of what presses and grips. What begins to press on the way is
-found by a few repetitions, each from the last one's end. A step that raises the energy gives way to one of a larger
-block, in the end of one that majorises everything. What else acts on the vertices is told by two functions (see
-`solvers.kernels.stencils`).
+The block and gradient of a vertex are those of its springs, of active half-spaces and of friction. Half-spaces that
+become active along the step are found by a few repetitions, each from the end of the last one. A step that increases
+the energy is replaced by one with a larger block, finally one that majorises all terms. Two functions provide all other
+energies of the vertices (see `solvers.methods.vertex_block.incident_elements`).
 """
 
 from __future__ import annotations
@@ -21,18 +21,24 @@ from solvers.vectors.springs import LANES, RIGHT
 
 _PASSES = 4
 EXACT, _GRIPPED, MAJORANT, _EVERYTHING = range(4)
-"""The blocks: exact, but for compressed springs; with a majorant of friction; of springs too; of what may press too."""
+"""The blocks: exact except for compressed springs; majorant of friction; also of springs; also of inactive contact."""
 
 _ROUND_OFF = 1e-14
-"""Pivots up to this share of the diagonal's sum are round-off."""
+"""Pivots up to this fraction of the trace are round-off."""
 
 
 class HalfSpaces(NamedTuple):
     """Half-spaces by the rows of their vertices.
 
-    first (rows + 1,): of each row; near (b,): whether a bundle has a vertex with any; of each half-space normal n and
-    anchor a (k, 3), offset d [m], stiffness k [N/m], grip F [N] and slip [m], (k,); both: whether they hold from both
-    sides, as planes do.
+    Attributes:
+        first: first half-space of each row (rows + 1,).
+        near: whether a packet has a vertex with a half-space (b,).
+        normal, anchor: n and a (k, 3).
+        offset: d [m] (k,).
+        stiffness: k [N/m] (k,).
+        grip: friction limit F [N] (k,).
+        slip: smoothing length [m] (k,).
+        both: whether they act on both sides, as planes do.
     """
 
     first: NDArray[np.int64]
@@ -58,7 +64,7 @@ def _rounded(u, slip):
 
 @inner
 def _across(s, k, x):
-    """u and |u| of a half-space at x."""
+    """Return u and |u| of a half-space at x."""
     n0, n1, n2 = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2]
     u0, u1, u2 = x[0] - s.anchor[k, 0], x[1] - s.anchor[k, 1], x[2] - s.anchor[k, 2]
     along = n0 * u0 + n1 * u1 + n2 * u2
@@ -68,7 +74,7 @@ def _across(s, k, x):
 
 @inner
 def pressed(s, p):
-    """The half-spaces' energy [J] at positions in rows of four; none without half-spaces."""
+    """Return the half-spaces' energy [J] at positions in rows of four; 0 without half-spaces."""
     if s is None:
         return 0.0
     total = 0.0
@@ -84,7 +90,7 @@ def pressed(s, p):
 
 @inner
 def _springs(bundles, b, lane, p, x, held, load):
-    """The gradient and the upper triangle of the block of a vertex's springs and of what holds it."""
+    """Return the gradient and the block's upper triangle of a vertex's springs, inertia and pins."""
     g0, g1, g2 = -load[0], -load[1], -load[2]
     a00, a01, a02, a11, a12, a22 = held, 0.0, 0.0, held, 0.0, held
     for entry in range(bundles.start[b], bundles.start[b + 1]):
@@ -123,7 +129,7 @@ def _add(block, weight, n0, n1, n2):
 
 @inner
 def pushed(s, i, x, d, level, gradient, block):
-    """The gradient and the block with what presses and grips at x and after a step d; and which those are, as bits."""
+    """Add active half-spaces and friction at x, or after a step d, to gradient and block; return the set as bits."""
     who = 0
     for k in range(s.first[i], s.first[i + 1]):
         n0, n1, n2, weight = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2], s.stiffness[k]
@@ -146,7 +152,7 @@ def pushed(s, i, x, d, level, gradient, block):
 
 @inner
 def solved(block, g):
-    """-B^-1 g, and whether B is positive definite."""
+    """Return -B^-1 g, and whether B is positive definite."""
     a, b, c, d, e, f = block
     least = _ROUND_OFF * (a + d + f)
     if not a > least:
@@ -167,8 +173,7 @@ def solved(block, g):
 
 @inner
 def _rise(bundles, b, lane, p, x, d, held, load):
-    """By how much a step d of a vertex raises the energy of its springs and of what holds it [J], from differences,
-    which do not cancel."""
+    """Return the change of a vertex's energy [J] of springs, inertia and pins by a step d, without cancellation."""
     total = 0.0
     for c in range(3):
         total += d[c] * (0.5 * held * d[c] - load[c])
@@ -190,7 +195,7 @@ def _rise(bundles, b, lane, p, x, d, held, load):
 
 @inner
 def deeper(s, i, x, d, total):
-    """A rise, and by how much a step d of row i from x raises the energy of its half-spaces [J]."""
+    """Add to a change that of the half-spaces' energy [J] by a step d of row i from x."""
     end = x[0] + d[0], x[1] + d[1], x[2] + d[2]
     for k in range(s.first[i], s.first[i + 1]):
         n0, n1, n2 = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2]
@@ -211,15 +216,18 @@ def deeper(s, i, x, d, total):
 
 
 def trying(risen: Any) -> Any:
-    """Finds a step of row i from x that lowers its energy, the first of those by ever larger blocks; none is a step of
-    length zero. A device compiles it for itself.
+    """Build a function that finds a step of row i from x that does not increase its energy.
 
-    risen(d, where): by how much a step raises what acts on the row beside half-spaces; where: whatever that reads.
+    It tries increasingly large blocks; if none succeeds, the step is zero. A device compiles it separately.
+
+    Args:
+        risen: function (d, where) that returns the change by a step of the other energies of the row; `where` is
+            passed to it unchanged.
     """
 
     @inner_closure
     def lowering(s, i, x, majorant, first, gradient, block, where):
-        """first: the block to begin with; majorant, gradient, block: of all but half-spaces."""
+        """Return the step; begin with the block `first`; majorant, gradient and block exclude the half-spaces."""
         for level in range(first, _EVERYTHING + 1):
             if level == MAJORANT:
                 block = majorant
@@ -238,9 +246,13 @@ def trying(risen: Any) -> Any:
 
 
 def moving(felt: Any, risen: Any) -> Any:
-    """Moves the vertices of a bundle to lower energies, one after another: none is joined to another.
+    """Build a function that moves the vertices of a packet to lower energies one after another.
 
-    felt(beside, i, p, gradient, block) adds what else row i feels, risen(beside, i, p, d) tells its rise by a step d.
+    No two of them are coupled.
+
+    Args:
+        felt: function (beside, i, p, gradient, block) that adds the other energies of row i.
+        risen: function (beside, i, p, d) that returns their change by a step d.
     """
 
     @inner_closure

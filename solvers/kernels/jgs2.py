@@ -1,4 +1,4 @@
-"""Each vertex's own step of JGS2, with all that answers to it (`solvers.methods.jgs2`), compiled.
+"""The compiled step of each vertex in JGS2, with its patch (`solvers.methods.vertex_block.jgs2`).
 
 d_i = -R_i S^-1 sum over a of W_a' g_a,   S = sum over a, b of W_a' H_ab W_b,   W_a = R_a response_ia
 """
@@ -14,8 +14,13 @@ from solvers.compiling import inner, kernel
 
 
 class Patches(NamedTuple):
-    """Which free vertices answer to each, and how. start (f + 1,): where those of each begin; near (e,): these, itself
-    among them, ascending; response (e, 3, 3): their displacements for one of its own, which are no unit's."""
+    """The patch of each free vertex and its response.
+
+    Attributes:
+        start: start of each patch (f + 1,).
+        near: vertices of the patches, ascending, with the vertex itself (e,).
+        response: displacements per displacement of the vertex (e, 3, 3), dimensionless.
+    """
 
     start: NDArray[np.int64]
     near: NDArray[np.int64]
@@ -23,7 +28,7 @@ class Patches(NamedTuple):
 
 
 class PatchScratch(NamedTuple):
-    """place (f,): -1; turned: W of the largest patch; product, block, pull: of one vertex, (3, 3), (3, 3), (3,)."""
+    """Scratch: local index (f,), initially -1; W of the largest patch; product, block (3, 3) and gradient (3,)."""
 
     place: NDArray[np.int64]
     turned: NDArray[np.float64]
@@ -33,7 +38,7 @@ class PatchScratch(NamedTuple):
 
     @classmethod
     def of(cls, patches: Patches) -> PatchScratch:
-        """For these."""
+        """Allocate the scratch of patches."""
         most = int(np.diff(patches.start).max(initial=1))
         return cls(
             np.full(len(patches.start) - 1, -1),
@@ -46,9 +51,15 @@ class PatchScratch(NamedTuple):
 
 @kernel
 def directions(patches, turn, pointers, columns, blocks, gradient, scratch, out):
-    """Write every free vertex's step d (f, 3) [m] to `out`.
+    """Write the step d of each free vertex (f, 3) [m] to `out`.
 
-    turn (f, 3, 3): the rotation of each; pointers, columns, blocks: H, by rows, all its columns; gradient (f, 3) [N].
+    Args:
+        patches: the patches.
+        turn: rotation of each vertex (f, 3, 3).
+        pointers, columns, blocks: H by rows, with all columns.
+        gradient: (f, 3) [N].
+        scratch: scratch memory.
+        out: output (f, 3) [m].
     """
     start, near, response = patches
     place, turned, product, block, pull = scratch
@@ -85,7 +96,7 @@ def directions(patches, turn, pointers, columns, blocks, gradient, scratch, out)
 
 @inner
 def _times(turned, place, a, pointers, columns, blocks, product):
-    """Write H_aa W_a / 2 and the sum of H_ab W_b over b > a to `product`: half of a symmetric sum."""
+    """Write H_aa W_a / 2 plus the sum of H_ab W_b over b > a to `product`, half of a symmetric sum."""
     for r in range(3):
         for c in range(3):
             product[r, c] = 0.0
@@ -103,7 +114,7 @@ def _times(turned, place, a, pointers, columns, blocks, product):
 
 @inner
 def _solve(half, x):
-    """x becomes (half + half')^-1 x, or x over the trace where that is not positive definite."""
+    """Overwrite x with (half + half')^-1 x, or with x over the trace if that is not positive definite."""
     a, b, c = 2.0 * half[0, 0], half[0, 1] + half[1, 0], half[0, 2] + half[2, 0]
     d, e, f = 2.0 * half[1, 1], half[1, 2] + half[2, 1], 2.0 * half[2, 2]
     trace = a + d + f

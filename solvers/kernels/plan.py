@@ -1,4 +1,4 @@
-"""In which order an iteration goes through a factor: blocks of subtrees that fit the cache, and those above."""
+"""The elimination schedule of an iteration over a factor: blocks of subtrees that fit the cache, and those above."""
 
 from __future__ import annotations
 
@@ -14,17 +14,21 @@ from solvers.linear.supernodes import LANES, WIDTH
 from solvers.memory import aligned
 
 BLOCK_BYTES = 2 << 20
-"""Of the panels of a block. Up to 8 MiB all are alike; a half of it costs up to 3 %, a quarter 8 %."""
+"""Maximum size of the panels of a block. Up to 8 MiB all are equal; half of this costs up to 3 %, a quarter 8 %."""
 
 DOWN, UP = 0, 1
-"""What a visit adds to twice a block's number."""
+"""Offset of a visit from twice the block's index."""
 
 
 class Order(NamedTuple):
-    """A factor, cut into blocks.
+    """A factor in blocks, and their schedule.
 
-    squares, panels, places, chunks, top, of_group, visits, visits_of, shift: see `solvers.kernels.step.Plan`; spans
-    (b, 5): the columns of its `blocks` without the bundles; slot (n,): the row of each unknown; rows: of a vector.
+    Attributes:
+        squares, panels, places, chunks, top, of_group, visits, visits_of, shift: see
+            `solvers.kernels.local_global_iteration.IterationPlan`.
+        spans: columns of its block table without the packets (b, 5).
+        slot: row of each unknown (n,).
+        rows: number of rows of a vector.
     """
 
     squares: NDArray[Any]
@@ -42,7 +46,7 @@ class Order(NamedTuple):
 
 
 def of_supernodal(factor: Supernodal) -> Order:
-    """The order for a supernodal factor: each group cut into blocks, the top a block of its own."""
+    """Build the schedule of a supernodal factor: each group is cut into blocks, the top is one block."""
     squares, panels, at = factor.squares, factor.panels, factor.layout
     places, chunks, spans = at.places, at.chunks, at.spans
     top, top_end = spans[-1, -2:].tolist()
@@ -81,7 +85,7 @@ def of_supernodal(factor: Supernodal) -> Order:
 
 
 def of_inverse(factor: Inverse) -> Order:
-    """The order for a small inverse: panels of its columns that are only gone down, from right-hand sides behind."""
+    """Build the schedule of a small inverse: column panels for one pass, with right-hand sides stored behind."""
     inverse = factor.inverse
     n = len(inverse)
     first = np.arange(0, n, WIDTH)
@@ -106,14 +110,14 @@ def of_inverse(factor: Inverse) -> Order:
 
 
 def vectors(dtype: Any, rows: int) -> tuple[NDArray[Any], ...]:
-    """Three vectors for the iterations, and one of float64 for scratch, of so many rows of four."""
+    """Allocate three vectors for the iterations, and one of float64 for scratch, in rows of four."""
     return *(aligned(4 * rows, dtype) for _ in range(3)), aligned(4 * rows)
 
 
 def _subtrees(
     chunks: NDArray[np.int64], places: NDArray[np.int32], top: int, square: int, panel: int
 ) -> tuple[list[int], list[int], list[int]]:
-    """The bytes of each chunk's subtree, its first chunk, and how many children it has; subtrees end at the top."""
+    """Return each chunk's subtree size [bytes], its first chunk, and its number of children; the top is excluded."""
     _, _, at, _, below, quads, slot = chunks.T
     above = places[np.minimum(at, len(places) - 1)] if len(places) else np.zeros(len(chunks), np.int64)
     inside = (below > 0) & (above < top)
@@ -130,9 +134,9 @@ def _subtrees(
 
 
 def _cut(begin: int, end: int, size: list[int], first: list[int], children: list[int]) -> list[tuple[int, int]]:
-    """The chunks from `begin` to `end` as blocks, each the chunks it spans: whole subtrees, or a path above some.
+    """Cut the chunks from `begin` to `end` into blocks: whole subtrees, or paths above them.
 
-    Chunks are in a postorder, so that a subtree is a stretch of them; neighbours join where they still fit.
+    Chunks are in a postorder, so that a subtree is a range of them. Neighbours are merged if they still fit.
     """
     blocks: list[tuple[int, int]] = []
     filled, whole = 0, False
@@ -153,8 +157,10 @@ def _cut(begin: int, end: int, size: list[int], first: list[int], children: list
 
 
 def _visits(blocks: list[tuple[int, int]], first: list[int], number: int) -> list[int]:
-    """The blocks of a group, the first of them with this number, in the order of both passes: down to each after those
-    above it, and up from each in the order in which they lie, after all below it."""
+    """Order the blocks of a group for both passes; `number` is the index of the first block.
+
+    The pass down visits each block after those above it. The pass up visits them in storage order, after all below.
+    """
     begins = [begin for begin, _ in blocks]
     below: list[list[int]] = [[] for _ in blocks]  # by the first block of their subtrees
     for k, (begin, end) in enumerate(blocks):

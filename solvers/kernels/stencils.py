@@ -1,10 +1,10 @@
-"""Energies of elements by their vertices: what one vertex feels of them, and what a step of it alone changes.
+"""Element energies by vertex: the gradient and block of one vertex, and the energy change of its step.
 
     E = sum_e phi_e(z_e),   z = A p       gradient_i = sum_e a_ei phi'(z_e),   block_i = sum_e a_ei^2 phi''(z_e)
 
-with the laws of one element that `solvers.energies.elements` has. Where phi'' does not depend on z, a vertex's block B
-is that of the whole step, and a step d of it raises the energy by g'd + d'Bd/2, with its gradient g: its elements are
-passed once, and not again for the rise. Positions have rows of four numbers.
+with the element laws of `solvers.model.energies.element_energies`. If phi'' does not depend on z, a vertex's block B is
+constant in the step, and a step d of the vertex changes the energy by g'd + d'Bd/2, with its gradient g. Its elements
+are then evaluated once, and not again for the change. Positions have rows of four numbers.
 """
 
 from __future__ import annotations
@@ -19,13 +19,17 @@ from solvers.energies.elements import Elements, Law
 
 
 class Around(NamedTuple):
-    """Elements by the rows of their vertices, and each of them once.
+    """Elements by the rows of their vertices, and as a list.
 
-    first (rows + 1,): the first entry of each row; element, own: of each entry, and the row's coefficient in it;
-    places, weights (entries, k - 1): where the other vertices' rows begin, and their coefficients; block (rows, 6),
-    pull (rows, 3): where phi'' is constant, of each row its sum and the gradient that was felt last; rows, coefficients
-    (m, k), numbers (m, q): of the elements, with what phi reads. Indices are
-    unsigned: no code has to ask whether they count from the end.
+    Indices are unsigned, so that compiled code needs no check for negative ones.
+
+    Attributes:
+        first: first entry of each row (rows + 1,).
+        element, own: of each entry, the element and the row's coefficient in it.
+        places, weights: offsets of the other vertices' rows, and their coefficients (entries, k - 1).
+        block, pull: for constant phi'', the sum of each row (rows, 6) and its last gradient (rows, 3).
+        rows, coefficients: of the elements (m, k).
+        numbers: parameters of phi (m, q).
     """
 
     first: NDArray[np.uint32]
@@ -41,8 +45,10 @@ class Around(NamedTuple):
 
     @classmethod
     def of(cls, law: Law, elements: Elements, row: NDArray[np.int64], rows: int) -> Around:
-        """Elements of a law, of vertices in rows `row` (n,), of so many; one that names a vertex twice is an edge from
-        it to itself, and nobody feels it."""
+        """Build the incident elements of rows `row` (n,) of `rows`.
+
+        An element that has a vertex twice is an edge from it to itself, and is omitted from the rows.
+        """
         at = row[elements.vertices].astype(np.int64)
         width = at.shape[1]
         ordered = np.sort(at, axis=1)
@@ -59,7 +65,7 @@ class Around(NamedTuple):
         return made.with_numbers(law, elements)
 
     def with_numbers(self, law: Law, elements: Elements) -> Around:
-        """The same elements with other numbers."""
+        """Return the elements with other parameters."""
         rows = len(self.first) - 1 if law.constant else 0
         block = np.zeros((rows, 6))
         if law.constant:
@@ -87,10 +93,14 @@ class Kind(NamedTuple):
 
 
 class Vertices(NamedTuple):
-    """What all kinds say, as functions for kernels; `around` has an Around for each kind.
+    """The functions of all kinds for kernels; `around` has incident elements for each kind.
 
-    total(around, p): the energy [J]; felt(around, i, p, gradient, block): with what row i feels added, of the block the
-    upper triangle, row by row; risen(around, i, p, d): the rise [J] by a step d of row i from where it felt last.
+    Attributes:
+        total: function (around, p) that returns the energy [J].
+        felt: function (around, i, p, gradient, block) that adds the elements of row i; the block is the upper triangle,
+            row by row.
+        risen: function (around, i, p, d) that returns the energy change [J] by a step d of row i, from the positions of
+            the last call of `add_gradient_block`.
     """
 
     total: Any
@@ -99,7 +109,7 @@ class Vertices(NamedTuple):
 
     @classmethod
     def of(cls, kinds: list[Kind]) -> Vertices:
-        """The functions of all kinds together."""
+        """Build the functions of all kinds together."""
         if not kinds:
             return cls(_no_energy, _unchanged, _no_rise)
         own_total, own_felt, own_risen = cls._of_one(*kinds[0])
@@ -122,7 +132,7 @@ class Vertices(NamedTuple):
 
     @classmethod
     def _of_one(cls, law: Law, width: int) -> Vertices:
-        """The functions of one kind, which take its Around alone; the width is known when they are compiled."""
+        """Build the functions of one kind, whose width is a compile-time constant."""
         value, gradients, curvature, rise = law.one.value, law.one.gradient, law.one.curvature, law.one.rise
 
         @inner_closure

@@ -1,4 +1,4 @@
-"""A step's beginning and end: from the problem's arrays to the rows of the kernels, and back."""
+"""Start and end of a step: conversion of the problem's arrays to the rows of the kernels and back."""
 
 from __future__ import annotations
 
@@ -15,12 +15,17 @@ from solvers.vectors.springs import LANES
 
 
 class VertexRows(NamedTuple):
-    """Where vertices lie, and what is constant of their right-hand side.
+    """The rows of the vertices, and the constant data of their right-hand side.
 
-    row (n,): of each vertex; right (n,): where its x is in the right-hand side; inertia: m/dt^2 (n,) [N/m]; weight: of
-    each pin (q,) [N/m], infinite for an exact one; pinned (q,): its vertex; coupling: Q's entries [N/m] between free
-    and exactly pinned vertices, the one (coupled) and the pin of the other (pin), none of them where corrections are
-    solved for.
+    Attributes:
+        row: row of each vertex (n,).
+        right: offset of its x in the right-hand side (n,).
+        inertia: m/dt^2 (n,) [N/m].
+        weight: weight of each pin (q,) [N/m], infinite for an exact one.
+        pinned: vertex of each pin (q,).
+        coupling: entries of Q [N/m] between free and exactly pinned vertices; empty if corrections are solved for.
+        coupled: the free vertex of each entry.
+        pin: the pin of each entry.
     """
 
     row: NDArray[np.int64]
@@ -34,7 +39,7 @@ class VertexRows(NamedTuple):
 
 
 _AHEAD = 64
-"""How many vertices ahead memory is asked for their rows, which lie in another order."""
+"""Number of vertices by which rows are prefetched, because they lie in another order in memory."""
 
 
 @inner
@@ -44,7 +49,7 @@ def _ask_ahead(rows, v, x):
 
 @kernel
 def state(rows, target, force, pin_targets, right):
-    """y = M target/dt^2 + f + w C'C p_pin, with the exact pins' columns of Q moved to the right-hand side."""
+    """Write y = M target/dt^2 + f + w C'C p_pin, with the exact pins' columns of Q moved to the right-hand side."""
     for v in range(len(target)):
         ask_for(right, rows.right[min(v + _AHEAD, len(rows.right) - 1)])
         for c in range(3):
@@ -60,7 +65,7 @@ def state(rows, target, force, pin_targets, right):
 
 @inner
 def pin(rows, pin_targets, x):
-    """Put the exactly pinned vertices on their targets."""
+    """Write the targets of the exactly pinned vertices."""
     for q in range(len(rows.pinned)):
         if rows.weight[q] == np.inf:
             for c in range(3):
@@ -69,7 +74,7 @@ def pin(rows, pin_targets, x):
 
 @inner
 def place(rows, positions, pin_targets, x):
-    """Positions to the rows of x, exactly pinned vertices on their targets."""
+    """Write positions to the rows of x, with exactly pinned vertices on their targets."""
     for v in range(len(positions)):
         _ask_ahead(rows, v, x)
         for c in range(3):
@@ -79,7 +84,7 @@ def place(rows, positions, pin_targets, x):
 
 @kernel
 def fetch(rows, x, out):
-    """The rows of x back to positions (n, 3)."""
+    """Write the rows of x to positions (n, 3)."""
     for v in range(len(out)):
         _ask_ahead(rows, v, x)
         for c in range(3):
@@ -88,7 +93,7 @@ def fetch(rows, x, out):
 
 @kernel
 def start(rows, vectors, p, positions, pin_targets):
-    """Put the positions to where the iterations begin."""
+    """Write the initial positions to the vectors from which the iterations start."""
     if p is not None:
         place(rows, positions, pin_targets, p)
         return
@@ -99,10 +104,27 @@ def start(rows, vectors, p, positions, pin_targets):
 
 @kernel
 def solve(plan, bundles, edges, form, rows, vectors, right, p, given, limits, threads, team, out):
-    """A whole step; given: target, force, targets of pins and first guess; limits: see `solvers.kernels.loop`. What an
-    iteration needs is not handed on as one: tuples of tuples cost a small step 3 %.
+    """Solve a whole step and write the positions to `out`.
 
-    Returns the count of iterations, the residual [J^(1/2)] and what ended them.
+    An iteration gets single arguments, because nested tuples cost 3 % of a small step.
+
+    Args:
+        plan: the plan.
+        bundles: packets of the springs.
+        edges: strain limits and dashpots, or None.
+        form: packets of |e|_Q^2.
+        rows: rows of the vertices.
+        vectors: vectors of the iterations.
+        right: right-hand side, overwritten.
+        p: positions to correct, or None.
+        given: target, force, targets of pins and initial guess.
+        limits: see `solvers.kernels.iteration_loop`.
+        threads: number of threads; None for one.
+        team: the thread team.
+        out: output (n, 3) [m].
+
+    Returns:
+        The number of iterations, the residual [J^(1/2)] and the termination reason.
     """
     target, force, pin_targets, guess = given
     state(rows, target, force, pin_targets, right)

@@ -1,4 +1,4 @@
-"""Vertex block descent, compiled: colour by colour, eight vertices at a time, all others at rest."""
+"""Compiled vertex block descent: colour by colour, in packets of eight vertices, all others at rest."""
 
 from __future__ import annotations
 
@@ -17,10 +17,16 @@ from solvers.vectors.vbd import descend
 
 
 class Blocks(NamedTuple):
-    """bundles: of the free vertices, by colour; shares: of the objective; unknowns: how many vertices are free;
-    majorant [N/m]: of each lane what holds its vertex, and the stiffness of its springs (1 where no vertex is).
+    """The packets of the free vertices and their majorants.
 
-    Vectors have rows of four numbers, the unknowns first."""
+    Vectors have rows of four numbers, the unknowns first.
+
+    Attributes:
+        bundles: packets of the free vertices, by colour.
+        shares: weights of the objective.
+        unknowns: number of free vertices.
+        majorant: of each lane, stiffness of inertia, pins and springs [N/m]; 1 for padding.
+    """
 
     bundles: Bundles
     shares: Shares
@@ -29,9 +35,16 @@ class Blocks(NamedTuple):
 
 
 class SweepScratch(NamedTuple):
-    """What a step's iterations write to, beside the positions: before and older, positions; out: scratch; near: scratch
-    of the springs of one bundle; sums: scratch of nine numbers a vertex of one; omega (1,): Chebyshev's factor, 0 where
-    a step begins; level (1,): the objective, nan where it is not known."""
+    """The arrays that the iterations of a step overwrite, except the positions.
+
+    Attributes:
+        before, older: previous positions.
+        out: scratch.
+        near: scratch for the springs of one packet.
+        sums: scratch of nine numbers per vertex of a packet.
+        omega: Chebyshev factor (1,), 0 at the start of a step.
+        level: the objective (1,), nan if it is unknown.
+    """
 
     before: NDArray[np.float64]
     older: NDArray[np.float64]
@@ -66,7 +79,7 @@ def _sweep(blocks, spaces, beside, right, p, work):
                 continue
         short = descend(blocks.bundles, b, p, right, blocks.majorant, work.near)
         if short:
-            # A spring without length has no Hessian: the majorant's step takes it apart.
+            # Step with the majorant's block, because a spring of zero length has no Hessian.
             forces(blocks.bundles, b, p, right, work.out)
             for lane in range(LANES):
                 i = own[LANES * b + lane]
@@ -76,7 +89,7 @@ def _sweep(blocks, spaces, beside, right, p, work):
 
 @inner
 def forces(bundles, b, p, right, out):
-    """Write minus the gradient of a bundle in which a spring has no length to the rows of `out`."""
+    """Write minus the gradient of a packet with a spring of zero length to the rows of `out`."""
     for lane in range(LANES):
         for k in range(4):
             out[bundles.own[LANES * b + lane] + k] = 0.0
@@ -95,15 +108,23 @@ def _level(blocks, spaces, beside, p, right, out):
 
 
 def over(sweep: Any, level: Any) -> Any:
-    """The iteration over a sweep and the objective."""
+    """Build the iteration from a sweep and the objective."""
 
     @kernel
     def iterate(blocks, spaces, beside, right, radius, work, p, iterations):
-        """That many sweeps over all vertices from p, which takes the result.
+        """Run n sweeps over all vertices from p, which is overwritten with the result.
 
-        spaces: half-spaces that vertices are kept in, or None; beside: what else acts on them, or None; right: see
-        `Bundles.right`; radius: of Chebyshev's extrapolation, 0 for none. An extrapolation that raises the objective
-        above that before the sweep is not taken, and they begin again.
+        An extrapolation that increases the objective above that before the sweep is rejected and restarts.
+
+        Args:
+            blocks: packets of the vertices.
+            spaces: half-spaces of the vertices, or None.
+            beside: other element energies, or None.
+            right: see `SpringPackets.build_right_hand_side`.
+            radius: spectral radius of Chebyshev's extrapolation, 0 for none.
+            work: scratch memory.
+            p: positions in rows of four [m].
+            iterations: number of sweeps.
         """
         omega, known, older = work.omega, work.level, work.older
         for _ in range(iterations):

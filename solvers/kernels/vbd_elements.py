@@ -1,7 +1,7 @@
-"""Vertex block descent, compiled, with energies of elements beside springs: strain limits, dashpots, one's own.
+"""Compiled vertex block descent with element energies in addition to springs: strain limits, dashpots, custom ones.
 
-Springs go eight vertices at a time, as they do alone; what the elements add to gradients, blocks and rises is computed
-vertex by vertex in between.
+Springs are processed in packets of eight vertices, as they are alone. The contributions of elements to gradients,
+blocks and energy changes are computed vertex by vertex in between.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from solvers.vectors.vbd import model, step
 
 _INFINITE = float("inf")
 _D, _RISE = 3, 6
-"""Where steps and rises lie among a bundle's sums."""
+"""Positions of steps and energy changes among a packet's sums."""
 
 
 @cache
 def iterating(*kinds: Kind) -> Any:
-    """The kernel `solvers.kernels.vbd.iterate` for elements of these kinds."""
+    """Build the kernel `vbd_sweeps.run_iterations` for elements of these kinds."""
     total, felt, risen = Vertices.of(list(kinds))
     move = moving(felt, risen)
 
     @inner_closure
     def without_length(blocks, beside, right, b, p, work):
-        """A spring without length has no Hessian: the majorant's step takes it apart."""
+        """Step with the majorant's block, because a spring of zero length has no Hessian."""
         forces(blocks.bundles, b, p, right, work.out)
         for lane in range(LANES):
             i = blocks.bundles.own[LANES * b + lane]

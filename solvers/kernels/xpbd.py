@@ -1,4 +1,4 @@
-"""Extended position based dynamics, compiled: all springs one after another, and whole steps of it."""
+"""Compiled extended position based dynamics: projection of all springs in order, and whole steps."""
 
 from __future__ import annotations
 
@@ -14,9 +14,13 @@ _TINY_SQUARED = TINY * TINY
 
 
 class Constraints(NamedTuple):
-    """Springs in the order in which they are gone through.
+    """Springs in the order of their projection.
 
-    ends (m, 2); stiffness: k (m,) [N/m]; rest_length: r (m,) [m]; rest_direction: (m, 3), taken at zero length.
+    Attributes:
+        ends: (m, 2).
+        stiffness: k (m,) [N/m].
+        rest_length: r (m,) [m].
+        rest_direction: direction at zero length (m, 3).
     """
 
     ends: NDArray[np.int32]
@@ -26,7 +30,7 @@ class Constraints(NamedTuple):
 
     @classmethod
     def of(cls, springs: Springs, order: NDArray[np.int64]) -> Constraints:
-        """The springs named in `order`."""
+        """Select the springs in the order `order`."""
         fields = (springs.stiffness, springs.rest_length, springs.rest_direction)
         return cls(
             np.ascontiguousarray(springs.edges[order], np.int32), *(np.ascontiguousarray(x[order]) for x in fields)
@@ -34,8 +38,13 @@ class Constraints(NamedTuple):
 
 
 class Pinned(NamedTuple):
-    """Pins in a step: vertices (q,), their weight (q,) [N/m], infinite for an exact one, and where they move from and
-    to, (q, 3) [m]."""
+    """The motion of the pins in a step.
+
+    Attributes:
+        vertices: (q,).
+        weight: (q,) [N/m], infinite for an exact pin.
+        begin, end: positions at the start and the end of the step (q, 3) [m].
+    """
 
     vertices: NDArray[np.int64]
     weight: NDArray[np.float64]
@@ -45,8 +54,7 @@ class Pinned(NamedTuple):
 
 @inner
 def _project(constraints, ease, compliance, tension, p):
-    """One pass: each spring's ends go to where its force, which is kept in `tension` where that is given, is
-    k (|p_i - p_j| - r)."""
+    """Project all springs once, so that each has the force k (|p_i - p_j| - r); `tension` accumulates it if given."""
     ends, stiffness, rest_length, rest_direction = constraints
     for e in range(len(stiffness)):
         i, j = ends[e]
@@ -72,10 +80,15 @@ def _project(constraints, ease, compliance, tension, p):
 
 @kernel
 def iterate(constraints, ease, compliance, tension, p, iterations):
-    """That many passes from p (n, 3) [m], which takes the result.
+    """Run n passes from p (n, 3) [m], which is overwritten with the result.
 
-    compliance: 1/held (n,) [m/N]; ease: 1/(1 + k (1/held_i + 1/held_j)) (m,); tension (m,) [N]: of each spring, zero
-    where a step begins, and kept from one pass to the next.
+    Args:
+        constraints: the springs.
+        ease: 1/(1 + k (1/h_i + 1/h_j)) (m,).
+        compliance: 1/h (n,) [m/N], with the stiffness h of inertia and pins.
+        tension: tension of each spring (m,) [N], zero at the start of a step and accumulated over the passes.
+        p: positions (n, 3) [m].
+        iterations: number of passes.
     """
     for _ in range(iterations):
         _project(constraints, ease, compliance, tension, p)
@@ -83,9 +96,17 @@ def iterate(constraints, ease, compliance, tension, p, iterations):
 
 @kernel
 def substeps(constraints, ease, compliance, pinned, force, before, p, v, h, count):
-    """`count` steps of h [s], each with one pass, from p (n, 3) [m] and v (n, 3) [m/s], which take the result.
+    """Run `count` steps of size h, each with one pass; p and v are overwritten with the result.
 
-    force: (n, 3) [N]; before: scratch like p; the others as in `iterate`, for steps of h.
+    Args:
+        constraints, ease, compliance: as for `run_iterations`, for steps of size h.
+        pinned: motion of the pins.
+        force: (n, 3) [N].
+        before: scratch like p.
+        p: positions (n, 3) [m].
+        v: velocities (n, 3) [m/s].
+        h: step size [s].
+        count: number of steps.
     """
     vertices, weight, begin, end = pinned
     for step in range(1, count + 1):
@@ -101,7 +122,7 @@ def substeps(constraints, ease, compliance, pinned, force, before, p, v, h, coun
                 if weight[q] == np.inf:
                     p[i, c] = target
                 else:
-                    # What inertia alone would lead to, without the force that was added above.
+                    # Displacement from the inertial motion, without the force that was added above.
                     away = target - before[i, c] - h * v[i, c]
                     p[i, c] += compliance[i] * weight[q] * away
         _project(constraints, ease, compliance, None, p)
