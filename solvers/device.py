@@ -25,8 +25,8 @@ class OnDevice:
 
     Attributes:
         device: processor or device.
-        unstated: parameters that rows and hashes omit at their default, so that they equal those from before the
-            parameter existed.
+        omitted_defaults: parameters that rows and hashes omit at their default, so that they equal those from before
+            the parameter existed.
     """
 
     unstated: ClassVar[frozenset[str]] = frozenset({"device", "precision"})

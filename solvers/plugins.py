@@ -35,10 +35,10 @@ class Plugin(str):
     """A name in a config that refers to third-party code.
 
     Attributes:
-        target: "module:name", or "path.py:name" with an absolute path.
-        module: the module, for display.
-        version: version of the code.
-        source: source file.
+        import_target: "module:name", or "path.py:name" with an absolute path.
+        module_name: the module, for display.
+        code_version: version of the code.
+        source_path: source file.
     """
 
     target: str

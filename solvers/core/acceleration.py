@@ -28,10 +28,10 @@ class Scheme:
 
     Attributes:
         name: name in the registry.
-        coefficients: rule of the coefficients, see `acceleration_coefficients`.
-        pairs: number of pairs in the history.
-        retries: shorter steps along a direction before the plain correction.
-        projective: whether energies must be projective.
+        coefficient_rule: rule of the coefficients, see `acceleration_coefficients`.
+        history_size: number of pairs in the history.
+        max_retries: shorter steps along a direction before the plain correction.
+        needs_projective: whether energies must be projective.
     """
 
     name: str

@@ -59,7 +59,7 @@ class Bounded(Energy, Protocol):
         Args:
             p: positions (n, 3) [m].
             direction: displacement (n, 3) [m] over the remaining part of the step.
-            begin: fraction of the step, in [0, 1], at which the obstacles start.
+            start_fraction: fraction of the step, in [0, 1], at which the obstacles start.
         """
         ...
 

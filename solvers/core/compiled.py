@@ -110,15 +110,15 @@ class PreparedCompiled(Iterative):
 
     Attributes:
         base: the uncompiled iteration.
-        parts: decomposition of the energies.
-        plan: plan of an iteration.
-        bundles: packets of the springs in the local step.
+        spring_form: decomposition of the energies.
+        iteration_plan: plan of an iteration.
+        spring_packets: packets of the springs in the local step.
         edges: strain limits and dashpots, or None.
-        form: packets of |e|_Q^2.
-        rows: rows of the vertices.
-        far: last row.
-        corrects: whether it solves for corrections.
-        reach: largest coordinate [m] up to which it may solve for positions.
+        norm_packets: packets of |e|_Q^2.
+        vertex_rows: rows of the vertices.
+        padding_row: last row.
+        use_corrections: whether it solves for corrections.
+        max_coordinate: largest coordinate [m] up to which it may solve for positions.
     """
 
     residual_of: ClassVar[ResidualOf] = "previous"

@@ -59,8 +59,8 @@ def factorised(
         hessian: the Hessian at a point.
         diagonal: diagonal whose multiples are added (3 f,) [N/m].
         shift: added to the diagonal at all levels [N/m].
-        levels: pairs of the negative fraction and the multiple of `diagonal`.
-        first: first level to try.
+        schedule: pairs of the negative fraction and the multiple of `diagonal`.
+        first_level: first level to try.
 
     Returns:
         The level; 0 is the exact Hessian; None if no level has a factor.
@@ -116,8 +116,8 @@ class Clamped(Graded):
     """Eigenvalues of all elements clamped, or replaced by their absolute values.
 
     Attributes:
-        absolute: whether absolute values are used.
-        looked, changed: numbers of elements examined and of elements projected in the solve so far.
+        use_absolute: whether absolute values are used.
+        num_examined, num_projected: numbers of elements examined and of elements projected in the solve so far.
     """
 
     def __init__(self, *, absolute: bool = False) -> None:

@@ -33,8 +33,8 @@ class Point(NamedTuple):
     """An iterate: positions and gradient, (n, 3).
 
     Attributes:
-        stalled: whether round-off prevents descent from here.
-        left: whether the previous point was a saddle point.
+        is_stalled: whether round-off prevents descent from here.
+        is_past_saddle: whether the previous point was a saddle point.
     """
 
     positions: Positions
@@ -76,9 +76,10 @@ def search(
         step: the objective.
         at: current point.
         direction: search direction (n, 3) [m].
-        first: first step size.
-        curvature: second derivative along the direction [J], if a decrease is expected from it.
-        settled: relaxation that lowers the objective from given positions; its result is tried first at each point.
+        initial_step: first step size.
+        directional_curvature: second derivative along the direction [J], if a decrease is expected from it.
+        relax_locally: relaxation that lowers the objective from given positions; its result is tried first at each
+            point.
     """
     slope = dot(at.gradient, direction)
     t = step.reach(at.positions, direction, first)
@@ -120,12 +121,12 @@ class Metric:
     """Q of a system's projective energies, factorised, which defines the norm of residuals.
 
     Attributes:
-        trace: trace of its unpinned part [N/m].
-        inner: its free part (f, f).
-        diagonal: diagonal of the free part (f,) [N/m].
+        unpinned_trace: trace of its unpinned part [N/m].
+        free_block: its free part (f, f).
+        free_diagonal: diagonal of the free part (f,) [N/m].
         factor: factor of the free part.
-        choice: description of the linear solver.
-        facts: exact counts.
+        description: description of the linear solver.
+        stats: exact counts.
     """
 
     def __init__(self, system: System) -> None:

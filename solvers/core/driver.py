@@ -91,10 +91,10 @@ class Iterative(ABC):
     """A method after the setup for a system; with `description` and `stats` it is a `PreparedSolver`.
 
     Attributes:
-        residual_of: the iterate of the residuals. It is "previous" for a method that computes them in its iteration as
-            |p - LG(p)|, and "none" for a method that does not minimise, which does all iterations.
-        keeps_lengths: whether length constraints are supported; if not, `iterates` and `solve` raise Unsupported for a
-            system that has any.
+        residual_iterate: the iterate of the residuals. It is "previous" for a method that computes them in its
+            iteration as |p - LG(p)|, and "none" for a method that does not minimise, which does all iterations.
+        supports_length_constraints: whether length constraints are supported; if not, `iterates` and `solve` raise
+            Unsupported for a system that has any.
     """
 
     residual_of: ClassVar[ResidualOf] = "returned"

@@ -35,10 +35,10 @@ class Objective:
     """The parts of a system's objective that do not change from step to step.
 
     Attributes:
-        stated: indices of energies with an element-wise form.
-        own: indices of energies without one.
-        moving: indices of quadratic forms with a force, or with one that changes from step to step.
-        projective: indices of projective energies other than springs.
+        element_energy_indices: indices of energies with an element-wise form.
+        other_energy_indices: indices of energies without one.
+        forms_with_force: indices of quadratic forms with a force, or with one that changes from step to step.
+        projective_indices: indices of projective energies other than springs.
     """
 
     def __init__(self, system: System) -> None:

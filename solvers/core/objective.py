@@ -40,10 +40,10 @@ class StepObjective:
     """The objective g of one step. All positions are (n, 3) [m], with exactly pinned vertices on their targets.
 
     Attributes:
-        stated: energies with an element-wise form, except those without elements in this step.
-        own: energies without an element-wise form.
-        bounded: barrier energies among these, which limit the step size.
-        matrix: the matrix of the Hessians.
+        element_energies: energies with an element-wise form, except those without elements in this step.
+        other_energies: energies without an element-wise form.
+        barrier_energies: barrier energies among these, which limit the step size.
+        step_matrix: the matrix of the Hessians.
     """
 
     def __init__(self, whole: Objective, problem: StepProblem) -> None:
@@ -198,7 +198,7 @@ class Hessian:
         """Factorise the Hessian and return whether it is positive definite; the defaults give the exact Hessian.
 
         Args:
-            keep: fraction of the negative transverse part of springs to include.
+            negative_fraction: fraction of the negative transverse part of springs to include.
             shift: value added to the diagonal [N/m].
             tension: tensions of the springs (m,) [N]; None for those at the point.
 

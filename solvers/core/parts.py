@@ -34,13 +34,14 @@ class Parts:
 
     Attributes:
         springs: springs of the system.
-        whole: these and the pairs of the forms.
-        pairs: all pairs in Q: these and the edges.
-        held: weight h of all forms at each vertex (n,) [N/m].
-        forms: builders of each form for a step.
-        limits, dashpots: edge energies, with k [N/m] of both.
-        unknown: names of unsupported energies.
-        cancel: whether pairs and springs of some vertices cancel, so that the pattern of Q omits their coupling.
+        springs_and_forms: these and the pairs of the forms.
+        system_pairs: all pairs in Q: these and the edges.
+        vertex_weight: weight h of all forms at each vertex (n,) [N/m].
+        form_builders: builders of each form for a step.
+        strain_limits, dashpots: edge energies, with k [N/m] of both.
+        unsupported_energies: names of unsupported energies.
+        has_cancellation: whether pairs and springs of some vertices cancel, so that the pattern of Q omits their
+            coupling.
     """
 
     springs: Springs

@@ -32,8 +32,8 @@ class Matrix:
         Args:
             system: the system.
             terms: objective terms.
-            form: quadratic form of the system, or None.
-            number: index of each vertex among the free ones (n,), or -1.
+            quadratic_form: quadratic form of the system, or None.
+            free_index: index of each vertex among the free ones (n,), or -1.
             graph: pattern of the blocks (f, f), sorted, with a diagonal.
         """
         self.graph, self._number, self._size = graph, number, len(system.free)

@@ -8,7 +8,7 @@ H+ is the Hessian at each point, with the negative eigenvalues of its elements c
 Both consist of products only, which suits a graphics processor. They use Q's factor for residuals only.
 
 Contact is far stiffer than Q, at a few vertices. There P = S Q S replaces Q, where S_i = (I + W_i/Q_ii)^(1/2)
-and W_i is the block that contact adds to H. At these vertices P equals Q + W except for couplings; elsewhere it equals Q.
+and W_i is the block that contact adds to H. At these vertices P is Q + W except for couplings; elsewhere it is Q.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ class Scaled:
     """The preconditioner (S Q S)^-1 with S_i = (I + W_i/Q_ii)^(1/2) at some vertices, I at all others.
 
     Attributes:
-        shrunk: these vertices (c,), and S_i^-1 (c, 3, 3).
+        inverse_scaling: these vertices (c,), and S_i^-1 (c, 3, 3).
     """
 
     def __init__(self, metric: Metric, vertices: NDArray[np.int64], blocks: NDArray[np.float64]) -> None:

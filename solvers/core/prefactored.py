@@ -41,17 +41,18 @@ class PreparedLocalGlobal(Iterative):
 
     Attributes:
         system: the system.
-        project: local step.
+        local_step: local step.
         factor: factor of Q's free rows and columns.
-        coupling: Q's free rows and exactly pinned columns (f, x).
-        norm: |e|_Q [J^(1/2)] of a displacement that vanishes at the pins.
-        trace: trace of the unpinned part of Q [N/m].
-        facts: exact counts of the setup.
-        choice: description of the linear solver.
-        lagged: builder of the local step of a problem, if it depends on the problem.
-        rounded: Q's free rows and columns if the factor has low precision. The iteration then solves for corrections,
-            p + Q^-1 (b - Q p), and the fixed point stays accurate to float64.
-        spread: max_i Q_ii / (Q 1)_i over the free rows and columns, half of a bound on the condition number.
+        pin_coupling: Q's free rows and exactly pinned columns (f, x).
+        energy_norm: |e|_Q [J^(1/2)] of a displacement that vanishes at the pins.
+        unpinned_trace: trace of the unpinned part of Q [N/m].
+        stats: exact counts of the setup.
+        description: description of the linear solver.
+        build_lagged_step: builder of the local step of a problem, if it depends on the problem.
+        correction_matrix: Q's free rows and columns if the factor has low precision. The iteration then solves for
+            corrections, p + Q^-1 (b - Q p), and the fixed point stays accurate to float64.
+        diagonal_dominance_ratio: max_i Q_ii / (Q 1)_i over the free rows and columns, half of a bound on the condition
+            number.
     """
 
     residual_of: ClassVar[ResidualOf] = "previous"
@@ -196,7 +197,7 @@ def prepared(
         system: the system.
         energies: its projective energies.
         factorise: function of Q's free part that returns a factor and a description.
-        rounded: whether the factor is less precise than float64.
+        is_low_precision: whether the factor is less precise than float64.
     """
     Q = matrices.assemble(system, energies)
     free = system.free

@@ -27,8 +27,8 @@ class Beside:
     """The projective energies of a system with an element-wise form.
 
     Attributes:
-        numbers: their indices in the system.
-        around: their elements by rows, one set for each law, once the rows are known.
+        energy_indices: their indices in the system.
+        incident_elements: their elements by rows, one set for each law, once the rows are known.
     """
 
     system: System

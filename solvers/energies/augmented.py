@@ -94,9 +94,9 @@ def augmented(system: System, lengths: Lengths, stiffness: NDArray[np.float64], 
 
     Args:
         system: the system with constraints.
-        lengths: its constraints.
+        constraints: its constraints.
         stiffness: stiffnesses k (m,) [N/m].
-        tension: tensions t (m,) [N].
+        tensions: tensions t (m,) [N].
     """
     if not len(lengths.edges):
         return replace(system, lengths=()) if system.lengths else system

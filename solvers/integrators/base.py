@@ -28,9 +28,9 @@ class Unknown(NamedTuple):
     """A stage of a step.
 
     Attributes:
-        when: time of x as a fraction of the step, 1 at its end.
-        target, origin: (n, 3) [m]; the caller may modify them.
-        acceleration: acceleration (n, 3) [m/s^2] at x predicted from the previous motion; None for none.
+        stage_fraction: time of x as a fraction of the step, 1 at its end.
+        inertial_target, velocity_origin: (n, 3) [m]; the caller may modify them.
+        predicted_acceleration: acceleration (n, 3) [m/s^2] at x predicted from the previous motion; None for none.
     """
 
     when: float

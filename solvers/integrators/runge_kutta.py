@@ -37,8 +37,8 @@ class RungeKutta:
     Attributes:
         order: order of the method.
         a: rows of the tableau, of lengths 1 to s.
-        lower: weights (s,) of the embedded method, if any.
-        embedded: order of the embedded method.
+        embedded_weights: weights (s,) of the embedded method, if any.
+        embedded_order: order of the embedded method.
     """
 
     order: int
@@ -83,7 +83,7 @@ class RungeKutta:
         The predicted acceleration of a stage is the known one that is nearest in time.
 
         Args:
-            now: motion at the start of the step.
+            motion: motion at the start of the step.
             acceleration: acceleration (n, 3) [m/s^2] at the start of the step, or None.
             dt: step size [s].
         """

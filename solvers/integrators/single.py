@@ -31,11 +31,11 @@ class Integrator:
     """An integrator with one stage per step.
 
     Attributes:
-        factor: c.
-        when: time of the stage as a fraction of the step, 1 at its end.
-        ahead: time of the external forces, as such a fraction.
-        history: whether the motion of the previous step is needed; implicit Euler then makes the first step.
-        predict: function of the motions now and one step earlier, and of dt [s], that returns target and
+        inertia_factor: c.
+        stage_fraction: time of the stage as a fraction of the step, 1 at its end.
+        extrapolation_fraction: time of the external forces, as such a fraction.
+        needs_history: whether the motion of the previous step is needed; implicit Euler then makes the first step.
+        predict_target: function of the motions now and one step earlier, and of dt [s], that returns target and
             velocity_origin, each (n, 3) [m].
         order: order of the error.
     """

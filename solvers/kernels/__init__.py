@@ -1,1 +1,1 @@
-"""Compiled (Numba) inner loops."""
+"""Inner loops compiled by Numba."""

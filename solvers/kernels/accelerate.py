@@ -60,15 +60,15 @@ class Window(NamedTuple):
     """The state of a solve with m pairs in the history and N entries per vector.
 
     Attributes:
-        steps, images: s and w (m N,).
-        position, trial: p and p + t d, N entries and possibly more that do not move.
-        descent, descent_there: -grad g at p and at the trial.
+        step_history, image_history: s and w (m N,).
+        position, trial_position: p and p + t d, N entries and possibly more that do not move.
+        descent, trial_descent: -grad g at p and at the trial.
         correction, direction: c and d (N,).
-        block: scratch.
+        block_scratch: scratch.
         sy, wy: s_i y_j for i not younger than j, and w_i y_j (m, m).
         sg, wg: s_i grad g(p) and w_i grad g(p) (m,).
         a, b: coefficients (m,).
-        now: scalars of the iteration.
+        window_state: scalars of the iteration.
 
     The arrays s, w, c and d have the precision of the factor.
     """
@@ -156,7 +156,7 @@ def accept(window, correction):
     new = (now.newest + 1) % m
     now.count = min(now.count + 1, m)
     for j in range(m):
-            # The product with a gradient difference is the difference of the products with the gradients.
+        # The product with a gradient difference is the difference of the products with the gradients.
         window.sy[j, new], window.wy[j, new] = -window.sg[j], -window.wg[j]
         window.sg[j] = window.wg[j] = 0.0
     window.sy[new, new] = window.wy[new, new] = 0.0

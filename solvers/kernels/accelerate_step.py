@@ -30,7 +30,7 @@ class Step(NamedTuple):
     """The plan, packets, objective weights and rows of a system, with vectors of all rows.
 
     The vectors are y, the solution (in the factor's type) and scratch (zero except in unknown rows). The objective
-    values (3,) [J] are: the objective at the position, the scale of its cancellation, and its negative part at the start.
+    values (3,) [J] are the objective at the position, the scale of its cancellation, and its initial negative part.
 
     The objective is a sum of squares a^2/2, where each a is a difference of two numbers of size A and so has the error
     eps A. The sum has the error eps (sum of a A), at most eps sqrt(2 g size), with size the sum of A^2. If some squares

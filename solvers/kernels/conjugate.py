@@ -32,12 +32,13 @@ class Newton(NamedTuple):
     """The state of the solve of a Newton equation H d = -g.
 
     Attributes:
-        hessian: arguments of `multiply_hessian`.
+        hessian_arguments: arguments of `multiply_hessian`.
         factor: factor of Q.
-        threads: threads of a solve with Q; None for one.
-        held: vertices that do not move.
-        shrunk: vertices (c,) and blocks S^-1 (c, 3, 3) of the preconditioner (S Q S)^-1; None for Q^-1.
-        d, r, p, z, product: iterate, residual, direction, preconditioned residual, and Hessian times direction (n, 3).
+        num_threads: threads of a solve with Q; None for one.
+        fixed_vertices: vertices that do not move.
+        inverse_scaling: vertices (c,) and blocks S^-1 (c, 3, 3) of the preconditioner (S Q S)^-1; None for Q^-1.
+        d, r, p, z, hessian_product: iterate, residual, direction, preconditioned residual, and Hessian times direction
+            (n, 3).
     """
 
     hessian: tuple[Any, ...]

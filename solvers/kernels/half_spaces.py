@@ -31,14 +31,14 @@ class HalfSpaces(NamedTuple):
     """Half-spaces by the rows of their vertices.
 
     Attributes:
-        first: first half-space of each row (rows + 1,).
-        near: whether a packet has a vertex with a half-space (b,).
-        normal, anchor: n and a (k, 3).
+        row_starts: first half-space of each row (rows + 1,).
+        has_half_space: whether a packet has a vertex with a half-space (b,).
+        normal, friction_anchor: n and a (k, 3).
         offset: d [m] (k,).
         stiffness: k [N/m] (k,).
-        grip: friction limit F [N] (k,).
-        slip: smoothing length [m] (k,).
-        both: whether they act on both sides, as planes do.
+        friction_limit: friction limit F [N] (k,).
+        smoothing_length: smoothing length [m] (k,).
+        is_two_sided: whether they act on both sides, as planes do.
     """
 
     first: NDArray[np.int64]
@@ -221,8 +221,8 @@ def trying(risen: Any) -> Any:
     It tries increasingly large blocks; if none succeeds, the step is zero. A device compiles it separately.
 
     Args:
-        risen: function (d, where) that returns the change by a step of the other energies of the row; `where` is
-            passed to it unchanged.
+        energy_change: function (d, where) that returns the change by a step of the other energies of the row; `where`
+            is passed to it unchanged.
     """
 
     @inner_closure
@@ -251,8 +251,8 @@ def moving(felt: Any, risen: Any) -> Any:
     No two of them are coupled.
 
     Args:
-        felt: function (beside, i, p, gradient, block) that adds the other energies of row i.
-        risen: function (beside, i, p, d) that returns their change by a step d.
+        add_gradient_block: function (beside, i, p, gradient, block) that adds the other energies of row i.
+        energy_change: function (beside, i, p, d) that returns their change by a step d.
     """
 
     @inner_closure

@@ -27,9 +27,9 @@ class Places(NamedTuple):
     """Block indices of vertices and springs in a matrix over the free vertices.
 
     Attributes:
-        free: free vertices (f,).
-        diagonal: diagonal block of each vertex (n,), -1 for a vertex that is not free.
-        across: blocks of each spring from its first end to its second and back (m, 2), -1 if an end is not free.
+        free_vertices: free vertices (f,).
+        diagonal_block: diagonal block of each vertex (n,), -1 for a vertex that is not free.
+        off_diagonal: blocks of each spring from its first end to its second and back (m, 2), -1 if an end is not free.
     """
 
     free: NDArray[np.int64]
@@ -160,7 +160,7 @@ def assemble(terms, places, constant, p, tension, keep, values):
         constant: blocks of inertia, pins and other terms independent of p; None if there are no other terms.
         p: positions (n, 3) [m].
         tension: tension of each spring (m,) [N].
-        keep: factor of the springs' negative transverse parts.
+        negative_fraction: factor of the springs' negative transverse parts.
         values: output (b, 3, 3) [N/m].
     """
     if constant is None:

@@ -17,8 +17,8 @@ class Patches(NamedTuple):
     """The patch of each free vertex and its response.
 
     Attributes:
-        start: start of each patch (f + 1,).
-        near: vertices of the patches, ascending, with the vertex itself (e,).
+        patch_starts: start of each patch (f + 1,).
+        patch_vertices: vertices of the patches, ascending, with the vertex itself (e,).
         response: displacements per displacement of the vertex (e, 3, 3), dimensionless.
     """
 
@@ -55,7 +55,7 @@ def directions(patches, turn, pointers, columns, blocks, gradient, scratch, out)
 
     Args:
         patches: the patches.
-        turn: rotation of each vertex (f, 3, 3).
+        rotations: rotation of each vertex (f, 3, 3).
         pointers, columns, blocks: H by rows, with all columns.
         gradient: (f, 3) [N].
         scratch: scratch memory.

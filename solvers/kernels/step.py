@@ -37,19 +37,20 @@ class Plan(NamedTuple):
     """The order of the operations of an iteration and their data.
 
     Attributes:
-        squares, panels, places, chunks: arrays of a factor (see `solvers.linalg.cholesky.supernodal_cholesky`).
-        top: first and last of the top's rows, and the number of groups (3,).
-        blocks: of each block its first and last slot, its first and last packet, its first chunk, and its last chunk
-            for forward and for back substitution (b, 7).
-        of_group: first block of each group and of the top (groups + 2,).
-        visits: operations of the groups in order; 2 b is back substitution of block b, 2 b + 1 its local step and
-            forward substitution.
-        visits_of: first visit of each group (groups + 1,).
-        held: m/dt^2 + w [N/m] of each row, plus the diagonal of quadratic forms.
-        measure: diagonal part of |e|_Q^2 in each lane of the packets: `held` without the pins, and half of each spring
-            to an exactly pinned vertex, because no packet of that vertex includes the other half.
-        loose: 1 for the rows of unpinned vertices, else 0.
-        shift: number of rows from a vertex's position to its right-hand side.
+        inverse_blocks, panels, row_slots, chunks: arrays of a factor (see
+            `solvers.linalg.cholesky.supernodal_cholesky`).
+        top_range: first and last of the top's rows, and the number of groups (3,).
+        block_table: of each block its first and last slot, its first and last packet, its first chunk, and its last
+            chunk for forward and for back substitution (b, 7).
+        group_blocks: first block of each group and of the top (groups + 2,).
+        visit_schedule: operations of the groups in order; 2 b is back substitution of block b, 2 b + 1 its local step
+            and forward substitution.
+        visit_starts: first visit of each group (groups + 1,).
+        anchor_stiffness: m/dt^2 + w [N/m] of each row, plus the diagonal of quadratic forms.
+        norm_diagonal: diagonal part of |e|_Q^2 in each lane of the packets: `anchor_stiffness` without the pins, and
+            half of each spring to an exactly pinned vertex, because no packet of that vertex includes the other half.
+        unpinned_mask: 1 for the rows of unpinned vertices, else 0.
+        row_shift: number of rows from a vertex's position to its right-hand side.
     """
 
     squares: NDArray[np.float64]

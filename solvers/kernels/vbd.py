@@ -22,9 +22,9 @@ class Blocks(NamedTuple):
     Vectors have rows of four numbers, the unknowns first.
 
     Attributes:
-        bundles: packets of the free vertices, by colour.
-        shares: weights of the objective.
-        unknowns: number of free vertices.
+        spring_packets: packets of the free vertices, by colour.
+        objective_weights: weights of the objective.
+        num_free: number of free vertices.
         majorant: of each lane, stiffness of inertia, pins and springs [N/m]; 1 for padding.
     """
 
@@ -38,12 +38,12 @@ class SweepScratch(NamedTuple):
     """The arrays that the iterations of a step overwrite, except the positions.
 
     Attributes:
-        before, older: previous positions.
-        out: scratch.
-        near: scratch for the springs of one packet.
-        sums: scratch of nine numbers per vertex of a packet.
+        previous_positions, older_positions: previous positions.
+        descent_scratch: scratch.
+        spring_scratch: scratch for the springs of one packet.
+        packet_sums: scratch of nine numbers per vertex of a packet.
         omega: Chebyshev factor (1,), 0 at the start of a step.
-        level: the objective (1,), nan if it is unknown.
+        objective_value: the objective (1,), nan if it is unknown.
     """
 
     before: NDArray[np.float64]

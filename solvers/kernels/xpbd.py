@@ -17,7 +17,7 @@ class Constraints(NamedTuple):
     """Springs in the order of their projection.
 
     Attributes:
-        ends: (m, 2).
+        end_vertices: (m, 2).
         stiffness: k (m,) [N/m].
         rest_length: r (m,) [m].
         rest_direction: direction at zero length (m, 3).
@@ -41,9 +41,9 @@ class Pinned(NamedTuple):
     """The motion of the pins in a step.
 
     Attributes:
-        vertices: (q,).
-        weight: (q,) [N/m], infinite for an exact pin.
-        begin, end: positions at the start and the end of the step (q, 3) [m].
+        pinned_vertices: (q,).
+        pin_weight: (q,) [N/m], infinite for an exact pin.
+        pin_start, pin_end: positions at the start and the end of the step (q, 3) [m].
     """
 
     vertices: NDArray[np.int64]
