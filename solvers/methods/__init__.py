@@ -1,1 +1,1 @@
-"""Methods that minimise a step's objective, or step without one: one a file."""
+"""Methods that minimise the objective of a step, or that integrate a step without an objective."""

@@ -1,16 +1,17 @@
-"""Projective dynamics whose global step is Jacobi's, several sweeps in one (A-Jacobi: Lan et al. 2022).
+"""Projective dynamics with an aggregated Jacobi global step (A-Jacobi: Lan et al. 2022).
 
     p <- p - S grad g(p),   S = sum over i < l of (I - D^-1 Q)^i D^-1,   D the diagonal of Q
 
-S grad g is what l sweeps of Jacobi's method make of Q x = grad g from x = 0. Their sum is a sparse matrix that is
-computed once, so that an iteration is a pass over the springs and one product, whatever l. Its rows reach l - 1 rings
-of neighbours. I - S Q = (I - D^-1 Q)^l, and the eigenvalues of D^-1 Q lie between 0 and 2, for Q is dominated by its
-diagonal: so S is positive definite, 2 S^-1 - Q is too, and as Q majorises the Hessian no iteration raises the energy.
-Bending has entries that let them exceed 2; there D is the diagonal times half of the largest.
+S grad g is the result of l Jacobi sweeps on Q x = grad g from x = 0. The sum is a sparse matrix that is computed once,
+so an iteration is one pass over the springs and one product, whatever l is. Its rows extend over l - 1 rings of
+neighbours. I - S Q = (I - D^-1 Q)^l, and the eigenvalues of D^-1 Q lie between 0 and 2, because Q is diagonally
+dominant. Hence S and 2 S^-1 - Q are positive definite. As Q majorises the Hessian, no iteration raises the energy.
+With bending terms the eigenvalues can exceed 2; D is then the diagonal times half of the largest eigenvalue.
 
-The iterations are accelerated by Chebyshev's polynomials, as Wang (2015) does those of Jacobi's method
-(`solvers.methods.chebyshev`). These expect eigenvalues of I - S Q that are not negative: for odd l, S is divided by the
-largest that S Q may have, 1 + (m - 1)^l where m is that of D^-1 Q. No factor of Q is used but to know the residual.
+The iterations are accelerated by Chebyshev polynomials, as Wang (2015) accelerates Jacobi's method
+(`solvers.methods.quasi_newton.chebyshev`). They require nonnegative eigenvalues of I - S Q. For odd l, S is therefore
+divided by the largest possible eigenvalue of S Q, 1 + (m - 1)^l, where m is that of D^-1 Q. The factor of Q serves
+only to compute the residual.
 """
 
 from __future__ import annotations
@@ -40,15 +41,19 @@ if TYPE_CHECKING:
 
 _SCHEME = Scheme("a-jacobi", CHEBYSHEV, 1, 0, True)
 _MOST = 8
-"""Sweeps: with more a row of S on a cloth has hundreds of entries."""
+"""Maximum number of sweeps: with more, a row of S on a cloth has hundreds of entries."""
 
 _ROUNDED = 2.0 + 1e-12
-"""What round-off makes of the largest eigenvalue that springs have."""
+"""Largest eigenvalue of D^-1 Q for springs, with an allowance for round-off."""
 
 
 @dataclass(frozen=True)
 class AggregatedJacobi:
-    """Projective dynamics without a factor. sweeps: l, of Jacobi's method in an iteration, 1 to 8."""
+    """Projective dynamics whose global step is a fixed number of Jacobi sweeps.
+
+    Args:
+        jacobi_sweeps: l, the number of Jacobi sweeps per iteration, 1 to 8.
+    """
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
@@ -69,7 +74,12 @@ class AggregatedJacobi:
         require_sweeps(self.sweeps)
 
     def prepare(self, system: System) -> PreparedAggregatedJacobi:
-        """Raises Unsupported for energies that are not projective, contact among them, NotPositiveDefinite."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: if an energy is not projective; contact is not.
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+        """
         if without_contact(system) is not system:
             raise Unsupported(
                 "a-jacobi: Q, of which its matrix is made once, has no rows for what begins to touch (Contact); take "
@@ -82,13 +92,17 @@ class AggregatedJacobi:
 
 
 def require_sweeps(sweeps: int) -> None:
-    """Raise ValueError for none, or too many."""
+    """Raise ValueError unless the number of sweeps is in the supported range."""
     if not 1 <= sweeps <= _MOST:
         raise ValueError(f"sweeps: should be from 1 to {_MOST}, not {sweeps}")
 
 
 class Aggregated:
-    """So many sweeps of Jacobi's method for Q x = b from x = 0, as one matrix. nonzeros: its entries."""
+    """Several Jacobi sweeps for Q x = b from x = 0, as one sparse matrix.
+
+    Attributes:
+        num_nonzeros: number of stored entries of the matrix.
+    """
 
     def __init__(self, Q: csr_array, sweeps: int) -> None:
         n, largest = len(Q.indptr) - 1, largest_eigenvalue(Q, Q.diagonal())
@@ -104,13 +118,22 @@ class Aggregated:
         self.nonzeros: int | None = int(self.matrix.nnz)
 
     def solve(self, b: Positions, out: Positions) -> None:
-        """Write S b (n, 3) to `out`."""
+        """Compute S b.
+
+        Args:
+            b: right-hand side (n, 3).
+            out: result (n, 3), overwritten.
+        """
         out[:] = self.matrix @ b
 
 
 class PreparedAggregatedJacobi(Iterative):
-    """The method, ready for a system. base: Q, with S for its factor; measure: an iteration of local-global from p
-    tells the residual at p, and is asked for nothing else."""
+    """A-Jacobi, prepared for a system.
+
+    Attributes:
+        local_global: the local-global solver of Q, with S in place of its factor.
+        residual_solver: computes the residual at p by one local-global iteration; it has no other use.
+    """
 
     def __init__(self, base: PreparedLocalGlobal, measure: Idle, objective: Objective) -> None:
         self.base, self.measure, self.objective = base, measure, objective
@@ -130,7 +153,7 @@ class PreparedAggregatedJacobi(Iterative):
         return self.base.scale(problem)
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """The gradient and the product with S, at the first guess."""
+        """Return the gradient and the product with S as callables, at the initial guess."""
         step = StepObjective(self.objective, problem)
         p = step.placed(problem.first_guess)
         gradient, out = step.gradient(p), np.zeros_like(p)
@@ -138,7 +161,7 @@ class PreparedAggregatedJacobi(Iterative):
 
 
 class _Iterating(Interpreted):
-    """See Interpreted, whose residual is that of Q's factor."""
+    """State of an A-Jacobi solve; the residual is measured with the factor of Q."""
 
     def __init__(self, prepared: PreparedAggregatedJacobi, problem: StepProblem, guess: Positions) -> None:
         super().__init__(prepared.base, _SCHEME, StepObjective(prepared.objective, problem), guess)

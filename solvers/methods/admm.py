@@ -1,17 +1,19 @@
 """ADMM for the step problem (Overby, Brown, Li and Narain 2017, "ADMM contains projective dynamics").
 
-    min  U(z) + what is quadratic in p   subject to   A p = z,   weighted by W K
+    min  U(z) + terms quadratic in p   subject to   A p = z,   weighted by W K
 
     z <- argmin U(z) + W/2 |A p + u - z|_K^2
     u <- u + A p - z
     p <- argmin of the quadratic part + W/2 |A p - z + u|_K^2
 
-For a projective energy U(z) = |z - d(z)|_K^2/2, with d the nearest vector at which an edge costs nothing, z = (d(v) +
-W v)/(1 + W) where v = A p + u. With W = 1 the matrix is Q and z - u = d(v): an iteration is one of local-global, but it
-projects A p + u, the edges lengthened by what they were off. The first one, with u = 0, is local-global itself.
+For a projective energy U(z) = |z - d(z)|_K^2/2, where d(z) is the nearest vector of zero energy,
+z = (d(v) + W v)/(1 + W) with v = A p + u. With W = 1 the matrix is Q and z - u = d(v). An iteration is then one of
+local-global, except that it projects A p + u, the edges extended by their accumulated error. The first iteration, with
+u = 0, equals local-global.
 
-It need not descend. At a fixed point v has the length l + (l - r)/W: a spring shorter than r/(1 + W) has none, for
-there its energy curves down by more than the weight curves up. Small weights are soon there where no spring is pressed.
+Descent is not guaranteed. At a fixed point v has the length l + (l - r)/W. A spring shorter than r/(1 + W) has no
+fixed point, because its negative curvature exceeds the curvature of the weight. Small weights converge fast where no
+spring is compressed.
 """
 
 from __future__ import annotations
@@ -39,9 +41,10 @@ from solvers.problem import Energy, Positions, StepProblem, System, Unsupported,
 
 @dataclass(frozen=True)
 class Admm:
-    """The alternating direction method of multipliers, over springs, strain limits and constant quadratic forms.
+    """ADMM for springs, strain limits and constant quadratic forms.
 
-    weight: W, in the stiffness of each edge.
+    Args:
+        weight: W, relative to the stiffness of each edge.
     """
 
     minimises: ClassVar[bool] = True
@@ -64,7 +67,12 @@ class Admm:
             raise ValueError(f"weight: should be positive and finite, not {self.weight}")
 
     def prepare(self, system: System) -> PreparedAdmm:
-        """Raises Unsupported for energies that have no projection along edges, NotPositiveDefinite."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: if an energy has no projection along edges.
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+        """
         others = {type(e).__name__ for e in system.energies if not isinstance(e, Springs | StrainLimits | Quadratic)}
         if others:
             raise Unsupported(
@@ -81,8 +89,14 @@ class Admm:
 
 @dataclass(frozen=True, eq=False)
 class _Projected:
-    """All springs and strain limits: edges (m, 2), stiffness (m,) [N/m], the lengths that cost nothing (m,) [m], and
-    directions of edges of zero length (m, 3)."""
+    """Edges of all springs and strain limits, with the lengths of zero energy.
+
+    Attributes:
+        edges: (m, 2) vertex indices.
+        stiffness: (m,) [N/m].
+        min_length, max_length: (m,) [m], bounds of the lengths at which an edge has no energy.
+        direction: (m, 3), unit vectors for edges of zero length.
+    """
 
     edges: NDArray[np.int64]
     stiffness: NDArray[np.float64]
@@ -104,7 +118,12 @@ class _Projected:
 
 
 class PreparedAdmm(Iterative):
-    """The method, ready for a system. base: its matrix, and measure: Q, with their factors."""
+    """ADMM, prepared for a system.
+
+    Attributes:
+        local_global: the factorised ADMM matrix.
+        residual_metric: Q with its factor, for residuals.
+    """
 
     def __init__(
         self,
@@ -127,7 +146,7 @@ class PreparedAdmm(Iterative):
 
 
 class _Iterating(Iterating):
-    """Positions, and u of each edge (m, 3) [m]."""
+    """State of an ADMM solve: positions, and the scaled dual variable u (m, 3) [m] of each edge."""
 
     def __init__(self, prepared: PreparedAdmm, problem: StepProblem, guess: Positions) -> None:
         self._base, self._measure, edges = prepared.base, prepared.measure, prepared.edges
@@ -149,6 +168,6 @@ class _Iterating(Iterating):
         return True
 
     def residual(self) -> float:
-        """See Iterating: a gradient and a solve beside those of the iteration."""
+        """Return the residual; costs a gradient and a solve in addition to those of the iteration."""
         gradient = self._step.gradient(self.positions)
         return self._measure.residual(self._measure.correction(gradient, np.zeros_like(gradient)))

@@ -1,11 +1,13 @@
-"""Anderson acceleration of local-global, safeguarded by the energy (Peng, Deng, Zhang, Geng, Qin, Liu 2018, "Anderson
-Acceleration for Geometry Optimization and Physics Simulation"; Anderson 1965).
+"""Anderson acceleration of local-global with an energy safeguard.
+
+Peng, Deng, Zhang, Geng, Qin, Liu 2018, "Anderson Acceleration for Geometry Optimization and Physics Simulation";
+Anderson 1965.
 
     p_(k+1) = LG(p_k) - sum_j theta_j (LG(p_(j+1)) - LG(p_j)),   theta = argmin |F_k - sum_j theta_j (F_(j+1) - F_j)|_Q
 
-with F = LG(p) - p over the last iterations. Residuals are compared in the norm of Q, in which F is the gradient and the
-scalar products are those that the iteration has anyway. An iterate that does not lower the objective is replaced by the
-plain LG(p_k), whose residual joins the others.
+with F = LG(p) - p over the most recent iterations. Residuals are compared in the norm of Q, in which F is the gradient
+and the inner products are by-products of the iteration. An iterate that does not lower the objective is replaced by
+the plain LG(p_k), whose residual is added to the history.
 """
 
 from __future__ import annotations
@@ -22,7 +24,13 @@ from solvers.problem import System
 
 @dataclass(frozen=True)
 class Anderson(Windowed):
-    """pairs: differences kept of the latest iterations; linear, precision: the solver of Q x = b and of its entries."""
+    """Anderson acceleration.
+
+    Args:
+        history_size: number of differences of the most recent iterations to store.
+        linear_solver: solver of Q x = b.
+        precision: floating-point type of its stored entries.
+    """
 
     about: ClassVar[About] = About(
         "accelerated local-global",
@@ -35,5 +43,10 @@ class Anderson(Windowed):
     )
 
     def prepare(self, system: System) -> PreparedAccelerated:
-        """Raises Unsupported for energies that are neither projective nor contact, NotPositiveDefinite."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: if an energy is neither projective nor contact.
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+        """
         return prepare(system, Scheme("anderson", ANDERSON, self.pairs, 0, True), self.linear, self.precision)

@@ -1,28 +1,29 @@
-"""Augmented vertex block descent (Giles, Diaz and Yuksel 2025): exact lengths within the sweeps of `vbd`.
+"""Augmented vertex block descent (Giles, Diaz and Yuksel 2025): length constraints within the sweeps of VBD.
 
-An edge of length l that is exact has a tension t [N] and a stiffness k [N/m]:
+A constrained edge of length l has a tension t [N] and a stiffness k [N/m]:
 
-    E_e = k/2 (l + t/k - clip(l + t/k, low, high))^2        in a sweep of `solvers.methods.vbd`, all vertices once
+    E_e = k/2 (l + t/k - clip(l + t/k, low, high))^2      in a sweep of `vertex_block.vbd` over all vertices
     t <- k (l + t/k - clip(l + t/k, low, high)),   k <- min(k + beta |l - clip(l, low, high)|, bound k_0)     after it
 
-so t tends to the Lagrange multipliers of the step (`solvers.energies.augmented`), and lengths to what they may be,
-whatever k is. A solve ends by its tolerance where the gradient that the best multipliers leave is small enough
-(`solvers.core.multipliers`): the tensions t may cancel it while lengths are still wrong. Here beta = ramp k_0/high and
-k_0 = 1/(1/q_i + 1/q_j), what the ends hold themselves with, where the paper has a beta of 10 N/m^2 and begins with 1
-N/m: so units of mass, length and time do not matter. A larger ramp mends lengths sooner, and leaves more of the
-gradient meanwhile.
+so t converges to the Lagrange multipliers of the step (`solvers.model.energies.augmented_lagrangian`), and the lengths
+to their feasible values, for any k. A solve converges when the gradient that the best multipliers leave is below the
+tolerance (`solvers.methods.vertex_block.lagrange_multipliers`), because the tensions t may cancel the gradient while
+lengths are still wrong. Here beta = ramp k_0/high and k_0 = 1/(1/q_i + 1/q_j), the anchor stiffness of the two ends;
+the paper has a beta of 10 N/m^2 and starts at 1 N/m. The choice here does not depend on the units of mass, length and
+time. A larger ramp corrects lengths sooner, but leaves a larger gradient in the meantime.
 
-A step begins with gamma t and max(gamma k, k_0) of the step before, which the solution keeps for it, gamma = `decay`.
-With `stabilisation` alpha limits are alpha times wider by what was off when the step began, l - alpha (l^t - clip l^t):
-errors that few iterations left are mended over some steps and not at once. With 0, the default, a solve tends to the
-minimum of the step; the paper takes .95, and multiplies t by it too. With `softened`, springs are edges as well that
-begin soft and whose stiffness grows by the same rule up to their own (section 3.4): for ratios of stiffness.
+A step starts with gamma t and max(gamma k, k_0) of the previous step, which the solution stores for this warm start,
+gamma = `warm_start_decay`. `error_stabilisation` alpha widens the limits by alpha times the error at the start of the
+step, l - alpha (l^t - clip l^t): errors that few iterations left are corrected over several steps, not in one. With 0,
+the default, a solve converges to the minimum of the step; the paper uses .95, and multiplies t by it too. With
+`ramp_spring_stiffness`, springs are edges too; their stiffness starts low and grows by the same rule up to its own
+value (section 3.4), for large ratios of stiffness.
 
-What differs beside: in place of a diagonal in which each column's length stands for the second derivatives across an
-edge, that of a pull is exact and that of a push left out, and a vertex whose step would raise the augmented energy
-takes that of its majorant. Sweeps are not accelerated, for each has another energy; several of them before a dual
-step, accelerated, were tried and left lengths farther off for the same work. Nothing exact and nothing softened: this
-is `vbd`.
+Further differences from the paper: instead of a diagonal in which the length of each column represents the second
+derivatives across an edge, those of a tensile force are exact and those of a compressive force are dropped. A vertex
+whose step would raise the augmented energy uses the step of its majorant. Sweeps are not accelerated, because each has
+another energy; several accelerated sweeps before a dual step left larger length errors for the same work. Without
+constrained edges and without `ramp_spring_stiffness`, the method equals VBD.
 """
 
 from __future__ import annotations
@@ -54,12 +55,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class AugmentedVertexBlockDescent:
-    """Augmented vertex block descent over what vertex block descent takes, and exact lengths.
+    """Augmented vertex block descent for the energies of vertex block descent and length constraints.
 
-    ramp: how many times its first stiffness an edge gains when it is off by its length, not negative; bound: the
-    largest stiffness, as a multiple of the first, at least 1; decay: what of tensions and stiffnesses the next step
-    begins with, from 0 to 1; stabilisation: what of the error that a step begins with it keeps, from 0 to 1; softened:
-    whether springs begin soft; spectral_radius: of `vbd`, where nothing is exact or softened.
+    Args:
+        stiffness_ramp: growth of an edge's stiffness for a relative length error of 1, as a multiple of its initial
+            stiffness; not negative.
+        max_stiffness_ratio: largest stiffness as a multiple of the initial one, at least 1.
+        warm_start_decay: fraction of tensions and stiffnesses that the next step starts with, 0 to 1.
+        error_stabilisation: fraction of the initial length error that a step retains, 0 to 1.
+        ramp_spring_stiffness: whether the stiffness of springs starts low and grows.
+        spectral_radius: as in `VertexBlockDescent`, used if nothing is constrained or ramped.
     """
 
     minimises: ClassVar[bool] = True
@@ -91,7 +96,12 @@ class AugmentedVertexBlockDescent:
         VertexBlockDescent(self.spectral_radius)
 
     def prepare(self, system: System) -> Prepared:
-        """Raises Unsupported for what `vbd` refuses, and for surfaces that touch, NotPositiveDefinite."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: for what `VertexBlockDescent` does not support, and for surface contact.
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+        """
         usual = VertexBlockDescent(self.spectral_radius)
         if not (system.lengths or self.softened):
             return usual.prepare(system)
@@ -117,8 +127,14 @@ class AugmentedVertexBlockDescent:
 
 @dataclass(frozen=True, eq=False)
 class PreparedAugmented(Iterative):
-    """made: vertex block descent with the edges beside all else, their first stiffness in its majorant; edges: those
-    that are exact and those that begin soft; least, most: their stiffnesses (m,) [N/m]; exact (m,): which are."""
+    """AVBD, prepared for a system.
+
+    Attributes:
+        made: vertex block descent of the other energies, with the initial stiffness of the edges in its majorant.
+        augmented_edges: constrained edges, and springs with ramped stiffness.
+        min_stiffness, max_stiffness: (m,) [N/m], bounds of the edges' stiffness.
+        exact_mask: (m,), whether an edge is constrained.
+    """
 
     keeps_lengths: ClassVar[bool] = True
 
@@ -132,7 +148,7 @@ class PreparedAugmented(Iterative):
 
     @cached_property
     def multipliers(self) -> Multipliers:
-        """Those of the exact lengths, by least squares."""
+        """Return the least-squares multipliers of the length constraints."""
         return Multipliers(self._with(np.zeros(len(self.least))), self._exact_lengths, self.least[self.exact])
 
     @property
@@ -150,15 +166,24 @@ class PreparedAugmented(Iterative):
         return Augmenting(self, problem, guess)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """See Iterative; with no tensions."""
+        """Return the residual [J^(1/2)] at positions p (n, 3) with zero tensions."""
         return self.residual(problem, p, np.zeros(len(self.least)))
 
     def residual(self, problem: StepProblem, p: Positions, tension: NDArray[np.float64]) -> float:
-        """|Q^-1 grad L|_Q [J^(1/2)] at p with tensions (m,) [N], L with the first stiffnesses, which are in Q."""
+        """Return |Q^-1 grad L|_Q [J^(1/2)] of the augmented Lagrangian.
+
+        Args:
+            problem: the step problem.
+            p: positions (n, 3) [m].
+            tension: (m,) [N].
+
+        Returns:
+            The residual of L with the initial stiffnesses, which are part of Q.
+        """
         return self._gauge.gauge(replace(problem, system=self._with(tension)))(p)
 
     def _with(self, tension: NDArray[np.float64]) -> System:
-        """The system of L, of exact lengths and the energies that there are."""
+        """Return the system of L: the constrained lengths and the other energies."""
         exact = self.exact
         return augmented(self.system, self._exact_lengths, self.least[exact], tension[exact])
 
@@ -169,14 +194,14 @@ class PreparedAugmented(Iterative):
 
     @cached_property
     def _gauge(self) -> Idle:
-        """What tells residuals: what `vbd` has for that, or of springs as they are where they begin soft."""
+        """Return the residual solver: that of `VertexBlockDescent`, or with full spring stiffness if ramped."""
         if self.exact.all():
             return self.made.measure
         return cast("Idle", CompiledLocalGlobal().prepare(self._with(np.zeros(len(self.least)))))
 
 
 class Augmenting(Sweeps):
-    """Sweeps and dual steps of one step problem."""
+    """State of an AVBD solve: sweeps and dual updates of one step problem."""
 
     def __init__(self, prepared: PreparedAugmented, problem: StepProblem, guess: Positions) -> None:
         made, method, edges = prepared.made, prepared.method, prepared.edges
@@ -209,15 +234,15 @@ class Augmenting(Sweeps):
 
     @property
     def kept(self) -> NDArray[np.float64]:
-        """Tensions [N] and stiffnesses [N/m], (m, 2)."""
+        """Tensions [N] and stiffnesses [N/m], (m, 2), for the warm start of the next step."""
         return np.column_stack([self._duals.tension, self._duals.stiffness])
 
     def residual(self) -> float:
-        """With the tensions that it has: it may be small where lengths are wrong."""
+        """Return the residual with the current tensions; it may be small while lengths are wrong."""
         return self._augmented.residual(self._problem, self.positions, self._duals.tension)
 
     def residual_of_step(self) -> float:
-        """The residual [J^(1/2)] with the multipliers of least squares, in which wrong lengths count."""
+        """Return the residual [J^(1/2)] with least-squares multipliers, which includes length errors."""
         if not np.isfinite(self.positions).all():
             return self.residual()
         tension = np.zeros(len(self._duals.exact))
@@ -225,10 +250,10 @@ class Augmenting(Sweeps):
         return self._augmented.residual(self._problem, self.positions, tension)
 
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """See Iterating; the residual is that of the step.
+        """Run iterations within the limits; the returned residual is `constrained_residual`.
 
-        It takes a factorisation, so it is looked at where that with the method's own tensions is small enough, and then
-        again whenever half as many iterations have been done since as at the last look.
+        `constrained_residual` requires a factorisation. It is evaluated once the residual with the method's own
+        tensions is small enough, and again each time the number of iterations has grown by half since.
         """
         count, residual, ended = super().iterate(limits)
         if limits.wanted == loop.NEVER or not self._duals.exact.any():
@@ -243,7 +268,7 @@ class Augmenting(Sweeps):
         return count, residual, ended
 
     def sweep(self, iterations: int) -> None:
-        """That many, each with a dual step after it."""
+        """Run sweeps, each followed by a dual update."""
         self._kernel(
             self._blocks, self._spaces, self._beside, self._right,
             self._work, self._rows, iterations, self._hard, self._duals,

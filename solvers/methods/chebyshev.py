@@ -1,16 +1,20 @@
-"""Chebyshev semi-iterative acceleration of local-global (Wang 2015, "A Chebyshev Semi-Iterative Approach for
-Accelerating Projective and Position-Based Dynamics"; Golub and Varga 1961).
+"""Chebyshev semi-iterative acceleration of local-global.
+
+Wang 2015, "A Chebyshev Semi-Iterative Approach for Accelerating Projective and Position-Based Dynamics"; Golub and
+Varga 1961.
 
     p_(k+1) = omega_(k+1) (gamma (LG(p_k) - p_k) + p_k - p_(k-1)) + p_(k-1)
     omega_1 = 1,   omega_2 = 2 / (2 - sigma^2),   omega_(k+1) = 4 / (4 - sigma^2 omega_k)
 
-The plain iteration multiplies errors by I - Q^-1 H, whose eigenvalues lie in [0, rho]: Q majorises the Hessian H. So
-the polynomials are those of [0, rho] instead of Wang's [-rho, rho]: gamma = 2 / (2 - rho) and sigma = rho / (2 - rho).
+The plain iteration multiplies errors by I - Q^-1 H, whose eigenvalues lie in [0, rho], because Q majorises the
+Hessian H. The polynomials are therefore those of [0, rho] instead of Wang's [-rho, rho]: gamma = 2 / (2 - rho) and
+sigma = rho / (2 - rho).
 
-rho is estimated while running (Hageman and Young 1981, chapters 5 and 6): at first it is the ratio of two residuals of
-the plain iteration. Where the residuals shrink more slowly than the polynomial of the present rho promises, an
-eigenvalue lies beyond it, and the ratio of the two tells where; with that a new polynomial begins. An iterate that
-would raise the objective is replaced by the plain LG(p_k), and a new polynomial begins there too.
+rho is estimated during the iteration (Hageman and Young 1981, chapters 5 and 6). The first estimate is the ratio of two
+residuals of the plain iteration. If the residuals then decrease more slowly than the polynomial of the current rho
+predicts, an eigenvalue lies beyond rho. It is computed from the ratio of the actual and the predicted decrease, and a
+new polynomial starts. An iterate that would raise the objective is replaced by the plain LG(p_k), and a new polynomial
+starts there too.
 """
 
 from __future__ import annotations
@@ -28,7 +32,12 @@ from solvers.problem import System
 
 @dataclass(frozen=True)
 class Chebyshev:
-    """linear, precision: the solver of Q x = b and of its stored entries."""
+    """Chebyshev acceleration.
+
+    Args:
+        linear_solver: solver of Q x = b.
+        precision: floating-point type of its stored entries.
+    """
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
@@ -46,5 +55,10 @@ class Chebyshev:
     precision: Precision = "float64"
 
     def prepare(self, system: System) -> PreparedAccelerated:
-        """Raises Unsupported for energies that are neither projective nor contact, NotPositiveDefinite."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: if an energy is neither projective nor contact.
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+        """
         return prepare(system, Scheme("chebyshev", CHEBYSHEV, 1, 0, True), self.linear, self.precision)

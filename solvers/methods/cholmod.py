@@ -1,6 +1,6 @@
-"""Local-global iterations as a careful C++ program has them (`cholmod.cpp`), with CHOLMOD's ordering and factor.
+"""Optimised C++ baseline: local-global iterations (`cholmod.cpp`) with CHOLMOD's ordering and factor.
 
-What the compiled solvers are measured with besides the plain program of `eigen`: the second yardstick.
+The second C++ baseline of the compiled solvers; the first is the plain program of `eigen_local_global`.
 """
 
 from __future__ import annotations
@@ -20,14 +20,19 @@ NEEDS = "CHOLMOD (Debian: libsuitesparse-dev) and C++17"
 
 @dataclass(frozen=True)
 class CholmodLocalGlobal:
-    """One loop over the springs, and a solve by the columns of CHOLMOD's simplicial factor, for springs."""
+    """Local-global in C++ for springs: one loop over springs, and solves with CHOLMOD's simplicial factor."""
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
     about: ClassVar[About] = About(LOCAL_GLOBAL, LIU_2013)
 
     def prepare(self, system: System) -> PreparedCholmod:
-        """Raises Unsupported for energies other than springs and where nothing can be compiled, NotPositiveDefinite."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: for energies other than springs, and if no C++ compiler is available.
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+        """
         springs = only_springs(system, "cholmod")
         library = native.library(native.HEADERS / "cholmod.cpp", NEEDS, ["-lcholmod"])
         compiled = native.Native(library, system, springs)
@@ -35,7 +40,7 @@ class CholmodLocalGlobal:
 
 
 class PreparedCholmod(PreparedLocalGlobal):
-    """Iterations of which nobody asks for the residual stay in C++."""
+    """CHOLMOD local-global, prepared; iterations without residual checks stay in C++."""
 
     def begin(self, problem: StepProblem, guess: Positions) -> _Iterations:
         """See Iterative."""

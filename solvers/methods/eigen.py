@@ -1,4 +1,4 @@
-"""Local-global iterations in C++ with Eigen, as a course's assignment has them written (`eigen.hpp`): the yardstick."""
+"""Plain C++ baseline: local-global iterations with Eigen, as in a course assignment (`eigen.hpp`)."""
 
 from __future__ import annotations
 
@@ -15,14 +15,19 @@ NEEDS = "Eigen 3.4 (Debian: libeigen3-dev) and C++17"
 
 @dataclass(frozen=True)
 class EigenLocalGlobal:
-    """Eigen's sparse matrices and its SimplicialLLT, for springs."""
+    """Local-global in C++ for springs, with Eigen's sparse matrices and SimplicialLLT."""
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
     about: ClassVar[About] = About(LOCAL_GLOBAL, LIU_2013)
 
     def prepare(self, system: System) -> PreparedLocalGlobal:
-        """Raises Unsupported for energies other than springs and where nothing can be compiled, NotPositiveDefinite."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: for energies other than springs, and if no C++ compiler is available.
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+        """
         springs = only_springs(system, "eigen")
         compiled = native.Native(native.library(native.HEADERS / "eigen.cpp", NEEDS), system, springs)
         return native.prepared(PreparedLocalGlobal, system, springs, compiled, "Eigen's SimplicialLLT")

@@ -1,11 +1,11 @@
-"""Explicit integrators: forces and no matrix, in as many substeps as stability or an error asks for.
+"""Explicit integrators with substeps chosen by a stability bound or an error tolerance.
 
     v' = M^-1 (f - grad E(p)) - c v,    p' = v
 
-Compositions of kicks and drifts are symplectic: without drag their energy stays near where it was for as long as one
-likes. Runge-Kutta methods of Tsitouras and of Dormand and Prince choose their substeps by an estimate of their error.
-Substeps of the others are stable while omega h is below a limit of the method, omega^2 the largest eigenvalue of
-M^-1 A'KA, which is that of the springs at their stiffest.
+Compositions of kicks and drifts are symplectic: without drag their energy stays near its initial value for long times.
+The Runge-Kutta methods of Tsitouras and of Dormand and Prince choose their substeps adaptively, by an error estimate.
+The substeps of the other methods are stable while omega h is below a limit of the method, where omega^2 is the largest
+eigenvalue of M^-1 A'KA, the value for springs at their largest stiffness.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ from solvers.kernels.explicit_steps import Coefficients, Forces, Scratch, Subdiv
 from solvers.problem import Positions, Prepared, StepProblem, System, Unsupported
 
 _SAFETY = 0.95
-"""Of the limit: at the limit itself a vibration neither grows nor keeps its size, and springs are not linear."""
+"""Fraction of the stability limit: at the limit a vibration neither grows nor decays, and springs are nonlinear."""
 
 _MOST = 1e9
-"""Springs that a step may go through, some seconds: compiled code cannot be interrupted meanwhile."""
+"""Maximum number of spring evaluations in a step, some seconds: compiled code cannot be interrupted meanwhile."""
 
 
 @dataclass(frozen=True)
 class Explicit:
-    """What they share."""
+    """Base class of the explicit solvers."""
 
     minimises: ClassVar[bool] = False
     descends: ClassVar[bool] = False
@@ -54,11 +54,17 @@ class Explicit:
     coefficients: ClassVar[Composition | Tableau]
 
     def method(self) -> Composition | Tableau:
-        """The coefficients."""
+        """Return the coefficients of the method."""
         return self.coefficients
 
     def _prepared(self, system: System, substeps: int, error: float) -> Prepared:
-        """substeps: times the fewest that are stable; error: of the springs' mean length, 0 for none."""
+        """Prepare the method for a system.
+
+        Args:
+            system: the system.
+            substeps: multiple of the smallest stable number of substeps.
+            error: tolerance relative to the mean spring length, 0 for fixed substeps.
+        """
         vertex_terms.require_implicit_euler(system, self.name)
         vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), self.name)
         method, parts = self.method(), ForceParts.of(system, self.name)
@@ -86,14 +92,21 @@ class Explicit:
 
 @dataclass(frozen=True)
 class _Fixed(Explicit):
-    """Substeps of one length. refine: by how much more of them than stability asks for."""
+    """Explicit solver with fixed substeps.
+
+    Args:
+        refinement_factor: number of substeps as a multiple of the smallest stable number.
+    """
 
     refine: int = 1
 
     def prepare(self, system: System) -> Prepared:
-        """Raises Unsupported for energies that are neither springs, constant quadratic forms nor drag on vertices, for
-        integrators other than `own` and implicit Euler, vertices without mass that are not pinned, and too many
-        substeps."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: for energies other than springs, constant quadratic forms and drag on vertices; for integrators
+                other than `own` and implicit Euler; for unpinned vertices without mass; for too many substeps.
+        """
         if not self.refine >= 1:
             raise Unsupported(f"{self.name}: refine came as {self.refine}; wanted 1 or more")
         return self._prepared(system, self.refine, 0.0)
@@ -101,13 +114,21 @@ class _Fixed(Explicit):
 
 @dataclass(frozen=True)
 class _Controlled(Explicit):
-    """Substeps by their error. error: of each, root mean square over the vertices, in parts of the springs' mean
-    length; an error of velocity counts by what it moves in a frame."""
+    """Explicit solver with adaptive substeps.
+
+    Args:
+        error_tolerance: error of each substep, root mean square over the vertices, relative to the mean spring length.
+            An error of velocity counts by the displacement that it causes in a frame.
+    """
 
     error: float = 1e-6
 
     def prepare(self, system: System) -> Prepared:
-        """Raises Unsupported as `_Fixed` does, and for an error that is no number from 1e-14 to 1."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: as for fixed substeps, and for a tolerance outside [1e-14, 1].
+        """
         if not 1e-14 <= self.error <= 1.0:
             raise Unsupported(f"{self.name}: error came as {self.error}; wanted a number from 1e-14 to 1")
         return self._prepared(system, 1, self.error)
@@ -134,7 +155,7 @@ _BLANES_MOAN = _about(
 
 @dataclass(frozen=True)
 class VelocityVerlet(_Fixed):
-    """Kick, drift, kick: symplectic, of order 2, one evaluation of the forces a substep."""
+    """Velocity Verlet: kick, drift, kick; symplectic, order 2, one force evaluation per substep."""
 
     name: ClassVar[str] = "velocity-verlet"
     about: ClassVar[About] = _about(
@@ -149,7 +170,7 @@ class VelocityVerlet(_Fixed):
 
 @dataclass(frozen=True)
 class BlanesMoan4(_Fixed):
-    """A symplectic composition of order 4, six evaluations a substep."""
+    """Symplectic composition of Blanes and Moan, order 4, six force evaluations per substep."""
 
     name: ClassVar[str] = "blanes-moan-4"
     about: ClassVar[About] = _BLANES_MOAN
@@ -158,7 +179,7 @@ class BlanesMoan4(_Fixed):
 
 @dataclass(frozen=True)
 class BlanesMoan6(_Fixed):
-    """A symplectic composition of order 6, ten evaluations a substep."""
+    """Symplectic composition of Blanes and Moan, order 6, ten force evaluations per substep."""
 
     name: ClassVar[str] = "blanes-moan-6"
     about: ClassVar[About] = _BLANES_MOAN
@@ -167,7 +188,7 @@ class BlanesMoan6(_Fixed):
 
 @dataclass(frozen=True)
 class RungeKutta4(_Fixed):
-    """Kutta's method of order 4, four evaluations a substep."""
+    """Kutta's Runge-Kutta method of order 4, four force evaluations per substep."""
 
     name: ClassVar[str] = "runge-kutta-4"
     about: ClassVar[About] = replace(_HAIRER, to_error=False, even=True)
@@ -176,7 +197,7 @@ class RungeKutta4(_Fixed):
 
 @dataclass(frozen=True)
 class Tsitouras5(_Controlled):
-    """Tsitouras's pair of orders 5 and 4, six evaluations a substep."""
+    """Tsitouras's embedded pair of orders 5 and 4, six force evaluations per substep."""
 
     name: ClassVar[str] = "tsitouras-5"
     about: ClassVar[About] = _about(
@@ -190,19 +211,19 @@ class Tsitouras5(_Controlled):
 
 @dataclass(frozen=True)
 class DormandPrince8(_Controlled):
-    """Dormand and Prince's method of order 8 with errors of orders 5 and 3, twelve evaluations a substep."""
+    """Dormand and Prince's method of order 8, error orders 5 and 3, twelve force evaluations per substep."""
 
     name: ClassVar[str] = "dormand-prince-8"
     about: ClassVar[About] = _HAIRER
 
     def method(self) -> Composition | Tableau:
-        """The coefficients; SciPy has them."""
+        """Return the coefficients, taken from SciPy."""
         return dormand_prince_8()
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedExplicit(Substepping, Iterative):
-    """On the processor."""
+    """Explicit integrator, prepared for a system; runs on the CPU."""
 
     system: System
     parts: ForceParts
@@ -210,16 +231,23 @@ class PreparedExplicit(Substepping, Iterative):
 
     @property
     def choice(self) -> str:
-        """What it chose."""
+        """Description of the chosen substeps."""
         return self.substeps.choice
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """The whole step."""
+        """Start a solve whose only iteration is the whole step."""
         return Whole(*self.step(problem)[:2])
 
     def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, NDArray[np.float64]]:
-        """Positions and velocities (n, 3) at the step's end, and what `integrate` tells. h: the first substep [s] of a
-        method that chooses them, from the fastest motion if left out."""
+        """Integrate one step.
+
+        Args:
+            problem: the step problem.
+            h: first substep [s] of an adaptive method; by default from the largest frequency.
+
+        Returns:
+            Positions and velocities (n, 3) at the end of the step, and the statistics of `integrate`.
+        """
         s, pins, start, frame = self.system, self.system.pins.vertices, problem.start, self.system.time_step
         begin, end = np.ascontiguousarray(start.positions[pins]), problem.pin_targets.copy()
         p, v = rows_of_four(start.positions, far=True), rows_of_four(start.velocity)
@@ -265,5 +293,5 @@ class PreparedExplicit(Substepping, Iterative):
 
 
 def _of_rows(of_vertices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What each vertex has, for all numbers of its row of four; nothing for the rows that fill up bundles."""
+    """Repeat the value of each vertex for the four numbers of its row; zero for padding rows."""
     return rows_of_four(np.repeat(of_vertices[:, None], 3, axis=1))

@@ -1,29 +1,31 @@
-"""A hybrid: L-BFGS and Newton's method with predicted tensions in turns, Newton's method in the end.
+"""Hybrid of L-BFGS and Newton's method with predicted tensions, which ends with Newton's method.
 
     H(t) = M/dt^2 + sum_e k nn' + t_e/l_e (I - nn'),   d = -H(t)^-1 grad g(p),   t_e <- k_e (l_e + n (A d)_e - r_e)
 
-Stiff springs hardly change their lengths, but on the way to the minimum they do, and their tensions k (l - r) then are
-larger than the true ones by orders of magnitude. In the exact Hessian they make springs stiff against bending, or
-unstable, where they are neither. Here tensions are unknowns of their own. Newton's method on the optimality conditions
-of both (primal-dual, as in interior point methods: Nocedal and Wright 2006, chapter 19; tensions that outlive an
-iteration stabilise stiff springs in Tournier et al. 2015, "Stable Constrained Dynamics") comes down to a Hessian with
-predicted tensions, and its steps are longer by as much. What such a step stretches at second order is local: a few
-iterations of L-BFGS take it back. The first one starts where the step before ended, from smooth positions. Where H(t)
-has no factor a multiple of inertia is added, as small a one as leaves a factor: a step along what is unstable is the
-longer the nearer that multiple is to the least (More and Sorensen 1983).
+Stiff springs hardly change their lengths between the start and the end of a step. During the iterations they do, and
+their tensions k (l - r) then exceed the true ones by orders of magnitude. In the exact Hessian these tensions make
+springs stiff against bending, or unstable, although they are neither. Here tensions are separate unknowns. Newton's
+method on the optimality conditions of both (primal-dual, as in interior-point methods: Nocedal and Wright 2006,
+chapter 19; tensions carried across iterations stabilise stiff springs in Tournier et al. 2015, "Stable Constrained
+Dynamics") reduces to a Hessian with predicted tensions, which allows correspondingly longer steps. The second-order
+stretch of such a step is local: a few iterations of L-BFGS remove it. The first prediction starts from smooth
+positions at the end of the previous step. If H(t) has no Cholesky factor, the smallest multiple of inertia that yields
+one is added: along unstable directions the step is longer, the closer that multiple is to the minimum (More and
+Sorensen 1983).
 
-L-BFGS comes first, over a factor of Q in float32: it is the memory that its iterations wait for, and its directions
-need no more digits. Once it gets slow, or has so little left that a saddle is as likely as a minimum, one step goes by
-the true tensions, and aside where the curvature there is negative: symmetric starts lead to saddles, near which all
-methods are slow. If the objective fell as the quadratic model promised, these tensions are the prediction. Then
-whichever brought the greater descent for its cost the last time goes on. The exact method takes over when the Hessian
-is positive definite as it is and the slope falls as it does where Newton's method converges quadratically. The start
-is the lower one of first guess and free fall.
+L-BFGS runs first, with a factor of Q in float32: its iterations are limited by memory bandwidth, and its directions
+need no more digits. One step with the true tensions follows when L-BFGS converges slowly, or when the remaining
+decrease is so small that a saddle is as likely as a minimum. If the curvature there is negative, the step leaves along
+that direction: symmetric initial guesses lead to saddles, near which all methods are slow. If the objective decreased
+as the quadratic model predicted, these tensions become the prediction. Then the method with the larger decrease per
+cost in its last run continues. The exact method takes over once the unmodified Hessian is positive definite and the
+slope decreases as in the quadratic convergence of Newton's method. The start is the better of the initial guess and
+the inertial prediction.
 
-Where something is touched, the exact method does it all: contact is in no Q, so that L-BFGS begins anew whenever
-another vertex is touched, and its stiffness is beyond what tensions predict. What a mesh may touch of itself L-BFGS is
-not told of: it goes as if nothing were there, and where a round's way is not free, or ends in range of something, that
-round never was and the exact method goes on.
+With active contacts the exact method does all iterations. Contact is not part of Q, so L-BFGS would restart at each
+newly active vertex, and the contact stiffness is beyond what tensions predict. L-BFGS ignores self-contact: if the
+displacement of a round is not collision-free, or ends with active contacts, the round is discarded and the exact method
+continues.
 """
 
 from __future__ import annotations
@@ -50,30 +52,30 @@ from solvers.methods.quasi_newton import PreparedAccelerated
 from solvers.problem import Positions, System
 
 _ROUND, _FIRST = 10, ((2, 2, 3, 3), (5, 5))
-"""Iterations of L-BFGS in a round, and what lies between the iterates of the first rounds: of the few that an easy step
-takes a third at most is too many."""
+"""Iterations per round of L-BFGS, and between the iterates of the first rounds: an easy step needs few iterations, of
+which at most a third are then superfluous."""
 
 _PROBE, _RELAXED = 4, 5
-"""Iterations after which it is known whether L-BFGS suits a problem, and those after a Newton step."""
+"""Iterations before the suitability of L-BFGS is assessed, and L-BFGS iterations after a Newton step."""
 
 _QUICK = 0.5
-"""The part of the residual that the very first iterations leave at most where L-BFGS suits a problem."""
+"""Largest ratio of residuals after the very first iterations at which L-BFGS is considered suitable."""
 
 _SLOW = 0.7
-"""Convergence counts as slow, and a Newton step is tried, where a round still lowers the objective by more than this
-part of what the round before it did."""
+"""Convergence counts as slow, and a Newton step is tried, if a round still decreases the objective by more than this
+fraction of the decrease of the previous round."""
 
 _LITTLE = 2e-6
-"""Of the descent from the start: a round that brings no more leaves about a millionth, to a saddle or a minimum."""
+"""Fraction of the decrease since the start: a round below it leaves about a millionth, to a saddle or a minimum."""
 
 _FLOPS_PER_ENTRY = 270.0
-"""Flops of a factorisation that take as long as one entry of Q's factor takes in a round of L-BFGS, both measured with
-all the work around them."""
+"""Flops of a factorisation that cost as much time as one entry of Q's factor in a round of L-BFGS; both were measured
+with all overheads."""
 
 
 @dataclass(frozen=True)
 class Hybrid:
-    """L-BFGS far from the minimum, Newton's method with predicted tensions nearer to it, Newton's method in the end."""
+    """L-BFGS far from the minimum, then Newton's method with predicted tensions, then Newton's method."""
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
@@ -89,7 +91,12 @@ class Hybrid:
     )
 
     def prepare(self, system: System) -> PreparedDescent:
-        """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere."""
+        """Prepare the method for a system.
+
+        Raises:
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+            Unsupported: if Q does not fit in memory.
+        """
         with analysed_once():
             metric, objective = Metric(system), Objective(system)
             lbfgs = Lbfgs(precision="float32").by_factor(without_bounded(system))
@@ -101,7 +108,7 @@ class Hybrid:
 
 
 class HybridMethod:
-    """The iteration for one system: a round of L-BFGS, or a step of one of Newton's methods."""
+    """The iteration for one system: a round of L-BFGS, or a step of one of the Newton methods."""
 
     def __init__(self, objective: Objective, metric: Metric, lbfgs: PreparedAccelerated) -> None:
         self.metric, self._newton, self._lbfgs = metric, NewtonMethod(metric), lbfgs
@@ -111,7 +118,7 @@ class HybridMethod:
         self._cost = 9.0 * max(1.0, factor.flops) / (_FLOPS_PER_ENTRY * max(1, factor.nonzeros))
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
-        """The points after `start`; where a saddle was left, all begins anew."""
+        """Yield the points after `start`; restarts after an escape from a saddle."""
         point = lower(step, start)
         while not point.stalled:
             for following in () if step.touched or near(step, point.positions) else self._approach(step, point):
@@ -126,7 +133,7 @@ class HybridMethod:
                     break
 
     def _approach(self, step: StepObjective, start: Point) -> Iterator[Point]:
-        """The points after `start`, until the exact method does better."""
+        """Yield the points after `start`, until the exact method becomes faster."""
         point, rounds = start, iter(_FIRST)
         predicting: Predicting | None = None
         run: Accelerating | None = self._begun(step, point.positions)
@@ -168,7 +175,7 @@ class HybridMethod:
                     yield point
 
     def _begun(self, step: StepObjective, p: Positions) -> Accelerating:
-        """L-BFGS from p, which knows of nothing that a step may not pass through."""
+        """Start L-BFGS at p, without surface contact."""
         problem = step.problem
         if step.bounded:
             problem = replace(problem, system=without_bounded(problem.system))
@@ -179,18 +186,18 @@ class HybridMethod:
         return self._newton.certifies(step, at)
 
     def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
-        """Those of Newton's method, and a round of L-BFGS."""
+        """Return the phases of Newton's method, and a round of L-BFGS, as callables."""
         return self._newton.phases(step, at) | {"lbfgs": lambda: self.relaxed(step, at.positions)}
 
     def relaxed(self, step: StepObjective, p: Positions) -> Point:
-        """Where some iterations of L-BFGS lead from p."""
+        """Return the point after a few iterations of L-BFGS from p."""
         run = self._begun(step, p)
         run.iterate(Limits(_RELAXED, 0.0, 0.0, NEVER))
         return _reached(run)
 
 
 def _clear(step: StepObjective, before: Point, after: Point) -> bool:
-    """Whether the way between two points is free, and nothing is in range at its end."""
+    """Return whether the displacement between two points is collision-free and ends without active contacts."""
     if not step.bounded:
         return True
     way = after.positions - before.positions

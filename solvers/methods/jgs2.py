@@ -1,19 +1,20 @@
-"""JGS2: Jacobi's method, each vertex's step taken with all that answers to it (Lan et al. 2025).
+"""JGS2: Jacobi's method with precomputed local responses of the mesh (Lan et al. 2025).
 
     p <- p + t d,     d_i = -(U_i' H U_i)^-1 U_i' grad g,     U_i = R W_i R_i'
 
     W_i = X_i (E_i' X_i)^-1,     X_i = (H0 among P)^-1 E_i
 
-A vertex that lowers its own energy alone overshoots what is good for the mesh, or crawls. So it moves together with the
-vertices P within some rings of springs, along U_i: what they do, the others held, where i is displaced and they are in
-equilibrium. Were P the whole mesh and H0 the Hessian H, d would be Newton's step, for then U_i' H U_i is the Schur
-complement of i. H0 is that of the rest shape, so that W_i is made once; it is turned along by rotations R of the
-vertices, those nearest to how their springs have turned (polar decomposition). At rest springs do not resist what is
-across them; H0 gives them `lateral` of their stiffness there, as if they were stretched.
+A vertex that lowers only its own energy overshoots, or converges slowly. In JGS2 it moves together with the vertices P
+within a few rings of springs, along U_i: their equilibrium response to a displacement of i, with all other vertices
+fixed. If P were the whole mesh and H0 the Hessian H, d would be Newton's step, because U_i' H U_i is then the Schur
+complement of i. H0 is the Hessian of the rest shape, so W_i is computed once. W_i is rotated by per-vertex rotations R,
+those nearest to the rotation of the incident springs (polar decomposition). At rest springs have no lateral stiffness;
+in H0 they have the fraction `lateral` of their stiffness there, as if they were stretched.
 
-The paper sums U'HU over elements that it samples (cubature); here the sum is that of all springs of P. Elements of H
-with negative eigenvalues are clamped, so that U'HU is positive definite. The length t is halved from 1 until the
-objective falls enough. Where d does not descend, the vertices go alone, P = {i}: these steps together always do.
+The paper approximates U'HU by a sum over sampled elements (cubature); here the sum is over all springs of P. Elements
+of H with negative eigenvalues are clamped, so that U'HU is positive definite. The step size t is halved from 1 until
+the objective decreases sufficiently. If d is no descent direction, vertices move individually, P = {i}: the combination
+of these steps always descends.
 """
 
 from __future__ import annotations
@@ -43,13 +44,16 @@ from solvers.linear.factors import DenseCholesky
 from solvers.problem import NotPositiveDefinite, Positions, ProjectiveEnergy, System, Unsupported
 
 _NEAR_NOTHING = 1e-10
-"""Of how springs have turned, what is added of no rotation: it decides where they do not, as along a line."""
+"""Weight of the identity added to the rotation estimate: it decides where springs do not, as for points on a line."""
 
 
 @dataclass(frozen=True)
 class Jgs2:
-    """Jacobi's method with precomputed responses. rings: of springs, how far from a vertex others answer to it, 0 for
-    Jacobi's method itself; lateral: of a spring's stiffness, what it resists across its length at rest, from 0 to 1.
+    """Jacobi's method with precomputed responses.
+
+    Args:
+        neighbour_rings: rings of springs around a vertex that respond to it; 0 gives Jacobi's method.
+        lateral_stiffness_ratio: lateral stiffness of a spring at rest, relative to its stiffness, 0 to 1.
     """
 
     minimises: ClassVar[bool] = True
@@ -76,8 +80,12 @@ class Jgs2:
             raise ValueError(f"lateral: should be from 0 to 1, not {self.lateral}")
 
     def prepare(self, system: System) -> PreparedDescent:
-        """Raises Unsupported for contact, for energies that are not projective, and where the responses do not fit in
-        memory; NotPositiveDefinite where nothing determines some positions."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: for contact, for energies that are not projective, and if the responses do not fit in memory.
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+        """
         unknown = {type(e).__name__ for e in system.energies if is_contact(e) or not isinstance(e, ProjectiveEnergy)}
         if unknown:
             raise Unsupported(
@@ -95,8 +103,16 @@ class Jgs2:
 
 
 def at_rest(system: System, springs: Springs, lateral: float) -> csr_array:
-    """H0 [N/m] over the coordinates of free vertices, (3f, 3f); springs: all of the system's. What is projective beside
-    them counts as in Q."""
+    """Assemble the Hessian H0 of the rest shape.
+
+    Args:
+        system: the system; its other projective energies contribute as in Q.
+        springs: all springs of the system.
+        lateral_stiffness_ratio: lateral stiffness of a spring at rest, relative to its stiffness.
+
+    Returns:
+        H0 [N/m] over the coordinates of the free vertices, (3f, 3f).
+    """
     others = [e for e in system.energies if isinstance(e, ProjectiveEnergy) and not isinstance(e, Springs)]
     held = vertex_terms.held(system)
     held[np.isinf(held)] = 0.0
@@ -107,9 +123,17 @@ def at_rest(system: System, springs: Springs, lateral: float) -> csr_array:
 
 
 def answering(H: csr_array, graph: csr_array, rings: int) -> Patches:
-    """The responses W of all vertices: H (3f, 3f); graph (f, f): who is next to whom, itself included.
+    """Compute the responses W of all vertices.
 
-    A vertex whose patch has no Cholesky factor goes alone. Raises Unsupported where they do not fit in memory.
+    A vertex whose patch has no Cholesky factor gets a patch of its own.
+
+    Args:
+        H: Hessian of the rest shape (3f, 3f).
+        graph: adjacency of the free vertices (f, f), with a full diagonal.
+        neighbour_rings: rings of springs in a patch.
+
+    Raises:
+        Unsupported: if the responses do not fit in memory.
     """
     f = len(graph.indptr) - 1
     link = csr_array((np.ones(graph.nnz), graph.indices, graph.indptr), shape=(f, f))
@@ -136,7 +160,7 @@ def answering(H: csr_array, graph: csr_array, rings: int) -> Patches:
 
 
 class _Patch:
-    """The factor of H among some vertices, kept for the next vertex that has the same ones."""
+    """Factor of H on a patch of vertices, reused if the next vertex has the same patch."""
 
     def __init__(self, H: csr_array) -> None:
         self._H, self._near = H, np.empty(0, np.int64)
@@ -144,7 +168,7 @@ class _Patch:
         self._inverse = np.empty((0, 0))
 
     def response(self, near: NDArray[np.int64], vertex: int) -> NDArray[np.float64]:
-        """W (k, 3, 3) of a vertex among those near it (k,)."""
+        """Compute the response W (k, 3, 3) of a vertex; `patch_vertices` (k,) are those of its patch."""
         if not np.array_equal(near, self._near):
             self._near, self._factor = near, self._factorised(near)
         own, alone = int(np.searchsorted(near, vertex)), np.zeros((len(near), 3, 3))
@@ -157,7 +181,7 @@ class _Patch:
         return W if np.isfinite(W).all() else alone
 
     def _columns(self, factor: DenseCholesky, own: int) -> NDArray[np.float64]:
-        """Those of the inverse that belong to vertex `own` of the patch, (3k, 3)."""
+        """Return the columns of the inverse for patch vertex `own`, (3k, 3)."""
         rows, columns = 3 * len(self._near), slice(3 * own, 3 * own + 3)
         if rows < self._H.shape[0]:
             out = np.empty((rows, 3))
@@ -177,7 +201,7 @@ class _Patch:
 
 
 class _Turns:
-    """The rotations of free vertices. springs: all of the system's; those without a rest length tell nothing."""
+    """Rotations of the free vertices, estimated from all springs with a rest length."""
 
     def __init__(self, system: System, springs: Springs) -> None:
         i, j = springs.edges.T
@@ -190,8 +214,10 @@ class _Turns:
         self._shares = csr_array(shares[system.free])
 
     def at(self, p: Positions) -> NDArray[np.float64]:
-        """R (f, 3, 3) at positions p (n, 3): the rotation nearest to the sum of nn0', n a spring's direction, n0 that
-        at rest."""
+        """Return R (f, 3, 3) at positions p (n, 3): the rotations nearest to the sums of n n0'.
+
+        n is the direction of an incident spring, n0 its direction at rest.
+        """
         i, j = self._edges.T
         _, unit = directions(p[i] - p[j], self._rest)
         sums = (self._shares @ (unit[:, :, None] * self._rest[:, None, :]).reshape(-1, 9)).reshape(-1, 3, 3)
@@ -202,7 +228,7 @@ class _Turns:
 
 
 class _Method:
-    """The iteration for one system."""
+    """The JGS2 iteration for one system."""
 
     def __init__(self, metric: Metric, springs: Springs, patches: Patches) -> None:
         self._metric, self._turns, self._free = metric, _Turns(metric.system, springs), metric.system.free
@@ -219,11 +245,11 @@ class _Method:
             yield point
 
     def certifies(self, step: StepObjective, at: Point) -> bool:
-        """See `solvers.core.descent.Method`; clamped elements tell no saddle from a minimum."""
+        """Return whether `at` may be the last point; clamped elements cannot separate saddles from minima."""
         return True
 
     def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
-        """The gradient, the Hessian, the rotations, and the vertices' steps."""
+        """Return the gradient, the Hessian, the rotations and the vertex steps as callables."""
         hessian, turns = step.hessian(at.positions).convex(), self._turns.at(at.positions)
         return {
             "gradient": lambda: step.gradient(at.positions),
@@ -233,7 +259,7 @@ class _Method:
         }
 
     def _next(self, step: StepObjective, at: Point) -> Point | None:
-        """The point after `at`, None where round-off lets nothing descend."""
+        """Return the next point, None if round-off prevents descent."""
         hessian, turns = step.hessian(at.positions).convex(), self._turns.at(at.positions)
         for way in self._ways:
             direction = self._direction(hessian, turns, at, *way)
@@ -246,7 +272,7 @@ class _Method:
     def _direction(
         self, hessian: Matrix, turns: NDArray[np.float64], at: Point, patches: Patches, scratch: PatchScratch
     ) -> Positions:
-        """The steps of all vertices (n, 3), zero where they are not free."""
+        """Compute the steps of all vertices (n, 3), zero for pinned vertices."""
         graph, free = hessian.graph, self._free
         steps, out = np.empty((len(free), 3)), np.zeros_like(at.positions)
         pointers, columns = np.asarray(graph.indptr, np.int64), np.asarray(graph.indices, np.int64)

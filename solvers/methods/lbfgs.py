@@ -1,16 +1,17 @@
-"""L-BFGS preconditioned by the prefactored matrix (Liu, Bouaziz, Kavan 2017, "Quasi-Newton Methods for Real-Time
-Simulation of Hyperelastic Materials"; Nocedal 1980).
+"""L-BFGS with the prefactored matrix Q as initial metric.
+
+Liu, Bouaziz, Kavan 2017, "Quasi-Newton Methods for Real-Time Simulation of Hyperelastic Materials"; Nocedal 1980.
 
     d = -H grad g(p),   H from H0 = gamma Q^-1 and the last pairs s = p' - p, y = grad g(p') - grad g(p)
 
-gamma = s y / y Q^-1 y of the newest pair, which the paper leaves at 1; it saves a third of the iterations on stiff
-cloths. With no pair the direction is a local-global iteration. It is taken at full length unless the objective does
-not fall enough; then the line search shortens it. A pair is kept if s y > .01 y Q^-1 y: where the Hessian is positive
-and below Q, s y is not less than y Q^-1 y, and H stays positive definite. Takes any energies: those that are not
-projective leave Q as it is.
+gamma = s y / y Q^-1 y of the newest pair; the paper uses 1. This choice saves a third of the iterations on stiff
+cloths. With no pair the direction is that of a local-global iteration. The step size is 1 unless the objective does not
+decrease sufficiently; the line search then shortens it. A pair is stored if s y > .01 y Q^-1 y: where the Hessian is
+positive and below Q, s y is at least y Q^-1 y, and H stays positive definite. All energies are supported; those that
+are not projective do not contribute to Q.
 
-`preconditioner: a-jacobi` takes S, what some sweeps of Jacobi's method make of Q^-1 (`solvers.methods.a_jacobi`), in
-its place: a product with a sparse matrix, as suits a graphics processor.
+`preconditioner: a-jacobi` replaces Q^-1 by S, the aggregate of several Jacobi sweeps
+(`solvers.methods.local_global.aggregated_jacobi`): a product with a sparse matrix, which suits a graphics processor.
 """
 
 from __future__ import annotations
@@ -35,8 +36,15 @@ from solvers.problem import Positions, Prepared, ProjectiveEnergy, StepProblem, 
 
 @dataclass(frozen=True)
 class Lbfgs(Windowed):
-    """pairs: kept of the latest iterations; linear, precision: the solver of Q x = b and of its stored entries;
-    preconditioner: what is in the place of Q^-1; sweeps: of Jacobi's method in that, 1 to 8."""
+    """L-BFGS, preconditioned.
+
+    Args:
+        history_size: number of stored pairs, those of the most recent iterations.
+        linear_solver: solver of Q x = b.
+        precision: floating-point type of its stored entries.
+        preconditioner: initial metric, Q^-1 or its Jacobi approximation.
+        jacobi_sweeps: number of Jacobi sweeps of that approximation, 1 to 8.
+    """
 
     unstated: ClassVar[frozenset[str]] = frozenset({"preconditioner", "sweeps"})
 
@@ -67,7 +75,12 @@ class Lbfgs(Windowed):
             raise ValueError(f"precision: {self.precision} is of a factor's entries")
 
     def prepare(self, system: System) -> Prepared:
-        """Raises NotPositiveDefinite, Unsupported where Q fits nowhere, and with a-jacobi for contact."""
+        """Prepare the method for a system.
+
+        Raises:
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+            Unsupported: if Q does not fit in memory, and for contact with the Jacobi preconditioner.
+        """
         if self.preconditioner == "a-jacobi" and without_bounded(without_contact(system)) is not system:
             raise Unsupported(
                 "lbfgs, preconditioner: a-jacobi: its matrix, which is made once, has no rows for what begins to "
@@ -81,7 +94,7 @@ class Lbfgs(Windowed):
         return _Prepared(base, metric, scheme, Objective(system))
 
     def by_factor(self, system: System) -> PreparedAccelerated:
-        """With Q's factor. Raises as `prepare` does."""
+        """Prepare with the factor of Q; raises as `prepare` does."""
         return prepare(system, self._scheme, self.linear, self.precision)
 
     @property
@@ -90,7 +103,7 @@ class Lbfgs(Windowed):
 
 
 class _Prepared(Iterative):
-    """With S for a factor of Q. metric: of residuals."""
+    """L-BFGS with S in place of the factor of Q, prepared; residuals have a metric of their own."""
 
     def __init__(self, base: PreparedLocalGlobal, metric: Metric, scheme: Scheme, objective: Objective) -> None:
         self._base, self._metric, self._scheme, self._objective = base, metric, scheme, objective
@@ -108,7 +121,7 @@ class _Prepared(Iterative):
 
 
 class _Iterating(Interpreted):
-    """See Interpreted, whose residual is that of Q's factor."""
+    """State of a solve with the Jacobi preconditioner; residuals are measured with the factor of Q."""
 
     def __init__(
         self, metric: Metric, base: PreparedLocalGlobal, scheme: Scheme, step: StepObjective, guess: Positions

@@ -1,12 +1,13 @@
-"""One linearised step of implicit Euler (Baraff and Witkin 1998): one factorisation, and no iteration.
+"""Linearised implicit Euler (Baraff and Witkin 1998): one factorisation per step, no iteration.
 
     (M/dt^2 + D/dt + K) (x - p) = f(p) + M v/dt,    K and D the derivatives of the forces at the start p
 
-which is Newton's first step on the objective g from where the frame begins: (H + E) (x - p) = -grad g(p). What most
-cloth code does. It has the order of the integrator that states the step, 1 with implicit Euler and 2 with BDF2 (Choi
-and Ko 2002) and midpoint, and no say in how well a step is solved: where springs turn far in one, x is far from the
-minimum. E is zero wherever H has a Cholesky factor. Where compressed springs leave it none, part of their negative
-lateral stiffness is taken away, and in the end all of it (`solvers.core.definite`), as Choi and Ko do at once.
+This is the first Newton step on the objective g from the start of the frame: (H + E) (x - p) = -grad g(p). Most cloth
+codes use it. It has the order of the integrator that defines the step, 1 with implicit Euler and 2 with BDF2 (Choi and
+Ko 2002) and midpoint. The accuracy of a step cannot be controlled: where springs rotate far in one step, x is far from
+the minimum. E is zero wherever H has a Cholesky factor. Where compressed springs leave it none, part of their negative
+lateral stiffness is removed, and if necessary all of it (`solvers.methods.newton.hessian_regularisation`); Choi and Ko
+always remove all of it.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from solvers.problem import (
 
 @dataclass(frozen=True)
 class BaraffWitkin:
-    """One linearised step of implicit Euler: one iterate, whatever the stop rule and the first guess."""
+    """Linearised implicit Euler: one iterate, independent of stop rule and initial guess."""
 
     minimises: ClassVar[bool] = False
     descends: ClassVar[bool] = False
@@ -50,8 +51,12 @@ class BaraffWitkin:
     )
 
     def prepare(self, system: System) -> PreparedLinearised:
-        """Raises Unsupported for contact, which begins and ends within a step, and for the stages of integrators of
-        several unknowns, which need each solved."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: for contact, which starts and ends within a step, and for integrators with several stages,
+                which require solved stages.
+        """
         if system.speed is not None:
             raise Unsupported(
                 "baraff-witkin: linearises the one unknown of a step, and this integrator needs its unknowns solved; "
@@ -73,7 +78,7 @@ class BaraffWitkin:
 
 @dataclass(frozen=True, eq=False)
 class PreparedLinearised(Iterative):
-    """diagonal: of Q's free part (3 f,) [N/m]."""
+    """The method, prepared for a system; `system_diagonal` is that of the free part of Q (3 f,) [N/m]."""
 
     residual_of: ClassVar[ResidualOf] = "none"
 
@@ -83,7 +88,11 @@ class PreparedLinearised(Iterative):
     facts: dict[str, float] = field(default_factory=dict[str, float])
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """The whole step. Raises NotPositiveDefinite where no change of the Hessian has a factor."""
+        """Start a solve whose only iteration is the whole step.
+
+        Raises:
+            NotPositiveDefinite: if no modification of the Hessian has a Cholesky factor.
+        """
         step = StepObjective(self.objective, problem)
         p = step.placed(problem.current)
         hessian = step.hessian(p)

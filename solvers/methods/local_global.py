@@ -1,15 +1,15 @@
-"""Local-global iterations over one prefactored matrix (Liu et al. 2013, section 4).
+"""Local-global iterations with one prefactored matrix (Liu et al. 2013, section 4).
 
     y = M target/dt^2 + f + w C'C p_pin                 once a step
     local step   d_e = r_e (A p)_e / |(A p)_e|          each iteration
     global step  Q p = A'K d + y
 
-An iteration from p to LG(p) is a preconditioned gradient step of length one, Q^-1 grad g(p) = p - LG(p), and the
-energy never rises in it, because A'KA - Hessian is positive semidefinite. Exact pins are eliminated: their rows
-leave Q, and their columns go to the right-hand side.
+An iteration from p to LG(p) is a preconditioned gradient step of length one, Q^-1 grad g(p) = p - LG(p). It never
+raises the energy, because A'KA - Hessian is positive semidefinite. Exact pins are eliminated: their rows are removed
+from Q, and their columns contribute to the right-hand side.
 
-Backends differ in how they do the two steps, and in nothing else: `DenseLocalGlobal` with NumPy's matrices,
-`SparseLocalGlobal` with SciPy's, and `solvers.methods.local_global_compiled` with steps that are compiled as a whole.
+Backends differ only in the implementation of the two steps: `DenseLocalGlobal` uses NumPy matrices,
+`SparseLocalGlobal` SciPy matrices, and `solvers.methods.local_global.compiled_local_global` compiled code.
 """
 
 from __future__ import annotations
@@ -31,12 +31,15 @@ from solvers.linear.factors import DenseCholesky, SparseLU
 from solvers.problem import Positions, Prepared, System, Unsupported
 
 _LARGE = 2**19
-"""Entries of a matrix that no cache of a core holds."""
+"""Entries of a matrix that exceeds the cache of any core."""
 
 
 def _times(matrix: NDArray[np.float64], x: Positions) -> Positions:
-    """A dense matrix times x (k, 3). A large one as (x' matrix')', with the same sums in half of the time: BLAS copies
-    one of two factors before it multiplies them, and this way it is not all of the matrix."""
+    """Multiply a dense matrix by x (k, 3).
+
+    A large product is computed as (x' matrix')' with the same sums in half of the time: BLAS copies one of the two
+    factors before the product, and this order avoids a copy of the whole matrix.
+    """
     if matrix.size < _LARGE:
         return matrix @ x
     return np.ascontiguousarray((np.ascontiguousarray(x.T) @ matrix.T).T)
@@ -44,14 +47,19 @@ def _times(matrix: NDArray[np.float64], x: Positions) -> Positions:
 
 @dataclass(frozen=True)
 class DenseLocalGlobal:
-    """NumPy matrices and one dense Cholesky factor: for small meshes, and to be read beside the paper."""
+    """Local-global with NumPy matrices and a dense Cholesky factor, for small meshes and for reading with the paper."""
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
     about: ClassVar[About] = About(LOCAL_GLOBAL, LIU_2013)
 
     def prepare(self, system: System) -> PreparedLocalGlobal:
-        """Raises Unsupported for energies other than springs, NotPositiveDefinite."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: for energies other than springs, and if the matrices do not fit in memory.
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+        """
         springs, n = only_springs(system, "dense"), system.vertices
         needs, room = 24.0 * n * (len(springs.edges) + n), memory.of_machine()  # three matrices of each shape
         if needs > room:
@@ -92,14 +100,19 @@ class DenseLocalGlobal:
 
 @dataclass(frozen=True)
 class SparseLocalGlobal:
-    """SciPy sparse matrices and one sparse factorisation, for any projective energies."""
+    """Local-global with SciPy sparse matrices and one sparse factorisation, for all projective energies."""
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
     about: ClassVar[About] = About(LOCAL_GLOBAL, LIU_2013)
 
     def prepare(self, system: System) -> Prepared:
-        """Raises Unsupported for energies that are not projective, NotPositiveDefinite."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: if an energy is not projective.
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+        """
         if without_contact(system) is not system:
             from solvers.contact.local_global import local_global  # for those who need it
 

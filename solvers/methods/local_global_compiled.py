@@ -1,8 +1,8 @@
-"""Local-global iterations, compiled as a whole: no Python between a step's beginning and its end.
+"""Compiled local-global iterations: a step runs without Python from start to end.
 
-Factors of float64 solve for positions, Q p = A'K d + y. Less precise ones solve for corrections,
-p <- p - Q^-1 grad g(p), with the gradient in float64: the iterations end where those of float64 do, to all of its
-digits, and only the way there differs.
+Factors in float64 solve for positions, Q p = A'K d + y. Less precise factors solve for corrections,
+p <- p - Q^-1 grad g(p), with the gradient in float64. Both converge to the same limit, to all digits of float64; only
+the intermediate iterates differ.
 """
 
 from __future__ import annotations
@@ -26,9 +26,11 @@ from solvers.problem import Positions, Prepared, System
 
 @dataclass(frozen=True)
 class CompiledLocalGlobal:
-    """Compiled steps over a linear solver that is chosen by size, or given.
+    """Compiled local-global with a linear solver that is selected by size, or given.
 
-    linear: the solver of Q p = b; precision: of its stored entries.
+    Args:
+        linear_solver: solver of Q p = b.
+        precision: floating-point type of its stored entries.
     """
 
     minimises: ClassVar[bool] = True
@@ -39,7 +41,12 @@ class CompiledLocalGlobal:
     precision: Precision = "float64"
 
     def prepare(self, system: System) -> Prepared:
-        """Raises Unsupported for energies that are neither projective nor contact, NotPositiveDefinite."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: if an energy is neither projective nor contact.
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+        """
         if without_contact(system) is not system:
             from solvers.contact.local_global import local_global  # for those who need it
 
@@ -65,7 +72,7 @@ class CompiledLocalGlobal:
 
 
 def _projection(springs: Springs, n: int) -> Project:
-    """The compiled local step for a linear solver that is called from Python."""
+    """Compile the local step for a linear solver that is called from Python."""
     bundles, _ = kernels.Bundles.of(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
     x, b = (aligned(4 * (n + 2)) for _ in range(2))
     x[4 * (n + 1)] = FAR

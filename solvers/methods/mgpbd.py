@@ -1,22 +1,23 @@
-"""XPBD solved globally, in its dual, by conjugate gradients with multigrid (MGPBD: Li et al. 2025).
+"""XPBD with a global dual solve by multigrid-preconditioned conjugate gradients (MGPBD: Li et al. 2025).
 
-It begins as XPBD does (`solvers.methods.xpbd`): where the vertices would go without springs, and with no tension. An
-iteration linearises all springs at once, solves for the changes of their tensions t, and moves the vertices by them:
+It starts as XPBD does (`solvers.methods.position_based.xpbd`): at the positions without springs, with zero tensions. An
+iteration linearises all springs, solves for the increments of their tensions t, and moves the vertices accordingly:
 
     (J W J' + K^-1) dt = C(p) - K^-1 t,    p <- p - W J' dt,   t <- t + dt
 
-with C the springs' lengthening (m,), J its derivative, a row n_e at i and -n_e at j, and W = 1/held the compliance of
-the vertices (`solvers.core.vertex_terms`): the paper's formula in forces, lambda = -t dt^2. It is solved for
-s = K^-1/2 t instead, which needs no division by a stiffness:
+with C the elongations of the springs (m,), J its derivative, a row n_e at i and -n_e at j, and W = 1/held the
+compliance of the vertices (`solvers.methods.base.vertex_terms`). This is the paper's formula in terms of forces,
+lambda = -t dt^2. It is solved for s = K^-1/2 t instead, which avoids a division by a stiffness:
 
     A ds = b,    A = G o (N N'),    G = I + K^1/2 A_s W A_s' K^1/2,    b = K^1/2 C(p) - s
 
-where A_s is the signed incidence of the springs, N their directions (m, 3) and o the product entry by entry: G is made
-once, and a row has an entry for each spring that shares a vertex. |b|^2 is what the tensions of springs are off by, in
-joules. A step is halved until |b| falls, as along ds it does (the authors' code halves the way of positions alone).
+where A_s is the signed incidence matrix of the springs, N their directions (m, 3) and o the entrywise product. G is
+computed once; a row has an entry for each spring that shares a vertex. |b|^2 is the error of the tensions in joules. A
+step is halved until |b| decreases, as it does along ds (the authors' code halves the displacement of positions only).
 
-It does not minimise the step's objective, as XPBD does not: tensions are added up along directions that turn meanwhile.
-Its end is the minimiser where springs do not turn, near to it where they turn little, and another than XPBD's.
+Like XPBD, it does not minimise the objective of the step: tensions are accumulated along directions that change during
+the iteration. Its limit is the minimiser if springs do not rotate, close to it if they rotate little, and differs from
+the limit of XPBD.
 """
 
 from __future__ import annotations
@@ -39,21 +40,24 @@ from solvers.problem import Positions, ResidualOf, StepProblem, System
 from solvers.round_off import EPS
 
 _SWEEPS = 30
-"""Of Gauss-Seidel's method, on random vectors, for components of the near-kernel."""
+"""Gauss-Seidel sweeps on random vectors that yield near-null-space vectors."""
 
 _NEAR, _MOST = 1e-5, 100
-"""The residual that a linear solve ends at, relative to its right-hand side's, and its iterations at most."""
+"""Relative residual at which a linear solve ends, and its maximum number of iterations."""
 
 _SHORTEST = 2.0**-30
-"""Of a step: a shorter one is round-off."""
+"""Shortest step size: a shorter step is round-off."""
 
 
 @dataclass(frozen=True)
 class MultigridXpbd:
-    """MGPBD; the first guess is not used, nor is a tolerance; it stops where round-off lets no tension be nearer.
+    """MGPBD; uses neither the initial guess nor a tolerance, and stops at round-off of the tensions.
 
-    components: of the near-kernel, each made by sweeps from a random vector; 0 for equal tensions alone. setup: after
-    so many iterations prolongations are made anew; they are in each step's first. smoothed: whether they are smoothed.
+    Args:
+        near_null_vectors: number of near-null-space vectors, each from sweeps on a random vector; 0 for constant
+            tensions only.
+        setup_interval: iterations between constructions of the prolongations; each step starts with one.
+        smooth_prolongation: whether prolongations are smoothed.
     """
 
     minimises: ClassVar[bool] = False
@@ -80,7 +84,11 @@ class MultigridXpbd:
                 raise ValueError(f"{name}: should be at least {least}, not {getattr(self, name)}")
 
     def prepare(self, system: System) -> PreparedMultigridXpbd:
-        """Raises Unsupported for energies other than springs, and for vertices without mass that are not pinned."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: for energies other than springs, and for unpinned vertices without mass.
+        """
         springs, held = only_springs(system, "mgpbd"), vertex_terms.held(system)
         vertex_terms.require_mass(system, held, "mgpbd")
         keep = np.flatnonzero(springs.edges[:, 0] != springs.edges[:, 1])  # self-loops stretch nothing
@@ -107,8 +115,16 @@ class MultigridXpbd:
 
 @dataclass(frozen=True, eq=False)
 class PreparedMultigridXpbd(Iterative):
-    """incidence: A_s (m, n); coupling: G (m, m); root: of the stiffnesses (m,); rest_length (m,) [m]; rest_direction
-    (m, 3); compliance: 1/held (n,) [m/N]."""
+    """MGPBD, prepared for a system.
+
+    Attributes:
+        incidence_matrix: A_s (m, n).
+        coupling_matrix: G (m, m).
+        root_stiffness: square roots of the stiffnesses (m,).
+        rest_length: (m,) [m].
+        rest_direction: (m, 3).
+        vertex_compliance: 1/held (n,) [m/N].
+    """
 
     residual_of: ClassVar[ResidualOf] = "none"
 
@@ -124,23 +140,23 @@ class PreparedMultigridXpbd(Iterative):
     facts: dict[str, float] = field(default_factory=dict)
 
     def begin(self, problem: StepProblem, guess: Positions) -> Dual:
-        """See Iterative; from where the vertices would go without springs."""
+        """Start a solve at the positions that the vertices have without springs."""
         return Dual(self, vertex_terms.anchors(problem))
 
     def stretched(self, p: Positions) -> tuple[NDArray[np.float64], Positions]:
-        """K^1/2 C(p) (m,) [J^(1/2)], and the springs' directions N (m, 3)."""
+        """Compute K^1/2 C(p) (m,) [J^(1/2)] and the spring directions N (m, 3) at positions p (n, 3)."""
         length, unit = directions(self.incidence @ p, self.rest_direction)
         return self.root * (length - self.rest_length), unit
 
     def matrix(self, unit: Positions) -> csr_array:
-        """A (m, m), at directions N (m, 3)."""
+        """Assemble the dual matrix A (m, m) for spring directions N (m, 3)."""
         G = self.coupling
         rows = np.repeat(np.arange(len(unit)), np.diff(G.indptr))
         entries = G.data * np.einsum("ij,ij->i", unit[rows], unit[G.indices])
         return csr_array((entries, G.indices, G.indptr), shape=G.shape)
 
     def prolongation(self, A: csr_array) -> Prolongation:
-        """For A and later ones, by the solver's rule."""
+        """Build the prolongation for A and its successors by the rule of the solver."""
         made = self.solver
         if coarsest(A):
             return Prolongation(A, np.empty((A.shape[0], 0)))
@@ -151,8 +167,13 @@ class PreparedMultigridXpbd(Iterative):
 
 
 class Dual(Iterating):
-    """A solve that has begun. tension: s = K^-1/2 t (m,) [J^(1/2)]; misfit: b, what it is off by (m,); iterations: of
-    conjugate gradients in the last iteration."""
+    """State of an MGPBD solve.
+
+    Attributes:
+        scaled_tension: s = K^-1/2 t (m,) [J^(1/2)].
+        dual_residual: b, the error of s (m,).
+        num_cg_iterations: conjugate gradient iterations of the most recent iteration.
+    """
 
     def __init__(self, prepared: PreparedMultigridXpbd, p: Positions) -> None:
         self._prepared, self.positions, self.iterations, self._count = prepared, p, 0, 0
@@ -160,7 +181,7 @@ class Dual(Iterating):
         self.misfit, self._unit = prepared.stretched(p)
 
     def advance(self) -> bool:
-        """See Iterating: all springs at once."""
+        """Update all springs; return False at round-off."""
         made, before = self._prepared, norm(self.misfit)
         round_off = EPS * norm(np.abs(self.misfit + self.tension) + made.root * made.rest_length)
         if not round_off < before < np.inf:

@@ -2,14 +2,15 @@
 
     p <- p - t (H + E)^-1 grad g(p)
 
-The Hessian of compressed springs may be indefinite. It is left exact wherever it has a Cholesky factor, which keeps the
-convergence quadratic; where it has none, more and more is taken from the springs' negative lateral parts, and in the
-end a multiple of the diagonal of Q is added. Other rules change elements by their eigenvalues (`indefinite`, see
-`solvers.core.definite`); clamping all of them (Teran et al. 2005) converges linearly. Where the slope is slight, none
-of these is followed: there the exact Hessian tells a minimum from a saddle. A point where the gradient vanishes but the
-exact Hessian has no factor is left (`solvers.core.saddles`).
+The Hessian of compressed springs may be indefinite. It remains exact wherever it has a Cholesky factor, which preserves
+quadratic convergence. Where it has none, an increasing part of the springs' negative lateral stiffness is removed, and
+finally a multiple of the diagonal of Q is added. Other rules modify the eigenvalues of elements (`indefinite`, see
+`solvers.methods.newton.hessian_regularisation`); clamping all of them (Teran et al. 2005) converges linearly. Where the
+slope is small, none of these rules applies: the exact Hessian distinguishes a minimum from a saddle. From a stationary
+point whose exact Hessian has no factor, the method escapes (`solvers.methods.newton.negative_curvature`).
 
-Where something is touched, an iteration settles friction, and may be several steps (`solvers.contact.settling`).
+With active contacts, an iteration converges friction and may consist of several steps
+(`solvers.methods.newton.friction_gauss_seidel`).
 """
 
 from __future__ import annotations
@@ -35,14 +36,15 @@ if TYPE_CHECKING:
     from solvers.contact.settling import Settling
 
 _SLIGHT = 1e-12
-"""Of the steepest slope of a solve, what tells of a saddle where the exact Hessian has no factor."""
+"""Fraction of the steepest slope of a solve below which an exact Hessian without a factor indicates a saddle."""
 
 
 @dataclass(frozen=True)
 class Newton:
-    """Newton's method. Where it ends by a close tolerance, or stalls, no curvature is negative but by round-off.
+    """Newton's method; at convergence or stagnation, negative curvature is at the level of round-off.
 
-    indefinite: what is done about Hessians that are (`solvers.core.definite`).
+    Args:
+        indefinite_strategy: modification of indefinite Hessians (`hessian_regularisation`).
     """
 
     minimises: ClassVar[bool] = True
@@ -57,8 +59,13 @@ class Newton:
     indefinite: Indefinite = "graded"
 
     def prepare(self, system: System) -> PreparedDescent:
-        """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere, and for
-        energies without elements that `indefinite` could change."""
+        """Prepare the method for a system.
+
+        Raises:
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+            Unsupported: if Q does not fit in memory, and for energies without an element-wise form that
+                `indefinite_strategy` requires.
+        """
         metric, objective = Metric(system), Objective(system)
         whole = {type(system.energies[k]).__name__ for k in objective.own if not is_bounded(system.energies[k])}
         if whole and self.indefinite != "graded":
@@ -82,7 +89,7 @@ class NewtonMethod:
         self._settling = settling_for(metric)
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
-        """The points after `start`."""
+        """Yield the points after `start`."""
         point, steepest, rule = start, 0.0, self._rule()
         if step.bounded and type(rule) is Graded:
             rule = Close()
@@ -97,7 +104,7 @@ class NewtonMethod:
         return certified(step, at.positions)
 
     def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
-        """The gradient, the Hessian with its factorisation, and a solve with it."""
+        """Return the gradient, the Hessian with its factorisation, and a solve as callables."""
         hessian, (keep, by) = step.hessian(at.positions), LEVELS[-1]  # any other may have no factor to solve with
         hessian.factorise(keep, by * self._diagonal)
         return {
@@ -107,7 +114,7 @@ class NewtonMethod:
         }
 
     def _next(self, step: StepObjective, at: Point, steepest: float, rule: Rule) -> tuple[Point, float]:
-        """The point after `at`, and the steepest slope so far [J]."""
+        """Return the next point, and the steepest slope so far [J]."""
         hessian = step.hessian(at.positions)
         level = rule.factorised(hessian, at, self._diagonal)
         if level is None:
@@ -129,21 +136,20 @@ class NewtonMethod:
         return found or at._replace(stalled=True), steepest
 
     def _descent(self, step: StepObjective, at: Point, direction: Positions, exact: bool) -> Point | None:
-        """A lower point by a direction, None for none; exact: whether nothing was added to the Hessian."""
+        """Return a lower point along a direction, or None; `exact` means an unmodified Hessian."""
         if self._settling is None or not exact or not step.touched:
             return search(step, at, direction)
         return self._settling.search(step, at, direction, lambda point: self._exact(step, point))
 
     @staticmethod
     def _exact(step: StepObjective, at: Point) -> Positions | None:
-        """The direction from a point by the exact Hessian, None where it is not positive definite."""
+        """Return the direction of the exact Hessian, None if it is not positive definite."""
         hessian = step.hessian(at.positions)
         return -hessian.solve(at.gradient) if hessian.factorise() else None
 
 
 def settling_for(metric: Metric) -> Settling | None:
-    """What Newton's methods do about contact between their steps; None for a system without,
-    and where a step may not pass through something else."""
+    """Return the friction search of Newton's methods; None without contact, and with surface contact."""
     energies = metric.system.energies
     if not any(is_contact(energy) for energy in energies) or any(is_bounded(energy) for energy in energies):
         return None  # its sweeps know of no bounds

@@ -1,12 +1,12 @@
-"""Inexact Newton's method: conjugate gradients, preconditioned by Q^-1, on the exact Hessian (Dembo and Steihaug 1983).
+"""Newton-CG: inexact Newton method with preconditioned conjugate gradients (Dembo and Steihaug 1983).
 
-    H d = -g to |H d + g| <= eta |g|,   |r|^2 = r' Q^-1 r,   eta = .9 (|g| / |g before|)^2    Eisenstat and Walker 1996
+    H d = -g to |H d + g| <= eta |g|,   |r|^2 = r' Q^-1 r,   eta = .9 (|g| / |g previous|)^2  Eisenstat and Walker 1996
 
-For springs Q majorises H, so that the eigenvalues of Q^-1 H are at most 1. Conjugate gradients end where they meet
-negative curvature, with what they have: from the first direction of all that is -Q^-1 g, a local-global iteration.
+For springs Q majorises H, so the eigenvalues of Q^-1 H are at most 1. Conjugate gradients stop at a direction of
+negative curvature with their current iterate; at the first direction, that is -Q^-1 g, a local-global iteration.
 
-What else may precondition it, and what takes the place of Q where something is touched, `solvers.core.preconditioning`
-tells. An iteration settles friction, and may be several steps, as that of Newton's method.
+`solvers.methods.base.preconditioners` documents the other preconditioners, and the matrix that replaces Q with active
+contacts. An iteration converges friction, and may consist of several steps, as in Newton's method.
 """
 
 from __future__ import annotations
@@ -31,21 +31,22 @@ from solvers.methods.newton import settling_for
 from solvers.problem import Positions, Prepared, System
 
 _LOOSE, _TIGHT = 0.5, 1e-10
-"""The bounds of eta."""
+"""Upper and lower bound of eta."""
 
 _TOUCHED = 1e-4
-"""The upper one where something is touched: what sticks does so within a hundred-millionth of a metre, and a direction
-that misses that by little leads where another quadratic model holds."""
+"""Upper bound of eta with active contacts: sticking friction acts within 1e-8 m, and a direction with a small error on
+that scale leads to where another quadratic model holds."""
 
 _MOST = 1000
-"""Iterations of conjugate gradients: as many as the stiffest springs need for a few digits."""
+"""Maximum number of conjugate gradient iterations: the stiffest springs need it for a few digits."""
 
 
 @dataclass(frozen=True)
 class NewtonCG(Precise):
-    """Newton's method without a factor of the Hessian: it needs the memory of local-global.
+    """Newton's method without a factorisation of the Hessian; needs as much memory as local-global.
 
-    preconditioner: of conjugate gradients; `solvers.core.preconditioning` tells them. A device knows schwarz.
+    Args:
+        preconditioner: of conjugate gradients (`solvers.methods.base.preconditioners`); a device supports schwarz only.
     """
 
     unstated: ClassVar[frozenset[str]] = Precise.unstated | {"preconditioner"}
@@ -65,8 +66,12 @@ class NewtonCG(Precise):
     preconditioner: Preconditioning = "factor"
 
     def prepare(self, system: System) -> Prepared:
-        """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere, and for
-        blocks of energies without elements."""
+        """Prepare the method for a system.
+
+        Raises:
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+            Unsupported: if Q does not fit in memory, and for block preconditioners with energies without elements.
+        """
         if self.device == "cuda":
             from solvers.cuda.device import ready  # for those who ask for it
 
@@ -81,7 +86,7 @@ class NewtonCG(Precise):
 
 
 class TruncatedNewton:
-    """The iteration for one system. compiled: its conjugate gradients in one kernel, None where that cannot be."""
+    """The iteration for one system; `compiled_cg` is the fused CG kernel, None if unavailable."""
 
     def __init__(self, metric: Metric, objective: Objective, by: Preconditioning = "factor") -> None:
         self._metric, self._at = metric, preconditioning(by, metric, objective, "newton-cg")
@@ -90,7 +95,7 @@ class TruncatedNewton:
         self._settling = settling_for(metric)
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
-        """The points after `start`."""
+        """Yield the points after `start`."""
         loose = _TOUCHED if step.touched else _LOOSE
         point, eta = self._settling.start(step, start) if self._settling and step.touched else start, loose
         hessian, solve = self._at(step, point.positions)
@@ -105,14 +110,14 @@ class TruncatedNewton:
                 return
             hessian, solve = self._at(step, found.positions)
             before, descent = dot(point.gradient, descent), solve(found.gradient)
-            # The safeguard of Eisenstat and Walker: eta falls no faster than its own square.
+            # Safeguard of Eisenstat and Walker: eta decreases no faster than its own square.
             following = 0.9 * dot(found.gradient, descent) / before
             eta = min(loose, max(_TIGHT, following, 0.9 * eta**2 if 0.9 * eta**2 > 0.1 else 0.0))
             point = found
             yield point
 
     def _along(self, step: StepObjective, at: Point, direction: Positions, eta: float) -> Point | None:
-        """A lower point by a direction, None for none."""
+        """Return a lower point along a direction, or None."""
         if self._settling is None or not step.touched:
             return search(step, at, direction)
 
@@ -123,11 +128,11 @@ class TruncatedNewton:
         return self._settling.search(step, at, direction, following)
 
     def certifies(self, step: StepObjective, at: Point) -> bool:
-        """It has no factor to tell by."""
+        """Return True: without a factor, definiteness is unknown."""
         return True
 
     def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
-        """The gradient, a product with the Hessian, and what preconditions it."""
+        """Return the gradient, a product with the Hessian and the preconditioner as callables."""
         hessian, solve = self._at(step, at.positions)
         return {
             "gradient": lambda: step.gradient(at.positions),
@@ -144,7 +149,7 @@ class TruncatedNewton:
         descent: Positions,
         eta: float,
     ) -> Positions:
-        """What conjugate gradients make of -H^-1 g; descent: what `solve`, the preconditioner, makes of g."""
+        """Solve H d = -g approximately; `descent` is the preconditioned gradient."""
         if self.compiled and not step.own:
             return self.compiled.direction(hessian, solve, at, descent, eta)
         product = dot(at.gradient, descent)
@@ -154,7 +159,15 @@ class TruncatedNewton:
 
 
 class _Newton(Iteration):
-    """H d = -g to a limit of r'z [J]; descent: what `solve`, the preconditioner, makes of the gradient g."""
+    """Conjugate gradients for H d = -g.
+
+    Args:
+        hessian: H.
+        solve: the preconditioner.
+        gradient: g (n, 3).
+        descent: the preconditioned gradient.
+        limit: tolerance of r'z [J].
+    """
 
     def __init__(
         self, hessian: Hessian, solve: Preconditioner, gradient: Positions, descent: Positions, limit: float
@@ -187,14 +200,14 @@ class _Newton(Iteration):
 
 
 def _known(metric: Metric) -> Supernodal | None:
-    """A factor of the metric that kernels know, small as it may be; None where Q has none."""
+    """Return a factor of the metric that kernels support, however small; None if Q has none."""
     if isinstance(metric.factor, Inverse):
         return Supernodal(metric.inner)
     return metric.factor if isinstance(metric.factor, Supernodal) else None
 
 
 class _Compiled:
-    """The same conjugate gradients in one kernel, for springs, forms and elements."""
+    """Conjugate gradients in one kernel, for springs, quadratic forms and elements."""
 
     def __init__(self, objective: Objective, factor: Supernodal) -> None:
         system = objective.system

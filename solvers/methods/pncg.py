@@ -1,15 +1,16 @@
-"""Nonlinear conjugate gradients, preconditioned by Q^-1: no Hessian is assembled, none is factorised (Shen et al. 2024,
-who precondition by the Hessian's diagonal, as there is no Q in interior-point elasticity).
+"""Nonlinear conjugate gradients, preconditioned by Q^-1, without a Hessian matrix or factorisation.
 
-    d = -z + beta d before,   z = Q^-1 grad g,   y = g - g before,   w = Q^-1 y
+Shen et al. 2024; they precondition by the diagonal of the Hessian, as interior-point elasticity has no Q.
+
+    d = -z + beta d_previous,   z = Q^-1 grad g,   y = g - g_previous,   w = Q^-1 y
     beta = (y z - (w y) (g d)/(d y)) / (d y)              Dai and Kou 2013
-    t = -(g d)/(d H d)                                    the least point of the quadratic model along d
+    t = -(g d)/(d H d)                                    the minimum of the quadratic model along d
 
-H d is a product, element by element. Where d does not descend, or the model curves downwards along it, d is -z again: a
-local-global iteration. A step that brings too little is halved, and none passes through what is bounded. Where surfaces
-touch, P = S Q S takes the place of Q (`solvers.core.preconditioning`). Contact of single vertices it refuses: that
-begins at once and grips within a hundred-millionth of a metre, so that a quadratic model holds for no step along d,
-and sheets that landed took 340 to 2,600 iterations where L-BFGS took 23 to 135.
+H d is a product, element by element. If d is no descent direction, or the model has negative curvature along it, d is
+reset to -z: a local-global iteration. A step without sufficient decrease is halved, and the step size is
+collision-free. With active surface contacts, P = S Q S replaces Q (`solvers.methods.base.preconditioners`). Contact of
+single vertices is not supported: it activates abruptly and friction sticks within 1e-8 m, so no quadratic model
+holds for a step along d. Landing sheets took 340 to 2,600 iterations where L-BFGS took 23 to 135.
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ from solvers.problem import Positions, Prepared, StepProblem, System, Unsupporte
 
 @dataclass(frozen=True)
 class NonlinearCG:
-    """Preconditioned nonlinear conjugate gradients: takes all energies, with the memory of local-global.
+    """Preconditioned nonlinear conjugate gradients for all energies; needs as much memory as local-global.
 
-    preconditioner: `solvers.core.preconditioning` tells them.
+    Args:
+        preconditioner: see `solvers.methods.base.preconditioners`.
     """
 
     unstated: ClassVar[frozenset[str]] = frozenset({"preconditioner"})
@@ -54,8 +56,13 @@ class NonlinearCG:
     preconditioner: Preconditioning = "factor"
 
     def prepare(self, system: System) -> Prepared:
-        """Raises NotPositiveDefinite where nothing determines some positions, Unsupported for contact of single
-        vertices, where Q fits nowhere, and for blocks of energies without elements."""
+        """Prepare the method for a system.
+
+        Raises:
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+            Unsupported: for contact of single vertices, if Q does not fit in memory, and for block preconditioners with
+                energies without elements.
+        """
         if without_contact(system) is not system:
             raise Unsupported(
                 "pncg: no quadratic model holds along a direction where single vertices begin to press and grip "
@@ -68,7 +75,7 @@ class NonlinearCG:
 
 @dataclass(frozen=True, eq=False)
 class PreparedPncg(Iterative):
-    """The method, ready for a system."""
+    """Nonlinear conjugate gradients, prepared for a system."""
 
     metric: Metric
     objective: Objective
@@ -85,7 +92,7 @@ class PreparedPncg(Iterative):
         return largest(problem) * self.metric.trace**0.5
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """The gradient, a product with the Hessian, and what preconditions it, at the first guess."""
+        """Return the gradient, a Hessian product and the preconditioner as callables, at the initial guess."""
         step = StepObjective(self.objective, problem)
         p = step.placed(problem.first_guess)
         (hessian, solve), gradient = self.at(step, p), step.gradient(p)
@@ -97,7 +104,7 @@ class PreparedPncg(Iterative):
 
 
 class _Iterating(Iterating):
-    """From point to point, with the direction that led to the last one."""
+    """State of a solve: the current point, and the direction that led to it."""
 
     def __init__(self, metric: Metric, preconditioned: At, step: StepObjective, guess: Positions) -> None:
         self._metric, self._preconditioned, self._step = metric, preconditioned, step
@@ -130,7 +137,7 @@ class _Iterating(Iterating):
         return True
 
     def _along(self, direction: Positions) -> Point | None:
-        """A lower point by the quadratic model along a direction, None where that ascends or curves downwards."""
+        """Return a lower point by the quadratic model; None without descent or with negative curvature."""
         slope, curvature = dot(self._at.gradient, direction), dot(direction, self._hessian.multiply(direction))
         if not (slope < 0.0 < curvature):
             return None

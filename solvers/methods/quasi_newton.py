@@ -1,13 +1,13 @@
-"""Accelerated first-order methods over one prefactored matrix: `anderson`, `chebyshev` and `lbfgs`.
+"""Accelerated first-order methods with one prefactored matrix: Anderson, Chebyshev and L-BFGS.
 
-They share the iteration (`solvers.kernels.accelerate`) and differ in a direction's coefficients. Where the energies
-are springs, quadratic forms, strain limits and dashpots, and the factor is one whose panels the kernels know, a step is
-compiled as a whole; else the same kernels take turns with the energies' own values and gradients, and with the factor's
-own solve.
+They share the iteration (`solvers.kernels.accelerated_descent`) and differ in the coefficients of a direction. A step
+is fully compiled if the energies are springs, quadratic forms, strain limits and dashpots, and the factor's panels are
+supported by the kernels. Otherwise the kernels alternate with the energies' own values and gradients, and with the
+factor's own solve.
 
-No iteration raises the objective, round-off apart: a trial that would is shortened or replaced by the plain
-correction, a local-global iteration, which descends by majorisation. Where that does not either, for all that round-off
-tells, the solve has "stalled", and its iterates stay where they are.
+No iteration raises the objective, except by round-off. A trial that would is shortened, or replaced by the plain
+correction, a local-global iteration, which descends by majorisation. If that does not descend either, within round-off,
+the solve terminates as "stalled" and its iterate stays unchanged.
 """
 
 from __future__ import annotations
@@ -38,7 +38,18 @@ from solvers.problem import Positions, ProjectiveEnergy, StepProblem, System
 
 
 def prepare(system: System, scheme: Scheme, linear: Linear, precision: Precision) -> PreparedAccelerated:
-    """Factorise Q and compile. Raises Unsupported for energies that the method does not take, NotPositiveDefinite."""
+    """Factorise Q and compile the iteration.
+
+    Args:
+        system: the system.
+        scheme: coefficients of the acceleration.
+        linear_solver: solver of Q x = b.
+        precision: floating-point type of its stored entries.
+
+    Raises:
+        Unsupported: for energies that the method does not support.
+        NotPositiveDefinite: if the system leaves some positions undetermined.
+    """
     bare = without_contact(system)
     energies = (
         projective(without_bounded(bare), scheme.name)
@@ -59,9 +70,12 @@ def prepare(system: System, scheme: Scheme, linear: Linear, precision: Precision
 
 @dataclass(frozen=True)
 class Windowed:
-    """A method that keeps differences of its latest iterations.
+    """Base class of methods with a history of recent iterations.
 
-    pairs: how many; linear, precision: the solver of Q x = b and of its stored entries.
+    Args:
+        history_size: number of stored differences.
+        linear_solver: solver of Q x = b.
+        precision: floating-point type of its stored entries.
     """
 
     minimises: ClassVar[bool] = True
@@ -78,19 +92,19 @@ class Windowed:
 
 @dataclass(frozen=True, eq=False)
 class PreparedAccelerated(Iterative):
-    """A method, ready for a system. base: the prefactored Q; engine: what iterates."""
+    """An accelerated method, prepared: `local_global` has the prefactored Q, `acceleration_engine` iterates."""
 
     base: PreparedLocalGlobal
     engine: Engine
 
     @property
     def facts(self) -> dict[str, float]:
-        """Exact counts of what was built."""
+        """Exact counts of the prepared data."""
         return self.base.facts
 
     @property
     def choice(self) -> str:
-        """The linear solver in words."""
+        """Description of the linear solver."""
         return self.base.choice
 
     def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
@@ -103,7 +117,7 @@ class PreparedAccelerated(Iterative):
 
 
 class _Compiled:
-    """Springs and what is like them, over a factor that is cut into blocks."""
+    """Compiled iteration for springs and similar energies, with a factor that is split into blocks."""
 
     def __init__(self, scheme: Scheme, compiled: PreparedCompiled) -> None:
         self._scheme = scheme
@@ -131,11 +145,11 @@ class _Compiled:
 
 
 _State = tuple[accelerate_step.Step, Window]
-"""The memory of a run."""
+"""Work arrays of a solve."""
 
 
 class _CompiledAccelerating(Accelerating):
-    """See Accelerating. idle: where its memory goes when it is not needed any more."""
+    """State of a compiled solve; `free_states` receives its work arrays when it is deleted."""
 
     def __init__(
         self,
@@ -149,7 +163,7 @@ class _CompiledAccelerating(Accelerating):
         self._idle, self._memory = idle, state
         step, window = state
         self._state = step, edges, window
-        # The kernels are compiled for arrays that may be written to.
+        # The kernels are compiled for writable arrays.
         given = [np.array(x, order="C") for x in (problem.target, parts.force(problem), problem.pin_targets, guess)]
         step.objective[2] = parts.negative(guess)
         self.positions = np.empty_like(guess)
@@ -185,7 +199,7 @@ class _CompiledAccelerating(Accelerating):
 
 
 class _Any:
-    """Any energies, and any factor."""
+    """Interpreted iteration for all energies and all factors."""
 
     def __init__(self, scheme: Scheme, system: System, base: PreparedLocalGlobal) -> None:
         self._scheme, self._base, self._objective = scheme, base, Objective(system)

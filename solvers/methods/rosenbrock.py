@@ -1,14 +1,14 @@
-"""Rosenbrock methods: linearly implicit, one factorisation a step and one solve a stage, no iteration.
+"""Rosenbrock methods: linearly implicit, with one factorisation per step, one solve per stage, no iteration.
 
 For p' = v, M v' = F(p) - D v and s = 1/(gamma h), a stage (u, w) of positions and velocities solves
 
     (s^2 M + s D + K) u = F(P) - D V + M sum c/h w_j + (s M + D) r,    w = s u - r,    r = V + sum c/h u_j
 
-with P = p + sum a u_j and V = v + sum a w_j: the velocities are eliminated, so the matrix is that of a step problem,
-and is factorised at the step's start. K is the exact Hessian of the energies there, which the orders need. A step that
-is too long for compressed springs may leave it no Cholesky factor. Steps by an error are halved then; steps of one
-length take away from the springs' negative lateral stiffness (`solvers.core.definite`), where ROS2 alone keeps its
-order.
+with P = p + sum a u_j and V = v + sum a w_j. The velocities are eliminated, so the matrix is that of a step problem. It
+is factorised at the start of the step. K is the exact Hessian of the energies there, as the order conditions require.
+If the step is too long for compressed springs, it may have no Cholesky factor. Adaptive steps are then halved. Fixed
+steps reduce the springs' negative lateral stiffness (`solvers.methods.newton.hessian_regularisation`); only ROS2
+retains its order in that case.
 """
 
 from __future__ import annotations
@@ -40,15 +40,20 @@ from solvers.problem import (
 )
 
 _CAUTION, _FEWEST, _LARGEST = 0.9, 0.2, 6.0
-"""Of the step that an error allows; what steps shrink and grow by at once, at most."""
+"""Safety factor of the step size; bounds of its decrease and increase from one step to the next."""
 _FLOOR, _MOST = 1e-9, 100_000
-"""Of a frame, the shortest step; steps that may be tried in a frame."""
+"""Shortest step, relative to a frame; maximum number of attempted steps in a frame."""
 
 
 @dataclass(frozen=True)
 class _Linear:
-    """refine: steps of one length in a frame, where `error` is 0; error: of each step, root mean square over the
-    vertices, in parts of the springs' mean length, an error of velocity counting by what it moves in a frame."""
+    """Base class of the Rosenbrock solvers.
+
+    Args:
+        refinement_factor: number of fixed steps in a frame, used if `error_tolerance` is 0.
+        error_tolerance: error of each adaptive step, root mean square over the vertices, relative to the mean spring
+            length. An error of velocity counts by the displacement that it causes in a frame.
+    """
 
     refine: int = 1
     error: float = 0.0
@@ -59,8 +64,12 @@ class _Linear:
     table: ClassVar[Rosenbrock]
 
     def prepare(self, system: System) -> PreparedRosenbrock:
-        """Raises Unsupported for integrators other than `own` and implicit Euler, vertices without mass that are not
-        pinned, and energies that depend on where a step starts, but for drag on vertices."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: for integrators other than `own` and implicit Euler, for unpinned vertices without mass, and
+                for energies that depend on the start of a step, except drag on vertices.
+        """
         if self.refine < 1 or not 0.0 <= self.error <= 1.0:
             raise Unsupported(
                 f"{self.name}: refine came as {self.refine} and error as {self.error}; wanted 1 or more, and a number "
@@ -94,7 +103,7 @@ def _about(authors: str, year: int, title: str, doi: str) -> About:
 
 @dataclass(frozen=True)
 class Ros2(_Linear):
-    """Two stages of order 2, for any matrix; L-stable."""
+    """ROS2: two stages, order 2 for any matrix; L-stable."""
 
     name: ClassVar[str] = "ros2"
     table: ClassVar[Rosenbrock] = ROS2
@@ -108,7 +117,7 @@ class Ros2(_Linear):
 
 @dataclass(frozen=True)
 class Ros3P(_Linear):
-    """Three stages of order 3; A-stable."""
+    """ROS3P: three stages, order 3; A-stable."""
 
     name: ClassVar[str] = "ros3p"
     table: ClassVar[Rosenbrock] = ROS3P
@@ -122,7 +131,7 @@ class Ros3P(_Linear):
 
 @dataclass(frozen=True)
 class Rodas(_Linear):
-    """Six stages of order 4 with an error of order 3; L-stable, and ends in its last stage."""
+    """RODAS: six stages, order 4 with an error estimate of order 3; L-stable and stiffly accurate."""
 
     name: ClassVar[str] = "rodas"
     table: ClassVar[Rosenbrock] = RODAS
@@ -138,7 +147,7 @@ class Rodas(_Linear):
 
 
 class Told(NamedTuple):
-    """Steps accepted and rejected, the last one's length [s], and the time of the frame that was reached [s]."""
+    """Counts of accepted and rejected steps, the last step size [s], and the reached time of the frame [s]."""
 
     accepted: int
     rejected: int
@@ -147,7 +156,7 @@ class Told(NamedTuple):
 
 
 class _Moved(NamedTuple):
-    """Positions and velocities (n, 3) after a step, and its error of both."""
+    """Positions and velocities (n, 3) after a step, and its error estimate for both."""
 
     positions: Positions
     velocity: Positions
@@ -156,8 +165,15 @@ class _Moved(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PreparedRosenbrock(Iterative):
-    """objective: of the energies alone; drag: d (n,) [N s/m]; refine: steps in a frame; tolerance [m]: of each where
-    they differ, else 0; factorisations: of a step that is tried."""
+    """A Rosenbrock method, prepared for a system.
+
+    Attributes:
+        fixed_objective: of the energies without drag.
+        drag: coefficients d (n,) [N s/m].
+        refinement_factor: number of fixed steps in a frame.
+        error_tolerance: error of each adaptive step [m], 0 for fixed steps.
+        num_factorisations: factorisations of an attempted step.
+    """
 
     residual_of: ClassVar[ResidualOf] = "none"
     factorisations: ClassVar[int] = 1
@@ -173,26 +189,35 @@ class PreparedRosenbrock(Iterative):
 
     @property
     def order(self) -> int:
-        """Of the error."""
+        """Order of the error estimate."""
         return self.table.order
 
     @property
     def evaluations(self) -> int:
-        """Solves of a step."""
+        """Number of solves in a step."""
         return len(self.table.a)
 
     def within(self, tolerance: float) -> PreparedRosenbrock:
-        """The same with steps by an error of each [m]."""
+        """Return a copy with adaptive steps of the given error tolerance [m]."""
         return replace(self, tolerance=tolerance)
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """The whole frame."""
+        """Start a solve whose only iteration is the whole frame."""
         return Whole(*self.step(problem)[:2])
 
     def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, Told]:
-        """Positions and velocities (n, 3) at the frame's end, and what it took. h: the first step [s] of those that go
-        by an error, the frame if left out. Exact pins move evenly in a frame. Raises RuntimeError where no step is
-        short enough for the error."""
+        """Integrate one frame; exact pins move at constant velocity.
+
+        Args:
+            problem: the step problem.
+            h: first step size [s] of an adaptive method, the frame by default.
+
+        Returns:
+            Positions and velocities (n, 3) at the end of the frame, and step statistics.
+
+        Raises:
+            RuntimeError: if no step size meets the error tolerance.
+        """
         frame = self.system.time_step
         within = _Frame(self, problem)
         p, v = within.begun()
@@ -226,7 +251,7 @@ class PreparedRosenbrock(Iterative):
 
 
 class _Frame:
-    """One frame: its forces, and where its pins are."""
+    """Integration of one frame: its forces, and the motion of its pins."""
 
     def __init__(self, prepared: PreparedRosenbrock, problem: StepProblem) -> None:
         self._of, self._start = prepared, problem.start
@@ -242,18 +267,18 @@ class _Frame:
         self._free = system.free
 
     def begun(self) -> tuple[Positions, Positions]:
-        """The motion at the frame's start, pins as they move in it."""
+        """Return the motion at the start of the frame, with the velocity of the pins."""
         v = self._start.velocity.copy()
         v[self._held] = self._pace
         return self._start.positions.copy(), v
 
     def carried(self, p: Positions, part: float) -> Positions:
-        """p with its exactly pinned vertices where they are after a part of the frame."""
+        """Return p with exactly pinned vertices moved to their targets at a fraction of the frame."""
         p[self._held] = self._to if part == 1.0 else self._from + part * (self._to - self._from)
         return p
 
     def size(self, made: _Moved) -> float:
-        """The error of a step [m]."""
+        """Return the norm of a step's error estimate [m]."""
         parts = (made.error[0][self._free], self._frame * made.error[1][self._free])
         with np.errstate(over="ignore", invalid="ignore"):
             found = (sum(float((x**2).sum()) for x in parts) / max(1, 3 * len(self._free))) ** 0.5
@@ -265,8 +290,17 @@ class _Frame:
         raise NotPositiveDefinite(f"after {time:.6g} s of the frame the Hessian is not finite, or nothing balances it")
 
     def moved(self, p: Positions, v: Positions, h: float, *, exact: bool = True) -> _Moved | None:
-        """A step of h [s] from positions p and velocities v; None where the matrix has no factor.
-        exact: whether it must be the exact one."""
+        """Attempt one step.
+
+        Args:
+            p: positions (n, 3) [m].
+            v: velocities (n, 3) [m/s].
+            h: step size [s].
+            exact: whether the exact Hessian is required.
+
+        Returns:
+            The motion after the step, None if the matrix has no factor.
+        """
         table, step, m, d = self._of.table, self._step, self._mass, self._drag
         s = 1.0 / (table.gamma * h)
         hessian = step.hessian(p)
@@ -292,7 +326,7 @@ class _Frame:
 
 
 def _sum(x: Positions, weights: tuple[float, ...], parts: list[Positions], factor: float = 1.0) -> Positions:
-    """x + factor sum_j weights_j parts_j, as an array of its own."""
+    """Return x + factor sum_j weights_j parts_j as a new array."""
     out = x.copy()
     for weight, part in zip(weights, parts, strict=False):
         if weight:

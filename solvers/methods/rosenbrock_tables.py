@@ -1,15 +1,15 @@
-"""Coefficients of Rosenbrock methods for y' = F(y), in the form that needs no product with the Jacobian J.
+"""Coefficients of Rosenbrock methods for y' = F(y), in the form without products with the Jacobian J.
 
     (1/(gamma h) - J) u_i = F(y + sum_(j<i) a_ij u_j) + sum_(j<i) c_ij/h u_j,    y' = y + sum_i m_i u_i
 
-(Hairer and Wanner, Solving Ordinary Differential Equations II, section IV.7, 7.25). The error is h sum_i e_i u_i of the
-embedded method's difference.
+(Hairer and Wanner, Solving Ordinary Differential Equations II, section IV.7, 7.25). The error estimate is
+h sum_i e_i u_i, the difference from the embedded method.
 
     ROS2     Verwer, Spee, Blom and Hundsdorfer 1999, "A second-order Rosenbrock method applied to photochemical
-             dispersion problems", with the smaller gamma of the two that are L-stable; of order 2 for any matrix J
+             dispersion problems", with the smaller of the two gammas that are L-stable; order 2 for any matrix J
     ROS3P    Lang and Verwer 2001, "ROS3P: an accurate third-order Rosenbrock solver designed for parabolic problems":
-             A-stable, keeps 0.73 of the highest frequencies a step
-    RODAS    Hairer and Wanner, the same book, section IV.7 and its code RODAS: L-stable and stiffly accurate
+             A-stable, damps the highest frequencies by a factor of 0.73 per step
+    RODAS    Hairer and Wanner, section IV.7 of the same book and the code RODAS: L-stable and stiffly accurate
 """
 
 from __future__ import annotations
@@ -21,7 +21,14 @@ Row = tuple[float, ...]
 
 @dataclass(frozen=True, slots=True)
 class Rosenbrock:
-    """order, and that of the embedded method; gamma; a and c: rows of 0 to s - 1; m and e: (s,)."""
+    """Coefficients of a Rosenbrock method.
+
+    Attributes:
+        order, embedded_order: orders of the method and of the embedded method.
+        gamma: diagonal coefficient.
+        a, c: rows of 0 to s - 1 entries.
+        m, e: weights of the solution and of the error estimate (s,).
+    """
 
     order: int
     embedded: int

@@ -1,15 +1,15 @@
-"""Symplectic Euler, in as many substeps h as stability asks for.
+"""Symplectic Euler with the number of substeps h that stability requires.
 
     v <- v + h M^-1 (f - grad E(p)),    p <- p + h v
 
 It is stable while h < 2/omega for the largest omega^2 of M^-1 Hessian (Hairer, Lubich and Wanner, Geometric Numerical
-Integration, section I.5). Springs are stiffest when stretched, Hessian <= A'KA, and the eigenvalues of M^-1 A'KA, which
-are those of K^(1/2) A M^-1 A'K^(1/2), are at most the largest sum of a row (Gershgorin, rows scaled by K^(1/2)):
+Integration, section I.5). Springs are stiffest under tension, Hessian <= A'KA. The eigenvalues of M^-1 A'KA equal those
+of K^(1/2) A M^-1 A'K^(1/2). The largest row sum bounds them (Gershgorin, rows scaled by K^(1/2)):
 
     omega^2 <= max over springs (i, j) of s_i + s_j,    s_i = sum of the stiffnesses at i / m_i, 0 if i is pinned
 
-The bound is that of a spring, and to 3 % of chains and nets; with shear and bending it is up to 1.12 times the largest
-omega of a sheet, and 1.28 times that of a solid.
+The bound is sharp for a single spring, and within 3 % for chains and nets. With shear and bending springs it is up to
+1.12 times the largest omega of a sheet, and 1.28 times that of a solid.
 """
 
 from __future__ import annotations
@@ -31,17 +31,19 @@ from solvers.kernels.springs import Bundles
 from solvers.problem import Positions, Prepared, ResidualOf, StepProblem, System, Unsupported
 
 _SAFETY = 0.95
-"""Of the limit's h: at the limit itself a vibration neither grows nor keeps its size, and springs are not linear."""
+"""Fraction of the stability limit: at the limit a vibration neither grows nor decays, and springs are nonlinear."""
 
 _MOST = 1e10
-"""Springs that a step may go through, some tens of seconds: compiled code cannot be interrupted meanwhile."""
+"""Maximum number of spring evaluations in a step, tens of seconds: compiled code cannot be interrupted meanwhile."""
 
 
 @dataclass(frozen=True)
 class SymplecticEuler:
-    """Symplectic Euler: one iterate, the whole step, whatever the stop rule and the first guess. Pins by
-    penalty are taken to be exact, for their weight would ask for the shortest substeps; pins move evenly, and forces
-    stay."""
+    """Symplectic Euler: one iterate, the whole step, independent of stop rule and initial guess.
+
+    Penalty pins are treated as exact, because their weight would require the shortest substeps. Pins move at constant
+    velocity, and forces are constant within a step.
+    """
 
     minimises: ClassVar[bool] = False
     descends: ClassVar[bool] = False
@@ -58,8 +60,12 @@ class SymplecticEuler:
     )
 
     def prepare(self, system: System) -> Prepared:
-        """Raises Unsupported for energies other than springs, integrators other than implicit Euler, vertices without
-        mass that are not pinned, and steps that would take too many substeps."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: for energies other than springs, integrators other than implicit Euler, unpinned vertices
+                without mass, and steps that need too many substeps.
+        """
         springs, n = only_springs(system, "symplectic-euler"), system.vertices
         vertex_terms.require_implicit_euler(system, "symplectic-euler")
         vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), "symplectic-euler")
@@ -79,7 +85,12 @@ class SymplecticEuler:
 
 
 def frequency_bound(system: System, springs: Springs) -> float:
-    """A bound of the largest angular frequency [rad/s] that the springs have in any shape, penalty pins held."""
+    """Return an upper bound of the largest angular frequency [rad/s] of the springs in any shape.
+
+    Args:
+        system: the system; vertices pinned by penalty count as fixed.
+        springs: its springs.
+    """
     edges = springs.edges[springs.edges[:, 0] != springs.edges[:, 1]]
     k = springs.stiffness[springs.edges[:, 0] != springs.edges[:, 1]]
     stiffness = np.bincount(edges.ravel(), np.repeat(k, 2), system.vertices)
@@ -89,7 +100,7 @@ def frequency_bound(system: System, springs: Springs) -> float:
 
 @dataclass(frozen=True, eq=False)
 class PreparedSymplecticEuler(Iterative):
-    """bundles: of the springs at unpinned vertices; substeps: of a step."""
+    """Symplectic Euler, prepared: SIMD packets of the springs at unpinned vertices, and substeps per step."""
 
     residual_of: ClassVar[ResidualOf] = "none"
 
@@ -100,7 +111,7 @@ class PreparedSymplecticEuler(Iterative):
     facts: dict[str, float] = field(default_factory=dict)
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative; the whole step."""
+        """Start a solve whose only iteration is the whole step."""
         return Whole(*self._step(problem))
 
     def _step(self, problem: StepProblem) -> tuple[Positions, Positions]:

@@ -1,22 +1,19 @@
-"""Vertex block descent (Chen, Liu, Yang and Yuksel 2024): one vertex after another takes a Newton step of its own.
+"""Vertex block descent (Chen, Liu, Yang and Yuksel 2024): one Newton step per vertex, one vertex after another.
 
     B_i d_i = -grad_i g(p),   p_i += d_i,   B_i = held_i I + sum over its springs of k (nn' + max(0, 1 - r/l) (I - nn'))
 
-with n the direction and l the length of a spring; compressed springs lose their negative lateral curvature, so B_i is
-positive definite. A quadratic form adds its own entry of the diagonal, contact its exact second derivatives, for it
-acts on single vertices, and a projective energy of elements (strain limits, dashpots) those of its elements that a
-vertex belongs to. The paper skips the line search. Here a step that would raise the energy gives way to that of
-the majorant (held_i + sum of k) I, which cannot: so no sweep raises the objective. What has no such majorant, because
-it is no projective energy, is refused.
-With `device: cuda` the same iterates come from `solvers.cuda.vbd`.
-Vertices go by colour: none is joined by a spring, a form or an element to another of its colour.
-
-Sweeps are accelerated by Chebyshev's semi-iteration with the spectral radius rho (Wang 2015),
+with n the direction and l the length of a spring. Compressed springs lose their negative lateral curvature, so B_i is
+positive definite. A quadratic form adds its diagonal entry. Contact adds its exact second derivatives, since it acts on
+single vertices. A projective energy of elements (strain limits, dashpots) adds those of the vertex's elements. The
+paper has no line search. Here a step that would raise the energy is replaced by that of the majorant
+(held_i + sum of k) I, which cannot raise it; hence no sweep raises the objective. Energies without such a majorant,
+that is, energies that are not projective, are not supported. `device: cuda` computes the same iterates in
+`solvers.cuda.device_vbd`. Vertices are processed by colour: no spring, form or element joins two of the same colour.
 
     p_{k+1} = w_{k+1} (sweep(p_k) - p_{k-1}) + p_{k-1},    w_1 = 1,  w_2 = 2/(2 - rho^2),  w_{k+1} = 4/(4 - rho^2 w_k),
 
-safeguarded: an extrapolation that would raise the objective above that of p_k is not taken, and the factors begin
-again at w_1. With these restarts rho needs no tuning: too large a one is no worse than the right one.
+with a safeguard: an extrapolation that would raise the objective above that of p_k is rejected, and the weights restart
+at w_1. With these restarts rho needs no tuning: overestimates perform as well as the exact value.
 """
 
 from __future__ import annotations
@@ -53,14 +50,15 @@ if TYPE_CHECKING:
     from solvers.core.fixed_objective import Objective
 
 _FAR = 1e100
-"""Where springs end that fill up bundles: at no vertex, whatever the unit of length."""
+"""Coordinate at which padding springs of a packet end: far from all vertices, whatever the unit of length."""
 
 
 @dataclass(frozen=True)
 class VertexBlockDescent(Precise):
-    """Vertex block descent over springs, quadratic forms, elements of projective energies, and contact.
+    """Vertex block descent for springs, quadratic forms, elements of projective energies, and contact.
 
-    spectral_radius: rho of the acceleration, at least 0 and less than 1; 0 does not accelerate.
+    Args:
+        spectral_radius: rho of the Chebyshev acceleration, in [0, 1); 0 disables it.
     """
 
     minimises: ClassVar[bool] = True
@@ -84,7 +82,12 @@ class VertexBlockDescent(Precise):
             raise ValueError(f"spectral_radius: should be at least 0 and less than 1, not {self.spectral_radius}")
 
     def prepare(self, system: System) -> Prepared:
-        """Raises Unsupported for other energies, NotPositiveDefinite."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: for other energies.
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+        """
         if self.device == "cuda":
             from solvers.cuda.device import ready  # for those who ask for it
 
@@ -121,9 +124,16 @@ class VertexBlockDescent(Precise):
 
 @dataclass(frozen=True, eq=False)
 class PreparedVertexBlockDescent(Iterative):
-    """parts: of the energies; beside: those of elements; blocks: of the free vertices; row (n,): where each vertex is
-    in them; held: what inertia and pins hold each row with [N/m]; majorant (n,): of all but contact [N/m]; measure: one
-    iteration of local-global from p tells the residual at p, and is asked for nothing else.
+    """Vertex block descent, prepared for a system.
+
+    Attributes:
+        spring_form: the springs and quadratic forms.
+        vertex_elements: the elements of the other energies.
+        colour_packets: packets of the free vertices by colour.
+        row_of_vertex: (n,), row of each vertex in the packets.
+        anchor_stiffness: inertia and penalty pins of each row [N/m].
+        majorant: (n,) [N/m], of all energies except contact.
+        residual_solver: computes the residual at p by one local-global iteration; it has no other use.
     """
 
     system: System
@@ -139,7 +149,7 @@ class PreparedVertexBlockDescent(Iterative):
 
     @property
     def facts(self) -> dict[str, float]:
-        """Exact counts of what was built."""
+        """Exact counts of the prepared data."""
         return self.measure.facts
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
@@ -160,7 +170,7 @@ class PreparedVertexBlockDescent(Iterative):
         return Objective(self.system)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """See Iterative; by an iteration of local-global, where nothing is touched."""
+        """Return the residual at p, by a local-global iteration if no contact is active."""
         return self.measure.gauge(problem)(p)
 
     def scale(self, problem: StepProblem) -> float:
@@ -168,20 +178,20 @@ class PreparedVertexBlockDescent(Iterative):
         return largest(problem) * float(self.majorant[self.system.unpinned].sum()) ** 0.5
 
     def in_rows(self, x: Positions) -> NDArray[np.float64]:
-        """x (n, 3) in rows of four, and the two rows that fill up bundles."""
+        """Pack x (n, 3) into rows of four numbers, followed by the two padding rows of the packets."""
         out = aligned(4 * (len(x) + 2))
         out.reshape(-1, 4)[self.row, :3] = x
         return out
 
     def spaces(self, contacts: list[ContactEnergy]) -> HalfSpaces:
-        """What is touched."""
+        """Build the half-spaces of the contacts."""
         from solvers.contact.bundles import half_spaces  # for those who need it
 
         return half_spaces(contacts, self.row, self.blocks.bundles, self.blocks.unknowns)
 
 
 class Sweeps(Iterating):
-    """Sweeps over all vertices in one step problem."""
+    """State of a solve: sweeps over all vertices in one step problem."""
 
     def __init__(self, prepared: PreparedVertexBlockDescent, problem: StepProblem, guess: Positions) -> None:
         contacts, blocks = touching(problem), prepared.blocks
@@ -209,14 +219,14 @@ class Sweeps(Iterating):
         return self._gauge(self.positions)
 
     def alone(self, p: Positions) -> Positions:
-        """See `solvers.contact.pairs_vbd.Sweeps`."""
+        """Return the positions (n, 3) after a sweep from p without contact planes."""
         if p is not self.positions:
             self._begin_at(p)
         self.sweep(1)
         return self.positions
 
     def pushed(self, p: Positions, planes: Planes) -> Positions:
-        """See `solvers.contact.pairs_vbd.Sweeps`."""
+        """Return the positions (n, 3) after a sweep from p with the given contact planes."""
         from solvers.contact.bundles import of_planes
 
         made = self._prepared
@@ -230,19 +240,19 @@ class Sweeps(Iterating):
         return self.positions
 
     def _begin_at(self, p: Positions) -> None:
-        """Forget all sweeps before."""
+        """Restart the sweeps at p."""
         self._rows.reshape(-1, 4)[self._prepared.row, :3] = p
         self._work.omega[0], self._work.level[0] = 0.0, np.nan
 
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """See Iterating; all at once where no residual may end them."""
+        """Run iterations within the limits, in one call if no residual can end them."""
         if limits.wanted == EACH:
             return super().iterate(limits)
         self.sweep(limits.iterations)
         return limits.iterations, self.residual() if limits.wanted == LAST else float("nan"), ITERATIONS
 
     def sweep(self, iterations: int) -> None:
-        """That many."""
+        """Run sweeps over all vertices."""
         made = self._prepared
         made.beside.kernel(
             self._blocks,

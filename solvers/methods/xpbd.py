@@ -1,19 +1,18 @@
-"""Extended position based dynamics: the springs as compliant constraints, one after another.
+"""Extended position based dynamics (XPBD): springs as compliant constraints, projected one after another.
 
-XPBD (Macklin, Mueller and Chentanez 2016) begins where the vertices would go without springs, and with no tension. In
-each iteration it goes through all springs, and moves the two ends of each so that its tension t, which is added up over
-the iterations, becomes k (|p_i - p_j| - r):
+XPBD (Macklin, Mueller and Chentanez 2016) starts at the positions without springs, with zero tensions. An iteration
+passes over all springs and moves the two ends of each spring, so that its accumulated tension t becomes
+k (|p_i - p_j| - r):
 
     dt = (k (|p_i - p_j| - r) - t) / (1 + k (1/held_i + 1/held_j)),    p_i -= dt/held_i n,    p_j += dt/held_j n
 
-with n the spring's direction and held = c m/dt^2 + w, so that pins of any weight need no constraints of their own
-(see `solvers.core.vertex_terms`); this is the paper's formula in forces, lambda = -t dt^2, and holds from k = 0 to the
-largest. Small steps (Macklin et al. 2019) divides the time step instead, and does one iteration in each substep.
+with n the direction of the spring and held = c m/dt^2 + w, so that pins of any weight need no separate constraints (see
+`solvers.methods.base.vertex_terms`). This is the paper's formula in terms of forces, lambda = -t dt^2, and valid from
+k = 0 to the largest k. Small steps (Macklin et al. 2019) divides the time step instead, with one iteration per substep.
 
-Neither minimises the step's objective. Tensions are added along directions that turn as the iteration goes on, and
-the terms that would correct for that are left out: the fixed point is the minimiser where springs do not turn (a
-straight chain), and near to it where they turn little in a step. With `device: cuda` the same iterates come from
-`solvers.cuda.xpbd`.
+Neither minimises the objective of the step. Tensions are accumulated along directions that rotate during the iteration,
+without correction terms. The fixed point is the minimiser if springs do not rotate (a straight chain), and close to it
+if they rotate little in a step. `device: cuda` computes the same iterates in `solvers.cuda.device_xpbd`.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from solvers.problem import Positions, Prepared, ResidualOf, StepProblem, System
 
 @dataclass(frozen=True)
 class Xpbd(Precise):
-    """XPBD; the first guess is not used, nor is a tolerance."""
+    """XPBD; uses neither the initial guess nor a tolerance."""
 
     minimises: ClassVar[bool] = False
     descends: ClassVar[bool] = False
@@ -51,7 +50,11 @@ class Xpbd(Precise):
     )
 
     def prepare(self, system: System) -> Prepared:
-        """Raises Unsupported for energies other than springs, and for vertices without mass that are not pinned."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: for energies other than springs, and for unpinned vertices without mass.
+        """
         held = vertex_terms.held(system)
         if self.device == "cuda":
             return _on_device(self, system, held, "xpbd", small=False)
@@ -61,8 +64,11 @@ class Xpbd(Precise):
 
 @dataclass(frozen=True)
 class XpbdSmallSteps(Precise):
-    """XPBD in small steps: as many substeps of one iteration as the stop rule has iterations. The k-th iterate is the
-    whole step in k substeps; pins move evenly, and forces stay. The first guess is not used, nor is a tolerance."""
+    """XPBD with small steps: as many substeps of one iteration as the stop rule has iterations.
+
+    The k-th iterate is the whole step in k substeps. Pins move at constant velocity, and forces are constant within a
+    step. Neither the initial guess nor a tolerance is used.
+    """
 
     minimises: ClassVar[bool] = False
     descends: ClassVar[bool] = False
@@ -80,7 +86,11 @@ class XpbdSmallSteps(Precise):
     )
 
     def prepare(self, system: System) -> Prepared:
-        """Raises Unsupported as `Xpbd` does, and for integrators other than implicit Euler."""
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: as for `Xpbd`, and for integrators other than implicit Euler.
+        """
         vertex_terms.require_implicit_euler(system, "xpbd-small-steps")
         held = vertex_terms.held(system)
         if self.device == "cuda":
@@ -91,7 +101,13 @@ class XpbdSmallSteps(Precise):
 
 @dataclass(frozen=True, eq=False)
 class PreparedXpbd(Iterative):
-    """constraints: the springs by colour; compliance: 1/held (n,) [m/N]; ease (m,): see the kernels."""
+    """XPBD, prepared for a system.
+
+    Attributes:
+        coloured_constraints: the springs by colour.
+        vertex_compliance: 1/held (n,) [m/N].
+        constraint_relaxation: (m,), documented with the kernels.
+    """
 
     residual_of: ClassVar[ResidualOf] = "none"
 
@@ -103,12 +119,12 @@ class PreparedXpbd(Iterative):
     facts: dict[str, float] = field(default_factory=dict)
 
     def begin(self, problem: StepProblem, guess: Positions) -> Passes:
-        """See Iterative; from where the vertices would go without springs."""
+        """Start a solve at the positions that the vertices have without springs."""
         return Passes(self, vertex_terms.anchors(problem))
 
 
 class Passes(Iterating):
-    """One pass over all springs after another. tension: t of each (m,) [N], in the order of `constraints`."""
+    """State of an XPBD solve; `spring_tensions` t (m,) [N] in the order of `coloured_constraints`."""
 
     def __init__(self, prepared: PreparedXpbd, p: Positions) -> None:
         self._prepared, self.tension, self.positions = prepared, np.zeros_like(prepared.ease), p
@@ -127,7 +143,7 @@ class Passes(Iterating):
 
 @dataclass(frozen=True, eq=False)
 class PreparedSmallSteps(Iterative):
-    """constraints: the springs by colour."""
+    """XPBD with small steps, prepared; `coloured_constraints` are the springs by colour."""
 
     residual_of: ClassVar[ResidualOf] = "none"
 
@@ -137,11 +153,11 @@ class PreparedSmallSteps(Iterative):
     facts: dict[str, float] = field(default_factory=dict)
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative; from where the step starts."""
+        """Start a solve at the start of the step."""
         return Substeps(self.step, problem)
 
     def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
-        """Positions [m] and velocity [m/s] after the step in so many substeps."""
+        """Integrate the step in `substeps` substeps; return positions [m] and velocities [m/s]."""
         s, pins, start = self.system, self.system.pins, problem.start
         h = s.time_step / substeps
         compliance, ease = _eased(self.constraints, vertex_terms.held(replace(s, time_step=h)))
@@ -154,7 +170,7 @@ class PreparedSmallSteps(Iterative):
 
 
 def _on_device(method: Precise, system: System, held: NDArray[np.float64], solver: str, *, small: bool) -> Prepared:
-    """See `solvers.cuda.xpbd`."""
+    """Prepare the method on a CUDA device (`solvers.cuda.device_xpbd`)."""
     from solvers.cuda.device import ready  # for those who ask for it
 
     ready(solver)
@@ -167,8 +183,11 @@ def _on_device(method: Precise, system: System, held: NDArray[np.float64], solve
 def _prepared(
     system: System, held: NDArray[np.float64], solver: str
 ) -> tuple[kernels.Constraints, NDArray[np.int64], str]:
-    """The springs by colour, the first of each (colours + 1,), and that in words; self-loops, which stretch nothing,
-    are left out."""
+    """Group the springs by colour, without self-loops, which have no elongation.
+
+    Returns:
+        The constraints, the first constraint of each colour (colours + 1,), and a description.
+    """
     springs = only_springs(system, solver)
     vertex_terms.require_mass(system, held, solver)
     keep = np.flatnonzero(springs.edges[:, 0] != springs.edges[:, 1])
@@ -180,7 +199,7 @@ def _prepared(
 def _eased(
     constraints: kernels.Constraints, held: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The compliance 1/held (n,) [m/N], and how far each spring moves of what it would without one, (m,)."""
+    """Compute the compliance 1/held (n,) [m/N], and the relative displacement of each spring (m,)."""
     compliance = 1.0 / held
     i, j = constraints.ends.T
     return compliance, 1.0 / (1.0 + constraints.stiffness * (compliance[i] + compliance[j]))
