@@ -1,1 +1,1 @@
-"""What a scene declares: mesh, material, effects, start and motion, bound to a mesh size."""
+"""Scenes: mesh, material, effects, initial state and motion, built for a mesh size."""

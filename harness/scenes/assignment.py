@@ -1,9 +1,9 @@
-"""Scenes of the University of Toronto mass-spring assignment, read as its own code reads them.
+"""Scenes of the University of Toronto mass-spring assignment, interpreted as its own code does.
 
-Springs: each `f` line where all name two vertices, in file order; otherwise the unique pairs of vertices
+Springs: one per `f` line if all of them name two vertices, in file order; otherwise the unique pairs of vertices
 that share a face, before triangulation, so that a quad has both diagonals. Mass: one value `m` for all
 vertices, or the mixed Voronoi areas of the faces, triangulated as fans, at density 1 (Meyer et al. 2003 in
-libigl's form): a triangle of area T gives each corner the part of it that is nearest to that corner,
+libigl's form). A triangle of area T gives each corner the part that is nearest to that corner,
 
     (|e_j|^2 cot a_j + |e_k|^2 cot a_k) / 8,
 
@@ -27,19 +27,24 @@ from harness.scenes.mesh.scene_json import line_of, read_scene_json
 from harness.scenes.mesh.topology import NO_PAIRS, NO_TRIANGLES, Indices, Points, fan
 
 TIME_STEP = 1 / 30
-"""dt [s]."""
+"""Time step dt [s]."""
 ITERATIONS = 50
-"""Local-global iterations a step; there is no other stop rule."""
+"""Local-global iterations per step; there is no other stop rule."""
 PIN_WEIGHT = 1e10
-"""Penalty weight of a pin [N/m]; pins hold vertices at rest positions."""
+"""Penalty weight of a pin [N/m]; pins fix vertices at their rest positions."""
 FORCE = (0.0, -9.8, 0.0)
-"""External force on every vertex [N], whatever its mass."""
+"""External force on every vertex [N], independent of its mass."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assignment:
-    """A scene. obj: the mesh file; mesh: with `mass` (n,) [kg]; stiffness: of every spring [N/m];
-    pins: the pinned vertices, (q,), from 0, in the order of the file.
+    """A scene of the assignment.
+
+    Attributes:
+        obj_path: the mesh file.
+        mesh: the mesh, with `mass` (n,) [kg].
+        stiffness: of every spring [N/m].
+        pinned_vertices: (q,), zero-based, in file order.
     """
 
     obj: Path
@@ -49,10 +54,12 @@ class Assignment:
 
 
 def read_assignment(path: Path) -> Assignment:
-    """The scene of a JSON file and of the OBJ file that it names.
+    """Read a scene from a JSON file and the OBJ file that it names.
 
-    A vertex that no face uses stays, with no mass unless `m` gives it one. Raises InputError with the file,
-    line and key of each mistake.
+    A vertex that no face uses remains in the mesh, without mass unless `m` is given.
+
+    Raises:
+        InputError: with the file, line and key of each mistake.
     """
     scene = read_scene_json(path)
     obj = path.parent / scene.obj
@@ -75,7 +82,12 @@ def read_assignment(path: Path) -> Assignment:
 
 
 def voronoi_areas(rest: Points, triangles: Indices) -> Points:
-    """The mixed Voronoi area of each vertex, (n,) [m^2]; triangles (f, 3) without area give none."""
+    """Compute the mixed Voronoi area of each vertex, (n,) [m^2].
+
+    Args:
+        rest_positions: (n, 3) [m].
+        triangles: (f, 3); triangles without area contribute nothing.
+    """
     corners = rest[triangles]
     edges = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)  # edge k lies opposite corner k
     squared = np.einsum("fkx,fkx->fk", edges, edges)
@@ -91,7 +103,7 @@ def voronoi_areas(rest: Points, triangles: Indices) -> Points:
 
 
 def _pins(one_based: list[int], n: int, path: Path) -> NDArray[np.int64]:
-    """Vertices from 0; refuses those that do not exist, and repetitions, which would double a penalty."""
+    """Convert pins to zero-based vertices; reject missing vertices and repetitions, which would double a penalty."""
     seen: set[int] = set()
     mistakes: list[tuple[int, str]] = []
     for position, vertex in enumerate(one_based):

@@ -1,4 +1,4 @@
-"""A scene bound to a mesh size: what the step formula needs, and nothing that the scene does not call for."""
+"""Build the simulated system of a scene for a mesh size, with only the terms that the scene requires."""
 
 from __future__ import annotations
 
@@ -32,23 +32,29 @@ if TYPE_CHECKING:  # for those who have any
 _LOG = logging.getLogger("springbench")
 AT_REST = Rest()
 COARSEST = 9
-"""The size from which on a mesh is not halved: a solve there costs next to nothing."""
+"""Smallest mesh size that is coarsened for nested iteration: below it, a solve costs next to nothing."""
 LONG = 1.0
-"""Time steps [s] beyond it are asked about: what moves in them is over within a few of them."""
+"""Time steps [s] above this value cause a warning: most motion ends within a few of them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is simulated.
+    """A scene, built for one mesh size.
 
-    mesh: at rest; start: how the start differs from that; system: what is factorised; load: the sum of the forces
-    that never change, (n, 3) [N], read-only; forces: those that change; filters: of the velocity;
-    pin_targets: (q, 3) [m], in the order of `system.pins`; moving: which of them move, and how;
-    velocity: of every vertex at the start [m/s], less the start's spin; integrator: its factor and speed are the
-    system's;
-    apart: what may not pass through what, nothing without an effect that sees to it;
-    alternate: the same in every second step, where that is of another length;
-    halved: binds the same on a mesh of half the size, None where there is none.
+    Attributes:
+        mesh: the mesh at rest.
+        start: the deviation of the initial state from the rest state.
+        system: the data that solvers factorise.
+        constant_force: sum of the constant forces, (n, 3) [N], read-only.
+        varying_forces: the other external forces.
+        velocity_filters: changes of the velocity before a step.
+        pin_targets: (q, 3) [m], in the order of `system.pins`.
+        pin_motions: which of the targets move, and how.
+        initial_velocity: of every vertex [m/s], without the start's spin.
+        integrator: the time integrator; its factor and velocity rule are those of the system.
+        intersection_checks: primitives that must not intersect; empty unless an effect prevents intersections.
+        alternate_scene: the same scene with the time step of every second step, if that differs.
+        build_coarser: builds the scene on a mesh of half the size, None if there is none.
     """
 
     mesh: Mesh
@@ -65,24 +71,24 @@ class Scene:
 
     @property
     def self_contact(self) -> bool:
-        """Whether an effect keeps the mesh from passing through itself."""
+        """Whether an effect prevents self-intersection of the mesh."""
         return any(one.beside is None for one in self.apart)
 
     alternate: Scene | None = None
     halved: Callable[[], Scene] | None = None
 
     def at(self, index: int) -> Scene:
-        """The scene in the step that follows step `index`."""
+        """Return the scene of the step that follows step `step_index`."""
         return self.alternate if self.alternate and index % 2 else self
 
     def time(self, index: int) -> float:
-        """When step `index` ends, and the next begins [s]; 0 is the start."""
+        """Return the time [s] at which step `step_index` ends and the next starts; 0 is the start."""
         if not self.alternate:
             return index * self.system.time_step
         return (index + 1) // 2 * self.system.time_step + index // 2 * self.alternate.system.time_step
 
     def pins_at(self, time: float) -> Positions:
-        """Where the pins want their vertices at a time [s], (q, 3) [m]."""
+        """Return the pin targets at a time [s], (q, 3) [m]."""
         if not self.moving:
             return self.pin_targets
         targets = self.pin_targets.copy()
@@ -91,7 +97,7 @@ class Scene:
         return targets
 
     def pins_moving(self, time: float) -> Positions:
-        """How fast the pins' targets move at a time [s], (q, 3) [m/s]."""
+        """Return the velocities of the pin targets at a time [s], (q, 3) [m/s]."""
         velocity = np.zeros_like(self.pin_targets)
         for rows, motion in self.moving:
             velocity[rows] = motion.velocity(self.pin_targets[rows], time)
@@ -99,8 +105,7 @@ class Scene:
 
     @cached_property
     def springs(self) -> Springs:
-        """All springs that have stiffness: effect by effect, each in the mesh's order; last those that are exact, whose
-        stiffness is infinite."""
+        """All springs with stiffness, by effect and in mesh order; then length constraints with infinite stiffness."""
         exact = [x for x in self.system.lengths if (x.low == x.high).all()]
         return Springs.joined(
             [
@@ -111,10 +116,16 @@ class Scene:
 
 
 def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, warns: bool = True) -> Scene:
-    """Bind a scene to a mesh of one size, which means nothing to a mesh from a file, and to an integrator by name.
+    """Build a scene for a mesh size and an integrator.
 
-    warns: whether what is allowed and seldom meant is logged; not where the program chooses the time step. Raises
-    InputError where the scene's parts do not fit together.
+    Args:
+        spec: the scene.
+        size: mesh size, ignored by a mesh from a file.
+        integrator: name of the time integrator.
+        log_warnings: whether valid but unusual values are logged; False if the program chooses the time step.
+
+    Raises:
+        InputError: if the parts of the scene do not fit together.
     """
     spec = spec.opened()
     mesh, method = _mesh(spec, size), find(integrator)
@@ -157,7 +168,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, war
 
 
 def _halved(spec: SceneSpec, size: int, integrator: str) -> Callable[[], Scene] | None:
-    """None for meshes of one size alone, the coarsest ones, and effects that name vertices by their numbers."""
+    """Return a builder of the coarser scene; None for fixed-size and coarse meshes and effects with vertex indices."""
     half = (size + 1) // 2
     numbered = any(isinstance(e, Selection) and (e.indices or e.every > 1) for e in spec.effects)
     return None if half < COARSEST or numbered else partial(build, spec, half, integrator)
@@ -188,7 +199,7 @@ def _bound(spec: SceneSpec, i: int, mesh: Mesh, mass: NDArray[np.float64]) -> Co
 
 
 def _check(parts: list[Contribution], start: Positions) -> None:
-    """Raise InputError where an effect does not fit the start (n, 3) [m] or the pins."""
+    """Raise InputError if an effect is incompatible with the start (n, 3) [m] or the pins."""
     pins = [pin for part in parts for pin in part.pins]
     for i, part in enumerate(parts):
         try:
@@ -199,7 +210,7 @@ def _check(parts: list[Contribution], start: Positions) -> None:
 
 
 def _single(spec: SceneSpec, parts: list[Contribution]) -> None:
-    """Raise InputError where two effects are what a scene can have but once."""
+    """Raise InputError if two effects provide a feature that a scene can have only once."""
     first: dict[str, int] = {}
     for i, part in enumerate(parts):
         for what in part.once:
@@ -209,7 +220,7 @@ def _single(spec: SceneSpec, parts: list[Contribution]) -> None:
 
 
 def _ends(parts: list[Contribution], method: integrators.AnyIntegrator, name: str) -> None:
-    """Raise InputError where an effect asks for unknowns at the step's end, and the integrator has others."""
+    """Raise InputError if an effect requires stages at the end of the step and the integrator has others."""
     there = [n for n, known in integrators.INTEGRATORS.items() if getattr(known, "when", 0.0) == 1.0 and n != "own"]
     for i, part in enumerate(parts):
         if part.ends and getattr(method, "when", 0.0) != 1.0:
@@ -218,7 +229,7 @@ def _ends(parts: list[Contribution], method: integrators.AnyIntegrator, name: st
 
 
 def _doubt(spec: SceneSpec) -> None:
-    """Say of what is allowed, and seldom meant."""
+    """Warn about valid but unusual values."""
     if spec.time_step > LONG:
         _LOG.warning("%s: a time step of %g s is long; is it meant in seconds?", spec.path.name, spec.time_step)
     for i, effect in enumerate(spec.effects):
@@ -242,7 +253,7 @@ def _mass(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:
 
 
 def _require_determined(system: System, mesh: Mesh) -> None:
-    """Raise InputError where nothing determines the position of a vertex without mass."""
+    """Raise InputError if a vertex without mass has an undetermined position."""
     if system.mass.all():
         return
     try:
@@ -255,7 +266,7 @@ def _require_determined(system: System, mesh: Mesh) -> None:
 def _pins(
     parts: list[Contribution], mesh: Mesh
 ) -> tuple[Pins, Positions, tuple[tuple[NDArray[np.int64], KeyedMotion], ...]]:
-    """All pins by vertex, their targets, and which move; a vertex may be named twice if both times mean the same."""
+    """Merge all pins by vertex, with targets and motions; duplicates must agree."""
     pins: list[Pin] = [pin for part in parts for pin in part.pins]
     if not pins:
         return Pins(), np.empty((0, 3)), ()

@@ -1,10 +1,10 @@
-"""Whether meshes pass through themselves or each other: edges against triangles, told exactly, by code that no solver
-shares.
+"""Exact intersection tests of meshes, edges against triangles, independent of all solver code.
 
-Two convex bodies are apart where an axis separates them. For an edge and a triangle the axes to try are the normal,
-the products of the edge with the sides, and in the plane those across the sides and across the edge: where one of them
-shows a gap beyond round-off, they are apart. What is left is decided in rational numbers, by signs of determinants
-(Guigue and Devillers 2003); to touch is to intersect. Pairs that share a vertex are left out.
+Two convex bodies are disjoint if an axis separates them. For an edge and a triangle the candidate axes are the normal,
+the cross products of the edge with the sides, and in the plane the normals of the sides and of the edge. If one of them
+shows a gap beyond round-off, the bodies are disjoint. The remaining pairs are decided in rational arithmetic, by signs
+of determinants (Guigue and Devillers 2003); contact without overlap counts as an intersection. Pairs that share a
+vertex are excluded.
 """
 
 from __future__ import annotations
@@ -24,28 +24,44 @@ Indices = NDArray[np.int64]
 Crossing = tuple[tuple[int, int], tuple[int, int, int]]
 
 _ROUND = 64.0 * np.finfo(np.float64).eps
-"""Of the coordinates about the pair: a gap beyond this along a unit axis is no round-off."""
+"""Round-off relative to the coordinates of the pair: a larger gap along a unit axis is significant."""
 
 _AT_ONCE = 200_000
-"""Pairs that are looked at together."""
+"""Number of pairs tested per chunk."""
 
 
 @dataclass(frozen=True, eq=False)
 class Apart:
-    """What may not pass through what: edges (m, 2) through triangles (f, 3) of a mesh, each pair once, by vertices of
-    the mesh and of what follows them: beside, where that is at a time [s], (o, 3) [m]."""
+    """Primitives that must not intersect.
+
+    Attributes:
+        edges_and_triangles: edges (m, 2) and triangles (f, 3) to test against each other, each pair once; vertices of
+            the mesh, followed by those of `obstacle_positions`.
+        obstacle_positions: returns the obstacle vertices (o, 3) [m] at a time [s].
+    """
 
     pairs: tuple[tuple[Indices, Indices], ...]
     beside: Callable[[float], Array] | None = None
 
     def crossings(self, p: Array, time: float) -> list[Crossing]:
-        """The edges that meet triangles at positions p (n, 3) [m] of the mesh at a time [s]."""
+        """Return the edges that intersect triangles.
+
+        Args:
+            p: positions of the mesh (n, 3) [m].
+            time: [s].
+        """
         every = p if self.beside is None else np.concatenate([p, self.beside(time)])
         return [found for edges, triangles in self.pairs for found in crossings(every, edges, triangles)]
 
 
 def crossings(p: Array, edges: Indices, triangles: Indices) -> list[Crossing]:
-    """The edges (m, 2) that meet triangles (f, 3) at positions p (n, 3) [m], and with which, in their order."""
+    """Return the edges that intersect triangles, with those triangles, sorted.
+
+    Args:
+        p: positions (n, 3) [m].
+        edges: (m, 2).
+        triangles: (f, 3).
+    """
     found: list[Crossing] = []
     if not (len(edges) and len(triangles)):
         return found
@@ -61,7 +77,7 @@ def crossings(p: Array, edges: Indices, triangles: Indices) -> list[Crossing]:
 
 
 def _near(p: Array, edges: Indices, triangles: Indices) -> Iterator[tuple[Indices, Indices]]:
-    """Edges and triangles that share no vertex and whose boxes overlap, by their numbers, some at a time."""
+    """Yield chunks of edges and triangles, by index, that share no vertex and have overlapping boxes."""
     a, b = p[edges], p[triangles]
     middle, centre = a.mean(axis=1), b.mean(axis=1)
     half = np.linalg.norm(a - middle[:, None], axis=2).max(axis=1)
@@ -81,7 +97,7 @@ def _near(p: Array, edges: Indices, triangles: Indices) -> Iterator[tuple[Indice
 
 
 def _apart(p: Array, edges: Indices, triangles: Indices) -> NDArray[np.bool_]:
-    """Which pairs (k, 2) and (k, 3) an axis separates, beyond round-off."""
+    """Return which pairs (k, 2) and (k, 3) have a separating axis, beyond round-off."""
     if not len(edges):
         return np.empty(0, bool)
     origin = p[triangles[:, 0]]
@@ -109,7 +125,7 @@ def _exact(x: Array) -> Point:
 
 
 def meets(edge: list[Point], triangle: list[Point]) -> bool:
-    """Whether an edge of two points and a triangle of three have a point in common, in rational numbers."""
+    """Return whether an edge (two points) and a triangle (three points) intersect, in rational arithmetic."""
     a, b = edge
     u, v, w = triangle
     above, below = _volume(u, v, w, a), _volume(u, v, w, b)
@@ -118,7 +134,7 @@ def meets(edge: list[Point], triangle: list[Point]) -> bool:
     if above != 0 or below != 0:
         turns = [_volume(a, b, one, two) for one, two in ((u, v), (v, w), (w, u))]
         return min(turns) >= 0 or max(turns) <= 0
-    # All in one plane, or a triangle without area: seen along each axis they overlap if they do.
+    # Coplanar points, or a degenerate triangle: they intersect if their projections along each axis overlap.
     return all(_flat_meet(_seen(edge, k), _seen(triangle, k)) for k in range(3))
 
 
@@ -135,7 +151,7 @@ def _seen(points: list[Point], axis: int) -> list[Flat]:
 
 
 def _flat_meet(edge: list[Flat], triangle: list[Flat]) -> bool:
-    """Whether convex figures in the plane overlap: no line along a side has them on different sides of it."""
+    """Return whether convex polygons in the plane overlap: no line along a side separates them."""
     sides = [*pairwise([*triangle, triangle[0]]), (edge[0], edge[1])]
     for (a, b), swap in product(sides, (False, True)):
         n = (b[0] - a[0], b[1] - a[1]) if swap else (a[1] - b[1], b[0] - a[0])

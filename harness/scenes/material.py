@@ -1,8 +1,8 @@
-"""Stiffness of the springs [N/m] from material constants and a rule of how they follow the mesh.
+"""Spring stiffness [N/m] from material constants and a scaling rule with the mesh size.
 
-fixed        The constants are the stiffness of each spring [N/m], whatever the mesh.
+fixed        The constants are the stiffness of each spring [N/m], independent of the mesh.
 
-continuum    The material stays the same when the mesh is refined. With h the spacing:
+continuum    The material is independent of mesh refinement. With h the spacing:
     dimension 1   k_e = EA / rest length; constants EA [N]. Springs in series add up to EA / L.
     dimension 2   k_e constant; constants [N/m]. There are 1/h springs across a metre of width, so that the
                   force per width and strain is k / h * h = k. With both diagonals, of constant s:
@@ -10,26 +10,26 @@ continuum    The material stays the same when the mesh is refined. With h the sp
     dimension 3   k_e = E h; constants [Pa]. There are 1/h^2 springs across a square metre, so that the
                   force per area and strain is k h / h^2 = E. With the diagonals of a block, of constant S:
                   C11 = E + 10/3 S, C12 = C66 = 7/3 S [Pa].
-    These are the limits. Springs on the boundary have cells on one side only and yet full stiffness, so that
-    a cloth of width W is stiffer by up to h / W, a block by up to that for each side of its cross-section.
+    These are limits for h -> 0. Springs on the boundary have cells on one side only but full stiffness, so a cloth of
+    width W is stiffer by up to h / W, and a block by up to that for each side of its cross-section.
     bending       k_e = 16 B / h^2, constant B [N m] (BEND springs, rest length 2h, in dimension 2), and
                   4 k_e less for the springs along the lines (STRETCH), 2 k_e less at the ends of lines.
 
     Skip-one springs have no quadratic bending energy about a flat sheet: a fold by the angle t shortens one
-    by 2h (1 - cos(t/2)), h t^2/4 to leading order, and a metre of fold has 1/h of them, which store
-    k h t^4/32. A sheet of bending stiffness B that takes the same fold over one spacing stores
+    by 2h (1 - cos(t/2)), h t^2/4 to leading order. A metre of fold has 1/h of them, which store
+    k h t^4/32. A sheet of bending stiffness B with the same fold over one spacing stores
     B (t/h)^2 h/2 = B t^2/(2h). The two agree at t = 1 rad for k = 16 B / h^2: the sharpest bends of the mesh
-    resist as the sheet does. Gentler ones are underestimated by the factor t^2; a fixed curvature c makes
-    t = c h, so smooth bends get softer as the mesh is refined, and the limit is the membrane without B.
-    Skip-one springs resist stretch too. Along a line each spring lies under two of them (under one at the
-    ends), each of which pulls with 2h k at a unit of strain, as much as 2 k more in the spring below would. That
-    has so much less, so that the sheet's membrane stiffness is `stretch` at every size. A mesh so fine that
-    nothing would be left, h < 8 sqrt(B / stretch), is refused. This rule is our own.
+    have the resistance of the sheet. Smaller angles are underestimated by the factor t^2. A fixed curvature c implies
+    t = c h, so smooth bends get softer under refinement, and the limit is the membrane without B.
+    Skip-one springs resist stretch too. Along a line each spring is covered by two of them (by one at the
+    ends). Each adds 2h k per unit of strain, as much as an increase of the spring's own stiffness by 2 k. The spring's
+    stiffness is reduced accordingly, so the membrane stiffness of the sheet is `stretch` at every size. A mesh with
+    h < 8 sqrt(B / stretch) would leave no stiffness and is rejected. This rule is original to this project.
 
-liu2013      k_e = constant * (resolution - 1) / (reference - 1), constants [N/m] as they are at the size
-    `reference`: Liu et al. 2013 give their curtain 150, 300, 600, 1200 at 11, 21, 41, 81 vertices a side.
-    Proportional to 1/h, this stiffens a cloth that is refined; it exists to reproduce their figures. It
-    needs a mesh that has a size, so meshes from files are refused; the two other rules serve them.
+liu2013      k_e = constant * (resolution - 1) / (reference - 1), constants [N/m] as given for the size
+    `reference`: Liu et al. 2013 use 150, 300, 600, 1200 for their curtain at 11, 21, 41, 81 vertices per side.
+    Proportional to 1/h, the rule stiffens a cloth under refinement; it exists to reproduce their figures. It
+    requires a mesh size and does not support meshes from files; the other two rules do.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
 from harness.scenes.weave import Weave
 
 Scale = Callable[[Mesh, str, int | None], NDArray[np.float64] | float]
-"""(mesh, family, reference) -> what a family's constant is multiplied by: one factor, or one a spring."""
+"""(mesh, family, reference size) -> factor of a family's constant: one for all springs, or one per spring."""
 
 
 def spring_stiffness(
@@ -58,12 +58,18 @@ def spring_stiffness(
     bend: float,
     reference: int | None = None,
 ) -> NDArray[np.float64]:
-    """The stiffness of each spring, (m,) [N/m], from a constant for each family, or by its direction, and one of
-    `RULES`.
+    """Compute the stiffness of each spring, (m,) [N/m].
 
-    A constant of stretch or shear may be infinite: those springs are exact. Raises InputError for an unknown rule, any
-    other constant that is not finite, one below zero, a rule that does not fit the mesh, and a `reference` that is
-    missing (liu2013) or has no meaning (the others).
+    Args:
+        mesh: the mesh.
+        scaling_rule: one of `SCALING_RULES`.
+        stretch, shear: constants of the families, or constants by direction; infinite for length constraints.
+        bend: constant of the skip-one springs.
+        reference_size: mesh size of the constants, for liu2013 only.
+
+    Raises:
+        InputError: for an unknown rule, for a constant that is negative or not finite (except as above), for a rule
+            that does not fit the mesh, and for a reference size that is missing or unused.
     """
     if rule not in RULES:
         raise InputError(Mistake(f"unknown rule {rule!r}; wanted {did_you_mean(rule, RULES)}", key="rule"))
@@ -82,7 +88,7 @@ def spring_stiffness(
 
 
 def _relieved(mesh: Mesh, k: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The stiffnesses, those along the lines less what skip-one springs add to them."""
+    """Subtract the stretch stiffness of skip-one springs from the springs along the lines."""
     if not k[mesh.families[BEND]].any():
         return k
     along = mesh.families[STRETCH]
@@ -101,7 +107,7 @@ def _relieved(mesh: Mesh, k: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _overlaps(mesh: Mesh) -> NDArray[np.int64]:
-    """Under how many BEND springs each STRETCH spring lies: one or two. A BEND spring spans two of them."""
+    """Count the BEND springs, one or two, that cover each STRETCH spring; a BEND spring spans two of them."""
     (i, j), (a, b) = (mesh.springs[mesh.families[family]].T for family in (STRETCH, BEND))
     n, name = len(mesh.rest), np.arange(1, len(i) + 1)
     spring = scipy.sparse.coo_array((np.tile(name, 2), (np.r_[i, j], np.r_[j, i])), shape=(n, n)).tocsr()
@@ -137,9 +143,9 @@ def _liu2013(mesh: Mesh, family: str, reference: int | None) -> float:
 
 
 def modulus_exponent(rule: str, dimension: int) -> int:
-    """Return the power of the spacing h that the modulus of a mesh's material is proportional to.
+    """Return the exponent of the spacing h in the material modulus of a mesh.
 
-    The modulus is EA of a chain (k h), E t of a sheet (k) and E of a solid (k / h), of springs of stiffness k along
+    The modulus is EA of a chain (k h), E t of a sheet (k) and E of a solid (k / h), for springs of stiffness k along
     its lines. With `continuum` it does not depend on h.
     """
     return {"continuum": 0, "fixed": 2 - dimension, "liu2013": 1 - dimension}[rule]

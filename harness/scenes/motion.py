@@ -1,9 +1,9 @@
-"""Motion along key frames: points are turned about an axis and shifted, both interpolated in time.
+"""Key-frame motion: rotation about an axis and translation, both interpolated in time.
 
     q(t) = about + R(axis, turn(t)) (q - about) + offset(t)
 
-linearly from key to key, or by the cubics of Fritsch and Carlson (1980), which have no corners and never overshoot a
-key. Before the first key and after the last one the points rest.
+linearly between key frames, or by the monotone cubics of Fritsch and Carlson (1980), which are smooth and never
+overshoot a key frame. Before the first key frame and after the last one the points are at rest.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from solvers.problem import Positions
 
 
 class Key(Model):
-    """Where the points are at one time."""
+    """Pose of the points at one time."""
 
     time: float = Field(ge=0.0, le=1e9)
     """Simulated time [s]."""
     offset: Vector = (0.0, 0.0, 0.0)
-    """Shift from where they were declared [m]."""
+    """Translation from the declared position [m]."""
     turn: float = Field(default=0.0, ge=-1e9, le=1e9)
-    """Turn about the axis [degrees]; more than 360 is more than once around."""
+    """Rotation angle about the axis [degrees]; more than 360 is more than one revolution."""
 
 
 class KeyedMotion(Model):
     """A rigid motion along key frames."""
 
     keys: tuple[Key, ...] = Field(min_length=1, max_length=10_000)
-    """The key frames, their times rising."""
+    """Key frames with increasing times."""
     axis: Vector = (0.0, 1.0, 0.0)
-    """The direction of the axis of turns, of any length but zero."""
+    """Direction of the rotation axis, of any length but zero."""
     about: Vector = (0.0, 0.0, 0.0)
-    """A point on that axis [m]."""
+    """A point on the rotation axis [m]."""
     between: Literal["linear", "smooth"] = "linear"
-    """How the way leads from key to key: straight, or along cubics that stand still where it turns back."""
+    """Interpolation between key frames: linear, or by cubics with zero velocity where the direction reverses."""
 
     @model_validator(mode="after")
     def _in_order(self) -> KeyedMotion:
@@ -54,23 +54,23 @@ class KeyedMotion(Model):
 
     @property
     def times(self) -> tuple[float, ...]:
-        """The times of the keys [s]."""
+        """Times of the key frames [s]."""
         return tuple(key.time for key in self.keys)
 
     def moved(self, points: Positions, time: float) -> Positions:
-        """Where points declared at (q, 3) [m] are at a time [s]."""
+        """Return the positions (q, 3) [m] at a time [s] of points with declared positions (q, 3) [m]."""
         *offset, turn = self._at(time)
         arm = points - self.about
         return points + offset + arm @ (_rotation(self.axis, np.deg2rad(turn)) - np.eye(3)).T
 
     def back(self, points: Positions, time: float) -> Positions:
-        """Where points that are at (q, 3) [m] at a time [s] were declared."""
+        """Return the declared positions (q, 3) [m] of points with positions (q, 3) [m] at a time [s]."""
         *offset, turn = self._at(time)
         arm = points - offset - self.about
         return points - offset + arm @ (_rotation(self.axis, np.deg2rad(turn)) - np.eye(3))
 
     def velocity(self, points: Positions, time: float) -> Positions:
-        """How fast points declared at (q, 3) [m] move at a time [s], and right after it at a key, (q, 3) [m/s]."""
+        """Return the velocity (q, 3) [m/s] of declared points (q, 3) [m] at a time [s], at a key right after it."""
         (*offset, rise), (*_, turn) = self._slope(time), self._at(time)
         arm = (points - self.about) @ _rotation(self.axis, np.deg2rad(turn)).T
         axis = np.array(self.axis) / np.linalg.norm(self.axis)
@@ -78,12 +78,18 @@ class KeyedMotion(Model):
 
     @property
     def straight(self) -> bool:
-        """Whether points go along straight lines from key to key, each at one speed."""
+        """Whether points move along straight lines at constant velocity between key frames."""
         return self.between == "linear" and len({key.turn for key in self.keys}) == 1
 
     def speed(self, begin: float, end: float, points: Positions, *, slack: float = 0.0) -> float:
-        """The largest speed [m/s], or more, of points (q, 3) [m], or of what is within `slack` [m] of where they are
-        declared, between two times [s] that no key lies between."""
+        """Return an upper bound of the speed [m/s] between two times without a key frame in between.
+
+        Args:
+            start_time: [s].
+            end_time: [s].
+            points: declared positions (q, 3) [m].
+            slack: the bound holds for all points within this distance [m] of `points`.
+        """
         times, values = self.table
         k = int(np.clip(np.searchsorted(times, begin, side="right"), 1, max(1, len(times) - 1)))
         if len(times) == 1 or begin >= times[-1] or end <= times[0]:
@@ -94,17 +100,17 @@ class KeyedMotion(Model):
 
     @cached_property
     def table(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The times [s] of the keys, and their offsets [m] and turns [degrees] (k, 4)."""
+        """Times [s] of the key frames, and their offsets [m] and angles [degrees] (k, 4)."""
         return np.array(self.times), np.array([(*key.offset, key.turn) for key in self.keys])
 
     def _at(self, time: float) -> NDArray[np.float64]:
-        """Offset [m] and turn [degrees] at a time [s], (4,)."""
+        """Interpolate offset [m] and angle [degrees] at a time [s], (4,)."""
         times, values = self.table
         t = float(np.clip(time, times[0], times[-1]))
         return values[0] if len(times) == 1 else _BETWEEN[self.between](times, values, t)
 
     def _slope(self, time: float) -> NDArray[np.float64]:
-        """What offset [m/s] and turn [degrees/s] change by at a time [s], (4,)."""
+        """Interpolate the rates of offset [m/s] and angle [degrees/s] at a time [s], (4,)."""
         times, values = self.table
         if not times[0] <= time < times[-1]:
             return np.zeros(4)
@@ -127,13 +133,13 @@ def _smooth(times: NDArray[np.float64], values: NDArray[np.float64], t: float) -
 
 
 _STEEPEST = {"linear": 1.0, "smooth": 3.0}
-"""The largest slope between two keys, in that of the straight line: Fritsch and Carlson's condition."""
+"""Bound of the slopes at two key frames relative to the secant: the condition of Fritsch and Carlson."""
 
 _BETWEEN: dict[str, Any] = {"linear": _linear, "smooth": _smooth}
 
 
 def _rotation(axis: Vector, angle: float) -> NDArray[np.float64]:
-    """Rodrigues' formula, (3, 3)."""
+    """Compute the rotation matrix by Rodrigues' formula, (3, 3)."""
     x, y, z = np.array(axis) / np.linalg.norm(axis)
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K

@@ -1,4 +1,4 @@
-"""Obstacles as a scene declares them: planes, spheres, capsules and boxes, at rest or moving along key frames."""
+"""Analytic obstacles: planes, spheres, capsules and boxes, at rest or moving along key frames."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ Length = Annotated[PositiveFloat, Field(le=1e9)]
 
 class _Moving(Model):
     motion: KeyedMotion | None = None
-    """Key frames that take the obstacle along; it is solid at every time, however fast."""
+    """Key frames of the obstacle's motion; it stays solid at any speed."""
 
     def _obstacle(self, origin: Vector, axes: Array, low: Array, high: Array, radius: float) -> Obstacle:
-        """axes: (3, 3), one a row."""
+        """Build a rounded box with the given axes (3, 3), one per row."""
         frame = np.concatenate([[origin], axes])
         motion = self.motion
         if motion is None:
@@ -37,13 +37,13 @@ class _Moving(Model):
 
 
 class Plane(_Moving):
-    """A plane without end, solid below."""
+    """An infinite plane, solid below."""
 
     kind: Literal["plane"] = "plane"
     point: Vector = (0.0, 0.0, 0.0)
-    """Any of its points [m]."""
+    """Any point of the plane [m]."""
     normal: Vector = (0.0, 1.0, 0.0)
-    """Away from what is solid, of any length but zero."""
+    """Outward normal, of any length but zero."""
 
     @model_validator(mode="after")
     def _directed(self) -> Plane:
@@ -52,7 +52,7 @@ class Plane(_Moving):
         return self
 
     def obstacle(self) -> Obstacle:
-        """What vertices are kept out of."""
+        """Return the obstacle in the solvers' form."""
         low, high = np.full(3, -np.inf), np.array([np.inf, 0.0, np.inf])
         return self._obstacle(self.point, _about(self.normal), low, high, 0.0)
 
@@ -62,12 +62,12 @@ class Sphere(_Moving):
 
     kind: Literal["sphere"] = "sphere"
     center: Vector = (0.0, 0.0, 0.0)
-    """Its middle [m]."""
+    """Centre [m]."""
     radius: Length
-    """Its radius [m]."""
+    """Radius [m]."""
 
     def obstacle(self) -> Obstacle:
-        """What vertices are kept out of."""
+        """Return the obstacle in the solvers' form."""
         return self._obstacle(self.center, np.eye(3), np.zeros(3), np.zeros(3), self.radius)
 
 
@@ -76,9 +76,9 @@ class Capsule(_Moving):
 
     kind: Literal["capsule"] = "capsule"
     ends: tuple[Vector, Vector]
-    """The segment's ends [m], apart from each other."""
+    """Two distinct ends of the segment [m]."""
     radius: Length
-    """The radius [m]."""
+    """Radius [m]."""
 
     @model_validator(mode="after")
     def _long(self) -> Capsule:
@@ -87,7 +87,7 @@ class Capsule(_Moving):
         return self
 
     def obstacle(self) -> Obstacle:
-        """What vertices are kept out of."""
+        """Return the obstacle in the solvers' form."""
         first, last = self.ends
         x, y, z = np.array(last) - first
         high = np.array([0.0, np.linalg.norm([x, y, z]), 0.0])
@@ -95,7 +95,7 @@ class Capsule(_Moving):
 
 
 class Box(_Moving):
-    """A box along the axes; a motion with one key turns it."""
+    """An axis-parallel box; a motion with one key frame rotates it."""
 
     kind: Literal["box"] = "box"
     low: Vector
@@ -110,7 +110,7 @@ class Box(_Moving):
         return self
 
     def obstacle(self) -> Obstacle:
-        """What vertices are kept out of."""
+        """Return the obstacle in the solvers' form."""
         return self._obstacle((0.0, 0.0, 0.0), np.eye(3), np.array(self.low), np.array(self.high), 0.0)
 
 
@@ -118,7 +118,7 @@ AnyObstacle = Annotated[Plane | Sphere | Capsule | Box, Field(discriminator="kin
 
 
 def _about(direction: Vector) -> Array:
-    """Orthonormal axes (3, 3), right-handed, the second along a direction."""
+    """Build right-handed orthonormal axes (3, 3), the second along a direction."""
     y = np.array(direction) / np.linalg.norm(direction)
     x = np.cross(y, np.eye(3)[np.abs(y).argmin()])
     x /= np.linalg.norm(x)

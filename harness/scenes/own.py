@@ -1,7 +1,8 @@
-"""Effects and meshes that are somebody else's code: named by a scene, and imported where they are used.
+"""Effects and meshes from plug-ins: named by a scene, and imported where they are used.
 
-A scene is passed around with `OwnEffect` and `OwnMesh`, which know name and parameters alone. `SceneSpec.opened`
-replaces them, in a process that may be lost. What their code returns is checked, and its errors name it.
+A scene is passed around with `PluginEffect` and `PluginMesh`, which hold only name and parameters.
+`SceneSpec.load_plugins` replaces them, in a process that may crash. Results of the plug-in code are checked, and its
+errors name it.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from solvers import integrators
 from solvers.plugins import Plugin, load
 
 ABOUT = "\0importing "
-"""What a process says, with the name of the code behind it, before it imports code of others."""
+"""Message of a process, with the name of the plug-in, before it imports third-party code."""
 
 
 def opened(document: Document, plugin: Plugin, what: str, at: Key) -> Any:
-    """What a plug-in leads to, one of WANTED; its code runs now. None after a mistake was noted."""
+    """Load a plug-in of one of PLUGIN_KINDS, which runs its code; None after a recorded mistake."""
     wanted, fits = WANTED[what]
     document.own.tell(f"{ABOUT}{plugin}")
     try:
@@ -55,7 +56,7 @@ def opened(document: Document, plugin: Plugin, what: str, at: Key) -> Any:
 
 
 def checked(document: Document, plugin: Plugin, what: str, parameters: dict[str, Any], at: Key) -> Any:
-    """An effect or a mesh with its parameters, by its class, which is imported. None after mistakes were noted."""
+    """Build an effect or a mesh from an imported plug-in class and its parameters; None after recorded mistakes."""
     model = opened(document, plugin, what, (*at, "kind"))
     if model is None:
         return None
@@ -98,28 +99,28 @@ WANTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
         lambda made: isinstance(made, integrators.AnyIntegrator) and _is_sound(made),
     ),
 }
-"""What own code may be: in words, and by a test."""
+"""Kinds of plug-ins: description and check."""
 
 
 @dataclass(frozen=True, slots=True)
 class OwnEffect:
-    """An effect that is known by its name and parameters. folder: of the file that names it."""
+    """An effect by name and parameters; `folder` is that of the file that names it."""
 
     kind: Plugin
     parameters: Mapping[str, Any]
     folder: str
 
     def opened(self) -> Effect:
-        """The effect. Raises InputError."""
+        """Load the effect; raise InputError on failure."""
         return _opened(self, "effect")
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """What the effect contributes. Raises InputError."""
+        """Build the effect's contribution; raise InputError on failure."""
         return self.opened().bind(mesh, mass, time_step)
 
 
 class OwnMesh(generator.Generator):
-    """A mesh that is known by its name and parameters. folder: of the file that names it."""
+    """A mesh by name and parameters; `folder` is that of the file that names it."""
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
 
@@ -130,15 +131,15 @@ class OwnMesh(generator.Generator):
     SPRINGS: ClassVar[int] = 1
 
     def opened(self) -> generator.Generator:
-        """The mesh. Raises InputError."""
+        """Load the mesh; raise InputError on failure."""
         return _opened(self, "mesh")
 
     def count(self, size: int) -> int:
-        """Unknown; taken for the size."""
+        """Return the size, as the number of vertices is unknown."""
         return size
 
     def generate(self, size: int) -> Mesh:
-        """The mesh of a size. Raises InputError."""
+        """Generate the mesh of a size; raise InputError on failure."""
         return self.opened().build(size)
 
 
@@ -152,7 +153,7 @@ def _opened(part: OwnEffect | OwnMesh, what: str) -> Any:
 
 @contextmanager
 def staying() -> Generator[None]:
-    """Come back to the working folder."""
+    """Restore the working directory on exit."""
     here = os.getcwd()
     try:
         yield
@@ -163,7 +164,7 @@ def staying() -> Generator[None]:
 
 @contextmanager
 def blaming(plugin: Plugin, does: str) -> Generator[None]:
-    """Turn whatever a plug-in raises, other than errors of ours, into InputError that names it and its line."""
+    """Turn exceptions of a plug-in, except the project's own, into InputError with its name and line."""
     try:
         with staying():
             yield
@@ -174,7 +175,18 @@ def blaming(plugin: Plugin, does: str) -> Generator[None]:
 
 
 def bound(plugin: Plugin, effect: Effect, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-    """What an effect of somebody's own contributes, checked. Raises InputError."""
+    """Build the contribution of a plug-in effect and check it.
+
+    Args:
+        plugin: the plug-in.
+        effect: its effect.
+        mesh: the mesh.
+        mass: vertex masses (n,) [kg].
+        time_step: dt [s].
+
+    Raises:
+        InputError: if the plug-in fails, or its contribution is invalid.
+    """
     before = [array.tobytes() for array in _arrays(mesh, mass)]
     with blaming(plugin, "bind"):
         made: Any = effect.bind(mesh, mass, time_step)
@@ -203,7 +215,7 @@ def bound(plugin: Plugin, effect: Effect, mesh: Mesh, mass: NDArray[np.float64],
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Checked:
-    """A force or a filter of somebody's own, whose answers are checked."""
+    """A force or filter of a plug-in with checked results."""
 
     function: Callable[..., Any]
     plugin: Plugin
@@ -258,7 +270,7 @@ def _require_pin(pin: Any, count: int) -> None:
 
 
 def sound(plugin: Plugin, mesh: Any) -> Mesh:
-    """A mesh that somebody's own code made, checked. Raises InputError."""
+    """Check a mesh from a plug-in; raise InputError if it is invalid."""
     with blaming(plugin, "generate"):
         _require(isinstance(mesh, Mesh), f"returned {_in_words(mesh)}; wanted a harness.scenes.mesh.base.Mesh")
         _require_array(mesh.rest, (None, 3), "`rest`")

@@ -1,8 +1,8 @@
-"""Whether moving obstacles leave room: for what is pinned, on all of its way, and for anything at all between planes.
+"""Clearance of moving obstacles: of pinned points along their motion, and between planes.
 
-Points that move no faster than L, seen from an obstacle, and lie at a distance d from it at t, are outside of it until
-t + d/L: so a way is gone along in steps of that length (conservative advancement, Mirtich 1996, "Impulse-based Dynamic
-Simulation of Rigid Body Systems", section 2.3).
+Points that move no faster than L relative to an obstacle and are at a distance d from it at time t stay outside of it
+until t + d/L. A motion is therefore checked in steps of that length (conservative advancement, Mirtich 1996,
+"Impulse-based Dynamic Simulation of Rigid Body Systems", section 2.3).
 """
 
 from __future__ import annotations
@@ -19,23 +19,30 @@ from solvers.contact.energy import Obstacle
 from solvers.problem import Positions
 
 _PARTS, _ALL = 512, 4096
-"""The shortest steps, as parts of the way between two key times and of the whole: what is thinner is not seen."""
+"""Shortest steps relative to the interval between two key times, and to the whole; thinner overlaps are missed."""
 _TURNS = 64
-"""How often planes that turn are looked at in all."""
+"""Total number of sample times for rotating planes."""
 
 
 def key_times(*motions: KeyedMotion | None) -> list[float]:
-    """The start, and the times [s] at which any of these motions has a key."""
+    """Return the start, and the times [s] at which any of these motions has a key frame, sorted."""
     return sorted({0.0, *(time for motion in motions if motion for time in motion.times)})
 
 
 def nearest(
     obstacle: Obstacle, taken: KeyedMotion | None, targets: Positions, motion: KeyedMotion | None, limit: float
 ) -> tuple[float, NDArray[np.float64]] | None:
-    """The first time [s] at which points declared at `targets` (q, 3) [m] are nearer than `limit` [m] to an obstacle,
-    and all their distances (q,) [m] then; None where they never are.
+    """Find the first time at which points are closer to an obstacle than a minimum distance.
 
-    taken and motion: how the obstacle and the points move, None for those that rest.
+    Args:
+        obstacle: the obstacle.
+        obstacle_motion: its motion, None if it is at rest.
+        points: declared positions (q, 3) [m].
+        point_motion: their motion, None if they are at rest.
+        min_distance: [m].
+
+    Returns:
+        The time [s] and all distances (q,) [m] at that time, None if there is no such time.
     """
     times = key_times(taken, motion)
     shortest = (times[-1] - times[0]) / _ALL
@@ -62,10 +69,10 @@ def nearest(
 
 
 def gap(planes: Sequence[Obstacle], time: float) -> float:
-    """The radius [m] of the largest ball between half-spaces, at most 1; less than zero where there is none."""
+    """Return the radius [m] of the largest ball between half-spaces, at most 1; negative if they overlap."""
     frames = [plane.frame(time) for plane in planes]
     normals, offsets = np.array([f[2] for f in frames]), np.array([f[2] @ f[0] for f in frames])
-    # n.x - r >= d for all of them, r as large as can be; about the planes' own points, so that digits are kept
+    # maximise r with n.x - r >= d for all planes; relative to the planes' own points, to preserve digits
     middle = np.mean([f[0] for f in frames], axis=0)
     unknowns = np.column_stack([-normals, np.ones(len(frames))])
     found = linprog([0, 0, 0, -1], unknowns, normals @ middle - offsets, bounds=[(None, None)] * 3 + [(None, 1)])
@@ -73,7 +80,7 @@ def gap(planes: Sequence[Obstacle], time: float) -> float:
 
 
 def looks(motions: Sequence[KeyedMotion | None]) -> Iterator[float]:
-    """The times [s] at which to look at what these motions move: their keys, and between those where they turn."""
+    """Yield sample times [s] of motions: their key times, and intermediate times if they rotate."""
     times = key_times(*motions)
     straight = all(motion.straight for motion in motions if motion)
     between = 1 if straight else max(1, _TURNS // max(1, len(times) - 1))

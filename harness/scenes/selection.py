@@ -1,4 +1,4 @@
-"""Which vertices of a mesh a key of a scene means: named parts, indices, places, boundary loops, numbers of a file."""
+"""Vertex selection: named parts, indices, regions, boundary loops, attributes of a file."""
 
 from __future__ import annotations
 
@@ -28,52 +28,52 @@ class Box(Model):
     """An axis-parallel box, its faces included."""
 
     low: Vector
-    """The corner with the smallest coordinates [m]."""
+    """Corner with the smallest coordinates [m]."""
     high: Vector
-    """The corner with the largest coordinates [m]."""
+    """Corner with the largest coordinates [m]."""
 
 
 class Ball(Model):
     """A ball, its surface included."""
 
     center: Vector
-    """Its middle [m]."""
+    """Centre [m]."""
     radius: PositiveFloat
-    """Its radius [m]."""
+    """Radius [m]."""
 
 
 class Attribute(Model):
-    """A range of a number that a mesh's file tells of each vertex, its ends included."""
+    """A range, ends included, of a vertex attribute from the mesh's file."""
 
     name: str
-    """As the file has it; one number of a vector is `name.0`, `name.1`, ..."""
+    """Name in the file; a component of a vector is `name.0`, `name.1`, ..."""
     low: float | None = None
-    """The smallest; any if left out."""
+    """Smallest value; unbounded by default."""
     high: float | None = None
-    """The largest; any if left out."""
+    """Largest value; unbounded by default."""
 
 
 class Selection(Model):
-    """Every vertex that any of the selectors names."""
+    """All vertices that at least one of the selectors names."""
 
     at: tuple[str, ...] = ()
     """Named parts of the mesh, such as corners, top or left, and groups of its file."""
     indices: tuple[NonNegativeInt, ...] = ()
-    """Vertices, counted from zero."""
+    """Zero-based vertex indices."""
     box: Box | None = None
-    """All vertices whose rest position lies in this box."""
+    """All vertices with rest positions in this box."""
     sphere: Ball | None = None
-    """All vertices whose rest position lies in this ball."""
+    """All vertices with rest positions in this ball."""
     nearest: tuple[Vector, ...] = ()
-    """Of each of these points [m] the vertex whose rest position is nearest, the first of those alike."""
+    """For each of these points [m] the vertex with the nearest rest position, the first one of equals."""
     loops: tuple[NonNegativeInt, ...] = ()
-    """Boundary loops of the mesh's triangles, the longest is 0."""
+    """Boundary loops of the mesh's triangles; the longest is 0."""
     holes: tuple[NonNegativeInt, ...] = ()
-    """Holes: boundary loops of connected surfaces but the longest of each, the longest hole is 0."""
+    """Holes: boundary loops except the longest of each connected surface; the longest hole is 0."""
     attribute: Attribute | None = None
-    """All vertices of which the mesh's file tells a number in this range."""
+    """All vertices with an attribute in this range."""
     every: PositiveInt = 1
-    """Of the vertices chosen so far (all of them where nothing else is chosen), every k-th, from the first."""
+    """Every k-th of the vertices selected so far, from the first; of all vertices if there is no other selector."""
 
     @model_validator(mode="after")
     def _selects(self) -> Self:
@@ -85,24 +85,32 @@ class Selection(Model):
 
     @model_serializer(mode="wrap")
     def _as_given(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Without the selectors that came later and are not used: runs are told apart by what is written here."""
+        """Dump without unused optional selectors: run identities depend on this dump, older ones lack them."""
         told: dict[str, Any] = dump(self)
         return {key: value for key, value in told.items() if value or key not in _LATER}
 
     @property
     def names(self) -> bool:
-        """Whether any selector but `every` does."""
+        """Whether any selector except the stride is used."""
         given = self.at, self.indices, self.box, self.sphere, self.nearest, self.loops, self.holes, self.attribute
         return any(map(bool, given))
 
     def told(self) -> str:
-        """The selectors that are used, in words."""
+        """Describe the used selectors in words."""
         given = self.model_dump(mode="json", include=set(Selection.model_fields), exclude_none=True)
         used = (f"{key} {_in_words(value)}" for key, value in given.items() if value and (key, value) != ("every", 1))
         return ", ".join(used)
 
     def chosen(self, mesh: Mesh, name: str) -> Indices:
-        """The vertices (q,), sorted; raises InputError, which speaks of `name`, for what the mesh does not have."""
+        """Return the selected vertices (q,), sorted.
+
+        Args:
+            mesh: the mesh.
+            name: name of the selection in messages.
+
+        Raises:
+            InputError: for parts, vertices and attributes that the mesh lacks.
+        """
         n, rest = len(mesh.rest), mesh.rest
         for part in self.at:
             if part not in mesh.parts:
@@ -134,7 +142,7 @@ _LATER = {"sphere", "nearest", "loops", "holes", "attribute"}
 
 
 def selections(effect: Any) -> Iterator[tuple[str, Selection]]:
-    """Those that an effect has: itself, by no name, and its fields."""
+    """Yield the selections of an effect: itself, with an empty name, and its fields."""
     if isinstance(effect, Selection):
         yield "", effect
     for key, value in effect:

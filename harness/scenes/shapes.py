@@ -1,4 +1,4 @@
-"""Obstacles as surfaces of triangles: meshes, and what of planes, spheres, capsules and boxes can be met by edges."""
+"""Obstacle surfaces as triangles: meshes, and triangulations of planes, spheres, capsules and boxes."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ Shape = tuple[Array, Indices]
 
 
 class Triangles(Model):
-    """A surface written out."""
+    """An inline surface."""
 
     kind: Literal["triangles"] = "triangles"
     points: tuple[Vector, ...] = Field(min_length=3)
-    """[m]"""
+    """Points [m]."""
     triangles: tuple[tuple[int, int, int], ...] = Field(min_length=1)
-    """Three points each, counted from zero."""
+    """Three zero-based point indices each."""
 
     @field_validator("triangles")
     @classmethod
@@ -62,19 +62,21 @@ class Triangles(Model):
 
 
 class Frames(Model):
-    """Where the points of a mesh are in frames of equal length, in between on straight ways; before the first frame and
-    after the last one they rest."""
+    """Recorded positions of a mesh's points at a fixed frame rate, linearly interpolated.
+
+    Before the first frame and after the last one the points are at rest.
+    """
 
     positions: Path | tuple[tuple[Vector, ...], ...]
-    """An .npz with `positions` (frames, points, 3) [m], as `springbench run --positions` writes it; or written out."""
+    """An .npz with `positions` (frames, points, 3) [m], as `springbench run --positions` writes it; or inline."""
     rate: Metres = 60.0
-    """Frames a second."""
+    """Frames per second."""
     begin: float = Field(default=0.0, ge=0.0, le=1e9)
-    """When the first frame is [s]."""
+    """Time of the first frame [s]."""
 
     @cached_property
     def stored(self) -> Array:
-        """(frames, points, 3) [m]; raises InputError."""
+        """Read the positions (frames, points, 3) [m]; raise InputError on failure."""
         path = self.positions if isinstance(self.positions, Path) else None
         found = read_numbers(path, "positions") if path else np.array(self.positions)
         if found.ndim != 3 or found.shape[2] != 3 or not found.size or not (np.abs(found) <= MAX_COORDINATE).all():
@@ -84,7 +86,7 @@ class Frames(Model):
         return found
 
     def at(self, time: float) -> Array:
-        """Where the points are at a time [s], (points, 3) [m]."""
+        """Interpolate the positions at a time [s], (points, 3) [m]."""
         frame = min(max((time - self.begin) * self.rate, 0.0), len(self.stored) - 1.0)
         k = min(int(frame), max(len(self.stored) - 2, 0))
         one, part = self.stored[k], frame - k
@@ -98,26 +100,26 @@ AnyShape = Annotated[
 
 
 class Solid(Model):
-    """A mesh; its triangles are what nothing passes through, from either side, closed or not."""
+    """A mesh obstacle; its triangles are impenetrable from either side, closed or not."""
 
     kind: Literal["mesh"] = "mesh"
     mesh: AnyShape
-    """A mesh from a file, or from a generator, or written out as `triangles`."""
+    """A mesh from a file, from a generator, or inline as `triangles`."""
     size: Annotated[int, Field(ge=2, le=10_000)] = 24
-    """The mesh's size, which means nothing to one from a file."""
+    """Mesh size, ignored for a mesh from a file."""
     scale: Metres = 1.0
-    """All coordinates of the mesh are multiplied by this,"""
+    """Factor of all coordinates of the mesh."""
     offset: Vector = (0.0, 0.0, 0.0)
-    """then shifted by this [m]."""
+    """Translation after scaling [m]."""
     motion: KeyedMotion | None = None
-    """Key frames that take the obstacle along."""
+    """Key frames of the obstacle's motion."""
     frames: Frames | None = None
-    """Frames in which its points are elsewhere: it deforms, and goes along its key frames besides."""
+    """Frames with recorded positions of its points: the obstacle deforms, in addition to its key frames."""
 
     @field_validator("mesh")
     @classmethod
     def _beside(cls, mesh: Any, info: ValidationInfo) -> Any:
-        """Names of files are relative to the config's folder."""
+        """Resolve file names relative to the config's folder."""
         return mesh.model_copy(update={"path": _beside(mesh.path, info)}) if isinstance(mesh, File) else mesh
 
     @field_validator("frames")
@@ -129,7 +131,7 @@ class Solid(Model):
 
     @model_validator(mode="after")
     def _readable(self) -> Solid:
-        """Files are read here already: a mistake that is found while a model is written out has no place."""
+        """Read files during validation: a mistake found during serialisation has no location."""
         if isinstance(self.mesh, File) or self.frames:
             try:
                 self.shape()
@@ -139,7 +141,7 @@ class Solid(Model):
 
     @model_serializer(mode="wrap")
     def _written_out(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """A file counts by what it holds; what a recording declares has to be there when it is read."""
+        """Dump the contents of files: they define the obstacle, and a recording must contain them."""
         told: dict[str, Any] = dump(self)
         if self.frames is None:
             told.pop("frames", None)  # which whoever leaves out what is None has done already
@@ -153,7 +155,7 @@ class Solid(Model):
         return told
 
     def shape(self) -> Shape:
-        """Its points and triangles; raises InputError."""
+        """Build its points and triangles; raise InputError on failure."""
         if isinstance(self.mesh, Triangles):
             points, triangles = np.array(self.mesh.points), np.array(self.mesh.triangles, np.int64)
         else:
@@ -170,14 +172,14 @@ class Solid(Model):
         return self.scale * points + np.array(self.offset), triangles
 
     def placed(self, points: Positions, time: float) -> Positions:
-        """Where the points that `shape` tells are at a time [s], (o, 3) [m]."""
+        """Return the positions (o, 3) [m] at a time [s] of the points of `build_surface`."""
         if self.frames:
             points = self.scale * self.frames.at(time) + np.array(self.offset)
         return points if self.motion is None else self.motion.moved(points, time)
 
 
 def _beside(name: Path, info: ValidationInfo) -> Path:
-    """A file by the config's folder."""
+    """Resolve a path relative to the config's folder."""
     path = Path(cast(Mapping[str, Any], info.context or {}).get("folder", ".")) / name
     if not path.is_file():
         raise ValueError(f"there is no file {path}")
@@ -188,27 +190,41 @@ AnySurface = Annotated[Plane | Sphere | Capsule | Box | Solid, Field(discriminat
 
 
 def from_json(text: str) -> tuple[AnySurface, ...]:
-    """The obstacles that a recording declares. Raises ValueError."""
+    """Parse the obstacles of a recording; raise ValueError on failure."""
     return TypeAdapter(tuple[AnySurface, ...]).validate_json(text)
 
 
 def deforming(obstacle: AnySurface) -> bool:
-    """Whether it goes along stored frames."""
+    """Return whether an obstacle has recorded frames."""
     return isinstance(obstacle, Solid) and obstacle.frames is not None
 
 
 def placed(obstacle: AnySurface, points: Positions, time: float) -> Positions:
-    """Where points of its shape, as they were declared, are at a time [s], (o, 3) [m] both."""
+    """Return the positions of declared surface points at a time.
+
+    Args:
+        obstacle: the obstacle.
+        points: declared positions (o, 3) [m].
+        time: [s].
+
+    Returns:
+        Positions (o, 3) [m].
+    """
     if isinstance(obstacle, Solid):
         return obstacle.placed(points, time)
     return points if obstacle.motion is None else obstacle.motion.moved(points, time)
 
 
 def shape(obstacle: AnySurface, sag: float, around: Positions) -> Shape:
-    """The triangles of an obstacle as it was declared; raises InputError.
+    """Build the triangles of an obstacle in its declared pose.
 
-    sag [m]: how far those of spheres and capsules lie inside at most; around (q, 3) [m]: what the two triangles of a
-    plane have to be seen from.
+    Args:
+        obstacle: the obstacle.
+        max_sag: largest inward deviation [m] of the triangles of spheres and capsules.
+        scene_points: (q, 3) [m]; the two triangles of a plane extend beyond them.
+
+    Raises:
+        InputError: if the obstacle is invalid.
     """
     if isinstance(obstacle, Solid):
         return obstacle.shape()
@@ -227,17 +243,19 @@ def shape(obstacle: AnySurface, sag: float, around: Positions) -> Shape:
 _FACES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 _CUBE = _FACES[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 _WIDE = 20.0
-"""Of what is around a plane: half the side of its two triangles."""
+"""Half the side of a plane's two triangles, relative to the extent of the scene around it."""
 
 
 def _fine(radius: float, sag: float) -> int:
-    """Into how many parts an icosahedron's edges are divided: a triangle with sides of 1.3 radius/k lies at most
-    (0.75 radius/k)^2/(2 radius) inside the sphere."""
+    """Return the subdivisions of an icosahedron's edges for a maximum sag.
+
+    A triangle with sides of 1.3 radius/k lies at most (0.75 radius/k)^2/(2 radius) inside the sphere.
+    """
     return int(np.clip(np.ceil((0.2813 * radius / sag) ** 0.5), 2, 60))
 
 
 def _capsule(one: Capsule, sag: float) -> Shape:
-    """Rings around the axis, as far apart along half circles as their corners are, and a point at each end."""
+    """Triangulate a capsule by rings, spaced on the half circles like their corners, and two end points."""
     around = 2 * int(np.ceil(np.pi / 2 / np.arccos(max(0.5, 1.0 - 0.5 * sag / one.radius))))
     turn, half = np.linspace(0, 2 * np.pi, around, endpoint=False), np.linspace(0, np.pi, around // 2 + 1)
     half = np.insert(half, len(half) // 2, 0.5 * np.pi)

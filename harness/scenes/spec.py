@@ -1,4 +1,4 @@
-"""A scene as its file declares it, once it was checked."""
+"""A validated scene specification."""
 
 from __future__ import annotations
 
@@ -25,14 +25,16 @@ from solvers import integrators, plugins
 from solvers.plugins import Plugin, Table
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-"""Names of scenes and sweeps; they become names of files in the results."""
+"""Pattern of the names of scenes and sweeps; they become file names in the results."""
 
 FirstGuess = Literal["assignment", "current", "inertial", "motion", "coarse"]
 
 
 def named_in(table: Table) -> Any:
-    """The type of a name in a table, or of somebody's own code as `solvers.plugins` tells; the folder of the config
-    comes with the context of the validation."""
+    """Return the type of a registered name or a plug-in (see `solvers.plugins.plugin_discovery`).
+
+    The validation context provides the folder of the config.
+    """
 
     def checked(value: str, info: ValidationInfo) -> str:
         name = table.named(value, Path(cast(Mapping[str, Any], info.context or {}).get("folder", ".")))
@@ -52,7 +54,7 @@ else:
 
 
 def _seconds(value: Any) -> Any:
-    """A fraction such as "1/30" as a number."""
+    """Convert a fraction such as "1/30" to a number."""
     if not isinstance(value, str):
         return value
     try:
@@ -80,93 +82,91 @@ Frames = Annotated[int, Field(ge=1, le=1_000_000)]
 
 
 class Camera(Model):
-    """Where pictures look from; the camera aims at the mesh's middle."""
+    """View direction of pictures; the camera aims at the centre of the mesh."""
 
     azimuth: float = Field(default=0.0, ge=-360, le=360)
-    """Angle around the vertical axis [degrees], 0 looks along -z."""
+    """Angle about the vertical axis [degrees], 0 is a view along -z."""
     elevation: float = Field(default=0.0, ge=-90, le=90)
     """Angle above the horizon [degrees]."""
 
 
 class SceneFields(Model):
-    """The keys of a scene that mean the same in its file and in memory."""
+    """Fields of a scene that are the same in its file and in memory."""
 
     description: str = Field(default="", max_length=1000)
-    """One sentence about the scene."""
+    """Description of the scene in one sentence."""
     mass: float | None = Field(default=None, gt=0, le=1e12)
-    """Total mass [kg]; may be left out where the mesh brings masses of its own."""
+    """Total mass [kg]; optional if the mesh provides masses."""
     mass_per_area: float | None = Field(default=None, gt=0, le=1e12)
-    """Instead of `mass`: of the mesh's triangles at rest [kg/m^2]."""
+    """Area density of the mesh's triangles at rest [kg/m^2], instead of `mass`."""
     time_step: TimeStep
     """Time step [s], a number or a fraction such as "1/30"."""
     alternate_time_step: TimeStep | None = None
-    """Time step [s] of every second step; that of all others if left out."""
+    """Time step [s] of every second step; equal to `time_step` by default."""
     frames: Frames
     """Number of steps to simulate."""
     velocity: tuple[Speed, Speed, Speed] = (0.0, 0.0, 0.0)
-    """Velocity of every vertex at the start [m/s]."""
+    """Initial velocity of every vertex [m/s]."""
     start: AnyStart | None = None
-    """How the start differs from the rest shape."""
+    """Deviation of the initial state from the rest state."""
     default_size: Size | None = None
-    """Mesh size where neither a sweep nor the command line gives sizes."""
+    """Mesh size if neither a sweep nor the command line gives sizes."""
     camera: Camera | None = None
-    """Where pictures look from; chosen by the mesh's shape if left out."""
+    """View direction of pictures; chosen from the shape of the mesh by default."""
 
 
 class SceneFile(SceneFields):
     """A scene: a mesh, its mass and time step, and the effects that act on it."""
 
     mesh: Any  # checked, like the effects, by the class that its kind names
-    """The mesh; its `kind` says which."""
+    """The mesh; `kind` selects its type."""
     effects: Any = ()
-    """What acts on the mesh; only what is listed is simulated."""
+    """Effects on the mesh; only listed effects are simulated."""
 
 
 class MeshSource(Protocol):
-    """A mesh as a scene declares it: a pydantic model with a literal `kind`."""
+    """A mesh as declared by a scene: a pydantic model with a literal `kind`."""
 
     def build(self, size: int) -> Mesh:
-        """The mesh of this size; raises InputError when it has no such size."""
+        """Build the mesh of a size; raise InputError if that size is not supported."""
         ...
 
 
 class SceneSpec(SceneFields):
-    """A checked scene."""
+    """A validated scene."""
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
 
     mesh: SkipValidation[MeshSource]
-    """The mesh; its `kind` says which."""
+    """The mesh; `kind` selects its type."""
     mesh_digest: str = ""
-    """SHA-256 of a mesh from a file; empty for a generated mesh, which its parameters and its size determine."""
+    """SHA-256 of a mesh from a file; empty for a generated mesh, which its parameters and size determine."""
     effects: SkipValidation[tuple[Effect, ...]] = ()
-    """What acts on the mesh; only what is listed is simulated."""
+    """Effects on the mesh; only listed effects are simulated."""
     first_guess: FirstGuess = "current"
-    """Where a step's iteration starts if a sweep does not say; see `guess`."""
+    """Initial guess of a step unless a sweep sets it; see `choose_initial_guess`."""
     path: Path
-    """The file that the scene was read from, for messages."""
+    """Source file of the scene, for messages."""
     own: SkipValidation[Mapping[str, tuple[Plugin, Mapping[str, Any]]]] = Field(default_factory=dict)
-    """Which of `mesh`, `effects[0]`, ... is somebody's own code, and the parameters that its file gives."""
+    """Plug-ins by location (`mesh`, `effects[0]`, ...), with the parameters from the scene file."""
     lines: SkipValidation[Mapping[str, int]] = Field(default_factory=dict)
-    """The lines of the keys in that file, for messages."""
+    """Line numbers of the keys in that file, for messages."""
 
     def guess(self, integrator: str) -> FirstGuess:
-        """Where iterations start by an integrator of this name if nobody says: where the motion so far leads, for those
-        of several unknowns a step."""
+        """Return the default initial guess for an integrator: extrapolated for multi-stage integrators."""
         method = integrators.INTEGRATORS.get(integrator, integrators.IMPLICIT_EULER)
         says = self.first_guess != "current" or isinstance(method, integrators.Integrator)
         return self.first_guess if says else "motion"
 
     def of_effects(self, chosen: Sequence[int]) -> dict[str, Any]:
-        """The fields `effects` and `own` of the same scene with these effects alone, by their places."""
+        """Return the fields `effects` and `plugins` of the scene restricted to effects with these indices."""
         own = {place: told for place, told in self.own.items() if place == "mesh"}
         places = {f"effects[{i}]": f"effects[{k}]" for k, i in enumerate(chosen)}
         own |= {places[place]: told for place, told in self.own.items() if place in places}
         return {"effects": tuple(self.effects[i] for i in chosen), "own": own}
 
     def opened(self) -> SceneSpec:
-        """The same scene with what somebody's own code makes in place of its names; that code is imported. Raises
-        InputError."""
+        """Return the scene with plug-ins loaded, which imports their code; raise InputError on failure."""
         parts = (self.mesh, *self.effects)
         if not any(isinstance(part, OwnEffect | OwnMesh) for part in parts):
             return self
@@ -175,21 +175,21 @@ class SceneSpec(SceneFields):
         return SceneSpec.model_construct(None, **values | {"mesh": made[0], "effects": tuple(made[1:])})
 
     def stepped(self, time_step: float) -> SceneSpec:
-        """The same scene with another time step [s], the same in all steps."""
+        """Return the scene with another time step [s], the same for all steps."""
         if time_step == self.time_step:
             return self
         values: dict[str, Any] = {key: getattr(self, key) for key in SceneSpec.model_fields}
         return SceneSpec.model_construct(None, **values | {"time_step": time_step, "alternate_time_step": None})
 
     def require_even_steps(self) -> None:
-        """Raise InputError for a scene whose steps differ in length."""
+        """Raise InputError if the steps differ in length."""
         if self.alternate_time_step is not None:
             key, wanted = "alternate_time_step", "what is measured here depends on one time step; leave it out"
             raise InputError(Mistake(wanted, self.path, self.lines.get(key), key))
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of all that determines a run of the scene; mesh files count by content, not by name."""
+        """SHA-256 of everything that determines a run; mesh files count by content, not by name."""
         content = self.model_dump(mode="json", include={"mass", "time_step", "velocity", "camera", "mesh", "effects"})
         content["mesh"] = self.mesh_digest or content["mesh"]
         for place, (plugin, given) in self.own.items():  # which need not be imported to be told apart

@@ -1,7 +1,7 @@
-"""How a simulation starts where it does not start at rest: other positions, and a spin.
+"""Initial states that differ from the rest state: other positions, and a spin.
 
-A start is a map of the rest positions (n, 3) [m]; `c` is their mean. The velocity of a vertex at p is that of the scene
-and spin x (p - c'), c' the mean of the positions at the start.
+A start maps the rest positions (n, 3) [m] to initial positions; `c` is their mean. The velocity of a vertex at p is
+that of the scene plus spin x (p - c'), where c' is the mean of the initial positions.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ Axis = Literal["x", "y", "z"]
 
 
 class Rest(Model):
-    """The rest shape, which may spin."""
+    """The rest shape, optionally with a spin."""
 
     kind: Literal["rest"] = "rest"
     spin: Vector = (0.0, 0.0, 0.0)
-    """Angular velocity about the mean of the positions [rad/s]."""
+    """Angular velocity about the mean position [rad/s]."""
 
     def positions(self, rest: Positions) -> Positions:
-        """The positions at the start (n, 3) [m] from those at rest; raises InputError for what the mesh lacks."""
+        """Return the initial positions (n, 3) [m]; raise InputError if the mesh lacks a named vertex."""
         return rest
 
     def velocity(self, p: Positions) -> Positions:
-        """The velocity (n, 3) [m/s] of the spin at positions p (n, 3) [m]."""
+        """Return the velocity of the spin (n, 3) [m/s] at positions p (n, 3) [m]."""
         return np.cross(self.spin, p - p.mean(axis=0))
 
 
 class Collapsed(Rest):
-    """All vertices in one point, the mean of the rest positions."""
+    """All vertices at one point, the mean of the rest positions."""
 
     kind: Literal["collapsed"] = "collapsed"  # pyright: ignore[reportIncompatibleVariableOverride]
 
@@ -46,11 +46,11 @@ class Collapsed(Rest):
 
 
 class Flattened(Rest):
-    """Flattened to a plane or, along two axes, to a line."""
+    """Flattened to a plane or, with two axes, to a line."""
 
     kind: Literal["flattened"] = "flattened"  # pyright: ignore[reportIncompatibleVariableOverride]
     along: Many[Axis]
-    """The coordinates that all vertices have in common."""
+    """Coordinates that are set to their mean for all vertices."""
 
     def positions(self, rest: Positions) -> Positions:
         """See Rest."""
@@ -60,11 +60,11 @@ class Flattened(Rest):
 
 
 class Scaled(Rest):
-    """c + factors (p - c): smaller, larger, mirrored where a factor is negative."""
+    """c + factors (p - c): shrunk, enlarged, or mirrored for a negative factor."""
 
     kind: Literal["scaled"] = "scaled"  # pyright: ignore[reportIncompatibleVariableOverride]
     factors: Vector
-    """Along x, y and z."""
+    """Factors along x, y and z."""
 
     def positions(self, rest: Positions) -> Positions:
         """See Rest."""
@@ -73,11 +73,11 @@ class Scaled(Rest):
 
 
 class Random(Rest):
-    """Each vertex anywhere in a cube about c, uniformly (as Chen et al. 2024 start vertex block descent)."""
+    """Vertices at uniformly random points of a cube about c (start of Chen et al. 2024 for vertex block descent)."""
 
     kind: Literal["random"] = "random"  # pyright: ignore[reportIncompatibleVariableOverride]
     side: PositiveFloat
-    """The side of the cube [m]."""
+    """Side of the cube [m]."""
     seed: NonNegativeInt = 0
 
     def positions(self, rest: Positions) -> Positions:
@@ -87,11 +87,11 @@ class Random(Rest):
 
 
 class Perturbed(Rest):
-    """Each coordinate moved by a normal random number."""
+    """Each coordinate perturbed by a normal random number."""
 
     kind: Literal["perturbed"] = "perturbed"  # pyright: ignore[reportIncompatibleVariableOverride]
     deviation: PositiveFloat
-    """Its standard deviation [m]."""
+    """Standard deviation [m]."""
     seed: NonNegativeInt = 0
 
     def positions(self, rest: Positions) -> Positions:
@@ -100,11 +100,11 @@ class Perturbed(Rest):
 
 
 class Merged(Rest):
-    """Some vertices in the place of another."""
+    """Some vertices moved to the position of another."""
 
     kind: Literal["merged"] = "merged"  # pyright: ignore[reportIncompatibleVariableOverride]
     vertices: tuple[NonNegativeInt, ...] = Field(min_length=2)
-    """The vertex that stays, and those that are put on it."""
+    """The vertex that stays, followed by those that are moved to it."""
 
     @model_validator(mode="after")
     def _differ(self) -> Merged:
@@ -123,4 +123,4 @@ class Merged(Rest):
 
 
 AnyStart = Annotated[Rest | Collapsed | Flattened | Scaled | Random | Perturbed | Merged, Field(discriminator="kind")]
-"""A start as a scene declares it; its `kind` says which."""
+"""A start as declared by a scene; `kind` selects its type."""

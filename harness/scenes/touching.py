@@ -1,4 +1,4 @@
-"""What effects share that keep a mesh from passing through something: what of it may touch, and what they refuse."""
+"""Shared parts of the barrier contact effects: collision primitives, stiffness, validation and messages."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ from solvers.matrices import assemble
 from solvers.problem import Energy, Pins, Positions, ProjectiveEnergy, System
 
 _STIFF = 0.1
-"""Of what inertia and springs resist with at a vertex."""
+"""Barrier stiffness as a fraction of the resistance of inertia and springs at a vertex."""
 
 _NAMED = 3
-"""Pairs that a message names."""
+"""Maximum number of pairs that a message names."""
 
 ENDS = ("keeps apart what it finds at the end of a step",)
 
 
 def outline(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The edges (m, 2) that may touch, sides of triangles and springs of stretch that run between other vertices, and
-    what points may touch (f, 3): triangles, and such springs i, j as triangles i, j, j.
+    """Return the edges (m, 2) and faces (f, 3) of the mesh that can collide.
 
-    Without those, two ropes that lie side by side would feel nothing: nearly parallel edges do not press.
+    Edges are the sides of triangles, and stretch springs between other vertices. Faces are the triangles, and such
+    springs i, j as triangles i, j, j. Without these, parallel ropes would not collide, because the edge-edge barrier
+    vanishes for nearly parallel edges.
     """
     triangles = mesh.triangles
     sides = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
@@ -45,7 +46,17 @@ def outline(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 def resisting(
     given: float | None, mass: NDArray[np.float64], time_step: float, energies: Sequence[Energy]
 ) -> NDArray[np.float64]:
-    """A barrier's stiffness (n,) [N/m]: what is given, or by what inertia and springs resist with."""
+    """Compute the barrier stiffness of each vertex.
+
+    Args:
+        stiffness: given value [N/m]; None for a fraction of the resistance of inertia and springs.
+        mass: (n,) [kg].
+        time_step: dt [s].
+        energies: energies of the other effects.
+
+    Returns:
+        Stiffness (n,) [N/m].
+    """
     if given is not None:
         return np.full(len(mass), given)
     projective = [energy for energy in energies if isinstance(energy, ProjectiveEnergy)]
@@ -54,26 +65,26 @@ def resisting(
 
 
 class PinLike(Protocol):
-    """What pins tell of themselves (`harness.scenes.effects.base`)."""
+    """Interface of pins (`harness.scenes.effects.effect_interface`)."""
 
     @property
     def vertices(self) -> NDArray[np.int64]:
-        """(q,)"""
+        """Pinned vertices (q,)."""
         ...
 
     @property
     def targets(self) -> Positions:
-        """(q, 3) [m]"""
+        """Targets (q, 3) [m]."""
         ...
 
     @property
     def weight(self) -> float:
-        """[N/m]"""
+        """Penalty weight [N/m]."""
         ...
 
     @property
     def motion(self) -> KeyedMotion | None:
-        """Takes the targets along."""
+        """Motion of the targets."""
         ...
 
 
@@ -89,7 +100,7 @@ def require_still(who: str, start: Positions, pins: Sequence[PinLike]) -> None:
 
 
 def require_open(who: str, energy: PairContact, start: Positions, thickness: float, mesh: Mesh) -> None:
-    """Raise InputError for a start (n, 3) [m] where pairs are nearer than the thickness [m]."""
+    """Raise InputError if pairs start closer than `min_distance` [m], at the start (n, 3) [m]."""
     if closed := energy.closed(start):
         near = "; ".join(f"{_pair(x.tolist(), two, mesh)} {apart:.3g} m apart" for x, two, apart in closed[:_NAMED])
         raise InputError(
@@ -104,7 +115,7 @@ def _pair(x: list[int], edges: bool, mesh: Mesh) -> str:
 
 
 def _part(x: Sequence[int], mesh: Mesh) -> str:
-    """A vertex, an edge or a triangle by its vertices; those beyond the mesh's are those of obstacles."""
+    """Describe a vertex, an edge or a triangle by its vertices; indices beyond the mesh are those of obstacles."""
     n = len(mesh.rest)
     own = all(i < n for i in x)
     kind = ("vertex", "edge", "triangle")[len(x) - 1]
@@ -112,6 +123,6 @@ def _part(x: Sequence[int], mesh: Mesh) -> str:
 
 
 def told(crossed: list[Crossing], mesh: Mesh) -> str:
-    """The first ones in words; vertices beyond those of the mesh are those of obstacles."""
+    """Describe the first intersections in words; indices beyond the mesh are those of obstacles."""
     words = "; ".join(f"{_part(e, mesh)} through {_part(t, mesh)}" for e, t in crossed[:_NAMED])
     return f"{len(crossed)} times: {words}"

@@ -1,12 +1,12 @@
-"""Cloth that is stiffer along one thread than along the other, and softest between them.
+"""Orthotropic cloth: different stiffness along warp and weft, and lowest at 45 degrees.
 
     k(theta) = (warp if cos 2 theta >= 0, else weft) cos^2 2 theta + bias sin^2 2 theta
 
-theta: from the warp's direction to a spring, in the plane that touches the mesh at rest. So springs along the warp have
-its stiffness, those across it that of the weft, and those at 45 degrees that of the bias; in between it is smooth, and
-no stiffness is below the least of the three. On a grid along both threads a strain of the warp or the weft is resisted
-by these springs and by the diagonals, of constant s = bias: C11 = warp + s, C22 = weft + s, C12 = C66 = s
-(`harness.scenes.material`, with both diagonals). The rule between the directions is our own.
+theta is the angle from the warp direction to a spring, in the tangent plane of the mesh at rest. Springs along the warp
+have its stiffness, those across it that of the weft, and those at 45 degrees that of the bias. The transition is
+smooth, and no stiffness is below the smallest of the three. On a grid along both threads, these springs and the
+diagonals of constant s = bias resist strain: C11 = warp + s, C22 = weft + s, C12 = C66 = s
+(`harness.scenes.material`, with both diagonals). The interpolation rule is original to this project.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from harness.base.model import Model, Vector
 from harness.scenes.mesh.base import Mesh
 
 _ACROSS = 1e-6
-"""Of the direction's length: less than that in the plane of the mesh is none."""
+"""Smallest tangential part of the warp direction, relative to its length, that counts as nonzero."""
 
 
 class Weave(Model):
-    """The stiffness of a woven cloth along its threads and between them, in the unit of `stretch`."""
+    """Stiffness of a woven cloth along and between its threads, in the unit of `stretch`."""
 
     warp: NonNegativeFloat
-    """Along the warp."""
+    """Stiffness along the warp."""
     weft: NonNegativeFloat
-    """Across it."""
+    """Stiffness along the weft, across the warp."""
     bias: NonNegativeFloat
-    """At 45 degrees to both."""
+    """Stiffness at 45 degrees to both."""
     direction: Vector
-    """Of the warp, in the rest shape, of any length but zero; on curved meshes what of it lies along the surface."""
+    """Direction of the warp in the rest shape, of any length but zero; on curved meshes its tangential part."""
 
     @model_validator(mode="after")
     def _directed(self) -> Weave:
@@ -42,7 +42,7 @@ class Weave(Model):
         return self
 
     def of(self, mesh: Mesh, springs: NDArray[np.int64]) -> NDArray[np.float64]:
-        """The constants (m,) of springs (m, 2); raises InputError where the mesh has no surface along the warp."""
+        """Compute the constants (m,) of springs (m, 2); raise InputError if the surface has no part along the warp."""
         if mesh.dimension != 2 or not len(mesh.triangles):
             raise InputError(Mistake("warp and weft need a mesh of triangles; give one number", key="stretch"))
         a, b, c = (mesh.rest[mesh.triangles[:, k]] for k in range(3))

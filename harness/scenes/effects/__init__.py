@@ -1,1 +1,1 @@
-"""What a scene can contain, one effect a file; the table of their names is in `effect_names.py`."""
+"""Effects of a scene, one per module; `effect_table.py` has the table of their names."""

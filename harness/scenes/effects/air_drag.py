@@ -1,10 +1,10 @@
-"""Air drag on vertices, in air at rest: f = -c v, or f = -c |v| v.
+"""Air drag on vertices in still air: f = -c v, or f = -c |v| v.
 
-The linear one is an energy (see `solvers.energies.quadratic`): unconditionally stable, and in Q. The quadratic one acts
-on the velocity before each step, by the exact solution of m dv/dt = -c |v| v over it: v <- m v / (m + c dt |v|),
-unconditionally stable too, and of order 1. Integrators that take forces at their unknowns have it as a force, up to
-what stops a vertex in one step, and keep their order. Wind on triangles drags as well, by their area and how they face
-the air.
+Linear drag is an energy (see `solvers.model.energies.quadratic_energy`): unconditionally stable, and part of Q.
+Quadratic drag acts on the velocity before each step, by the exact solution of m dv/dt = -c |v| v:
+v <- m v / (m + c dt |v|), which is unconditionally stable too, and of order 1. Integrators that evaluate forces at
+their stages treat it as a force, limited to what stops a vertex in one step, and retain their order. Wind on triangles
+includes drag as well, by their area and their angle to the flow.
 """
 
 from math import inf
@@ -22,24 +22,24 @@ from solvers.filters import QuadraticDrag
 from solvers.problem import Positions
 
 ALIVE = 0.1
-"""Of the largest kinetic energy: more than this, on average over the last quarter, and the scene does not rest."""
+"""Ratio of kinetic energy to its maximum: a larger average over the last quarter means that the scene does not rest."""
 
 
 class AirDrag(Model):
-    """Drag of the air on the vertices, spread as the mass is."""
+    """Air drag on the vertices, distributed like the mass."""
 
     exact_to: ClassVar[float] = inf
     damps: ClassVar[bool] = True
 
     kind: Literal["air-drag"] = "air-drag"
     law: Literal["linear", "quadratic"] = "linear"
-    """How the drag grows with the speed."""
+    """Growth of the drag with the speed: linear or quadratic."""
     coefficient: NonNegativeFloat
-    """The drag of the whole mesh at a speed of 1 m/s [N]: c [N s/m] if linear, half of the air's density times area
-    times drag coefficient [kg/m] if quadratic."""
+    """Drag of the whole mesh at a speed of 1 m/s [N]: c [N s/m] if linear; if quadratic, half of the air density times
+    area times drag coefficient [kg/m]."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The drag as an energy or as a filter; none at all for a coefficient of zero."""
+        """Return the drag as an energy or a filter; empty for a zero coefficient."""
         c = self.coefficient * mesh.shares
         if not c.any():
             return Contribution()
@@ -53,7 +53,7 @@ class AirDrag(Model):
 
     @classmethod
     def called_for(cls, seen: Seen) -> str:
-        """See `harness.scenes.effects.base.Effect`: nothing drives the motion, and it does not end."""
+        """Return evidence for drag: motion without driving forces that does not end."""
         mass, v = seen.mass, seen.velocities
         if seen.driven or seen.damped or len(v) < 8:
             return ""
@@ -71,7 +71,7 @@ class AirDrag(Model):
 
 
 def _force(c: NDArray[np.float64], limit: NDArray[np.float64]) -> Force:
-    """The force for c (n,) [kg/m], at most `limit` (n,) [kg/s] times the velocity."""
+    """Build the force for c (n,) [kg/m], limited to `limit` (n,) [kg/s] times the velocity."""
 
     def drag(p: Positions, v: Positions, t: float) -> Positions:
         return -np.minimum(c * np.linalg.norm(v, axis=1), limit)[:, None] * v
@@ -80,5 +80,5 @@ def _force(c: NDArray[np.float64], limit: NDArray[np.float64]) -> Force:
 
 
 def _kinetic(mass: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The kinetic energy in each frame [J]."""
+    """Compute the kinetic energy of each frame [J]."""
     return 0.5 * np.einsum("i,fix,fix->f", mass, v, v)

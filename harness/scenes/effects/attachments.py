@@ -1,4 +1,4 @@
-"""Attachments: springs of zero rest length from vertices to points that may move, E = sum_i k_i/2 |p_i - q_i(t)|^2."""
+"""Attachments: zero-length springs from vertices to points that may move, E = sum_i k_i/2 |p_i - q_i(t)|^2."""
 
 from math import inf
 from typing import ClassVar, Literal
@@ -18,20 +18,20 @@ from solvers.problem import Positions
 
 
 class Attachments(Selection):
-    """Ties every vertex that any of its selectors names to a point of its own, softly, unlike pins."""
+    """Attaches each selected vertex to its own anchor by a spring; softer than pins."""
 
     exact_to: ClassVar[float] = inf
 
     kind: Literal["attachments"] = "attachments"
     stiffness: NonNegativeFloat
-    """The stiffness of all the springs together [N/m], shared equally, so that it means the same at every mesh size."""
+    """Total stiffness of the springs [N/m], divided equally, so that it is independent of the mesh size."""
     to: tuple[Vector, ...] | None = None
-    """The points [m]: one for all of the vertices, or one for each in their order; left out, their rest positions."""
+    """Anchors [m]: one for all vertices, or one for each in their order; by default their rest positions."""
     motion: KeyedMotion | None = None
-    """Key frames that take the points along, all together."""
+    """Key frames of the motion of all anchors."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The springs as one energy, none for a stiffness of zero; raises InputError where they do not fit the mesh."""
+        """Return the springs as one energy, empty for zero stiffness; raise InputError if they do not fit the mesh."""
         vertices = self.chosen(mesh, self.kind)
         if self.to and len(self.to) not in (1, len(vertices)):
             raise InputError(

@@ -1,4 +1,4 @@
-"""The interface of an effect: what a scene declares, bound to a mesh, contributes to the step's formula.
+"""Interface of an effect: its contribution to the step objective for a given mesh.
 
 An absent effect is an empty tuple: no flag, no branch, no allocation.
 """
@@ -26,34 +26,44 @@ if TYPE_CHECKING:  # for those who have any
 
 
 class Force(Protocol):
-    """An external force, folded into the right-hand side once a step."""
+    """External force, added to the right-hand side once per step."""
 
     def __call__(self, p: Positions, v: Positions, t: float) -> Positions:
-        """The force [N], shape (n, 3), at positions p [m], velocities v [m/s] and time t [s] of the step's start."""
+        """Return the force [N].
+
+        Args:
+            p: positions (n, 3) [m] at the start of the step.
+            v: velocities (n, 3) [m/s] at the start of the step.
+            t: time [s] of the start of the step.
+
+        Returns:
+            The force (n, 3) [N].
+        """
         ...
 
 
 class VelocityFilter(Protocol):
-    """A change of the velocity at the start of a step."""
+    """Modification of the velocity at the start of a step."""
 
     def __call__(self, v: Positions) -> Positions:
-        """The changed velocity [m/s], shape (n, 3)."""
+        """Return the modified velocity (n, 3) [m/s]."""
         ...
 
 
 class Derived(Protocol):
-    """Energies that follow from those of a scene's other effects."""
+    """Energies that depend on the energies of the scene's other effects."""
 
     def __call__(self, energies: Sequence[Energy]) -> tuple[Energy, ...]:
-        """The energies to be added to these."""
+        """Return the additional energies."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pin:
-    """Vertices (q,) held at targets (q, 3) [m] with a penalty weight [N/m]; an infinite weight is exact.
+    """Vertices (q,) pinned to targets (q, 3) [m] with a penalty weight [N/m]; an infinite weight is exact.
 
-    motion: takes the targets along, where they move.
+    Attributes:
+        motion: motion of the targets, None if they are fixed.
     """
 
     vertices: NDArray[np.int64]
@@ -63,16 +73,16 @@ class Pin:
 
 
 class Check(Protocol):
-    """What an effect asks of a scene's other parts."""
+    """Requirement of an effect on the other parts of a scene."""
 
     def __call__(self, start: Positions, pins: Sequence[Pin]) -> None:
-        """Raise InputError where the effect does not fit the start (n, 3) [m], or the pins."""
+        """Raise InputError if the effect is incompatible with the start (n, 3) [m] or the pins."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contribution:
-    """The places that the step formula has, and no others."""
+    """Contributions of an effect to the step problem, by kind of term."""
 
     energies: tuple[Energy, ...] = field(default=())
     forces: tuple[Force, ...] = field(default=())
@@ -82,55 +92,67 @@ class Contribution:
     lengths: tuple[Lengths, ...] = field(default=())
     checks: tuple[Check, ...] = field(default=())
     once: tuple[str, ...] = field(default=())
-    """What a scene can have but once, in words; a second one would be added to the first."""
+    """Features that a scene can have only once, in words; a second one would be added to the first."""
     apart: tuple[Apart, ...] = ()
-    """What may not pass through what, for whoever looks."""
+    """Primitives that must not intersect, for verification."""
     ends: tuple[str, ...] = ()
-    """Why each unknown has to be where a step ends, in words."""
+    """Reasons why each stage has to lie at the end of a step, in words."""
     continuous: tuple[Callable[[], Contribution], ...] = field(default=())
-    """Makes what does the same by forces and energies alone: for integrators that take forces at their unknowns."""
+    """Builds an equivalent form with forces and energies only, for integrators that evaluate forces at their stages."""
 
     def by(self, method: integrators.AnyIntegrator) -> Contribution:
-        """What an integrator takes of it."""
+        """Return the form of the contribution that an integrator supports."""
         return self.continuous[0]() if self.continuous and not splits(method) else self
 
     @property
     def empty(self) -> bool:
-        """Whether there is nothing in any place."""
+        """Whether the contribution has no terms."""
         return not (self.energies or self.forces or self.pins or self.filters or self.derived or self.lengths)
 
 
 class Effect(Protocol):
     """A pydantic model with a literal `kind`.
 
-    Its class states `exact_to`, a class variable: the order of the error, by steps, up to which integrators keep their
-    own with it; infinite where it is smooth and they take it where it acts. One that does not say so promises nothing.
-    It may state class variables: `damps`, True where it takes energy out of any motion; `plain`, True where scenes have
-    it that the prices of effects are told against, so that it has none; and
-    `called_for(seen: Seen) -> str`, a class method: by what evidence the motion of a scene that does not list it asks
-    for it, "" where it does not.
+    Its class states `max_convergence_order`, a class variable: the order of the error in the step size up to which
+    integrators retain their own order with the effect. It is infinite if the effect is smooth and evaluated where it
+    acts; without it, no order is guaranteed. Optional class variables: `is_dissipative`, True if the effect removes
+    energy from any motion; `is_baseline_effect`, True if the baseline scenes of the effects' cost contain it, so it has
+    no cost of its own; and `find_evidence(observed: ObservedMotion) -> str`, a class method that returns the evidence
+    in the motion of a scene that the effect is missing, or "".
     """
 
     @property
     def kind(self) -> str:
-        """The effect's name in `harness.scenes.effects.effect_names`."""
+        """Name of the effect in `harness.scenes.effects.effect_table`."""
         ...
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """What the effect contributes on this mesh with these vertex masses [kg] and dt [s], once a scene.
+        """Build the contribution of the effect, once per scene.
 
-        Raises InputError when the effect does not fit the mesh.
+        Args:
+            mesh: the mesh.
+            mass: vertex masses (n,) [kg].
+            time_step: dt [s].
+
+        Raises:
+            InputError: if the effect does not fit the mesh.
         """
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """What was seen of a scene, for effects that it does not list.
+    """Observed motion of a scene, for the detection of missing effects.
 
-    springs: with (m, 2) ends and their (m,) rest lengths [m]; length: the mean of these, or the mesh's spacing [m];
-    mass: (n,) [kg]; held: whether pins hold it; driven: whether forces or obstacles keep it moving; damped: whether an
-    effect takes energy out of it; positions [m], velocities [m/s]: (frames, n, 3).
+    Attributes:
+        springs: ends (m, 2) and rest lengths (m,) [m].
+        mean_spring_length: mean rest length, or the mesh's spacing [m].
+        mass: (n,) [kg].
+        has_pins: whether vertices are pinned.
+        is_driven: whether forces or obstacles maintain the motion.
+        is_damped: whether an effect dissipates energy.
+        positions: (frames, n, 3) [m].
+        velocities: (frames, n, 3) [m/s].
     """
 
     mesh: Mesh
@@ -145,30 +167,37 @@ class Seen:
     velocities: NDArray[np.float64]
 
     def time(self, frame: int) -> float:
-        """Of a frame's end [s]; counted from 0."""
+        """Return the time [s] of the end of a frame; frames count from 0."""
         return (frame + 1) * self.time_step
 
 
 FEW = 0.01
-"""Of springs, and of edges: fewer are the corners that hang on a pin, where strain and curvature grow without bound as
-the mesh is refined."""
+"""Fraction of springs or edges that is negligible: the corners next to a pin, where strain and curvature grow without
+bound under mesh refinement."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steady:
-    """A force (n, 3) [N] that never changes; a scene adds all of these up once."""
+    """A constant force field (n, 3) [N]; a scene adds all of them once."""
 
     force: Positions
 
     def __call__(self, p: Positions, v: Positions, t: float) -> Positions:
-        """The same force at all times."""
+        """Return the force, which is the same at all times."""
         return self.force
 
 
 def kept(mesh: Mesh, springs: NDArray[np.int64], shortest: float, longest: float) -> Contribution:
-    """Lengths of springs (m, 2) that are exact, from `shortest` to `longest` times those at rest; nothing for none.
+    """Build length constraints of springs, empty for no springs.
 
-    Raises InputError for a spring of no length.
+    Args:
+        mesh: the mesh.
+        springs: (m,) indices of springs.
+        min_ratio: smallest length relative to the rest length.
+        max_ratio: largest length relative to the rest length.
+
+    Raises:
+        InputError: for a spring of zero length.
     """
     if not len(springs):
         return Contribution()
@@ -183,6 +212,6 @@ def kept(mesh: Mesh, springs: NDArray[np.int64], shortest: float, longest: float
 
 
 def steady(force: Positions) -> tuple[Steady, ...]:
-    """A force (n, 3) [N] that never changes; none at all where it is zero everywhere."""
+    """Wrap a constant force (n, 3) [N]; empty if it is zero everywhere."""
     force.flags.writeable = False
     return (Steady(force),) if force.any() else ()

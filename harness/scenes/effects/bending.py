@@ -1,4 +1,4 @@
-"""Bending: the quadratic energy of surfaces that hardly stretch (Bergou et al. 2006), flat at rest."""
+"""Bending: the quadratic energy of nearly inextensible surfaces (Bergou et al. 2006), flat at rest."""
 
 from math import inf
 from typing import ClassVar, Literal
@@ -14,20 +14,20 @@ from harness.scenes.mesh.base import Mesh
 from solvers.energies import bending
 
 SHARP = np.deg2rad(60.0)
-"""More than this from triangle to triangle, and the mesh shows its edges."""
+"""Dihedral angle above which a mesh shows its edges."""
 
 
 class Bending(Model):
-    """Resists bending of the mesh's triangles. Their rest state is flat whatever the mesh's shape is: a tube opens."""
+    """Bending stiffness of the triangles. The rest state is flat, whatever the shape of the mesh: a tube opens."""
 
     exact_to: ClassVar[float] = inf
 
     kind: Literal["bending"] = "bending"
     stiffness: NonNegativeFloat
-    """The flexural rigidity B [N m]: the moment for a curvature of 1/m, for each metre of width, at every mesh size."""
+    """Flexural rigidity B [N m]: the moment per metre of width for a curvature of 1/m, at every mesh size."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The energy, none for a stiffness of zero; raises InputError for a mesh that is no surface."""
+        """Return the energy, empty for zero stiffness; raise InputError if the mesh is no surface."""
         if not self.stiffness:
             return Contribution()
         triangles = mesh.triangles
@@ -50,7 +50,7 @@ class Bending(Model):
 
     @classmethod
     def called_for(cls, seen: Seen) -> str:
-        """See `harness.scenes.effects.base.Effect`: folds as sharp as the mesh."""
+        """Return evidence for bending stiffness: folds as sharp as the mesh."""
         mesh = seen.mesh
         hinges = _hinges(mesh.triangles)
         if mesh.dimension != 2 or not len(hinges):
@@ -69,7 +69,7 @@ class Bending(Model):
 
 
 def _hinges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The edges that two triangles share, with the corners across: (k, 4)."""
+    """Find the edges shared by two triangles, with the two opposite corners: (k, 4)."""
     if not len(triangles):
         return np.empty((0, 4), np.int64)
     rolled = np.concatenate([np.roll(triangles, -k, axis=1) for k in range(3)])  # an edge, then the corner across
@@ -82,7 +82,7 @@ def _hinges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _angles(p: NDArray[np.float64], hinges: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The signed angle by which the second triangle turns away from the plane of the first [rad], (k,)."""
+    """Compute the signed angle between the second triangle and the plane of the first [rad], (k,)."""
     a, b, c, d = (p[corner] for corner in hinges.T)
     edge = b - a
     left, right = np.cross(edge, c - a), np.cross(d - a, edge)

@@ -1,4 +1,4 @@
-"""The assignment's external force: the same newtons on every vertex, whatever its mass."""
+"""The assignment's external force: equal for all vertices, whatever their mass."""
 
 from math import inf
 from typing import ClassVar, Literal
@@ -12,14 +12,14 @@ from harness.scenes.mesh.base import Mesh
 
 
 class ConstantForce(Model):
-    """One force on every vertex. It is gravity only where every vertex weighs the same."""
+    """One force on every vertex. It equals gravity only if all vertices have the same mass."""
 
     exact_to: ClassVar[float] = inf
 
     kind: Literal["constant-force"] = "constant-force"
     force: Vector
-    """The force on each vertex [N]."""
+    """Force on each vertex [N]."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The force on every vertex."""
+        """Return the force on every vertex."""
         return Contribution(forces=steady(np.tile(np.array(self.force), (len(mass), 1))))

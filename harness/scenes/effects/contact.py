@@ -1,4 +1,4 @@
-"""Contact with obstacles, and Coulomb friction; vertices meet obstacles, not each other."""
+"""Contact of vertices with obstacles, with Coulomb friction; vertices do not collide with each other."""
 
 from __future__ import annotations
 
@@ -23,38 +23,38 @@ from solvers.problem import Energy as AnyEnergy
 from solvers.problem import Pins, Positions, ProjectiveEnergy, System
 
 _SAFETY = 4.0
-"""How much stiffer contact is than one collision at full speed needs: neighbours that are stopped one after another
-pull as well."""
+"""Safety factor of the contact stiffness relative to one collision at full speed: neighbours that are stopped in turn
+exert a force as well."""
 
 _MARGIN = 0.1
-"""How far forces alone may bring a vertex in one step, as a part of the mesh's size."""
+"""Largest displacement of a vertex by forces in one step, as a fraction of the mesh's size."""
 
 
 class Contact(Model):
-    """Keeps the mesh's vertices out of obstacles: what crosses one within a step, however thin, is stopped too.
+    """Keeps the vertices of the mesh outside of obstacles; thin obstacles cannot be tunnelled within a step.
 
-    The stiffness k of contact follows from the depth tolerance. A vertex that arrives with the speed v ends at most
-    v dt Q_ii / k deep, with Q_ii all that inertia and springs resist with, so k_i = 4 Q_ii max(1, v dt / tolerance).
+    The stiffness k of contact follows from the penetration tolerance. A vertex that arrives with the speed v ends at
+    most v dt Q_ii / k deep, where Q_ii is the resistance of inertia and springs: k_i = 4 Q_ii max(1, v dt / tolerance).
     """
 
     exact_to: ClassVar[float] = 1.0
 
     kind: Literal["contact"] = "contact"
     obstacles: tuple[AnyObstacle, ...] = Field(min_length=1)
-    """What vertices are kept out of."""
+    """Obstacles that the vertices collide with."""
     thickness: Annotated[PositiveFloat, Field(le=1e9)] = 0.005
-    """How far from an obstacle's surface vertices stay [m]; shorter than every spring at rest."""
+    """Distance [m] that vertices keep from an obstacle's surface; shorter than every spring at rest."""
     friction: NonNegativeFloat = 0.0
-    """Coulomb's coefficient mu, the same at rest and in motion."""
+    """Coulomb's friction coefficient mu, both static and kinetic."""
     tolerance: PositiveFloat | None = None
-    """How much nearer than `thickness` vertices may end a step [m]; a tenth of it if left out."""
+    """Penetration [m] into `thickness` that is allowed at the end of a step; by default a tenth of `thickness`."""
     speed: PositiveFloat = 10.0
-    """The largest speed [m/s] at which the tolerance is kept."""
+    """Largest speed [m/s] at which the penetration tolerance is met."""
     creep: PositiveFloat = 1e-5
-    """Vertices that slip slower than this [m/s] count as sticking, and creep."""
+    """Tangential speed [m/s] below which vertices count as sticking, and creep."""
     friction_rounds: PositiveInt = ROUNDS
-    """Solves of a step at most, each with the normal forces of the one before, until friction does not change; 1 takes
-    those of the step's start, which is of order 1 and misses the first step of contact."""
+    """Maximum number of solves per step until friction converges, each with the normal forces of the previous one; 1
+    uses those of the step's start, which is of order 1 and misses the first step of contact."""
 
     @model_validator(mode="after")
     def _within(self) -> Contact:
@@ -64,11 +64,15 @@ class Contact(Model):
 
     @property
     def depth(self) -> float:
-        """The tolerance [m]."""
+        """Penetration tolerance [m]."""
         return self.thickness / 10.0 if self.tolerance is None else self.tolerance
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The contact as one energy, its stiffness by the other effects'; raises InputError for a mesh too fine."""
+        """Return the contact as one energy, with a stiffness from the other effects.
+
+        Raises:
+            InputError: if the mesh is too fine for the thickness.
+        """
         lengths = mesh.rest_lengths
         if len(lengths) and not self.thickness < lengths.min():
             raise InputError(
@@ -89,7 +93,7 @@ class Contact(Model):
         return Contribution(derived=(derived,), checks=(partial(self._check, mesh),))
 
     def _check(self, mesh: Mesh, start: Positions, pins: Sequence[Pin]) -> None:
-        """Raise InputError for pins or a start (n, 3) [m] inside an obstacle, and for planes without room between."""
+        """Raise InputError for pins or a start (n, 3) [m] inside an obstacle, and for planes without a gap."""
         limit = self.thickness - self.depth
         for k, given in enumerate(self.obstacles):
             obstacle = given.obstacle()

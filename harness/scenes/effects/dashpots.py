@@ -1,4 +1,4 @@
-"""Dashpots: damping along the mesh's springs, f = -c n n'(v_i - v_j), by a rule of `scenes.material` like springs."""
+"""Dashpots: damping along the springs, f = -c n n'(v_i - v_j), scaled by a rule of `harness.scenes.material`."""
 
 from math import inf
 from typing import ClassVar, Literal
@@ -15,23 +15,23 @@ from solvers.energies import dashpots
 
 
 class Dashpots(Model):
-    """Damping of the speed at which springs change their length; motion of the mesh as a whole is not damped."""
+    """Damping of the rate of change of spring lengths; rigid motion of the mesh is not damped."""
 
     exact_to: ClassVar[float] = inf
     damps: ClassVar[bool] = True
 
     kind: Literal["dashpots"] = "dashpots"
     rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
-    """What the numbers below mean when the mesh size changes, as for springs."""
+    """Scaling rule of the coefficients with the mesh size, as for springs."""
     stretch: NonNegativeFloat
-    """Along the mesh's lines, in the unit of the stiffness of springs times seconds: `fixed` [N s/m] each."""
+    """Along the mesh's lines, in the unit of spring stiffness times seconds: `fixed` [N s/m] each."""
     shear: NonNegativeFloat | None = None
-    """Across the mesh's cells, in the same unit; as `stretch` if left out."""
+    """Across the mesh's cells, in the same unit; equal to `stretch` by default."""
     reference: PositiveInt | None = None
-    """liu2013: the mesh size at which the coefficients above hold."""
+    """liu2013: the mesh size for which the coefficients above are given."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The dashpots as one energy; none at all where no spring is damped."""
+        """Return the dashpots as one energy; empty if no spring is damped."""
         shear = self.stretch if self.shear is None else self.shear
         c = spring_stiffness(
             mesh, rule=self.rule, stretch=self.stretch, shear=shear, bend=0.0, reference=self.reference

@@ -1,4 +1,4 @@
-"""The effects by name. One of ours is a file and a line here, others need no line; a scene imports what it names."""
+"""Table of the effects by name; a scene imports only the effects that it names."""
 
 from solvers.plugins import Table
 
@@ -23,4 +23,4 @@ EFFECTS = {
 }
 
 EVERY = Table("springbench.effects", EFFECTS)
-"""All that a scene can name."""
+"""All effects by name."""

@@ -1,7 +1,7 @@
-"""Ether drag (Liu et al. 2013, section 5): before each step the velocity decays, v <- exp(-c dt) v.
+"""Ether drag (Liu et al. 2013, section 5): velocity decay before each step, v <- exp(-c dt) v.
 
-So a step is split, at order 1. Integrators that take forces at their unknowns have it as what it is, a linear force
-f = -c M v, and keep their order.
+This splits a step, at order 1. Integrators that evaluate forces at their stages treat it as the linear force
+f = -c M v, and retain their order.
 """
 
 from math import exp, inf
@@ -19,7 +19,7 @@ from solvers.filters import Decay
 
 
 class EtherDrag(Model):
-    """Damping of the velocity relative to space at rest, the same at any time step."""
+    """Damping of the absolute velocity, independent of the time step."""
 
     exact_to: ClassVar[float] = inf
     damps: ClassVar[bool] = True
@@ -27,10 +27,10 @@ class EtherDrag(Model):
 
     kind: Literal["ether-drag"] = "ether-drag"
     rate: NonNegativeFloat
-    """The rate of decay c [1/s]; the paper's factor a step is exp(-c dt)."""
+    """Decay rate c [1/s]; the paper's factor per step is exp(-c dt)."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """A filter that scales the velocity; none at all for a rate of zero."""
+        """Return a filter that scales the velocity; empty for a zero rate."""
         if self.rate == 0.0:
             return Contribution()
 

@@ -1,4 +1,4 @@
-"""Gas: a fixed amount of it in a closed mesh, E = -p0 V0 ln(V/V0)."""
+"""Gas: a fixed amount of gas in a closed mesh, E = -p0 V0 ln(V/V0)."""
 
 from math import inf
 from typing import ClassVar, Literal
@@ -15,16 +15,16 @@ from solvers.energies import gas
 
 
 class Gas(Model):
-    """Gas at constant temperature in a closed mesh, with nothing outside: p V stays what it is at rest."""
+    """Isothermal gas in a closed mesh, with vacuum outside: p V is constant."""
 
     exact_to: ClassVar[float] = inf
 
     kind: Literal["gas"] = "gas"
     pressure: NonNegativeFloat
-    """The pressure p0 in the rest shape, above that outside [Pa]."""
+    """Pressure p0 in the rest shape relative to the outside [Pa]."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The energy, none for a pressure of zero; raises InputError for a mesh that is not closed."""
+        """Return the energy, empty for zero pressure; raise InputError if the mesh is not closed."""
         if not self.pressure:
             return Contribution()
         triangles = mesh.triangles
@@ -40,7 +40,7 @@ class Gas(Model):
 
 
 def _check_closed(sides: NDArray[np.int64], mesh: Mesh) -> None:
-    """Raise InputError unless each side (3 f, 2) of a triangle is that of one other, which goes along it backwards."""
+    """Raise InputError unless each triangle side (3 f, 2) has exactly one opposite side of reversed direction."""
     n = len(mesh.rest)
     forth, back = sides[:, 0] * n + sides[:, 1], sides[:, 1] * n + sides[:, 0]
     code, count = np.unique(forth, return_counts=True)

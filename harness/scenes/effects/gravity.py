@@ -12,16 +12,16 @@ from harness.scenes.mesh.base import Mesh
 
 
 class Gravity(Model):
-    """Weight on every vertex: its mass times one acceleration."""
+    """Gravity on every vertex: its mass times one acceleration."""
 
     exact_to: ClassVar[float] = inf
     plain: ClassVar[bool] = True
 
     kind: Literal["gravity"] = "gravity"
     acceleration: Vector = (0.0, -9.81, 0.0)
-    """The acceleration of gravity [m/s^2]."""
+    """Acceleration of gravity [m/s^2]."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """m g on every vertex."""
+        """Return the force m g on every vertex."""
         forces = steady(mass[:, None] * np.array(self.acceleration))
         return Contribution(forces=forces, once=("gravity",) if forces else ())

@@ -1,4 +1,4 @@
-"""Pins: chosen vertices are held at their rest positions, which may move, by a penalty w/2 |p - q|^2 or exactly."""
+"""Pins: Dirichlet conditions at rest positions, which may move, by a penalty w/2 |p - q|^2 or exactly."""
 
 from math import inf
 from typing import ClassVar, Literal
@@ -14,19 +14,19 @@ from harness.scenes.selection import Selection
 
 
 class Pins(Selection):
-    """Holds every vertex that any of its selectors names."""
+    """Pins each selected vertex."""
 
     exact_to: ClassVar[float] = inf
     plain: ClassVar[bool] = True
 
     kind: Literal["pins"] = "pins"
     weight: PositiveFloat | Literal["exact"] = Field(default=1e10)
-    """The penalty's weight w [N/m], or `exact`: the vertices are no unknowns any more."""
+    """Penalty weight w [N/m], or `exact`: the degrees of freedom of the vertices are eliminated."""
     motion: KeyedMotion | None = None
-    """Key frames that take the pinned vertices along, all together."""
+    """Key frames of the motion of all pinned vertices."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The chosen vertices at rest; raises InputError for parts and vertices that the mesh does not have."""
+        """Return the selected vertices at rest; raise InputError for parts and vertices that the mesh lacks."""
         vertices = self.chosen(mesh, self.kind)
         weight = inf if self.weight == "exact" else float(self.weight)
         return Contribution(pins=(Pin(vertices, mesh.rest[vertices], weight, self.motion),))

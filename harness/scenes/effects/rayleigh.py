@@ -1,8 +1,8 @@
 """Rayleigh damping (Rayleigh 1877): the damping matrix is C = a M + b K.
 
-A mode of the angular frequency w is damped by the fraction (a/w + b w)/2 of critical damping. K is the stiffness of
-springs along their directions at the step's start, k nn', so that b damps no rotation, and the matrix of bending. Gas,
-strain limits and attachments have no share.
+A mode of angular frequency w has the damping ratio (a/w + b w)/2. K is the stiffness of springs along their directions
+at the start of the step, k nn', so that b does not damp rotations, and the bending matrix. Gas, strain limits and
+attachments are not included.
 """
 
 from collections.abc import Sequence
@@ -23,19 +23,19 @@ from solvers.problem import Energy, is_lagged
 
 
 class Rayleigh(Model):
-    """Damping in proportion to masses and to stiffness."""
+    """Damping proportional to mass and to stiffness."""
 
     exact_to: ClassVar[float] = inf
     damps: ClassVar[bool] = True
 
     kind: Literal["rayleigh"] = "rayleigh"
     mass: NonNegativeFloat = 0.0
-    """The coefficient a [1/s] of the masses: slow modes and motion as a whole decay, v by exp(-a t)."""
+    """Mass coefficient a [1/s]: damps slow modes and rigid motion, v by exp(-a t)."""
     stiffness: NonNegativeFloat = 0.0
-    """The coefficient b [s] of the stiffness: fast modes decay."""
+    """Stiffness coefficient b [s]: damps fast modes."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The damping of masses as an energy, that of the other effects' energies once they are known."""
+        """Return the mass damping as an energy, and the damping derived from the other effects' energies."""
         damping = self.mass * mass
         return Contribution(
             energies=(RayleighDamping.of_vertices(damping),) if damping.any() else (),

@@ -1,4 +1,4 @@
-"""Self-contact: a mesh that cannot pass through itself."""
+"""Self-contact: the mesh cannot intersect itself."""
 
 from __future__ import annotations
 
@@ -22,41 +22,43 @@ from solvers.problem import Energy as AnyEnergy
 from solvers.problem import Positions
 
 NEAR = 0.5
-"""Of the mean rest length: vertices that come closer than that lie as good as inside each other."""
+"""Distance relative to the mean rest length below which vertices practically coincide."""
 LOOKS = 30
-"""How many frames of a motion are looked at for vertices that come close, evenly spread."""
+"""Number of frames, evenly spaced, that are searched for close vertices."""
 
 
 class SelfContact(Model):
-    """Keeps points from triangles and edges from edges of the mesh, by a barrier that grows without bound as their gap
-    closes (formulas: `solvers.contact.barrier`). Every position on the way is free of intersections.
+    """Separates points from triangles and edges from edges of the mesh by a barrier that diverges as their gap closes.
 
-    Pairs that share a vertex are left out. Those that are nearer at rest than thickness and range keep both in
-    proportion to their distance there, so that a mesh may be as fine as it likes. Vertices that are in no edge and no
-    triangle meet nothing.
+    Formulas: `solvers.contact.potentials.barrier`. All intermediate positions are intersection-free. Pairs that share a
+    vertex are excluded. Pairs that are closer at rest than thickness plus range have both reduced in proportion to
+    their rest distance, so the mesh may be arbitrarily fine. Vertices in no edge and no triangle do not collide.
     """
 
     exact_to: ClassVar[float] = 1.0
 
     kind: Literal["self-contact"] = "self-contact"
     thickness: Annotated[PositiveFloat, Field(le=1e9)] = 0.002
-    """How far apart points and triangles, edges and edges stay at least [m]: two layers lie so far apart, and a little
-    more."""
+    """Minimum distance [m] between points and triangles, and between edges: two layers rest at slightly more than this
+    distance."""
     range: PositiveFloat | None = None
-    """How far beyond that they feel each other [m]; as far as the thickness if left out."""
+    """Distance [m] beyond the thickness at which the barrier activates; equal to the thickness by default."""
     stiffness: PositiveFloat | None = None
-    """The barrier's stiffness k [N/m] at each vertex; a tenth of what inertia and springs resist with if left out."""
+    """Barrier stiffness k [N/m] at each vertex; by default a tenth of the resistance of inertia and springs."""
     friction: NonNegativeFloat = 0.0
-    """Coulomb's coefficient mu, the same at rest and in motion."""
+    """Coulomb's friction coefficient mu, both static and kinetic."""
     creep: PositiveFloat = 1e-3
-    """Pairs that slip slower than this [m/s] count as sticking, and creep."""
+    """Tangential speed [m/s] below which pairs count as sticking, and creep."""
     friction_rounds: PositiveInt = ROUNDS
-    """Solves of a step at most, each with the normal forces of the one before, until friction does not change; 1 takes
-    those of the step's start, which is of order 1 and misses the first step of contact."""
+    """Maximum number of solves per step until friction converges, each with the normal forces of the previous one; 1
+    uses those of the step's start, which is of order 1 and misses the first step of contact."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The barrier as one energy, its stiffness by the other effects'; raises InputError for a mesh that touches
-        itself at rest."""
+        """Return the barrier as one energy, with a stiffness from the other effects.
+
+        Raises:
+            InputError: if the mesh intersects itself at rest.
+        """
         (edges, faces), rest = outline(mesh), mesh.rest
         if not len(edges):
             return Contribution()
@@ -74,7 +76,7 @@ class SelfContact(Model):
             return (energy(resisting(self.stiffness, mass, time_step, energies)),)
 
         def check(start: Positions, pins: Sequence[Pin]) -> None:
-            """Raise InputError for exact pins that move, and for a start (n, 3) [m] that is not free."""
+            """Raise InputError for exact pins that move, and for a start (n, 3) [m] with intersections."""
             require_still("self-contact", start, pins)
             if crossed := crossings(start, edges, mesh.triangles):
                 raise InputError(
@@ -87,7 +89,7 @@ class SelfContact(Model):
 
     @classmethod
     def called_for(cls, seen: Seen) -> str:
-        """See `harness.scenes.effects.base.Effect`: vertices as good as inside each other."""
+        """Return evidence for self-contact: vertices that practically coincide."""
         frames, n = len(seen.positions), len(seen.mesh.rest)
         reach = NEAR * seen.length
         known = _codes(np.concatenate([seen.mesh.springs, _pairs(seen.mesh.rest, reach)]), n)
@@ -110,12 +112,12 @@ class SelfContact(Model):
 
 
 def _pairs(p: NDArray[np.float64], reach: float) -> NDArray[np.int64]:
-    """Pairs of vertices (k, 2) that are closer than `reach` [m]."""
+    """Find pairs of vertices (k, 2) closer than `reach` [m]."""
     from scipy.spatial import KDTree  # for those who look
 
     return KDTree(p).query_pairs(reach, output_type="ndarray").astype(np.int64)
 
 
 def _codes(pairs: NDArray[np.int64], n: int) -> NDArray[np.int64]:
-    """One number for each pair, whichever end comes first."""
+    """Encode each pair as one number, independent of the order of its ends."""
     return pairs.min(axis=1) * n + pairs.max(axis=1)

@@ -1,4 +1,4 @@
-"""Sewing springs: two rows of vertices are drawn together over time, and stay so."""
+"""Sewing springs: two rows of vertices are pulled together over time, and stay together."""
 
 from typing import ClassVar, Literal
 
@@ -17,25 +17,27 @@ Indices = NDArray[np.int64]
 
 
 class Sewing(Model):
-    """Threads from each vertex of one row to that of the other row which is nearest at rest, and back. They pull where
-    they are longer than they may be, which becomes less from `begin` to `end`, evenly; they never push.
+    """Threads between each vertex of one row and the nearest vertex at rest of the other row, in both directions.
+
+    A thread pulls if it is longer than its current limit, which decreases linearly from `begin` to `end`; it never
+    pushes.
     """
 
     exact_to: ClassVar[float] = 1.0
 
     kind: Literal["sewing"] = "sewing"
     first: Selection
-    """One of the rows: chosen as pins choose."""
+    """First row: a vertex selection as for pins."""
     second: Selection
-    """The other row."""
+    """Second row."""
     stiffness: NonNegativeFloat
-    """The stiffness of all the threads together [N/m], shared equally, so that it means the same at every mesh size."""
+    """Total stiffness of the threads [N/m], divided equally, so that it is independent of the mesh size."""
     begin: NonNegativeFloat = 0.0
-    """When the threads begin to be drawn in [s]; until then they are as long as at rest."""
+    """Time [s] at which the threads start to shorten; until then they have their rest lengths."""
     end: NonNegativeFloat = 1.0
-    """When they are as short as they get [s]; as `begin` for at once."""
+    """Time [s] at which the threads reach their final length; equal to `begin` for an instantaneous change."""
     gap: NonNegativeFloat = 0.0
-    """How long they are then [m]; with self-contact no less than its thickness and range, or it pushes back."""
+    """Final length [m]; with self-contact at least its thickness plus range, or contact forces oppose it."""
 
     @model_validator(mode="after")
     def _in_order(self) -> "Sewing":
@@ -44,7 +46,7 @@ class Sewing(Model):
         return self
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The threads as one energy, none for a stiffness of zero; raises InputError for rows that share a vertex."""
+        """Return the threads as one energy, empty for zero stiffness; raise InputError if the rows overlap."""
         rows = self.first.chosen(mesh, f"{self.kind}: first"), self.second.chosen(mesh, f"{self.kind}: second")
         if len(both := np.intersect1d(*rows)):
             raise InputError(
@@ -66,7 +68,7 @@ class Sewing(Model):
 
 
 def _matched(mesh: Mesh, first: Indices, second: Indices) -> Indices:
-    """Each vertex of either row with the nearest one of the other, (m, 2), each pair once."""
+    """Match each vertex of either row with the nearest one of the other, (m, 2), each pair once."""
     from scipy.spatial import cKDTree  # for those who sew
 
     one = np.asarray(cKDTree(mesh.rest[second]).query(mesh.rest[first])[1], np.int64)

@@ -1,6 +1,6 @@
-"""Springs: one linear spring for each of the mesh's, its stiffness by a rule of `harness.scenes.material`.
+"""Springs: one linear spring per mesh spring, with a stiffness by a rule of `harness.scenes.material`.
 
-Those of infinite stiffness are no energy: their lengths are kept exactly.
+Springs of infinite stiffness have no energy: they are length constraints.
 """
 
 from dataclasses import replace
@@ -20,29 +20,31 @@ from solvers.energies import springs
 
 
 class Springs(Model):
-    """Springs k/2 (length - rest length)^2 along the mesh's edges; those of no stiffness are left out, and those of
-    infinite stiffness keep their lengths."""
+    """Springs k/2 (length - rest length)^2 along the mesh's edges.
+
+    Springs of zero stiffness are omitted; springs of infinite stiffness are length constraints.
+    """
 
     exact_to: ClassVar[float] = inf
     plain: ClassVar[bool] = True
 
     kind: Literal["springs"] = "springs"
     rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
-    """What the numbers below mean when the mesh size changes. `continuum`: the material stays the same;
-    `fixed`: each spring has the stiffness given [N/m]; `liu2013`: stiffness in proportion to resolution,
+    """Scaling rule of the values below with the mesh size. `continuum`: the material is independent of the mesh;
+    `fixed`: each spring has the given stiffness [N/m]; `liu2013`: stiffness proportional to the resolution,
     given at the size `reference`."""
     stretch: NonNegativeFloat | Literal["exact"] | Weave
-    """Along the mesh's lines. Continuum: EA [N] for chains and trusses, [N/m] for cloth, [Pa] for solids; or one for
-    each of warp, weft and bias, of a woven cloth; or `exact`: lengths do not change, which `avbd` alone can do."""
+    """Along the mesh's lines. Continuum: EA [N] for chains and trusses, [N/m] for cloth, [Pa] for solids; or one value
+    each for warp, weft and bias of a woven cloth; or `exact`: length constraints, supported by `avbd` only."""
     shear: NonNegativeFloat | Literal["exact"] | None = None
-    """Across the mesh's cells, in the same unit; as `stretch` if left out."""
+    """Across the mesh's cells, in the same unit; equal to `stretch` by default."""
     bend: NonNegativeFloat = 0.0
-    """From a vertex to the next but one. Continuum: bending stiffness [N m]; else [N/m]."""
+    """Springs that skip one vertex. Continuum: bending stiffness [N m]; otherwise [N/m]."""
     reference: PositiveInt | None = None
-    """liu2013: the mesh size at which the stiffnesses above hold."""
+    """liu2013: the mesh size for which the stiffnesses above are given."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The springs as one energy, none at all where no spring has stiffness, and the lengths that are exact."""
+        """Return the springs as one energy, empty without stiffness, and the length constraints."""
         given = self.stretch if self.shear is None else self.shear
         stretch, shear = (inf if x == "exact" else x for x in (self.stretch, given))
         k = spring_stiffness(

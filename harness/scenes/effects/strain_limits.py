@@ -1,4 +1,4 @@
-"""Strain limits: springs that resist only beyond a shortest and a longest length (Bouaziz et al. 2014)."""
+"""Strain limits: springs that act only beyond a minimum and a maximum length (Bouaziz et al. 2014)."""
 
 from typing import ClassVar, Literal
 
@@ -14,27 +14,26 @@ from solvers.energies import strain_limits
 from solvers.energies.edges import rest_directions
 
 STRETCH = 0.1
-"""Cloth that stretches further than this looks like rubber (Provot 1995)."""
+"""Strain above which cloth looks like rubber (Provot 1995)."""
 
 
 class StrainLimits(Model):
-    """Limits how far the mesh's springs along and across its cells stretch and shrink, with a stated stiffness or
-    exactly."""
+    """Limits the stretch and compression of the springs along and across cells, by a stiffness or exactly."""
 
     exact_to: ClassVar[float] = 1.0
 
     kind: Literal["strain-limits"] = "strain-limits"
     longest: float = Field(default=1.1, ge=1.0, le=1e6)
-    """The largest length, as a multiple of the rest length."""
+    """Largest length relative to the rest length."""
     shortest: float = Field(default=0.0, ge=0.0, le=1.0)
-    """The smallest length, as a multiple of the rest length; 0 lets springs shrink freely."""
+    """Smallest length relative to the rest length; 0 lets springs shrink freely."""
     stiffness: NonNegativeFloat | Literal["exact"]
-    """What a spring resists with beyond its limits, in the unit of the `stretch` of springs by the same rule; or
-    `exact`: none is beyond them, which `avbd` alone can do."""
+    """Stiffness of a spring beyond its limits, in the unit of the `stretch` of springs by the same rule; or `exact`:
+    inequality constraints of the length, supported by `avbd` only."""
     rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
-    """What the stiffness means when the mesh size changes, as for springs."""
+    """Scaling rule of the stiffness with the mesh size, as for springs."""
     reference: PositiveInt | None = None
-    """liu2013: the mesh size at which the stiffness holds."""
+    """liu2013: the mesh size for which the stiffness is given."""
 
     @model_validator(mode="after")
     def _limits(self) -> "StrainLimits":
@@ -43,7 +42,7 @@ class StrainLimits(Model):
         return self
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The limits as one energy, none at all for a stiffness of zero, or as lengths that are exact."""
+        """Return the limits as one energy, empty for zero stiffness, or as length constraints."""
         s = 1.0 if self.stiffness == "exact" else self.stiffness
         k = spring_stiffness(mesh, rule=self.rule, stretch=s, shear=s, bend=0.0, reference=self.reference)
         edges = mesh.springs[k > 0.0]
@@ -57,7 +56,7 @@ class StrainLimits(Model):
 
     @classmethod
     def called_for(cls, seen: Seen) -> str:
-        """See `harness.scenes.effects.base.Effect`: springs stretch as no cloth does."""
+        """Return evidence for strain limits: springs that stretch more than cloth does."""
         rest = seen.springs.rest_length
         if not rest.any():
             return ""

@@ -1,4 +1,4 @@
-"""Contact of a mesh's points, edges and triangles with the surfaces of obstacles, meshes among them."""
+"""Contact of points, edges and triangles of the mesh with the surfaces of obstacles, meshes among them."""
 
 from __future__ import annotations
 
@@ -23,48 +23,52 @@ from solvers.contact.self_contact import ObstacleContact
 from solvers.problem import Energy, Positions
 
 _SAG = 0.1
-"""Of the thickness: how far the triangles of round obstacles lie inside."""
+"""Largest inward deviation of the triangles of round obstacles, relative to the thickness."""
 
 
 class SurfaceContact(Model):
-    """Keeps points, edges and triangles of the mesh from those of obstacles, from either side, by a barrier that grows
-    without bound as their gap closes (formulas: `solvers.contact.barrier`). Every position on the way is free of
-    intersections, and obstacles that move go where they go without passing through the mesh.
+    """Separates points, edges and triangles of the mesh from those of obstacles by a barrier.
 
-    Planes, spheres, capsules and boxes are met as triangles too: those of round ones lie a tenth of the thickness
-    inside at most.
+    The barrier acts on either side and diverges as the gap closes (formulas: `solvers.contact.potentials.barrier`). All
+    intermediate positions are intersection-free. Moving obstacles advance along their motion without passing through
+    the mesh. Planes, spheres, capsules and boxes are represented by triangles too; those of round obstacles lie at most
+    a tenth of the thickness inside.
     """
 
     exact_to: ClassVar[float] = 1.0
 
     kind: Literal["surface-contact"] = "surface-contact"
     obstacles: tuple[AnySurface, ...] = Field(min_length=1)
-    """What the mesh is kept from."""
+    """Obstacles that the mesh collides with."""
     thickness: Annotated[PositiveFloat, Field(le=1e9)] = 0.002
-    """How far from an obstacle's triangles the mesh stays at least [m], and a little more."""
+    """Minimum distance [m] from an obstacle's triangles; the mesh rests at slightly more."""
     range: PositiveFloat | None = None
-    """How far beyond that they feel each other [m]; as far as the thickness if left out."""
+    """Distance [m] beyond the thickness at which the barrier activates; equal to the thickness by default."""
     stiffness: PositiveFloat | None = None
-    """The barrier's stiffness k [N/m] at each vertex; a tenth of what inertia and springs resist with if left out."""
+    """Barrier stiffness k [N/m] at each vertex; by default a tenth of the resistance of inertia and springs."""
     friction: NonNegativeFloat = 0.0
-    """Coulomb's coefficient mu, the same at rest and in motion."""
+    """Coulomb's friction coefficient mu, both static and kinetic."""
     creep: PositiveFloat = 1e-3
-    """Pairs that slip slower than this [m/s] count as sticking, and creep."""
+    """Tangential speed [m/s] below which pairs count as sticking, and creep."""
     friction_rounds: PositiveInt = ROUNDS
-    """Solves of a step at most, each with the normal forces of the one before, until friction does not change; 1 takes
-    those of the step's start, which is of order 1 and misses the first step of contact."""
+    """Maximum number of solves per step until friction converges, each with the normal forces of the previous one; 1
+    uses those of the step's start, which is of order 1 and misses the first step of contact."""
 
     @property
     def reach(self) -> float:
-        """How far beyond the thickness they feel each other [m]."""
+        """Barrier activation distance beyond the thickness [m], with its default resolved."""
         return self.thickness if self.range is None else self.range
 
     def shapes(self, rest: Positions) -> list[Shape]:
-        """The obstacles' points and triangles, as they are declared; rest (n, 3) [m]: of the mesh."""
+        """Build the surfaces of the obstacles in their declared poses; `rest_positions` (n, 3) [m] of the mesh."""
         return [shape(one, _SAG * self.thickness, rest) for one in self.obstacles]
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The barrier as one energy, its stiffness by the other effects'; raises InputError for a bad obstacle."""
+        """Return the barrier as one energy, with a stiffness from the other effects.
+
+        Raises:
+            InputError: if an obstacle is invalid.
+        """
         (edges, faces), n, shapes = outline(mesh), len(mesh.rest), self.shapes(mesh.rest)
         if not len(edges):
             return Contribution()
@@ -102,7 +106,7 @@ class SurfaceContact(Model):
         apart = Apart(((edges, n + triangles), (n + ends, mesh.triangles)), place)
 
         def check(start: Positions, pins: Sequence[Pin]) -> None:
-            """Raise InputError for exact pins that move, and for a start (n, 3) [m] that is not free."""
+            """Raise InputError for exact pins that move, and for a start (n, 3) [m] with intersections."""
             require_still(self.kind, start, pins)
             if crossed := apart.crossings(start, 0.0):
                 raise InputError(

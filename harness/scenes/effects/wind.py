@@ -1,24 +1,24 @@
-"""Wind: a field of forces on the vertices, or of air that drags and lifts the triangles.
+"""Wind: a force field on the vertices, or an air velocity field with drag and lift on the triangles.
 
-On triangles (Keckeisen et al. 2004), by the air's velocity u relative to the triangle, its area A and its normal n on
-the side that the air leaves by, with the air's density rho:
+On triangles (Keckeisen et al. 2004), with the air velocity u relative to the triangle, its area A, its normal n on the
+downstream side, and the air density rho:
 
     f = rho/2 A |u| (n.u) (C_D u/|u| + C_L (n - (n.u) u/|u|^2))
 
-They are taken at the step's start. No triangle is given more than brings it to the speed of the air in one step,
-f dt <= m |u|: nothing else keeps light cloth in a storm stable. The field is one of
+Forces are evaluated at the start of the step. The force on a triangle is limited to what accelerates it to the velocity
+of the air in one step, f dt <= m |u|; otherwise light cloth is unstable in a storm. The field is one of
 
-    constant    the same everywhere and always
-    gusts       the constant one, and waves that it carries along (after Kraichnan 1970): each component varies by the
-                fraction `gustiness` of the mean's size (root mean square), at 16 frequencies around `frequency`
-    assignment  the University of Toronto assignment's, with t the simulated time [s], b the length of the diagonal of
+    constant    uniform in space and time
+    gusts       the constant one, and waves that it advects (after Kraichnan 1970): each component varies by the
+                fraction `gustiness` of the mean's magnitude (root mean square), at 16 frequencies around `frequency`
+    assignment  that of the University of Toronto assignment, with t the simulated time [s], b the diagonal of
                 the rest bounding box and phi = x / b + t at the current x:
 
                     (3 + 1.5 (1 + cos 5 phi),  1 + cos(0.3 + phi),  sin phi)
 
-                (it adds its gravity of -9.8 newtons to the second component; here that is an effect of its own)
+                (the assignment adds a gravity of -9.8 newtons to the second component; here gravity is another effect)
 
-in newtons, or in metres a second on triangles.
+in newtons on vertices, or in metres per second on triangles.
 """
 
 from collections.abc import Callable
@@ -36,41 +36,41 @@ from harness.scenes.mesh.base import Mesh
 from solvers.problem import Positions
 
 Field = Callable[[Positions, float], Positions]
-"""(places (k, 3) [m], time [s]) -> the field there, (k, 3) or (3,)."""
+"""(points (k, 3) [m], time [s]) -> the field there, (k, 3) or (3,)."""
 
 _WAVES = 16
 
 
 class Wind(Model):
-    """A field that blows on the mesh."""
+    """Wind on the mesh."""
 
     exact_to: ClassVar[float] = inf
 
     kind: Literal["wind"] = "wind"
     field: Literal["constant", "gusts", "assignment"] = "constant"
-    """How the field varies: not at all, by random gusts, or by the assignment's, which travel along x."""
+    """Variation of the field: constant, random gusts, or the assignment's waves along x."""
     per: Literal["vertex", "share", "triangle"] = "share"
-    """What it acts on. `vertex`: the force acts on every vertex, as the assignment has it, so a finer mesh feels more
-    of it; `share`: it is the total, spread over the vertices as the mass is, the same at every mesh size; `triangle`:
-    the field is the air's velocity, which drags and lifts triangles."""
+    """Target of the field. `vertex`: the force acts on every vertex, as in the assignment, so the total grows with the
+    mesh size; `share`: the field is the total force, distributed like the mass, independent of the mesh size;
+    `triangle`: the field is the velocity of the air, with drag and lift on triangles."""
     force: Vector = (1.0, 0.0, 0.0)
-    """The constant field and the gusts' mean, on vertices [N]."""
+    """Constant field, or mean of the gusts, on vertices [N]."""
     velocity: Vector = (1.0, 0.0, 0.0)
-    """The constant field and the gusts' mean, on triangles [m/s]; zero is air at rest, which drags."""
+    """Constant field, or mean of the gusts, on triangles [m/s]; zero is still air, which causes drag."""
     strength: float = 1.0
-    """A factor on the field; zero takes the wind away, and the drag with it."""
+    """Factor of the field; zero disables the wind, including its drag."""
     gustiness: NonNegativeFloat = 0.3
-    """gusts: by what fraction of the mean each component of the field varies."""
+    """gusts: root mean square variation of each component relative to the mean."""
     frequency: PositiveFloat = 1.0
-    """gusts: the middle of their frequencies [1/s], which reach from a quarter to four times of it."""
+    """gusts: centre frequency [1/s]; frequencies range from a quarter to four times of it."""
     seed: NonNegativeInt = 0
-    """gusts: which of them; the same seed has the same at all times and mesh sizes."""
+    """gusts: random seed; the same seed gives the same gusts at all times and mesh sizes."""
     density: NonNegativeFloat = 1.2
-    """triangle: of the air [kg/m^3]."""
+    """triangle: density of the air [kg/m^3]."""
     drag: NonNegativeFloat = 1.0
-    """triangle: the drag coefficient C_D."""
+    """triangle: drag coefficient C_D."""
     lift: NonNegativeFloat = 0.0
-    """triangle: the lift coefficient C_L."""
+    """triangle: lift coefficient C_L."""
 
     @model_validator(mode="after")
     def _fits(self) -> "Wind":
@@ -85,11 +85,11 @@ class Wind(Model):
 
     @property
     def mean(self) -> NDArray[np.float64]:
-        """The constant field, (3,) [N] or [m/s], strength included."""
+        """Constant field or mean of the gusts, (3,) [N] or [m/s], including the strength."""
         return self.strength * np.array(self.velocity if self.per == "triangle" else self.force)
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The field as one force, none at all for a strength of zero; raises InputError where triangles are missing."""
+        """Return the field as one force, empty for zero strength; raise InputError if triangles are missing."""
         if not self.strength:
             return Contribution()
         if self.per == "triangle":
@@ -99,7 +99,7 @@ class Wind(Model):
 
 
 def _on_vertices(wind: Wind, mesh: Mesh, weight: NDArray[np.float64]) -> tuple[Force, ...]:
-    """The field times weights (n, 1)."""
+    """Return the field times weights (n, 1) as a force on vertices."""
     if wind.field == "constant" or (wind.field == "gusts" and not wind.mean.any()):
         return steady(weight * wind.mean)
     field = _FIELDS[wind.field](wind, mesh)
@@ -140,7 +140,7 @@ def _on_triangles(wind: Wind, mesh: Mesh, mass: NDArray[np.float64], dt: float) 
 
 
 def _masses(mesh: Mesh, mass: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The mass that moves with each triangle, (f,) [kg]: each vertex's is dealt out by the triangles' areas at rest."""
+    """Compute the mass that moves with each triangle, (f,) [kg]: vertex masses divided by rest areas."""
     a, b, c = (mesh.rest[corner] for corner in mesh.triangles.T)
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     around = np.bincount(mesh.triangles.ravel(), np.repeat(area, 3), minlength=len(mass))
@@ -158,7 +158,7 @@ def _gusts(wind: Wind, mesh: Mesh) -> Field:
     turns = 2.0 * np.pi * wind.frequency * np.exp(rng.uniform(np.log(0.25), np.log(4.0), _WAVES))
     phase = rng.uniform(0.0, 2.0 * np.pi, (_WAVES, 3))
     height = wind.gustiness * size * (2.0 / _WAVES) ** 0.5  # a cosine's mean square is 1/2
-    # Air that moves carries its gusts along; a field of forces has no speed, and passes the mesh in a second.
+    # Moving air advects its gusts. A force field has no speed; its waves cross the mesh in a second.
     carried = mean / size**2 if wind.per == "triangle" else mean / size / (mesh.size or 1.0)
 
     def field(x: Positions, t: float) -> Positions:

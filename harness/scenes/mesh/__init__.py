@@ -1,1 +1,1 @@
-"""Meshes: generators with one number for the size, and files."""
+"""Meshes: generators with a single size parameter, and files."""

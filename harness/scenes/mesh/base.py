@@ -1,4 +1,4 @@
-"""A mesh: vertices at rest, triangles to draw and to weigh, springs by family."""
+"""A mesh: rest positions, triangles for drawing and areas, springs by family."""
 
 from __future__ import annotations
 
@@ -9,25 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 STRETCH, SHEAR, BEND = "stretch", "shear", "bend"
-"""The families of springs: along the mesh's lines, across its cells, from a vertex to the next but one."""
+"""Families of springs: along the mesh's lines, across its cells, and from a vertex to the next but one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """A spring network at rest.
+    """A spring network at rest. All arrays are read-only.
 
-    rest: (n, 3) [m], the rest positions and the start; springs: (m, 2), vertex indices, in a fixed order;
-    families: each of STRETCH, SHEAR, BEND -> the indices of its springs, a partition of range(m);
-    triangles: (f, 3), for pictures and wind, empty for a chain;
-    shares: (n,), the share of the total mass that each vertex carries, sums to 1;
-    dimension: 1 chain and truss, 2 cloth, 3 solid; spacing: the typical rest length h [m];
-    resolution: the mesh size, mostly vertices along a side; 0 for a mesh from a file;
-    parts: named sets of vertices (`corners`, `top`, `left`, ...), each (q,), sorted;
-    mass: (n,) [kg] where a file gives absolute masses, else None;
-    attributes: numbers by vertex that a file names, each (n,);
-    areas: (n,) [m^2] at rest by vertex where they are not thirds of its triangles, else None;
-    first_vertex: the number of the first vertex in the mesh's file.
-    All arrays are read-only.
+    Attributes:
+        rest_positions: (n, 3) [m], also the initial positions.
+        springs: (m, 2), vertex indices, in a fixed order.
+        spring_families: STRETCH, SHEAR and BEND -> indices of their springs, a partition of range(m).
+        triangles: (f, 3), for pictures and wind, empty for a chain.
+        mass_fractions: (n,), share of the total mass of each vertex, sums to 1.
+        dimension: 1 chain and truss, 2 cloth, 3 solid.
+        spacing: typical rest length h [m].
+        resolution: mesh size, usually vertices per side; 0 for a mesh from a file.
+        parts: named sets of vertices (`corners`, `top`, `left`, ...), each (q,), sorted.
+        mass: (n,) [kg] if a file gives absolute masses, else None.
+        attributes: vertex attributes from a file, each (n,).
+        vertex_areas: (n,) [m^2] at rest if they are not thirds of the triangles, else None.
+        first_vertex: number of the first vertex in the mesh's file.
     """
 
     rest: NDArray[np.float64]
@@ -52,23 +54,23 @@ class Mesh:
 
     @property
     def size(self) -> float:
-        """The diagonal of the rest shape's bounding box [m]."""
+        """Diagonal of the bounding box of the rest shape [m]."""
         return float(np.linalg.norm(np.ptp(self.rest, axis=0))) if len(self.rest) else 0.0
 
     def in_file(self, *vertices: int) -> str:
-        """What a message adds behind vertices counted from 0: their numbers in the file, where they are others."""
+        """Format the file numbers of zero-based vertices for a message; empty if they are equal."""
         numbers = ", ".join(str(vertex + self.first_vertex) for vertex in vertices)
         return f" ({numbers} in the file)" if self.first_vertex else ""
 
     @property
     def rest_lengths(self) -> NDArray[np.float64]:
-        """The rest length of each spring [m], shape (m,)."""
+        """Rest length of each spring [m], shape (m,)."""
         i, j = self.springs.T
         return np.linalg.norm(self.rest[i] - self.rest[j], axis=1)
 
 
 def distinct(vertices: NDArray[np.int64], n: int) -> NDArray[np.int64]:
-    """Some of n vertices, sorted and each once; `np.unique` would load `numpy.ma`, a tenth of a whole `list`."""
+    """Sort unique vertices of n; `np.unique` would load `numpy.ma`, a tenth of the time of the command `list`."""
     there = np.zeros(n, np.bool_)
     there[vertices] = True
     return np.flatnonzero(there)

@@ -1,4 +1,4 @@
-"""A dress form with a head: what garments hang on."""
+"""A dress form with a head, on which garments hang."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ _OUTLINE = np.array(
         (0.0, 0.0, 0.0),
     ]
 )
-"""Height, half width and half depth from the crown down, in the height of the form."""
+"""Height, half width and half depth from the crown down, relative to the height of the form."""
 
 
 class Body(Generator):
     """A closed surface that stands on y = 0 and looks along +z: head, neck, shoulders, waist and hips.
 
     `size` vertices around, ring by ring from the crown, which is one vertex, down to the last one, in the middle of the
-    base. Cells are about as high as they are wide at the waist. Springs: along rings and down (STRETCH), then the
-    diagonals down forwards and down backwards (SHEAR). Triangles face outwards. Parts: crown, base (one vertex each).
-    Mass goes by area. Dimension 2.
+    base. Cells are about square at the waist. Springs: along rings and down (STRETCH), then the diagonals down
+    forwards and down backwards (SHEAR). Triangles face outwards. Parts: crown, base (one vertex each). Mass is
+    proportional to area. Dimension 2.
     """
 
     kind: Literal["body"] = "body"
     height: Metres = 0.9
-    """From the base to the crown [m]."""
+    """Height from the base to the crown [m]."""
 
     SMALLEST: ClassVar[int] = 4
     COUNTS: ClassVar[str] = "vertices around"
@@ -90,6 +90,6 @@ def _between(places: Points, along: Points, values: Points) -> Points:
 
 
 def _rows(size: int) -> int:
-    """Cells from crown to base along the outline."""
+    """Return the number of cells from crown to base along the outline."""
     length = float(np.linalg.norm(np.diff(_OUTLINE, axis=0), axis=1).sum())
     return max(8, cells(length, 2 * np.pi * 0.127 / size))

@@ -1,4 +1,4 @@
-"""The boundary of a surface: loops of edges that one triangle has alone, and which of them are holes."""
+"""The boundary of a surface: loops of edges with one triangle, and their classification as holes."""
 
 from __future__ import annotations
 
@@ -13,12 +13,17 @@ from harness.scenes.mesh.base import Mesh
 Indices = NDArray[np.int64]
 
 _ALIKE = 9
-"""Digits by which lengths of loops are told apart: round-off decides no order."""
+"""Number of compared digits of loop lengths, so that round-off does not affect the order."""
 
 
 class Loop(NamedTuple):
-    """A connected piece of the boundary. vertices (k,): sorted; length [m]; hole: whether the connected surface that it
-    belongs to has a longer one."""
+    """A connected piece of the boundary.
+
+    Attributes:
+        vertices: (k,), sorted.
+        length: [m].
+        is_hole: whether the same connected surface has a longer loop.
+    """
 
     vertices: Indices
     length: float
@@ -26,7 +31,7 @@ class Loop(NamedTuple):
 
 
 def loops(mesh: Mesh) -> list[Loop]:
-    """Of a mesh at rest, the longest first; of those alike that with the lowest vertex."""
+    """Find the boundary loops of a mesh at rest, longest first; ties by the lowest vertex."""
     if not len(mesh.triangles):
         return []
     from scipy.sparse import coo_array  # for those who ask

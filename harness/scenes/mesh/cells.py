@@ -1,4 +1,4 @@
-"""What a mesh file holds, cells on points, and the spring network that it becomes."""
+"""Contents of a mesh file, cells on points, and their conversion to a spring network."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ from harness.scenes.mesh.topology import (
 SpringRule = Literal["edges", "face_pairs"]
 
 MAX_BYTES = 2**30
-"""Larger files are refused before they are read."""
+"""Maximum size of a file; larger files are rejected before reading."""
 MAX_COORDINATE = 1e12
-"""No position [m] may be farther out: squares of lengths must stay finite with digits to spare."""
+"""Maximum coordinate [m]: squares of lengths must stay finite with digits to spare."""
 _MAX_PAIRS = 200_000_000
 _MOST_MISTAKES, _MOST_REPEATS = 20, 5
 _LOG = logging.getLogger("springbench")
@@ -51,9 +51,19 @@ _LOG = logging.getLogger("springbench")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """points: (n, 3) [m]; polygons: corners k >= 2 -> (f, k); places: k -> the line of each, (f,), or its number in the
-    file; counted: which of them; segments: (s, 2); tetrahedra: (t, 4); groups: the points of what the file names;
-    attributes: numbers by point that it names, each (n,); first_vertex: the number of the first point in the file."""
+    """Points and cells of a mesh file.
+
+    Attributes:
+        points: (n, 3) [m].
+        polygons: number of corners k >= 2 -> (f, k).
+        polygon_locations: k -> line of each polygon, (f,), or its number in the file.
+        location_unit: which of the two.
+        segments: (s, 2).
+        tetrahedra: (t, 4).
+        vertex_groups: points of the groups named in the file.
+        attributes: point attributes, each (n,).
+        first_vertex: number of the first point in the file.
+    """
 
     points: Points
     polygons: Mapping[int, Indices] = field(default_factory=dict[int, Indices])
@@ -67,12 +77,12 @@ class Cells:
 
     @property
     def lines_only(self) -> bool:
-        """Whether every cell names two vertices."""
+        """Whether every cell has two vertices."""
         return not len(self.tetrahedra) and set(self.polygons) <= {2}
 
 
 def check_file(path: Path, *, most: int = MAX_BYTES) -> None:
-    """Raise InputError unless `path` is a file of so many bytes at most, and neither empty nor a stand-in for one."""
+    """Raise InputError unless `path` is a nonempty regular file of at most `max_bytes` and no placeholder."""
     try:
         size = path.stat().st_size
     except (OSError, ValueError) as error:
@@ -92,17 +102,22 @@ def check_file(path: Path, *, most: int = MAX_BYTES) -> None:
 
 
 def network(cells: Cells, rule: SpringRule, path: Path) -> Mesh:
-    """The spring network of a file's cells; `path` is for messages.
+    """Build the spring network of a file's cells.
 
-    Where every cell names two vertices, each is a spring (STRETCH), in file order: polygons, then segments.
+    If every cell has two vertices, each is a spring (STRETCH), in file order: polygons, then segments.
     Otherwise the springs are unique pairs in lexicographic order: the sides of polygons, the segments and the
     edges of tetrahedra (STRETCH), then with `face_pairs` the other pairs of corners of a face (SHEAR).
-    Triangles: those of the polygons, or the surface of the tetrahedra, facing outwards. Mass goes by volume
-    where there are tetrahedra, else by area, else by length; a vertex that no such cell uses gets none. A cell that
+    Triangles: those of the polygons, or the surface of the tetrahedra, facing outwards. Mass is proportional to volume
+    if there are tetrahedra, else to area, else to length; a vertex without such a cell has none. A cell that
     repeats another, or is a part of it, counts once, with a warning.
 
-    Raises InputError where there are no vertices or springs, too many, nothing that has a size, and for faces that
-    cross themselves.
+    Args:
+        cells: the contents of the file.
+        spring_rule: springs along edges, or between all pairs of face corners.
+        path: the file, for messages.
+
+    Raises:
+        InputError: without vertices or springs, with too many of them, without any extent, and for self-crossing faces.
     """
     rest, groups = cells.points, list(cells.polygons.values())
     pairs = sum(len(g) * (g.shape[1] if rule == "edges" else g.shape[1] ** 2 // 2) for g in groups)
@@ -155,8 +170,11 @@ def network(cells: Cells, rule: SpringRule, path: Path) -> Mesh:
 
 
 def _surface_of_faces(cells: Cells, path: Path) -> tuple[Indices, Points | None]:
-    """The triangles (f, 3) of the faces, each part of the surface once, and the areas (n,) [m^2] by vertex, None where
-    they are thirds of the triangles."""
+    """Triangulate the faces (f, 3), each part of the surface once.
+
+    Returns:
+        The triangles, and the vertex areas (n,) [m^2], None if they are thirds of the triangles.
+    """
     faces = {k: polygons for k, polygons in cells.polygons.items() if k >= 3}
     places = {k: cells.places.get(k, np.arange(len(polygons))) for k, polygons in faces.items()}
     surfaces = {k: triangulate(cells.points, polygons) for k, polygons in faces.items()}
@@ -194,7 +212,7 @@ def _crossed_face(cells: Cells, path: Path, place: int, corners: int) -> Mistake
 
 
 def _warn_of_repeats(cells: Cells, path: Path, repeats: list[tuple[int, int]]) -> None:
-    """Say which faces repeat another; pairs of places, the repetition first."""
+    """Warn about faces that repeat others; pairs of locations, the repetition first."""
     what = "line" if cells.counted == "line" else "face, counted from 0"
     listed = ", ".join(f"{place} repeats {other}" for place, other in repeats[:_MOST_REPEATS])
     more = f", and {len(repeats) - _MOST_REPEATS:,} more" if len(repeats) > _MOST_REPEATS else ""
@@ -203,7 +221,7 @@ def _warn_of_repeats(cells: Cells, path: Path, repeats: list[tuple[int, int]]) -
 
 
 def _distinct_tetrahedra(tetrahedra: Indices, path: Path) -> Indices:
-    """Each set of corners once."""
+    """Remove tetrahedra with the same corners as an earlier one."""
     new = repeated_rows(tetrahedra) == np.arange(len(tetrahedra))
     if not new.all():
         at = int(np.flatnonzero(~new)[0])
@@ -215,18 +233,18 @@ def _distinct_tetrahedra(tetrahedra: Indices, path: Path) -> Indices:
 
 
 def _edges(tetrahedra: Indices) -> Indices:
-    """The six edges of each tetrahedron, (6 t, 2), repetitions included."""
+    """Return the six edges of each tetrahedron, (6 t, 2), with repetitions."""
     return np.concatenate([tetrahedra[:, [i, j]] for i, j in combinations(range(4), 2)])
 
 
 def _without(pairs: Indices, others: Indices) -> Indices:
-    """The pairs that are not among the others; both sorted within a pair."""
+    """Return the pairs that are not among the others; both are sorted within a pair."""
     base = int(max(pairs.max(initial=0), others.max(initial=0))) + 1
     return pairs[~np.isin(pairs @ [base, 1], others @ [base, 1])]
 
 
 def _surface(rest: Points, tetrahedra: Indices) -> Indices:
-    """The faces that belong to one tetrahedron alone, facing outwards, (f, 3)."""
+    """Return the faces of exactly one tetrahedron, facing outwards, (f, 3)."""
     inverted = signed_volumes(rest, tetrahedra) < 0
     tetrahedra = np.where(inverted[:, None], tetrahedra[:, [1, 0, 2, 3]], tetrahedra)
     faces = np.concatenate([tetrahedra[:, f] for f in ([0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2])])

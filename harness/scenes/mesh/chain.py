@@ -1,4 +1,4 @@
-"""A chain: vertices on a straight line, a spring from each to the next; a rope resists bending too."""
+"""A chain of vertices on a straight line with springs between neighbours; a rope also resists bending."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ def _not_zero(direction: tuple[float, float, float]) -> tuple[float, float, floa
 
 
 class Chain(Generator):
-    """`size` vertices from the origin along `direction`, numbered along the line; so are the springs.
+    """`size` vertices from the origin along `direction`; vertices and springs are numbered along the line.
 
-    Parts: first, last, ends. Mass goes by length. Dimension 1: every spring is a piece of the same rope.
+    Parts: first, last, ends. Mass is proportional to length. Dimension 1: every spring is a piece of the same rope.
     """
 
     kind: Literal["chain"] = "chain"
     length: Metres = 1.0
-    """From the first vertex to the last [m]."""
+    """Length from the first vertex to the last [m]."""
     direction: Annotated[tuple[float, float, float], AfterValidator(_not_zero)] = (1.0, 0.0, 0.0)
-    """Where the chain points; its length does not matter."""
+    """Direction of the chain, of any length but zero."""
 
     COUNTS: ClassVar[str] = "vertices along the chain"
     SPRINGS: ClassVar[int] = 1
@@ -54,12 +54,12 @@ class Chain(Generator):
         )
 
     def _bends(self, size: int) -> Indices:
-        """Springs against bending (k, 2)."""
+        """Return the pairs of the springs against bending (k, 2)."""
         return NO_PAIRS
 
 
 class Rope(Chain):
-    """A chain with springs from each vertex to the next but one (BEND), which resist bending."""
+    """A chain with additional springs from each vertex to the next but one (BEND), against bending."""
 
     kind: Literal["rope"] = "rope"  # pyright: ignore[reportIncompatibleVariableOverride]
 

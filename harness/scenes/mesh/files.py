@@ -1,4 +1,4 @@
-"""Meshes from files: OBJ, the assignment's JSON scenes, PLY, VTP, and every format that meshio reads."""
+"""Meshes from files: OBJ, the assignment's JSON scenes, PLY, VTP, and all formats that meshio reads."""
 
 from __future__ import annotations
 
@@ -20,32 +20,35 @@ from harness.scenes.mesh.scene_json import read_scene_json
 from harness.scenes.mesh.topology import NO_PAIRS, Indices
 
 _KINDS = ("line", *FACES, "tetra")
-"""The kinds of cells that springs are made of; the kind `vertex` is passed over."""
+"""Kinds of cells that yield springs; the kind `vertex` is ignored."""
 
 _MOST_NAMED = 3
 _LOG = logging.getLogger("springbench")
 
 SECONDS, BYTES_PER_SECOND = 5.0, 1e6
-"""What a file may take to read: meshio takes text at 1 MB/s at least, and reads some broken files for ever."""
+"""Time limit of reading: meshio reads text at 1 MB/s or more, and does not terminate on some broken files."""
 MEMORY, MEMORY_PER_BYTE = 2**29, 20
-"""Bytes that it may take: lists of Python, for a number of two characters each."""
+"""Memory limit of reading [bytes]: Python lists, with numbers of two characters in the worst case."""
 
 
 class File(Model):
-    """A mesh from a file; its size is the file's own. Parts: the sides of its bounding box, and the groups that the
-    file names; attributes: what it tells of its points."""
+    """A mesh from a file, of fixed size.
+
+    Parts: the sides of its bounding box, and the groups named in the file. Attributes: point data of the file.
+    """
 
     kind: Literal["file"] = "file"
     path: Path
-    """An OBJ, a JSON scene of the assignment (its OBJ is read), a PLY, a VTP, or what meshio reads (VTK, STL, ...)."""
+    """Path of an OBJ, a JSON scene of the assignment (its OBJ is read), a PLY, a VTP, or a meshio format (VTK, ...)."""
     springs: SpringRule | None = None
-    """Springs along `edges` of faces alone, or between all `face_pairs`; by default as JSON scenes want it
-    (face_pairs), and edges for all other files."""
+    """Springs along `edges` of faces only, or between all corners of a face (`face_pairs`); by default face_pairs for
+    JSON scenes, and edges for all other files."""
 
     def build(self, size: int = 0) -> Mesh:
-        """The file's mesh, whatever the size; see `harness.scenes.mesh.cells.network` for springs and masses.
+        """Build the file's mesh, ignoring the size; `mesh.spring_network` defines springs and masses.
 
-        Raises InputError for a file that is missing, malformed, empty or too large.
+        Raises:
+            InputError: for a file that is missing, malformed, empty or too large.
         """
         path, suffix = self.path, self.path.suffix.lower()
         rule = self.springs or ("face_pairs" if suffix == ".json" else "edges")
@@ -56,7 +59,7 @@ class File(Model):
 
 
 def _read_meshio(path: Path) -> Cells:
-    """What is found in a child; whatever goes wrong there is an InputError."""
+    """Read cells with meshio in a subprocess; raise InputError on any failure."""
     check_file(path)
     state = path.stat()
     found = _read(path, state.st_mtime_ns, state.st_size)
@@ -89,7 +92,7 @@ def _read_meshio(path: Path) -> Cells:
 
 @lru_cache(maxsize=2)  # a scene builds its mesh several times, and a child takes a while to start
 def _read(path: Path, changed: int, size: int) -> Found:
-    """What is in a file of so many bytes, changed last at a time [ns]."""
+    """Read a file; the cache key is its path, its modification time [ns] and its size in bytes."""
     limits = child.Allowance(SECONDS + size / BYTES_PER_SECOND, MEMORY + MEMORY_PER_BYTE * size)
     try:
         return child.call(read, path, limits=limits)
@@ -98,7 +101,7 @@ def _read(path: Path, changed: int, size: int) -> Found:
 
 
 def _problem_of_groups(found: Found) -> str:
-    """What is wrong with the groups, or nothing."""
+    """Describe what is wrong with the groups; empty if they are valid."""
     for name, group in found.groups.items():
         if group[0] < 0 or group[-1] >= len(found.points):
             return f"its group {name[:40]!r} names the point {group[-1]}; wanted 0 to {len(found.points) - 1}"
@@ -106,7 +109,7 @@ def _problem_of_groups(found: Found) -> str:
 
 
 def _problem(points: np.ndarray, blocks: list[tuple[str, Indices]]) -> str:
-    """What is wrong with what meshio read, or nothing."""
+    """Describe what is wrong with meshio's points and cells; empty if they are valid."""
     if points.ndim != 2 or not 1 <= points.shape[1] <= 3:
         return f"has points of shape {points.shape}; wanted 1 to 3 coordinates each"
     if not np.all(np.abs(points) <= MAX_COORDINATE):

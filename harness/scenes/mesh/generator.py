@@ -1,4 +1,4 @@
-"""The base of the mesh generators: a model of physical parameters that builds meshes of any size."""
+"""Base class of the mesh generators: physical parameters, from which meshes of any size are built."""
 
 from __future__ import annotations
 
@@ -14,40 +14,40 @@ from harness.scenes.mesh.base import Mesh
 from solvers import memory
 
 MAX_VERTICES = 5_000_000
-"""No mesh may have more: positions, springs and a factor of that size fill the memory of a workstation."""
+"""Maximum number of vertices: positions, springs and a factor of that size fill the memory of a workstation."""
 
 _BYTES, _BYTES_PER_SPRING = 150, 240
-"""Of each vertex and spring, at most while mesh, springs and Q are made: chains took 380 bytes a vertex, sheets 1090,
-solids 2740. What a solver makes of Q comes later, and is estimated when Q is known."""
+"""Memory per vertex and per spring [bytes], an upper bound while mesh, springs and Q are built: chains took 380 bytes per
+vertex, sheets 1090, solids 2740. A solver's data is estimated later, when Q is available."""
 
 Metres = Annotated[float, Field(ge=1e-6, le=1e6)]
-"""A length [m] from a micrometre to a thousand kilometres."""
+"""A length [m] from 1e-6 to 1e6."""
 
 
 class Generator(Model):
-    """Parameters of a family of meshes that differ in their size alone."""
+    """Parameters of a family of meshes that differ only in their size."""
 
     SMALLEST: ClassVar[int] = 2
-    """The smallest size that makes a mesh."""
+    """Smallest valid size."""
     COUNTS: ClassVar[str]
-    """What the size counts, for messages."""
+    """Meaning of the size, for messages."""
     SPRINGS: ClassVar[int]
-    """How many springs a vertex has, inside a large mesh."""
+    """Number of springs per vertex in the interior of a large mesh."""
 
     def build(self, size: int) -> Mesh:
-        """The mesh of this size; raises InputError as `check` does, before anything is allocated."""
+        """Build the mesh of a size; raise InputError as `check_size` does, before any allocation."""
         self.check(size)
         return self.generate(size)
 
     def check(self, size: int) -> None:
-        """Raise InputError for a size outside the range that the generator, `MAX_VERTICES` and the memory allow."""
+        """Raise InputError for a size outside the limits of the generator, `MAX_VERTICES` and the memory."""
         if size < self.SMALLEST:
             raise self._refusal(size, "is too small")
         if excess := self.excess(size):
             raise self._refusal(size, excess)
 
     def excess(self, size: int) -> str:
-        """What is wrong with a size that is too large, in words; nothing is with others."""
+        """Describe why a size is too large; empty if it is not."""
         if size > MAX_VERTICES:
             return "is too large"
         if (vertices := self.count(size)) <= self._most:
@@ -60,21 +60,21 @@ class Generator(Model):
 
     @property
     def _bytes(self) -> int:
-        """Of a vertex and its springs."""
+        """Memory per vertex with its springs [bytes]."""
         return _BYTES + _BYTES_PER_SPRING * self.SPRINGS
 
     @property
     def _most(self) -> int:
-        """The most vertices on this machine."""
+        """Maximum number of vertices on this machine."""
         return min(MAX_VERTICES, int(memory.of_machine() // self._bytes))
 
     @abstractmethod
     def count(self, size: int) -> int:
-        """How many vertices a mesh of a size from SMALLEST to MAX_VERTICES has; never falls as it grows."""
+        """Return the number of vertices for a size from MIN_SIZE to MAX_VERTICES; nondecreasing in the size."""
 
     @abstractmethod
     def generate(self, size: int) -> Mesh:
-        """The mesh of a size that has been checked."""
+        """Generate the mesh of a valid size."""
 
     def _refusal(self, size: int, why: str) -> InputError:
         largest = self.SMALLEST - 1 + bisect_right(range(self.SMALLEST, MAX_VERTICES + 1), self._most, key=self.count)
@@ -84,5 +84,5 @@ class Generator(Model):
 
 
 def cells(length: float, spacing: float) -> int:
-    """How many cells of about `spacing` [m] fill `length` [m]: at least one."""
+    """Return the number of cells of about `spacing` [m] in `length` [m], at least one."""
     return max(1, round(length / spacing))

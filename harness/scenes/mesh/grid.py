@@ -18,14 +18,14 @@ class _Sheet(Generator):
     """A rectangle, centred on the vertical axis x = z = 0; row 0 is its top."""
 
     width: Metres = 1.0
-    """Along x [m]."""
+    """Width along x [m]."""
     height: Metres = 1.0
-    """From the top row to the bottom row [m]."""
+    """Height from the top row to the bottom row [m]."""
     plane: Literal["horizontal", "vertical"] = "horizontal"
-    """Lying at y = 0 with its top towards -z, or hanging from y = 0 in the plane z = 0."""
+    """Horizontal at y = 0 with the top towards -z, or hanging from y = 0 in the plane z = 0."""
 
     def _place(self, across: Points, down: Points) -> Points:
-        """Positions (n, 3) [m] from fractions of the width and of the height, (n,) each."""
+        """Compute positions (n, 3) [m] from fractions of the width and of the height, (n,) each."""
         x, zero = self.width * (across - 0.5), np.zeros_like(across)
         if self.plane == "vertical":
             return np.stack([x, -self.height * down, zero], axis=1)
@@ -33,7 +33,7 @@ class _Sheet(Generator):
 
 
 def _parts(top: Indices, bottom: Indices, left: Indices, right: Indices) -> dict[str, Indices]:
-    """The sides of a sheet, each in order along it, and what they make together."""
+    """Name the sides of a sheet, each in order along it, and their unions."""
     return {
         "top": top,
         "bottom": bottom,
@@ -51,12 +51,12 @@ class Grid(_Sheet):
     Springs: along rows, along columns (STRETCH); the diagonals down to the right, then down to the left
     (SHEAR); from a vertex to the next but one along rows, then along columns (BEND). 81 x 81 vertices with
     one diagonal and skip-one springs have the 32,158 springs of the curtain of Liu et al. 2013.
-    Parts: top, bottom, left, right, boundary, corners, top_corners. Mass goes by area. Dimension 2.
+    Parts: top, bottom, left, right, boundary, corners, top_corners. Mass is proportional to area. Dimension 2.
     """
 
     kind: Literal["grid"] = "grid"
     diagonals: Literal["none", "one", "both"] = "both"
-    """Diagonal springs in each cell, against shear."""
+    """Diagonal springs per cell, against shear."""
     skip_one: bool = False
     """Springs from a vertex to the next but one, against bending."""
 
@@ -94,13 +94,13 @@ class Grid(_Sheet):
 
 
 class Net(_Sheet):
-    """A net of ropes: square meshes that stand on a corner, and a rope around; no triangles.
+    """A net of ropes: square meshes that stand on a corner, and a rope along the boundary; no triangles.
 
     `size` knots along its top. Rows of `size` knots alternate with rows of `size - 1` knots half a mesh
     lower; knots are numbered row by row. Springs, all STRETCH: from each knot of the short rows up
     left, up right, down left, down right (one direction after another), then along top, bottom, left, right.
-    Parts: top, bottom, left, right, boundary, corners, top_corners. Mass goes by length. Dimension 2, since
-    a net with finer meshes is to stretch as much: its ropes are thinner.
+    Parts: top, bottom, left, right, boundary, corners, top_corners. Mass is proportional to length. Dimension 2, so that
+    a net with finer meshes has the same stretch: its ropes are thinner.
     """
 
     kind: Literal["net"] = "net"
@@ -114,7 +114,7 @@ class Net(_Sheet):
         return size * (meshes + 1) + (size - 1) * meshes
 
     def _meshes(self, size: int) -> int:
-        """How many meshes are stacked from top to bottom."""
+        """Return the number of mesh rows from top to bottom."""
         return cells(self.height, self.width / (size - 1))
 
     def generate(self, size: int) -> Mesh:

@@ -1,4 +1,4 @@
-"""The kinds of mesh that a scene may name, as `module:Class`, so that a run imports the one it uses."""
+"""Table of the mesh types as `module:Class`; a run imports only the type that it uses."""
 
 from solvers.plugins import Table
 
@@ -19,4 +19,4 @@ MESHES: dict[str, str] = {
 }
 
 EVERY = Table("springbench.meshes", MESHES)
-"""All that a scene can name."""
+"""All mesh types by name."""

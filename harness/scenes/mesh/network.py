@@ -1,4 +1,4 @@
-"""A spring network written out in the scene: vertices, springs and masses one by one."""
+"""An inline spring network: vertices, springs and masses listed in the scene."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ Pairs = tuple[tuple[NonNegativeInt, NonNegativeInt], ...]
 
 
 class Network(Model):
-    """Vertices, and springs between pairs of them; two vertices may be joined more than once. Dimension 1."""
+    """Vertices, and springs between pairs of them; multiple springs per pair are allowed. Dimension 1."""
 
     kind: Literal["network"] = "network"
     positions: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = Field(min_length=1)
-    """The rest position of each vertex [m]."""
+    """Rest position of each vertex [m]."""
     springs: Pairs = ()
-    """The springs along the lines (stretch), as pairs of vertices counted from zero."""
+    """Springs along the lines (stretch), as pairs of zero-based vertices."""
     shear: Pairs = ()
-    """The springs across cells."""
+    """Springs across cells."""
     bend: Pairs = ()
-    """The springs from a vertex to the next but one."""
+    """Springs from a vertex to the next but one."""
     mass: tuple[NonNegativeFloat, ...] | None = None
-    """The mass of each vertex [kg]; where left out, all carry the same share of the scene's."""
+    """Mass of each vertex [kg]; by default equal shares of the scene's mass."""
 
     @field_validator("springs", "shear", "bend")
     @classmethod
@@ -54,7 +54,7 @@ class Network(Model):
         return mass
 
     def build(self, size: int = 0) -> Mesh:
-        """The network as it stands, whatever the size."""
+        """Build the network, ignoring the size."""
         rest = np.array(self.positions, float)
         mass = None if self.mass is None else np.array(self.mass, float)
         families = {STRETCH: self.springs, SHEAR: self.shear, BEND: self.bend}

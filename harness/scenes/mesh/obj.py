@@ -1,9 +1,9 @@
-"""A strict reader of Wavefront OBJ: vertices, polygons of any number of corners, lines.
+"""Strict reader of Wavefront OBJ: vertices, polygons of any number of corners, lines.
 
-A `\\` at the end of a line continues it on the next one. Vertex tokens are `v`, `v/vt`, `v//vn` or
+A `\\` at the end of a line continues the statement on the next line. Vertex tokens are `v`, `v/vt`, `v//vn` or
 `v/vt/vn`, counted from 1, or from -1 backwards from the last vertex read so far. An `f` line of two
-vertices is a spring (scenes of the Toronto assignment use it so), an `l` line is a polyline. Texture,
-normals, groups and materials are passed over; anything else is a mistake.
+vertices is a spring, as in scenes of the Toronto assignment; an `l` line is a polyline. Texture,
+normals, groups and materials are ignored; anything else is a mistake.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ _MOST_MISTAKES = 20
 
 
 def read_obj(path: Path) -> Cells:
-    """The points, polygons (`f`) and segments (`l`) of an OBJ file, in file order.
+    """Read the points, polygons (`f`) and segments (`l`) of an OBJ file, in file order.
 
-    Raises InputError, with the lines, for what cannot be read, numbers that are not finite, indices out of
-    range, faces that name a vertex twice, and files that are empty or too large.
+    Raises:
+        InputError: with the lines, for unreadable statements, numbers that are not finite, indices out of range,
+            repeated vertices of a face, and empty or oversized files.
     """
     check_file(path)
     reader = _Reader(path)
@@ -49,7 +50,7 @@ def read_obj(path: Path) -> Cells:
 
 
 def _statements(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
-    """Statements without comments, and the number of the line in which each begins."""
+    """Yield statements without comments, each with the number of its first line."""
     begun, parts = 0, list[str]()
     for number, line in enumerate(lines, 1):
         text, comment, _ = line.partition("#")
@@ -64,7 +65,7 @@ def _statements(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
 
 
 class _Reader:
-    """Collects lines; all mistakes are reported together at the end."""
+    """Collects statements; all mistakes are reported together at the end."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -79,7 +80,7 @@ class _Reader:
         self.mistakes: list[Mistake] = []
 
     def read(self, number: int, text: str) -> None:
-        """Take in one statement that begins in line `number`."""
+        """Read one statement that starts in line `number`."""
         keyword, *words = text.split() or [""]
         try:
             if keyword == "v":
@@ -112,7 +113,7 @@ class _Reader:
             self.groups[name].update(corners)
 
     def _corners(self, words: list[str]) -> list[int]:
-        """Zero-based vertices; whether they exist is known only at the end of the file."""
+        """Parse zero-based vertices; their existence is checked at the end of the file."""
         if len(words) < 2:
             raise ValueError(f"a face or line needs at least 2 vertices, came {len(words)}")
         corners: list[int] = []
@@ -127,7 +128,7 @@ class _Reader:
         return corners
 
     def cells(self) -> Cells:
-        """What was read; raises InputError with all mistakes."""
+        """Return the cells; raise InputError with all mistakes."""
         if not self.mistakes and not self.points:
             self.mistakes.append(Mistake("has no vertices (v lines)", self.path))
         if not self.mistakes:
@@ -157,7 +158,7 @@ class _Reader:
 
 
 def _point(words: list[str]) -> tuple[float, float, float]:
-    """The position on a `v` line; a weight or a colour may follow it."""
+    """Parse the position of a `v` line, optionally followed by a weight or a colour."""
     if not 3 <= len(words) <= 7:
         raise ValueError(f"a vertex needs 3 coordinates (and at most a weight and a colour), came {len(words)}")
     x, y, z = map(_coordinate, words[:3])

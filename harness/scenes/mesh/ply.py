@@ -1,6 +1,6 @@
-"""PLY files (Turk 1994), in text or binary: vertices with their numbers, and faces.
+"""Reader of PLY files (Turk 1994), text or binary: vertices with attributes, and faces.
 
-Any other element, and any property of a face besides its list of vertices, is skipped: the head says how long it is.
+Other elements, and other properties of faces than the vertex list, are skipped; the header gives their length.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _MOST_OF_HEAD = 2**20
 
 
 class Property(NamedTuple):
-    """A number, or a list of them if `length` names the type of its length."""
+    """A scalar property, or a list if `length_type` is set, the type of its length."""
 
     name: str
     type: str
@@ -39,7 +39,7 @@ class Property(NamedTuple):
 
 
 class Element(NamedTuple):
-    """What the head says of so many rows."""
+    """An element of the header, with its number of rows."""
 
     name: str
     rows: int
@@ -47,8 +47,14 @@ class Element(NamedTuple):
 
 
 class Ply(NamedTuple):
-    """points (n, 3); numbers: by name (n,); faces: by the number of corners k, (f, k), and the number of each in the
-    file, from 0; first_line: of the faces where each row has a line of its own, else 0."""
+    """Contents of a PLY file.
+
+    Attributes:
+        points: (n, 3).
+        vertex_attributes: by name (n,).
+        faces: number of corners k -> faces (f, k), and their zero-based numbers in the file.
+        first_face_line: line of the first face if each face has its own line, else 0.
+    """
 
     points: Array
     numbers: dict[str, Array]
@@ -57,7 +63,7 @@ class Ply(NamedTuple):
 
 
 def read(content: bytes) -> Ply:
-    """What a file holds; raises ValueError for a broken one."""
+    """Read the contents of a PLY file; raise ValueError for a broken one."""
     form, elements, start = _head(content)
     rows_of: Callable[[Element, str], _Rows] = (
         _Text(content[start:]).rows if form == "ascii" else _Binary(content, start, _ORDERS[form]).rows
@@ -79,7 +85,7 @@ def read(content: bytes) -> Ply:
 
 
 def _head(content: bytes) -> tuple[str, list[Element], int]:
-    """The format, the elements, and where the head ends."""
+    """Parse the header: the format, the elements, and the end of the header."""
     end = re.search(rb"^end_header[ \t]*\r?\n?", content[:_MOST_OF_HEAD], re.M)
     if not re.match(rb"ply[ \t]*\r?\n", content) or not end:
         raise ValueError("it has no head from `ply` to `end_header`")
@@ -112,7 +118,7 @@ def _list_of_corners(element: Element) -> str:
 
 
 def _by_corners(lists: list[Array] | Array) -> dict[int, tuple[Indices, Indices]]:
-    """Faces by the number of their corners. Raises ValueError for corners that are no whole numbers."""
+    """Group faces by their number of corners; raise ValueError for corners that are not integers."""
     if isinstance(lists, np.ndarray):
         return {lists.shape[1]: (_whole(lists), np.arange(len(lists)))} if len(lists) else {}
     length = np.array([len(one) for one in lists], np.int64)
@@ -138,7 +144,7 @@ def _first_line(content: bytes, start: int, elements: list[Element]) -> int:
 
 
 class _Rows(NamedTuple):
-    """columns: numbers by name (n,); lists: what the rows have of the wanted list, (n, k) where all are as long."""
+    """Rows of an element: scalar columns by name (n,), and the wanted list, (n, k) if all lengths are equal."""
 
     columns: dict[str, Array]
     lists: list[Array] | Array
@@ -149,7 +155,7 @@ def _short(element: Element) -> ValueError:
 
 
 class _Text:
-    """The numbers of a body in text."""
+    """Numbers of a text body."""
 
     def __init__(self, body: bytes) -> None:
         with warnings.catch_warnings():
@@ -161,7 +167,7 @@ class _Text:
         self._at = 0
 
     def rows(self, element: Element, wanted: str) -> _Rows:
-        """The next rows. Raises ValueError."""
+        """Read the next rows; raise ValueError on failure."""
         n, properties, begun = element.rows, element.properties, self._at
         if not n or not properties:
             return _Rows({one.name: np.empty(0) for one in properties}, [])
@@ -182,7 +188,7 @@ class _Text:
         return self._unequal(element, wanted, begun)
 
     def _widths(self, element: Element) -> tuple[dict[str, int], int]:
-        """Where the properties of the row stand that begins here, and where the row ends."""
+        """Locate the properties of the row that starts here, and the end of the row."""
         places, at, begun = dict[str, int](), self._at, self._at
         for one in element.properties:
             places.setdefault(one.name, at - begun)
@@ -214,13 +220,13 @@ class _Text:
 
 
 class _Binary:
-    """The bytes of a binary body."""
+    """Bytes of a binary body."""
 
     def __init__(self, content: bytes, start: int, order: str) -> None:
         self._content, self._at, self._order = content, start, order
 
     def rows(self, element: Element, wanted: str) -> _Rows:
-        """The next rows. Raises ValueError."""
+        """Read the next rows; raise ValueError on failure."""
         n, properties, begun = element.rows, element.properties, self._at
         if not n or not properties:
             return _Rows({one.name: np.empty(0) for one in properties}, [])
@@ -249,7 +255,7 @@ class _Binary:
         return self._unequal(element, wanted, begun)
 
     def _length(self, element: Element, one: Property) -> int:
-        """The length of the list that begins here; goes on behind it."""
+        """Read the length of the list that starts here, and advance past it."""
         (value,) = self._taken(element, one.length, 1).tolist()
         if not 0 <= value < 2**32 or value != int(value):
             raise ValueError(f"a list of its {element.name} has the length {value:g}; wanted a whole number")

@@ -1,16 +1,16 @@
-"""Faces of any number of corners: triangles, areas by vertex, and duplicates, whichever corner a face lists first.
+"""Polygonal faces: triangulation, vertex areas and duplicates, independent of a face's first corner.
 
-Triangles: a convex quadrangle is cut by its shorter diagonal; a convex face of more corners is a fan from its
-lowest-numbered vertex; other faces lose one ear after the other, that with the shortest diagonal first (Meisters 1975,
-"Polygons have ears"). Lengths that differ by less than a millionth count as equal, and the diagonal with the lowest
-numbers is taken. Convex is what is so in the plane across the face's vector area.
+Triangles: a convex quadrangle is split along its shorter diagonal; a convex face with more corners is a fan from its
+lowest-numbered vertex; other faces are triangulated by ear clipping, shortest diagonal first (Meisters 1975,
+"Polygons have ears"). Lengths that differ by less than a millionth count as equal; the diagonal with the lowest
+vertex numbers is then chosen. Convexity is tested in the plane normal to the vector area of the face.
 
-Areas: the mean over the fans from all corners, for a convex face. That is half of each diagonal's thirds in a
-quadrangle, which is also what the bilinear map gives, and thirds in a triangle:
+Areas: for a convex face, the mean over the fans from all corners. In a quadrangle that is half of each diagonal's
+thirds, which also equals the integral of the bilinear map; in a triangle it is thirds:
 
     a_i = (t_(i-1) + t_i)/3 + sum(t)/(3 k),     t_i the area of the mean of the k corners, corner i and corner i + 1
 
-The area of a face that is not flat is that of its triangles, which the sum of the a_i is scaled to. Faces that are not
+The area of a face that is not planar is that of its triangles; the a_i are scaled to that sum. Faces that are not
 convex give each corner a third of its triangles.
 """
 
@@ -26,32 +26,37 @@ from numpy.typing import NDArray
 from harness.scenes.mesh.topology import Indices, Points, by_area
 
 MAX_CONCAVE_CORNERS = 2_000
-"""More corners take too long: each ear is looked for among all of them."""
+"""Maximum number of corners: ear clipping searches all corners for each ear."""
 _ROUND = 16.0 * float(np.finfo(np.float64).eps)
-"""Of the coordinates times the size of a face: an area below it is round-off."""
+"""Round-off of an area, relative to coordinates times face size."""
 _EQUAL = 1e-6
-"""Squared lengths that differ by less are equal, relatively."""
+"""Relative difference below which squared lengths count as equal."""
 _INSIDE = 1e-9
-"""Of a triangle: how far outside of it a point still counts as inside."""
+"""Tolerance of point-in-triangle tests, relative to the triangle."""
 _AT_ONCE = 1_000_000
-"""Corners that are looked at together."""
+"""Number of corners processed per chunk."""
 
 
 class Surface(NamedTuple):
-    """Triangles (f, k - 2, 3) of f faces of k corners, in their orientation; convex (f,); failed (f,): faces whose
-    boundary crosses itself, whose triangles mean nothing."""
+    """Triangulation of f faces of k corners.
+
+    Attributes:
+        triangles: (f, k - 2, 3), in the orientation of the faces.
+        is_convex: (f,).
+        is_self_crossing: (f,), faces with a self-crossing boundary, whose triangles are invalid.
+    """
 
     triangles: Indices
     convex: NDArray[np.bool_]
     failed: NDArray[np.bool_]
 
     def chosen(self, rows: NDArray[np.bool_]) -> Surface:
-        """The same of some of the faces, rows (f,)."""
+        """Return the triangulation of some of the faces, rows (f,)."""
         return Surface(self.triangles[rows], self.convex[rows], self.failed[rows])
 
 
 def triangulate(rest: Points, polygons: Indices) -> Surface:
-    """Cut faces (f, k) of vertices at rest (n, 3) [m] into triangles."""
+    """Triangulate faces (f, k) of vertices with rest positions (n, 3) [m]."""
     f, k = polygons.shape
     if k == 3:
         return Surface(polygons.reshape(f, 1, 3), np.ones(f, np.bool_), np.zeros(f, np.bool_))
@@ -81,7 +86,7 @@ def _triangulate(rest: Points, polygons: Indices) -> Surface:
 
 
 def _halves(rest: Points, corners: Indices) -> Indices:
-    """The triangles (f, 2, 3) of convex quadrangles (f, 4), the lowest corner first."""
+    """Split convex quadrangles (f, 4) into triangles (f, 2, 3), the lowest corner first."""
     one, two = (((rest[corners[:, i + 2]] - rest[corners[:, i]]) ** 2).sum(axis=1) for i in (0, 1))
     other = one > (1.0 + _EQUAL) * two
     cuts = np.where(other[:, None], [0, 1, 3, 1, 2, 3], [0, 1, 2, 0, 2, 3])
@@ -89,19 +94,19 @@ def _halves(rest: Points, corners: Indices) -> Indices:
 
 
 def _fans(corners: Indices) -> Indices:
-    """The triangles (f, k - 2, 3) of faces (f, k) around their first corners."""
+    """Split faces (f, k) into fans (f, k - 2, 3) around their first corners."""
     first = np.repeat(corners[:, :1], corners.shape[1] - 2, axis=1)
     return np.stack([first, corners[:, 1:-1], corners[:, 2:]], axis=2)
 
 
 def _lowest_first(triangles: Indices) -> Indices:
-    """The same triangles (..., 3), each from its lowest corner on."""
+    """Rotate each triangle (..., 3) so that its lowest corner is first."""
     lowest = triangles.argmin(axis=-1)[..., None]
     return np.take_along_axis(triangles, (lowest + np.arange(3)) % 3, axis=-1)
 
 
 def vertex_areas(rest: Points, polygons: Indices, surface: Surface) -> Points:
-    """The area (n,) [m^2] of faces (f, k) by vertex."""
+    """Compute the area (n,) [m^2] of faces (f, k) by vertex."""
     if polygons.shape[1] == 3:
         return by_area(rest, polygons)
     faces = polygons[surface.convex]
@@ -119,7 +124,7 @@ def vertex_areas(rest: Points, polygons: Indices, surface: Surface) -> Points:
 
 
 def repeated_rows(cells: Indices) -> Indices:
-    """For each cell (f, k) the first one with the same vertices in any order, (f,): itself if it is new."""
+    """Return for each cell (f, k) the first cell with the same vertices in any order, (f,); itself if new."""
     rows = np.sort(cells, axis=1)
     order = np.lexsort(rows.T[::-1]) if len(rows) > 1 else np.arange(len(rows))  # stable: the first one leads
     new = np.ones(len(rows), np.bool_)
@@ -130,7 +135,7 @@ def repeated_rows(cells: Indices) -> Indices:
 
 
 class Cover(NamedTuple):
-    """Faces of `corners` corners, their rows (c,), that faces of `larger` corners, their rows (c,), cover."""
+    """Faces of `corners` corners, rows (c,), and the faces of `larger_corners` corners that contain them, rows (c,)."""
 
     corners: int
     rows: Indices
@@ -139,7 +144,7 @@ class Cover(NamedTuple):
 
 
 def find_covers(rest: Points, polygons: Mapping[int, Indices], surfaces: Mapping[int, Surface]) -> list[Cover]:
-    """Find faces that are a part of a larger one: all their corners are its corners, and they lie inside it."""
+    """Find faces that are part of a larger face: their corners are corners of it, and they lie inside."""
     sizes = [k for k in sorted(polygons) if k >= 3 and len(polygons[k])]
     if len(sizes) < 2:
         return []
@@ -162,8 +167,10 @@ def find_covers(rest: Points, polygons: Mapping[int, Indices], surfaces: Mapping
 
 
 def _contains(rest: Points, large: Indices, small: Indices) -> NDArray[np.bool_]:
-    """Whether the middles of the triangles small (c, s, 3) all lie in triangles of large (c, l, 3), seen along the
-    normal of these."""
+    """Return whether the midpoints of triangles small (c, s, 3) lie in triangles of large (c, l, 3).
+
+    The test is in the projection along the normal of the large face.
+    """
     a, b, c = (rest[large[..., i]] for i in range(3))
     normal = np.cross(b - a, c - a).sum(axis=1)
     middle = rest[small].mean(axis=2)[:, :, None]
@@ -176,7 +183,7 @@ def _contains(rest: Points, large: Indices, small: Indices) -> NDArray[np.bool_]
 
 
 def _projected(rest: Points, corners: Indices) -> tuple[Points, Points]:
-    """Corners (f, k) in the plane across each face's vector area, (f, k, 2) [m]; twice the area (f,) that is none."""
+    """Project corners (f, k) to the plane of the vector area, (f, k, 2) [m]; also twice the round-off area (f,)."""
     p = rest[corners]
     farthest = np.abs(p).max(axis=(1, 2))
     p = p - p[:, :1]
@@ -200,13 +207,13 @@ def _projected(rest: Points, corners: Indices) -> tuple[Points, Points]:
 
 
 def _turn(a: Points, b: Points, c: Points) -> Points:
-    """Twice the signed areas of triangles in the plane, (..., 2) each."""
+    """Compute twice the signed areas of triangles in the plane, (..., 2) each."""
     one, two = b - a, c - b
     return one[..., 0] * two[..., 1] - one[..., 1] * two[..., 0]
 
 
 def _winds_once(flat: Points, slack: Points) -> NDArray[np.bool_]:
-    """Whether closed paths (f, k, 2) that only turn left go around once: a pentagram goes around twice."""
+    """Return whether closed left-turning paths (f, k, 2) have winding number 1; a pentagram has 2."""
     if flat.shape[1] == 4:
         return np.ones(len(flat), np.bool_)
     sides = np.roll(flat, -1, axis=1) - flat
@@ -216,7 +223,7 @@ def _winds_once(flat: Points, slack: Points) -> NDArray[np.bool_]:
 
 
 def _crosses(flat: Points, slack: Points) -> NDArray[np.bool_]:
-    """Whether two sides of a closed path (f, k, 2) cross each other; those that only touch do not."""
+    """Return whether two sides of a closed path (f, k, 2) cross; touching does not count."""
     k = flat.shape[1]
     a, b, found = flat, np.roll(flat, -1, axis=1), np.zeros(len(flat), np.bool_)
     for shift in range(2, k // 2 + 1):
@@ -228,7 +235,7 @@ def _crosses(flat: Points, slack: Points) -> NDArray[np.bool_]:
 
 
 def _clip_ears(rest: Points, corners: Indices, flat: Points, slack: Points) -> tuple[Indices, NDArray[np.bool_]]:
-    """The triangles (f, k - 2, 3) of faces (f, k), and which faces (f,) have no ear left though corners are left."""
+    """Clip ears: the triangles (f, k - 2, 3) of faces (f, k), and which faces (f,) run out of ears too early."""
     f, k = corners.shape
     triangles, failed = np.zeros((f, k - 2, 3), np.int64), np.zeros(f, np.bool_)
     around: Indices = np.arange(k, dtype=np.int64)
@@ -274,7 +281,7 @@ def _clip_ears(rest: Points, corners: Indices, flat: Points, slack: Points) -> t
 
 
 def _diagonals(rest: Points, corners: Indices, before: Indices, after: Indices) -> Points:
-    """The squared length (f, k) [m^2] of what each corner's neighbours are apart."""
+    """Compute the squared distance (f, k) [m^2] of each corner's neighbours."""
     one, two = (rest[np.take_along_axis(corners, index, axis=1)] for index in (before, after))
     return ((two - one) ** 2).sum(axis=2)
 
@@ -282,7 +289,7 @@ def _diagonals(rest: Points, corners: Indices, before: Indices, after: Indices) 
 def _first_of_shortest(
     ears: NDArray[np.bool_], squared: Points, corners: Indices, before: Indices, after: Indices
 ) -> Indices:
-    """Of the ears (f, k) that with the shortest diagonal; of equal ones the lowest numbers, (f,)."""
+    """Choose of the ears (f, k) the one with the shortest diagonal, ties by the lowest numbers, (f,)."""
     shortest = np.where(ears, squared, np.inf)
     tied = ears & (shortest <= (1.0 + _EQUAL) * shortest.min(axis=1, keepdims=True))
     one, two = (np.take_along_axis(corners, index, axis=1) for index in (before, after))
@@ -296,7 +303,7 @@ def _first_of_shortest(
 def _blocked(
     flat: Points, there: NDArray[np.bool_], a: Indices, b: Indices, c: Indices, slack: Points
 ) -> NDArray[np.bool_]:
-    """Whether another corner lies in the triangle of the corners a, b, c (f,), or on its sides; not at its corners."""
+    """Return whether another corner lies in the closed triangle of corners a, b, c (f,), except at its corners."""
     rows = np.arange(len(flat))
     p, q, s = (flat[rows, x][:, None] for x in (a, b, c))
     margin = -slack[:, None]

@@ -1,4 +1,4 @@
-"""The JSON scenes of the University of Toronto mass-spring assignment, as they are written."""
+"""Reader of the JSON scenes of the University of Toronto mass-spring assignment."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from harness.base.model import Model, meanings
 from harness.scenes.mesh.cells import check_file
 
 MAX_BYTES = 2**22
-"""Larger files are refused: they name a mesh, and half a million pins at most."""
+"""Maximum size of a scene file: it names a mesh, and at most half a million pins."""
 
 
 class SceneJson(Model):
-    """The keys of a scene. `b` counts vertices from 1."""
+    """Keys of a scene. `b` counts vertices from 1."""
 
     obj: str = Field(min_length=1)
-    """The OBJ file, relative to the JSON file."""
+    """Path of the OBJ file, relative to the JSON file."""
     k: float = Field(ge=0)
     """Stiffness of every spring [N/m]."""
     m: float | None = Field(default=None, gt=0)
-    """Mass of every vertex [kg]; if absent, the faces are weighed at density 1."""
+    """Mass of every vertex [kg]; by default from the areas of the faces at density 1."""
     b: Annotated[list[int], FailFast()]
     """Pinned vertices, each once."""
     png: str | None = None
@@ -33,7 +33,7 @@ class SceneJson(Model):
 
 
 def read_scene_json(path: Path) -> SceneJson:
-    """The scene that a JSON file describes; raises InputError with file, line and key of each mistake."""
+    """Read a scene from a JSON file; raise InputError with file, line and key of each mistake."""
     check_file(path, most=MAX_BYTES)
     try:
         data = json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_once)
@@ -51,14 +51,14 @@ def read_scene_json(path: Path) -> SceneJson:
 
 
 def line_of(path: Path, key: str) -> int | None:
-    """The line of a key in a file of one flat JSON object, for messages."""
+    """Return the line of a key in a file with one flat JSON object, for messages."""
     text = path.read_text(encoding="utf-8-sig")
     match = re.search(rf'"{re.escape(key)}"\s*:', text)
     return text.count("\n", 0, match.start()) + 1 if match else None
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object whose keys differ."""
+    """Build a JSON object; reject repeated keys."""
     result = dict(pairs)
     if len(result) < len(pairs):
         twice = next(key for k, (key, _) in enumerate(pairs) if key in dict(pairs[:k]))
@@ -67,7 +67,7 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _mistake(path: Path, detail: Any) -> Mistake:
-    """A pydantic error as a mistake."""
+    """Convert a pydantic error to a mistake."""
     key = str(detail["loc"][0])[:80]
     problem = f"{detail['msg']}, came {str(detail['input'])[:80]!r}"
     if detail["type"] == "extra_forbidden":

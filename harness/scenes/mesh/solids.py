@@ -16,19 +16,19 @@ from harness.scenes.mesh.topology import Points, assemble, box_parts, by_length,
 class Tower(Generator):
     """A truss tower of square, tapering cross-section on the ground y = 0, `size` storeys high.
 
-    Vertices are numbered ring by ring from the base, four a ring, counter-clockwise seen from above.
+    Vertices are numbered ring by ring from the base, four per ring, counter-clockwise as viewed from above.
     Members: rings, then legs (STRETCH); both diagonals of each face, then one diagonal across each ring
-    (SHEAR). Members are bars, hence dimension 1 (stiffness EA / length). No triangles: wind blows through a
-    truss. Parts: base, top. Mass goes by length.
+    (SHEAR). Members are bars, hence dimension 1 (stiffness EA / length). No triangles: wind passes through a
+    truss. Parts: base, top. Mass is proportional to length.
     """
 
     kind: Literal["tower"] = "tower"
     height: Metres = 3.0
-    """From the base to the top [m]."""
+    """Height from the base to the top [m]."""
     base_width: Metres = 1.0
-    """Side of the base [m]."""
+    """Side length of the base [m]."""
     top_width: Metres = 0.4
-    """Side of the top [m]."""
+    """Side length of the top [m]."""
 
     SMALLEST: ClassVar[int] = 1
     COUNTS: ClassVar[str] = "storeys"
@@ -74,19 +74,19 @@ class Block(Generator):
 
     Vertices are numbered with z fastest and x slowest. Springs: along x, y, z (STRETCH); the diagonals of
     the faces in x-y, x-z and y-z, then the four diagonals through each cell (SHEAR). Triangles: the surface,
-    facing outwards. Parts: left, right, bottom, top, back, front, corners. Mass goes by the volume of the
+    facing outwards. Parts: left, right, bottom, top, back, front, corners. Mass is proportional to the volume of the
     cells. Dimension 3.
     """
 
     kind: Literal["block"] = "block"
     length: Metres = 1.0
-    """Along x [m]."""
+    """Extent along x [m]."""
     height: Metres = 0.5
-    """Along y [m]."""
+    """Extent along y [m]."""
     depth: Metres = 0.5
-    """Along z [m]."""
+    """Extent along z [m]."""
     diagonals: Literal["one", "all"] = "all"
-    """Diagonal springs: one on each face, which is just enough to be rigid, or all on faces and through cells."""
+    """Diagonal springs: one per face, which is just enough for rigidity, or all on faces and through cells."""
 
     COUNTS: ClassVar[str] = "vertices along its longest side"
     SPRINGS: ClassVar[int] = 12
@@ -99,7 +99,7 @@ class Block(Generator):
         return self.length, self.height, self.depth
 
     def _shape(self, size: int) -> tuple[int, int, int]:
-        """Vertices along x, y and z."""
+        """Return the number of vertices along x, y and z."""
         spacing = max(self._sides()) / (size - 1)
         x, y, z = (cells(side, spacing) + 1 for side in self._sides())
         return x, y, z
@@ -129,5 +129,5 @@ class Block(Generator):
 
 
 def _owned(n: int) -> Points:
-    """How much of the cells beside it each vertex on a line owns; the product over the axes is its volume."""
+    """Return the part of the adjacent cells that each vertex on a line has; products over the axes give volumes."""
     return np.where((np.arange(n) == 0) | (np.arange(n) == n - 1), 0.5, 1.0)

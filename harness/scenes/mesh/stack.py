@@ -1,4 +1,4 @@
-"""Sheets that lie one above the other."""
+"""A stack of parallel sheets."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from harness.scenes.mesh.topology import Indices, Points, assemble
 
 
 class Stack(Grid):
-    """Layers of a grid, which no spring joins, from the lowest to the highest, each numbered as a grid is.
+    """Unconnected layers of a grid, from the lowest to the highest, each numbered like a grid.
 
-    `size` vertices along the width of each. Springs: those of all layers, family by family. Parts: those of a grid in
-    all layers, and lowest, highest. Mass goes by area. Dimension 2.
+    `size` vertices along the width of each. Springs: those of all layers, by family. Parts: those of a grid in
+    all layers, and lowest, highest. Mass is proportional to area. Dimension 2.
     """
 
     kind: Literal["stack"] = "stack"  # pyright: ignore[reportIncompatibleVariableOverride]
     layers: Annotated[int, Field(ge=1, le=10_000)] = 2
-    """How many."""
+    """Number of layers."""
     apart: Annotated[float, Field(ge=0.0, le=1e6)] = 0.01
-    """From each to the next [m], along +y where they lie, along +z where they hang."""
+    """Distance between layers [m], along +y for horizontal layers, along +z for hanging ones."""
     turn: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
-    """By how much each is turned in its plane against the one below [degrees]."""
+    """Rotation of each layer in its plane relative to the one below [degrees]."""
 
     COUNTS: ClassVar[str] = "vertices along the width of each layer"
 

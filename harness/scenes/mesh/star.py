@@ -12,14 +12,14 @@ from harness.scenes.mesh.topology import assemble, by_length
 
 
 class Star(Generator):
-    """The hub, vertex 0, in the origin, and `size` vertices on a level circle; a spring from the hub to each.
+    """The hub, vertex 0, at the origin, and `size` vertices on a horizontal circle; a spring from the hub to each.
 
-    Parts: hub, rim. Mass goes by length, so that the hub has half of it. Dimension 1.
+    Parts: hub, rim. Mass is proportional to length, so the hub has half of it. Dimension 1.
     """
 
     kind: Literal["star"] = "star"
     radius: Metres = 1.0
-    """Of the circle [m]."""
+    """Radius of the circle [m]."""
 
     COUNTS: ClassVar[str] = "vertices around the hub"
     SPRINGS: ClassVar[int] = 1

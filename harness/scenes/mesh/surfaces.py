@@ -24,9 +24,9 @@ from harness.scenes.mesh.topology import (
 class Skirt(Generator):
     """A truncated cone that hangs from y = 0, `size` vertices around, numbered ring by ring from the waist.
 
-    Rings run counter-clockwise seen from above. Springs: along rings, down (STRETCH), then the diagonals down
+    Rings run counter-clockwise as viewed from above. Springs: along rings, down (STRETCH), then the diagonals down
     forwards and down backwards (SHEAR). Triangles face outwards. Cells are near-square at half height.
-    Parts: top (the waist), bottom (the hem). Mass goes by area. Dimension 2.
+    Parts: top (the waist), bottom (the hem). Mass is proportional to area. Dimension 2.
     """
 
     kind: Literal["skirt"] = "skirt"
@@ -35,7 +35,7 @@ class Skirt(Generator):
     bottom_radius: Metres = 0.5
     """Radius of the hem [m]."""
     height: Metres = 0.6
-    """From the waist down to the hem [m]."""
+    """Height from the waist down to the hem [m]."""
 
     SMALLEST: ClassVar[int] = 3
     COUNTS: ClassVar[str] = "vertices around"
@@ -46,7 +46,7 @@ class Skirt(Generator):
         return size * (self._cells(size)[0] + 1)
 
     def _cells(self, size: int) -> tuple[int, float]:
-        """How many cells there are from waist to hem, and their typical side [m]."""
+        """Return the number of cells from waist to hem, and their typical side [m]."""
         slant = math.hypot(self.height, self.bottom_radius - self.top_radius)
         around = math.pi * (self.top_radius + self.bottom_radius) / size
         rows = cells(slant, around)
@@ -83,7 +83,7 @@ class Balloon(Generator):
 
     10 size^2 + 2 vertices: the icosahedron's corners from top to bottom, then those on its edges, then those
     in its faces. Springs, all STRETCH: the sides of the triangles in lexicographic order. Triangles face
-    outwards. Parts: pole_top, pole_bottom (one vertex each). Mass goes by area. Dimension 2.
+    outwards. Parts: pole_top, pole_bottom (one vertex each). Mass is proportional to area. Dimension 2.
     """
 
     kind: Literal["balloon"] = "balloon"
@@ -120,7 +120,7 @@ class Balloon(Generator):
 
 
 def _icosahedron() -> tuple[Points, Indices]:
-    """Corners (12, 3) on the unit sphere: pole, two rings, pole; faces (20, 3), outwards."""
+    """Build corners (12, 3) on the unit sphere: pole, two rings, pole; and faces (20, 3), outwards."""
     k = np.arange(5)
     angle = 2 * np.pi / 5 * np.concatenate([k, k + 0.5])
     y = np.repeat([1.0, -1.0], 5) / math.sqrt(5)
@@ -138,10 +138,11 @@ def _icosahedron() -> tuple[Points, Indices]:
 
 
 def _geodesic(faces: Indices, size: int) -> tuple[Indices, Indices, Indices]:
-    """Each face's points in the order of (i, j), i + j <= size, i towards corner 1 and j towards corner 2.
+    """Subdivide faces into points in the order of (i, j), i + j <= size, i towards corner 1, j towards corner 2.
 
-    Returns the points' vertices (20, t), their weights of the face's corners (t, 3), which sum to `size`, and
-    the triangles of a face (size^2, 3), indices into its t points. Faces share the vertices on their edges.
+    Returns:
+        The vertices of the points (20, t), their weights of the face's corners (t, 3), which sum to `size`, and
+        the triangles of a face (size^2, 3), indices into its t points. Faces share the vertices on their edges.
     """
     i, j = np.nonzero(np.tri(size + 1, dtype=bool)[::-1])
     weights = np.stack([size - i - j, i, j], axis=1)

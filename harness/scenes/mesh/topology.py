@@ -1,4 +1,4 @@
-"""What the meshes are put together from: pairs on lattices and polygons, triangles, lumped weights, parts.
+"""Building blocks of meshes: pairs on lattices and polygons, triangles, lumped weights, parts.
 
 Vertices are numbered through index arrays: `index[r, c]` is the vertex in row r and column c of a lattice.
 """
@@ -20,7 +20,7 @@ NO_TRIANGLES: Indices = np.empty((0, 3), np.int64)
 
 
 def offset_pairs(index: Indices, *offsets: tuple[int, ...]) -> Indices:
-    """The pairs (v, v + offset) of a lattice, (k, 2): offset by offset, each in the order of v."""
+    """Build the pairs (v, v + offset) of a lattice, (k, 2): offset by offset, each in the order of v."""
     pairs = [NO_PAIRS]
     for offset in offsets:
         steps = list(zip(offset, index.shape, strict=True))
@@ -31,20 +31,20 @@ def offset_pairs(index: Indices, *offsets: tuple[int, ...]) -> Indices:
 
 
 def lattice_triangles(index: Indices) -> Indices:
-    """Two triangles a cell, (f, 3), split from [r, c] to [r+1, c+1]; their normals are rows x columns."""
+    """Build two triangles per cell, (f, 3), split from [r, c] to [r+1, c+1]; their normals are rows x columns."""
     a, b, c, d = (x.ravel() for x in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
     return np.stack([a, c, d, a, d, b], axis=1).reshape(-1, 3)
 
 
 def closed_by_points(rings: Indices, first: int, last: int) -> Indices:
-    """The triangles of a lattice of rings (r, k), whose last column is the first one, and of a point at each end."""
+    """Build the triangles of a lattice of rings (r, k), whose last column equals the first, with a point at each end."""
     begin = np.column_stack([np.full(rings.shape[1] - 1, first), rings[0, :-1], rings[0, 1:]])
     end = np.column_stack([np.full(rings.shape[1] - 1, last), rings[-1, 1:], rings[-1, :-1]])
     return np.concatenate([begin, lattice_triangles(rings), end])
 
 
 def unique_pairs(pairs: Indices) -> Indices:
-    """Each unordered pair once, the lower vertex first, in lexicographic order, (k, 2)."""
+    """Sort unordered pairs, each once, the lower vertex first, in lexicographic order, (k, 2)."""
     if not len(pairs):
         return NO_PAIRS
     i, j = pairs.T
@@ -54,54 +54,54 @@ def unique_pairs(pairs: Indices) -> Indices:
 
 
 def sides(polygons: Indices) -> Indices:
-    """The sides of polygons of k corners, (f, k), as pairs (f k, 2), repetitions included."""
+    """Return the sides of polygons of k corners, (f, k), as pairs (f k, 2), with repetitions."""
     return np.stack([polygons, np.roll(polygons, -1, axis=1)], axis=2).reshape(-1, 2)
 
 
 def corner_pairs(polygons: Indices) -> Indices:
-    """All pairs of corners of polygons of k corners, (f, k), as (f k (k-1)/2, 2), repetitions included."""
+    """Return all pairs of corners of polygons of k corners, (f, k), as (f k (k-1)/2, 2), with repetitions."""
     i, j = np.triu_indices(polygons.shape[1], 1)
     return np.stack([polygons[:, i], polygons[:, j]], axis=2).reshape(-1, 2)
 
 
 def fan(polygons: Indices) -> Indices:
-    """Polygons of k corners, (f, k), as fans of triangles from their first corner, (f (k-2), 3)."""
+    """Split polygons of k corners, (f, k), into fans of triangles from their first corner, (f (k-2), 3)."""
     k = np.arange(1, polygons.shape[1] - 1, dtype=np.int64)
     first = np.repeat(polygons[:, :1], len(k), axis=1)
     return np.stack([first, polygons[:, k], polygons[:, k + 1]], axis=2).reshape(-1, 3)
 
 
 def lump(cells: Indices, measure: Points, n: int) -> Points:
-    """Each cell's measure, (f,), dealt out equally to its corners, (f, k): weights of the vertices, (n,)."""
+    """Distribute each cell's measure, (f,), equally to its corners, (f, k): vertex weights, (n,)."""
     corners = cells.shape[1]
     weights = np.bincount(cells.ravel(), np.repeat(measure / corners, corners), minlength=n)
     return weights.astype(np.float64, copy=False)
 
 
 def by_length(rest: Points, pairs: Indices) -> Points:
-    """Half the length of its springs for each vertex, (n,) [m]."""
+    """Lump half the length of each spring to its vertices, (n,) [m]."""
     return lump(pairs, np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1), len(rest))
 
 
 def by_area(rest: Points, triangles: Indices) -> Points:
-    """A third of the area of its triangles for each vertex (barycentric lumping), (n,) [m^2]."""
+    """Lump a third of the area of each triangle to its vertices (barycentric lumping), (n,) [m^2]."""
     a, b, c = (rest[triangles[:, k]] for k in range(3))
     return lump(triangles, np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2, len(rest))
 
 
 def by_volume(rest: Points, tetrahedra: Indices) -> Points:
-    """A quarter of the volume of its tetrahedra for each vertex, (n,) [m^3]."""
+    """Lump a quarter of the volume of each tetrahedron to its vertices, (n,) [m^3]."""
     return lump(tetrahedra, np.abs(signed_volumes(rest, tetrahedra)), len(rest))
 
 
 def signed_volumes(rest: Points, tetrahedra: Indices) -> Points:
-    """The volume of each tetrahedron, (t,) [m^3], positive where corner 3 sees 0, 1, 2 counter-clockwise."""
+    """Compute the volume of each tetrahedron, (t,) [m^3], positive if corner 3 sees 0, 1, 2 counter-clockwise."""
     a, b, c, d = (rest[tetrahedra[:, k]] for k in range(4))
     return np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6
 
 
 def box_parts(rest: Points) -> dict[str, Indices]:
-    """The vertices on the sides of the bounding box; within a millionth of its diagonal counts as on it."""
+    """Find the vertices on the sides of the bounding box, within a millionth of its diagonal."""
     low, high = rest.min(axis=0), rest.max(axis=0)
     near = 1e-6 * np.linalg.norm(high - low)
     names = (("left", "right"), ("bottom", "top"), ("back", "front"))
@@ -126,10 +126,13 @@ def assemble(
     first_vertex: int = 0,
     attributes: Mapping[str, Points] | None = None,
 ) -> Mesh:
-    """A mesh of springs given by family, (k, 2) each: first all STRETCH, then all SHEAR, then all BEND.
+    """Assemble a mesh from springs by family, (k, 2) each: first all STRETCH, then all SHEAR, then all BEND.
 
-    weights: in proportion to the vertices' masses, half the length of its springs for each if left out; spacing: the
-    springs' mean length if left out. The rest as `Mesh` has it.
+    Args:
+        vertex_weights: proportional to the vertex masses; by default half the length of the springs of each.
+        spacing: by default the mean spring length.
+
+    The other arguments are attributes of `Mesh`.
     """
     blocks = [springs.get(family, NO_PAIRS) for family in (STRETCH, SHEAR, BEND)]
     pairs = np.concatenate(blocks)

@@ -1,7 +1,7 @@
-"""VTK's XML files of surfaces and lines (.vtp), as they are written: in text, in base64 or raw, compressed or not.
+"""Reader of VTK's XML files of surfaces and lines (.vtp): text, base64 or raw, compressed or not.
 
 (VTK file formats, https://docs.vtk.org/en/latest/vtk_file_formats/vtkxml_file_format.html) Polygons, strips and lines
-of all pieces are read, vertices are passed over; numbers by point come along.
+of all pieces are read, and point data; vertex cells are ignored.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _TYPES = {
 
 
 class Surface(NamedTuple):
-    """points (n, 3); polygons and lines: the points of each; numbers: by name (n,) or (n, k)."""
+    """Points (n, 3), polygons and lines by their points, and point attributes by name, (n,) or (n, k)."""
 
     points: Array
     polygons: list[Indices]
@@ -44,7 +44,7 @@ class Surface(NamedTuple):
 
 
 def read(content: bytes) -> Surface:
-    """What a file holds; raises ValueError, and what the standard library raises, for a broken one."""
+    """Read the contents of a file; raise ValueError, or an exception of the standard library, if it is broken."""
     found = _APPENDED.search(content)
     if found:
         end = content.rfind(b"</AppendedData>")
@@ -93,7 +93,7 @@ def _cells(piece: Element, kind: str, arrays: _Arrays) -> list[Indices]:
 
 
 class _Arrays:
-    """The arrays of one file."""
+    """Data arrays of one file."""
 
     def __init__(self, root: Element, appended: bytes, *, raw: bool) -> None:
         order = "<" if root.get("byte_order", "LittleEndian") == "LittleEndian" else ">"
@@ -105,7 +105,7 @@ class _Arrays:
         self._decompress = _DECOMPRESS[name] if name else None
 
     def of(self, array: Element) -> NDArray[np.generic]:
-        """The numbers of one, in one row."""
+        """Decode one data array as one row of numbers."""
         if (kind := array.get("type", "")) not in _TYPES:
             raise ValueError(f"has numbers of type {kind!r}; wanted one of {', '.join(_TYPES)}")
         dtype, form = np.dtype(self._order + _TYPES[kind]), array.get("format", "ascii")
@@ -117,7 +117,7 @@ class _Arrays:
         return np.frombuffer(self._decoded("".join(text.split()).encode(), 0, raw=False), dtype)
 
     def _decoded(self, source: bytes, at: int, *, raw: bool) -> bytes:
-        """The bytes of an array from a place on: a header that tells how many, then they, or blocks of them."""
+        """Decode the bytes of an array from an offset: a header with the size, then the data or its blocks."""
         size = self._header.itemsize
         (count,) = self._numbers(_taken(source, at, size, raw=raw)[0])
         if self._decompress is None:
@@ -136,7 +136,7 @@ class _Arrays:
 
 
 def _taken(source: bytes, at: int, count: int, *, raw: bool) -> tuple[bytes, int]:
-    """So many bytes from a place on, and where they end. Raises ValueError where there are fewer."""
+    """Read `count` bytes from an offset; return them and their end, raise ValueError if there are fewer."""
     end = at + (count if raw else 4 * -(-count // 3))
     part = source[at:end]
     found = part if raw else base64.b64decode(part)[:count]
