@@ -1,1 +1,1 @@
-"""Programs of others as solvers, each in a file of its own."""
+"""External simulation engines as solvers, one per module."""

@@ -1,10 +1,11 @@
-"""Outside engines: programs of others that take the same network, and step it through their own public interface.
+"""External engines: third-party programs that step the same network through their own public interface.
 
     positions, velocities, masses, springs (k, r), pins, load -> substeps of the engine's own -> positions, velocities
 
-None minimises the step's objective: they are graded by their motion. As with other methods that divide the step by
-themselves, the iterations are substeps: the k-th iterate is the whole step in k of them. Loads stay within a step, and
-pins move evenly. What an engine cannot express it refuses by name; where it is not installed, it says how to have it.
+None minimises the objective of the step: they are evaluated by their motion. As with other substepping methods, the
+iterations are substeps: the k-th iterate is the whole step in k of them. Loads are constant within a step, and pins
+move at constant velocity. A feature that an engine does not support raises an error with its name; if the engine is not
+installed, the error has the installation command.
 """
 
 from __future__ import annotations
@@ -26,18 +27,18 @@ from solvers.energies.springs import Springs
 from solvers.problem import Positions, ResidualOf, StepProblem, System, Unsupported
 
 _SAME = 1e-12
-"""Of the largest acceleration: what the division of weights by masses may round."""
+"""Tolerance relative to the largest acceleration: the round-off of weights divided by masses."""
 
 
 class Package(NamedTuple):
-    """What is installed: the module that is imported, the distribution that brings it, our extra that names it."""
+    """The package of an engine: imported module, distribution, and our extra that installs it."""
 
     module: str
     distribution: str
     extra: str
 
     def load(self, engine: str) -> Any:
-        """The module. Raises Unsupported with the command that installs it."""
+        """Import the module; raise Unsupported with the installation command on failure."""
         try:
             return import_module(self.module)
         except ImportError as error:
@@ -48,7 +49,7 @@ class Package(NamedTuple):
 
     @property
     def told(self) -> str:
-        """Its name and version."""
+        """Return the name and version."""
         try:
             return f"{self.distribution} {version(self.distribution)}"
         except PackageNotFoundError:
@@ -56,7 +57,14 @@ class Package(NamedTuple):
 
 
 class Lines(NamedTuple):
-    """What acts along edges: ends (m, 2); stiffness k [N/m], rest_length r [m] and damping c [N s/m], each (m,)."""
+    """Forces along edges.
+
+    Attributes:
+        ends: (m, 2).
+        stiffness: k (m,) [N/m].
+        rest_length: r (m,) [m].
+        damping: c (m,) [N s/m].
+    """
 
     ends: NDArray[np.int64]
     stiffness: NDArray[np.float64]
@@ -66,10 +74,15 @@ class Lines(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """A system as engines take it.
+    """A system in the form that engines support.
 
-    mass (n,) [kg]; free (f,), the vertices that move, and pinned (q,), those that do not by themselves; lines: springs
-    and dashpots that act on any that moves; drag (n,) [N s/m], of vertices; time_step [s].
+    Attributes:
+        mass: (n,) [kg].
+        free_vertices: (f,), the vertices that move.
+        pinned_vertices: (q,), the vertices with prescribed motion.
+        spring_dashpots: springs and dashpots with at least one free end.
+        vertex_drag: (n,) [N s/m].
+        time_step: [s].
     """
 
     mass: NDArray[np.float64]
@@ -81,8 +94,17 @@ class Network:
 
     @classmethod
     def of(cls, system: System, engine: str, *, damps: bool) -> Network:
-        """damps: whether the engine knows dashpots and drag on vertices. Raises Unsupported for other energies, other
-        integrators than `own` and implicit Euler, and vertices without mass that are not pinned."""
+        """Build the network of a system.
+
+        Args:
+            system: the system.
+            engine: name of the engine, for messages.
+            supports_damping: whether the engine supports dashpots and drag on vertices.
+
+        Raises:
+            Unsupported: for other energies, integrators other than `own` and implicit Euler, and unpinned vertices
+                without mass.
+        """
         vertex_terms.require_implicit_euler(system, engine)
         vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), engine)
         lines, drag, others = list[Lines](), np.zeros(system.vertices), set[str]()
@@ -104,21 +126,23 @@ class Network:
         return cls(system.mass, free, system.pins.vertices, _joined(lines, system.unpinned), drag, system.time_step)
 
     def acceleration(self, force: Positions) -> NDArray[np.float64] | None:
-        """The acceleration (3,) [m/s^2] that a force (n, 3) [N] gives to all that moves, as gravity does; None where
-        they are not given the same."""
+        """Return the common acceleration (3,) [m/s^2] of all free vertices under a force (n, 3) [N].
+
+        Gravity is such a force. Return None if the accelerations differ.
+        """
         found = force[self.free] / self.mass[self.free, None]
         one = np.median(found, axis=0) if len(found) else np.zeros(3)
         return one if np.allclose(found, one, rtol=0.0, atol=_SAME * max(1.0, float(np.abs(one).max()))) else None
 
     def arrays(self, problem: StepProblem) -> dict[str, NDArray[Any]]:
-        """All of it with a step's start and load, by the names that scripts read."""
+        """Return all arrays with a step's start and load, by the names that scripts read."""
         start, lines = problem.start, self.lines._asdict()
         begun = {"positions": start.positions, "velocities": start.velocity, "force": problem.force}
         return {"mass": self.mass, "free": self.free, "pinned": self.pinned, "drag": self.drag, **lines, **begun}
 
 
 def _joined(parts: list[Lines], unpinned: NDArray[np.bool_]) -> Lines:
-    """Those that have two ends, of which one moves."""
+    """Concatenate edges with two distinct ends, at least one of them free."""
     none = Lines(np.empty((0, 2), np.int64), np.empty(0), np.empty(0), np.empty(0))
     ends, *rest = (np.concatenate(arrays) for arrays in zip(none, *parts, strict=True))
     acts = (ends[:, 0] != ends[:, 1]) & unpinned[ends].any(axis=1) & ((rest[0] > 0.0) | (rest[2] > 0.0))
@@ -126,16 +150,16 @@ def _joined(parts: list[Lines], unpinned: NDArray[np.bool_]) -> Lines:
 
 
 class Stepping(Protocol):
-    """An engine that has the network."""
+    """Interface of an engine with a loaded network."""
 
     def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
-        """Positions [m] and velocities [m/s], (n, 3), at the step's end, after so many substeps."""
+        """Integrate a step in `substeps` substeps; return positions [m] and velocities [m/s], (n, 3), at its end."""
         ...
 
 
 @dataclass(frozen=True)
 class Engine(ABC):
-    """What engines share: a frozen dataclass of parameters each."""
+    """Base class of the engines; each is a frozen dataclass of parameters."""
 
     minimises: ClassVar[bool] = False
     descends: ClassVar[bool] = False
@@ -144,7 +168,11 @@ class Engine(ABC):
     damps: ClassVar[bool] = False
 
     def prepare(self, system: System) -> PreparedEngine:
-        """Raises Unsupported for what the engine cannot express, and where it is not installed."""
+        """Prepare the engine for a system.
+
+        Raises:
+            Unsupported: for features that the engine does not support, and if it is not installed.
+        """
         network = Network.of(system, self.name, damps=self.damps)
         stepping, told = self.built(network, self.package.load(self.name))
         soft = int((~system.pins.exact).sum())
@@ -153,18 +181,31 @@ class Engine(ABC):
 
     @abstractmethod
     def built(self, network: Network, library: Any) -> tuple[Stepping, str]:
-        """The network in the engine, and what was chosen, in words. Raises Unsupported."""
+        """Build the network in the engine; return its stepper and a description, or raise Unsupported."""
 
     @abstractmethod
     def script(self, name: str, network: Network, problem: StepProblem, substeps: int, frames: int) -> dict[str, str]:
-        """What repeats a motion from a step's start by the engine alone, files by name: `NAME.py`, and what else it
-        reads besides `NAME.npz`, which holds `Network.arrays` and the positions at the end, `end`. Raises
-        Unsupported."""
+        """Return scripts that repeat a motion from a step's start with the engine only.
+
+        Args:
+            file_stem: NAME of the files.
+            network: the network.
+            problem: the step problem with the start.
+            num_substeps: substeps per frame.
+            num_frames: number of frames.
+
+        Returns:
+            Files by name: `NAME.py`, and the files that it reads except `NAME.npz`. The latter contains
+            `EngineNetwork.export_arrays` and the final positions, `end`.
+
+        Raises:
+            Unsupported: for features that the script cannot express.
+        """
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedEngine(Iterative):
-    """stepping: the engine with the network."""
+    """An engine, prepared for a system; `engine_stepper` has the network."""
 
     residual_of: ClassVar[ResidualOf] = "none"
 
@@ -174,12 +215,21 @@ class PreparedEngine(Iterative):
     facts: dict[str, float] = field(default_factory=dict[str, float])
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative; from where the step starts."""
+        """Start a solve at the start of the step."""
         return Substeps(self.stepping.step, problem)
 
 
 def evenly(begin: Positions, end: Positions, substeps: int) -> list[Positions] | None:
-    """Where pins (q, 3) [m] are at the start of each substep; None where they are at rest."""
+    """Interpolate the pins (q, 3) [m] linearly.
+
+    Args:
+        start_targets: at the start of the step.
+        end_targets: at its end.
+        substeps: number of substeps.
+
+    Returns:
+        The pins at the start of each substep, None if they are at rest.
+    """
     if np.array_equal(begin, end):
         return None
     return [begin + k / substeps * (end - begin) for k in range(substeps)]

@@ -2,12 +2,12 @@
 
     M a = f - sum of k (l - r) + c dl/dt along the tendons - drag v
 
-`Euler`, `implicitfast` and `implicit` take positions explicitly, damping implicitly as far as the pattern of M goes:
-v <- v + h M^^-1 M a, p <- p + h v, M^ = M - h D. `Euler` has drag alone in D, the others the share too that each body
-has in what its tendons damp; what couples bodies of different trees, which these are, is outside that pattern. So all
-three, and `RK4`, are stable with springs while omega h is below about 2 (2.8), and the documentation's advice is a
-shorter time step; it recommends `implicitfast` for most models, and `RK4` for those that conserve energy (Computation,
-"Numerical integration", "Choosing timestep and integrator").
+`Euler`, `implicitfast` and `implicit` are explicit in the positions, and implicit in the damping within the sparsity
+pattern of M: v <- v + h M^^-1 M a, p <- p + h v, M^ = M - h D. In `Euler`, D contains only drag; in the others it also
+contains each body's own part of the tendon damping. The coupling between bodies of different trees, as here, is
+outside of that pattern. So with springs all three, and `RK4`, are stable while omega h is below about 2 (2.8 for RK4).
+The documentation recommends a shorter time step in that case, `implicitfast` for most models, and `RK4` for
+energy-conserving ones (Computation, "Numerical integration", "Choosing timestep and integrator").
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from solvers.problem import Positions, StepProblem, Unsupported
 Integrator = Literal["implicitfast", "implicit", "Euler", "RK4"]
 
 _LIMIT = {"RK4": 8.0**0.5}
-"""Of omega h, where vibrations do not grow; 2 for the others."""
+"""Stability limit of omega h for RK4; it is 2 for the others."""
 
 _SCRIPT = """\
 import time
@@ -44,7 +44,11 @@ print(f"{{seconds:.3g}} s; {{abs(p - known['end'][known['free']]).max():.3g}} m 
 
 @dataclass(frozen=True)
 class Mujoco(Engine):
-    """integrator: one of MuJoCo's four, by its name there."""
+    """MuJoCo.
+
+    Args:
+        mujoco_integrator: one of MuJoCo's four integrators, by its MuJoCo name.
+    """
 
     name: ClassVar[str] = "mujoco"
     package: ClassVar[Package] = Package("mujoco", "mujoco", "mujoco")
@@ -78,7 +82,7 @@ class Mujoco(Engine):
 
 
 class _Model:
-    """A compiled model and its state; free bodies come first, pinned ones are placed from outside ("mocap")."""
+    """A compiled model with its state; free bodies come first, pinned bodies have prescribed poses ("mocap")."""
 
     def __init__(self, library: Any, model: Any, network: Network) -> None:
         self._library, self._model, self._data, self._network = library, model, library.MjData(model), network
@@ -107,12 +111,23 @@ class _Model:
 
 
 def _unheard(warning: str) -> None:
-    """Positions tell whoever asks that a simulation is unstable."""
+    """Ignore MuJoCo's warning: an unstable simulation is visible in the positions."""
 
 
 def mjcf(network: Network, integrator: str, problem: StepProblem | None = None, substeps: int = 1) -> str:
-    """The network as MuJoCo's XML; with a step, its start is the first key frame. Bodies are at the origin, so that
-    joints tell positions to the last bit. Raises Unsupported for masses that MuJoCo takes for none."""
+    """Build MuJoCo's XML of the network.
+
+    Bodies are at the origin, so that joint coordinates equal positions exactly.
+
+    Args:
+        network: the network.
+        integrator: MuJoCo's name of the integrator.
+        problem: step problem whose start becomes the first key frame, None for no key frame.
+        substeps: number of substeps per step.
+
+    Raises:
+        Unsupported: for masses that MuJoCo treats as zero.
+    """
     net, lines = network, network.lines
     if (net.mass[net.free] < 1e-14).any():
         raise Unsupported("mujoco: takes masses below 1e-15 kg for none; give the vertices more")
@@ -146,5 +161,5 @@ def mjcf(network: Network, integrator: str, problem: StepProblem | None = None, 
 
 
 def _numbers(values: NDArray[np.float64]) -> str:
-    """Numbers in as many digits as they have."""
+    """Format numbers with all their digits."""
     return " ".join(map(repr, values.ravel().tolist()))

@@ -1,17 +1,18 @@
-"""Newton (Warp): springs of its particles, stepped by three of its solvers in float32, on the CPU or a CUDA device.
+"""Newton (Warp): particle springs, stepped by three of its solvers in float32, on the CPU or a CUDA device.
 
-- `vbd`, vertex block descent (Chen et al. 2024), and `xpbd`: implicit Euler in substeps, of some iterations each.
-  Newton's `ModelBuilder.color` sees triangles, tetrahedra and bending edges, and no springs: a net of springs is one
-  colour to it, whose vertices all move at once, which diverges where springs are stiff. So colours of the springs' own
-  are set by `set_coloring`, unless `colours` asks for Newton's.
-- XPBD there moves along all springs at once, with no relaxation, and forgets multipliers between iterations: what it
-  tends to is C = 0 and not the springs' stiffness (issue 2933 of newton-physics/newton), so one iteration a substep is
-  the one that means XPBD.
+- `vbd`, vertex block descent (Chen et al. 2024), and `xpbd`: implicit Euler in substeps with several iterations each.
+  Newton's `ModelBuilder.color` considers triangles, tetrahedra and bending edges, but no springs: a spring network has
+  one colour, so all its vertices move simultaneously, which diverges for stiff springs. Colours of the springs are
+  therefore set by `set_coloring`, unless `colours` selects Newton's.
+- Newton's XPBD projects all springs simultaneously, without relaxation, and discards multipliers between iterations. It
+  converges to C = 0, whatever the stiffness of the springs (issue 2933 of newton-physics/newton). Only one iteration
+  per substep therefore corresponds to XPBD.
 - `semi-implicit`: v <- v + h M^-1 f(p), p <- p + h v.
 
-Its documentation meets stiff springs by more substeps ("Tuning VBD"; its example of a hanging cloth takes 10 of a frame
-of 1/60 s, of 10 iterations each, by VBD and XPBD and 32 explicit ones). Kernels are compiled while a run is prepared,
-a minute at first, and kept in Warp's cache. Style3D, its fourth solver of cloth, has no springs but triangles.
+Its documentation handles stiff springs by more substeps ("Tuning VBD"). Its example of a hanging cloth uses 10 substeps
+of a frame of 1/60 s, with 10 iterations each, for VBD and XPBD, and 32 explicit substeps. Kernels are compiled during
+preparation, which takes a minute the first time, and cached by Warp. Style3D, its fourth cloth solver, supports
+triangles but no springs.
 """
 
 from __future__ import annotations
@@ -59,8 +60,14 @@ print(f"{{seconds:.3g}} s; {{abs(p - net['end']).max():.3g}} m from the end of t
 
 @dataclass(frozen=True)
 class NewtonPhysics(Engine, OnDevice):
-    """method: one of Newton's solvers. iterations: in each substep; an explicit method has none. colours: whose
-    vertices move at the same time by `vbd`. device: as it is for ours."""
+    """Newton physics engine.
+
+    Args:
+        newton_solver: one of Newton's solvers.
+        iterations_per_substep: number of iterations; unused by the explicit solver.
+        colouring_source: vertices that `vbd` moves simultaneously: by springs, or Newton's colouring.
+        device: as for the other solvers.
+    """
 
     name: ClassVar[str] = "newton-physics"
     package: ClassVar[Package] = Package("newton", "newton", "newton")
@@ -108,7 +115,7 @@ class NewtonPhysics(Engine, OnDevice):
         return made, f"{self.method}, {told}, in float32 on {where}"
 
     def _colour(self, builder: Any, network: Network) -> int:
-        """Set the colours; how many there are."""
+        """Set the colours; return their number."""
         if self.colours == "newton":
             builder.color()
         else:
@@ -147,7 +154,7 @@ class NewtonPhysics(Engine, OnDevice):
 
 
 class _Model:
-    """A model, its solver and two states that take turns. On the CPU its arrays are seen in place."""
+    """A model, its solver and two alternating states. On the CPU its arrays are accessed in place."""
 
     def __init__(self, warp: Any, model: Any, solver: Any, network: Network, *, explicit: bool) -> None:
         self._warp, self._solver, self._network, self._explicit = warp, solver, network, explicit
@@ -178,7 +185,7 @@ class _Model:
 
 
 def _set(array: Any, values: NDArray[np.float64] | float, rows: NDArray[np.int64] | None = None) -> None:
-    """Write values to an array of Warp's (n, 3), or to some of its rows."""
+    """Write values to a Warp array (n, 3), or to some of its rows."""
     if rows is None and array.device.is_cuda:
         array.assign(np.asarray(values, np.float32))
         return

@@ -1,10 +1,10 @@
-"""PositionBasedDynamics, by its Python interface pyPBD: springs are its XPBD distance constraints.
+"""PositionBasedDynamics through its Python interface pyPBD: springs are its XPBD distance constraints.
 
     lambda' = -(C + lambda / (k h^2)) / (1/m_i + 1/m_j + 1/(k h^2)),    C = |p_i - p_j| - r
 
-(Macklin, Mueller and Chentanez 2016), in the substeps h of its `TimeStepController`, each of some iterations over all
-constraints. Its documentation and examples meet stiff cloth by substeps rather than by iterations, after Macklin et al.
-2019: by default a time step of 5 ms has 5 substeps of one iteration each. Gravity is the only force that it has.
+(Macklin, Mueller and Chentanez 2016), in the substeps h of its `TimeStepController`, each with several iterations over
+all constraints. Its documentation and examples handle stiff cloth by substeps rather than by iterations, after Macklin
+et al. 2019: by default a time step of 5 ms has 5 substeps of one iteration each. Gravity is its only force.
 """
 
 from __future__ import annotations
@@ -47,7 +47,11 @@ print(f"{{seconds:.3g}} s; {{abs(p - net['end']).max():.3g}} m from the end of t
 
 @dataclass(frozen=True)
 class PyPbd(Engine):
-    """iterations: over all constraints, in each substep."""
+    """PositionBasedDynamics.
+
+    Args:
+        iterations_per_substep: iterations over all constraints in each substep.
+    """
 
     name: ClassVar[str] = "pypbd"
     package: ClassVar[Package] = Package("pypbd", "pyPBD", "pypbd")
@@ -80,7 +84,7 @@ class PyPbd(Engine):
 
 
 GRAVITY = (0.0, -9.81, 0.0)
-"""Its interface sets no other [m/s^2]."""
+"""Gravity of pyPBD, the only value that its interface supports [m/s^2]."""
 
 
 def _require_gravity(network: Network, problem: StepProblem) -> None:
@@ -91,14 +95,14 @@ def _require_gravity(network: Network, problem: StepProblem) -> None:
 
 
 def _pin_threads() -> None:
-    """Let its own OpenMP have as many threads as our kernels have."""
+    """Limit the engine's OpenMP threads to the number of threads of our kernels."""
     for pool in ThreadpoolController().select(internal_api="openmp").lib_controllers:
         if "pypbd" in pool.filepath:
             pool.set_num_threads(numba.get_num_threads())
 
 
 class _Model:
-    """A model and its state. Only what differs from the state that it ended at is set, vertex by vertex."""
+    """A model and its state. Only vertices that differ from the previous final state are set, one by one."""
 
     def __init__(self, library: Any, network: Network, iterations: int) -> None:
         self._library, self._network = library, network
@@ -131,7 +135,7 @@ class _Model:
         return np.array(self._particles.getVertices(), np.float64)
 
     def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
-        """See Stepping. Raises Unsupported for other loads than its gravity."""
+        """Integrate a step; raise Unsupported for loads other than its gravity."""
         net, start, particles = self._network, problem.start, self._particles
         _require_gravity(net, problem)
         for i in np.flatnonzero((self._positions() != start.positions).any(axis=1)).tolist():
@@ -160,7 +164,7 @@ class _Model:
         return p, v
 
     def _steps(self, h: float, number: int) -> None:
-        """So many substeps of h [s]."""
+        """Run substeps of h [s]."""
         if number:
             self._library.TimeManager.getCurrent().setTimeStepSize(h * number)
             self._set(number, "NUM_SUB_STEPS")

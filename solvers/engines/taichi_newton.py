@@ -1,7 +1,7 @@
-"""Taichi: implicit Euler by Newton's method with conjugate gradients, in substeps; see `taichi_program`.
+"""Taichi: implicit Euler in substeps by Newton's method with conjugate gradients; see `taichi_program`.
 
-Taichi is a language, and has no solver of nets: the program is ours, in the manner of its own examples. Its kernels are
-compiled while a run is prepared, for one core; Taichi keeps them in its cache.
+Taichi is a language without a solver of spring networks: the program is ours, in the style of Taichi's examples. Its
+kernels are compiled during preparation, for one core, and cached by Taichi.
 """
 
 from __future__ import annotations
@@ -41,8 +41,12 @@ print(f"{{seconds:.3g}} s; {{abs(p - net['end']).max():.3g}} m from the end of t
 
 @dataclass(frozen=True)
 class TaichiNewton(Engine):
-    """iterations: of Newton's method in each substep; one is Baraff and Witkin's linearised step. tolerance: of
-    conjugate gradients, relative to the gradient."""
+    """Newton's method with conjugate gradients in Taichi.
+
+    Args:
+        iterations_per_substep: Newton iterations; one equals Baraff and Witkin's linearised step.
+        cg_rtol: tolerance of conjugate gradients, relative to the gradient.
+    """
 
     name: ClassVar[str] = "taichi"
     package: ClassVar[Package] = Package("taichi", "taichi", "taichi")
@@ -86,12 +90,12 @@ class TaichiNewton(Engine):
 
 @cache
 def _begin(library: Any) -> None:
-    """Taichi is begun once a process: again, it would forget all that there is."""
+    """Initialise Taichi once per process: a second time, it would discard all existing data."""
     library.init(arch=library.cpu, cpu_max_num_threads=1, default_fp=library.f64, log_level=library.WARN)
 
 
 class _Model:
-    """The program of a network."""
+    """The Taichi program of a network."""
 
     def __init__(self, library: Any, network: Network, iterations: int, tolerance: float) -> None:
         _begin(library)

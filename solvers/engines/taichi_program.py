@@ -1,10 +1,10 @@
-"""Implicit Euler of a net of springs, written in Taichi: Newton's method with conjugate gradients, on one core.
+"""Implicit Euler of a spring network in Taichi: Newton's method with conjugate gradients, on one core.
 
     g(x) = |x - y|^2_M / 2h^2 + sum of k (|x_i - x_j| - r)^2 / 2,    y = x + h v + h^2 M^-1 f
 
-As Taichi's own example of cloth in implicit steps (`implicit_mass_spring`) has it: blocks by springs, no matrix; beyond
-it the blocks' eigenvalues are clamped, block Jacobi preconditions, and steps are halved until g does not rise. Nothing
-here needs springbench.
+As in Taichi's own implicit cloth example (`implicit_mass_spring`): blocks per spring, no matrix. In addition the
+eigenvalues of the blocks are clamped, block Jacobi preconditions, and steps are halved until g does not increase. The
+program does not depend on springbench.
 """
 
 from types import SimpleNamespace
@@ -14,8 +14,20 @@ import numpy as np
 
 
 def program(ti: Any, mass: Any, pinned: Any, ends: Any, stiffness: Any, rest_length: Any, tolerance: float) -> Any:
-    """Fields and kernels of a net of n vertices: `x`, `v`, `load` (n, 3) [m, m/s, N], `h` [s], `newton` (iterations),
-    `step()`. tolerance: of conjugate gradients, relative to the gradient."""
+    """Build fields and kernels of a network of n vertices.
+
+    Args:
+        ti: the module `taichi`.
+        mass: (n,) [kg].
+        pinned: indices of the pinned vertices.
+        ends: (m, 2).
+        stiffness: (m,) [N/m].
+        rest_length: (m,) [m].
+        cg_rtol: tolerance of conjugate gradients, relative to the gradient.
+
+    Returns:
+        An object with `x`, `v`, `load` (n, 3) [m, m/s, N], `h` [s], `newton` (iterations) and `step()`.
+    """
     n, m = len(mass), len(ends)
     x, v, y, load, g, d, p, q, z, last = (ti.Vector.field(3, ti.f64, max(n, 1)) for _ in range(10))
     block, inverse = ti.Matrix.field(3, 3, ti.f64, max(m, 1)), ti.Matrix.field(3, 3, ti.f64, max(n, 1))

@@ -1,10 +1,9 @@
 # pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
 # meshio has no types.
-"""Mesh files of other programs, as meshio reads them, and PLY and .vtp, by readers of our own: what runs in the child
-that `harness.base.child` keeps.
+"""Mesh file readers that run in a subprocess: meshio's formats, and own readers of PLY and .vtp.
 
-meshio takes some files for whole that were cut before their end. So the sections of a .msh must be closed, and an STL
-in text must be ended.
+The subprocess is that of `harness.execution.sandbox`. meshio accepts some truncated files as complete. Hence the
+sections of a .msh must be closed, and a text STL must have its end marker.
 """
 
 from __future__ import annotations
@@ -28,18 +27,24 @@ from numpy.typing import NDArray
 from harness.scenes.mesh import ply, vtp
 
 Block = tuple[str, NDArray[np.int64]]
-"""Cells of one kind: its name in meshio, and the points of each."""
+"""Cells of one kind: its meshio name, and the point indices of each cell."""
 
 FACES = ("triangle", "quad", "polygon")
 _KINDS = {2: "line", 3: "triangle", 4: "quad"}
-"""By the number of corners; others are a polygon."""
+"""Kind of a cell by its number of corners; others are polygons."""
 _PHYSICAL = "gmsh:physical"
 
 
 class Found(NamedTuple):
-    """What a file holds. points (n, 3); groups: points by the name of a group; attributes: numbers by point (n,), those
-    of vectors by their name and a number, `normal.0`; places: the line of each cell of a block, or its number;
-    left_out: points that no cell uses, of a format that has them besides the mesh, (k, 3)."""
+    """Contents of a mesh file.
+
+    Attributes:
+        points: (n, 3).
+        vertex_groups: points by group name.
+        attributes: point data (n,); components of vectors have a number in their name, `normal.0`.
+        face_locations: line or number of each cell of a block.
+        unused_points: points that no cell uses, of formats that store others besides the mesh, (k, 3).
+    """
 
     points: NDArray[np.float64]
     blocks: list[Block]
@@ -56,7 +61,7 @@ class _Cells(Protocol):
 
 
 class _Raw(Protocol):
-    """What meshio makes of a file."""
+    """The part of meshio's result that is used."""
 
     points: NDArray[Any]
     cells: list[_Cells]
@@ -68,8 +73,13 @@ class _Raw(Protocol):
 
 
 def read(path: Path) -> Found:
-    """What a mesh file holds; raises anything on a broken file, ValueError on one that was cut, PermissionError on one
-    that refers to a file outside of its folder."""
+    """Read a mesh file.
+
+    Raises:
+        ValueError: for a truncated file.
+        PermissionError: if the file refers to a file outside of its folder.
+        Exception: of any type, for other broken files.
+    """
     with _confined_to(path):
         return _read(path)
 
@@ -95,7 +105,7 @@ def _read(path: Path) -> Found:
 
 
 class _Confinement:
-    """An audit hook by which this process opens files in some folders alone, and writes none, while there are any."""
+    """Audit hook that restricts opened files to some folders, read-only, while it is active."""
 
     def __init__(self) -> None:
         self.folders: tuple[Path, ...] = ()
@@ -119,7 +129,7 @@ def _confinement() -> _Confinement:
 
 @contextmanager
 def _confined_to(path: Path) -> Generator[None]:
-    """Let nothing be opened but what lies in the folder of a file, and what Python imports."""
+    """Restrict file access to the folder of a file, and to what Python imports."""
     installed = (Path(sys.prefix).resolve(), Path(sys.base_prefix).resolve())
     _confinement().folders = (path.resolve(), path.parent.resolve(), *installed)
     try:
@@ -129,7 +139,7 @@ def _confined_to(path: Path) -> Generator[None]:
 
 
 def _by_meshio(path: Path) -> _Raw:
-    """What meshio makes of a file. Raises ValueError with the reason where it prints that and exits."""
+    """Read a file with meshio; raise ValueError with the reason if meshio prints it and exits."""
     said = io.StringIO()
     try:
         with warnings.catch_warnings(), redirect_stdout(said):
@@ -141,8 +151,10 @@ def _by_meshio(path: Path) -> _Raw:
 
 
 def _tagged(read_entities: Callable[..., Any]) -> Callable[..., Any]:
-    """A reader of entities that gives those without a physical group the tag 0, which means none: meshio counts blocks
-    of cells wrongly where some entities have none at all."""
+    """Wrap a reader of Gmsh entities so that entities without a physical group get the tag 0, which means none.
+
+    meshio counts blocks of cells incorrectly if some entities have no tag at all.
+    """
 
     def read(*arguments: Any) -> Any:
         found = read_entities(*arguments)
@@ -159,13 +171,13 @@ for _module in (_gmsh40, _gmsh41):
 
 
 def _numbered(blocks: list[Block]) -> list[NDArray[np.int64]]:
-    """The number of each face among all faces, from 0; of other cells nothing that is used."""
+    """Number each face among all faces, from 0; the numbers of other cells are unused."""
     faces = [0, *np.cumsum([len(data) if kind in FACES else 0 for kind, data in blocks]).tolist()]
     return [first + np.arange(len(data)) for first, (_, data) in zip(faces, blocks, strict=False)]
 
 
 def _without_stray(found: Found) -> Found:
-    """Without the points that no cell uses: Gmsh saves the points of a geometry, such as the centres of circles."""
+    """Remove points without cells: Gmsh saves the points of a geometry, such as the centres of circles."""
     used = np.zeros(len(found.points), np.bool_)
     for _, data in found.blocks:
         if len(data) and (data.min() < 0 or data.max() >= len(used)):
@@ -192,7 +204,7 @@ def _of_ply(read: ply.Ply) -> Found:
 
 
 def _of_vtp(read: vtp.Surface) -> Found:
-    """By the number of their corners."""
+    """Convert VTP content, with faces grouped by their number of corners."""
     groups = dict[int, list[NDArray[np.int64]]]()
     for polygon in read.polygons:
         groups.setdefault(len(polygon), []).append(polygon)
@@ -204,7 +216,7 @@ def _of_vtp(read: vtp.Surface) -> Found:
 
 
 def _groups(raw: _Raw) -> dict[str, NDArray[np.int64]]:
-    """The points of named sets of points and of cells, and of Gmsh's physical groups."""
+    """Collect the points of named point sets and cell sets, and of Gmsh's physical groups."""
     found: dict[str, list[NDArray[Any]]] = {name: [np.asarray(some)] for name, some in raw.point_sets.items()}
     for name, sets in raw.cell_sets.items():
         if name.startswith("gmsh:"):  # numbers of bounding entities, of no cells
@@ -220,7 +232,7 @@ def _groups(raw: _Raw) -> dict[str, NDArray[np.int64]]:
 
 
 def _columns(numbers: dict[str, NDArray[Any]], n: int) -> dict[str, NDArray[np.float64]]:
-    """Each column of what is told of n points."""
+    """Split point data of n points into columns."""
     found: dict[str, NDArray[np.float64]] = {}
     for name, values in numbers.items():
         if len(values) != n:
@@ -235,7 +247,7 @@ _PARAMETRIC = re.compile(rb"^\$ParametricNodes\b", re.M)
 
 
 def _open_sections(content: bytes, raw: _Raw) -> str:
-    """Of Gmsh's .msh, whose other kind, ANSYS's, has none."""
+    """Find an unclosed section of a Gmsh .msh; the ANSYS format of the same suffix has no sections."""
     begun: dict[bytes, int] = {}
     for end, name in _SECTION.findall(content):
         begun[name] = begun.get(name, 0) + (-1 if end else 1)
@@ -244,7 +256,7 @@ def _open_sections(content: bytes, raw: _Raw) -> str:
 
 
 def _not_ended(content: bytes, raw: _Raw) -> str:
-    """Of an STL; a binary one holds its count."""
+    """Detect a truncated STL; a binary one contains its number of triangles."""
     text = content.lstrip().startswith(b"solid") and b"facet" in content
     return "it has no endsolid" if text and b"endsolid" not in content else ""
 

@@ -17,7 +17,7 @@ MAX_VERTICES = 5_000_000
 """Maximum number of vertices: positions, springs and a factor of that size fill the memory of a workstation."""
 
 _BYTES, _BYTES_PER_SPRING = 150, 240
-"""Memory per vertex and per spring [bytes], an upper bound while mesh, springs and Q are built: chains took 380 bytes per
+"""Memory per vertex and per spring [bytes], an upper bound while mesh, springs and Q are built: chains took 380 bytes a
 vertex, sheets 1090, solids 2740. A solver's data is estimated later, when Q is available."""
 
 Metres = Annotated[float, Field(ge=1e-6, le=1e6)]

@@ -99,8 +99,8 @@ class Net(_Sheet):
     `size` knots along its top. Rows of `size` knots alternate with rows of `size - 1` knots half a mesh
     lower; knots are numbered row by row. Springs, all STRETCH: from each knot of the short rows up
     left, up right, down left, down right (one direction after another), then along top, bottom, left, right.
-    Parts: top, bottom, left, right, boundary, corners, top_corners. Mass is proportional to length. Dimension 2, so that
-    a net with finer meshes has the same stretch: its ropes are thinner.
+    Parts: top, bottom, left, right, boundary, corners, top_corners. Mass is proportional to length. Dimension 2, so
+    that a net with finer meshes has the same stretch: its ropes are thinner.
     """
 
     kind: Literal["net"] = "net"

@@ -37,7 +37,7 @@ def lattice_triangles(index: Indices) -> Indices:
 
 
 def closed_by_points(rings: Indices, first: int, last: int) -> Indices:
-    """Build the triangles of a lattice of rings (r, k), whose last column equals the first, with a point at each end."""
+    """Build the triangles of a lattice of rings (r, k), whose last column equals the first, with two end points."""
     begin = np.column_stack([np.full(rings.shape[1] - 1, first), rings[0, :-1], rings[0, 1:]])
     end = np.column_stack([np.full(rings.shape[1] - 1, last), rings[-1, 1:], rings[-1, :-1]])
     return np.concatenate([begin, lattice_triangles(rings), end])
