@@ -41,7 +41,7 @@ class Collapsed(Rest):
     kind: Literal["collapsed"] = "collapsed"  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def positions(self, rest: Positions) -> Positions:
-        """See Rest."""
+        """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m]."""
         return np.tile(rest.mean(axis=0), (len(rest), 1))
 
 
@@ -53,7 +53,7 @@ class Flattened(Rest):
     """Coordinates that are set to their mean for all vertices."""
 
     def positions(self, rest: Positions) -> Positions:
-        """See Rest."""
+        """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m]."""
         p, columns = rest.copy(), [_AXES[axis] for axis in self.along]
         p[:, columns] = rest[:, columns].mean(axis=0)
         return p
@@ -67,7 +67,7 @@ class Scaled(Rest):
     """Factors along x, y and z."""
 
     def positions(self, rest: Positions) -> Positions:
-        """See Rest."""
+        """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m]."""
         c = rest.mean(axis=0)
         return c + np.array(self.factors) * (rest - c)
 
@@ -81,7 +81,7 @@ class Random(Rest):
     seed: NonNegativeInt = 0
 
     def positions(self, rest: Positions) -> Positions:
-        """See Rest."""
+        """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m]."""
         shift = np.random.default_rng(self.seed).uniform(-0.5, 0.5, rest.shape)
         return rest.mean(axis=0) + self.side * shift
 
@@ -95,7 +95,7 @@ class Perturbed(Rest):
     seed: NonNegativeInt = 0
 
     def positions(self, rest: Positions) -> Positions:
-        """See Rest."""
+        """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m]."""
         return rest + self.deviation * np.random.default_rng(self.seed).normal(size=rest.shape)
 
 
@@ -113,7 +113,7 @@ class Merged(Rest):
         return self
 
     def positions(self, rest: Positions) -> Positions:
-        """See Rest."""
+        """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m]."""
         if max(self.vertices) >= len(rest):
             problem = f"came {max(self.vertices)}; the mesh has the vertices 0 to {len(rest) - 1}"
             raise InputError(Mistake(problem, key="start.vertices"))

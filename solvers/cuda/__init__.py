@@ -1,1 +1,1 @@
-"""Methods on a CUDA device, in Numba's own target; one a file, beside what they share."""
+"""Solvers on a CUDA device, in Numba's CUDA target."""

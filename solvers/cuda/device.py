@@ -1,7 +1,7 @@
-"""The device: whether there is one, what it is, how much it has left, and what becomes of its errors.
+"""The CUDA device: availability, description, free memory and error handling.
 
-`NUMBA_ENABLE_CUDASIM=1` in the environment, before Numba is imported, takes Numba's simulator for a device. It runs the
-same kernels thread by thread in Python, without one; rows then say so.
+With `NUMBA_ENABLE_CUDASIM=1` in the environment, set before Numba is imported, Numba's simulator replaces the device.
+It runs the same kernels thread by thread in Python, without a GPU; rows state that.
 """
 
 from __future__ import annotations
@@ -20,22 +20,25 @@ from solvers.problem import Unsupported
 INSTALL = "`.venv/bin/pip install -e '.[cuda]'` in the checkout installs what it needs beside NVIDIA's driver"
 _PACKAGES = "numba-cuda", "cuda-bindings", "cuda-core", "cuda-toolkit", "nvidia-ml-py"
 _DRIVERS = ("cudadrv", "cuda.bindings", "cuda.core")
-"""What errors of a driver come from, as parts of the names of modules."""
+"""Parts of the names of modules that raise driver errors."""
 
 
 class DeviceFailed(RuntimeError):
-    """The device gave up: no memory is left, a kernel failed, or the device is lost."""
+    """Failure of the device: no free memory, a failed kernel, or a lost device."""
 
 
 def simulated() -> bool:
-    """Whether the simulator stands for a device."""
+    """Return whether the simulator replaces the device."""
     config = import_module("numba.core.config")
     return bool(config.ENABLE_CUDASIM)
 
 
 def ready(solver: str) -> Any:
-    """The module `numba.cuda` with a device. Raises Unsupported with the reason where there is none, and the command
-    that installs what a method needs there."""
+    """Return the module `numba.cuda` with a usable device.
+
+    Raises:
+        Unsupported: if there is none, with the reason and the installation command.
+    """
     if simulated():
         return import_module("numba.cuda")
     if broken():
@@ -54,7 +57,7 @@ def ready(solver: str) -> Any:
 
 
 def require_memory(solver: str, needed: float) -> None:
-    """Raise Unsupported where the device has not so many bytes left."""
+    """Raise Unsupported if the device has fewer free bytes than needed."""
     if simulated():
         return
     left, _ = import_module("numba.cuda").current_context().get_memory_info()
@@ -63,7 +66,7 @@ def require_memory(solver: str, needed: float) -> None:
 
 
 def told() -> dict[str, Any]:
-    """The columns of rows that tell of the device: its name, its memory, its driver and versions."""
+    """Return the row columns that describe the device: its name, memory, driver and versions."""
     versions = json.dumps(dict(_versions()), sort_keys=True)
     if simulated():
         return {"device": SIMULATED, "device_versions": versions}
@@ -94,11 +97,11 @@ _ASKED: dict[str, Callable[[Any, Any], float]] = {
     "performance_state": lambda nvml, handle: nvml.nvmlDeviceGetPerformanceState(handle),
     "temperature_c": lambda nvml, handle: nvml.nvmlDeviceGetTemperature(handle, nvml.NVML_TEMPERATURE_GPU),
 }
-"""What NVIDIA's management library tells of a device's state, by column."""
+"""NVML queries of the device's state, by column."""
 
 
 def state() -> dict[str, float | None]:
-    """The columns of its clocks, power and temperature now; None for what is not told, by the simulator everything."""
+    """Return the current clocks, power and temperature; None if unavailable, as in the simulator."""
     found: dict[str, float | None] = dict.fromkeys(_ASKED)
     with _management() as nvml, suppress(Exception):  # the library, its driver or the right to ask may be missing
         handle = _handle(nvml, import_module("numba.cuda").get_current_device())
@@ -117,7 +120,7 @@ def _driver() -> dict[str, str]:
 
 @contextmanager
 def _management() -> Generator[Any]:
-    """NVIDIA's management library; None where it cannot be had."""
+    """Open NVIDIA's management library; yield None if it is unavailable."""
     nvml: Any = None
     if not simulated():
         with suppress(Exception):
@@ -132,7 +135,7 @@ def _management() -> Generator[Any]:
 
 
 def _handle(nvml: Any, device: Any) -> Any:
-    """The library's own handle of the device; by its identity, for the two may number devices differently."""
+    """Return the library's handle of the device, by its UUID, because the two may number devices differently."""
     uuid = str(getattr(device, "uuid", ""))
     if uuid:
         return nvml.nvmlDeviceGetHandleByUUID(uuid if uuid.startswith("GPU-") else f"GPU-{uuid}")
@@ -141,8 +144,10 @@ def _handle(nvml: Any, device: Any) -> Any:
 
 @contextmanager
 def guarded() -> Generator[None]:
-    """Turn errors of the driver into DeviceFailed; after one other than a lack of memory this process cannot go on with
-    its device, and does not try to."""
+    """Convert driver errors to DeviceFailure.
+
+    After an error other than a lack of memory, the process cannot use its device again and does not attempt to.
+    """
     try:
         yield
     except Exception as error:

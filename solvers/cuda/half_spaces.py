@@ -1,9 +1,9 @@
-"""Contact of vertices with obstacles on a device: half-spaces, found where a step starts there, and swept with.
+"""Vertex contact with obstacles on a device: half-spaces, built at the start of a step and used in sweeps.
 
-A host is asked for the frames of obstacles that move, and for nothing else. The functions are the processor's: which
-half-space a vertex has (`solvers.contact.planes`), what it adds to the vertex's gradient and block, and the steps that
-are tried (`solvers.kernels.half_spaces`). They compute in float64, for few vertices touch; what springs do comes from
-the kernels of `solvers.cuda.vbd_kernels` in their type.
+The host only provides the frames of moving obstacles. The functions are shared with the CPU: the half-space of a vertex
+(`solvers.contact.half_space.separating_planes`), its terms in the gradient and block of the vertex, and the trial steps
+(`solvers.contact.half_space.half_space_steps`). They compute in float64, as few vertices are in contact. The springs'
+terms come from the kernels of `solvers.cuda.vbd_kernels` in their type.
 """
 
 from __future__ import annotations
@@ -28,15 +28,23 @@ from solvers.kernels.half_spaces import EXACT, MAJORANT, HalfSpaces
 from solvers.problem import System
 
 NUMBERS = 12
-"""Float64 of each row and obstacle."""
+"""Number of float64 values per row and obstacle."""
 
 _plane, _deeper = shared(planes.plane), shared(half_spaces.deeper)
 _Rounded = planes.Rounded
 
 
 class Bodies(NamedTuple):
-    """Of each obstacle: low, high (o, 3) and radius (o,) of its rounded box, thickness included [m]; margin (o,) [m],
-    friction (o,); creep (o,) [m/s]; stiffness (o, n) of each row [N/m]."""
+    """Obstacles on the device.
+
+    Attributes:
+        low, high: (o, 3) [m], corners of the rounded boxes.
+        radius: (o,) [m], including the thickness.
+        margin: (o,) [m].
+        friction: (o,), Coulomb coefficients.
+        creep: (o,) [m/s], sliding speed below which friction counts as sticking.
+        stiffness: (o, n) [N/m], of each row.
+    """
 
     low: Any
     high: Any
@@ -48,10 +56,10 @@ class Bodies(NamedTuple):
 
 
 class Spaces:
-    """The half-spaces of a solve, one of each free row for each obstacle. given: on the device."""
+    """Half-spaces of a solve on the device, one per free row and obstacle."""
 
     def __init__(self, stream: Stream, system: System, order: NDArray[np.int64], vertex: Any, free: int) -> None:
-        """order, vertex (n,): of each row, here and on the device; free: how many rows move."""
+        """Allocate the half-spaces; `order` and `vertex` (n,) are the vertices of the rows on host and device."""
         self._stream, self._vertex, self._dt = stream, vertex, system.time_step
         self._contacts = [energy for energy in system.energies if isinstance(energy, Contact)]
         all_of = [(contact, one) for contact in self._contacts for one in contact.obstacles]
@@ -78,7 +86,7 @@ class Spaces:
         self.over = sums.blocks(free), sums.THREADS, stream.queue
 
     def take(self, step: Step) -> None:
-        """Those of a step."""
+        """Build the half-spaces of a step."""
         begin, end = step.times
         if self._move:
             self._stream.put(self._frames_at(begin), self._frames)
@@ -96,7 +104,7 @@ class Spaces:
 
 @cuda.jit
 def fastest(v, out):
-    """The largest |v|^2, if it is larger than out[0]; which it is depends on no order."""
+    """Update out[0] to the largest |v|^2, a maximum that is independent of the order of threads."""
     most, i = 0.0, cuda.grid(1)
     while i < v.shape[0]:
         most = max(most, v[i, 0] * v[i, 0] + v[i, 1] * v[i, 1] + v[i, 2] * v[i, 2])
@@ -106,12 +114,18 @@ def fastest(v, out):
 
 @cuda.jit
 def find(vertex, p, v, dt, when, square, frames, bodies, found, rounds, pressed, spaces):
-    """Write the half-spaces of the free rows, one for each obstacle; where a vertex comes near none of them it is
-    empty. See `solvers.contact.energy.Contact`.
+    """Write the half-spaces of the free rows, one per obstacle; empty if the vertex is not near the obstacle.
 
-    p [m], v [m/s]: at the step's start, by vertices; when: the unknown's time within the step, 1 at its end; square: of
-    the largest speed; frames (o, 2, 4, 3): of obstacles; found: a view of `spaces`;
-    rounds: whether friction takes its normal forces at `pressed` (n, 3) [m], by vertices.
+    See `solvers.contact.half_space.half_space_potential`.
+
+    Args:
+        p: positions [m] at the start of the step, by vertices.
+        v: velocities [m/s] at the start of the step, by vertices.
+        when: time of the stage within the step, 1 at its end.
+        square: largest squared speed.
+        frames: (o, 2, 4, 3), frames of the obstacles.
+        found: a view of `spaces`.
+        rounds: whether friction uses the normal forces at `pressed` (n, 3) [m], by vertices.
     """
     work = cuda.local.array((5, 3), np.float64)
     i, many = cuda.grid(1), bodies.radius.shape[0]
@@ -143,7 +157,7 @@ def find(vertex, p, v, dt, when, square, frames, bodies, found, rounds, pressed,
 
 
 class Kernels(NamedTuple):
-    """Kernels in one type of numbers."""
+    """Kernels in one floating-point type."""
 
     push: Any
     press: Any
@@ -151,7 +165,7 @@ class Kernels(NamedTuple):
 
 @cache
 def kernels(real: Any) -> Kernels:
-    """Those of a type, that of displacements."""
+    """Build the kernels for the floating-point type of the displacements."""
     of_springs = vbd_kernels.kernels(real)
     gathered, lowering = of_springs.gathered, shared(half_spaces.trying(of_springs.risen_there))
 
@@ -160,8 +174,10 @@ def kernels(real: Any) -> Kernels:
         begin, end, own, start, neighbour, kind, weights, spring, direction, arrows,
         nobody, far, held, majorant, force, u, before, x, spaces,
     ):  # fmt: skip
-        """Move those vertices of a colour anew that have half-spaces, from where they were before its sweep; x: the
-        reference, in rows of four [m]. See `solvers.cuda.vbd_kernels` for all else."""
+        """Recompute the steps of a colour's vertices with half-spaces, from their positions before the sweep.
+
+        x is the reference, in rows of four [m]; `solvers.cuda.vbd_kernels` documents the other arguments.
+        """
         t = begin + cuda.grid(1)
         if t >= end or own[t] == nobody or not spaces.near[own[t]]:
             return
@@ -175,7 +191,7 @@ def kernels(real: Any) -> Kernels:
         gradient = -float64(f0), -float64(f1), -float64(f2)
         block = float64(b00), float64(b01), float64(b02), float64(b11), float64(b12), float64(b22)
         lane = t, first, last, (u0, u1, u2), (f0, f1, f2), neighbour, kind, weights, arrows, far, held, u
-        # Where a spring has no length there is no Hessian: the majorant's step takes it apart.
+        # A spring of zero length has no Hessian: the step of the majorant separates its ends.
         level = MAJORANT if lengthless else EXACT
         most = float64(majorant[t])
         d = lowering(spaces, i, at, (most, 0.0, 0.0, most, 0.0, most), level, gradient, block, lane)
@@ -183,8 +199,10 @@ def kernels(real: Any) -> Kernels:
 
     @cuda.jit
     def press(spaces, x, u, asked, control, first, out):
-        """Write by how much half-spaces' energy rises from the reference to u, to `out` from `first` on, a number a
-        block [J]; see `solvers.cuda.vbd_kernels.level`."""
+        """Write the change of the half-space energy from the reference to u [J], one number per block.
+
+        The numbers are stored in `out` from `first` on; see `sum_objective` in `solvers.cuda.vbd_kernels`.
+        """
         if asked == ASKED and not control[ASKED] > 0.0:
             return
         if asked == WEIGHT and not control[WEIGHT] > 1.0:

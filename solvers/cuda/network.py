@@ -1,13 +1,14 @@
-"""A step's springs, forms and dashpots on a device, by vertices: each thread gathers what acts on its own.
+"""Springs, quadratic forms and dashpots of a step on a device: each thread gathers the terms of its vertex.
 
     E = sum_e k_e/2 (|v_e| - r_e)^2 + sum_e k_e/2 (n_e.v_e - o_e)^2 + sum_i h_i/2 |p_i - c_i|^2 - tr(p'f)
 
-Of the second kind, which `rest` tells by nan, are dashpots. What holds each vertex is one number and one centre,
-h c = inertia target + penalty pin, so that far-off targets round as positions do. A form is springs without length and
-what holds (`solvers.core.parts`). What couples other than two vertices linearly, or not at all, is refused by name.
+Edges of the second kind, marked by nan in `rest`, are dashpots. Each vertex has one anchor stiffness and one centre,
+h c = inertia target + penalty pin, so that distant targets round as positions do. A form is represented by zero-length
+springs and anchors (`solvers.objective.spring_form`). Energies that couple vertices nonlinearly, or more than two of
+them, are not supported; the error names them.
 
-Vertices are in rows: the free ones first, in patches of neighbours (`solvers.linear.schwarz`), then those that exact
-pins hold. Of the entries of 32 rows, a warp's, those that are read together lie side by side.
+Vertices are in rows: the free ones first, in patches of neighbours (`solvers.linalg.additive_schwarz`), then those with
+exact pins. The entries of 32 rows, a warp, that are read together are contiguous.
 """
 
 from __future__ import annotations
@@ -25,14 +26,19 @@ from solvers.cuda.target import Stream
 from solvers.problem import System, Unsupported
 
 WARP = 32
-"""Rows whose entries are side by side."""
+"""Number of rows with interleaved entries: a warp."""
 
 Ints = NDArray[np.int64]
 
 
 class Entries(NamedTuple):
-    """Edges from both of their ends. first (warps + 1,): the first entry of each warp's rows; of each entry the row of
-    the other end (other), the row itself where a list is filled up, and the edge, ~edge at its second end."""
+    """Edges listed at both of their ends.
+
+    Attributes:
+        warp_starts: (warps + 1,), first entry of each warp's rows.
+        neighbour_rows: row of the other end of each entry; the row itself for padding.
+        edge_indices: edge of each entry, ~edge at its second end.
+    """
 
     first: Any
     other: Any
@@ -40,7 +46,7 @@ class Entries(NamedTuple):
 
     @classmethod
     def of(cls, ends: Ints, rows: int) -> Entries:
-        """Of edges between rows (m, 2), for the first `rows` of them; those from a row to itself are left out."""
+        """Build the entries of edges between rows (m, 2), for the first `rows` rows, without self-loops."""
         kept = np.flatnonzero(ends[:, 0] != ends[:, 1])
         here, there = ends[kept].T.ravel(), ends[kept, ::-1].T.ravel()
         edge = np.concatenate([kept, ~kept])
@@ -60,9 +66,16 @@ class Entries(NamedTuple):
 
 
 class Edges(NamedTuple):
-    """On the device. first, other, edge: see `Entries`; stiffness, rest: of each entry [N/m, m]; then of each edge: its
-    ends (m, 2), its stiffness and rest length (m,), and its axis (m, 3) and offset (m,) [m], of a dashpot; axis: of a
-    spring what it takes without a length."""
+    """Edges on the device.
+
+    Attributes:
+        warp_starts, neighbour_rows, edge_indices: see `EdgeEntries`.
+        entry_stiffness, entry_rest_length: of each entry [N/m, m].
+        ends: (m, 2), rows.
+        edge_stiffness, edge_rest_length: (m,) [N/m, m].
+        edge_direction: (m, 3), axis of a dashpot, or direction of a spring of zero length.
+        dashpot_offset: (m,) [m].
+    """
 
     first: Any
     other: Any
@@ -77,7 +90,7 @@ class Edges(NamedTuple):
 
 
 class Given(NamedTuple):
-    """On the device: what holds each free row, h (f,) [N/m], where, c (f, 3) [m], and the force (f, 3) [N]."""
+    """Data of a step on the device: anchor stiffness h (f,) [N/m], centres c (f, 3) [m] and force (f, 3) [N]."""
 
     hold: Any
     centre: Any
@@ -86,7 +99,7 @@ class Given(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """The edges of a system. order (n,): the vertex of each row; free: how many rows move; hold: h of all rows."""
+    """Edges of a system; `row_vertices` (n,) are the vertices of the rows, the first `num_free` rows move."""
 
     system: System
     parts: Parts
@@ -101,8 +114,16 @@ class Network:
 
     @classmethod
     def of(cls, solver: str, system: System, order: Ints) -> Network:
-        """order (f,): of the free vertices, as numbers among them. Raises Unsupported with the names of energies that
-        are not springs, constant forms or dashpots."""
+        """Build the network of a system.
+
+        Args:
+            solver: name of the solver, for messages.
+            system: the system.
+            free_order: (f,), order of the free vertices, as indices among them.
+
+        Raises:
+            Unsupported: with the names of energies other than springs, constant forms and dashpots.
+        """
         parts = split(system)
         require_known(solver, system)
         exact = system.pins.vertices[system.pins.exact]
@@ -124,11 +145,11 @@ class Network:
 
     @property
     def bytes(self) -> float:
-        """What it takes on the device, beside vectors."""
+        """Return the bytes of the network on the device, without vectors."""
         return 24.0 * len(self.entries.other) + 64.0 * len(self.ends)
 
     def upload(self, stream: Stream) -> Edges:
-        """Copy it to the device."""
+        """Copy the edges to the device."""
         first, other, edge = self.entries
         named = np.maximum(edge, ~edge)
         return Edges(
@@ -146,7 +167,7 @@ class Network:
 
 
 def require_known(solver: str, system: System) -> None:
-    """Raise Unsupported with the names of energies that the kernels on a device do not know."""
+    """Raise Unsupported with the names of energies that the device kernels do not support."""
     bare = without_bounded(without_contact(system))
     there = {type(e).__name__ for e in system.energies if e not in bare.energies}
     parts = split(bare)

@@ -1,14 +1,14 @@
-"""Newton's method by conjugate gradients on a device: the iterates of `solvers.methods.newton_cg`, by additive Schwarz.
+"""Newton-CG on a device: the iterates of `solvers.methods.newton.newton_cg` with additive Schwarz.
 
-Positions and gradients are float64, directions `real`: p + t d keeps the positions' digits, and the next gradient tells
-what a direction missed. The host reads a few numbers: those of a trial, once each, and of conjugate gradients, which
-run on the device, after each TOGETHER iterations whether they have ended. H d = -g to r'z <= limit
-(`solvers.linear.krylov`):
+Positions and gradients are float64, directions `real`: p + t d retains the digits of positions, and the next gradient
+corrects the error of a direction. The host reads few numbers: those of each trial once, and after each TOGETHER
+iterations of conjugate gradients, which run on the device, whether they have ended. H d = -g to r'z <= limit
+(`solvers.linalg.krylov`):
 
     turn     p = z + r'z / (r'z before) p         multiply   y = H p, and p'y         curve    whether p'y > 0
     go       d += t p,   r -= t y                 apply      z = M^-1 r, and r'z      judge    whether r'z <= limit
 
-The numbers are in `now` on the device; kernels of one block write them. Once it has ended all kernels do nothing.
+The scalars are in `now` on the device, written by kernels of one block. After the end all kernels return at once.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from solvers.linear.schwarz import ordered
 from solvers.problem import StepProblem, System, Unsupported
 
 TOGETHER = 16
-"""Iterations of conjugate gradients that are launched at a time."""
+"""Iterations of conjugate gradients per check of their end."""
 
 _SUMS = 2
-"""At a time."""
+"""Number of simultaneous sums."""
 
 ENDED, COUNT, PRODUCT, BEFORE, CURVATURE, LIMIT = range(6)
-"""Where in `now`: what ended it; iterations done; r'z, the one before, p'Hp and what r'z should be at most [J]."""
+"""Indices of `now`: reason of the end; iterations; r'z, its previous value, p'Hp and the tolerance of r'z [J]."""
 
 GOING, NEAR, CURVED = 0.0, 1.0, 2.0
-"""What ended it."""
+"""Reasons of the end of conjugate gradients."""
 
 Real = type[np.float32] | type[np.float64]
 
@@ -52,9 +52,19 @@ Real = type[np.float32] | type[np.float64]
 def prepare(
     system: System, preconditioner: Preconditioning, real: Real, forcing: tuple[float, float], most: int
 ) -> PreparedNewtonCG:
-    """The method on the device, which is `ready`. forcing: the bounds of eta, from above and from below; most:
-    iterations of conjugate gradients. Raises NotPositiveDefinite, and Unsupported for what kernels do not know and for
-    what the device has no room for."""
+    """Prepare the method on an available device.
+
+    Args:
+        system: the system.
+        preconditioner: of conjugate gradients; only schwarz is supported.
+        real: floating-point type of the directions.
+        eta_bounds: upper and lower bound of eta.
+        max_cg_iterations: maximum number of conjugate gradient iterations.
+
+    Raises:
+        NotPositiveDefinite: if the system leaves some positions undetermined.
+        Unsupported: for energies that kernels do not support, and if the device memory is too small.
+    """
     if preconditioner != "schwarz":
         raise Unsupported(
             f"newton-cg, device: cuda: knows preconditioner: schwarz, not {preconditioner}; take that, or device: cpu"
@@ -88,8 +98,10 @@ def prepare(
 
 @dataclass(frozen=True, eq=False)
 class PreparedNewtonCG(Minimising):
-    """The method, ready for a system. levels, on_device: of the preconditioner; forcing, most: see `prepare`; columns:
-    of the device."""
+    """Newton-CG, prepared on a device, with the levels of the preconditioner on host and device.
+
+    `forcing` and `most` are the arguments of the preparation, `columns` the device columns of rows.
+    """
 
     uploaded: Uploaded
     metric: Metric
@@ -104,22 +116,29 @@ class PreparedNewtonCG(Minimising):
 
     @property
     def facts(self) -> dict[str, float]:
-        """Exact counts of what was built."""
+        """Exact counts of the prepared data."""
         return self.metric.facts
 
     def iterating(self) -> DeviceIterating:
-        """See DeviceIterative."""
+        """Allocate the memory of a solve."""
         return _Iterating(self)
 
     def scale(self, problem: StepProblem) -> float:
-        """See Iterative."""
+        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
         return largest(problem) * self.metric.trace**0.5
 
 
 class _Iterating(DeviceIterating):
-    """From point to point. p, q (n, 3): where it is and a trial, in rows; g: the gradient at p (f, 3); z: what the
-    preconditioner makes of -g; d, s, y, w (f, 3): the sum, a direction, its product and what the preconditioner makes
-    of a residual, of conjugate gradients; floor: g H^-1 g [J] of round-off; product: g'z [J] at p."""
+    """State of a Newton-CG solve, in rows on the device.
+
+    Attributes:
+        p, q: (n, 3), current point and trial.
+        g: gradient at p (f, 3).
+        z: preconditioned negative gradient.
+        d, s, y, w: (f, 3), solution, direction, its product and preconditioned residual of conjugate gradients.
+        floor: g H^-1 g [J] of round-off.
+        product: g'z [J] at p.
+    """
 
     def __init__(self, made: PreparedNewtonCG) -> None:
         of, network = made.uploaded, made.uploaded.network
@@ -141,7 +160,7 @@ class _Iterating(DeviceIterating):
         self._floor = self._eta = self._product = 0.0
 
     def take(self, step: Step) -> None:
-        """See DeviceIterating; waits for the largest coordinate, by which round-off is told."""
+        """Load a step; waits for the largest coordinate, which determines round-off."""
         self._begun.take(step, self._p, self._q)
         self.stream.put(np.zeros(1), self._largest)
         farthest[self._over_all](self._p, self._largest)
@@ -149,18 +168,18 @@ class _Iterating(DeviceIterating):
         self._eta, self._product = self._loose, self._arrived()
 
     def settled(self) -> Any:
-        """See DeviceIterating."""
+        """Return the current positions in rows (n, 3) [m], on the device."""
         return self._p
 
     def sweep(self, count: int) -> int:
-        """See DeviceIterating; each iteration waits for the numbers of its trial."""
+        """Run iterations; each waits for the numbers of its trial."""
         for number in range(count):
             if self.stalled or not self._advanced():
                 return number
         return count
 
     def _advanced(self) -> bool:
-        """An iteration; False where nothing descends."""
+        """Do one iteration; return False if no direction descends."""
         if not self._product > self._floor or not (self._search(self._direction()) or self._search(self._z)):
             return False
         before, self._product = self._product, self._arrived()
@@ -169,7 +188,7 @@ class _Iterating(DeviceIterating):
         return True
 
     def _arrived(self) -> float:
-        """Compute the gradient at p, the Hessian there, and z; g'z [J]."""
+        """Compute the gradient, the Hessian and z at p; return g'z [J]."""
         objective_kernels.gradient[self._over](self._edges, self._given, self._p, self._g)
         self._kernels.linearise[self._over](self._edges, len(self._g), self._p, self._linear)
         self._preconditioner.linearised(self._edges, self._p)
@@ -178,12 +197,12 @@ class _Iterating(DeviceIterating):
         return float(self._collected(1, len(self._d))[0])
 
     def _collected(self, count: int, terms: int) -> NDArray[np.float64]:
-        """The first sums, of so many terms; waits for them."""
+        """Wait for the first `count` sums of `terms` terms, and return them."""
         sums.collect[1, sums.THREADS, self.stream.queue](count, self._partials, sums.blocks(terms), self._sums)
         return self.stream.download(self._sums)[:count]
 
     def _search(self, direction: Any) -> bool:
-        """Go to the first point at 1, 1/2, ... of a direction (f, 3) that descends enough; whether any does."""
+        """Move to the first point at 1, 1/2, ... of a direction (f, 3) with sufficient decrease; return success."""
         t, network = 1.0, self._made.uploaded.network
         for _ in range(HALVINGS):
             trial[self._over_all](self._p, direction, t, self._q, self._g, 0, self._partials)
@@ -198,7 +217,7 @@ class _Iterating(DeviceIterating):
         return False
 
     def _direction(self) -> Any:
-        """What conjugate gradients make of -H^-1 g."""
+        """Solve for -H^-1 g approximately by conjugate gradients."""
         limit, most = self._eta**2 * self._product, self._made.most
         if self._product <= limit:
             return self._d
@@ -229,7 +248,7 @@ class _Iterating(DeviceIterating):
 
 @cuda.jit
 def farthest(p, out):
-    """The largest coordinate of p (n, 3), if it is larger than out[0]; which it is depends on no order."""
+    """Update out[0] to the largest coordinate of p (n, 3), a maximum that is independent of the order of threads."""
     most, i = 0.0, cuda.grid(1)
     while i < p.shape[0]:
         for c in range(3):
@@ -240,7 +259,7 @@ def farthest(p, out):
 
 @cuda.jit
 def negated(x, out):
-    """Write -x (f, 3) to `out`, rounded."""
+    """Write -x (f, 3) to `out`, rounded to its type."""
     i = cuda.grid(1)
     while i < out.shape[0]:
         out[i, 0], out[i, 1], out[i, 2] = -x[i, 0], -x[i, 1], -x[i, 2]
@@ -249,7 +268,7 @@ def negated(x, out):
 
 @cuda.jit
 def trial(p, d, t, q, g, which, partials):
-    """Write p + t d to the first rows of q, and keep the first stage of g'd."""
+    """Write p + t d to the first rows of q, and store the first stage of the sum g'd."""
     total, i = 0.0, cuda.grid(1)
     while i < d.shape[0]:
         for c in range(3):
@@ -261,7 +280,7 @@ def trial(p, d, t, q, g, which, partials):
 
 
 class Kernels(NamedTuple):
-    """Of a precision: see each."""
+    """Conjugate gradient kernels for one precision."""
 
     turn: Any
     go: Any
@@ -269,11 +288,11 @@ class Kernels(NamedTuple):
 
 @cache
 def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
-    """Those that compute in `real`."""
+    """Build the kernels that compute in `real`."""
 
     @cuda.jit
     def turn(z, p, now):
-        """p = z + r'z / (r'z before) p."""
+        """Update the direction: p = z + r'z / (r'z before) p."""
         if now[ENDED] != GOING:
             return
         first, scale = now[COUNT] == 0.0, real(now[PRODUCT] / now[BEFORE])
@@ -285,7 +304,7 @@ def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
 
     @cuda.jit
     def go(p, y, d, r, now):
-        """d += t p, r -= t y."""
+        """Update the iterate: d += t p, r -= t y."""
         if now[ENDED] != GOING:
             return
         first, length = now[COUNT] == 0.0, real(now[PRODUCT] / now[CURVATURE])
@@ -302,7 +321,7 @@ def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
 
 @cuda.jit
 def curve(partials, which, count, now):
-    """The second stage of p'Hp, and whether it is positive; one block."""
+    """Second stage of p'Hp, and its sign; one block."""
     if now[ENDED] != GOING:
         return
     total = sums.of_all(which, partials, count)
@@ -314,7 +333,7 @@ def curve(partials, which, count, now):
 
 @cuda.jit
 def judge(partials, which, count, now):
-    """The second stage of r'z, and whether it is small; one block."""
+    """Second stage of r'z, and the convergence test; one block."""
     if now[ENDED] != GOING:
         return
     total = sums.of_all(which, partials, count)

@@ -1,10 +1,10 @@
-"""Kernels of a step's objective: gradient and rise in float64, products with its Hessian in `real`.
+"""Kernels of a step's objective: gradient and change in float64, Hessian products in `real`.
 
     grad_i g = h_i (p_i - c_i) - f_i + sum over its edges of t n,      t = k (l - r), or k (n.v - o) of a dashpot
     (H x)_i  = h_i x_i + sum over its edges of b + a n (n.b),  b = s (x_i - x_j),  s = t/l,  a = (k - s)
-    g(q) - g(p): a sum of differences, as `solvers.kernels.objective` has it
+    g(q) - g(p): a sum of differences, as in `solvers.kernels.objective_kernels`
 
-Each row gathers its own, in an order that its list has, and nobody adds to another's.
+Each row gathers its own terms, in the order of its list, so no thread writes to another's row.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from solvers.energies.edges import TINY
 
 @cuda.jit(device=True)
 def along(edges, e, v0, v1, v2):
-    """The direction of an entry's edge from its own end, and its tension [N] and length [m]; v: from the other end."""
+    """Return the direction of an entry's edge from its own end, its tension [N] and length [m]; v: from the other."""
     length = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
     k, rest = edges.stiffness[e], edges.rest[e]
     if rest == rest and length > TINY:
@@ -61,7 +61,7 @@ def gradient(edges, given, p, out):
 
 @cuda.jit
 def rise(edges, given, p, q, which, partials):
-    """The first stage of g(q) - g(p) [J], p and q in rows."""
+    """First stage of the sum g(q) - g(p) [J], with p and q in rows."""
     total = 0.0
     i = cuda.grid(1)
     while i < given.hold.shape[0]:
@@ -95,7 +95,7 @@ def rise(edges, given, p, q, which, partials):
 
 
 class Kernels(NamedTuple):
-    """Of a precision: see each."""
+    """Hessian kernels for one precision."""
 
     linearise: Any
     multiply: Any
@@ -103,11 +103,11 @@ class Kernels(NamedTuple):
 
 @cache
 def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
-    """Those that compute in `real`."""
+    """Build the kernels that compute in `real`."""
 
     @cuda.jit
     def linearise(edges, free, p, linear):
-        """Write of each entry of the `free` first rows sqrt(a) n and s to linear (4, entries)."""
+        """Write sqrt(a) n and s of each entry of the first `free` rows to linear (4, entries)."""
         i = cuda.grid(1)
         while i < free:
             x, y, z = p[i, 0], p[i, 1], p[i, 2]
@@ -131,7 +131,7 @@ def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
 
     @cuda.jit
     def multiply(edges, hold, linear, x, out, which, partials, now):
-        """Write H x (f, 3) to `out`, and keep the first stage of x'H x; nothing where now[ENDED] is not 0."""
+        """Write H x (f, 3) to `out` and store the first stage of x'H x; do nothing if now[ENDED] is not 0."""
         if now[0] != 0.0:
             return
         total, rows = 0.0, x.shape[0]

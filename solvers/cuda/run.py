@@ -1,9 +1,9 @@
-"""What solves on a device share: one stream, events, and copies that are made only where somebody asks.
+"""Base classes of device solvers: one stream, events, and copies to the host only on demand.
 
-    begin: upload | launch, launch, ... | positions: download                       all in one stream, in their order
+    start: upload | launch, launch, ... | positions: download                       all in one stream, in their order
 
-A kernel is launched and not waited for. `positions` copies when it is asked for; a residual is asked for after each
-EVERY iterations where one may end a solve. Iterates depend on neither.
+Kernels are launched asynchronously. `positions` copies on access. The residual is evaluated after each
+ITERATIONS_PER_RESIDUAL iterations if it can end a solve. The iterates depend on neither.
 """
 
 from __future__ import annotations
@@ -27,12 +27,16 @@ from solvers.kernels.loop import EACH, ITERATIONS, LAST, STALLED, Limits, verdic
 from solvers.problem import Positions, Solution, StepProblem, StopRule
 
 EVERY = 8
-"""Iterations from one residual to the next."""
+"""Iterations between evaluations of the residual."""
 
 
 class DeviceIterating(Iterating):
-    """A solve on a device, with memory of its own. order: the vertex of each row (n,); stalled: whether the last
-    iteration moved nothing; gauge: tells the residual [J^(1/2)] at positions, nan of a method that does not minimise.
+    """State of a solve on a device, with its own memory.
+
+    Attributes:
+        row_vertices: (n,), the vertex of each row.
+        is_stalled: whether the last iteration moved nothing.
+        residual_of_positions: returns the residual [J^(1/2)] at positions; nan for a method that does not minimise.
     """
 
     def __init__(self, stream: Stream, order: NDArray[np.int64]) -> None:
@@ -43,27 +47,27 @@ class DeviceIterating(Iterating):
         self._done = 0
 
     def begun(self) -> None:
-        """A solve begins: what it needs is copied from here on."""
+        """Mark the start of a solve: the following copies belong to it."""
         self._began = self.stream.mark()
 
     def uploaded(self) -> None:
-        """All that the solve needs is on its way."""
+        """Mark the end of the uploads of a solve."""
         self._up = self._asked = self._down = self.stream.mark()
 
     @abstractmethod
     def take(self, step: Step) -> None:
-        """Begin to solve a step, which is on the device and stays as it is until the solve has ended."""
+        """Start to solve a step that is on the device; it must not change until the solve has ended."""
 
     @abstractmethod
     def sweep(self, count: int) -> int:
-        """Launch so many iterations; how many moved something."""
+        """Launch iterations; return how many of them moved something."""
 
     @abstractmethod
     def settled(self) -> Any:
-        """Where it is, in rows (n, 3) [m], on the device."""
+        """Return the current positions in rows (n, 3) [m], on the device."""
 
     def speeds(self) -> Any:
-        """The velocity at the step's end, in rows (n, 3) [m/s], on the device; None of a method that keeps none."""
+        """Return the final velocity in rows (n, 3) [m/s], on the device; None for a method without its own."""
         return None
 
     def _by_vertices(self, rows: Any) -> Positions:
@@ -73,7 +77,7 @@ class DeviceIterating(Iterating):
 
     @property
     def positions(self) -> Positions:  # pyright: ignore[reportIncompatibleVariableOverride] a copy, when asked for
-        """A copy of where it is (n, 3) [m], with its velocity; the same one until the next iteration."""
+        """A copy of the current positions (n, 3) [m], with the velocity; reused until the next iteration."""
         if self._copy is None:
             with device.guarded():
                 self._asked = self.stream.mark()
@@ -85,23 +89,23 @@ class DeviceIterating(Iterating):
         return self._copy
 
     def advance(self) -> bool:
-        """See Iterating."""
+        """Do one iteration; return False if round-off prevents any further change."""
         self.launch(1)
         return not self.stalled
 
     def launch(self, count: int) -> int:
-        """So many iterations, and forget the copy; how many moved something."""
+        """Run iterations and invalidate the copy; return how many of them moved something."""
         with device.guarded():
             moved = self.sweep(count)
         self._copy, self._done, self.stalled = None, self._done + moved, moved < count
         return moved
 
     def residual(self) -> float:
-        """See Iterating; on the host, at a copy."""
+        """Return the residual; computed on the host from a copy of the positions."""
         return self.gauge(self.positions)
 
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """See Iterating; a residual after each EVERY iterations where it may end them."""
+        """Run iterations within the limits; evaluate the residual at intervals if it can end the solve."""
         count, found, ended = 0, float("nan"), ITERATIONS
         while count < limits.iterations and ended == ITERATIONS:
             some = limits.iterations - count
@@ -117,30 +121,29 @@ class DeviceIterating(Iterating):
         return count, found, ended
 
     def marks(self) -> Marks | None:
-        """Events up to the last copy of positions, which has been waited for; none of the simulator, whose events tell
-        nothing."""
+        """Events up to the last copy of positions, already synchronised; None in the simulator, which has no times."""
         return None if device.simulated() else Marks(self._began, self._up, self._asked, self._down)
 
 
 class DeviceIterative(Iterative):
-    """A method that is ready on a device, with `columns` for its rows."""
+    """A method that is prepared on a device, with the device `columns` of its rows."""
 
     columns: dict[str, Any]
 
     def state(self) -> dict[str, float | None]:
-        """See Remote."""
+        """Return the device's clocks, power and temperature now; None for unavailable values."""
         return device.state()
 
     @abstractmethod
     def iterating(self) -> DeviceIterating:
-        """Memory for a solve."""
+        """Allocate the memory of a solve."""
 
     @abstractmethod
     def stated(self, problem: StepProblem, guess: Positions) -> Step:
-        """A step on the device, from a first guess (n, 3) [m]."""
+        """Upload a step to the device, with an initial guess (n, 3) [m]."""
 
     def begin(self, problem: StepProblem, guess: Positions) -> DeviceIterating:
-        """See Iterative."""
+        """Start a solve from an initial guess (n, 3) [m]."""
         with device.guarded():
             run = self.iterating()
             run.begun()
@@ -150,12 +153,12 @@ class DeviceIterative(Iterative):
             return run
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """See Iterative."""
+        """Iterate until the stop rule is met, or until no iteration descends."""
         with device.guarded():
             return super().solve(problem, stop)
 
     def uncopied(self, problem: StepProblem) -> Iterator[Callable[[], Positions]]:
-        """The iterates of `iterates`, each done when it is yielded and copied only where it is called."""
+        """Yield a function per iterate that copies it; each iterate is complete when it is yielded."""
         with device.guarded():
             run = self.begin(problem, problem.first_guess)
             while True:
@@ -164,7 +167,7 @@ class DeviceIterative(Iterative):
                 yield lambda: run.positions
 
     def replay(self, problem: StepProblem, iterations: int) -> tuple[Solution, Marks | None]:
-        """See Remote."""
+        """Repeat iterations without residuals; return the solution, and the events or None without a clock."""
         with device.guarded():
             run = self.begin(problem, problem.first_guess)
             run.launch(iterations)
@@ -174,8 +177,13 @@ class DeviceIterative(Iterative):
 
 
 class Minimising(DeviceIterative):
-    """A method whose rows are those of a network. uploaded: that; metric, objective: on the host, of residuals;
-    touches: whether it knows contact, and so asks for where a step starts."""
+    """A device method that minimises the objective of a network.
+
+    Attributes:
+        uploaded: the network on the device.
+        metric, objective: for residuals, on the host.
+        touches: whether the method supports contact and requires the start of a step.
+    """
 
     uploaded: Uploaded
     metric: Metric
@@ -183,20 +191,20 @@ class Minimising(DeviceIterative):
     touches: ClassVar[bool] = False
 
     def stated(self, problem: StepProblem, guess: Positions) -> Step:
-        """See DeviceIterative."""
+        """Upload a step to the device, with an initial guess (n, 3) [m]."""
         return self.uploaded.step(problem, guess, touches=self.touches)
 
     def begin(self, problem: StepProblem, guess: Positions) -> DeviceIterating:
-        """See Iterative."""
+        """Start a solve from an initial guess (n, 3) [m]."""
         run = super().begin(problem, guess)
         run.gauge = self.gauge(problem)
         return run
 
     def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
-        """See Iterative."""
+        """Return the residual as a function of positions, for many evaluations in one step."""
         step = StepObjective(self.objective, problem)
         return lambda p: self.metric.residual(step.gradient(step.placed(p)))
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """See Iterative."""
+        """Return the residual [J^(1/2)] at positions p (n, 3) [m]."""
         return self.gauge(problem)(p)

@@ -1,10 +1,10 @@
-"""The preconditioner on a device that `solvers.core.preconditioning` calls schwarz: `solvers.linear.schwarz`, of H+.
+"""Additive Schwarz preconditioner on a device: `solvers.linalg.additive_schwarz` of H+.
 
     z = sum over levels l of P_l diag(B_l^-1) P_l' r
     H+_ii = h_i + sum over its edges of b,   H+_ij = -b,   b = s I + (k - s) n n',   s no less than zero
 
-Node i of a level is part of node i // PATCH of the next one. An edge between two nodes of a level is all edges between
-their parts: b of a coarse edge is a sum over a list of finer ones, in its order, so that no atomics are needed.
+Node i of a level is part of node i // PATCH of the next level. An edge between two nodes of a level combines all edges
+between their parts. b of a coarse edge is a sum over a list of finer edges, in a fixed order, without atomics.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from solvers.cuda.target import Stream, cuda
 from solvers.linear import schwarz
 
 THREADS = 1 if device.simulated() else 96
-"""Of a patch; see `sums` for the simulator's."""
+"""Threads per subdomain; see `sums` for the simulator's value."""
 
 _MOST_BLOCKS = 65_535
 
@@ -31,9 +31,15 @@ Real = type[np.float32] | type[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """On the host. nodes: how many; entries: edges between them, or to what does not move, from both ends; held
-    (nodes,): h of their parts [N/m]; edges: how many; first (edges + 1,), finer: of each the list of finer edges, none
-    on the first level."""
+    """A level on the host.
+
+    Attributes:
+        num_nodes: number of nodes.
+        edge_entries: edges between nodes, or to fixed rows, from both ends.
+        anchor_stiffness: (nodes,), sum of h over the parts [N/m].
+        num_edges: number of edges.
+        fine_edge_starts, fine_edges: (edges + 1,) and list of the finer edges of each edge; empty on the first level.
+    """
 
     nodes: int
     entries: Entries
@@ -44,12 +50,12 @@ class Level:
 
     @property
     def patches(self) -> int:
-        """How many."""
+        """Return the number of subdomains."""
         return -(-self.nodes // schwarz.PATCH)
 
 
 def levels(network: Network, held: NDArray[np.float64]) -> list[Level]:
-    """Those of a network. held (f,): what holds its rows [N/m]."""
+    """Build the levels of a network; `anchor_stiffness` (f,) is that of its rows [N/m]."""
     none = np.zeros(1, np.int64)
     found = [Level(network.free, network.entries, held, len(network.ends), none, none)]
     ends = network.ends
@@ -68,7 +74,7 @@ def levels(network: Network, held: NDArray[np.float64]) -> list[Level]:
 
 
 def needed(of: list[Level], size: int) -> float:
-    """Bytes on the device, with numbers of so many bytes."""
+    """Return the bytes on the device, for numbers of `item_size` bytes."""
     return sum(
         1.0 * size * packed(schwarz.PATCH) * one.patches
         + 48.0 * one.edges
@@ -90,7 +96,7 @@ class UploadedLevel(NamedTuple):
 
     @classmethod
     def of(cls, stream: Stream, level: Level) -> UploadedLevel:
-        """A copy; a device has no empty arrays."""
+        """Copy a level to the device, which does not support empty arrays."""
         first, other, edge = level.entries
         some = np.zeros(1, np.int32)
         return cls(
@@ -104,7 +110,7 @@ class UploadedLevel(NamedTuple):
 
 
 class Schwarz:
-    """The inverses of one solve, of each level those of its patches, packed. r (f, 3): what `apply` is applied to."""
+    """Packed inverses of the subdomains of all levels for one solve; `apply_preconditioner` acts on r (f, 3)."""
 
     def __init__(self, of: list[Level], uploaded: list[UploadedLevel], stream: Stream, rows: int, real: Real) -> None:
         self._stream, self.r = stream, stream.zeros((rows, 3), real)
@@ -116,7 +122,7 @@ class Schwarz:
         self._moved = [cuda.device_array((one.nodes, 3), real) for one in of[1:]]
 
     def linearised(self, edges: Edges, p: Any) -> None:
-        """Invert the patches of H+ at rows p (n, 3) [m]."""
+        """Invert the subdomains of H+ at rows p (n, 3) [m]."""
         stiffen[self._over(self._levels[0].edges)](edges, p, self._stiff[0])
         for k, (level, there, stiff) in enumerate(zip(self._levels, self._uploaded, self._stiff, strict=True)):
             if k:
@@ -124,7 +130,7 @@ class Schwarz:
             self._of.invert[self._patches(level)](there, stiff, level.nodes, self._inverses[k])
 
     def apply(self, z: Any, which: int, partials: Any, now: Any) -> None:
-        """Write z (f, 3), and keep the first stage of r'z; nothing where now[0] is not 0."""
+        """Write z (f, 3), and store the first stage of r'z; do nothing if now[0] is not 0."""
         for level, r, coarse in zip(self._levels[1:], self._residuals, self._residuals[1:], strict=False):
             self._of.gather[self._over(level.nodes)](r, coarse, now)
         moved = [z, *self._moved]

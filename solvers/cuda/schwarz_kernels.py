@@ -1,8 +1,8 @@
-"""Kernels of the additive Schwarz preconditioner: put patches of a level together, invert them, multiply by them.
+"""Kernels of the additive Schwarz preconditioner: assembly and inversion of subdomains, multiplication by inverses.
 
-A patch is inverted where it is put together, in shared memory, in float64 and in place: it is symmetric, and half of
-it, packed by rows, is all there is. Sweeping each pivot of a positive definite A leaves -A^-1 (Goodnight 1979, "A
-tutorial on the SWEEP operator"):
+A subdomain is inverted where it is assembled, in shared memory, in float64 and in place. It is symmetric, and only one
+half is stored, packed by rows. Sweeping each pivot of a positive definite A yields -A^-1 (Goodnight 1979, "A tutorial
+on the SWEEP operator"):
 
     a_ij <- a_ij - a_ik a_kj / a_kk,   a_ik <- a_ik / a_kk,   a_kk <- -1 / a_kk
 """
@@ -23,7 +23,7 @@ Real = type[np.float32] | type[np.float64]
 
 
 def packed(nodes: int) -> int:
-    """Numbers in half of a patch of so many nodes."""
+    """Return the length of the packed half of a subdomain's matrix."""
     return 3 * nodes * (3 * nodes + 1) // 2
 
 
@@ -50,7 +50,7 @@ def stiffen(edges, p, stiff):
 
 @cuda.jit
 def fold(level, count, finer, stiff):
-    """Add up b of each of `count` edges of a level from those of finer edges (6, m)."""
+    """Sum b of the finer edges (6, m) for each of `count` edges of a level."""
     e = cuda.grid(1)
     while e < count:
         for c in range(6):
@@ -62,7 +62,7 @@ def fold(level, count, finer, stiff):
 
 
 class Kernels(NamedTuple):
-    """Of a precision and a size of patches: see each."""
+    """Kernels for one precision and one size of subdomains."""
 
     invert: Any
     gather: Any
@@ -72,12 +72,12 @@ class Kernels(NamedTuple):
 
 @cache
 def kernels(real: Real, patch: int) -> Kernels:
-    """Those whose inverses and residuals are `real`."""
+    """Build the kernels with inverses and residuals of type `real`."""
     rows, half = 3 * patch, packed(patch)
 
     @cuda.jit
     def invert(level, stiff, nodes, inverses):
-        """Write the inverses of a level's patches, packed by rows; a block of threads goes from patch to patch."""
+        """Write the inverses of a level's subdomains, packed by rows; blocks of threads loop over subdomains."""
         a = cuda.shared.array(half, np.float64)
         column = cuda.shared.array(rows, np.float64)  # by its line the simulator tells it from another
         b = cuda.blockIdx.x
@@ -165,7 +165,7 @@ def kernels(real: Real, patch: int) -> Kernels:
 
     @cuda.jit
     def gather(r, coarse, now):
-        """Write the sums of the parts of a level's nodes (N, 3); nothing where now[0] is not 0."""
+        """Restrict the residual: sum the parts of a level's nodes (N, 3); do nothing if now[0] is not 0."""
         if now[0] != 0.0:
             return
         i = cuda.grid(1)
@@ -179,8 +179,10 @@ def kernels(real: Real, patch: int) -> Kernels:
 
     @cuda.jit
     def multiply(inverses, r, coarse, add, z, now):
-        """Write B^-1 r of a level's patches to z (N, 3), and add what the next level moves each patch by, if there is
-        one."""
+        """Write B^-1 r of a level's subdomains to z (N, 3).
+
+        With `add`, also add the correction of the next level.
+        """
         if now[0] != 0.0:
             return
         a = cuda.shared.array(half, real)
@@ -213,7 +215,7 @@ def kernels(real: Real, patch: int) -> Kernels:
 
     @cuda.jit
     def dot(r, z, which, partials, now):
-        """The first stage of r'z."""
+        """First stage of the sum r'z."""
         if now[0] != 0.0:
             return
         total, i = 0.0, cuda.grid(1)

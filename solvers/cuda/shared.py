@@ -1,8 +1,7 @@
-"""Functions of the processor's kernels, compiled for a device: no formula is written twice.
+"""Reuse of CPU kernel functions on a device, so that each formula is written once.
 
-A copy of the function has in its globals, and in what it closes over, such copies of the inner functions that it calls.
-NumPy's functions of one number are those of `math`, which Numba's CUDA target knows. In the simulator copies are
-functions of Python.
+The copy of a function refers to such copies of the inner functions in its globals and closure. NumPy's scalar functions
+are replaced by those of `math`, which Numba's CUDA target supports. In the simulator the copies are Python functions.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ def _on_device(function: Any) -> Any:
 
 
 def shared(function: Any) -> Any:
-    """A function of the processor's, inner, kernel or not compiled, for kernels on a device."""
+    """Return a CPU function (inner function, kernel, or not compiled) for use in device kernels."""
     plain = getattr(function, "py_func", function)
     if plain not in _COPIES:
         names = {name for code in _codes(plain.__code__) for name in code.co_names}
@@ -37,12 +36,12 @@ def shared(function: Any) -> Any:
 
 
 def _codes(code: Any) -> list[Any]:
-    """A code and those of what is defined in it."""
+    """Return a code object and all code objects nested in it."""
     return [code] + [one for inside in code.co_consts if hasattr(inside, "co_names") for one in _codes(inside)]
 
 
 def _replaced(value: Any) -> Any:
-    """What stands for a global on a device."""
+    """Return the device replacement of a global."""
     if value is np and not simulated():
         return math
     of_processor = hasattr(value, "py_func") and "cuda" not in type(value).__module__

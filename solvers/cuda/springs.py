@@ -1,15 +1,15 @@
-"""What springs do on a device, in correction form: positions x + u of a reference x in float64 and a displacement u.
+"""Springs on a device in correction form: reference x in float64 plus displacement u.
 
     D = x_i - x_j,   w = u_i - u_j,   v = D + w,   |v| - |D| = (D + v).w / (|v| + |D|)
     force(v) - force(D) = k r (v/|v| - D/|D|) - k w = (k r/|v| - k) w - (k r/|v|) (|v| - |D|)/|D| D
     E(v) - E(D) - grad E(D).w = k/2 |w|^2 - k r (|w|^2 - (D.w/|D|) (|v| - |D|)) / (|v| + |D|)
 
-Nothing here is a difference of large numbers: each is known to the last digits of w, so that float32 errs by a part of
-the change since the reference, and of nothing else. The force at the reference itself is computed in float64.
+No difference of large numbers occurs: each term is accurate to the last digits of w, so the error of float32 is
+relative to the change since the reference. The force at the reference itself is computed in float64.
 
-A thread has a lane of `solvers.kernels.springs.Bundles`, with rows in the place of its places: eight vertices side by
-side read eight neighbours, eight arrows and one kind. Positions are in rows of four numbers, so that a neighbour is one
-sector of memory.
+A thread processes one lane of `solvers.kernels.spring_local_step`'s packets, with rows as indices: eight adjacent
+vertices read eight neighbours, eight spring vectors and one weight offset. Positions are in rows of four numbers, so
+that a neighbour is one memory sector.
 """
 
 from __future__ import annotations
@@ -27,13 +27,23 @@ from solvers.kernels.springs import TINY_SQUARED, Bundles
 from solvers.vectors.springs import LANES
 
 SHORT = {np.float32: 1e-36, np.float64: TINY_SQUARED}
-"""Squared lengths [m^2] up to which a spring counts as one without length, where smaller ones have no digits."""
+"""Squared length [m^2] at or below which a spring counts as having zero length, as smaller values have no digits."""
 
 
 class Lanes(NamedTuple):
-    """Bundles on the device. own (L,): the row of each lane; start (b + 1,); neighbour (8 e,): rows; kind (e,);
-    weights: of the kernels' type, exact: in float64; spring (8 e,), direction (m, 3): as in `Bundles`; nobody, far:
-    rows of what fills up; arrows (3, 8 e): D [m], of the reference."""
+    """Spring packets on the device.
+
+    Attributes:
+        lane_row: (L,), the row of each lane.
+        packet_start: (b + 1,).
+        neighbour_row: (8 e,).
+        weight_offset: (e,).
+        spring_weights: in the kernels' type.
+        float64_weights: in float64.
+        spring_index, rest_direction: (8 e,) and (m, 3), as in the host's packets.
+        spring_vectors: (3, 8 e), D [m] of the reference.
+        padding_row, padding_end_row: rows of padding lanes, and of the ends of padding springs.
+    """
 
     own: Any
     start: Any
@@ -49,7 +59,7 @@ class Lanes(NamedTuple):
 
     @classmethod
     def of(cls, stream: Stream, bundles: Bundles, nobody: int, real: Any) -> Lanes:
-        """The bundles, on the device. nobody: the row of what fills them up; the next one is that of springs' ends."""
+        """Copy the packets to the device; `padding_row` + 1 is the row of the ends of padding springs."""
         entries = len(bundles.neighbour)
         direction = bundles.direction if len(bundles.direction) else np.zeros((1, 3))
         return cls(
@@ -68,28 +78,28 @@ class Lanes(NamedTuple):
 
     @property
     def read(self) -> tuple[Any, ...]:
-        """What kernels in the kernels' type take."""
+        """Return the arguments of the kernels in the kernels' type."""
         return self.own, self.start, self.neighbour, self.kind, self.weights, self.spring, self.direction, self.arrows
 
     @property
     def written(self) -> tuple[Any, ...]:
-        """What the kernel in float64 takes that writes the arrows."""
+        """Return the arguments of the float64 kernel that writes the spring vectors."""
         return self.own, self.start, self.neighbour, self.kind, self.exact, self.spring, self.direction, self.arrows
 
 
 def _some(array: NDArray[Any]) -> NDArray[Any]:
-    """The array, or one number, for a device has no empty ones."""
+    """Return the array, or one element, as a device does not support empty arrays."""
     return array if len(array) else np.zeros(1, array.dtype)
 
 
 def needed(bundles: Bundles, real: Any) -> int:
-    """Bytes of these lanes on the device."""
+    """Return the bytes of the lanes on the device."""
     size = np.dtype(real).itemsize
     return len(bundles.neighbour) * (8 + 3 * size) + 8 * len(bundles.own) + (8 + size) * bundles.weights.size
 
 
 class Kernels(NamedTuple):
-    """Device functions and kernels in one type of numbers; see where they are written."""
+    """Device functions and kernels in one floating-point type."""
 
     unit: Any
     change: Any
@@ -100,13 +110,13 @@ class Kernels(NamedTuple):
 
 @cache
 def kernels(real: Any) -> Kernels:
-    """Those of a type. All literals are of it: one in float64 would make all that it meets float64."""
+    """Build the kernels of one type; all literals have it, as a float64 literal would promote the arithmetic."""
     zero, one, short = real(0.0), real(1.0), real(SHORT[real])
     tiny = TINY_SQUARED
 
     @cuda.jit(device=True)
     def unit(v0, v1, v2, squared, name, direction):
-        """The direction of a spring, where it has no length that of its rest shape."""
+        """Return the direction of a spring; that of its rest shape at zero length."""
         if squared <= short:
             sign = one
             if name < 0:
@@ -121,7 +131,7 @@ def kernels(real: Any) -> Kernels:
 
     @cuda.jit(device=True)
     def change(d0, d1, d2, w0, w1, w2, pull, k, name, direction):
-        """What a spring's force on its first end changes by (3), its length there, and whether it has none."""
+        """Return the change (3) of a spring's force on its first end, its length, and whether it has zero length."""
         v0, v1, v2 = d0 + w0, d1 + w1, d2 + w2
         begin, end = d0 * d0 + d1 * d1 + d2 * d2, v0 * v0 + v1 * v1 + v2 * v2
         if begin <= short or end <= short:
@@ -136,7 +146,7 @@ def kernels(real: Any) -> Kernels:
 
     @cuda.jit
     def clear(x, u, older, before):
-        """Zeros in rows of four."""
+        """Set rows of four to zero."""
         i = cuda.grid(1)
         if i < len(x):
             for c in range(4):
@@ -144,7 +154,7 @@ def kernels(real: Any) -> Kernels:
 
     @cuda.jit
     def settle(x, u, out):
-        """Positions x + u [m], in rows of three."""
+        """Write positions x + u [m] in rows of three."""
         i = cuda.grid(1)
         if i < len(out):
             for c in range(3):
@@ -152,7 +162,7 @@ def kernels(real: Any) -> Kernels:
 
     @cuda.jit
     def linearise(own, start, neighbour, kind, weights, spring, direction, arrows, nobody, far, given, x, force):
-        """Write the arrows of the reference, and minus the gradient there, in float64, to `force` (3, lanes) [N]."""
+        """Write the spring vectors of the reference and the negative gradient there, in float64 (3, lanes) [N]."""
         t = cuda.grid(1)
         if t >= len(own) or own[t] == nobody:
             return

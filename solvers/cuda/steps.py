@@ -1,9 +1,9 @@
-"""A step on a device: what it gives, from a host's problem, and rows of it.
+"""Step data on a device: upload of a host's step problem, and kernels that convert it to rows.
 
     centre_i = (c m/dt^2 target + w pin) / (c m/dt^2 + w),     force_i = f_i - h_i centre_i        h: of forms
     n = v/|v| and n'(A origin) of dashpots, v = A p at the step's start
 
-Rows are those of `solvers.cuda.network`; a step's arrays are by vertices, as a host has them.
+Rows are those of `solvers.cuda.device_network`; the arrays of a step are by vertices, as on the host.
 """
 
 from __future__ import annotations
@@ -23,11 +23,19 @@ from solvers.problem import Positions, StepProblem, System
 
 
 class Step(NamedTuple):
-    """On the device, by vertices. target, guess (n, 3) [m]; force (n, 3) [N], with that of forms; pins (q, 3): where
-    they want their vertices [m], one row where there are none; origin, lagged (n, 3) [m]: of the unknown's velocity,
-    and where dashpots take their directions, any of a network without these; positions [m], velocity [m/s]: at the
-    step's start (n, 3), any where a method that minimises touches nothing; times: of that, and of the unknown [s];
-    pressed (n, 3) [m]: where friction's normal forces are taken, None for the step's start."""
+    """A step on the device, by vertices.
+
+    Attributes:
+        inertial_target, initial_guess: (n, 3) [m].
+        external_force: (n, 3) [N], including that of forms.
+        pin_targets: (q, 3) [m]; one row if there are none.
+        velocity_origin, lagged_positions: (n, 3) [m], of the stage's velocity and of the dashpots' directions;
+            arbitrary without dashpots.
+        positions, velocity: (n, 3) [m, m/s] at the start of the step; arbitrary for a minimising method without
+            contact.
+        start_and_stage_time: [s].
+        normal_force_positions: (n, 3) [m], where friction evaluates normal forces; None for the start of the step.
+    """
 
     target: Any
     force: Any
@@ -42,8 +50,15 @@ class Step(NamedTuple):
 
 
 class Places(NamedTuple):
-    """On the device, of each row (n,). vertex: which it is; pin: the number of its pin, -1 for none; inertia: c m/dt^2,
-    weight: of a pin by penalty, form: h of all forms [N/m]."""
+    """Data of each row (n,) on the device.
+
+    Attributes:
+        row_vertices: the vertex.
+        pin_indices: index of its pin, -1 for none.
+        inertia_diagonal: c m/dt^2 [N/m].
+        pin_weight: weight of a penalty pin [N/m].
+        form_weight: h of all forms [N/m].
+    """
 
     vertex: Any
     pin: Any
@@ -54,8 +69,13 @@ class Places(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Uploaded:
-    """A network on a device. edges, places: of it; hold (f,): h of all that hold a row [N/m]; axis (m, 3): of edges as
-    they were made."""
+    """A network on a device.
+
+    Attributes:
+        device_edges, row_data: of the network.
+        anchor_stiffness: (f,), sum of all anchors of a row [N/m].
+        axis: (m, 3), of the edges as prepared.
+    """
 
     network: Network
     stream: Stream
@@ -81,7 +101,7 @@ class Uploaded:
         return cls(network, stream, network.upload(stream), places, hold)
 
     def step(self, problem: StepProblem, guess: Positions, *, touches: bool = False) -> Step:
-        """A host's problem, from a first guess (n, 3) [m]; touches: whether the method asks for its start."""
+        """Upload a step problem with an initial guess (n, 3) [m], and with its start for methods with contact."""
         force, up = self.network.parts.force(problem), self.stream.upload
         target, pins, start = up(problem.target), pins_of(problem, self.stream), problem.start
         lagged = (up(start.origin), up(start.expected)) if self.network.parts.dashpots else (target, target)
@@ -91,20 +111,24 @@ class Uploaded:
 
 
 def pin_numbers(system: System) -> NDArray[np.int32]:
-    """The number of each vertex's pin (n,), -1 for none."""
+    """Return the index of each vertex's pin (n,), -1 for none."""
     numbers = np.full(system.vertices, -1, np.int32)
     numbers[system.pins.vertices] = np.arange(len(system.pins.vertices))
     return numbers
 
 
 def pins_of(problem: StepProblem, stream: Stream) -> Any:
-    """Where the pins want their vertices, on the device, which has no empty arrays."""
+    """Upload the pin targets to the device, which does not support empty arrays."""
     return stream.upload(problem.pin_targets if len(problem.pin_targets) else np.zeros((1, 3)))
 
 
 class Begun:
-    """What a solve holds of its step, in rows. edges: as they are in it; given: what holds the free rows (f,), and by
-    what (f, 3)."""
+    """Data of a solve for its step, in rows.
+
+    Attributes:
+        device_edges: the edges, as in this step.
+        step_data: anchors of the free rows (f,) and (f, 3).
+    """
 
     def __init__(self, uploaded: Uploaded) -> None:
         stream, network, edges = uploaded.stream, uploaded.network, uploaded.edges
@@ -116,8 +140,10 @@ class Begun:
         self.given = Given(uploaded.hold, stream.zeros(rows, np.float64), stream.zeros(rows, np.float64))
 
     def take(self, step: Step, *rows: Any) -> None:
-        """The step, and its first guess in each of these rows of three numbers or more, exactly pinned vertices on
-        their targets."""
+        """Load the step, and write its initial guess to the given rows of at least three numbers.
+
+        Exactly pinned vertices are set to their targets.
+        """
         uploaded, queue = self._uploaded, self._uploaded.stream.queue
         network, places = uploaded.network, uploaded.places
         launch = sums.blocks(len(network.order)), sums.THREADS, queue
@@ -132,7 +158,7 @@ class Begun:
 
 @cuda.jit
 def give(places, target, force, pins, given):
-    """Write what holds the free rows where, and what pulls at them besides."""
+    """Write the anchors of the free rows, and the other forces on them."""
     i = cuda.grid(1)
     while i < given.centre.shape[0]:
         v, m, w = places.vertex[i], places.inertia[i], places.weight[i]
@@ -147,7 +173,7 @@ def give(places, target, force, pins, given):
 
 @cuda.jit
 def place(places, free, guess, pins, rows):
-    """Write a guess by vertices (n, 3) to rows; from row `free` on they are on their pins' targets."""
+    """Write an initial guess (n, 3) to rows; rows from `num_free` on are set to their pins' targets."""
     i = cuda.grid(1)
     while i < places.vertex.shape[0]:
         for c in range(3):
@@ -157,8 +183,10 @@ def place(places, free, guess, pins, rows):
 
 @cuda.jit
 def lag(first, vertex, origin, lagged, made, edges):
-    """Write directions and offsets of dashpots, which are the edges from `first` on; made: directions of those without
-    length."""
+    """Write directions and offsets of the dashpots, the edges from `first_dashpot` on.
+
+    `default_directions` are used at zero length.
+    """
     e = first + cuda.grid(1)
     while e < edges.ends.shape[0]:
         i, j = vertex[edges.ends[e, 0]], vertex[edges.ends[e, 1]]

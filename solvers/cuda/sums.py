@@ -1,11 +1,10 @@
-"""Sums over all threads, in an order that depends on nothing but the number of terms: they repeat bit by bit.
+"""Parallel sums in an order that depends only on the number of terms: they are bitwise reproducible.
 
-Threads go through the terms in strides and add up what they find, a block's threads add theirs by a tree, and one block
-adds the blocks' sums by the same tree. The two stages are two kernels, so that no block waits for another and nothing
-is added by atomics.
+Threads loop over the terms with a stride, the threads of a block are summed by a tree, and one block sums the blocks by
+the same tree. The two stages are two kernels, so no block waits for another and atomics are unnecessary.
 
-`keep` and `of_all` are inlined: Numba compiles a function anew for each literal that it is given, and takes in with
-each what that one calls, so that `of_block`'s shared array would be there twice, which libNVVM refuses.
+`store_partial_sum` and `sum_partials` are inlined. Numba compiles a function once for each literal argument, including
+its callees, so the shared array of `sum_block` would be defined twice, which libNVVM rejects.
 """
 
 from __future__ import annotations
@@ -18,18 +17,18 @@ from solvers.cuda.device import simulated
 from solvers.cuda.target import cuda
 
 THREADS, MOST_BLOCKS = (1, 2) if simulated() else (256, 1024)
-"""Of a launch. The simulator makes a thread of Python of each, which takes longer than what it does there; and device
-functions of another file than the kernel's know their thread there where it is the only one of its block."""
+"""Threads per block. The simulator starts a Python thread for each, which is slower than its work. Its device functions
+from other files than the kernel's also require a block of one thread."""
 
 
 def blocks(n: int) -> int:
-    """Of a launch for n terms, which the threads go through in strides."""
+    """Return the number of blocks of a launch for n terms, over which threads loop with a stride."""
     return max(1, min(MOST_BLOCKS, -(-n // THREADS)))
 
 
 @cuda.jit(device=True)
 def of_block(value):
-    """The sum of a float64 over the block's threads, told to all of them."""
+    """Return the sum of a float64 over the threads of the block, to all of them."""
     shared = cuda.shared.array(THREADS, np.float64)
     thread = cuda.threadIdx.x
     cuda.syncthreads()
@@ -46,7 +45,7 @@ def of_block(value):
 
 @cuda.jit(device=True, inline="always")
 def keep(value, which, partials):
-    """The first stage: the block's sum, kept in a row of partials (k, MOST_BLOCKS)."""
+    """First stage: store the sum of the block in a row of partials (k, MAX_BLOCKS)."""
     total = of_block(value)
     if cuda.threadIdx.x == 0:
         partials[which, cuda.blockIdx.x] = total
@@ -54,7 +53,7 @@ def keep(value, which, partials):
 
 @cuda.jit(device=True, inline="always")
 def of_all(which, partials, count):
-    """The second stage, in a kernel of one block: the sum of a row's first `count` partials, told to all threads."""
+    """Second stage, in a kernel of one block: return the sum of a row's first `count` partials to all threads."""
     mine, k = 0.0, cuda.threadIdx.x
     while k < count:
         mine += partials[which, k]
@@ -64,7 +63,7 @@ def of_all(which, partials, count):
 
 @cuda.jit
 def collect(rows, partials, count, out):
-    """The second stage of the first `rows` sums; one block."""
+    """Second stage of the first `rows` sums; one block."""
     for k in range(rows):
         total = of_all(k, partials, count)
         if cuda.threadIdx.x == 0:
@@ -72,5 +71,5 @@ def collect(rows, partials, count, out):
 
 
 def partials(rows: int) -> Any:
-    """Memory for so many sums at a time."""
+    """Allocate memory for `rows` simultaneous sums."""
     return cuda.device_array((rows, MOST_BLOCKS), np.float64)

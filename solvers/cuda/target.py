@@ -1,4 +1,4 @@
-"""Numba's CUDA target, or its simulator, and streams there; Numba states no types for what kernels ask of it."""
+"""Numba's CUDA target or its simulator, and streams; Numba has no types for device arrays and kernels."""
 
 from __future__ import annotations
 
@@ -13,52 +13,52 @@ from solvers.cuda.device import simulated
 cuda: Any = import_module("numba.cuda")
 
 THREADS = 8 if simulated() else 128
-"""In a block; the simulator's take a thread of the processor each."""
+"""Threads per block; the simulator starts a CPU thread for each."""
 
 
 def blocks(threads: int) -> int:
-    """How many blocks so many threads take; one at least."""
+    """Return the number of blocks for a number of threads, at least one."""
     return max(1, -(-threads // THREADS))
 
 
 class Stream:
-    """A stream with the arrays that are brought to it, and a clock on it. Device arrays live as long as this does."""
+    """A stream with its uploaded arrays and its events; device arrays live as long as the stream."""
 
     def __init__(self) -> None:
         self.queue: Any = cuda.stream()
 
     def upload(self, array: NDArray[Any], dtype: Any = None) -> Any:
-        """A copy of a host's array on the device."""
+        """Copy a host array to the device."""
         return cuda.to_device(np.ascontiguousarray(array, dtype), stream=self.queue)
 
     def put(self, array: NDArray[Any], there: Any) -> None:
-        """Copy a host's array to one of the device of the same shape and type."""
+        """Copy a host array to an existing device array of the same shape and type."""
         there.copy_to_device(np.ascontiguousarray(array, there.dtype), stream=self.queue)
 
     def copy(self, array: Any, there: Any) -> None:
-        """Copy an array of the device to another of the same shape and type."""
+        """Copy a device array to another one of the same shape and type."""
         there.copy_to_device(array, stream=self.queue)
 
     def empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
-        """Memory of the device, with whatever is there."""
+        """Allocate an uninitialised device array."""
         return cuda.device_array(shape, dtype, stream=self.queue)
 
     def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
-        """Zeros on the device."""
+        """Allocate a device array of zeros."""
         return self.upload(np.zeros(shape, dtype))
 
     def download(self, there: Any) -> NDArray[Any]:
-        """A copy of a device's array; waits for all that was launched."""
+        """Copy a device array to the host; waits for all launched kernels."""
         out = there.copy_to_host(stream=self.queue)
         self.wait()
         return out
 
     def wait(self) -> None:
-        """Until all that was launched is done."""
+        """Wait for all launched work."""
         self.queue.synchronize()
 
     def mark(self) -> Any:
-        """An event here and now on the stream."""
+        """Record an event on the stream."""
         event = cuda.event()
         event.record(self.queue)
         return event

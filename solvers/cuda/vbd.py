@@ -1,8 +1,9 @@
-"""Vertex block descent on a device: the iterates of `solvers.methods.vbd`, a colour a launch.
+"""Vertex block descent on a device: the iterates of `solvers.methods.vertex_block.vbd`, one launch per colour.
 
-Colours, their order, bundles and sums are the processor's. Springs, quadratic forms and contact of vertices with
-obstacles are taken; elements of other energies and pairs are refused. Every REBASE iterations the displacement is added
-to the reference in float64, and the gradient computed there: in float32 too iterates tend to the minimum in float64.
+Colours, their order, packets and sums are those of the CPU. Springs, quadratic forms and vertex contact with obstacles
+are supported; elements of other energies and barrier contact are not. Every REBASE_INTERVAL iterations the displacement
+is added to the reference in float64, and the gradient is computed there. Hence float32 iterates converge to the minimum
+in float64 as well.
 """
 
 from __future__ import annotations
@@ -32,12 +33,22 @@ from solvers.problem import StepProblem, System, Unsupported
 from solvers.vectors.springs import LANES
 
 REBASE = 16
-"""Iterations from one gradient in float64 to the next."""
+"""Iterations between evaluations of the gradient in float64."""
 
 
 def prepare(system: System, parts: Parts, made: VertexBlocks, radius: float, real: Any) -> PreparedVertexBlockDescent:
-    """The method on the device, which is `ready`. radius: rho of the acceleration; real: what kernels compute in.
-    Raises Unsupported."""
+    """Prepare the method on an available device.
+
+    Args:
+        system: the system.
+        spring_form: its springs and quadratic forms.
+        vertex_blocks: coloured packets.
+        spectral_radius: rho of the acceleration.
+        real: floating-point type of the kernels.
+
+    Raises:
+        Unsupported: for other energies, and if the device memory is too small.
+    """
     taken = Springs, Quadratic, Contact
     others = sorted({type(energy).__name__ for energy in system.energies if not isinstance(energy, taken)})
     if others:
@@ -72,7 +83,7 @@ def prepare(system: System, parts: Parts, made: VertexBlocks, radius: float, rea
 
 @dataclass(frozen=True, eq=False)
 class PreparedVertexBlockDescent(Minimising):
-    """parts, made: as on the processor; the rest is on the device: lanes; held, majorant, of each lane [N/m]."""
+    """VBD, prepared on a device, with lanes, anchor stiffness and majorant of each lane [N/m] there."""
 
     system: System
     parts: Parts
@@ -90,31 +101,37 @@ class PreparedVertexBlockDescent(Minimising):
 
     @property
     def facts(self) -> dict[str, float]:
-        """Exact counts of what was built."""
+        """Exact counts of the prepared data."""
         return self.metric.facts
 
     @property
     def choice(self) -> str:
-        """What it chose."""
+        """Description of the prepared solver."""
         return (
             f"vertices in {self.made.colours} colours; kernels in {np.dtype(self.real)}, the gradient in float64; for "
             f"the residual alone {self.metric.choice}"
         )
 
     def iterating(self) -> DeviceIterating:
-        """See DeviceIterative."""
+        """Allocate the memory of a solve."""
         return Sweeps(self)
 
     def scale(self, problem: StepProblem) -> float:
-        """See Iterative."""
+        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
         stiffness = self.made.majorant[self.made.row][self.system.unpinned]
         return largest(problem) * float(stiffness.sum()) ** 0.5
 
 
 class Sweeps(DeviceIterating):
-    """x (n + 2, 4), the reference in float64; u, the displacement from it; older, the iterate before, and before, the
-    one where the sweep began, from it too [m]. force (3, lanes): minus the gradient at it [N]; rows (n, 3): where it
-    is, where somebody asks for it."""
+    """State of a VBD solve on the device.
+
+    Attributes:
+        x: (n + 2, 4), the reference in float64 [m].
+        u: the displacement from the reference [m].
+        older, before: displacements of the previous iterate and of the start of the sweep [m].
+        force: (3, lanes), negative gradient at the reference [N].
+        rows: (n, 3), the current positions, written on demand.
+    """
 
     def __init__(self, made: PreparedVertexBlockDescent) -> None:
         super().__init__(made.uploaded.stream, made.uploaded.network.order)
@@ -137,7 +154,7 @@ class Sweeps(DeviceIterating):
         self._launch(self._springs.clear, len(self._x), self._x, self._u, self._older, self._before)
 
     def take(self, step: Step) -> None:
-        """See DeviceIterating."""
+        """Load a step that is on the device, and start to solve it."""
         self._launch(self._springs.clear, len(self._x), self._x, self._u, self._older, self._before)
         self.stream.copy(self._fresh, self._control)
         self.loaded.take(step, self._x)
@@ -145,12 +162,12 @@ class Sweeps(DeviceIterating):
             self._spaces.take(step)
 
     def settled(self) -> Any:
-        """See DeviceIterating."""
+        """Return the current positions in rows (n, 3) [m], on the device."""
         self._launch(self._springs.settle, len(self._rows), self._x, self._u, self._rows)
         return self._rows
 
     def sweep(self, count: int) -> int:
-        """See DeviceIterating."""
+        """Launch iterations; return how many of them moved something."""
         for number in range(self._done, self._done + count):
             if number % REBASE == 0:
                 self._rebase(moved=number > 0)
@@ -181,7 +198,7 @@ class Sweeps(DeviceIterating):
             self._launch(run.finish, rows, self._u, self._before, self._older, self._control)
 
     def _colours(self) -> None:
-        """A sweep; of each colour then the vertices that have half-spaces, anew from where they were before."""
+        """Sweep all colours; vertices with half-spaces are then recomputed from their previous positions."""
         made = self._made
         lanes, first = made.lanes, made.made.first
         for begin, end in zip(LANES * first[:-1], LANES * first[1:], strict=True):

@@ -1,11 +1,11 @@
 """Vertex block descent on a device: the Newton step of each vertex of a colour, and Chebyshev's extrapolation.
 
-A colour is one launch, a vertex one thread: no two of a colour are neighbours, so that a thread writes one row that
-nobody else reads in this launch. Sums are those of blocks, in their order, and then of one block in a tree: the bits
-are the same each time. What to extrapolate by is decided on the device, in `control`, which nobody waits for:
+A colour is one launch, a vertex one thread: no two vertices of a colour are neighbours, so a thread writes one row that
+no other thread reads in this launch. Sums are computed per block, in block order, and then by one block in a tree, so
+they are bitwise reproducible. The extrapolation is decided on the device, in `control`, without synchronisation:
 
-    OMEGA of the last iteration, KNOWN the objective there (nan where it is not known), WEIGHT of this iteration's
-    extrapolation, TAKEN whether it was taken, ASKED whether the objective before it is needed
+    OMEGA of the last iteration, KNOWN the objective there (nan if unknown), WEIGHT of this iteration's
+    extrapolation, TAKEN whether it was accepted, ASKED whether the objective before it is needed
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from solvers.vectors.springs import LANES
 OMEGA, KNOWN, WEIGHT, TAKEN, ASKED = range(5)
 CONTROLS = 5
 _ROUND_OFF = {np.float32: 1e-6, np.float64: 1e-14}
-"""Pivots up to this share of the diagonal's sum are round-off, of some ten springs."""
+"""Pivots up to this fraction of the diagonal's sum are round-off, with about ten springs per vertex."""
 
 
 class Kernels(NamedTuple):
-    """Device functions and kernels in one type of numbers."""
+    """Device functions and kernels in one floating-point type."""
 
     gathered: Any
     risen_there: Any
@@ -43,7 +43,7 @@ class Kernels(NamedTuple):
 
 @cache
 def kernels(real: Any) -> Kernels:
-    """Those of a type."""
+    """Build the kernels of one type."""
     zero, half, one = real(0.0), real(0.5), real(1.0)
     least = real(_ROUND_OFF[real])
     change, unit_exact = springs.kernels(real).change, springs.kernels(np.float64).unit
@@ -53,8 +53,10 @@ def kernels(real: Any) -> Kernels:
     def gathered(
         t, first, last, u0, u1, u2, neighbour, kind, weights, spring, direction, arrows, far, held, force, u,
     ):  # fmt: skip
-        """The force [N] on a lane's vertex at the displacement u0, u1, u2, the upper triangle of its block [N/m], and
-        whether one of its springs has no length, and so no share in the block."""
+        """Return the force [N] on a lane's vertex at displacement u0, u1, u2, and its block [N/m].
+
+        The block is stored as its upper triangle. Also return whether a spring has zero length; such a spring does not contribute to the block.
+        """
         lane, h = t % LANES, held[t]
         f0, f1, f2 = force[0, t] - h * u0, force[1, t] - h * u1, force[2, t] - h * u2
         b00, b01, b02, b11, b12, b22 = h, zero, zero, h, zero, h
@@ -74,7 +76,7 @@ def kernels(real: Any) -> Kernels:
                 continue
             inward = pull / length
             tension = inward - k
-            # A spring whose k is negative is a form's, has no rest length and is never compressed.
+            # A spring with negative k belongs to a form, has no rest length and is never compressed.
             lateral = zero if tension > zero and inward > zero else -tension
             axial = (k - lateral) / (length * length)
             v0, v1, v2 = d0 + w0, d1 + w1, d2 + w2
@@ -87,8 +89,10 @@ def kernels(real: Any) -> Kernels:
     def risen(
         t, first, last, u0, u1, u2, x0, x1, x2, f0, f1, f2, neighbour, kind, weights, arrows, far, held, u,
     ):  # fmt: skip
-        """By how much a step x0, x1, x2 of a lane's vertex raises the energy [J], from where the force is f0, f1, f2;
-        no spring has no length."""
+        """Return the energy change [J] of a step x0, x1, x2 of a lane's vertex, from where the force is f0, f1, f2.
+
+        All springs must have nonzero length.
+        """
         lane = t % LANES
         moved = x0 * x0 + x1 * x1 + x2 * x2
         rise = half * held[t] * moved - (f0 * x0 + f1 * x1 + f2 * x2)
@@ -111,7 +115,7 @@ def kernels(real: Any) -> Kernels:
 
     @cuda.jit(device=True)
     def risen_there(d, lane):
-        """The same in float64, of a step d; lane: which it is, its displacement and force, and the arrays."""
+        """Return the energy change in float64 for a step d; lane: its index, displacement, force and the arrays."""
         t, first, last, at, pull, neighbour, kind, weights, arrows, far, held, u = lane
         return float64(
             risen(
@@ -125,9 +129,12 @@ def kernels(real: Any) -> Kernels:
         begin, end, own, start, neighbour, kind, weights, spring, direction, arrows,
         nobody, far, held, majorant, force, u, before,
     ):  # fmt: skip
-        """Move the vertices of a colour, lanes `begin` to `end`, each to a lower energy; `before` keeps where it was.
+        """Move the vertices of a colour, lanes `begin` to `end`, each to a lower energy.
 
-        held, majorant (lanes,) [N/m]; force (3, lanes) [N]: minus the gradient at the reference.
+        Args:
+            held, majorant: (lanes,) [N/m], anchor stiffness and majorant.
+            force: (3, lanes) [N], negative gradient at the reference.
+            before: receives the displacements before the sweep.
         """
         t = begin + cuda.grid(1)
         if t >= end or own[t] == nobody:
@@ -147,7 +154,7 @@ def kernels(real: Any) -> Kernels:
         l3 = below / second
         third = b22 - l2 * b02 - l3 * below
         bound = least * (b00 + b11 + b22)
-        # Where a spring has no length there is no Hessian: the majorant's step takes it apart.
+        # A spring of zero length has no Hessian: the step of the majorant separates its ends.
         if not lengthless and b00 > bound and second > bound and third > bound:
             y1 = f1 - l1 * f0
             x2 = (f2 - l2 * f0 - l3 * y1) / third
@@ -162,7 +169,7 @@ def kernels(real: Any) -> Kernels:
 
     @cuda.jit
     def extrapolate(u, older, control):
-        """`older`, the iterate before the last one, to w (u - older) + older."""
+        """Extrapolate `older`, the iterate before the last one, to w (u - older) + older."""
         i = cuda.grid(1)
         w = real(control[WEIGHT])
         if i < len(u) and w > one:
@@ -174,11 +181,13 @@ def kernels(real: Any) -> Kernels:
         own, start, neighbour, kind, weights, spring, direction, arrows,
         nobody, far, free, held, force, u, asked, control, sums,
     ):  # fmt: skip
-        """Write the objective at the reference and u, less that at the reference, to `sums`, a number a block [J].
+        """Write the objective at the reference plus u, minus that at the reference, to `sums` [J], one per block.
 
-        In float64, from u and arrows as they are: what is decided by it is no matter of round-off.
-        free: so many rows, from the first one on, may move; asked: what of `control` must be positive (ASKED), or more
-        than one (WEIGHT).
+        It is evaluated in float64, from the stored u and spring vectors, so that decisions do not depend on round-off.
+
+        Args:
+            free: number of rows, from the first one, that may move.
+            asked: index in `control`; the kernel runs if that entry is positive (ASKED), or above one (WEIGHT).
         """
         kept = cuda.shared.array(THREADS, float64)
         t, inside = cuda.grid(1), cuda.threadIdx.x
@@ -226,9 +235,11 @@ def kernels(real: Any) -> Kernels:
 
     @cuda.jit
     def decide(radius, at_before, at_new, control):
-        """One block: whether an extrapolation is taken, and what the next one's weight is.
+        """Decide in one block whether an extrapolation is accepted, and compute the next weight.
 
-        radius: rho; at_before, at_new: the sums of `level` where they were asked for.
+        Args:
+            radius: rho.
+            at_before, at_new: sums of the objective, if requested.
         """
         kept = cuda.shared.array((2, THREADS), float64)
         inside = cuda.threadIdx.x
@@ -268,7 +279,7 @@ def kernels(real: Any) -> Kernels:
 
     @cuda.jit
     def finish(u, before, older, control):
-        """Take the extrapolation, if it is; and remember where the iteration began."""
+        """Apply the extrapolation if accepted; store where the iteration started."""
         i = cuda.grid(1)
         taken = control[TAKEN] > 0.0
         if i < len(u):
@@ -279,7 +290,7 @@ def kernels(real: Any) -> Kernels:
 
     @cuda.jit
     def rebase(x, u, older, control):
-        """The displacement into the reference: there the objective is known to be 0, if it was known."""
+        """Add the displacement to the reference; the objective there is 0 by definition if it was known."""
         i = cuda.grid(1)
         if i == 0 and not math.isnan(control[KNOWN]):
             control[KNOWN] = 0.0

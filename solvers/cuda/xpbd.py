@@ -1,7 +1,7 @@
-"""XPBD on a device: the iterates of `solvers.methods.xpbd`, a colour of springs a launch, a spring a thread.
+"""XPBD on a device: the iterates of `solvers.methods.position_based.xpbd`, with one launch per colour.
 
-No two springs of a colour share a vertex, so that nobody writes what another reads. What is computed in which precision
-`solvers.cuda.xpbd_kernels` says.
+Each thread processes one spring. No two springs of a colour share a vertex, so no thread writes what another reads. `solvers.cuda.xpbd_kernels` documents
+the precision of each quantity.
 """
 
 from __future__ import annotations
@@ -27,8 +27,19 @@ Real = type[np.float32] | type[np.float64]
 def prepare(
     system: System, constraints: Constraints, first: NDArray[np.int64], real: Real, choice: str, *, small: bool
 ) -> PreparedXpbd:
-    """The method on the device, which is `ready`. constraints: the springs by colour; first (colours + 1,): the first
-    of each; small: whether in small steps. Raises Unsupported where the device has no room."""
+    """Prepare the method on an available device.
+
+    Args:
+        system: the system.
+        coloured_constraints: the springs by colour.
+        colour_starts: (colours + 1,), the first spring of each colour.
+        real_dtype: floating-point type of the kernels.
+        description: description of the solver.
+        small_steps: whether in small steps.
+
+    Raises:
+        Unsupported: if the device memory is too small.
+    """
     m, n, size = len(constraints.stiffness), system.vertices, np.dtype(real).itemsize
     solve = m * 5.0 * size + n * (5 * 24 + 8 + 5.0 * size)
     device.require_memory("xpbd", m * (8 + 8 + 24.0 + size) + n * (6 * 24 + 32) + solve)
@@ -41,8 +52,16 @@ def prepare(
 
 
 class Springs(NamedTuple):
-    """On the device: ends (m, 2), stiffness (m,) [N/m], rest: r (m,) [m], and direction (m, 3), taken at zero length;
-    of a solve arrows (4, m): D and |D| - r [m], and tension (m,) [N]."""
+    """Springs on the device.
+
+    Attributes:
+        ends: (m, 2).
+        stiffness: (m,) [N/m].
+        rest_length: r (m,) [m].
+        rest_direction: (m, 3), used at zero length.
+        reference_vectors: (4, m), D and |D| - r [m] of a solve.
+        spring_tensions: (m,) [N] of a solve.
+    """
 
     ends: Any
     stiffness: Any
@@ -53,7 +72,7 @@ class Springs(NamedTuple):
 
     @classmethod
     def of(cls, stream: Stream, constraints: Constraints, real: Real) -> Springs:
-        """The constraints, on the device, which has no empty arrays."""
+        """Copy the constraints to the device, which does not support empty arrays."""
         m = max(1, len(constraints.stiffness))
         ends, direction = np.zeros((m, 2), np.int32), np.zeros((m, 3))
         stiffness, rest = np.zeros(m), np.zeros(m)
@@ -67,14 +86,20 @@ class Springs(NamedTuple):
         )
 
     def begun(self, real: Real) -> Springs:
-        """For a solve."""
+        """Allocate the arrays of a solve."""
         m = len(self.stiffness)
         return self._replace(arrows=cuda.device_array((4, m), real), tension=cuda.device_array(m, real))
 
 
 class Places(NamedTuple):
-    """On the device, of each vertex (n,). pin: the number of its pin, -1 for none; weight: of
-    that, 0 for none; held: c m/dt^2 + weight [N/m]; mass [kg]."""
+    """Data of each vertex (n,) on the device.
+
+    Attributes:
+        pin_indices: index of its pin, -1 for none.
+        pin_weight: weight of the pin, 0 for none.
+        anchor_stiffness: c m/dt^2 + weight [N/m].
+        mass: [kg].
+    """
 
     pin: Any
     weight: Any
@@ -83,7 +108,7 @@ class Places(NamedTuple):
 
     @classmethod
     def of(cls, stream: Stream, system: System) -> Places:
-        """Those of a system."""
+        """Build the vertex data of a system."""
         n, pins = system.vertices, system.pins
         weight = np.zeros(n)
         weight[pins.vertices] = pins.weight
@@ -93,7 +118,7 @@ class Places(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PreparedXpbd(DeviceIterative):
-    """first (colours + 1,): of each colour's springs."""
+    """XPBD, prepared on a device; `colour_starts` (colours + 1,) are the first springs of the colours."""
 
     residual_of: ClassVar[ResidualOf] = "none"
 
@@ -110,29 +135,29 @@ class PreparedXpbd(DeviceIterative):
     own: ClassVar[bool] = False
 
     def stated(self, problem: StepProblem, guess: Positions) -> Step:
-        """See DeviceIterative; the guess is not used."""
+        """Upload a step problem; the initial guess is not used."""
         up, start = self.stream.upload, problem.start
         target, force, pins = up(problem.target), up(problem.force), pins_of(problem, self.stream)
         here = (up(start.positions), up(start.velocity)) if self.own else (target, target)
         return Step(target, force, target, pins, target, target, *here, (start.time, start.until))
 
     def iterating(self) -> DeviceIterating:
-        """See DeviceIterative."""
+        """Allocate the memory of a solve."""
         return Passes(self)
 
 
 class PreparedSmallSteps(PreparedXpbd):
-    """In small steps."""
+    """XPBD with small steps, prepared on a device."""
 
     own: ClassVar[bool] = True
 
     def iterating(self) -> DeviceIterating:
-        """See DeviceIterative."""
+        """Allocate the memory of a solve."""
         return SmallSteps(self)
 
 
 class _Iterating(DeviceIterating):
-    """x (n, 3): the reference [m]; u (n, 4): the displacement from it; compliance (n,): 1/held [m/N]."""
+    """State of a solve: reference x (n, 3) [m], displacement u (n, 4) [m], vertex compliance (n,) [m/N]."""
 
     def __init__(self, made: PreparedXpbd) -> None:
         n, stream = made.system.vertices, made.stream
@@ -142,43 +167,43 @@ class _Iterating(DeviceIterating):
         self.u, self.compliance = stream.empty((n, 4), made.real), stream.empty(n, made.real)
 
     def settled(self) -> Any:
-        """See DeviceIterating."""
+        """Return the current positions in rows (n, 3) [m], on the device."""
         self.run(moved, len(self.x), self.x, self.u, self.out)
         return self.out
 
     def run(self, kernel: Any, threads: int, *arguments: Any) -> None:
-        """Launch a kernel whose threads go through so many items."""
+        """Launch a kernel whose threads loop over `threads` items."""
         kernel[sums.blocks(threads), sums.THREADS, self.stream.queue](*arguments)
 
     def linearise(self) -> None:
-        """The springs at the reference, without tension."""
+        """Initialise the springs at the reference, with zero tensions."""
         count = int(self.made.first[-1])
         self.run(self.kernels.linearise, count, self.x, count, self.springs)
 
     def project(self) -> None:
-        """One pass over all springs."""
+        """Project all springs once."""
         for begin, end in zip(self.made.first[:-1].tolist(), self.made.first[1:].tolist(), strict=True):
             self.run(self.kernels.project, end - begin, begin, end, self.springs, self.compliance, self.u)
 
 
 class Passes(_Iterating):
-    """From where the vertices would go without springs."""
+    """State of an XPBD solve, which starts at the positions without springs."""
 
     def take(self, step: Step) -> None:
-        """See DeviceIterating."""
+        """Load a step that is on the device, and start to solve it."""
         n, places = len(self.x), self.made.places
         self.run(self.kernels.anchor, n, places, step.target, step.force, step.pins, self.x, self.u, self.compliance)
         self.linearise()
 
     def sweep(self, count: int) -> int:
-        """See DeviceIterating."""
+        """Launch iterations; return how many of them moved something."""
         for _ in range(count):
             self.project()
         return count
 
 
 class SmallSteps(_Iterating):
-    """The whole step in as many substeps as iterations were asked for so far, each time from its start."""
+    """State of a small-steps solve: the whole step, with one substep per iteration so far, from its start."""
 
     def __init__(self, made: PreparedXpbd) -> None:
         super().__init__(made)
@@ -188,19 +213,19 @@ class SmallSteps(_Iterating):
         self._step: Step
 
     def take(self, step: Step) -> None:
-        """See DeviceIterating."""
+        """Load a step that is on the device, and start to solve it."""
         self._substeps, self._step = 0, step
 
     def settled(self) -> Any:
-        """See DeviceIterating."""
+        """Return the current positions in rows (n, 3) [m], on the device."""
         return super().settled() if self._substeps else self._step.positions
 
     def speeds(self) -> Any:
-        """See DeviceIterating."""
+        """Return the final velocity in rows (n, 3) [m/s], on the device."""
         return self._v if self._substeps else self._step.velocity
 
     def sweep(self, count: int) -> int:
-        """See DeviceIterating."""
+        """Launch iterations; return how many of them moved something."""
         step, n, places = self._step, len(self.x), self.made.places
         self._substeps += count
         if not self._substeps:

@@ -1,10 +1,10 @@
-"""Kernels of XPBD: where vertices would go without springs, springs there, and how they move their ends.
+"""Kernels of XPBD: positions without springs, their initialisation, and the projection of springs.
 
     D = x_i - x_j,   w = u_i - u_j,   v = D + w,   |v| - r = (|D| - r) + (D + v).w / (|D| + |v|)
 
-x, where the vertices would go without springs, and |D| - r are float64, what the springs move from there, u, is of the
-kernels' type: float32 errs by a part of that, and of how far a spring is from its rest length. `ease` is computed where
-it is used.
+x, the positions without springs, and |D| - r are float64. The displacement u from there has the kernels' type: the
+error of float32 is relative to u and to the distance of a spring from its rest length. `ease` is computed where it is
+used.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Real = type[np.float32] | type[np.float64]
 
 
 class Kernels(NamedTuple):
-    """Of a precision: see each."""
+    """Kernels for one precision."""
 
     anchor: Any
     soften: Any
@@ -32,12 +32,12 @@ class Kernels(NamedTuple):
 
 @cache
 def kernels(real: Real) -> Kernels:
-    """Those that compute in `real`."""
+    """Build the kernels that compute in `real`."""
     zero, one, short = real(0.0), real(1.0), real(SHORT[real])
 
     @cuda.jit
     def anchor(places, target, force, pins, x, u, compliance):
-        """Write to x where the vertices would go without springs, y/held; u is 0 there."""
+        """Write the positions without springs, y/held, to x; set u to 0."""
         i = cuda.grid(1)
         while i < x.shape[0]:
             held, w, q = places.held[i], places.weight[i], places.pin[i]
@@ -52,7 +52,7 @@ def kernels(real: Real) -> Kernels:
 
     @cuda.jit
     def soften(places, h, u, compliance, gives):
-        """Write 1/held of a step of h [s], in `real` and in float64; u is 0."""
+        """Write 1/held for a step of h [s], in `real` and in float64; set u to 0."""
         i = cuda.grid(1)
         while i < gives.shape[0]:
             gives[i] = 1.0 / (places.mass[i] / (h * h) + places.weight[i])
@@ -63,7 +63,7 @@ def kernels(real: Real) -> Kernels:
 
     @cuda.jit
     def linearise(x, count, springs):
-        """Write D and |D| - r of `count` springs, and no tension."""
+        """Write D and |D| - r of `count` springs, and zero tensions."""
         e = cuda.grid(1)
         while e < count:
             i, j = springs.ends[e, 0], springs.ends[e, 1]
@@ -76,7 +76,7 @@ def kernels(real: Real) -> Kernels:
 
     @cuda.jit
     def project(begin, end, springs, compliance, u):
-        """Move both ends of the springs from `begin` to `end`, all of one colour."""
+        """Project the springs from `begin` to `end`, all of one colour, by moving both ends."""
         e = begin + cuda.grid(1)
         while e < end:
             i, j = springs.ends[e, 0], springs.ends[e, 1]
@@ -117,9 +117,13 @@ def moved(x, u, out):
 
 @cuda.jit
 def predict(h, left, places, start, pins, compliance, force, v, before, x, u):
-    """Write to x where the vertices would go without springs in a substep of h [s]; u is 0 there.
+    """Write the positions without springs in a substep of h [s] to x; set u to 0.
 
-    left: the part of the step that comes after it; start (n, 3), pins (q, 3): where pins move from, and to [m].
+    Args:
+        h: substep [s].
+        remaining_fraction: part of the step after this substep.
+        start_positions: (n, 3) [m], where pins start.
+        pin_targets: (q, 3) [m], where pins end.
     """
     i = cuda.grid(1)
     while i < x.shape[0]:
@@ -133,7 +137,7 @@ def predict(h, left, places, start, pins, compliance, force, v, before, x, u):
                 if math.isinf(w):
                     there = target
                 else:
-                    # What inertia alone would lead to, without the force that was added above.
+                    # Prediction by inertia alone, without the force that was added above.
                     there += compliance[i] * w * (target - here - h * v[i, c])
             x[i, c] = there
         i += cuda.gridsize(1)
@@ -141,7 +145,7 @@ def predict(h, left, places, start, pins, compliance, force, v, before, x, u):
 
 @cuda.jit
 def settle(h, before, x, u, v):
-    """The end of a substep: x + u is where it ends, and by that the velocity."""
+    """Finish a substep: it ends at x + u, which determines the velocity."""
     i = cuda.grid(1)
     while i < x.shape[0]:
         for c in range(3):

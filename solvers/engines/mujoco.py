@@ -68,13 +68,13 @@ class Mujoco(Engine):
     integrator: Integrator = "implicitfast"
 
     def built(self, network: Network, library: Any) -> tuple[_Model, str]:
-        """See Engine."""
+        """Build the network in the engine; return its stepper and a description."""
         model = library.MjModel.from_xml_string(mjcf(network, self.integrator))
         limit = _LIMIT.get(self.integrator, 2.0)
         return _Model(library, model, network), f"{self.integrator}, stable with springs while omega h < {limit:.2g}"
 
     def script(self, name: str, network: Network, problem: StepProblem, substeps: int, frames: int) -> dict[str, str]:
-        """See Engine."""
+        """Return scripts that repeat a motion from a step's start with the engine only, by file name."""
         load = "" if network.acceleration(problem.force) is not None else 'known["force"][known["free"]].ravel()'
         load = f"data.qfrc_applied[:] = {load}\n" if load else ""
         text = _SCRIPT.format(name=name, load=load, steps=substeps * frames)
@@ -89,7 +89,7 @@ class _Model:
         library.set_mju_user_warning(_unheard)  # it would write a file here
 
     def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
-        """See Stepping."""
+        """Integrate a step in `substeps` substeps; return positions [m] and velocities [m/s] at its end."""
         net, model, data, start = self._network, self._model, self._data, problem.start
         gravity = net.acceleration(problem.force)
         model.opt.timestep = net.time_step / substeps

@@ -83,14 +83,14 @@ class NewtonPhysics(Engine, OnDevice):
     colours: Colours = "springs"
 
     def prepare(self, system: System) -> PreparedEngine:
-        """See Engine."""
+        """Prepare the engine for a system; raise Unsupported for unsupported features."""
         with suppress(ImportError):  # which is told where Newton is asked for
             warp = import_module("warp")
             warp.config.log_level = warp.LOG_ERROR  # it tells of devices and of each module that it compiles
         return super().prepare(system)
 
     def built(self, network: Network, library: Any) -> tuple[_Model, str]:
-        """See Engine."""
+        """Build the network in the engine; return its stepper and a description."""
         if not self.iterations >= 1:
             raise Unsupported(f"newton-physics: iterations came as {self.iterations}; wanted 1 or more")
         warp = import_module("warp")
@@ -129,7 +129,7 @@ class NewtonPhysics(Engine, OnDevice):
         return {"vbd": solvers.SolverVBD, "xpbd": solvers.SolverXPBD}[self.method](model, iterations=self.iterations)
 
     def script(self, name: str, network: Network, problem: StepProblem, substeps: int, frames: int) -> dict[str, str]:
-        """See Engine."""
+        """Return scripts that repeat a motion from a step's start with the engine only, by file name."""
         made = {
             "vbd": f"SolverVBD(model, iterations={self.iterations})",
             "xpbd": f"SolverXPBD(model, iterations={self.iterations})",
@@ -163,7 +163,7 @@ class _Model:
         solver.step(self._now, self._then, None, None, network.time_step)  # compiles; each step sets its own state
 
     def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
-        """See Stepping."""
+        """Integrate a step in `substeps` substeps; return positions [m] and velocities [m/s] at its end."""
         net, start, h = self._network, problem.start, self._network.time_step / substeps
         _set(self._now.particle_q, start.positions)
         _set(self._now.particle_qd, start.velocity)

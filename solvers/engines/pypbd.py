@@ -70,14 +70,14 @@ class PyPbd(Engine):
     iterations: int = 1
 
     def built(self, network: Network, library: Any) -> tuple[_Model, str]:
-        """See Engine."""
+        """Build the network in the engine; return its stepper and a description."""
         if not self.iterations >= 1:
             raise Unsupported(f"pypbd: iterations came as {self.iterations}; wanted 1 or more")
         made = _Model(library, network, self.iterations)
         return made, f"{self.iterations} iterations a substep, in {made.precision}"
 
     def script(self, name: str, network: Network, problem: StepProblem, substeps: int, frames: int) -> dict[str, str]:
-        """See Engine."""
+        """Return scripts that repeat a motion from a step's start with the engine only, by file name."""
         _require_gravity(network, problem)
         given = {"time_step": network.time_step, "substeps": substeps, "iterations": self.iterations, "frames": frames}
         return {f"{name}.py": _SCRIPT.format(name=name, **given)}

@@ -66,12 +66,12 @@ class TaichiNewton(Engine):
     tolerance: float = 1e-6
 
     def prepare(self, system: System) -> PreparedEngine:
-        """See Engine."""
+        """Prepare the engine for a system; raise Unsupported for unsupported features."""
         os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
         return super().prepare(system)
 
     def built(self, network: Network, library: Any) -> tuple[_Model, str]:
-        """See Engine."""
+        """Build the network in the engine; return its stepper and a description."""
         if not self.iterations >= 1:
             raise Unsupported(f"taichi: iterations came as {self.iterations}; wanted 1 or more")
         if not 0.0 < self.tolerance < 1.0:
@@ -82,7 +82,7 @@ class TaichiNewton(Engine):
         return made, f"{self.iterations} iterations of Newton's method a substep, in float64, on one thread"
 
     def script(self, name: str, network: Network, problem: StepProblem, substeps: int, frames: int) -> dict[str, str]:
-        """See Engine."""
+        """Return scripts that repeat a motion from a step's start with the engine only, by file name."""
         given = {"tolerance": self.tolerance, "newton": self.iterations, "steps": substeps * frames}
         driver = _SCRIPT.format(name=name, h=network.time_step / substeps, **given)
         return {f"{name}.py": Path(taichi_program.__file__).read_text(encoding="utf-8") + driver}
@@ -107,7 +107,7 @@ class _Model:
         self._made.newton[None] = iterations
 
     def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
-        """See Stepping."""
+        """Integrate a step in `substeps` substeps; return positions [m] and velocities [m/s] at its end."""
         net, made, start = self._network, self._made, problem.start
         for field, values in ((made.x, start.positions), (made.v, start.velocity), (made.load, problem.force)):
             field.from_numpy(values)

@@ -70,7 +70,7 @@ class AggregatedJacobi:
     sweeps: int = 2
 
     def __post_init__(self) -> None:
-        """Raises ValueError."""
+        """Raise ValueError if a parameter is out of range."""
         require_sweeps(self.sweeps)
 
     def prepare(self, system: System) -> PreparedAggregatedJacobi:
@@ -141,15 +141,15 @@ class PreparedAggregatedJacobi(Iterative):
         self.facts = base.facts
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative."""
+        """Start a solve from an initial guess (n, 3) [m]."""
         return _Iterating(self, problem, guess)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """See Iterative."""
+        """Return the residual [J^(1/2)] at positions p (n, 3) [m]."""
         return self.measure.gauge(problem)(p)
 
     def scale(self, problem: StepProblem) -> float:
-        """See Iterative."""
+        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
         return self.base.scale(problem)
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
@@ -168,5 +168,5 @@ class _Iterating(Interpreted):
         self._gauge = prepared.measure.gauge(problem)
 
     def residual(self) -> float:
-        """See Iterating."""
+        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
         return self._gauge(self.positions)

@@ -62,7 +62,7 @@ class Admm:
     weight: float = 1.0
 
     def __post_init__(self) -> None:
-        """Raises ValueError."""
+        """Raise ValueError if a parameter is out of range."""
         if not 0.0 < self.weight < np.inf:
             raise ValueError(f"weight: should be positive and finite, not {self.weight}")
 
@@ -137,11 +137,11 @@ class PreparedAdmm(Iterative):
         self.choice, self.facts = base.choice, base.facts
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative."""
+        """Start a solve from an initial guess (n, 3) [m]."""
         return _Iterating(self, problem, guess)
 
     def scale(self, problem: StepProblem) -> float:
-        """See Iterative."""
+        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
         return self.measure.scale(problem)
 
 
@@ -162,7 +162,7 @@ class _Iterating(Iterating):
         self._right, self._u = np.empty_like(self.positions), np.zeros((len(edges.edges), 3))
 
     def advance(self) -> bool:
-        """See Iterating."""
+        """Do one iteration; return False if round-off prevents any further change."""
         kernels.project(*self._edges, self.positions, self._constant, self._u, self._right)
         self._base.correction(self._right, self.positions)
         return True

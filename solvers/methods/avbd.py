@@ -88,7 +88,7 @@ class AugmentedVertexBlockDescent:
     spectral_radius: float = 0.999
 
     def __post_init__(self) -> None:
-        """Raises ValueError."""
+        """Raise ValueError if a parameter is out of range."""
         for name, least, most in (("ramp", 0, np.inf), ("bound", 1, np.inf), ("decay", 0, 1), ("stabilisation", 0, 1)):
             if not least <= (came := getattr(self, name)) <= most:
                 wanted = f"from {least} to {most}" if most == 1 else f"at least {least}"
@@ -153,16 +153,16 @@ class PreparedAugmented(Iterative):
 
     @property
     def choice(self) -> str:
-        """See Prepared."""
+        """Description of the prepared solver."""
         return self.made.choice
 
     @property
     def facts(self) -> dict[str, float]:
-        """See Prepared."""
+        """Exact counts of the prepared data."""
         return self.made.facts
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative."""
+        """Start a solve from an initial guess (n, 3) [m]."""
         return Augmenting(self, problem, guess)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:

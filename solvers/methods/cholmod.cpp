@@ -1,6 +1,6 @@
-// Local-global steps as somebody writes them who cares: x, y, z of a vertex side by side, one loop over the springs that
-// scatters to both ends, nothing allocated in an iteration, and Q = L D L' by CHOLMOD (AMD or METIS, whichever fills
-// less; Chen, Davis, Hager, Rajamanickam 2008), whose columns are gone through once for all three coordinates.
+// Optimised local-global steps: x, y, z of a vertex are contiguous, one loop over the springs scatters to both ends, and
+// an iteration allocates nothing. Q = L D L' by CHOLMOD (AMD or METIS, whichever has less fill-in; Chen, Davis, Hager,
+// Rajamanickam 2008); a solve passes over its columns once for all three coordinates.
 
 #include <cholmod.h>
 
@@ -28,7 +28,7 @@ struct Steps {
         }
     }
 
-    // x = (L D L')^-1 x, the rows in the order of L.
+    // x = (L D L')^-1 x, with rows in the order of L.
     void solve() {
         const int *start = static_cast<int*>(L->p), *row = static_cast<int*>(L->i), *nz = static_cast<int*>(L->nz);
         const double* value = static_cast<double*>(L->x);
@@ -53,8 +53,8 @@ struct Steps {
 
 extern "C" {
 
-// edges: (m, 2); free: the f vertices that no exact pin holds; pinned, w: the q pins by penalty; inertia: M/dt^2.
-// Null where Q has no factor.
+// edges: (m, 2); free: the f vertices without exact pins; pinned, w: the q penalty pins; inertia: M/dt^2.
+// Returns null if Q has no factor.
 Steps* prepare(std::int64_t n, std::int64_t m, std::int64_t q, std::int64_t f, const std::int64_t* edges,
                const std::int64_t* pinned, const std::int64_t* free, const double* k, const double* rest,
                const double* inertia, const double* w) {
@@ -102,7 +102,7 @@ Steps* prepare(std::int64_t n, std::int64_t m, std::int64_t q, std::int64_t f, c
 
 void local(const Steps* made, std::int64_t, const double* p, const double* y, double* b) { made->local(p, y, b); }
 
-// The free rows alone.
+// Solves for the free rows only.
 void global_(Steps* made, std::int64_t f, const double* b, double* p) {
     const int* order = static_cast<int*>(made->L->Perm);
     for (std::int64_t v = 0; v < f; ++v)

@@ -43,13 +43,13 @@ class PreparedCholmod(PreparedLocalGlobal):
     """CHOLMOD local-global, prepared; iterations without residual checks stay in C++."""
 
     def begin(self, problem: StepProblem, guess: Positions) -> _Iterations:
-        """See Iterative."""
+        """Start a solve from an initial guess (n, 3) [m]."""
         return _Iterations(self, problem, guess)
 
 
 class _Iterations(Iterations):
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """See Iterating."""
+        """Run iterations within the limits; return their number, the residual and the reason of the end."""
         if limits.wanted == EACH or limits.iterations < 2:
             return super().iterate(limits)
         compiled = self.base.factor

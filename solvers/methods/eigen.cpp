@@ -1,4 +1,4 @@
-// What `solvers.methods.eigen` calls. Points come and go as x, y, z of one vertex after the other.
+// C interface for `solvers.methods.local_global.eigen_local_global`. Points are stored as x, y, z per vertex.
 
 #include "eigen.hpp"
 
@@ -8,7 +8,7 @@ using Out = Eigen::Map<Rows>;
 
 extern "C" {
 
-// Null where Q has no factor.
+// Returns null if Q has no factor.
 LocalGlobal* prepare(std::int64_t n, std::int64_t m, std::int64_t q, std::int64_t f, const std::int64_t* edges,
                      const std::int64_t* pinned, const std::int64_t* free, const double* k, const double* rest,
                      const double* mass_over_dt2, const double* w) {

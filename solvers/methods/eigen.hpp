@@ -1,4 +1,4 @@
-// Local-global steps as a course's assignment has them written, with Eigen's SimplicialLLT.
+// Local-global steps as in a course assignment, with Eigen's SimplicialLLT.
 //
 //     y = M target/dt^2 + f + w C'p_pin        once a step
 //     local step   d_e = r_e (A p)_e / |(A p)_e|

@@ -182,7 +182,7 @@ class HybridMethod:
         return self._lbfgs.begin(problem, p)
 
     def certifies(self, step: StepObjective, at: Point) -> bool:
-        """See Method."""
+        """Return whether the stationary point `at` is a minimum, as far as the method can determine."""
         return self._newton.certifies(step, at)
 
     def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:

@@ -73,7 +73,7 @@ class Jgs2:
     lateral: float = 0.03
 
     def __post_init__(self) -> None:
-        """Raises ValueError."""
+        """Raise ValueError if a parameter is out of range."""
         if self.rings < 0:
             raise ValueError(f"rings: should not be negative, not {self.rings}")
         if not 0.0 <= self.lateral <= 1.0:
@@ -238,7 +238,7 @@ class _Method:
         self._ways = [(way, PatchScratch.of(way)) for way in ways]
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
-        """See `solvers.core.descent.Method`."""
+        """Yield the points after `start`."""
         point = start
         while not point.stalled:
             point = self._next(step, point) or point._replace(stalled=True)

@@ -64,7 +64,7 @@ class Lbfgs(Windowed):
     sweeps: int = 2
 
     def __post_init__(self) -> None:
-        """Raises ValueError."""
+        """Raise ValueError if a parameter is out of range."""
         super().__post_init__()
         require_sweeps(self.sweeps)
         if self.preconditioner == "factor":
@@ -111,12 +111,12 @@ class _Prepared(Iterative):
         self.facts = base.facts
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative."""
+        """Start a solve from an initial guess (n, 3) [m]."""
         step = StepObjective(self._objective, problem)
         return _Iterating(self._metric, self._base, self._scheme, step, guess)
 
     def scale(self, problem: StepProblem) -> float:
-        """See Iterative."""
+        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
         return self._base.scale(problem)
 
 
@@ -130,5 +130,5 @@ class _Iterating(Interpreted):
         self._metric = metric
 
     def residual(self) -> float:
-        """See Iterating."""
+        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
         return self._metric.residual(self.gradient())

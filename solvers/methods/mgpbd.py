@@ -78,7 +78,7 @@ class MultigridXpbd:
     smoothed: bool = False
 
     def __post_init__(self) -> None:
-        """Raises ValueError."""
+        """Raise ValueError if a parameter is out of range."""
         for name, least in (("components", 0), ("setup", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: should be at least {least}, not {getattr(self, name)}")

@@ -100,7 +100,7 @@ class NewtonMethod:
             yield point
 
     def certifies(self, step: StepObjective, at: Point) -> bool:
-        """See Method."""
+        """Return whether the stationary point `at` is a minimum, as far as the method can determine."""
         return certified(step, at.positions)
 
     def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:

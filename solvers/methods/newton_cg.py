@@ -176,14 +176,14 @@ class _Newton(Iteration):
         self.d, self.p, self._r, self._z = np.zeros_like(descent), np.zeros_like(descent), -gradient, -descent
 
     def turn(self, product: float, before: float) -> float:
-        """See Iteration."""
+        """Update the search direction p; return p'Ap."""
         self.p *= product / before
         self.p += self._z
         self._product = self._hessian.multiply(self.p)
         return dot(self.p, self._product)
 
     def go(self, product: float, curvature: float) -> float:
-        """See Iteration."""
+        """Update the iterate, r and z; return r'z."""
         length = product / curvature
         self.d += length * self.p
         self._r -= length * self._product
@@ -191,11 +191,11 @@ class _Newton(Iteration):
         return dot(self._r, self._z)
 
     def convex(self, curvature: float) -> bool:
-        """See Iteration."""
+        """Return whether the curvature along p is positive."""
         return not curvature <= 0.0
 
     def near(self, product: float) -> bool:
-        """See Iteration."""
+        """Return whether r'z has reached the tolerance."""
         return product <= self._limit
 
 
@@ -218,7 +218,7 @@ class _Compiled:
     def direction(
         self, hessian: Hessian, solve: Preconditioner, at: Point, descent: Positions, eta: float
     ) -> Positions:
-        """See `TruncatedNewton._direction`."""
+        """Solve H d = -g approximately; `descent` is the preconditioned gradient."""
         d = np.empty_like(descent)
         shrunk = solve.shrunk if isinstance(solve, Scaled) else None
         solving = self._factor, self._threads(), self._held, shrunk

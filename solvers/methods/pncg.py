@@ -84,11 +84,11 @@ class PreparedPncg(Iterative):
     facts: dict[str, float]
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative."""
+        """Start a solve from an initial guess (n, 3) [m]."""
         return _Iterating(self.metric, self.at, StepObjective(self.objective, problem), guess)
 
     def scale(self, problem: StepProblem) -> float:
-        """See Iterative."""
+        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
         return largest(problem) * self.metric.trace**0.5
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
@@ -118,7 +118,7 @@ class _Iterating(Iterating):
         self._z = self._solve(at.gradient)
 
     def advance(self) -> bool:
-        """See Iterating."""
+        """Do one iteration; return False if round-off prevents any further change."""
         at, z = self._at, self._z
         if not dot(at.gradient, z) > self._metric.round_off(at.positions):
             return False
@@ -144,7 +144,7 @@ class _Iterating(Iterating):
         return search(self._step, self._at, direction, first=-slope / curvature)
 
     def residual(self) -> float:
-        """See Iterating."""
+        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
         gradient = self._at.gradient
         if self._solve == self._metric.solve:
             return self._metric.norm(self._z.copy(), gradient)

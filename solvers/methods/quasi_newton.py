@@ -86,7 +86,7 @@ class Windowed:
     precision: Precision = "float64"
 
     def __post_init__(self) -> None:
-        """Raises ValueError."""
+        """Raise ValueError if a parameter is out of range."""
         require_pairs(self.pairs)
 
 
@@ -108,11 +108,11 @@ class PreparedAccelerated(Iterative):
         return self.base.choice
 
     def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
-        """See Iterative."""
+        """Start a solve from an initial guess (n, 3) [m]."""
         return self.engine.begin(problem, guess)
 
     def scale(self, problem: StepProblem) -> float:
-        """See Iterative."""
+        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
         return largest(problem) * self.base.trace**0.5
 
 
@@ -138,7 +138,7 @@ class _Compiled:
         return accelerate_step.Step(self._plan, self._bundles, self._form, self._shares, self._rows, *vectors), window
 
     def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
-        """See Engine."""
+        """Start a solve from an initial guess (n, 3) [m]."""
         state = self._idle.pop() if self._idle else self._new()
         edges, given = self._parts.begun(self._edges, problem), (problem, guess)
         return _CompiledAccelerating(self._idle, state, self._parts, edges, *given)
@@ -171,24 +171,24 @@ class _CompiledAccelerating(Accelerating):
         step.objective[1] += parts.size(guess)
 
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """See Iterating."""
+        """Run iterations within the limits; return their number, the residual and the reason of the end."""
         return accelerate_step.run(*self._state, limits, self.positions)
 
     def advance(self) -> bool:
-        """See Iterating."""
+        """Do one iteration; return False if round-off prevents any further change."""
         return self.iterate(ONE)[0] == 1
 
     def residual(self) -> float:
-        """See Iterating."""
+        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
         return self.iterate(at_most(0))[1]
 
     @property
     def fallen(self) -> float:
-        """See Accelerating."""
+        """Decrease of the objective so far [J], unless round-off hides it."""
         return float(self._state[-1].now["fallen"][0])
 
     def gradient(self) -> Positions:
-        """See Accelerating."""
+        """Return the gradient of the objective (n, 3) [N] at the current point."""
         step, _, window = self._state
         out = np.empty_like(self.positions)
         step_ends.fetch(step.rows, window.descent, out)
@@ -205,5 +205,5 @@ class _Any:
         self._scheme, self._base, self._objective = scheme, base, Objective(system)
 
     def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
-        """See Engine."""
+        """Start a solve from an initial guess (n, 3) [m]."""
         return Interpreted(self._base, self._scheme, StepObjective(self._objective, problem), guess)

@@ -76,7 +76,7 @@ class VertexBlockDescent(Precise):
     spectral_radius: float = 0.999
 
     def __post_init__(self) -> None:
-        """Raises ValueError."""
+        """Raise ValueError if a parameter is out of range."""
         super().__post_init__()
         if not 0.0 <= self.spectral_radius < 1.0:
             raise ValueError(f"spectral_radius: should be at least 0 and less than 1, not {self.spectral_radius}")
@@ -153,7 +153,7 @@ class PreparedVertexBlockDescent(Iterative):
         return self.measure.facts
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative."""
+        """Start a solve from an initial guess (n, 3) [m]."""
         sweeps = Sweeps(self, problem, guess)
         if not any(map(is_bounded, self.system.energies)):
             return sweeps
@@ -174,7 +174,7 @@ class PreparedVertexBlockDescent(Iterative):
         return self.measure.gauge(problem)(p)
 
     def scale(self, problem: StepProblem) -> float:
-        """See Iterative."""
+        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
         return largest(problem) * float(self.majorant[self.system.unpinned].sum()) ** 0.5
 
     def in_rows(self, x: Positions) -> NDArray[np.float64]:
@@ -210,12 +210,12 @@ class Sweeps(Iterating):
         self._rows, self.positions = p, guess
 
     def advance(self) -> bool:
-        """See Iterating."""
+        """Do one iteration; return False if round-off prevents any further change."""
         self.sweep(1)
         return True
 
     def residual(self) -> float:
-        """See Iterating."""
+        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
         return self._gauge(self.positions)
 
     def alone(self, p: Positions) -> Positions:

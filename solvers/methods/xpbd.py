@@ -130,12 +130,12 @@ class Passes(Iterating):
         self._prepared, self.tension, self.positions = prepared, np.zeros_like(prepared.ease), p
 
     def advance(self) -> bool:
-        """See Iterating."""
+        """Do one iteration; return False if round-off prevents any further change."""
         self.iterate(ONE)
         return True
 
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """See Iterating."""
+        """Run iterations within the limits; return their number, the residual and the reason of the end."""
         made = self._prepared
         kernels.iterate(made.constraints, made.ease, made.compliance, self.tension, self.positions, limits.iterations)
         return limits.iterations, float("nan"), ITERATIONS

@@ -54,11 +54,11 @@ class Body(Generator):
     SPRINGS: ClassVar[int] = 4
 
     def count(self, size: int) -> int:
-        """See Generator."""
+        """Return the number of vertices of a mesh of this size."""
         return size * (_rows(size) - 1) + 2
 
     def generate(self, size: int) -> Mesh:
-        """See Generator."""
+        """Generate the mesh of a valid size."""
         along: Points = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(_OUTLINE, axis=0), axis=1))])
         places: Points = np.linspace(0.0, float(along[-1]), _rows(size) + 1)
         y, across, deep = (self.height * _between(places, along, column) for column in _OUTLINE.T)

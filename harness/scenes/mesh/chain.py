@@ -34,11 +34,11 @@ class Chain(Generator):
     SPRINGS: ClassVar[int] = 1
 
     def count(self, size: int) -> int:
-        """See Generator."""
+        """Return the number of vertices of a mesh of this size."""
         return size
 
     def generate(self, size: int) -> Mesh:
-        """See Generator."""
+        """Generate the mesh of a valid size."""
         direction = np.array(self.direction) / np.max(np.abs(self.direction))
         direction /= np.linalg.norm(direction)
         rest = np.linspace(0.0, self.length, size)[:, None] * direction

@@ -64,14 +64,14 @@ class Grid(_Sheet):
     SPRINGS: ClassVar[int] = 4
 
     def count(self, size: int) -> int:
-        """See Generator."""
+        """Return the number of vertices of a mesh of this size."""
         return size * self._rows(size)
 
     def _rows(self, size: int) -> int:
         return cells(self.height, self.width / (size - 1)) + 1
 
     def generate(self, size: int) -> Mesh:
-        """See Generator."""
+        """Generate the mesh of a valid size."""
         rows = self._rows(size)
         index = np.arange(rows * size).reshape(rows, size)
         down, across = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, size), indexing="ij")
@@ -109,7 +109,7 @@ class Net(_Sheet):
     SPRINGS: ClassVar[int] = 2
 
     def count(self, size: int) -> int:
-        """See Generator."""
+        """Return the number of vertices of a mesh of this size."""
         meshes = self._meshes(size)
         return size * (meshes + 1) + (size - 1) * meshes
 
@@ -118,7 +118,7 @@ class Net(_Sheet):
         return cells(self.height, self.width / (size - 1))
 
     def generate(self, size: int) -> Mesh:
-        """See Generator."""
+        """Generate the mesh of a valid size."""
         meshes, period = self._meshes(size), 2 * size - 1
         full = period * np.arange(meshes + 1)[:, None] + np.arange(size)
         short = period * np.arange(meshes)[:, None] + np.arange(size, period)

@@ -183,7 +183,7 @@ def _contains(rest: Points, large: Indices, small: Indices) -> NDArray[np.bool_]
 
 
 def _projected(rest: Points, corners: Indices) -> tuple[Points, Points]:
-    """Project corners (f, k) to the plane of the vector area, (f, k, 2) [m]; and the round-off (f,) of twice the area."""
+    """Project corners (f, k) to the plane of the vector area, (f, k, 2) [m]; and round-off (f,) of twice the area."""
     p = rest[corners]
     farthest = np.abs(p).max(axis=(1, 2))
     p = p - p[:, :1]

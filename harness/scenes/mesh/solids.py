@@ -35,11 +35,11 @@ class Tower(Generator):
     SPRINGS: ClassVar[int] = 4
 
     def count(self, size: int) -> int:
-        """See Generator."""
+        """Return the number of vertices of a mesh of this size."""
         return 4 * (size + 1)
 
     def generate(self, size: int) -> Mesh:
-        """See Generator."""
+        """Generate the mesh of a valid size."""
         index = np.arange(4 * (size + 1)).reshape(size + 1, 4)
         closed = np.column_stack([index, index[:, 0]])
         up = np.linspace(0, 1, size + 1)[:, None]
@@ -92,7 +92,7 @@ class Block(Generator):
     SPRINGS: ClassVar[int] = 12
 
     def count(self, size: int) -> int:
-        """See Generator."""
+        """Return the number of vertices of a mesh of this size."""
         return math.prod(self._shape(size))
 
     def _sides(self) -> tuple[float, float, float]:
@@ -105,7 +105,7 @@ class Block(Generator):
         return x, y, z
 
     def generate(self, size: int) -> Mesh:
-        """See Generator."""
+        """Generate the mesh of a valid size."""
         shape = self._shape(size)
         index = np.arange(math.prod(shape)).reshape(shape)
         along = [np.linspace(0, 1, n) for n in shape]

@@ -30,11 +30,11 @@ class Stack(Grid):
     COUNTS: ClassVar[str] = "vertices along the width of each layer"
 
     def count(self, size: int) -> int:
-        """See Generator."""
+        """Return the number of vertices of a mesh of this size."""
         return self.layers * super().count(size)
 
     def generate(self, size: int) -> Mesh:
-        """See Generator."""
+        """Generate the mesh of a valid size."""
         one = super().generate(size)
         n, middle = len(one.rest), one.rest.mean(axis=0)
         normal = np.array([0.0, 1.0, 0.0] if self.plane == "horizontal" else [0.0, 0.0, 1.0])

@@ -25,11 +25,11 @@ class Star(Generator):
     SPRINGS: ClassVar[int] = 1
 
     def count(self, size: int) -> int:
-        """See Generator."""
+        """Return the number of vertices of a mesh of this size."""
         return size + 1
 
     def generate(self, size: int) -> Mesh:
-        """See Generator."""
+        """Generate the mesh of a valid size."""
         angle = 2.0 * np.pi * np.arange(size) / size
         circle = self.radius * np.stack([np.cos(angle), np.zeros(size), np.sin(angle)], axis=1)
         rest = np.concatenate([np.zeros((1, 3)), circle])

@@ -42,7 +42,7 @@ class Skirt(Generator):
     SPRINGS: ClassVar[int] = 4
 
     def count(self, size: int) -> int:
-        """See Generator."""
+        """Return the number of vertices of a mesh of this size."""
         return size * (self._cells(size)[0] + 1)
 
     def _cells(self, size: int) -> tuple[int, float]:
@@ -53,7 +53,7 @@ class Skirt(Generator):
         return rows, math.sqrt(around * slant / rows)
 
     def generate(self, size: int) -> Mesh:
-        """See Generator."""
+        """Generate the mesh of a valid size."""
         rows, spacing = self._cells(size)
         index = np.arange((rows + 1) * size).reshape(rows + 1, size)
         closed = np.column_stack([index, index[:, 0]])
@@ -95,11 +95,11 @@ class Balloon(Generator):
     SPRINGS: ClassVar[int] = 3
 
     def count(self, size: int) -> int:
-        """See Generator."""
+        """Return the number of vertices of a mesh of this size."""
         return 10 * size**2 + 2
 
     def generate(self, size: int) -> Mesh:
-        """See Generator."""
+        """Generate the mesh of a valid size."""
         corners, faces = _icosahedron()
         index, weights, cells_of_face = _geodesic(faces, size)
         rest = np.empty((self.count(size), 3))
