@@ -55,7 +55,8 @@ def kernels(real: Any) -> Kernels:
     ):  # fmt: skip
         """Return the force [N] on a lane's vertex at displacement u0, u1, u2, and its block [N/m].
 
-        The block is stored as its upper triangle. Also return whether a spring has zero length; such a spring does not contribute to the block.
+        The block is stored as its upper triangle. Also return whether a spring has zero length;
+        such a spring does not contribute to the block.
         """
         lane, h = t % LANES, held[t]
         f0, f1, f2 = force[0, t] - h * u0, force[1, t] - h * u1, force[2, t] - h * u2

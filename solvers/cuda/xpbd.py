@@ -1,7 +1,7 @@
 """XPBD on a device: the iterates of `solvers.methods.position_based.xpbd`, with one launch per colour.
 
-Each thread processes one spring. No two springs of a colour share a vertex, so no thread writes what another reads. `solvers.cuda.xpbd_kernels` documents
-the precision of each quantity.
+Each thread processes one spring. No two springs of a colour share a vertex, so no thread writes what another reads.
+`solvers.cuda.xpbd_kernels` documents the precision of each quantity.
 """
 
 from __future__ import annotations

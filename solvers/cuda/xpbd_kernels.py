@@ -37,7 +37,7 @@ def kernels(real: Real) -> Kernels:
 
     @cuda.jit
     def anchor(places, target, force, pins, x, u, compliance):
-        """Write the positions without springs, y/held, to x; set u to 0."""
+        """Write the positions without springs, y/q, to x; set u to 0."""
         i = cuda.grid(1)
         while i < x.shape[0]:
             held, w, q = places.held[i], places.weight[i], places.pin[i]
@@ -52,7 +52,7 @@ def kernels(real: Real) -> Kernels:
 
     @cuda.jit
     def soften(places, h, u, compliance, gives):
-        """Write 1/held for a step of h [s], in `real` and in float64; set u to 0."""
+        """Write 1/q for a step of h [s], in `real` and in float64; set u to 0."""
         i = cuda.grid(1)
         while i < gives.shape[0]:
             gives[i] = 1.0 / (places.mass[i] / (h * h) + places.weight[i])

@@ -1,6 +1,6 @@
-// Optimised local-global steps: x, y, z of a vertex are contiguous, one loop over the springs scatters to both ends, and
-// an iteration allocates nothing. Q = L D L' by CHOLMOD (AMD or METIS, whichever has less fill-in; Chen, Davis, Hager,
-// Rajamanickam 2008); a solve passes over its columns once for all three coordinates.
+// Optimised local-global steps: x, y, z of a vertex are contiguous, one loop over the springs scatters to both ends,
+// and an iteration allocates nothing. Q = L D L' by CHOLMOD (AMD or METIS, whichever has less fill-in; Chen, Davis,
+// Hager, Rajamanickam 2008); a solve passes over its columns once for all three coordinates.
 
 #include <cholmod.h>
 

@@ -4,8 +4,8 @@
 //     local step   d_e = r_e (A p)_e / |(A p)_e|
 //     global step  Q p = A'K d + y             Q = A'K A + M/dt^2 + w C'C, factorised once
 //
-// Plain code on purpose: Eigen's matrices of doubles, column by column as they come (p is n x 3), products of sparse
-// matrices, one loop over the springs.
+// Deliberately plain: Eigen matrices of doubles in their default column-major order (p is n x 3), sparse matrix
+// products, one loop over the springs.
 
 #pragma once
 
@@ -25,7 +25,7 @@ inline Sparse matrix(std::int64_t rows, std::int64_t columns, const std::vector<
     return built;
 }
 
-// The matrix that picks some of n rows.
+// Selection matrix for some of n rows.
 inline Sparse selection(const std::int64_t* rows, std::int64_t count, std::int64_t n) {
     std::vector<Triplet> entries;
     for (std::int64_t i = 0; i < count; ++i) entries.emplace_back(i, rows[i], 1.0);
@@ -34,7 +34,7 @@ inline Sparse selection(const std::int64_t* rows, std::int64_t count, std::int64
 
 class LocalGlobal {
 public:
-    // edges: (m, 2); free: the f vertices that no exact pin holds; pinned, w: the q pins by penalty; inertia: M/dt^2.
+    // edges: (m, 2); free: the f vertices without exact pins; pinned, w: the q penalty pins; inertia: M/dt^2.
     LocalGlobal(std::int64_t n, std::int64_t m, std::int64_t q, std::int64_t f, const std::int64_t* edges,
                 const std::int64_t* pinned, const std::int64_t* free, const double* k, const double* rest,
                 const double* mass_over_dt2, const double* w)

@@ -5,9 +5,9 @@ iteration linearises all springs, solves for the increments of their tensions t,
 
     (J W J' + K^-1) dt = C(p) - K^-1 t,    p <- p - W J' dt,   t <- t + dt
 
-with C the elongations of the springs (m,), J its derivative, a row n_e at i and -n_e at j, and W = 1/held the
-compliance of the vertices (`solvers.methods.base.vertex_terms`). This is the paper's formula in terms of forces,
-lambda = -t dt^2. It is solved for s = K^-1/2 t instead, which avoids a division by a stiffness:
+with C the elongations of the springs (m,), J its derivative, a row n_e at i and -n_e at j, and W = 1/q the compliance
+of the vertices (`solvers.methods.base.vertex_terms`). This is the paper's formula in terms of forces, lambda = -t dt^2.
+It is solved for s = K^-1/2 t instead, which avoids a division by a stiffness:
 
     A ds = b,    A = G o (N N'),    G = I + K^1/2 A_s W A_s' K^1/2,    b = K^1/2 C(p) - s
 
@@ -123,7 +123,7 @@ class PreparedMultigridXpbd(Iterative):
         root_stiffness: square roots of the stiffnesses (m,).
         rest_length: (m,) [m].
         rest_direction: (m, 3).
-        vertex_compliance: 1/held (n,) [m/N].
+        vertex_compliance: 1/q (n,) [m/N].
     """
 
     residual_of: ClassVar[ResidualOf] = "none"

@@ -1,14 +1,15 @@
 """Vertex block descent (Chen, Liu, Yang and Yuksel 2024): one Newton step per vertex, one vertex after another.
 
-    B_i d_i = -grad_i g(p),   p_i += d_i,   B_i = held_i I + sum over its springs of k (nn' + max(0, 1 - r/l) (I - nn'))
+    B_i d_i = -grad_i g(p),   p_i += d_i,   B_i = q_i I + sum over its springs of k (nn' + max(0, 1 - r/l) (I - nn'))
 
-with n the direction and l the length of a spring. Compressed springs lose their negative lateral curvature, so B_i is
-positive definite. A quadratic form adds its diagonal entry. Contact adds its exact second derivatives, since it acts on
-single vertices. A projective energy of elements (strain limits, dashpots) adds those of the vertex's elements. The
-paper has no line search. Here a step that would raise the energy is replaced by that of the majorant
-(held_i + sum of k) I, which cannot raise it; hence no sweep raises the objective. Energies without such a majorant,
-that is, energies that are not projective, are not supported. `device: cuda` computes the same iterates in
-`solvers.cuda.device_vbd`. Vertices are processed by colour: no spring, form or element joins two of the same colour.
+with n the direction and l the length of a spring, and q the anchor stiffness (inertia and penalty pins). Compressed
+springs lose their negative lateral curvature, so B_i is positive definite. A quadratic form adds its diagonal entry.
+Contact adds its exact second derivatives, since it acts on single vertices. A projective energy of elements (strain
+limits, dashpots) adds those of the vertex's elements. The paper has no line search. Here a step that would raise the
+energy is replaced by that of the majorant (q_i + sum of k) I, which cannot raise it; hence no sweep raises the
+objective. Energies without such a majorant, that is, energies that are not projective, are not supported. `device:
+cuda` computes the same iterates in `solvers.cuda.device_vbd`. Vertices are processed by colour: no spring, form or
+element joins two of the same colour.
 
     p_{k+1} = w_{k+1} (sweep(p_k) - p_{k-1}) + p_{k-1},    w_1 = 1,  w_2 = 2/(2 - rho^2),  w_{k+1} = 4/(4 - rho^2 w_k),
 

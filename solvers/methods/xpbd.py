@@ -4,11 +4,12 @@ XPBD (Macklin, Mueller and Chentanez 2016) starts at the positions without sprin
 passes over all springs and moves the two ends of each spring, so that its accumulated tension t becomes
 k (|p_i - p_j| - r):
 
-    dt = (k (|p_i - p_j| - r) - t) / (1 + k (1/held_i + 1/held_j)),    p_i -= dt/held_i n,    p_j += dt/held_j n
+    dt = (k (|p_i - p_j| - r) - t) / (1 + k (1/q_i + 1/q_j)),    p_i -= dt/q_i n,    p_j += dt/q_j n
 
-with n the direction of the spring and held = c m/dt^2 + w, so that pins of any weight need no separate constraints (see
-`solvers.methods.base.vertex_terms`). This is the paper's formula in terms of forces, lambda = -t dt^2, and valid from
-k = 0 to the largest k. Small steps (Macklin et al. 2019) divides the time step instead, with one iteration per substep.
+with n the direction of the spring and q = c m/dt^2 + w the anchor stiffness of a vertex, so that pins of any weight
+need no separate constraints (see `solvers.methods.base.vertex_terms`). This is the paper's formula in terms of forces,
+lambda = -t dt^2, and valid from k = 0 to the largest k. Small steps (Macklin et al. 2019) divides the time step
+instead, with one iteration per substep.
 
 Neither minimises the objective of the step. Tensions are accumulated along directions that rotate during the iteration,
 without correction terms. The fixed point is the minimiser if springs do not rotate (a straight chain), and close to it
@@ -105,7 +106,7 @@ class PreparedXpbd(Iterative):
 
     Attributes:
         coloured_constraints: the springs by colour.
-        vertex_compliance: 1/held (n,) [m/N].
+        vertex_compliance: 1/q (n,) [m/N].
         constraint_relaxation: (m,), documented with the kernels.
     """
 
@@ -199,7 +200,7 @@ def _prepared(
 def _eased(
     constraints: kernels.Constraints, held: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compute the compliance 1/held (n,) [m/N], and the relative displacement of each spring (m,)."""
+    """Compute the compliance 1/q (n,) [m/N], and the relative displacement of each spring (m,)."""
     compliance = 1.0 / held
     i, j = constraints.ends.T
     return compliance, 1.0 / (1.0 + constraints.stiffness * (compliance[i] + compliance[j]))
