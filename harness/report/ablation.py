@@ -139,7 +139,10 @@ def ablation_table(rows: Sequence[Row]) -> Table:
 
 
 def price_table(rows: Sequence[Row]) -> Table:
-    """Build a table of overheads: one row per effect, one column per solver, each with its lower bound."""
+    """Build a table of overheads with one row per effect and one column per solver.
+
+    Each overhead is followed by its lower bound.
+    """
     found = {(row["name"], row["solver"]): row for row in of_kind(rows, "price")}
     effects, solvers = (list(dict.fromkeys(key[k] for key in found)) for k in (0, 1))
     table = Table(box=SIMPLE_HEAD, title="an iteration with the effect over one without", caption=PRICES)

@@ -1,8 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Plot of an ablation: cost of each effect on the x-axis, largest displacement without it on the y-axis.
+"""Plot of an ablation: cost of effects against the displacement without them.
 
-Effects below the error lines change less than the error that the scene has in any case.
+The x-axis shows the cost of each effect, the y-axis the largest displacement without it. Effects below the error lines
+change less than the error that the scene has in any case.
 """
 
 from __future__ import annotations
@@ -60,7 +61,10 @@ def draw_ablation(rows: Sequence[Row], path: Path) -> None:
 
 
 def _errors(ax: Axes, rows: Sequence[Row], points: Sequence[Row]) -> None:
-    """Draw the error lines, set limits that contain all points, and shade the region below both errors."""
+    """Draw the error lines and shade the region below both errors.
+
+    The limits of the y-axis contain all errors and points.
+    """
     known = [row for row in of_kind(rows, "error") if row["status"] == "ok"]
     values = [max(row["largest"], _NOTHING) for row in (*known, *points)]
     low, high = min(values, default=1e-3) / 4.0, max(values, default=1.0) * 4.0

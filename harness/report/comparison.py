@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Side-by-side pictures of solvers: final frames per scene and size, with one camera, one scale, and their costs."""
+"""Side-by-side pictures of solvers: final frames and costs.
+
+For each scene and size, all frames share one camera and one scale.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +45,10 @@ _HEADING, _CAPTION, _GAP = 26, 104, 16
 
 
 class _Grid(NamedTuple):
-    """Layout of the panels and of the tiles within a panel; `width` and `height` of a tile [pixels]."""
+    """Layout of the panels and of the tiles within a panel.
+
+    `width` and `height` are those of a tile [pixels].
+    """
 
     panel_columns: int
     tile_columns: int
@@ -51,9 +57,10 @@ class _Grid(NamedTuple):
 
 
 def draw_comparison(replays: Mapping[str, Replay], path: Path) -> None:
-    """Draw the final frames of several runs as one PNG picture, PAGE_WIDTH pixels wide, at most PAGE_HEIGHT high.
+    """Draw the final frames of several runs as one PNG picture.
 
-    Distances refer to the run with the lowest residual of each scene and size.
+    The picture is PAGE_WIDTH pixels wide and at most PAGE_HEIGHT high. Distances refer to the run with the lowest
+    residual of each scene and size.
 
     Args:
         replays: runs by label; the label is shown where the solver's name is ambiguous.
@@ -102,7 +109,10 @@ def _shape(finite: Sequence[Replay]) -> float:
 
 
 def _layout(panels: int, tiles: int, aspect: float) -> _Grid:
-    """Return the grid that shows scenes of this aspect ratio largest, with a penalty for empty cells."""
+    """Return the grid that shows scenes of this aspect ratio largest.
+
+    Empty cells are penalised.
+    """
 
     def grid(panel_columns: int, tile_columns: int) -> _Grid:
         columns = panel_columns * tile_columns
@@ -140,7 +150,7 @@ def _panel(
     grid: _Grid,
     looks: Mapping[str, Mark],
 ) -> None:
-    """Draw the tiles of one scene and size row by row, all with the same camera."""
+    """Draw the tiles of one scene and size with the same camera."""
     finite = [replay for _, replay in panel if _ends_finite(replay)]
     points = np.concatenate([r.positions[-1][framed(r, [-1])] for r in finite] or [np.zeros((1, 3))])
     areas = np.concatenate([area_vectors(r, -1) for r in finite] or [np.zeros((0, 3))])
@@ -200,7 +210,10 @@ def _ends_finite(replay: Replay) -> bool:
 
 
 def _distance(replay: Replay, reference: Replay) -> float:
-    """Return the largest vertex distance [mean rest lengths]; NaN if the runs end in different frames or non-finite."""
+    """Return the largest vertex distance [mean rest lengths].
+
+    The result is NaN if the runs end in different frames or non-finite.
+    """
     comparable = (
         _ends_finite(replay)
         and _ends_finite(reference)

@@ -1,8 +1,8 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords, and PyVista is only partly typed.
-"""Gallery of scenes: one tile per scene with its name and effects, and the provenance at the foot.
+"""Gallery of scenes: one tile per scene with its name and effects.
 
-All text of one kind has one size.
+The provenance is stated at the foot of the sheet. All text of one kind has one size.
 """
 
 from __future__ import annotations
@@ -59,7 +59,9 @@ class Tile:
 
 
 def draw_sheet(tiles: Sequence[Tile], path: Path, facts: Sequence[str] = ()) -> None:
-    """Draw the tiles row by row as a PNG file, with facts, processor and commit at the foot.
+    """Draw the gallery as a PNG file, tile by tile.
+
+    Facts, processor and commit are stated at the foot.
 
     Args:
         tiles: scenes in the order in which they are drawn.
@@ -87,7 +89,10 @@ def draw_sheet(tiles: Sequence[Tile], path: Path, facts: Sequence[str] = ()) -> 
 
 
 def abreast(count: int) -> int:
-    """Return the number of columns that leaves the fewest cells empty; ties go to the number closest to 4."""
+    """Return the number of columns that leaves the fewest cells empty.
+
+    Among equal choices it is the number closest to 4.
+    """
     if count < _FEWEST:
         return max(count, 1)
     return min(range(_FEWEST, _MOST + 1), key=lambda columns: (-count % columns, abs(columns - 4)))
@@ -98,7 +103,7 @@ def _words(tile: Tile) -> str:
 
 
 def _lines(effects: str, width: int) -> list[tuple[str, int, float, str]]:
-    """Wrap the effects into at most two lines, each with its vertical offset, size and colour."""
+    """Wrap the effects into at most two lines with offset, size and colour."""
     lines = wrap(effects, int(width / 7.2), max_lines=2, placeholder=" …")
     return [(words, 40 + 16 * k, 10.0, MUTED) for k, words in enumerate(lines)]
 

@@ -1,4 +1,6 @@
-"""Speedup of a CUDA device, from the rows of a sweep: time to a residual, compared with the processor of that computer.
+"""Speedup of a CUDA device over the processor of the same computer.
+
+It compares times to a residual, from the rows of a sweep:
 
     time(errors, vertices) = min over solvers of the median wall seconds of a step, for runs whose every step converged
 
@@ -63,7 +65,10 @@ from rows_of group by run_id order by any_value("size"), any_value(solver), run_
 
 
 class Pair(NamedTuple):
-    """The fastest run on each side for one residual and one mesh; None where no run reached the residual."""
+    """The fastest run on each side for one residual and one mesh.
+
+    A side is None if none of its runs reached the residual.
+    """
 
     vertices: int
     there: Run | None
@@ -91,7 +96,10 @@ def runs(table: pa.Table) -> list[Run]:
 
 
 def _on_one(run: Run) -> Run:
-    """Mark a run in the simulator as unsupported, because its times are not those of a device."""
+    """Mark a run in the simulator as unsupported.
+
+    Its times are not those of a device.
+    """
     return run._replace(status="unsupported", reason=SIMULATED) if run.device == SIMULATED else run
 
 
@@ -121,7 +129,10 @@ def _pair(vertices: int, mine: Sequence[Run]) -> Pair:
 
 
 def pays_from(compared: Sequence[Pair]) -> Pair | None:
-    """Return the smallest mesh from which on the device is faster wherever both sides converged, or None."""
+    """Return the smallest mesh from which on the device is faster, or None.
+
+    Only meshes where both sides converged count.
+    """
     both = [pair for pair in compared if pair.ratio is not None]
     first = None
     for pair in reversed(both):

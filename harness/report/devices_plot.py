@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Plot of device speedups: seconds of a step against vertices, the fastest run of each side, per residual."""
+"""Plot of device speedups: step times of both sides against vertices.
+
+Each side is represented by its fastest run to a residual.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +50,9 @@ def draw_devices(results: Path) -> Iterator[tuple[Path | None, list[str]]]:
 
 
 def draw(compared: dict[tuple[str, float], list[Pair]], path: Path, title: str, facts: Sequence[str]) -> None:
-    """Draw the fastest runs of both sides as a PNG file, PAGE_WIDTH pixels wide, at most PAGE_HEIGHT high.
+    """Draw the fastest runs of both sides as a PNG file.
+
+    The picture is PAGE_WIDTH pixels wide and at most PAGE_HEIGHT high.
 
     Args:
         pairs_by_panel: device pairs by scene and tolerance.

@@ -1,4 +1,4 @@
-"""Selection of the frames of a recording that can be drawn, and the strain scale that suits them."""
+"""Selection of drawable frames of a recording, and their strain scale."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ _BLOWN_UP = 1e4  # coordinates this many times larger than the start's are drawn
 
 
 def drawable_frames(replay: Replay) -> NDArray[np.int64]:
-    """Return the indices of the recorded frames before the first that is not finite or has blown up."""
+    """Return the indices of the frames that can be drawn.
+
+    These are the recorded frames before the first that is not finite or has blown up.
+    """
     start = replay.positions[0]
     limit = _BLOWN_UP * (max(float(np.abs(start).max(initial=0.0)), spacing(replay)) or 1.0)
     with np.errstate(invalid="ignore"):
@@ -35,7 +38,10 @@ def shown_limit(replays: Sequence[Replay], frames: Sequence[int]) -> float:
 
 
 def largest_strain(replay: Replay) -> float:
-    """Return the largest strain of the run as its rows state it; NaN if no frame after the start was recorded."""
+    """Return the largest strain of the run as its rows state it.
+
+    The result is NaN if no frame after the start was recorded.
+    """
     if "/strain/largest" in replay.scalars:
         return quantities.largest_strain(*replay.scalars["/strain/largest"])
     strains = [np.abs(spring_strain(replay, k)).max(initial=0.0) for k in range(len(replay.frames))]

@@ -53,7 +53,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class StoredResult:
-    """A stored result; `value`, `low` and `high` are the ratio to the baseline, or all three the minimum time [s]."""
+    """A stored benchmark result.
+
+    `value`, `low` and `high` are the ratio to the baseline, or all three the minimum time [s].
+    """
 
     commit: str
     value: float
@@ -87,7 +90,7 @@ class GateHistory:
 
     @property
     def changes(self) -> list[tuple[int, float]]:
-        """The index of each change, and the ratio of the new level to the old one."""
+        """The index and the ratio of new to old level of each change."""
         levels = self.levels
         return [(at, new / old) for at, old, new in zip(self.starts[1:], levels, levels[1:], strict=False)]
 
@@ -142,7 +145,10 @@ def _point(stored: Stored, benchmark: Benchmark) -> StoredResult:
 
 
 def changes(points: Sequence[StoredResult]) -> tuple[int, ...]:
-    """Return the starts of the segments; (0,) if nothing changed or there are too few results."""
+    """Return the starts of the segments.
+
+    The result is (0,) if nothing changed or there are too few results.
+    """
     if len(points) < FEWEST:
         return (0,)
     from ruptures import Pelt

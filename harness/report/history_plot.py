@@ -94,7 +94,10 @@ def _panel(axis: Any, series: GateHistory) -> None:
 
 
 def _ticks(series: GateHistory) -> list[int]:
-    """Choose the results whose commits are labelled: changes first, then the last, the first and others that fit."""
+    """Choose the results whose commits are labelled.
+
+    Changes come first, then the last, the first and others that fit.
+    """
     count = len(series.points)
     wanted = [*(at for at, _ in series.changes), count - 1, *range(0, count, max(1, count // 8))]
     ticks = list[int]()

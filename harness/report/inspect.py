@@ -135,7 +135,7 @@ def _print_summary(found: Summary, console: Console) -> None:
 
 
 def _print_difference(paths: list[Path], console: Console) -> None:
-    """Print the distance between the final positions of two runs, and their times side by side."""
+    """Print the distance between the final positions of two runs, and their times."""
     for path in paths:
         read_replay(path, [-1])  # refuses what is not one run's recording
     first, second = (summary(path) for path in paths)
@@ -172,7 +172,10 @@ def _ratio(times: list[dict[str, NDArray[np.float64]]], entity: str) -> float:
 
 
 def _series(scalars: pa.Table) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Yield each entity's finite values in the order of the frames, without values of single iterations."""
+    """Yield each entity's finite values in the order of the frames.
+
+    Values of single iterations are omitted.
+    """
     once = scalars.filter(scalars["iteration"].is_null())
     entities, values = once["entity"].to_numpy(), once["value"].to_numpy()
     for entity in dict.fromkeys(entities):

@@ -16,7 +16,9 @@ End = tuple[float, float, str, str]
 
 
 def direct_labels(ax: Axes, ends: Sequence[End]) -> None:
-    """Draw labels to the right of the lines' ends; labels that would overlap are moved apart.
+    """Draw labels to the right of the lines' ends.
+
+    Labels that would overlap are moved apart.
 
     Args:
         ax: axes of the lines.
@@ -43,7 +45,9 @@ def direct_labels(ax: Axes, ends: Sequence[End]) -> None:
 
 
 def spread(wanted: Sequence[float], bottom: float, top: float) -> list[float]:
-    """Return sorted heights [pixels], at least LABEL_SPACING apart: moved up from below, then down from the top.
+    """Return sorted heights [pixels] that are at least LABEL_SPACING apart.
+
+    They are moved up from below, then down from the top.
 
     Args:
         targets: preferred heights, ascending [pixels].

@@ -23,7 +23,7 @@ GROWS = 1.5
 
 
 def closing(table: pa.Table, config: Path, results: Path, folder: Path) -> list[str]:
-    """Build the last lines of a sweep: findings, suggested commands, and the address of the results page.
+    """Build the last lines of a sweep: findings, commands, and the page's address.
 
     No line is longer than TABLE_WIDTH, except for paths.
 
@@ -48,7 +48,9 @@ def sentences(found: Sequence[RunTimes]) -> list[str]:
 
 
 def commands(found: Sequence[RunTimes], config: Path, results: Path, recordings: Path) -> list[str]:
-    """Suggest commands with a comment each: replay a run, find the fastest at equal accuracy, update the page.
+    """Suggest commands, each with a comment.
+
+    They replay a run, find the fastest solver at equal accuracy, and update the page.
 
     Args:
         timed_runs: runs of the sweep.
@@ -83,7 +85,10 @@ def _at_round_off(run: RunTimes) -> bool:
 
 
 def _unsolved(fine: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[str]:
-    """Describe the residual that methods which do not minimise leave, as the independent check measured it."""
+    """Describe the remaining residual of methods that do not minimise.
+
+    It is the one that the independent check measured.
+    """
     for run in fine:
         if run.left is not None and run.left > SOLVED:
             yield (
@@ -136,7 +141,10 @@ def _strain_words(coarse: RunTimes, fine: RunTimes) -> str:
 
 
 def _to_see(found: Sequence[RunTimes], recordings: Path) -> Path | None:
-    """Return a recording of the largest mesh, that of the fastest run at equal accuracy where runs were compared."""
+    """Return a recording of the largest mesh.
+
+    It is that of the fastest run at equal accuracy, where runs were compared.
+    """
     best = {compared.equal[0].run_id for compared in comparisons(found) if compared.equal}
     timed = [run for run in found if run.step]
     order = sorted(timed, key=lambda run: (-(run.vertices or 0), run.run_id not in best, run.step))

@@ -1,4 +1,4 @@
-"""Footer of tables: the machines of the rows, and which numbers may be compared across machines.
+"""Footer of tables: machines of the rows, and which numbers are comparable.
 
 A machine is identified by the id of its kind, followed by the computer's own id where several computers are of one
 kind.
@@ -41,7 +41,10 @@ def names(places: Iterable[Place]) -> dict[Place, str]:
 
 
 def foot(table: pa.Table) -> list[str]:
-    """Return the footer lines of a table of rows: its machines, and which numbers may be compared."""
+    """Return the footer lines of a table of rows.
+
+    They list its machines, and which numbers may be compared.
+    """
     able = ", ".join(f'any_value("{name}")' for name in COLUMNS)
     found = answer(f"select machine, node, {able} from rows_of where machine is not null group by all", table)
     known = names((machine, node) for machine, node, *_ in found)

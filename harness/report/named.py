@@ -1,4 +1,7 @@
-"""Reports that a sweep names, built in or from plug-ins: each receives the rows and writes its files."""
+"""Reports that a sweep names: built-in ones and plug-ins.
+
+Each receives the rows and writes its files.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ class Report(Protocol):
     """A report: a function that writes files."""
 
     def __call__(self, rows: pa.Table, folder: Path) -> Iterable[Path]:
-        """Write files into the folder of a sweep's results, from all of its rows, and return their paths."""
+        """Write files into the folder of a sweep's results, and return their paths."""
         ...
 
 

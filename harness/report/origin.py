@@ -17,12 +17,18 @@ NEEDED = ("cpu", "threads", "commit", "code")
 
 
 def abridged(commit: str) -> str:
-    """Abbreviate a commit; a suffix marks modified files, because no checkout contains the code that was run."""
+    """Abbreviate a commit.
+
+    A suffix marks modified files, because no checkout contains the code that was run.
+    """
     return f"{commit:.7}{_DIRTY if commit.endswith(_DIRTY) else ''}"
 
 
 def commits(known: Iterable[object]) -> list[str]:
-    """Return the common commit in words, or the number of commits; empty if none is known."""
+    """Return the common commit in words, or the number of commits.
+
+    The result is empty if none is known.
+    """
     found = sorted({str(commit) for commit in known if commit})
     return [f"commit {abridged(found[0])}" if len(found) == 1 else f"{len(found)} commits"] if found else []
 

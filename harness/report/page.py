@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Layout of a picture of PAGE_WIDTH x PAGE_HEIGHT pixels: title, strain scale, text and images at pixel positions."""
+"""Layout of a picture: title, strain scale, text and images at pixel positions.
+
+The page has PAGE_WIDTH x PAGE_HEIGHT pixels.
+"""
 
 from __future__ import annotations
 
@@ -84,13 +87,18 @@ def save(page: Figure, path: Path, *, used: float = HEIGHT) -> None:
 
 
 def header(page: Figure, headline: str, facts: Sequence[str], *, letters: int = 56) -> None:
-    """Draw the title, shortened to `max_letters`, in the upper left corner and a line of facts below it."""
+    """Draw the title in the upper left corner and a line of facts below.
+
+    The title is shortened to `max_letters`.
+    """
     text(page, 40, 50, shorten(headline, letters), size=21, weight="bold")
     text(page, 41, 82, "   ·   ".join(facts), size=11.5, color=MUTED)
 
 
 def strain_scale(page: Figure, limit: float, ends: tuple[float, float], *, pins: bool) -> None:
-    """Draw the colour bar of strains in the upper right corner, with percent ticks below and labels above.
+    """Draw the colour bar of strains in the upper right corner.
+
+    Ticks in percent are below it, labels above.
 
     Args:
         page: figure to draw on.
@@ -158,6 +166,9 @@ def shorten(words: str, limit: int) -> str:
 
 
 def step_words(dt: float) -> str:
-    """Format a time step [s]: as 1/30 s, or in milliseconds if it is not the inverse of an integer."""
+    """Format a time step [s], such as 1/30 s.
+
+    It is given in milliseconds if it is not the inverse of an integer.
+    """
     whole = round(1 / dt)
     return f"1/{whole} s" if abs(whole * dt - 1) < 1e-9 else f"{1e3 * dt:.3g} ms"

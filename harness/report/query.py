@@ -1,8 +1,8 @@
-"""SQL over the rows of all sweeps, accuracy configs and ablations (DuckDB on the Parquet files).
+"""SQL over the rows of all sweeps, accuracy configs and ablations.
 
-A query runs in the child process of `harness.execution.sandbox`, because it may exceed the allowed time or memory.
-Read-only queries are answered from the files; for other statements (PIVOT, CREATE) all rows are loaded into memory
-first.
+DuckDB reads the Parquet files. A query runs in the child process of `harness.execution.sandbox`, because it may exceed
+the allowed time or memory. Read-only queries are answered from the files; for other statements (PIVOT, CREATE) all rows
+are loaded into memory first.
 """
 
 from __future__ import annotations
@@ -72,7 +72,9 @@ def _shown(value: Any) -> str:
 
 
 def answer(sql: str, results: Path, *, most: int = SHOWN, seconds: float = 15.0) -> QueryResult:
-    """Run a query on the tables `rows`, `accuracy` and `ablation`; it has no other read access and cannot write.
+    """Run a query on the tables `rows`, `accuracy` and `ablation`.
+
+    The query has no other read access and cannot write.
 
     Args:
         sql: query.

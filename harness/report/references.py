@@ -26,7 +26,10 @@ def cited(reference: str | None) -> str:
 
 
 def bibtex(references: Iterable[str | None]) -> str:
-    """Format one BibTeX entry per distinct reference, sorted by key; Unicode, for biber and recent BibTeX."""
+    """Format one BibTeX entry per distinct reference, sorted by key.
+
+    The text is Unicode, for biber and recent BibTeX.
+    """
     known = sorted({reference for reference in references if reference}, key=lambda r: (_key(json.loads(r)), r))
     entries, keys = list[str](), [_key(json.loads(reference)) for reference in known]
     for k, reference in enumerate(known):

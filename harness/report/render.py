@@ -1,8 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # PyVista's filters and meshes are only partly typed.
-"""Shaded renderings of recorded frames: surface or tubes coloured by strain, pinned vertices, and a soft shadow.
+"""Shaded renderings of recorded frames.
 
-All frames of a run share one camera, so that apparent motion is that of the scene.
+They show a surface or tubes coloured by strain, pinned vertices, and a soft shadow. All frames of a run share one
+camera, so that apparent motion is that of the scene.
 """
 
 from __future__ import annotations
@@ -90,7 +91,10 @@ class View:
         return View(by * self.position, by * self.target, by * self.ground, by * self.low, by * self.high)
 
     def near(self, p: Points) -> Points:
-        """Return the points (n, 3) in the box or within its diagonal of it; all points if there are none."""
+        """Return the points (n, 3) in the box or within its diagonal of it.
+
+        If there are none, all points are returned.
+        """
         around = _extent(np.stack([self.low, self.high]))
         inside = ((p >= self.low - around) & (p <= self.high + around)).all(axis=1)
         return p[inside] if inside.any() else p
@@ -171,7 +175,10 @@ def _ground(points: Points) -> float:
 
 
 def shape(points: Points, angles: tuple[float, float]) -> float:
-    """Return width / height of points (q, 3) [m] and their shadow, seen from far away at these angles."""
+    """Return width / height of points (q, 3) [m] and their shadow.
+
+    They are seen from far away at these angles.
+    """
     whole = np.concatenate([points, _cast(points, _ground(points))])
     across, up, _ = np.ptp(_camera_axes(angles) @ whole.astype(np.float64).T, axis=1)
     return float(across / max(up, 1e-30))
@@ -189,7 +196,10 @@ def _cast(p: Points, ground: float) -> Points:
 
 
 def _is_closed(triangles: NDArray[np.int64]) -> bool:
-    """Return whether every edge has two triangles; such surfaces bound a solid and get sharp edges."""
+    """Return whether every edge has two triangles.
+
+    Such surfaces bound a solid and get sharp edges.
+    """
     edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     return bool((np.unique(edges @ [triangles.max() + 1, 1], return_counts=True)[1] == 2).all())
 
@@ -328,8 +338,9 @@ class Studio:
         self._plotter.add_mesh(_balls(p, 1.5 * radius), color=_JOINT, smooth_shading=True, **_MATERIAL)
 
     def _tube(self, sizes: _Sizes) -> float:
-        """Return the radius of a spring's tube: thin relative to its length and the scene, but at least about a
-        pixel.
+        """Return the radius of a spring's tube.
+
+        It is thin relative to its length and the scene, but at least about a pixel.
         """
         thin = min(0.07 * sizes.spacing, 0.007 * sizes.extent)
         return max(thin, 1.1 * sizes.extent / self._height)
@@ -341,7 +352,10 @@ class Studio:
             self._plotter.add_mesh(_balls(at, radius), color=colour, smooth_shading=True, **_MATERIAL)
 
     def _shadow(self, replay: Replay, p: NDArray[np.float32], view: View, sizes: _Sizes, behind: str) -> None:
-        """Add a soft shadow: the scene projected from the light, as a blurred texture on an unlit plane."""
+        """Add a soft shadow on the ground.
+
+        The scene is projected from the light, as a blurred texture on an unlit plane.
+        """
         ground = view.ground
         flat, near = (_cast(points, ground)[:, [0, 2]] for points in (p, view.near(p)))
         centre = (near.min(axis=0) + near.max(axis=0)) / 2

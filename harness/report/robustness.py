@@ -1,11 +1,11 @@
-"""Robustness of solvers: the outcome of each verified run of a sweep, from its rows only.
+"""Robustness of solvers: the outcome of each verified run of a sweep.
 
-A run of a minimising solver is correct if, in every step, the result is stationary to the requested tolerance, up to
-round-off at each vertex, and a certified minimum, and if the motion matches the reference in every frame. All three are
-checked by the reference evaluator, never by the solver's own report. That report is compared: if a step ended because
-its residual met the tolerance, but the evaluator finds it not stationary, the run is falsely converged instead of
-merely unconverged. A method that does not minimise is scored by its motion only. If the independent implementation of
-the formulas disagrees with the steps themselves, no run of them is correct.
+Outcomes follow from the rows only. A run of a minimising solver is correct if, in every step, the result is stationary
+to the requested tolerance, up to round-off at each vertex, and a certified minimum, and if the motion matches the
+reference in every frame. All three are checked by the reference evaluator, never by the solver's own report. That
+report is compared: if a step ended because its residual met the tolerance, but the evaluator finds it not stationary,
+the run is falsely converged instead of merely unconverged. A method that does not minimise is scored by its motion
+only. If the independent implementation of the formulas disagrees with the steps themselves, no run of them is correct.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class Judged:
 
     @property
     def figure(self) -> str:
-        """The worst error in few characters: a power of ten, or a percentage of the scene's size."""
+        """The worst error: a power of ten, or a percentage of the scene's size."""
         if self.worst is None:
             return ""
         if self.graded == "distance":
@@ -135,9 +135,10 @@ class Judged:
 
 
 def read_cells(folder: Path) -> list[Judged]:
-    """Read the outcomes of the runs in a sweep's folder, ordered by case and solver; of repeated runs the newest.
+    """Read the outcomes of the runs in a sweep's folder.
 
-    Units with invalid values are omitted; the results page lists them.
+    They are ordered by case and solver; of repeated runs the newest counts. Units with invalid values are omitted; the
+    results page lists them.
 
     Raises:
         InputError: if no run was verified.
@@ -265,7 +266,10 @@ def percent(share: float | None) -> str:
 
 
 def summary(cells: Sequence[Judged]) -> Table:
-    """Build a table with one row per solver: counts of the outcomes that occur, shares, and the worst error."""
+    """Build a table of scores with one row per solver.
+
+    Columns are counts of the outcomes that occur, shares, and the worst error.
+    """
     found = scores(cells)
     there = [k for k, _ in enumerate(OUTCOMES) if any(score.counts[k] for score in found)]
     table = Table(box=SIMPLE_HEAD, caption_justify="left")

@@ -168,7 +168,7 @@ def _ink(outcome: Outcome) -> str:
 
 
 def draw_maps(results: Path, older: Callable[[Path], Collection[str]]) -> Iterator[tuple[Path, list[Judged]]]:
-    """Draw the maps of all sweeps with verified runs in a folder of results, or of one sweep.
+    """Draw the maps of all sweeps with verified runs in a folder.
 
     Args:
         results: folder of results, or the folder of one sweep.

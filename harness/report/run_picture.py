@@ -1,9 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Picture of one run: its final frame large, four earlier frames next to it, and the strain scale above.
+"""Picture of one run: its final frame large, and four earlier frames.
 
-The scale covers the typical strains of the shown frames. On a scale set by the neighbours of a pin most of a mesh would
-be grey, and on a scale that is too short all of it would have one colour.
+The strain scale is above them. The scale covers the typical strains of the shown frames. On a scale set by the
+neighbours of a pin most of a mesh would be grey, and on a scale that is too short all of it would have one colour.
 """
 
 from __future__ import annotations
@@ -57,7 +57,9 @@ class PixelBox(NamedTuple):
 
 
 def layout(final: float, whole: float, earlier: int) -> tuple[PixelBox, list[PixelBox]]:
-    """Lay out the final frame and the earlier ones, so that scenes of these aspect ratios fill their boxes.
+    """Lay out the final frame and the earlier ones.
+
+    Scenes of the given aspect ratios fill their boxes.
 
     Args:
         final: width / height of the final frame.

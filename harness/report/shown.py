@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Preview of a scene at its start: mesh, obstacles, and the vertices that its effects select, one colour each."""
+"""Preview of a scene at its start.
+
+It shows mesh, obstacles, and the vertices that its effects select, in one colour each.
+"""
 
 from __future__ import annotations
 

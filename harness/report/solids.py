@@ -43,7 +43,7 @@ def framed(replay: Replay, frames: Iterable[int]) -> NDArray[np.bool_]:
 
 
 def seen(replay: Replay, frames: Sequence[int]) -> NDArray[np.float32]:
-    """Return all points (q, 3) [m] of mesh and obstacles that a camera should see in these frames.
+    """Return all points (q, 3) [m] of mesh and obstacles to be framed.
 
     Vertices far from all others are omitted. If the others coincide in one point, the whole mesh at its start is
     included.

@@ -1,4 +1,7 @@
-"""SQL queries on a table of rows, in one shared in-memory database: opening one takes longer than most queries."""
+"""SQL queries on a table of rows, in one shared in-memory database.
+
+Opening a database takes longer than most queries.
+"""
 
 from __future__ import annotations
 

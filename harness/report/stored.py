@@ -1,9 +1,9 @@
-"""Comparison of two stored results, folders or archives of rows: regressions in time, and other changes.
+"""Comparison of two stored results, folders or archives of rows.
 
-Runs are paired by their inputs, and compared step by step (`harness.results.bootstrap_statistics.estimate_slowdown`).
-The load of the machine may have differed between the two results, and statistics cannot detect that: hence a margin
-beyond the interval, and `springbench gate --against` for smaller changes. Times of two machines are not comparable;
-with a baseline solver that both ran, the ratios to it are.
+It finds regressions in time, and other changes. Runs are paired by their inputs, and compared step by step
+(`harness.results.bootstrap_statistics.estimate_slowdown`). The load of the machine may have differed between the two
+results, and statistics cannot detect that: hence a margin beyond the interval, and `springbench gate --against` for
+smaller changes. Times of two machines are not comparable; with a baseline solver that both ran, the ratios to it are.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def compare(old: Path, new: Path, console: Console, yardstick: str | None = None
 
 
 def read(path: Path) -> dict[Key, StoredRun]:
-    """Read the runs of a folder of results, or of an archive of one, by their inputs.
+    """Read the runs in a folder or archive of results, by their inputs.
 
     Raises:
         InputError: if there are no rows or they cannot be read.
@@ -220,7 +220,10 @@ def _incomparable(old: StoredRun, new: StoredRun, yardstick: str | None) -> str:
 
 
 def _unit(runs: Mapping[Key, StoredRun], key: Key, yardstick: str) -> float | None:
-    """Return 1 / (median step time of the baseline [s]) in the same scene, size and steps; None if it was not run."""
+    """Return 1 / (median step time of the baseline [s]).
+
+    The baseline has the same scene, size and steps; None if it was not run.
+    """
     at = {name: key[ASKED.index(name)] for name in ("scene", "size", "time_step", "integrator", "threads")}
     found = [run for run in runs.values() if run.row["solver"] == yardstick and run.status == "ok" and run.seconds]
     found = [run for run in found if all(run.row[name] == value for name, value in at.items())]
@@ -228,7 +231,10 @@ def _unit(runs: Mapping[Key, StoredRun], key: Key, yardstick: str) -> float | No
 
 
 def _judged(old: StoredRun, new: StoredRun, units: Sequence[float | None]) -> tuple[tuple[str, str, str], str]:
-    """Return both times, their change with its interval, and its class: slower, faster, unchanged or fails now."""
+    """Return both times, their change with its interval, and its class.
+
+    Classes are slower, faster, unchanged and fails now.
+    """
     if new.status != "ok":
         return ("", "", ""), "fails now"
     frames = sorted(set(old.seconds) & set(new.seconds))

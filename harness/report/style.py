@@ -1,4 +1,4 @@
-"""Visual style of all pictures: page size, colours, strain scale, and a colour and marker for each solver."""
+"""Visual style of all pictures: page size, colours, strain scale, solver styles."""
 
 from __future__ import annotations
 
@@ -142,10 +142,11 @@ _STRANGERS = (
 
 
 def marks(solvers: Iterable[str] = ()) -> dict[str, Mark]:
-    """Return the style of each solver: of the registry, and of these others; styles are stable and distinct.
+    """Return the style of each solver of the registry, and of these others.
 
-    The style of a solver outside the registry follows from a hash of its name. If two would get the same colour, the
-    later one in alphabetical order gets the next free colour, and if there is none, the next free style.
+    Styles are stable and distinct. The style of a solver outside the registry follows from a hash of its name. If two
+    would get the same colour, the later one in alphabetical order gets the next free colour, and if there is none, the
+    next free style.
     """
     looks = dict(_shipped((*SOLVERS, *OPTIONAL)))
     free = [Mark(color, marker, dash) for dash in _DASHES for color in _STRANGERS for marker in _MARKERS]
@@ -161,9 +162,10 @@ def marks(solvers: Iterable[str] = ()) -> dict[str, Mark]:
 
 @cache
 def _shipped(names: tuple[str, ...]) -> dict[str, Mark]:
-    """Return the styles of the registry's solvers: the colour of their family, and a marker of their own.
+    """Return the styles of the registry's solvers.
 
-    Solvers beyond the number of markers get no style here.
+    A style has the colour of the solver's family, and a marker of its own. Solvers beyond the number of markers get no
+    style here.
     """
     families: dict[str, list[str]] = {}
     for name in names:
@@ -231,8 +233,9 @@ def _varied(labelled: Iterable[tuple[str, str]], vary: Callable[[Mark, int], Mar
 
 
 def numbered(number: int) -> Mark:
-    """Return the style of something that is not a solver, by its index from 0: 64 styles, the first 8 in distinct
-    colours.
+    """Return the style of something that is not a solver, by its index.
+
+    There are 64 styles from index 0 on, the first 8 in distinct colours.
     """
     # The marker is shifted by one with each pass through the colours.
     return Mark(_FAMILIES[number % 8], _MARKERS[(number + number // 8) % 8], (0, (3, 1.2)))

@@ -1,4 +1,7 @@
-"""Pictures of a sweep: of each run, of solver comparisons, and of run times; and side-by-side recordings."""
+"""Pictures of a sweep: runs, solver comparisons, and run times.
+
+Side-by-side recordings are made too.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +76,10 @@ def draw_sweep(
 
 
 def get_ready() -> None:
-    """Load the drawing modules in this process, in parts, none of them while a timing runs."""
+    """Load the drawing modules in this process, in parts.
+
+    No part is loaded while a timing runs.
+    """
     from harness.report import opengl
 
     with beside(_silent):
@@ -151,7 +157,10 @@ def _stale(made: Path, sources: Iterable[Path]) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """Runs that differ only in their solver or its settings, by these differences, and the files that compare them."""
+    """Runs that differ only in their solver or its settings.
+
+    `jobs_by_label` has them by these differences; the paths are those of the files that compare them.
+    """
 
     label: str
     runs: dict[str, Pictured]
@@ -192,7 +201,10 @@ def compared(drawn: list[Pictured], folder: Path) -> list[Compared]:
 
 
 def _distinct(p: Pictured, group: list[Pictured]) -> str:
-    """Return the solver's name with the parameters and options in which the group's runs of this solver differ."""
+    """Return the solver's name with its varying parameters and options.
+
+    These are the ones in which the group's runs of this solver differ.
+    """
 
     def settings(run: RunSpec) -> dict[str, Any]:
         return {**run.solver.parameters, **{option: getattr(run, option) for option in OPTIONS}}

@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Step time and preparation time [ms] against number of vertices, by solver; a pair of panels for each scene."""
+"""Step and preparation times [ms] against number of vertices, by solver.
+
+Each scene has a pair of panels.
+"""
 
 from __future__ import annotations
 
@@ -44,10 +47,11 @@ def timing(rows: pa.Table, folder: Path) -> list[Path]:
 
 
 def draw_timing(table: pa.Table, path: Path, title: str, older: Collection[str] = ()) -> None:
-    """Draw the times of a sweep's runs as a PNG file, PAGE_WIDTH pixels wide and at most PAGE_HEIGHT high.
+    """Draw the times of a sweep's runs as a PNG file.
 
-    Failed runs are crosses at the upper edge, with their reasons in words at the foot. A scene of one size has a row
-    for each solver instead of a point in an empty frame.
+    The picture is PAGE_WIDTH pixels wide and at most PAGE_HEIGHT high. Failed runs are crosses at the upper edge, with
+    their reasons in words at the foot. A scene of one size has a row for each solver instead of a point in an empty
+    frame.
 
     Args:
         table: rows (schema: `harness.results.run_schema.RUN_SCHEMA`).
@@ -135,7 +139,10 @@ def _scene(
 
 
 def _variants(series: Mapping[str, Sequence[RunTimes]], looks: Mapping[str, Mark]) -> list[Any]:
-    """Assign a line style to each series: the solver's own style to the first series of a solver."""
+    """Assign a line style to each series.
+
+    The first series of a solver gets the solver's own style.
+    """
     dashes: list[Any] = []
     solvers = [members[0].solver for members in series.values()]
     for k, solver in enumerate(solvers):
@@ -146,7 +153,10 @@ def _variants(series: Mapping[str, Sequence[RunTimes]], looks: Mapping[str, Mark
 
 
 def _times(found: Sequence[RunTimes], *fields: str) -> list[float]:
-    """Return all times [ms] in these fields of the runs; at least two, so that a scale always exists."""
+    """Return all times [ms] in these fields of the runs.
+
+    There are at least two, so that a scale always exists.
+    """
     times = [getattr(run, field) for run in found for field in fields]
     return [time for time in times if time] or [0.1, 10.0]
 
@@ -154,7 +164,10 @@ def _times(found: Sequence[RunTimes], *fields: str) -> list[float]:
 def _scales(
     ax: Axes, sizes: Sequence[int], times: Sequence[float], labels_share: float, *, crosses: bool = False
 ) -> None:
-    """Set logarithmic scales with space for direct labels at the right and, if needed, for crosses at the top."""
+    """Set logarithmic scales with space for labels and crosses.
+
+    Direct labels are at the right and, if needed, crosses at the top.
+    """
     sizes = sizes or [1, 10]
     first, last = (sizes[0] / 1.15, sizes[-1] * 1.15) if len(sizes) > 1 else (sizes[0] / 2, sizes[0] * 2)
     ax.set_xscale("log")
@@ -189,7 +202,10 @@ def _apart(ax: Axes, sizes: Sequence[int]) -> list[int]:
 def _draw_steps(
     ax: Axes, name: str, members: Sequence[RunTimes], look: Mark, dash: Any, older: Collection[str]
 ) -> list[End]:
-    """Draw one line with its quartile band, and return the position, text and colour of its direct label."""
+    """Draw one line with its quartile band.
+
+    Returns the position, text and colour of its direct label.
+    """
     timed = sorted((run for run in members if run.step), key=lambda run: run.vertices or 0)
     if not timed:
         return []
@@ -224,7 +240,10 @@ def _draw_prepare(ax: Axes, members: Sequence[RunTimes], look: Mark, older: Coll
 
 
 def _crosses(ax: Axes, failed: Sequence[RunTimes], looks: Mapping[str, Mark]) -> None:
-    """Draw a cross at the upper edge for each failed run; those of one size are stacked."""
+    """Draw a cross at the upper edge for each failed run.
+
+    Crosses of one size are stacked.
+    """
     taken: dict[int, int] = {}
     for run in failed:
         size = run.vertices or 0

@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Times of a scene of one size: one row per solver, the fastest first; step and preparation side by side."""
+"""Times of a scene of one size: one row per solver, the fastest first.
+
+Panels of step and preparation are side by side.
+"""
 
 from __future__ import annotations
 
@@ -74,8 +77,9 @@ def draw_rows(
 
 
 def _scales(ax: Axes, values: Sequence[float], labels: Sequence[str], width: float) -> None:
-    """Set a logarithmic time axis over at least a decade, with row names at the left of the first panel; width
-    [pixels].
+    """Set a logarithmic time axis over at least a decade.
+
+    Row names are at the left of the first panel; `width` is in pixels.
     """
     low, high = (min(values), max(values)) if values else (0.1, 10.0)
     reach = max((high / low) ** (1.0 + 40.0 / width) * 1.3, 10.0) ** 0.5

@@ -1,4 +1,7 @@
-"""Summary of each run of a sweep from its rows, in milliseconds, and the table printed at the end of a sweep."""
+"""Summary of each run of a sweep in milliseconds, and its table.
+
+The table is printed at the end of a sweep.
+"""
 
 from __future__ import annotations
 
@@ -128,15 +131,19 @@ def runs(table: pa.Table) -> list[RunTimes]:
 
 
 def _stated(run: RunTimes) -> dict[str, Any]:
-    """Return a run's options; with a requested error, only that and the options that were set."""
+    """Return a run's options.
+
+    With a requested error, these are only that error and the options that were set.
+    """
     options = json.loads(run.settings)
     return {key: value for key, value in options.items() if value is not None or options["asked"] is None}
 
 
 def labels(found: Sequence[RunTimes]) -> dict[str, str]:
-    """Return a label by run id: the solver with the settings in which its runs of the scene differ.
+    """Return a label by run id: the solver with its varying settings.
 
-    If there are several machines, the label includes the machine, so that each label denotes one curve or table row.
+    These are the settings in which the solver's runs of the scene differ. If there are several machines, the label
+    includes the machine, so that each label denotes one curve or table row.
     """
     parameters: dict[str, dict[str, Any]] = {run.run_id: json.loads(run.parameters or "{}") for run in found}
     settings = {run.run_id: _stated(run) | parameters[run.run_id] for run in found}
@@ -194,7 +201,9 @@ SHARED = "timed beside others, up to {} at once, each on cores of its own: slowe
 
 
 def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
-    """Build a table with one line per run: identification, status and times [ms], with marks on doubtful values.
+    """Build a table with one line per run.
+
+    It has the identification, the status and the times [ms], with marks on doubtful values.
 
     Args:
         table: rows of the sweep.
@@ -255,7 +264,7 @@ def _ended(run: RunTimes) -> str:
 
 
 def _apart(run: RunTimes, value: float | None) -> str:
-    """Return the mark of a phase's time if the phases do not add up to an iteration."""
+    """Return the mark of phases that do not add up to an iteration."""
     return "~" if value is not None and run.adds_up is False else ""
 
 

@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Convergence on a step snapshot: energy gap, largest error and stationarity, against iterations and wall time."""
+"""Convergence on a step snapshot, against iterations and wall time.
+
+The panels show energy gap, largest error and stationarity.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +48,7 @@ _LEAST = 1e-16  # what is smaller is drawn there: double precision knows nothing
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """A row of panels: its label, the values of a curve that it shows, and its share of the height."""
+    """A row of panels: label, plotted values of a curve, and share of the height."""
 
     name: str
     values: Callable[[Curve], Values]
@@ -78,7 +81,10 @@ def draw_convergence(table: Measurements, folder: Path) -> list[Path]:
 
 
 def _grouped(curves: Sequence[Curve]) -> list[str]:
-    """Group the remarks on curves: one sentence per kind of early end and per minimum, with all curves concerned."""
+    """Group the remarks on curves that ended early or in another minimum.
+
+    There is one sentence per kind of early end and per minimum, with all curves concerned.
+    """
     ends: dict[str, list[str]] = {}
     for curve in curves:
         cause = f"{curve.status}: {curve.reason}" if curve.status in ("failed", "unsupported") else curve.status
@@ -184,7 +190,10 @@ def _panel(ax: Axes, row: _Row, curves: Sequence[Curve], marked: dict[str, Mark]
 
 
 def _vertical(ax: Axes, row: _Row, curves: Sequence[Curve], problem: Problem, column: int, *, last: bool) -> None:
-    """Set the same scale in all panels of a row; shade round-off, and show metres at the right of the errors."""
+    """Set the same scale in all panels of a row.
+
+    Round-off is shaded, and metres are shown at the right of the errors.
+    """
     all_values = np.concatenate([np.maximum(row.values(curve), _LEAST) for curve in curves] or [[np.nan]])
     low, high = limits(all_values, margin=2.0)
     if row is _ROWS[0] and np.isfinite(problem.round_off):

@@ -1,4 +1,6 @@
-"""Comparison with external engines: the shortest wall time for a motion within an error, over each engine's settings.
+"""Comparison with external engines by the shortest wall time within an error.
+
+Each engine is represented by the best of its settings:
 
     ratio = (shortest time of an engine's settings within the error) / (shortest time of all own methods within it)
 
@@ -32,7 +34,10 @@ class Standing(NamedTuple):
     best: dict[str, WorkPoint]
 
     def ratio(self, engine: str) -> float | None:
-        """Return the engine's time divided by the own time; None if either does not reach the error."""
+        """Return the engine's time divided by the own time.
+
+        The result is None if either does not reach the error.
+        """
         if engine not in self.best or OURS not in self.best:
             return None
         return self.best[engine].seconds / self.best[OURS].seconds
@@ -52,7 +57,10 @@ def met(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
 
 
 def fronts(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
-    """Return the Pareto front of each program's settings in time and error, cheapest first; own methods come first."""
+    """Return the Pareto front of each program's settings in time and error.
+
+    The cheapest setting comes first, and so do the own methods.
+    """
     by_program: dict[str, list[WorkPoint]] = {OURS: []}
     for work in works:
         by_program.setdefault(program(work), []).append(work)
@@ -87,8 +95,9 @@ def marks(works: Iterable[WorkPoint]) -> dict[str, Mark]:
 
 
 def table(works: Sequence[WorkPoint]) -> Iterator[str]:
-    """Format the ratios as a Markdown table: one row per mesh and error, one column per engine, and the best own
-    setting.
+    """Format the time ratios as a Markdown table.
+
+    There is one row per mesh and error, one column per engine, and a column with the best own setting.
     """
     names = engines(works)
     if not names:

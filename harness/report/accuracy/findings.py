@@ -41,7 +41,7 @@ def findings(table: Measurements) -> Chapters:
 
 
 def failures(table: Measurements) -> list[dict[str, str]]:
-    """List each run whose status is not ok: what it was, its status and the reason."""
+    """List the runs whose status is not ok, with status and reason."""
     curves = [
         (f"{c.problem.name}, {GUESSES.get(c.first_guess, c.first_guess)}", c.label, c.status, c.reason)
         for c in table.curves
@@ -52,7 +52,10 @@ def failures(table: Measurements) -> list[dict[str, str]]:
 
 
 def summary(table: Measurements) -> list[dict[str, Any]]:
-    """Build one entry per curve: identification, result, and seconds to each accuracy (null if not reached)."""
+    """Build a summary entry for each curve.
+
+    It has the identification, the result, and the seconds to each accuracy (null if not reached).
+    """
     return [_entry(curve) for curve in table.curves]
 
 
@@ -169,8 +172,9 @@ def _growth(table: Measurements) -> Iterator[str]:
 
 
 def _paper(table: Measurements) -> Iterator[str]:
-    """Yield a table with one row per curve of both figures: own error / the paper's, bold where they differ
-    strongly.
+    """Yield a Markdown table with one row per curve of both figures.
+
+    Cells show own error / the paper's error, bold where they differ strongly.
     """
     by_curve: dict[str, dict[int, PaperComparison]] = {}
     for found in comparisons(table):

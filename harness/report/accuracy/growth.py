@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Scaling with size: time to a gap of 1e-3 against the number of vertices, and fitted exponents."""
+"""Scaling with size: time to a gap of 1e-3 against the number of vertices.
+
+Power laws are fitted to these times.
+"""
 
 from __future__ import annotations
 
@@ -89,7 +92,10 @@ def _exponent(times: dict[int, float]) -> float:
 
 
 def draw_growth(table: Measurements, stem: Path) -> list[Path]:
-    """Draw a column for each scene with several sizes and a row for each initial guess; return the files."""
+    """Draw the scaling of all scenes with several sizes, and return the files.
+
+    There is a column for each scene and a row for each initial guess.
+    """
     found = growths(table)
     scenes = list(dict.fromkeys(growth.scene for growth in found))[:_COLUMNS]
     if not scenes:

@@ -62,7 +62,10 @@ class Problem:
 
     @property
     def name(self) -> str:
-        """Mesh, snapshot and, if not implicit Euler, the integrator; problems that differ otherwise share the label."""
+        """Mesh, snapshot and, if not implicit Euler, the integrator.
+
+        Problems that differ otherwise share the label.
+        """
         frame = "" if self.moment.startswith("frame") else f" (frame {self.frame})"
         euler = "" if self.integrator == "implicit-euler" else f", {self.integrator}"
         return f"{self.mesh}, {self.moment}{frame}{euler}"
@@ -78,7 +81,10 @@ class Problem:
         return (g - self.best) / (self.g0 - self.best)
 
     def branch(self, name: str | None) -> int | None:
-        """Return the index of the minimum with this name, 0 for the lowest; None if unknown."""
+        """Return the index of a minimum by its name.
+
+        The lowest has index 0; None if the name is unknown.
+        """
         return self.names.index(name) if name in self.names else None
 
 
@@ -122,7 +128,9 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class WorkPoint:
-    """One simulation up to `t_end` [s]: its relative error, and wall seconds per simulated second (nan if it failed).
+    """One simulation up to `t_end` [s], with its error and its cost.
+
+    Times are wall seconds per simulated second; nan if the simulation failed.
 
     Attributes:
         family, citation, is_minimiser, is_substepping: metadata of the solver.
@@ -194,12 +202,15 @@ class Measurements:
 
 
 def older(one: Curve | WorkPoint) -> bool:
-    """Return whether other code than the current version measured it; rows without a fingerprint count as current."""
+    """Return whether other code than the current version measured it.
+
+    Rows without a fingerprint count as current.
+    """
     return one.code not in ("", machine.code_hash())
 
 
 def by_other_code(measured: Iterable[Curve | WorkPoint], newest: str | None = None) -> list[str]:
-    """Describe which results were measured by other code than the current version, in at most one sentence.
+    """Describe which results were measured by other code, in at most one sentence.
 
     For charts that have no marks of their own for stale results.
 
@@ -223,7 +234,10 @@ LONG = 500
 
 
 def without_short(table: Measurements) -> Measurements:
-    """Return the data without the many short curves, from which only means for the paper's Figure 3 are taken."""
+    """Return the data without the short curves of the reproduction.
+
+    From these many curves only means for the paper's Figure 3 are taken.
+    """
     long = {c.problem.digest for c in table.curves if not c.problem.paper or c.iterations.max(initial=0.0) >= LONG}
     problems = tuple(p for p in table.problems if p.digest in long)
     return replace(table, problems=problems, curves=tuple(c for c in table.curves if c.problem.digest in long))

@@ -1,10 +1,11 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Reproduction of figures 2 and 3 of Liu et al. 2013: own curves over the paper's, and their differences.
+"""Reproduction of figures 2 and 3 of Liu et al. 2013.
 
-The paper's values are read from its figures and text: the relative error (g - g*)/(g0 - g*), g0 at the inertial target,
-of the curtain (1 m x 1 m, 1 kg, dt = 1/30 s). Figure 2 is one step of the 81 x 81 curtain on one core of 2012; figure 3
-has means over 50 frames. The paper does not state pins, damping and frames.
+Own curves are drawn over the paper's, and their differences are listed. The paper's values are read from its figures
+and text: the relative error (g - g*)/(g0 - g*), g0 at the inertial target, of the curtain (1 m x 1 m, 1 kg, dt = 1/30
+s). Figure 2 is one step of the 81 x 81 curtain on one core of 2012; figure 3 has means over 50 frames. The paper does
+not state pins, damping and frames.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ _HEADINGS = ("Figure 2, by iterations", "Figure 2, by time", "Figure 3, by size"
 
 
 class PaperComparison(NamedTuple):
-    """One point of a curve: iterations, own error, the paper's error, and the number of frames averaged over."""
+    """One point of a curve: own error, the paper's error, and averaged frames."""
 
     curve: str
     iterations: int
@@ -109,7 +110,9 @@ def comparisons(table: Measurements) -> list[PaperComparison]:
 
 
 def at(curve: Curve, iterations: int) -> float:
-    """Return the gap after n iterations, at least round-off; a curve that converged before keeps its last gap.
+    """Return the gap after n iterations, at least round-off.
+
+    A curve that converged before n iterations counts with its last gap.
 
     Returns: the gap; nan if it is unknown or the minimum is not certified.
     """
@@ -130,7 +133,10 @@ def own(table: Measurements) -> Iterator[Curve]:
 
 
 def _iteration_seconds(curve: Curve) -> float:
-    """Return the time of one iteration per vertex [s], as sizes differ; infinite if nothing was timed."""
+    """Return the time of one iteration per vertex [s].
+
+    Times are per vertex because sizes differ; infinite if nothing was timed.
+    """
     done = curve.iterations.max(initial=0.0) * curve.problem.vertices
     seconds = float(np.median(curve.seconds[:, -1])) if len(curve.iterations) else np.nan
     return seconds / done if done and np.isfinite(seconds) else np.inf
@@ -149,7 +155,10 @@ def _frames(table: Measurements, side: int, k: float) -> list[Curve]:
 
 
 def draw_paper(table: Measurements, stem: Path) -> list[Path]:
-    """Draw four panels of own results over the paper's, and return the files; none without rows of the reproduction."""
+    """Draw four panels of own results over the paper's, and return the files.
+
+    No file is written if no row belongs to the reproduction.
+    """
     found = comparisons(table)
     if not found:
         return []

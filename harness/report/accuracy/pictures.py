@@ -9,7 +9,9 @@ from harness.report.accuracy.measured import Curve, Measurements, Problem
 
 
 def draw_meshes(table: Measurements, results: Path, folder: Path) -> dict[str, Path]:
-    """Draw the mesh of each problem, from the recorded solve that came closest to the minimum.
+    """Draw the mesh of each problem from its closest recorded solve.
+
+    This is the solve that came closest to the minimum.
 
     Args:
         table: data of an accuracy measurement.
@@ -38,7 +40,9 @@ def place(problem: Problem, folder: Path) -> Path:
 
 
 def nearest(table: Measurements, problem: Problem, results: Path) -> Curve | None:
-    """Find the recorded solve of a problem that came closest to the lowest minimum, or None.
+    """Find the recorded solve of a problem closest to the lowest minimum.
+
+    The result is None if no solve was recorded.
 
     Args:
         table: data of an accuracy measurement.

@@ -1,8 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Performance profiles (Dolan and More 2002) and data profiles (More and Wild 2009) over all step snapshots.
+"""Performance profiles and data profiles over all step snapshots.
 
-A step with one initial guess is one problem. With t the time of a solver on a problem,
+Performance profiles follow Dolan and More 2002, data profiles More and Wild 2009. A step with one initial guess is one
+problem. With t the time of a solver on a problem,
 
     performance profile  rho(tau)  = share of the problems with t <= tau * (the smallest t of all solvers)
     data profile         d(kappa)  = share of the problems with t <= kappa * (one iteration of the baseline)
@@ -80,7 +81,7 @@ def _ratios(
 
 
 def partly_tried(table: Measurements) -> dict[str, int]:
-    """Return the number of measured problems by label, for solvers measured on fewer problems than others."""
+    """Count the problems, by label, of solvers measured on fewer problems than others."""
     tried = Counter(label for race in races(table).values() for label in {curve.label for curve in race})
     return {label: count for label, count in sorted(tried.items()) if count < max(tried.values())}
 
@@ -102,17 +103,26 @@ def not_shown(table: Measurements) -> list[str]:
 
 
 def share(values: Values, at: Values) -> Values:
-    """Return the share of `values` (k,) that is at most each of `at` (m,); shape (m,)."""
+    """Return the cumulative share of values at given limits.
+
+    This is the share of `values` (k,) that is at most each of `at` (m,); shape (m,).
+    """
     return np.searchsorted(np.sort(values), at, side="right") / len(values)
 
 
 def judged(table: Measurements, target: float) -> list[list[Curve]]:
-    """Return the races for which this accuracy is meaningful: some solver reaches it, but no initial guess does."""
+    """Return the races for which this accuracy is meaningful.
+
+    In these, some solver reaches the accuracy, but no initial guess does.
+    """
     return [r for r in races(table).values() if askable(r[0].problem, target) and contested(r, target)]
 
 
 def iteration_seconds(race: Iterable[Curve], solver: str) -> float:
-    """Return the median time of one iteration of a solver in a race [s]; nan if it did not take part."""
+    """Return the median time of one iteration of a solver in a race [s].
+
+    The result is nan if the solver did not take part.
+    """
     for curve in race:
         if curve.solver == solver and len(curve.iterations) > 1 and np.isfinite(curve.seconds).all():
             spans = curve.seconds[:, -1] - curve.seconds[:, 0]
@@ -127,7 +137,10 @@ _KINDS = (
 
 
 def draw_profiles(table: Measurements, stem: Path) -> list[Path]:
-    """Draw a row of performance profiles and a row of data profiles, one column per accuracy; return the files."""
+    """Draw performance profiles and data profiles, and return the files.
+
+    There is a row for each kind and a column for each accuracy.
+    """
     if not any(judged(table, target) for target in TARGETS):
         return []
     missed = partly_tried(table)

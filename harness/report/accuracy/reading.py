@@ -65,7 +65,10 @@ def read(
 
 
 def _problems(kinds: dict[str, list[_Row]]) -> dict[str, Problem]:
-    """Build the snapshots by digest; an energy below all certified minima shows that they are not the lowest."""
+    """Build the snapshots by digest.
+
+    An energy below all certified minima shows that they are not the lowest.
+    """
     lowest: dict[str, float] = {}
     for row in kinds["curve"]:
         if row["g"] is not None and row["g"] < lowest.get(row["problem"], np.inf):
@@ -184,7 +187,10 @@ def _work(row: _Row, label: _Label) -> WorkPoint:
 
 
 def _labels(rows: Sequence[_Row]) -> _Label:
-    """Return a function that labels a row: its solver, with the parameters and threads in which its rows differ."""
+    """Return a function that labels a row by its solver and varying settings.
+
+    These are the parameters and threads in which the solver's rows differ.
+    """
     values: dict[tuple[str, str], set[str]] = defaultdict(set)
 
     def settings(row: _Row) -> _Row:

@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Shared layout of accuracy plots: a page with one legend at the right, logarithmic axes, and notes at the foot."""
+"""Shared layout of accuracy plots.
+
+A page has one legend at the right, logarithmic axes, and notes at the foot.
+"""
 
 from __future__ import annotations
 
@@ -83,7 +86,7 @@ def line(
 
 
 def mark(look: Mark, *, hollow: bool) -> dict[str, Any]:
-    """Return the fill and edge of a marker, hollow if other code than the current version measured it."""
+    """Return the fill and edge of a marker, hollow for stale results."""
     return {"mfc": PAGE, "mec": look.color, "mew": 1.3} if hollow else {"mfc": look.color, "mec": PAGE, "mew": 0.5}
 
 
@@ -93,7 +96,7 @@ def size(look: Mark) -> float:
 
 
 def legend(page: Figure, entries: Mapping[str, Mark], *, below: Sequence[tuple[Line2D | Patch, str]] = ()) -> None:
-    """Draw the legend at the right of the page: solvers first, then other marks and their meanings."""
+    """Draw the legend at the right: solvers first, then other marks."""
     handles: list[Line2D | Patch] = [
         Line2D(
             [],
@@ -119,7 +122,10 @@ def legend(page: Figure, entries: Mapping[str, Mark], *, below: Sequence[tuple[L
 
 
 def notes(page: Figure, words: Sequence[str]) -> None:
-    """Draw notes on failures and doubts at the foot: as many lines as fit, and the number of further ones."""
+    """Draw notes on failures and doubts at the foot.
+
+    As many lines are drawn as fit, with the number of further ones.
+    """
     shown = _lines(words)
     for k, sentence in enumerate(shown):
         y = HEIGHT - 16 - _LINE * (len(shown) - 1 - k)
@@ -127,12 +133,18 @@ def notes(page: Figure, words: Sequence[str]) -> None:
 
 
 def foot(words: Sequence[str]) -> float:
-    """Return the y position [pixels] that panels and their axis labels must stay above for these notes."""
+    """Return the y position [pixels] above the area of these notes.
+
+    Panels and their axis labels must stay above it.
+    """
     return BOTTOM - _LINE * len(_lines(words))
 
 
 def _lines(words: Sequence[str]) -> list[str]:
-    """Wrap the notes to the page's width, each into two lines if there is space for all."""
+    """Wrap the notes to the page's width.
+
+    Each note gets up to two lines if there is space for all.
+    """
     lines = [line for sentence in words for line in wrap(sentence, _WIDE, max_lines=2, placeholder=" …")]
     if len(lines) > _NOTES:
         lines = [shorten(sentence, _WIDE) for sentence in words]
@@ -175,7 +187,10 @@ def log_axis(axis: Axis, low: float, high: float, *, unit: str = "power") -> Non
 
 
 def _inward(ax: Axes) -> None:
-    """Align the labels at the ends of the x-axis inwards, so that those of neighbouring panels do not overlap."""
+    """Align the labels at the ends of the x-axis inwards.
+
+    Otherwise those of neighbouring panels would overlap.
+    """
     for tick, at in zip(ax.xaxis.get_major_ticks(), ax.xaxis.get_majorticklocs(), strict=False):
         x = ax.transAxes.inverted().transform(ax.transData.transform((at, ax.get_ylim()[1])))[0]
         tick.label1.set_horizontalalignment("left" if x < _END else "right" if x > 1 - _END else "center")

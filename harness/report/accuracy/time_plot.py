@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Time to each accuracy for every solver on a mesh: of the step only, and with set-up amortised over many steps."""
+"""Time to each accuracy for every solver on a mesh.
+
+Panels show the time of the step only, and with set-up amortised over many steps.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,10 @@ _COLUMNS = {None: "the step alone", **{n: f"set-up over {count(n)} step{'s' if n
 
 
 def draw_times(table: Measurements, folder: Path) -> list[Path]:
-    """Draw a picture for each mesh, only of problems with a certified minimum; return the files."""
+    """Draw a picture for each mesh, and return the files.
+
+    Only problems with a certified minimum are included.
+    """
     drawn: list[Path] = []
     marked = looks((curve.label, curve.solver) for curve in table.curves)
     for mesh in dict.fromkeys(problem.mesh for problem in table.problems):
@@ -83,7 +89,10 @@ def differing(series: Mapping[str, Mapping[str, Sequence[Curve]]]) -> tuple[dict
 
 
 def middle(curves: Sequence[Curve], target: float, steps: int | None = None) -> float:
-    """Return the median time over a solver's solvable problems [s]; infinite if half of them are unsolved."""
+    """Return the median time over a solver's solvable problems [s].
+
+    It is infinite if half of them are unsolved.
+    """
     times = [seconds_to(curve, target, steps) for curve in curves if askable(curve.problem, target)]
     # The upper of the two middle values: a mean with infinity would hide the solved half.
     return sorted(times)[len(times) // 2] if times else np.nan
@@ -135,7 +144,10 @@ def _draw(
 def _panel(
     ax: Axes, series: dict[str, list[Curve]], marked: dict[str, Mark], steps: int | None, span: tuple[float, float]
 ) -> None:
-    """Draw times to all accuracies, with a cross at the upper edge where a solver fails to reach the next one."""
+    """Draw times to all accuracies.
+
+    A cross at the upper edge marks the first accuracy that a solver fails to reach.
+    """
     ticks = [power(target) for target in TARGETS]
     taken: dict[int, int] = {}
     for label, curves in series.items():

@@ -1,4 +1,4 @@
-"""Time to accuracy: when a curve first reaches a gap, amortised set-up, and crossings between solvers.
+"""Time to accuracy, amortised set-up, and crossings between solvers.
 
 Rows contain about 12 iterates per decade. Between two of them the gap is assumed to decrease geometrically. A solver
 can stop only after whole iterations: the first one at or below the accuracy counts.
@@ -29,7 +29,10 @@ _FINE = tuple(10.0 ** (-k / 2) for k in range(1, 19))  # half decades, in which 
 
 @dataclass(frozen=True, slots=True)
 class Reached:
-    """When a curve reached an accuracy: the iteration, and median and quartiles of the time over the rounds [s]."""
+    """Iteration and time at which a curve reached an accuracy.
+
+    The time is given as median and quartiles over the rounds [s].
+    """
 
     iteration: int
     seconds: float
@@ -94,7 +97,7 @@ def left_out(problems: Iterable[Problem]) -> list[str]:
 
 
 def races(table: Measurements) -> dict[tuple[str, str], list[Curve]]:
-    """Group the curves with the same start, by problem and initial guess, in the order of the rows."""
+    """Group the curves with the same start, by problem and initial guess."""
     found: dict[tuple[str, str], list[Curve]] = {}
     for curve in table.curves:
         found.setdefault((curve.problem.digest, curve.first_guess), []).append(curve)
@@ -102,7 +105,7 @@ def races(table: Measurements) -> dict[tuple[str, str], list[Curve]]:
 
 
 def contested(race: Sequence[Curve], target: float) -> bool:
-    """Return whether some solver reaches the accuracy and the initial guess does not have it already."""
+    """Return whether a solver, but not the initial guess, reaches the accuracy."""
     times = [reached for curve in race if (reached := reach(curve, target))]
     return bool(times) and all(reached.iteration > 0 for reached in times)
 

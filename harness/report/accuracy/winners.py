@@ -1,4 +1,4 @@
-"""Cheapest family of methods for an error in processor time, by the stiffness number of a mesh.
+"""Cheapest family of methods for an error, by the stiffness number of a mesh.
 
     stiffness number = k dt^2/m,    dt = 1/30 s, a frame;    k of the median spring, m of the mean free vertex
 
@@ -45,7 +45,10 @@ class Cell:
 
     @property
     def ahead(self) -> float:
-        """The cost of the second cheapest family divided by the cheapest; infinite without a second one."""
+        """The cost of the second cheapest family divided by the cheapest.
+
+        It is infinite without a second family.
+        """
         order = sorted(work.cpu for work in self.prices.values())
         return order[1] / order[0] if len(order) > 1 else inf
 
@@ -59,8 +62,9 @@ def family(work: WorkPoint) -> str:
 
 
 def cells(works: Iterable[WorkPoint], errors: Sequence[float] = ERRORS) -> list[Cell]:
-    """Build a cell for each mesh and error, ordered by vertices, stiffness and error; meshes without springs have
-    none.
+    """Build a cell for each mesh and error.
+
+    Cells are ordered by vertices, stiffness and error; meshes without springs have none.
     """
     meshes: dict[tuple[str, int, float], list[WorkPoint]] = {}
     for work in works:

@@ -48,7 +48,10 @@ ERRORS = (0.1, 0.03, 0.01, 0.003, 0.001)
 
 
 def is_default(work: WorkPoint) -> bool:
-    """Return whether this is the most common setting: implicit Euler at 1/30 s with 50 iterations of local-global."""
+    """Return whether this is the most common setting.
+
+    It is implicit Euler at 1/30 s with 50 iterations of local-global.
+    """
     same_method = work.family == LOCAL_GLOBAL and work.integrator == "implicit-euler"
     return same_method and work.tolerance is None and work.iterations == 50 and abs(30 * work.time_step - 1) < 1e-9
 
@@ -163,7 +166,10 @@ def _sizes(works: Iterable[WorkPoint]) -> dict[float | None, float]:
 
 
 def _panel(ax: Axes, works: list[WorkPoint], marked: dict[str, Mark], sizes: dict[float | None, float]) -> None:
-    """Draw the points of one integrator; those that differ only in the time step, or in the substeps, are joined."""
+    """Draw the points of one integrator.
+
+    Points that differ only in the time step, or only in the substeps, are joined.
+    """
     chains: dict[tuple[str, float | None, float, str], list[WorkPoint]] = {}
     divided = _divided(works)
     for work in works:
@@ -185,7 +191,7 @@ def _panel(ax: Axes, works: list[WorkPoint], marked: dict[str, Mark], sizes: dic
 
 
 def _divided(works: Iterable[WorkPoint]) -> set[str]:
-    """Find the labels of substepping methods that were measured with several numbers of substeps per time step."""
+    """Find the labels of methods that were measured with several numbers of substeps."""
     tried: dict[str, set[int]] = {}
     for work in works:
         if work.own_steps:
@@ -194,7 +200,10 @@ def _divided(works: Iterable[WorkPoint]) -> set[str]:
 
 
 def _front(ax: Axes, works: list[WorkPoint]) -> None:
-    """Draw the Pareto front of all integrators, the same in each panel: the smallest error for each wall time."""
+    """Draw the Pareto front of all integrators, the same in each panel.
+
+    It is the smallest error for each wall time.
+    """
     best = front(works)
     if best:
         x, y = [work.seconds for work in best], [work.error for work in best]

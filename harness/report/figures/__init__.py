@@ -1,1 +1,4 @@
-"""Figures for print: any panel or picture at a given width, with its data and a script that reproduces it."""
+"""Figures for print, with their data and a script that reproduces them.
+
+Any panel or picture can be drawn at a given width.
+"""

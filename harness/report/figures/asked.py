@@ -1,4 +1,4 @@
-"""Options of a figure from the command line: its width, formats and font size. Lengths are in millimetres."""
+"""Options of a figure from the command line; lengths are in millimetres."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Composition of a figure at its width: title, panels, one legend below them, and notes at the foot.
+"""Composition of a figure at its width.
 
-Nothing covers data. The height follows from the width: each strip is as high as its text, and each frame has the height
-that suits its width.
+A figure has a title, panels, one legend below them, and notes at the foot. Nothing covers data. The height follows from
+the width: each strip is as high as its text, and each frame has the height that suits its width.
 """
 
 from __future__ import annotations
@@ -153,7 +153,10 @@ def _draw(ax: Axes, panel: Panel, head: Sequence[str], asked: Asked, columns: in
 
 
 def wrapped(words: str, room: float, size: float) -> list[str]:
-    """Wrap text into lines that fit into `room` [points]; a letter is about 0.6 of the font size wide."""
+    """Wrap text into lines that fit into `room` [points].
+
+    A letter is about 0.6 of the font size wide.
+    """
     return textwrap.wrap(words, max(12, int(room / (0.58 * size))), break_long_words=True) or [""]
 
 
@@ -182,7 +185,10 @@ def _strain_scale(figure: Figure, axes: Sequence[Axes], panels: Sequence[Panel],
 
 
 def _strips(figure: Figure, panels: Sequence[Panel], title: str, height: float, asked: Asked, *, legend: bool) -> None:
-    """Draw title, legend and foot, and set the figure's height, given that of the panels [inches]."""
+    """Draw title, legend and foot, and set the figure's height.
+
+    The argument `height` is the height of the panels [inches].
+    """
     room = asked.width / INCH * 72.0 - 2.0 * _PAD
     said = list(dict.fromkeys(note for panel in panels for note in panel.notes))
     machines = list(dict.fromkeys(panel.machine for panel in panels if panel.machine))
@@ -213,7 +219,10 @@ def _tall(lines: Sequence[str], size: float) -> float:
 
 
 def _legend(figure: Figure, panels: Sequence[Panel], asked: Asked, room: float) -> Legend | None:
-    """Draw the legend in as many columns as fit; read downwards, its order is that of the curves."""
+    """Draw the legend in as many columns as fit.
+
+    Read downwards, its order is that of the curves.
+    """
     entries = _entries(panels)
     if not entries:
         return None
@@ -249,7 +258,10 @@ def _entries(panels: Sequence[Panel]) -> list[Any]:
 
 
 def ordered(series: Sequence[Series]) -> list[Series]:
-    """Sort series by the end values of their curves, the highest first; those without a point come last."""
+    """Sort series by the end values of their curves, the highest first.
+
+    Series without a point come last.
+    """
 
     def end(one: Series) -> float:
         known = one.y[np.isfinite(one.y) & np.isfinite(one.x)]
@@ -259,7 +271,10 @@ def ordered(series: Sequence[Series]) -> list[Series]:
 
 
 def _settle(axes: Sequence[Axes], panels: Sequence[Panel], asked: Asked) -> None:
-    """Adjust what depends on the final size of the frames: tick labels, values in cells, labels at curve ends."""
+    """Adjust what depends on the final size of the frames.
+
+    These are tick labels, values in cells, and labels at curve ends.
+    """
     figure: Any = axes[0].figure
     warnings.simplefilter("ignore", UserWarning)  # where frames have no room the faults are told
     figure.draw_without_rendering()

@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Direct labels at the ends of curves, to the right of the frame, where they fit; they replace a legend."""
+"""Direct labels to the right of curve ends, where they fit.
+
+They replace a legend.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +58,10 @@ def _end(series: Series) -> list[float]:
 
 
 class _Names:
-    """Labels of one frame: created before the layout, which reserves space for them, and positioned after it."""
+    """Labels at the curve ends of one frame.
+
+    They are created before the layout, which reserves space for them, and positioned after it.
+    """
 
     def __init__(self, ax: Axes, known: Sequence[Series], asked: Asked) -> None:
         self._ax, self._gap = ax, 1.25 * asked.small
@@ -122,7 +128,10 @@ def _dark(color: str) -> str:
 
 
 def _name_points(ax: Axes, series: Sequence[Series], asked: Asked) -> None:
-    """Label single points, each on a side where its label overlaps no other label and no other point."""
+    """Label single points without overlap.
+
+    A label is on a side of its point where it overlaps no other label and no other point.
+    """
     for one in series:
         for x, y in zip(one.x, one.y, strict=True):
             name = ax.annotate(
@@ -147,7 +156,10 @@ _SIDES: tuple[tuple[float, float, Any], ...] = tuple(
 
 
 def _place(ax: Axes, name: Annotation) -> None:
-    """Place a label on the first side where it is inside the frame and overlaps no earlier label or point."""
+    """Place a label on the first side without overlap.
+
+    There it is inside the frame and overlaps no earlier label or point.
+    """
     before = [other for other in ax.texts[: ax.texts.index(name)] if isinstance(other, Annotation)]
     taken = [other.get_window_extent() for other in before]
     points = [ax.transData.transform(line.get_xydata()) for line in ax.lines if line.get_marker() not in ("None", "")]

@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Drawing of panels in their frames: curves, cells, pictures. Sizes are in points of the printed figure."""
+"""Drawing of panels in their frames: curves, cells, pictures.
+
+Sizes are in points of the printed figure.
+"""
 
 from __future__ import annotations
 
@@ -107,9 +110,10 @@ def handle(series: Series) -> Line2D:
 
 
 def draw_grid(ax: Axes, panel: CellMap, asked: Asked) -> None:
-    """Draw the cells of a map, with row names at the left and column names above.
+    """Draw the cells of a map with row and column names.
 
-    Cells measured by other code have a dot in the corner, unless that holds for all.
+    Row names are at the left, column names above. Cells measured by other code have a dot in the corner, unless that
+    holds for all.
 
     Args:
         ax: axes.
@@ -134,7 +138,10 @@ def draw_grid(ax: Axes, panel: CellMap, asked: Asked) -> None:
 
 
 def write_cells(ax: Axes, panel: CellMap, asked: Asked) -> None:
-    """Write the values of all cells if the longest one fits; call it after the frame has its final size."""
+    """Write the values of all cells if the longest one fits.
+
+    The frame must have its final size.
+    """
     rows, columns = names(panel)
     longest = max((len(cell.figure) for cell in panel.cells), default=0)
     width, _ = in_points(ax)

@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false
-"""Checks of a figure as it would be printed: text that is too small, cut off, or overlaps other text."""
+"""Checks of a figure for text that is too small, cut off, or overlapping."""
 
 from __future__ import annotations
 

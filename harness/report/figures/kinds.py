@@ -100,7 +100,9 @@ KINDS: dict[str, Kind] = {
 
 
 def kind(name: str) -> Kind:
-    """Find the kind with this name; an installed report with a `panels` attribute is a kind too.
+    """Find the kind of figure with this name.
+
+    An installed report with a `panels` attribute is a kind too.
 
     Raises:
         InputError: if there is no such kind.

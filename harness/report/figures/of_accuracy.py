@@ -106,7 +106,10 @@ def _ended(curves: Sequence[Curve]) -> list[str]:
 
 
 def times(folder: Path) -> list[Entry]:
-    """Build panels of the time to each accuracy, for each mesh and initial guess, without and with amortised set-up."""
+    """Build panels of the time to each accuracy.
+
+    There are panels for each mesh and initial guess, without set-up and with amortised set-up.
+    """
     table = without_short(read(folder))
     marked = looks((curve.label, curve.solver) for curve in table.curves)
     plots: list[Plot] = []
@@ -229,7 +232,10 @@ def _stairs(found: dict[str, Values], marked: dict[str, Mark]) -> Iterator[Serie
 
 
 def growth(folder: Path) -> list[Entry]:
-    """Build panels of time to a gap against the number of vertices, for each scene and initial guess."""
+    """Build panels of time to a gap against the number of vertices.
+
+    There is one for each scene and initial guess.
+    """
     table = without_short(read(folder))
     marked = looks((curve.label, curve.solver) for curve in table.curves)
     found = [one for one in growths(table) if one.vertices]
@@ -258,7 +264,7 @@ def growth(folder: Path) -> list[Entry]:
 
 
 def paper(folder: Path) -> list[Entry]:
-    """Build panels of figures 2 and 3 of Liu et al. 2013, compared with own results."""
+    """Build panels of figures 2 and 3 of Liu et al. 2013 with own results."""
     from harness.report.accuracy.paper import comparisons, own
 
     table = read(folder)

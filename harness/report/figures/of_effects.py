@@ -1,4 +1,7 @@
-"""Panels of ablations: cost and influence of effects, and their overhead per iteration for every solver."""
+"""Panels of ablations: cost, influence and overhead of effects.
+
+The overhead per iteration is shown for every solver.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +45,7 @@ _ALL = "all"
 
 
 def _ablations(folder: Path, kind: str) -> Iterator[tuple[str, Sequence[Row]]]:
-    """Yield the rows of each ablation with rows of a kind, and the name of its file.
+    """Yield the rows of each ablation with rows of a kind, by file name.
 
     Raises:
         InputError: if there are none.
@@ -56,7 +59,7 @@ def _ablations(folder: Path, kind: str) -> Iterator[tuple[str, Sequence[Row]]]:
 
 
 def effects(folder: Path) -> list[Entry]:
-    """Build panels of the cost of each effect of a scene, and of the changes without it."""
+    """Build panels of the cost of each effect and the changes without it."""
     plots: list[Plot] = []
     for stem, table in _ablations(folder, "without"):
         (whole,) = ablation.of_kind(table, "whole")
@@ -94,7 +97,10 @@ def _effect(k: int, row: Row, whole: float, *, older: bool) -> Series:
 
 
 def prices(folder: Path) -> list[Entry]:
-    """Build panels of the overhead per iteration: a map of all solvers, and intervals for each solver."""
+    """Build panels of the overhead per iteration.
+
+    These are a map of all solvers, and intervals for each solver.
+    """
     found = _labelled([row for _, table in _ablations(folder, "price") for row in ablation.of_kind(table, "price")])
     marked = looks((row["label"], row["solver"]) for row in found)
     panels: list[Panel] = []
@@ -109,7 +115,7 @@ def prices(folder: Path) -> list[Entry]:
 
 
 def _labelled(rows: Sequence[Row]) -> list[Row]:
-    """Add a `label` to rows: the solver, with its parameters if it was measured with several."""
+    """Add a `label` to rows: the solver, with its parameters if they vary."""
     settings: dict[str, set[str]] = {row["solver"]: set() for row in rows}
     for row in rows:
         settings[row["solver"]].add(row["parameters"] or "{}")
@@ -125,7 +131,10 @@ def _other(row: Row) -> bool:
 
 
 def _map(of: tuple[str, ...], subject: str, here: Sequence[Row]) -> CellMap:
-    """Build the overhead map: effects in rows, the most expensive first and all together last; solvers in columns."""
+    """Build the overhead map with effects in rows and solvers in columns.
+
+    The most expensive effect comes first, and all effects together come last.
+    """
     known = [row for row in here if row["status"] == "ok"]
     paid = {row["name"]: [r["price"] for r in known if r["name"] == row["name"]] for row in here}
     order = sorted(paid, key=lambda name: (name == _ALL, -median(paid[name] or [0.0])))

@@ -1,4 +1,7 @@
-"""Comparison with external engines: the Pareto front of each program over all settings, one panel per mesh."""
+"""Comparison with external engines by Pareto fronts, one panel per mesh.
+
+The front of a program is taken over all its settings.
+"""
 
 from __future__ import annotations
 

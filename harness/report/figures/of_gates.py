@@ -1,4 +1,4 @@
-"""Panels of stored benchmark results: each benchmark's results by commit, its level, and changes of the level."""
+"""Panels of stored benchmark results by commit, with levels and changes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Panels of verified runs: each solver's shares, and the robustness map, with one map per family of cases."""
+"""Panels of verified runs: each solver's shares, and robustness maps.
+
+There is one map per family of cases.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,10 @@ def _cell(cell: Judged, *, older: bool) -> Cell:
 
 
 def together(grids: Sequence[CellMap]) -> CellMap:
-    """Merge the maps of several families into one, whose rows include the name of their family."""
+    """Merge the maps of several families into one.
+
+    The names of its rows include the family.
+    """
     if len(grids) == 1:
         return grids[0]
     cells = [cell._replace(row=f"{grid.title}: {cell.row}") for grid in grids for cell in grid.cells]

@@ -1,4 +1,7 @@
-"""Pictures of recorded meshes: the last frame of one run, of all solvers of a scene, or of all scenes."""
+"""Pictures of recorded meshes at their last frames.
+
+They show one run, all solvers of a scene, or all scenes.
+"""
 
 from __future__ import annotations
 
@@ -74,12 +77,18 @@ def run(folder: Path) -> list[Entry]:
 
 
 def comparison(folder: Path) -> list[Entry]:
-    """Build entries for the last frames of all solvers of a scene and size, with one camera and one scale."""
+    """Build entries for the last frames of all solvers of a scene and size.
+
+    They share one camera and one scale.
+    """
     return [one.entry(one.mesh, one.parts) for one in _recorded(folder)]
 
 
 def scenes(folder: Path) -> list[Entry]:
-    """Build an entry for the last frame of each scene at its largest size, from the run with the lowest residual."""
+    """Build an entry for the last frame of each scene.
+
+    It shows the largest size, and the run with the lowest residual.
+    """
     best = {one.run.scene: one for one in sorted(_recorded(folder), key=_worth)}
     return [one.entry(("scenes",), (scene,)) for scene, one in sorted(best.items())]
 
@@ -162,8 +171,9 @@ class _Render(Renderer):
 
 
 def alike(pictures: Sequence[Picture]) -> list[Picture]:
-    """Give pictures of one scene the same camera, strain scale and aspect ratio, and state distances from the
-    reference.
+    """Give pictures of one scene the same camera, strain scale and aspect ratio.
+
+    Distances from the reference run are added to their facts.
     """
     renders: list[Any] = [picture.render for picture in pictures]
     replays = [render.replay for render in renders]
@@ -192,7 +202,10 @@ _FROM = "Distance: of the farthest vertex from the reference, the run of the low
 
 
 def sheet(pictures: Sequence[Picture]) -> list[Picture]:
-    """Build pictures of several scenes, each with its own camera, with one aspect ratio and one strain scale."""
+    """Build pictures of several scenes with one aspect ratio and strain scale.
+
+    Each picture has its own camera.
+    """
     limit = max(picture.limit for picture in pictures)
     aspect = float(np.median([picture.aspect for picture in pictures]))
     out: list[Picture] = []

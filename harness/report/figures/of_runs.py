@@ -93,7 +93,10 @@ def _by_size(
     fields: Sequence[str],
     other: Collection[str],
 ) -> tuple[list[Series], tuple[Scale, Scale]]:
-    """Build curves against the number of vertices, or, for a single size, one row per solver, the fastest first."""
+    """Build curves of time against the number of vertices.
+
+    For a single size there is one row per solver instead, the fastest first.
+    """
     each: dict[str, list[RunTimes]] = {}
     for run in sorted(timed, key=lambda run: run.vertices or 0):
         each.setdefault(names[run.run_id], []).append(run)
@@ -113,7 +116,7 @@ def _by_size(
 
 
 def speed(folder: Path) -> list[Entry]:
-    """Build panels of each phase's time against size, and of the reached share of the binding limit."""
+    """Build panels of phase times and of the reached share of the limit."""
     units = shelf.units(folder / "rows")
     table = rows.read(units, needed=_NEEDED) if units else None
     if table is None or speed_figures.MACHINE not in table["solver"].unique().to_pylist():

@@ -1,4 +1,7 @@
-"""Map of winners: stiffness number against error, coloured by the cheapest family of methods, one map per mesh size."""
+"""Map of winners: stiffness number against error, one map per mesh size.
+
+Cells have the colour of the cheapest family of methods.
+"""
 
 from __future__ import annotations
 

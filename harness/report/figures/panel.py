@@ -1,4 +1,4 @@
-"""Panels of a figure as plain data: plots of curves, maps of cells, and pictures of meshes.
+"""Panels of a figure as plain data: plots, cell maps and mesh pictures.
 
 The same panel is drawn, written as CSV, and reproduced by the script next to the CSV file.
 """
@@ -110,8 +110,9 @@ class Plot:
 
 
 class Cell(NamedTuple):
-    """One cell of a map: its row and column by name, its outcome, colour and value, and whether other code measured
-    it.
+    """One cell of a map: row, column, outcome, colour and value.
+
+    `is_stale` states whether other code measured it.
     """
 
     row: str
@@ -131,7 +132,10 @@ def dotted(cells: Sequence[Cell]) -> list[str]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CellMap:
-    """Coloured cells in rows and columns; `outcomes` are pairs of meaning and colour, in the order of the legend."""
+    """Coloured cells in rows and columns.
+
+    `outcomes` are pairs of meaning and colour, in the order of the legend.
+    """
 
     of: tuple[str, ...]
     name: tuple[str, ...]

@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Axes of figures for print: limits, tick labels that do not overlap, and numbers without small type."""
+"""Axes of figures for print: limits, tick positions and tick labels.
+
+Tick labels do not overlap, and numbers contain no small type.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,10 @@ def in_points(ax: Axes) -> tuple[float, float]:
 
 
 def _superscript(words: str) -> str:
-    """Convert a number to superscript characters of the full font size, because math text would use 0.7 of it."""
+    """Convert a number to superscript characters of the full font size.
+
+    Math text would use 0.7 of it.
+    """
     return words.translate(_SUPERSCRIPTS)
 
 
@@ -150,8 +156,9 @@ def _written(axis: Axis, scale: Scale) -> None:
 
 
 def thin(ax: Axes) -> None:
-    """Remove ticks until their labels do not overlap: keep every second one, every third, and so on; call it after
-    drawing.
+    """Remove ticks until their labels do not overlap.
+
+    Every second tick remains, or every third, and so on. The axes must have been drawn.
     """
     for axis in (ax.xaxis, ax.yaxis):
         places = [float(at) for at in np.asarray(axis.get_majorticklocs()) if _seen(axis, float(at))]

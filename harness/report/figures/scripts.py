@@ -1,4 +1,7 @@
-"""Templates of the scripts that reproduce figures: a common head, and the code for curves, cells and meshes."""
+"""Templates of the scripts that reproduce figures.
+
+These are a common head, and the code for curves, cells and meshes.
+"""
 
 HEAD = '''"""Draws {name} again from {name}.csv, for you to change; needs Python with matplotlib alone."""
 

@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Output files of a figure: the figure in each format, its data as CSV, and a short script that reproduces it."""
+"""Output files of a figure: image formats, data as CSV, and a script.
+
+The short script reproduces the figure from the data.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ from harness.report.figures.panel import CellMap, Panel, Picture, Plot, Row
 
 
 def write(figure: Figure, panels: Sequence[Panel], stem: Path, title: str, asked: Asked) -> list[Path]:
-    """Write the figure in all formats, its data as CSV and its script, and return the files.
+    """Write a figure, its data as CSV and its script, and return the files.
 
     Args:
         figure: figure to write.
@@ -53,7 +56,10 @@ def write(figure: Figure, panels: Sequence[Panel], stem: Path, title: str, asked
 
 
 def _metadata(kind: str, title: str, about: str) -> dict[str, Any]:
-    """Build the metadata of a file, without a date, so that equal data gives equal files."""
+    """Build the metadata of a file, without a date.
+
+    Equal data thus gives equal files.
+    """
     if kind == "pdf":
         return {"Title": title, "Subject": about, "Creator": "springbench", "CreationDate": None}
     if kind == "svg":

@@ -1,4 +1,6 @@
-"""The results page: one `index.html` that a browser opens from the file system, without network or server.
+"""The results page: one `index.html` that a browser opens from the file system.
+
+It needs neither network nor server. Its files are:
 
     index.html                     next to the folders of the sweeps, or in the folder of one sweep
     site/*.js, *.css               scripts and style of the page; plotly.js, loaded when a plot is opened

@@ -1,4 +1,4 @@
-"""Charts of ablations for the results page: cost and influence of each effect, and its overhead per iteration."""
+"""Charts of ablations for the results page: cost, influence and overhead of effects."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ _NAMES = {"type": "category", "autorange": "reversed"}
 
 
 def charts(rows: Sequence[Row]) -> tuple[dict[str, dict[str, Any]], list[str]]:
-    """Build the charts by their ids, and the verdicts in sentences, from the rows of one or several scenes."""
+    """Build the charts by their ids, and the verdicts in sentences.
+
+    The rows may belong to several scenes.
+    """
     made = {"ablation": _effects(rows), "prices": _prices(rows)}
     by_whole = [_of(whole, rows) for whole in of_kind(rows, "whole") if whole["status"] == "ok"]
     words = [f"{some[0]['scene']}: {said}" for some in by_whole for said in sentences(some)]

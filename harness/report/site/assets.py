@@ -1,4 +1,7 @@
-"""Static files of the results page: its scripts and its style, and Plotly's script from the installed package."""
+"""Static files of the results page: scripts, style, and Plotly's script.
+
+Plotly's script comes from the installed package.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,10 @@ def version() -> str:
 
 
 def place(results: Path) -> str:
-    """Install the page next to the folders of results unless it is up to date; return its version."""
+    """Install the page next to the folders of results, and return its version.
+
+    Files that are up to date are not written again.
+    """
     site, stamp = results / "site", results / "site" / "version.txt"
     if stamp.is_file() and stamp.read_text() == version() and (results / "index.html").is_file():
         return version()

@@ -1,4 +1,4 @@
-"""Update of the results page: new data of each sweep, then the index of all sweeps."""
+"""Update of the results page: changed sweeps first, then the index."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def update(
     viewer: bool = False,
     say: Callable[[str], None] = lambda words: None,
 ) -> Path:
-    """Update the results page of a folder of results, or of one sweep, and return `index.html`.
+    """Update the results page, and return the path of `index.html`.
 
     Args:
         results: folder of results, or the folder of one sweep.
@@ -57,9 +57,10 @@ def update(
 
 
 def keep(results: Path, folder: Path, say: Callable[[str], None], *, quiet: bool = False) -> None:
-    """Update the page of all results with the new data of a sweep's folder, and print its path unless `is_quiet`.
+    """Update the page of all results with the new data of a sweep.
 
-    If rows are damaged, it prints a remark instead of raising: the measured data is stored in any case.
+    It prints the path of the page unless `is_quiet`. If rows are damaged, it prints a remark instead of raising: the
+    measured data is stored in any case.
 
     Args:
         results: folder of results.
@@ -87,7 +88,10 @@ def _write(home: Path, folder: Folder, found: Overview, state: str) -> None:
 
 
 def _known(home: Path) -> dict[str, Any]:
-    """Read the summary written by the last update of a sweep; empty if it is missing or incomplete."""
+    """Read the summary written by the last update of a sweep.
+
+    It is empty if the file is missing or incomplete.
+    """
     try:
         return json.loads((home / SUMMARY).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -95,7 +99,10 @@ def _known(home: Path) -> dict[str, Any]:
 
 
 def _state(folder: Folder, code: str, recorded: bool) -> str:
-    """Return a hash that changes if a sweep has new data, or if this program would present it differently."""
+    """Return a hash of the state of a sweep's data.
+
+    It changes with new data, or if this program would present them differently.
+    """
     told: list[Any] = [code, recorded]
     for kind in KINDS:
         home = folder.path / kind
@@ -110,13 +117,19 @@ def _state(folder: Folder, code: str, recorded: bool) -> str:
 
 
 def _called(results: Path) -> str:
-    """Return the folder's path relative to the current directory, or its name if it is elsewhere."""
+    """Return the folder's path relative to the current directory.
+
+    If the folder is elsewhere, only its name is returned.
+    """
     there, here = results.resolve(), Path.cwd()
     return there.relative_to(here).as_posix() if there.is_relative_to(here) else there.name
 
 
 def _index(results: Path, data: Path) -> None:
-    """Write the index of all existing sweeps with a summary; the others are listed as absent."""
+    """Write the index of all existing sweeps with a summary.
+
+    The others are listed as absent.
+    """
     there = {folder.slug: folder for folder in folders(results)}
     known = {slug: _known(data / slug) for slug in there}
     told = sorted((summary for summary in known.values() if summary), key=lambda s: s["to"] or "", reverse=True)

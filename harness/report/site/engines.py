@@ -1,4 +1,7 @@
-"""Chart of external engines for the results page: the Pareto front of each program over all of its settings."""
+"""Chart of external engines for the results page: Pareto fronts.
+
+The front of each program is taken over all its settings.
+"""
 
 from __future__ import annotations
 

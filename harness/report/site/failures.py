@@ -14,7 +14,7 @@ MOST = 200
 
 
 class Failed(NamedTuple):
-    """One failed run: scene, solver, status and reason, and its run id if it has one."""
+    """One failed run: scene, solver, status, reason and, if known, its id."""
 
     where: str
     solver: str

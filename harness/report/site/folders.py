@@ -50,7 +50,10 @@ def folder_of(path: Path, results: Path) -> Folder:
 
 
 def _slug(parts: tuple[str, ...]) -> str:
-    """Make a unique name for a folder: its parts joined by ~, or a hash if that is unsafe or ambiguous."""
+    """Make a unique name for a folder.
+
+    It consists of its parts joined by ~, or of a hash if that is unsafe or ambiguous.
+    """
     joined = "~".join(parts) or "this"
     unique = joined.count("~") == max(len(parts) - 1, 0) and parts != ("this",)
     if unique and re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._~-]{0,99}", joined):

@@ -1,4 +1,7 @@
-"""Per-frame data of each run, in a script per run: loaded when a run is opened or compared."""
+"""Per-frame data of each run, in a script per run.
+
+A script is loaded when its run is opened or compared.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Stored benchmark results for the results page: each benchmark by commit, its level, and changes of the level."""
+"""Stored benchmark results for the results page, by commit.
+
+Charts show each benchmark's level and its changes.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +51,10 @@ def read(files: Iterable[Path], say: Say) -> list[Stored]:
 
 
 def charts(stored: Sequence[Stored]) -> tuple[dict[str, Chart], list[Chart]]:
-    """Build the charts of ratios and of times by their ids, and the findings: the changes, the largest first."""
+    """Build the charts by their ids, and the findings.
+
+    Charts are of ratios and of times; findings are the changes, the largest first.
+    """
     found = histories(stored)
     made = {name: _chart(name, [one for one in found if one.ratio == (name == "gates")]) for name in _KINDS}
     return {name: chart for name, chart in made.items() if chart["items"]}, [*_findings(found)]
@@ -87,7 +93,10 @@ def _chart(name: str, found: Sequence[GateHistory]) -> Chart:
 
 
 def _items(gate: GateHistory, panel: str) -> Iterable[Chart]:
-    """Build items of the results, of the level with a gap before each change, and of the changes."""
+    """Build the chart items of results, level and changes.
+
+    The level has a gap before each change.
+    """
     names = _named(gate.points)
     scale = 1.0 if gate.ratio else 1e3
     same = {"what": gate.gate, "gate": gate.gate, "panel": panel, "parameters": "{}"}

@@ -1,4 +1,7 @@
-"""Robustness map for the results page: solvers x cases, with the outcome of each run and its reason."""
+"""Robustness map for the results page: outcomes of solvers x cases.
+
+Each outcome has its reason.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,9 @@ def judged(table: pa.Table) -> bool:
 
 
 def chart(folder: Folder) -> dict[str, Any]:
-    """Build the map: cells by case and solver, the solvers' shares, and the meanings of the colours.
+    """Build the robustness map for the results page.
+
+    It has cells by case and solver, the solvers' shares, and the meanings of the colours.
 
     Raises:
         InputError: if no run was verified.

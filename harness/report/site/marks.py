@@ -43,5 +43,8 @@ def drawn(mark: Mark) -> dict[str, str]:
 
 
 def axis(column: str, title: str, how: Mapping[str, Any] = LOG) -> dict[str, Any]:
-    """Return a possible axis of a chart: a column of its items, its title, and the layout for Plotly."""
+    """Return a possible axis of a chart.
+
+    It has a column of the items, a title, and the layout for Plotly.
+    """
     return {"column": column, "title": title, "axis": how}

@@ -1,7 +1,7 @@
-"""Meshes for the results page from recordings: the last frame of each run, and iterates of solves with a reference.
+"""Meshes for the results page, from recordings.
 
-Positions are in single precision relative to the recording's origin: differences below 1e-7 of a scene's size are not
-resolved.
+These are the last frame of each run, and the iterates of solves with a reference. Positions are in single precision
+relative to the recording's origin: differences below 1e-7 of a scene's size are not resolved.
 """
 
 from __future__ import annotations
@@ -90,7 +90,10 @@ def write_recordings(folder: Folder, home: Path, recordings: Mapping[str, str]) 
 
 
 def _solves(folder: Folder, home: Path, curves: Sequence[Curve], best: Curve, say: Say) -> dict[str, str]:
-    """Write the solves of one snapshot; the last iterate of `best` is the reference of all."""
+    """Write the solves of one snapshot.
+
+    The last iterate of `best` is the reference of all.
+    """
     truth = folder.path / best.recording
     targets = {curve.recording: script.below(home / "solves", Path(curve.recording).stem) for curve in curves}
     stale = [name for name, target in targets.items() if not _fresh(target, folder.path / name, truth)]
@@ -108,7 +111,10 @@ def _solves(folder: Folder, home: Path, curves: Sequence[Curve], best: Curve, sa
 
 
 def _iterates(replay: Replay, reference: NDArray[np.float32]) -> dict[str, Any]:
-    """Select some of a solve's iterates, with the limits of their distances [m] from the reference."""
+    """Select some of a solve's iterates, with the limits of their distances [m].
+
+    Distances are from the reference.
+    """
     kept = np.unique(np.linspace(0, len(replay.frames) - 1, min(KEPT, len(replay.frames))).round().astype(int))
     farthest = float(np.linalg.norm(replay.positions[kept] - reference, axis=2).max()) or 1.0
     return _shape(replay) | {

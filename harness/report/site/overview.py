@@ -1,6 +1,9 @@
 # pyright: reportUnknownMemberType=false
 # pyarrow's stubs do not type every kind of file that Parquet is written to.
-"""Data of one sweep for the results page: its entry in the index, and the scripts with its runs and charts."""
+"""Data of one sweep for the results page.
+
+These are its entry in the index, and the scripts with its runs and charts.
+"""
 
 from __future__ import annotations
 
@@ -131,7 +134,10 @@ def _runs(folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
 
 
 def _add_recorded(folder: Folder, home: Path, found: Sequence[dict[str, Any]], anew: bool, say: Say) -> None:
-    """Mark whether each run's last frame and recording are in the page's data; with `include_missing`, add them."""
+    """Mark whether each run's last frame and recording are in the page's data.
+
+    With `include_missing`, missing ones are added.
+    """
     there = {part: {path.stem for path in (home / part).glob("*.js")} for part in ("meshes", "recordings")}
     if anew and (recorded := {run["unit"]: title(run) for run in found if run["recording"]}):
         from harness.report.site.meshes import write_last, write_recordings

@@ -1,4 +1,4 @@
-"""Provenance of rows for the results page: code version, machine, and the config that reproduces them."""
+"""Provenance of rows for the results page: code, machine and config."""
 
 from __future__ import annotations
 
@@ -34,7 +34,10 @@ def made(table: pa.Table, unit: str) -> list[dict[str, Any]]:
 
 
 def config_of(folder: Path) -> str:
-    """Find the config of a sweep's folder, in the form suited to a command line; "" if unknown or deleted."""
+    """Find the config of a sweep's folder, as a path for a command line.
+
+    It is "" if the config is unknown or deleted.
+    """
     note = folder / CLAIM
     said = note.read_text(errors="replace").strip() if note.is_file() else ""
     path = folder / said
@@ -48,7 +51,10 @@ def config_of(folder: Path) -> str:
 
 
 def scenes_of(folder: Path) -> dict[str, str]:
-    """Find the scene files that a sweep's config lists, by scene name, relative to the same folder as the config."""
+    """Find the scene files that a sweep's config lists, by scene name.
+
+    Paths are relative to the same folder as that of the config.
+    """
     from harness.base.yaml import read_yaml
 
     called = config_of(folder)

@@ -57,7 +57,9 @@ def read(folder: Folder, left_out: Callable[[Mistake], None]) -> pa.Table:
 
 
 def table_of(folder: Folder, table: pa.Table) -> list[Run]:
-    """Build records of the runs, ordered by scene, size and solver: identification, status, and times [ms].
+    """Build records of the runs, ordered by scene, size and solver.
+
+    A record has the identification, the status, and the times [ms].
 
     Args:
         folder: folder of the sweep's results.
@@ -150,7 +152,10 @@ _SHOWN = (
 
 
 def _more(table: pa.Table) -> dict[str, Run]:
-    """Query details of runs that the table at the end of a sweep does not include, by run id."""
+    """Query further details of runs, by run id.
+
+    The table at the end of a sweep does not include them.
+    """
     return {run.pop("run_id"): run for run in answers(_MORE, table)}
 
 

@@ -1,4 +1,7 @@
-"""Data as scripts that a page from the file system can load: each passes one value by name."""
+"""Data as scripts that a page from the file system can load.
+
+Each script passes one value by name.
+"""
 
 from __future__ import annotations
 
@@ -70,8 +73,9 @@ def numbers(values: Iterable[Any]) -> list[float | int | None]:
 
 
 def column(values: Sequence[Any]) -> Any:
-    """Encode a column for the page: numbers as they are; strings as a list of distinct ones, `of`, and indices,
-    `at`.
+    """Encode a column for the page.
+
+    Numbers stay as they are; strings become a list of distinct ones, `of`, and indices, `at`.
     """
     if str not in set(map(type, values)):
         return numbers(values)

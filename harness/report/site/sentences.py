@@ -1,4 +1,4 @@
-"""Sentences on the runs of a sweep: the fastest at equal accuracy, and the number of unconverged runs."""
+"""Sentences on the runs of a sweep: fastest at equal accuracy, unconverged runs."""
 
 from __future__ import annotations
 

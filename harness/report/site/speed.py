@@ -1,4 +1,7 @@
-"""Chart of a speed report for the results page: times and bandwidth by size, compared with the machine's limits."""
+"""Chart of a speed report for the results page.
+
+It shows times and bandwidth by size, compared with the machine's limits.
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
-"""Replay of recordings in a page: Rerun's web viewer, and recordings, as scripts that a page can load from files.
+"""Replay of recordings in a page by Rerun's web viewer.
 
-The viewer is the one that the installed `rerun` serves to browsers: a script and its WebAssembly module. Both are
-packed into one `viewer.js`, the module as gzipped base64. A recording becomes a script of the same kind.
-`static/replay.js` loads them when a recording is opened. The start of the viewer from a page is undocumented: the code
-that depends on it is in this module and in that script, and is valid only for RERUN_VERSION.
+The viewer and the recordings are stored as scripts that a page can load from files. The viewer is the one that the
+installed `rerun` serves to browsers: a script and its WebAssembly module. Both are packed into one `viewer.js`, the
+module as gzipped base64. A recording becomes a script of the same kind. `static/replay.js` loads them when a recording
+is opened. The start of the viewer from a page is undocumented: the code that depends on it is in this module and in
+that script, and is valid only for RERUN_VERSION.
 """
 
 from __future__ import annotations
@@ -60,8 +61,9 @@ return wasm_bindgen;
 
 
 def binary() -> Path:
-    """Return the path of Rerun's executable from the wheel; its wrapper script would leave a process behind when
-    killed.
+    """Return the path of Rerun's executable from the wheel.
+
+    Its wrapper script would leave a process behind when killed.
     """
     return Path(rerun_cli.__file__).with_name("rerun.exe" if os.name == "nt" else "rerun")
 
@@ -85,7 +87,9 @@ def write_viewer(folder: Path) -> Path:
 
 
 def write_recording(recording: Path, script: Path, title: str) -> Path:
-    """Write a recording (.rrd) as a script unless that is up to date; return the script's path.
+    """Write a recording (.rrd) as a script, and return the script's path.
+
+    A script that is up to date is not written again.
 
     Args:
         recording: recording.
@@ -105,9 +109,10 @@ def write_recording(recording: Path, script: Path, title: str) -> Path:
 
 
 def layout_first(data: bytes) -> bytes:
-    """Move the messages of a recording's layout before the others, so that the viewer opens with it immediately.
+    """Move the messages of a recording's layout before the others.
 
-    The index at the end of the file, up to half of its size, is omitted, because a stream needs no lookup.
+    The viewer then opens with it immediately. The index at the end of the file, up to half of its size, is omitted,
+    because a stream needs no lookup.
     """
     messages, place = list[tuple[int, bytes]](), _HEADER
     while place + 16 <= len(data):
@@ -137,7 +142,10 @@ def _packed(data: bytes) -> str:
 
 
 def _served() -> tuple[str, bytes]:
-    """Fetch the viewer's script and its WebAssembly module from its own server, on the loopback interface only."""
+    """Fetch the viewer's script and WebAssembly module from its own server.
+
+    The server listens only on the loopback interface.
+    """
     with _serving() as address:
         script, wasm = (_fetched(f"{address}/{name}") for name in (_SCRIPT, _WASM))
     return script.decode().replace("arg0.fetch(", "fetch("), wasm  # that of the window, else

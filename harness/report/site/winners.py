@@ -1,4 +1,7 @@
-"""Map of winners as a chart of the results page: the cheapest family of methods for each error on each mesh."""
+"""Map of winners as a chart of the results page.
+
+It shows the cheapest family of methods for each error on each mesh.
+"""
 
 from __future__ import annotations
 

@@ -36,7 +36,9 @@ class Counted(NamedTuple):
 
 
 def count(facts: Mapping[str, float], vertices: int, springs: int, precision: str = "float64") -> dict[str, Counted]:
-    """Count the work of one local step, one global step and one iteration (both); unknown counts are omitted.
+    """Count the work of a local step, a global step and an iteration.
+
+    An iteration is both steps. Unknown counts are omitted.
 
     Args:
         stats: `nnz_factor`, `panel_bytes` and `flops_per_solve` of a prepared solver, as far as known.

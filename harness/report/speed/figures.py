@@ -1,4 +1,7 @@
-"""Figures of a speed report from its rows: times, bandwidth, the binding limit and its reached share, speedups."""
+"""Figures of a speed report, computed from its rows.
+
+These are times, bandwidth, the binding limit and its reached share, and speedups.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,9 @@ class Limit(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """One candidate at one size. Times are medians over the rounds [ms]; None: not measured or unknown.
+    """One candidate at one size.
+
+    Times are medians over the rounds [ms]; None: not measured or unknown.
 
     Attributes:
         step: time of STEP_ITERATIONS iterations.
@@ -87,12 +92,18 @@ class Figures(NamedTuple):
 
     @property
     def older(self) -> bool:
-        """Whether other code than the current version measured it; rows without a fingerprint count as current."""
+        """Whether other code than the current version measured it.
+
+        Rows without a fingerprint count as current.
+        """
         return self.code not in ("", machine.code_hash())
 
 
 class MachineLimits:
-    """Measured limits of the machine, from the rounds of one size: bandwidth by working set, and flops, by threads."""
+    """Measured limits of the machine, from the rounds of one size.
+
+    These are bandwidth by working set, and flops, each by number of threads.
+    """
 
     def __init__(self, rows: Sequence[Row]) -> None:
         best: dict[tuple[int, str], dict[float, float]] = defaultdict(dict)
@@ -131,7 +142,10 @@ class MachineLimits:
         return self._binding(far + again, counted, threads, precision)
 
     def passes(self, counted: Counted, threads: int, precision: str) -> Limit:
-        """Compute the time if all moved bytes are loaded from the location of the working set each time."""
+        """Compute the time if all moved bytes are loaded from the working set.
+
+        Each access is then as slow as the location of the working set.
+        """
         far = counted.bytes / self.bandwidth(threads, counted.working_set)
         return self._binding(far, counted, threads, precision)
 
@@ -142,7 +156,10 @@ class MachineLimits:
 
 
 def figures(table: pa.Table) -> list[Figures]:
-    """Compute the figures of all candidates in the rows, in their order, relative to the machine's own rows."""
+    """Compute the figures of all candidates in the rows, in their order.
+
+    They are relative to the machine's own rows.
+    """
     runs: dict[str, list[Row]] = defaultdict(list)
     for row in table.to_pylist():
         runs[row["run_id"]].append(row)
@@ -160,7 +177,10 @@ def figures(table: pa.Table) -> list[Figures]:
 
 
 def _labels(firsts: Sequence[Row]) -> dict[str, str]:
-    """Label candidates by run id: the solver with its varying parameters, and its threads if several."""
+    """Label candidates by run id.
+
+    A label has the solver, its varying parameters, and its threads if several.
+    """
     values: dict[tuple[str, str], set[str]] = defaultdict(set)
     for row in firsts:
         for key, value in json.loads(row["parameters"]).items():
@@ -241,7 +261,10 @@ def _by_cholespy(row: Row) -> bool:
 def _against(
     group: Mapping[str, list[Row]], yardstick: str, phase: str, times: Mapping[str, NDArray[np.float64]]
 ) -> Interval | None:
-    """Compute the speedup over a baseline in the same rounds; None if the baseline has no times."""
+    """Compute the speedup over a baseline in the same rounds.
+
+    The result is None if the baseline has no times.
+    """
     theirs = _times(group.get(yardstick, ()), phase)
     rounds = min(len(theirs), len(times[phase]))
     return ratio(theirs[:rounds], times[phase][:rounds]) if rounds else None

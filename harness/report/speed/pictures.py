@@ -14,7 +14,10 @@ from harness.report.style import OLDER
 
 @dataclass(frozen=True, slots=True)
 class SpeedPicture:
-    """One plot: the stem of its file, its title, the plotted value of a candidate, and whether that is a share."""
+    """One plot: file stem, title, and plotted value of a candidate.
+
+    `is_share` states whether that is a share.
+    """
 
     stem: str
     title: str

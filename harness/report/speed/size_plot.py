@@ -1,7 +1,8 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Plot of one quantity against mesh size on a page of its own: a line for each candidate, with a legend at the
-right.
+"""Plot of one quantity against mesh size on a page of its own.
+
+There is a line for each candidate, and a legend at the right.
 """
 
 from __future__ import annotations

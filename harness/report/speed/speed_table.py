@@ -1,4 +1,7 @@
-"""Table of a speed report: a line for each candidate at each size, compared with the machine's limits."""
+"""Table of a speed report, compared with the machine's limits.
+
+There is a line for each candidate at each size.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +40,10 @@ _NUMBERS = (
 
 
 def speed_table(found: Sequence[Figures]) -> Table:
-    """Build a table with a line for each candidate at each size; speedups have their 95 % intervals."""
+    """Build a table with a line for each candidate at each size.
+
+    Speedups have their 95 % intervals.
+    """
     title = "medians over the rounds, and of the ratios round by round with their 95 % intervals"
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     table.add_column("scene", justify="right")
@@ -56,7 +62,10 @@ def speed_table(found: Sequence[Figures]) -> Table:
 
 
 def _places(found: Sequence[Figures]) -> Callable[[Figures], str]:
-    """Return a function that labels a candidate's scene: by its size only, if there is one scene."""
+    """Return a function that labels a candidate's scene.
+
+    If there is one scene, the label is the size only.
+    """
     if len({f.scene for f in found}) == 1:
         return lambda f: count(f.size)
     return lambda f: f"{f.scene} {count(f.size)}"
@@ -95,7 +104,10 @@ def _ratio(interval: Interval | None) -> str:
 
 
 def remarks(found: Sequence[Figures]) -> list[str]:
-    """Describe omitted and failed candidates with reasons, the solvers' choices, and how the cost of a solve scales."""
+    """Describe failures, choices of the solvers, and the scaling of a solve.
+
+    Failed and omitted candidates are listed with their reasons.
+    """
     where = _places(found)
     told: dict[str, list[str]] = defaultdict(list)
     for f in sorted(found, key=lambda f: f.status == "ok"):
@@ -112,7 +124,7 @@ def remarks(found: Sequence[Figures]) -> list[str]:
 
 
 def exponents(found: Sequence[Figures], figure: str = "global_", least: int = 10_000) -> dict[tuple[str, str], float]:
-    """Fit exponents of the growth of a figure with the number of vertices, by scene and label.
+    """Fit exponents of a figure's growth with size, by scene and label.
 
     Args:
         candidates: figures of all candidates.
