@@ -93,7 +93,13 @@ class Recorder(Protocol):
         ...
 
     def convergence(self, frame: int, residuals: Sequence[float], objective: Sequence[float]) -> None:
-        """Record the residual [J^(1/2)] and the objective [J] of each iteration within one frame."""
+        """Record the convergence within one frame.
+
+        Args:
+          frame: frame index.
+          residuals: residual [J^(1/2)] of each iteration.
+          objective: objective [J] of each iteration.
+        """
         ...
 
     def close(self, milliseconds: Mapping[str, Sequence[float]]) -> Path:

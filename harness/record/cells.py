@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 
 
 def cell(batch: pa.RecordBatch, name: str, row: int = 0) -> NDArray[Any]:
-    """Return all numbers of one row of a component as a flat array."""
+    """Return all numbers of one row of a component as a flat array.
+
+    Args:
+      batch: chunk of a recording.
+      name: name of the component.
+      row: index of the row.
+    """
     values = scalar(batch, name, row).values
     while pa.types.is_nested(values.type):
         values = values.flatten()
@@ -41,6 +47,12 @@ def scalar(batch: pa.RecordBatch, name: str, row: int) -> Any:
 
 
 def replaced(batch: pa.RecordBatch, name: str, rows: Sequence[NDArray[Any]]) -> pa.RecordBatch:
-    """Return the batch with the numbers of a component replaced row by row."""
+    """Return the batch with the numbers of a component replaced row by row.
+
+    Args:
+      batch: chunk of a recording.
+      name: name of the component.
+      rows: new numbers of each row, flat.
+    """
     at = batch.schema.get_field_index(name)
     return batch.set_column(at, batch.schema.field(at), pa.array(rows, batch.schema.field(at).type))

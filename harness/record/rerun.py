@@ -125,7 +125,13 @@ class RerunRecorder:
             self._file.flush()
 
     def convergence(self, frame: int, residuals: Sequence[float], objective: Sequence[float]) -> None:
-        """Record the residual [J^(1/2)] and the objective [J] after each iteration of a frame."""
+        """Record the convergence within one frame.
+
+        Args:
+          frame: frame index.
+          residuals: residual [J^(1/2)] after each iteration, from the first.
+          objective: objective [J] after each iteration.
+        """
         self._curves[frame] = residuals, objective
 
     def solve(self, numbers: Sequence[int], curves: Mapping[str, Sequence[float]]) -> None:

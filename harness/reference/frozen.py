@@ -66,6 +66,12 @@ class Frozen:
 def bind(spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, warns: bool = True) -> Scene:
     """Build the scene with all of its pins exact.
 
+    Args:
+      spec: specification of the scene.
+      size: size of the scene.
+      integrator: name of the integrator.
+      show_warnings: whether warnings of the scene are shown.
+
     Raises:
       InputError: the scene cannot be built.
     """

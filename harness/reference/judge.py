@@ -71,9 +71,15 @@ class Judge:
 
 
 def reference(scene: Scene, solver: Solver, *, first_guess: str, frames: int) -> NDArray[np.float64]:
-    """Compute positions (frames, n, 3) [m] of a run with steps solved to round-off.
+    """Compute positions of a run with steps solved to round-off.
 
-    Positions are nan from the first step on that does not end at a stationary point.
+    Args:
+      scene: scene that is stepped.
+      solver: solver of the steps.
+      initial_guess: name of the initial guess.
+      frames: number of steps.
+
+    Returns: positions (frames, n, 3) [m], nan from the first step on that does not end at a stationary point.
     """
     judge, found = Judge(scene, None, minimises=True), np.full((frames, len(scene.mesh.rest), 3), np.nan)
     for step in simulate(scene, prepare(scene, solver), TO_THE_END, first_guess=first_guess, frames=frames):

@@ -133,7 +133,13 @@ def reference(found: Iterable[Minimum]) -> KnownMinima:
 
 
 def polish(problem: StepProblem, p: Positions, solver: Solver) -> Minimum:
-    """Find and certify the minimum of the basin of p (n, 3) [m]."""
+    """Find and certify the minimum of the basin of p.
+
+    Args:
+      problem: step problem.
+      p: positions (n, 3) [m].
+      solver: Newton's method.
+    """
     solution = solver.prepare(problem.system).solve(replace(problem, first_guess=p), TO_THE_END)
     return certify(problem, solution.positions)
 

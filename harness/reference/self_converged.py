@@ -123,7 +123,14 @@ def converge(bound: Bound, frame: float, times: Sequence[float], error: float) -
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Motion:
-    """A sampled motion: free vertices; start positions (n, 3) [m]; positions and velocities (k, n, 3)."""
+    """A sampled motion.
+
+    Attributes:
+      free_vertices: indices of the free vertices.
+      start_positions: positions at the start (n, 3) [m].
+      positions: positions (k, n, 3) [m].
+      velocities: velocities (k, n, 3) [m/s].
+    """
 
     free: NDArray[np.int64]
     begin: Positions

@@ -112,7 +112,10 @@ class Watch:
 
 
 class Clock:
-    """Stopwatch for successive pieces of work, also timed by a watch; `seconds` is the last time."""
+    """Stopwatch for successive pieces of work, each also timed by a watch.
+
+    `seconds` is the time of the last one [s].
+    """
 
     def __init__(self, watch: Watch) -> None:
         self.watch, self.seconds, self._began = watch, 0.0, 0.0

@@ -40,7 +40,13 @@ class Coarser:
 
     @classmethod
     def of(cls, fine: Scene, coarse: Scene, prepared: Prepared) -> Coarser:
-        """Build the transfer between two scenes that differ only in the size of their meshes."""
+        """Build the transfer between two scenes that differ only in mesh size.
+
+        Args:
+          fine: scene on the finer mesh.
+          coarse: scene on the coarser mesh.
+          prepared: solver prepared for the coarser scene.
+        """
         a, b = fine.mesh.rest, coarse.mesh.rest
         return cls(coarse, prepared, interpolation(a, b), interpolation(b, a))
 

@@ -205,6 +205,12 @@ def steps(
 ) -> Iterator[Step]:
     """Iterate over the run's steps, each computed within the clock.
 
+    Args:
+      scene: scene that is stepped.
+      prepared: prepared solver.
+      settings: settings of the time stepping.
+      clock: context within which each step is computed.
+
     Raises:
       StepError: a step failed, or, caused by DivergenceError, a position is not finite.
     """

@@ -1,11 +1,12 @@
-"""Derivatives along a direction d from values alone, with bounds on the round-off of both implementations.
+"""Derivatives along a direction d from values alone, with bounds on the round-off.
 
     f'(x).d  = Im f(x + i h d) / h                               complex step (Squire and Trapp 1998): no cancellation
     d'f''(x) d = (f'(x + s d).d - f'(x - s d).d) / (2 s)         in extended precision, where the machine has it
 
-Values are those of elements, f = sum_e f_e, so that sums of absolute values measure the magnitude of what was summed. A
-coordinate of magnitude X has the error eps X. With l the smallest length that the terms depend on, an error of eps X
-is the fraction eps X / l of any term, and is multiplied by one more derivative of each:
+The bounds apply to both implementations. Values are those of elements, f = sum_e f_e, so that sums of absolute values
+measure the magnitude of what was summed. A coordinate of magnitude X has the error eps X. Let l be the smallest length
+that the terms depend on. An error of eps X changes a term by the fraction eps X / l, and by eps X times its next
+derivative:
 
     |error of f|   <= C eps ((1 + X/l) sum |f_e|   + X sum |f_e'|)
     |error of f'|  <= C eps ((1 + X/l) sum |f_e'|  + X sum |f_e''|)

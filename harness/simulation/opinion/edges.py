@@ -21,7 +21,17 @@ from harness.simulation.opinion.selected import chosen
 
 
 def stiffness(mesh: Mesh, effect: Any, stretch: Any, shear: Any, bend: float) -> Array:
-    """Compute the stiffness (m,) [N/m] of each spring by the effect's rule (see `harness.scenes.material`)."""
+    """Compute the stiffness (m,) [N/m] of each spring by the effect's rule.
+
+    The rules are those of `harness.scenes.material`.
+
+    Args:
+      mesh: mesh of the scene.
+      effect: effect that states the rule.
+      stretch: constant of stretch springs, a number or that of a woven cloth.
+      shear: constant of shear springs, a number or that of a woven cloth.
+      bend: constant of bend springs.
+    """
     k, h = np.zeros(len(mesh.springs)), mesh.spacing
     for family, given in {"stretch": stretch, "shear": shear, "bend": bend}.items():
         for e in mesh.families[family]:

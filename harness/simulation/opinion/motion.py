@@ -82,7 +82,13 @@ def speed(motion: Any, q: Wide, time: float) -> Wide:
 
 
 def blur(motion: Any, size: float, time: float) -> float:
-    """Bound the round-off [m] of moved points within `size` [m] of zero."""
+    """Bound the round-off [m] of moved points.
+
+    Args:
+      motion: key frames, None for none.
+      size: distance [m] from zero within which the points are.
+      time: time [s].
+    """
     if motion is None:
         return EPS * size
     keys: list[Any] = list(motion.keys)

@@ -43,7 +43,13 @@ def _each(pin: Pin) -> list[tuple[int, Any]]:
 
 
 def resistance(energies: Sequence[Energy], n: int, time_step: float) -> Array:
-    """Sum the energies' shares of the diagonal of Q (n,) [N/m]."""
+    """Sum the energies' shares of the diagonal of Q (n,) [N/m].
+
+    Args:
+      energies: energies of the effect.
+      n: number of vertices.
+      time_step: step size dt [s]; the shares are those at the rate 1/dt.
+    """
     zero, total = np.zeros((n, 3)), np.zeros(n)
     start = Start(zero, zero, 0.0, zero, 1.0 / time_step, 0.0)
     for energy in energies:

@@ -87,7 +87,13 @@ def points(scene: Scene, declared: Declared, frames: int) -> Iterator[SamplePoin
 
 
 def led(k: int, size: float, rest: Array) -> Array:
-    """Return the random acceleration (n, 3) [m/s^2] of a given size for point k."""
+    """Return the random acceleration (n, 3) [m/s^2] of point k.
+
+    Args:
+      k: index of the point, used as seed.
+      size: standard deviation [m/s^2].
+      rest: rest positions (n, 3) [m].
+    """
     return size * np.random.default_rng(k).normal(size=rest.shape)
 
 

@@ -148,7 +148,14 @@ class Touching:
         return scale, m, wide(np.where(own, k[np.where(own, rows, 0)], 0).sum(axis=1)) / own.sum(axis=1)
 
     def rubs(self, friction: float, grip: Grip, slip: float, time: float) -> Values:
-        """Build the friction potential [J] of pairs at a time [s]."""
+        """Build the friction potential [J] of pairs.
+
+        Args:
+          friction: coefficient of friction mu.
+          grip: friction data of the pairs.
+          slip: s [m].
+          time: time [s].
+        """
         return lambda x: friction * rubbed(self.whole(x, time), *grip, slip)
 
     def grip(self, p: Wide, begun: Wide, t: float, r: float, k: Array, edges: bool) -> Grip:
@@ -210,7 +217,17 @@ def near(x: Array, one: Indices, two: Indices, reach: float) -> Indices:
 
 
 def rubbed(x: Wide, rows: Indices, weights: Wide, n: Wide, anchor: Wide, force: Wide, slip: float) -> Wide:
-    """Compute the friction potential (g,) [J] of pairs, without the factor mu."""
+    """Compute the friction potential (g,) [J] of pairs, without the factor mu.
+
+    Args:
+      x: positions (N, 3) [m].
+      rows: vertices of the pairs (g, 4).
+      weights: coefficients c (g, 4).
+      n: contact normals (g, 3).
+      anchor: z^t (g, 3) [m].
+      force: normal forces F (g,) [N].
+      slip: s [m].
+    """
     u = (weights[:, :, None] * x[rows]).sum(axis=1) - anchor
     u = u - (u * n).sum(axis=1)[:, None] * n
     square = (u * u).sum(axis=1)
@@ -276,7 +293,13 @@ def _sides(rows: Indices, rest: Wide) -> Wide:
 
 
 def gathered(effect: Any, declared: Declared, p: Array) -> Array:
-    """Contract positions (n, 3) [m] until the nearest pairs are in mid-range."""
+    """Contract positions until the nearest pairs are in mid-range.
+
+    Args:
+      effect: contact effect.
+      declared: declaration of the scene.
+      p: positions (n, 3) [m].
+    """
     mesh, r = Touching(declared), effect.thickness if effect.range is None else effect.range
     wanted = effect.thickness + r
     reach = max(wanted, 2.0 * declared.mesh.spacing)

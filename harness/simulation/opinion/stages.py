@@ -126,7 +126,16 @@ class _Step:
         return [p, v]
 
     def state(self, c: Any, rate: Any, when: Any, target: Wide, origin: Wide, expected: Wide) -> tuple[Wide, Wide]:
-        """Record a stage; returns its solution and velocity."""
+        """Record a stage; return its solution and velocity.
+
+        Args:
+          c: inertia factor.
+          rate: factor [1/s] in the velocity, rate (x - origin).
+          when: fraction of the step.
+          target: inertial target (n, 3) [m].
+          origin: origin (n, 3) [m] in the velocity.
+          expected: expected acceleration (n, 3) [m/s^2].
+        """
         until = self.time + float(when) * self.declared.time_step
         origin, led = origin.copy(), target + self.dt**2 / c * expected
         held = wide([pin.place(until) for _, pin in self.pins]).reshape(-1, 3)

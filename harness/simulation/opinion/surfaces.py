@@ -33,7 +33,15 @@ def bending(effect: Any, declared: Declared) -> Opinion:
 
 
 def damped_bending(effect: Any, b: float, declared: Declared) -> Any:
-    """Build damping by b times the bending matrix."""
+    """Build damping by the bending matrix.
+
+    Args:
+      effect: bending effect.
+      b: factor on the matrix [s].
+      declared: declaration of the scene.
+
+    Returns: builder of the energy of a step.
+    """
     corners, K, weight = stencils(effect.stiffness, declared)
 
     def begin(moment: Moment) -> Values:

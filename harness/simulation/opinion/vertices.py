@@ -108,7 +108,13 @@ def pins(effect: Any, declared: Declared) -> Opinion:
 
 
 def pin(weight: float, motion: Any, q: Wide) -> PinnedVertex:
-    """Build a pin of a point declared at q (3,) [m]."""
+    """Build a pin.
+
+    Args:
+      weight: penalty weight [N/m], infinite for an exact pin.
+      motion: key frames, None for none.
+      q: declared point (3,) [m].
+    """
 
     def there(time: float) -> Wide:
         return place(motion, time).there(q[None])[0]
