@@ -85,7 +85,7 @@ def _cleared(problem: StepProblem, energies: Sequence[Bounded]) -> Positions:
             p = _pushed(problem, waiting, p)
     raise Blocked(
         f"obstacles leave no room: what is in their way could be moved out of it for {part:.3g} of the step's length; "
-        "move them less in a step, or take shorter steps"
+        "reduce their motion per step, or use a smaller step size"
     )
 
 

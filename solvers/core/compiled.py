@@ -75,7 +75,7 @@ def _order(base: PreparedLocalGlobal) -> Order | None:
 
 
 def _reach(base: PreparedLocalGlobal, springs: Springs) -> float:
-    """Return the largest coordinate [m] for which a direct solve keeps the position error below the limit."""
+    """Return the largest coordinate [m] for which a direct solve has an acceptable position error."""
     lengths = springs.rest_length[springs.rest_length > 0.0]
     return _LOST * float(np.median(lengths)) / (2.0 * EPS * base.spread) if len(lengths) else np.inf
 
@@ -149,7 +149,7 @@ class PreparedCompiled(Iterative):
         corrects |= order.squares.dtype != np.float64
         where = row, part, len(order.spans), nobody, nobody + 1
         form, first = kernels.Bundles.of(parts.pairs, *where)
-        # Positions are solved for with the forms in Q; corrections need their gradient too.
+        # A solve for positions has the forms in Q; one for corrections also needs their gradient.
         local = parts.whole if corrects else parts.springs
         bundles = form if local is parts.pairs else kernels.Bundles.of(local, *where)[0]
         inertia = s.inertia

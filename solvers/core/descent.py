@@ -211,7 +211,7 @@ class PreparedDescent(Iterative):
 
 
 class _Iterating(Iterating):
-    """The state of a solve; a stalled point keeps the previous positions."""
+    """The state of a solve; a stalled point has the previous positions."""
 
     def __init__(self, prepared: PreparedDescent, step: StepObjective, start: Point) -> None:
         self._metric, self._method, self._step = prepared.metric, prepared.method, step

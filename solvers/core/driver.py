@@ -41,8 +41,8 @@ _CLOSE = 1e-5
 
 
 EXACT = (
-    "minimises what is finite, and the scene has lengths that are kept exactly (a stiffness that is `exact`): take "
-    "avbd, which keeps them, or give springs and strain limits a stiffness in figures"
+    "supports finite stiffness only, and the scene has length constraints (a stiffness of `exact`): use "
+    "avbd, which supports them, or give springs and strain limits a finite stiffness"
 )
 """Reason, after the method's name, why a method without length constraints does not support the scene."""
 

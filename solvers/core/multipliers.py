@@ -1,5 +1,5 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# SciPy's stubs say little of sparse matrices.
+# SciPy's type stubs for sparse matrices are incomplete.
 """The Lagrange multipliers of length constraints at a point, by least squares, for the residual of a step.
 
     minimise grad g . d + |d|_Q^2 / 2   such that   low <= l + n . A d <= high
@@ -26,7 +26,7 @@ from solvers.matrices import assemble
 from solvers.problem import Positions, ProjectiveEnergy, StepProblem, System
 
 _COMPLIANCE = 1e-10
-"""The value eps relative to 1/k, which keeps redundant constraints nonsingular. Refinement removes its effect."""
+"""The value eps relative to 1/k. It regularises redundant constraints; refinement removes its effect."""
 _REFINEMENTS = 4
 _CHANGES = 50
 """Maximum number of changes of the active set."""

@@ -67,5 +67,5 @@ def require_implicit_euler(system: System, solver: str) -> None:
     if system.factor != 1.0:
         raise Unsupported(
             f"{solver}: divides the step by itself and keeps its own velocity, which takes the place of an integrator; "
-            "run it with the integrator implicit-euler"
+            "use the integrator implicit-euler"
         )
