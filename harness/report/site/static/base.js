@@ -1,12 +1,12 @@
-// What all views share: data that come as scripts, the selection in the URL, and elements.
+// Shared by all views: data loaded as scripts, the selection in the URL, and DOM elements.
 "use strict";
 window.springbench = (() => {
   const given = new Map(), waiting = new Map();
 
-  // Called by every script of data.
+  // Called by every data script.
   function give(name, value) { given.set(name, value); }
 
-  // A script of this page's folder, loaded once: fulfilled when it has run.
+  // Load a script of this page's folder once; the promise is fulfilled when it has run.
   function script(path) {
     if (!waiting.has(path)) {
       waiting.set(path, new Promise((done, failed) => {
@@ -20,20 +20,20 @@ window.springbench = (() => {
     return waiting.get(path);
   }
 
-  // The data of a name, such as quickstart/runs.
+  // Load the data with a name, such as quickstart/runs.
   async function data(name) {
     if (!given.has(name)) await script(`site/data/${name.split("/").map(encodeURIComponent).join("/")}.js`);
     return given.get(name);
   }
 
-  // The address of a file below a folder of the page, of the folder's escaped address `up` and a plain path; nothing
-  // where it would lead out of the page's own scheme, as a folder called "javascript:..." might.
+  // Return the URL of a file below a folder of the page, from the folder's escaped URL `up` and a plain path. Return
+  // "" if it would leave the page's scheme, as for a folder called "javascript:...".
   function link(up, path) {
     const made = up + path.split("/").map(encodeURIComponent).join("/");
     return new URL(made, document.baseURI).protocol === location.protocol ? made : "";
   }
 
-  // What an object of data holds under a name; nothing for names that every object has, such as "constructor".
+  // Look up a name in a data object; ignore names that every object has, such as "constructor".
   const own = (object, name) => (object && Object.hasOwn(object, name) ? object[name] : undefined);
 
   // The selection: a view and its parameters, both in the fragment of the URL.
@@ -45,7 +45,7 @@ window.springbench = (() => {
     const words = new URLSearchParams(Object.entries(query).filter(([, value]) => value !== "" && value != null)).toString();
     return `#${view}${words ? `?${words}` : ""}`;
   }
-  // Change parameters of this view; step: as one of its own in the browser's history.
+  // Change parameters of this view; step: whether to add an entry to the browser's history.
   let kept = {}, soon;
   function change(changes, step = false) {
     const { view, query } = where();
@@ -56,8 +56,8 @@ window.springbench = (() => {
     else location.replace(next);
   }
 
-  // Parameters of what is shown already, such as how a mesh is turned: nothing is drawn anew, and browsers take few of
-  // these changes a second.
+  // Update parameters of the current display, such as the rotation of a mesh: nothing is redrawn. Updates are throttled,
+  // because browsers limit their rate.
   function keep(changes) {
     const from = where().view;
     Object.assign(kept, changes);
@@ -71,7 +71,7 @@ window.springbench = (() => {
     }, 200);
   }
 
-  // An element: element("a.link", {href: "#"}, "words", child...); properties that begin with "on" are listeners.
+  // Create an element: element("a.link", {href: "#"}, "words", child...); properties that begin with "on" are listeners.
   function element(kind, properties = {}, ...children) {
     const [tag, ...classes] = kind.split(".");
     const made = document.createElement(tag);
@@ -84,13 +84,13 @@ window.springbench = (() => {
     }
     return put(made, ...children);
   }
-  // Append what there is: nothing of null, undefined, false, 0 and empty words.
+  // Append children; null, undefined, false, 0 and empty strings are skipped.
   function put(parent, ...children) {
     parent.append(...children.filter(Boolean));
     return parent;
   }
 
-  // A remark that screen readers hear, and that goes by itself.
+  // Show a message that screen readers announce, and that disappears by itself.
   let until;
   function tell(words) {
     const box = document.getElementById("status");

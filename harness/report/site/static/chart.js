@@ -1,4 +1,4 @@
-// One way to draw lines and points, for all plots: by Plotly, with a legend, a remark and keys of our own.
+// Line and point charts for all plots: by Plotly, with a custom legend, tooltip and keyboard control.
 "use strict";
 springbench.chart = (() => {
   const { element, script, own, number, colour, glyph, keep, where } = springbench;
@@ -18,7 +18,7 @@ springbench.chart = (() => {
     return [element("b", {}, item.label), item.what, element("table", {}, element("tbody", {}, ...rows.filter(Boolean)))];
   }
 
-  // Beside the point and inside the window, never wider than a remark.
+  // Next to the point and inside the window, never wider than a tooltip.
   function show(x, y, content) {
     tip.replaceChildren(...content);
     if (!tip.isConnected) document.body.append(tip);
@@ -37,13 +37,13 @@ springbench.chart = (() => {
       type: "data", symmetric: false, color: ink, thickness: 1.2, width: 3,
       array: some[2].map((v, k) => v - some[0][k]), arrayminus: some[1].map((v, k) => some[0][k] - v),
     } : undefined);
-    // What other code than the newest measured is hollow.
+    // Results of other code than the newest are hollow.
     const hollow = item[x.column].map((_, k) => older(item, k));
     return {
       x: item[x.column], y: item[y.column], name: item.label, xaxis: `x${tail}`, yaxis: `y${tail}`, meta: { item },
       mode: item.joined ? "lines" : points ? "markers" : "lines+markers", hoverinfo: "none", error_x: bars(ends), error_y: bars(upright),
       line: { color: ink, dash: mark.dash, width: 1.7, shape: chart.shape === "hv" ? "hv" : undefined },
-      // Marks stand apart: so many of a line at most, whatever the number of its points.
+      // The number of markers per line is limited, whatever the number of its points.
       marker: { symbol: hollow.map(yes => mark.symbol + (yes ? "-open" : "")), color: ink, size: item.small ? 5 : item.large ? 13 : 8, maxdisplayed: points ? 0 : chart.shape === "hv" ? 4 : 9, line: { width: hollow.map(yes => (yes ? 1.6 : 0)), color: ink } },
     };
   }
@@ -56,7 +56,7 @@ springbench.chart = (() => {
     }];
   }
 
-  // What of the axes is shown, as a parameter of the URL: "x:0,2;y:-3,1"; nothing where all of it is.
+  // The visible range of the axes as a URL parameter, such as "x:0,2;y:-3,1"; empty if everything is visible.
   const zoomed = layout => Object.keys(layout).filter(key => /^[xy]axis\d*$/.test(key) && layout[key].autorange === false && layout[key].range)
     .map(key => `${key.replace("axis", "")}:${layout[key].range.map(v => Number(Number(v).toPrecision(5))).join(",")}`).join(";");
   function zoom(layout, asked) {
@@ -66,7 +66,7 @@ springbench.chart = (() => {
     }
   }
 
-  // Draw the items of a chart, by the columns x and y, a panel for each of `item.panel`; zoomKey: of the URL.
+  // Draw the items of a chart by the columns x and y, one panel per `item.panel`; zoomKey: parameter of the URL.
   async function draw(plot, chart, items, x, y, { hidden = new Set(), onPoint = () => {}, small = false, zoomKey = "zoom" } = {}) {
     await script("site/plotly.js");
     const panels = [...new Set(items.map(item => item.panel ?? ""))], narrow = plot.clientWidth < 640 && panels.length > 1;
@@ -80,7 +80,7 @@ springbench.chart = (() => {
       annotations: [], font: { family: getComputedStyle(document.body).fontFamily, color: css("--ink") }, dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom",
     };
     const traces = [], gap = narrow ? 0.16 : 0.05, n = panels.length;
-    // Of few decades 1, 2 and 5 are named, of more the powers of ten.
+    // Over few decades 1, 2 and 5 are labelled, over more only the powers of ten.
     const room = axis => (axis === y ? (narrow ? 330 : plot.clientHeight) / 42 : plot.clientWidth / (narrow ? 1 : panels.length) / 70);
     const range = axis => {
       if (axis.axis.type !== "log") return axis.axis;
@@ -119,8 +119,8 @@ springbench.chart = (() => {
     keys(plot, chart, onPoint);
   }
 
-  // Left and right go along a line, up and down to the next line, Enter opens the point, plus and minus zoom, Home shows
-  // all again.
+  // Left and right move along a line, up and down to the next line, Enter opens the point, plus and minus zoom, Home
+  // resets the zoom.
   function keys(plot, chart, onPoint) {
     let line = -1, k = 0;
     plot.onkeydown = event => {
@@ -148,7 +148,7 @@ springbench.chart = (() => {
     plot.onblur = hide;
   }
 
-  // Names with their marks; each is a switch.
+  // Labels with their markers; each toggles a series.
   function legend(labels, chart, items, hidden, onChange) {
     return labels.map(label => {
       const source = own(chart.references, label), drawn = items.some(item => item.label === label && item[chart.x[0].column].some(v => v !== null));

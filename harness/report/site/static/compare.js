@@ -1,4 +1,4 @@
-// Runs side by side: in what they differ, their times with intervals, their curves, and how far apart they end.
+// Comparison of runs: their settings, times with intervals, curves, and the distance of their final positions.
 "use strict";
 (() => {
   const { element, data, number, fixed, percent, state, glyph, title, address, rowOf, picture, floats, whole } = springbench;
@@ -10,7 +10,7 @@
 
   const middle = some => { const s = Float64Array.from(some).sort(), h = s.length >> 1; return s.length % 2 ? s[h] : (s[h - 1] + s[h]) / 2; };
 
-  // The 95 % interval of the quotient of two runs' ms a step, by resampling the frames (seeded, so it repeats).
+  // The 95 % interval of the ratio of two runs' ms a step, by resampling the frames (seeded, so it is reproducible).
   function interval(frames, first) {
     const pairs = frames.ms.map((v, k) => [v, first.ms[k]]).filter(([a, b]) => a > 0 && b > 0);
     if (pairs.length < 2) return null;

@@ -1,11 +1,11 @@
-// The runs of all sweeps as rows, and what is known of each.
+// The runs of all sweeps as rows, and further data of each sweep.
 "use strict";
 Object.assign(springbench, (() => {
   const { data, link, own } = springbench;
   let index = null;
   const tables = new Map();
 
-  // The rows of a sweep's runs, made of its columns.
+  // Build the rows of a sweep's runs from its columns.
   async function rowsOf(sweep) {
     if (tables.has(sweep.slug)) return tables.get(sweep.slug);
     const table = await data(`${sweep.slug}/runs`), names = Object.keys(table.columns);
@@ -25,7 +25,7 @@ Object.assign(springbench, (() => {
     return rows;
   }
 
-  // All rows, or those of one sweep.
+  // Return all rows, or those of one sweep.
   async function rows(slug = "") {
     index ??= await data("index");
     const chosen = index.sweeps.filter(sweep => sweep.runs && (!slug || sweep.slug === slug));
@@ -43,10 +43,10 @@ Object.assign(springbench, (() => {
   const recording = row => (row.recording ? link(sweepOf(row.slug).up, `recordings/${row.unit}.rrd`) : "");
   const title = row => `${row.scene}${row.size ? ` ${row.size}` : ""}, ${row.label}`;
 
-  // A word as a shell takes it.
+  // Quote a word for the shell.
   const quoted = words => (/^[\w./:=@%+,-]+$/.test(words) ? words : `'${String(words).replaceAll("'", "'\\''")}'`);
 
-  // The command line that does a run again: of its scene alone where the solver is called by its name, else the sweep.
+  // Return the command that repeats a run: of its scene only if the solver's name identifies it, otherwise of the sweep.
   function command(row) {
     const sweep = sweepOf(row.slug), scene = own(sweep.scenes, row.scene);
     const whole = `springbench run ${quoted(sweep.config || `${sweep.name}.yaml`)}`;
@@ -63,7 +63,7 @@ Object.assign(springbench, (() => {
     return [`springbench run ${quoted(scene)}`, ...told.map(([name, value]) => `--${name} ${quoted(String(value))}`)].join(" ");
   }
 
-  // A file of the results, as commands call it.
+  // Return the path of a results file as commands refer to it.
   const called = file => quoted(`${index.place === "." ? "" : `${index.place}/`}${plain(file).replace(/^\.\//, "")}`);
   function plain(file) {
     try {

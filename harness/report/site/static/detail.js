@@ -1,4 +1,4 @@
-// One run: what it was, what became of it, its picture and recording, and the command that does it again.
+// One run: identification, outcome, picture and recording, and the command that repeats it.
 "use strict";
 Object.assign(springbench, (() => {
   const { element, put, number, percent, fixed, step, day, commit, glyph, state, copy, link, own, title, picture, recording, command, rowOf, references, sweepOf } = springbench;
@@ -10,7 +10,7 @@ Object.assign(springbench, (() => {
     return element("div.command", {}, element("code", { tabIndex: 0, "aria-label": label }, words), element("button.quiet", { type: "button", onclick: () => copy(words) }, "Copy"));
   }
 
-  // A method's source: authors, year and doi, and BibTeX to copy.
+  // The reference of a method: authors, year and DOI, and BibTeX to copy.
   function method(reference) {
     if (!reference) return null;
     const doi = /doi:(\S+)$/.exec(reference.cited);
@@ -19,7 +19,7 @@ Object.assign(springbench, (() => {
       reference.bibtex && element("button.quiet", { type: "button", onclick: () => copy(reference.bibtex) }, "Copy BibTeX"));
   }
 
-  // A recording: replayed in the page where it is among the page's scripts, offered as a file else.
+  // A recording: replayed in the page if it is among the page's scripts, otherwise offered as a file.
   function replay(id, file, name, words) {
     if (!file) return element("p.muted", {}, "No recording was kept.");
     const box = element("div.replays");

@@ -1,10 +1,10 @@
-// Numbers, marks and names as people read them.
+// Formatting of numbers, markers and names.
 "use strict";
 Object.assign(springbench, (() => {
   const { element, isDark, own } = springbench;
   const power = text => text.replace(/e([-+]?)(\d+)/, (_, sign, digits) => `e${sign === "-" ? "−" : ""}${digits}`);
 
-  // To three digits, with an exponent only where people would write one.
+  // Format to three digits, with an exponent only where it is customary.
   function number(value, digits = 3) {
     if (value === null || value === undefined) return "–";
     const size = Math.abs(value);
@@ -26,7 +26,7 @@ Object.assign(springbench, (() => {
     return Math.abs(whole * dt - 1) < 1e-4 ? `1/${whole} s` : `${number(1e3 * dt)} ms`;
   };
 
-  // By which code and on which machine figures were made: each pair once, the newest of them first.
+  // List the code versions and machines of figures: each pair once, the newest first.
   const commit = text => (text || "unknown").slice(0, 10) + (/dirty/.test(text) ? "-dirty" : "");
   function madeBy(some, most = 2) {
     const told = [...new Set(some.map(one => `${one.cpu || "unknown processor"}${one.machine ? ` (machine ${one.machine.slice(0, 6)})` : ""}, code ${commit(one.commit)}`))];
@@ -35,7 +35,7 @@ Object.assign(springbench, (() => {
     return `made on ${told.slice(0, most).join("; on ")}${told.length > most ? `; and by ${told.length - most} more` : ""}${compare}`;
   }
 
-  // A solver's colour as it stands out from the page: lighter on dark, darker on light where it is pale.
+  // Adjust a solver's colour for contrast with the page: lighter on dark, darker on light if it is pale.
   function colour(hex) {
     const parts = [1, 3, 5].map(k => parseInt(hex.slice(k, k + 2), 16));
     const light = (0.2126 * parts[0] + 0.7152 * parts[1] + 0.0722 * parts[2]) / 255;
@@ -44,7 +44,7 @@ Object.assign(springbench, (() => {
     return `#${parts.map(p => Math.round(p + (end - p) * Math.abs(by)).toString(16).padStart(2, "0")).join("")}`;
   }
 
-  // The same marks as in plots, as paths in a box from -8 to 8.
+  // The markers of the plots, as paths in a box from -8 to 8.
   const ring = (n, inner = 1, turn = 0) => {
     const points = [], steps = inner === 1 ? n : 2 * n;
     for (let k = 0; k < steps; k++) {
@@ -81,7 +81,7 @@ Object.assign(springbench, (() => {
     return svg;
   }
 
-  // A word for how a run ended, with a sign beside the colour.
+  // A word for how a run ended, with a symbol in addition to the colour.
   const SIGNS = { ok: "✓", right: "✓", unsupported: "–", refused: "–", "another minimum": "≈", "not converged": "…" };
   function state(words, plain = "") {
     const kind = words === "ok" || words === "right" ? "good" : own(SIGNS, words) ? "mild" : "bad";

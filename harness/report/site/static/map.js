@@ -1,4 +1,4 @@
-// The map of hard cases: solvers across, cases down, what became of each; arrow keys go through the cells.
+// Robustness map: solvers in columns, cases in rows, coloured by outcome; arrow keys move between the cells.
 "use strict";
 springbench.map = (chart, sweep) => {
   const { element, own, address } = springbench;

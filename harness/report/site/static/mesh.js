@@ -1,8 +1,8 @@
-// Meshes on a canvas, turned by dragging or by arrow keys, coloured by a number at each vertex; and solves, iterate by iterate.
+// Meshes on a canvas, rotated by dragging or by arrow keys, coloured by a number at each vertex; and iterates of solves.
 "use strict";
 Object.assign(springbench, (() => {
   const { element, put, data, link, own, number, keep, where } = springbench;
-  // From near to far: a scale that is read in grey as well (viridis).
+  // From near to far: a colour map that is readable in grey as well (viridis).
   const RAMP = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
   const ramp = t => {
     const s = Math.max(0, Math.min(1, Number.isFinite(t) ? t : 0)) * (RAMP.length - 1), k = Math.min(RAMP.length - 2, Math.floor(s)), f = s - k;
@@ -13,7 +13,7 @@ Object.assign(springbench, (() => {
   const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer;
   const floats = text => new Float32Array(bytes(text)), whole = text => new Uint32Array(bytes(text));
 
-  // How one looks at a mesh: along the direction in which it is thinnest, shared by meshes side by side.
+  // Initial view of a mesh: along the direction in which it is thinnest, shared by meshes side by side.
   function camera(points) {
     const low = [1e30, 1e30, 1e30], high = [-1e30, -1e30, -1e30];
     for (let i = 0; i < points.length; i++) { low[i % 3] = Math.min(low[i % 3], points[i]); high[i % 3] = Math.max(high[i % 3], points[i]); }
@@ -41,7 +41,7 @@ Object.assign(springbench, (() => {
         flat[3 * i + 1] = high / 2 - scale * (ct * z + st * deep);
         flat[3 * i + 2] = ct * deep - st * z;
       }
-      // Without values faces are grey between darker lines: else a mesh of triangles would be one dark patch.
+      // Without values faces are grey between darker lines; otherwise a triangle mesh would be one dark patch.
       const style = getComputedStyle(canvas), [line, edge, face] = ["--ink", "--muted", "--rule"].map(name => style.getPropertyValue(name));
       const of = (...ids) => (values ? `rgb(${ramp(ids.reduce((sum, i) => sum + values[i], 0) / ids.length)})` : line);
       ink.lineWidth = ratio * (triangles.length ? 0.7 : 1.6);
@@ -88,7 +88,7 @@ Object.assign(springbench, (() => {
 
   const scaleBox = (low, high) => element("div", {}, element("div.ramp", { style: `background: ${rampCss}` }), element("div.scale", {}, element("span", {}, low), element("span", {}, high)));
 
-  // A point of an accuracy plot: whose solve it is, the iterate beside its reference, and how to make it again.
+  // Details of a point of an accuracy plot: its solve, the iterate and the reference, and the command that repeats it.
   async function solve(box, sweep, chart, item, k, close) {
     const shut = element("button.quiet.close", { type: "button", onclick: close, "aria-label": "Close" }, "×");
     box.onkeydown = event => { if (event.key === "Escape" && event.target.tagName !== "INPUT") close(); };
@@ -110,7 +110,7 @@ Object.assign(springbench, (() => {
     await scrubber(scrub, sweep, item, k);
   }
 
-  // The mesh of the iterate beside the reference's, with the distance coloured, and a slider through the iterates.
+  // The mesh of the iterate next to the reference's, coloured by distance, and a slider over the iterates.
   async function scrubber(box, sweep, item, k) {
     const name = own(sweep.solves, item.recording), at = item.iteration?.[k];
     if (!name) {

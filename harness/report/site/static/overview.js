@@ -1,4 +1,4 @@
-// The first view: what was run, by which code and where, what is known now, what failed and why.
+// Overview: what was run, with provenance, current findings, and failures with their causes.
 "use strict";
 (() => {
   const { element, put, link, address, commit, many, count, duration, day, state } = springbench;

@@ -1,11 +1,11 @@
-// All plots of the project, one at a time, with what they are drawn by in the URL; a point leads to its run.
+// All plots, one at a time, with the selection of axes in the URL; a point links to its run.
 "use strict";
 (() => {
   const { element, data, own, change, address, where, save } = springbench;
   const LOG = { type: "log" }, PLAIN = {};
   const axis = (column, title, how = LOG) => ({ column, title, axis: how });
 
-  // What a sweep's runs themselves say, as a chart.
+  // A chart of a sweep's runs themselves.
   const OF_RUNS = {
     size: {
       title: "Time by size", note: "The median over frames and rounds, with its quartiles, at each size; point at a mark to read its run.",

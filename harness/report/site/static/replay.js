@@ -1,10 +1,10 @@
-// Recordings replayed in the page, by Rerun's own web viewer. The page calls
+// Replay of recordings in the page, by Rerun's web viewer. The page calls
 //
 //   springbench.replay(runId, script, {title, file})
 //
-// script: where the recording lies as a script; title: what stands above it; file: where the recording itself lies.
-// The viewer, `viewer.js` beside this file, is loaded at the first call. Each script hands over what it brings as
-// `springbench.taken`. How the viewer is started is not documented: harness/report/site/viewer.py pins its version.
+// script: URL of the recording as a script; title: heading above it; file: URL of the recording itself.
+// The viewer, `viewer.js` next to this file, is loaded at the first call. Each script passes its content as
+// `springbench.taken`. The start of the viewer is undocumented: harness/report/site/viewer.py pins its version.
 "use strict";
 window.springbench ??= {};
 (() => {
@@ -70,7 +70,7 @@ window.springbench ??= {};
     return /^[\w./~+-]+$/.test(plain) ? plain : `'${plain.replaceAll("'", "'\\''")}'`;
   }
 
-  // What a script hands over; one is loaded at a time. A page from the file system may load nothing but scripts.
+  // The content of a script; one is loaded at a time. A page from the file system can load only scripts.
   function taken(source, problem) {
     const next = loading.then(() => new Promise((done, fail) => {
       const script = element("script", document.head, { src: source });
@@ -93,7 +93,7 @@ window.springbench ??= {};
     return new Uint8Array(await new Response(stream).arrayBuffer());
   }
 
-  // A module that uses SIMD, as the viewer's does; browsers before 2021 and 2023 (Safari) refuse it.
+  // A module that uses SIMD, as the viewer does; browsers before 2021 and 2023 (Safari) do not support it.
   const SIMD = [0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 10, 10, 1, 8, 0, 65, 0, 253, 15, 253, 98, 11];
 
   function lacking() {
@@ -105,7 +105,7 @@ window.springbench ??= {};
     return "";
   }
 
-  // Milliseconds after which the viewer is shown in any case.
+  // Time after which the viewer is shown in any case [ms].
   const OPENS = 20000;
   let ready;
 
@@ -128,7 +128,7 @@ window.springbench ??= {};
     const dark = matchMedia("(prefers-color-scheme: dark)").matches;
     let opened = () => {};
     const seen = new Promise(done => { opened = done; });
-    // Until the recording is open the viewer shows its own welcome, which is not what was asked for.
+    // Until the recording is open the viewer shows its own welcome screen, which is hidden.
     canvas.style.visibility = "hidden";
     const handle = new WebHandle({
       on_viewer_event: event => { if (JSON.parse(event).type === "recording_open") opened(); },
@@ -151,7 +151,7 @@ window.springbench ??= {};
     dialog.querySelector(".stage").replaceChildren();
   }
 
-  // Shows a recording; resolves to whether it is seen, and says why not where it is not.
+  // Show a recording; resolves to whether it is visible, and states the reason if it is not.
   springbench.replay = async (runId, script, { title = runId, file = "" } = {}) => {
     stop();
     const mine = turn;

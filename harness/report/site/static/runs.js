@@ -1,4 +1,4 @@
-// All runs in a table: sorted, filtered, chosen to be compared; the whole of what is shown stands in the URL.
+// Table of all runs: sorting, filtering, selection for comparison; the state of the view is in the URL.
 "use strict";
 (() => {
   const { element, change, address, madeBy, number, count, percent, fixed, glyph, state, many, save, picture } = springbench;
@@ -11,7 +11,7 @@
   const DOUBT = "the process was interrupted while steps were timed: its least time is nearest to the truth";
   const doubt = row => (row.interrupted ? element("span.doubt", { title: DOUBT }, " !") : "");
 
-  // meaning: on pointing; show: of a row; numeric: to the right; spare: the higher, the sooner it goes where there is no room.
+  // meaning: tooltip; show: cell of a row; numeric: right-aligned; spare: priority for removal if space is short.
   const COLUMNS = [
     { id: "check", width: "34px", title: "Compare", sort: false, show: (row, on) => element("span.box", { "aria-label": on ? "chosen to compare" : "not chosen" , role: "img"}, on ? "✓" : "") },
     { id: "shot", width: "76px", spare: 4, title: "Picture", sort: false, show: shot },

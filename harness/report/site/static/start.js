@@ -1,4 +1,4 @@
-// The views, the way between them, and light or dark.
+// Views, navigation between them, and the light or dark theme.
 "use strict";
 (() => {
   const { element, data, own, where, views, isDark } = springbench;

@@ -1,4 +1,4 @@
-// A table of any number of rows of which only those in sight are elements: a grid for the keyboard and for readers.
+// Virtualised table: only visible rows are elements; an ARIA grid for keyboard and screen readers.
 "use strict";
 springbench.table = ({ columns, onOpen, onSelect, onSort }) => {
   const { element } = springbench;
@@ -75,7 +75,7 @@ springbench.table = ({ columns, onOpen, onSelect, onSort }) => {
     else return;
     event.preventDefault();
   });
-  // Columns that there is no room for go, the least wanted first; the panel of a run has all figures.
+  // Columns without space are removed, the least important first; the panel of a run shows all figures.
   function fit() {
     const least = some => some.reduce((sum, column) => sum + parseFloat(column.width.match(/\d+/)[0]), 48);
     let some = columns;
