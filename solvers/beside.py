@@ -32,7 +32,10 @@ sys.meta_path.append(_Files())
 
 
 def module(path: Path) -> ModuleType:
-    """Return the module in a file; the file is executed again if its content has changed since the last call."""
+    """Return the module in a file.
+
+    The file is executed again if its content has changed since the last call.
+    """
     name, content = f"{_PREFIX}{str(path).encode().hex()}", path.read_bytes()
     if _READ.get(name, content) != content:
         sys.modules.pop(name, None)

@@ -124,7 +124,10 @@ def assemble(system: System, energies: Iterable[ProjectiveEnergy]) -> scipy.spar
 
 
 def shares(system: System, energies: Iterable[ProjectiveEnergy]) -> Iterator[scipy.sparse.csr_array]:
-    """Yield each energy's contribution A'KA [N/m] to Q, (n, n); that of a lagged one depends on velocity_rate alone."""
+    """Yield each energy's contribution A'KA [N/m] to Q, (n, n).
+
+    That of a lagged energy depends on the velocity_rate of the steps only.
+    """
     nowhere = np.zeros((system.vertices, 3))
     start = Start(nowhere, nowhere, 0.0, nowhere, system.rate, 0.0)
     for energy in energies:

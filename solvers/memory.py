@@ -18,7 +18,10 @@ def aligned(size: int, dtype: Any = np.float64) -> NDArray[Any]:
 
 
 def of_machine() -> float:
-    """Return three quarters of the machine's memory [bytes]; the remainder is for other data of a run."""
+    """Return three quarters of the machine's memory [bytes].
+
+    The remainder is for other data of a run.
+    """
     return 0.75 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 

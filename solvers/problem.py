@@ -328,7 +328,10 @@ class Prepared(Protocol):
         ...
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """Return |Q^-1 grad g|_Q [J^(1/2)] at p (n, 3) [m], or nan if it is not defined; may cost an iteration."""
+        """Return |Q^-1 grad g|_Q [J^(1/2)] at p (n, 3) [m], or nan if it is not defined.
+
+        The evaluation may cost an iteration.
+        """
         ...
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:

@@ -68,5 +68,8 @@ def name_of(solver: Any) -> str:
 
 
 def about(solver: Any, name: str) -> About:
-    """Return the metadata of a solver of this name; without any, the solver is a family of its own."""
+    """Return the metadata of a solver of this name.
+
+    Without any, the solver is a family of its own.
+    """
     return getattr(solver, "about", About(name))

@@ -72,7 +72,10 @@ class Bounded(Energy, Protocol):
         ...
 
     def neighbours(self, p: Positions) -> NDArray[np.int64]:
-        """Return the vertices (a, k) of all pairs at p (n, 3) and of candidates near it; -1 for none."""
+        """Return the vertices (a, k) of all candidate pairs at and near p (n, 3).
+
+        The index -1 means none.
+        """
         ...
 
     def coupled(self, p: Positions) -> NDArray[np.int64]:
@@ -80,11 +83,21 @@ class Bounded(Energy, Protocol):
         ...
 
     def add_curvature(self, p: Positions, keep: float, places: NDArray[np.int64], values: NDArray[np.float64]) -> None:
-        """Add the Hessian blocks at p (n, 3) to matrix blocks (b, 3, 3) [N/m], at indices (a, k^2); -1 for none."""
+        """Add the Hessian blocks at p (n, 3) to a matrix.
+
+        Args:
+            p: positions (n, 3) [m].
+            negative_fraction: factor of the blocks' negative part.
+            block_indices: (a, k^2), -1 for none.
+            values: matrix blocks (b, 3, 3) [N/m].
+        """
         ...
 
     def blocks(self, p: Positions, keep: float = 1.0) -> PairBlocks:
-        """Return the Hessian blocks at p (n, 3); negative_fraction 0 makes them positive semidefinite."""
+        """Return the Hessian blocks at p (n, 3).
+
+        `negative_fraction` is the factor of their negative part; 0 makes them positive semidefinite.
+        """
         ...
 
 

@@ -85,7 +85,10 @@ class Rule(Protocol):
 
 
 class Graded:
-    """The smallest change of a schedule; the only rule that supports energies without an element-wise form."""
+    """The smallest change of a schedule.
+
+    It is the only rule that supports energies without an element-wise form.
+    """
 
     def factorised(self, hessian: Hessian, at: Point, diagonal: NDArray[np.float64]) -> int | None:
         """Factorise at the first level of the schedule that has a factor."""

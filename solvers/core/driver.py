@@ -165,7 +165,10 @@ class Iterative(ABC):
         return count, residual, ended
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """Return the residual [J^(1/2)] at p (n, 3) [m]; costs one iteration if it belongs to the previous iterate."""
+        """Return the residual [J^(1/2)] at p (n, 3) [m].
+
+        It costs one iteration if it belongs to the previous iterate.
+        """
         if self.residual_of == "none":
             return float("nan")
         return self.begin(problem, p).iterate(at_most(int(self.residual_of == "previous")))[1]
@@ -187,7 +190,10 @@ class Iterative(ABC):
 
 
 class Substeps(Iterating):
-    """The whole step in 1, 2, ... substeps, each time from its start; iterates that are not needed are skipped."""
+    """The whole step in 1, 2, ... substeps, each time from its start.
+
+    Iterates that are not needed are skipped.
+    """
 
     def __init__(self, step: Callable[[StepProblem, int], tuple[Positions, Positions]], problem: StepProblem) -> None:
         """Create the state; `step_in_substeps(problem, n)` returns positions [m] and velocity [m/s]."""

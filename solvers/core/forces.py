@@ -93,7 +93,10 @@ _FAR = 1e100
 
 
 def rows_of_four(x: Positions, *, far: bool = False) -> NDArray[np.float64]:
-    """Return x (n, 3) in rows of four with the two padding rows; pad_far moves the last one away from all vertices."""
+    """Return x (n, 3) in rows of four, with two padding rows.
+
+    `pad_far` moves the last one away from all vertices.
+    """
     out = aligned(4 * (len(x) + 2))
     out.reshape(-1, 4)[: len(x), :3] = x
     if far:

@@ -74,7 +74,10 @@ class StepObjective:
         return any(not one.projective for one in self.stated)
 
     def reach(self, p: Positions, direction: Positions, first: float = 1.0) -> float:
-        """Return the largest step size up to `initial_step` from p along a direction (n, 3); see `barrier_energy`."""
+        """Return the largest collision-free step size up to `initial_step`.
+
+        It is that from p along the search direction, both (n, 3); see `barrier_energy`.
+        """
         return (
             first * reach(self.bounded, p, direction if first == 1.0 else first * direction) if self.bounded else first
         )
@@ -221,13 +224,19 @@ class Hessian:
         return self._assembled(clamped.keep, 0.0, clamped.tension, clamped)
 
     def factorise_filtered(self, filtered: Filtered, shift: Values | float = 0.0) -> bool:
-        """Factorise a projected Hessian plus `shift` [N/m] on its diagonal; return whether it is positive definite."""
+        """Factorise a projected Hessian plus `shift` [N/m] on its diagonal.
+
+        Returns whether it is positive definite.
+        """
         return self._factor.factorise(self._assembled(filtered.keep, shift, filtered.tension, filtered).values)
 
     def solve_anew(
         self, b: Positions, keep: float = 1.0, shift: Values | float = 0.0, tension: Values | None = None
     ) -> Positions | None:
-        """Factorise and solve in one pass, faster than both calls; return None if it is not positive definite."""
+        """Factorise and solve in one pass, faster than both calls.
+
+        Returns None if it is not positive definite.
+        """
         out = np.zeros_like(b)
         x = self._factor.solve_anew(self._assembled(keep, shift, tension).values, b[self.free])
         if x is None:
@@ -257,7 +266,10 @@ class Hessian:
         return matrix
 
     def solve(self, b: Positions) -> Positions:
-        """Solve with the last factor for b (n, 3); the result is zero at vertices that are not free."""
+        """Solve with the last factor for b (n, 3).
+
+        The result is zero at vertices that are not free.
+        """
         out = np.zeros_like(b)
         out[self.free] = self._factor.solve(b[self.free])
         return out

@@ -55,7 +55,10 @@ class PairsAt:
         return [energy.coupled(self._p) for energy in self._energies]
 
     def add(self, keep: float, matrix: Matrix) -> None:
-        """Add the blocks to the matrix; they are linear in the fraction of their negative part."""
+        """Add the blocks to the matrix.
+
+        They are linear in the fraction of their negative part.
+        """
         if any(map(len, self.coupled)):
             for end, share in ((1.0, keep), (0.0, 1.0 - keep)):
                 if share:

@@ -57,7 +57,10 @@ class Matrix:
         i: Indices,
         j: Indices,
     ) -> Matrix:
-        """Return a matrix with the blocks of a graph and those between free vertices i and j in both directions."""
+        """Return a matrix with the blocks of a graph and additional ones.
+
+        The latter are between vertices i and j, in both directions, where both are free.
+        """
         i, j = i[(i >= 0) & (j >= 0)], j[(i >= 0) & (j >= 0)]
         ones = np.ones(2 * len(i))
         more = csr_array(coo_array((ones, (np.append(i, j), np.append(j, i))), shape=graph.shape))

@@ -45,7 +45,10 @@ LEAST = 1e-6
 
 
 def preconditioning(name: Preconditioning, metric: Metric, objective: Objective, solver: str) -> At:
-    """Return the builder of a preconditioner; raise Unsupported if an energy without elements must be clamped."""
+    """Return the builder of a preconditioner.
+
+    Raises Unsupported if an energy without elements must be clamped.
+    """
     if name == "factor":
         return _Factor(metric)
     energies = objective.system.energies

@@ -123,7 +123,10 @@ class PreparedLocalGlobal(Iterative):
         return out
 
     def toward(self, b: Positions, p: Positions, out: Positions) -> None:
-        """Write the solution of Q p = b to `out`, all (n, 3); a low-precision factor solves for the correction of p."""
+        """Write the solution of Q p = b to `out`, all (n, 3).
+
+        A low-precision factor solves for the correction of p.
+        """
         if self.rounded is None:
             self.correction(b, out)
             return
@@ -140,7 +143,10 @@ class PreparedLocalGlobal(Iterative):
         return placed
 
     def residual(self, e: Positions) -> float:
-        """Return |e|_Q [J^(1/2)] of a displacement (n, 3) [m] over the unpinned vertices; sets pinned rows to zero."""
+        """Return |e|_Q [J^(1/2)] of a displacement (n, 3) [m] over the unpinned vertices.
+
+        The pinned rows are set to zero.
+        """
         e[self.system.pins.vertices] = 0.0
         return self.norm(e)
 

@@ -48,7 +48,10 @@ class Substepping:
         return self.method.evaluations
 
     def within(self, tolerance: float) -> Self:
-        """Return the solver with another error tolerance [m] of substeps; raise Unsupported for a fixed size."""
+        """Return the solver with another error tolerance [m] of substeps.
+
+        Raises Unsupported for a fixed size.
+        """
         if not self.substeps.tolerance:
             raise Unsupported("the method chooses no steps by an error")
         return replace(self, substeps=replace(self.substeps, tolerance=tolerance))

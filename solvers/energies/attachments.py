@@ -26,7 +26,14 @@ class Attachments(Quadratic):
     def of(
         cls, vertices: NDArray[np.int64], stiffness: NDArray[np.float64], points: Callable[[float], Positions], n: int
     ) -> Attachments:
-        """Return attachments of vertices (m,) of n with stiffness k (m,) [N/m], at time zero."""
+        """Return attachments of vertices, at time zero.
+
+        Args:
+            vertices: (m,).
+            stiffness: k (m,) [N/m].
+            anchor_positions_at: anchor points (m, 3) [m] as a function of time [s].
+            n: number of vertices.
+        """
         return cls(selection_matrix_sparse(vertices, n), stiffness, points(0.0), points)
 
     def begin_step(self, start: Start) -> Attachments:

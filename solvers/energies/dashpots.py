@@ -76,7 +76,13 @@ class Dashpots(Edges):
 
     @classmethod
     def along(cls, rest: Positions, edges: NDArray[np.int64], damping: NDArray[np.float64]) -> Dashpots:
-        """Return dashpots along edges (m, 2) of a rest shape (n, 3) [m] with coefficients c (m,) [N s/m]."""
+        """Return dashpots along edges of a rest shape.
+
+        Args:
+            rest: rest positions (n, 3) [m].
+            edges: (m, 2).
+            damping: coefficients c (m,) [N s/m].
+        """
         _, direction = rest_directions(rest, edges)
         return cls(edges, damping, direction, np.zeros(len(edges)))
 

@@ -97,7 +97,10 @@ def directions(v: Positions, fallback: Positions) -> tuple[NDArray[np.float64], 
 
 
 def rest_directions(rest: Positions, edges: NDArray[np.int64]) -> tuple[NDArray[np.float64], Positions]:
-    """Return the rest lengths (m,) [m] and directions (m, 3); edges of zero length get the first axis."""
+    """Return the rest lengths (m,) [m] and directions (m, 3).
+
+    Edges of zero length get the first axis.
+    """
     i, j = edges.T
     v = rest[i] - rest[j]
     return directions(v, np.tile([1.0, 0.0, 0.0], (len(v), 1)))

@@ -189,7 +189,10 @@ def add_blocks(elements, places, curvature, values):
 
 @inner
 def add_products(joined, curvature, x, out):
-    """Add the product [N] of all second derivatives with x [m], (n, 3), to `out`; do nothing without elements."""
+    """Add the product [N] of all second derivatives with x [m], (n, 3), to `out`.
+
+    Does nothing without elements.
+    """
     if joined is None:
         return
     for e in range(len(curvature)):

@@ -49,7 +49,10 @@ class Gas:
         return [x[corner] for corner in self.triangles.T]
 
     def value(self, p: Positions) -> float:
-        """Return the energy [J] at p, shape (n, 3), zero at rest; infinite if the volume is not positive."""
+        """Return the energy [J] at p, shape (n, 3), zero at rest.
+
+        It is infinite if the volume is not positive.
+        """
         volume = self.volume_at(p)
         return -self.pressure * self.volume * float(np.log(volume / self.volume)) if volume > 0.0 else np.inf
 

@@ -74,7 +74,10 @@ class Viscous(Quadratic):
 
     @classmethod
     def of(cls, A: scipy.sparse.csr_array, damping: NDArray[np.float64]) -> Viscous:
-        """Return damping of A v, A: (m, n), with coefficients c (m,) [N s/m]; undamped rows are omitted."""
+        """Return damping of A v, A: (m, n), with coefficients c (m,) [N s/m].
+
+        Undamped rows are omitted.
+        """
         damped = np.flatnonzero(damping)
         return cls(scipy.sparse.csr_array(A[damped]), damping[damped], np.zeros((len(damped), 3)))
 

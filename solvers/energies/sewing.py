@@ -33,7 +33,14 @@ class Sewing(StrainLimits):
         stiffness: NDArray[np.float64],
         longest: Callable[[float], NDArray[np.float64]],
     ) -> Sewing:
-        """Return threads between pairs (m, 2) of a rest shape (n, 3) [m] with stiffness k (m,) [N/m], at time zero."""
+        """Return threads between pairs of vertices, at time zero.
+
+        Args:
+            rest: rest positions (n, 3) [m].
+            pairs: (m, 2).
+            stiffness: k (m,) [N/m].
+            max_length_at: maximum lengths (m,) [m] as a function of time [s].
+        """
         return cls(pairs, stiffness, np.zeros(len(pairs)), longest(0.0), rest_directions(rest, pairs)[1], longest)
 
     def begin_step(self, start: Start) -> Sewing:

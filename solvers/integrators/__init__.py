@@ -58,7 +58,10 @@ EVERY = Table("springbench.integrators", INTEGRATORS)
 
 
 def splits(method: AnyIntegrator) -> bool:
-    """Return whether velocity filters act before a step; an integrator that evaluates forces at the stage has none."""
+    """Return whether velocity filters act before a step.
+
+    An integrator that evaluates forces at the stage has none.
+    """
     return isinstance(method, Integrator) and method.splits
 
 

@@ -79,7 +79,10 @@ def _midpoint(now: Motion, before: Motion, dt: float) -> tuple[Positions, Positi
 
 @dataclass(frozen=True, slots=True)
 class Own(Integrator):
-    """The integrator for solvers that integrate a step themselves and return the velocity; drag is then a force."""
+    """The integrator for solvers that integrate a step themselves and return the velocity.
+
+    Drag is then a force.
+    """
 
     splits: ClassVar[bool] = False
 

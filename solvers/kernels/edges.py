@@ -91,7 +91,10 @@ def _at(edges, row, entry, x):
 
 @inner
 def add_edges(edges, begin, end, x, out, shift, correct):
-    """Add A'K d, or minus the gradient if `correct`, of rows `begin` to `end` to rows shifted by `shift`."""
+    """Add A'K d, or minus the gradient if `correct`, to rows shifted by `shift`.
+
+    It is that of the rows from `begin` to `end`.
+    """
     if edges is None:
         return
     for row in range(begin, end):

@@ -87,7 +87,10 @@ def carry(forces, part, p):
 
 @inner
 def kick(inverse, kept, gained, first, second, h, p, v, force):
-    """Apply one kick to v, a second one unless it is negative, and a drift of p for h [s]; clear the force [N]."""
+    """Apply one kick to v, a second one unless it is negative, and a drift of p for h [s].
+
+    The force [N] is cleared.
+    """
     for i in range(len(p)):
         a = force[i] * inverse[i]
         force[i] = 0.0

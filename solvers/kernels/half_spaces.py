@@ -129,7 +129,10 @@ def _add(block, weight, n0, n1, n2):
 
 @inner
 def pushed(s, i, x, d, level, gradient, block):
-    """Add active half-spaces and friction at x, or after a step d, to gradient and block; return the set as bits."""
+    """Add active half-spaces and friction at x, or after a step d, to gradient and block.
+
+    Returns the active set as bits.
+    """
     who = 0
     for k in range(s.first[i], s.first[i + 1]):
         n0, n1, n2, weight = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2], s.stiffness[k]

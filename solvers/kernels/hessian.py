@@ -190,7 +190,10 @@ def assemble(terms, places, constant, p, tension, keep, values):
 
 @kernel
 def linearise(terms, p, out):
-    """Write sqrt(k - lateral) n and the transverse stiffness of each spring at p (n, 3) to out (m, 4)."""
+    """Write the linearised springs at p (n, 3) to out (m, 4).
+
+    These are sqrt(k - lateral) n and lateral, the transverse stiffness.
+    """
     for e in range(len(terms.stiffness)):
         n0, n1, n2, length = along(terms, e, p)
         k = terms.stiffness[e]

@@ -156,7 +156,10 @@ def kinds(*numbers: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.
 
 @inner
 def add_projection(bundles, begin, end, p, right, out, shift):
-    """Add y + A'K d(p) of the packets from `begin` to `end` to rows of `out`, moved by `shift`."""
+    """Add y + A'K d(p) to rows of `out` that are shifted by `shift`.
+
+    It is that of the packets from `begin` to `end`.
+    """
     moved = out[4 * shift :]
     for b in range(begin, end):
         if vectors.project(bundles, b, p, right, moved):
@@ -165,7 +168,10 @@ def add_projection(bundles, begin, end, p, right, out, shift):
 
 @inner
 def add_descent(bundles, begin, end, p, right, out, shift):
-    """Add y - Q p + A'K d(p), minus the gradient, of the packets from `begin` to `end` to rows of `out`."""
+    """Add minus the gradient, y - Q p + A'K d(p), to rows of `out`.
+
+    It is that of the packets from `begin` to `end`.
+    """
     moved = out[4 * shift :]
     for b in range(begin, end):
         if vectors.correct(bundles, b, p, right, moved):
@@ -186,7 +192,10 @@ def add_short(bundles, b, p, right, out, correct):
 
 @inner
 def one_by_one(bundles, b, p, out, correct):
-    """Add a packet's springs one by one; one of zero length has the direction of its rest shape."""
+    """Add a packet's springs one by one.
+
+    One of zero length has the direction of its rest shape.
+    """
     for lane in range(LANES):
         i = bundles.own[LANES * b + lane]
         s0 = s1 = s2 = 0.0
@@ -223,7 +232,10 @@ def squared_norm(bundles, begin, end, e, measure):
 
 @kernel
 def project(bundles, p, y, x, b, zero, out):
-    """Write y + A'K d(p), all (n, 3), to `out`; scratch: x, b (n + 2 rows of four) and a zero right-hand side."""
+    """Write y + A'K d(p), all (n, 3), to `out`.
+
+    Scratch are x and b (n + 2 rows of four) and `zero`, a right-hand side of zeros.
+    """
     n = len(p)
     for i in range(n):
         for c in range(3):

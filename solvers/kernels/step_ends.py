@@ -49,7 +49,10 @@ def _ask_ahead(rows, v, x):
 
 @kernel
 def state(rows, target, force, pin_targets, right):
-    """Write y = M target/dt^2 + f + w C'C p_pin, with the exact pins' columns of Q moved to the right-hand side."""
+    """Write the right-hand side y = M target/dt^2 + f + w C'C p_pin.
+
+    The exact pins' columns of Q are moved to it.
+    """
     for v in range(len(target)):
         ask_for(right, rows.right[min(v + _AHEAD, len(rows.right) - 1)])
         for c in range(3):
