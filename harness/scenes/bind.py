@@ -168,7 +168,10 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, war
 
 
 def _halved(spec: SceneSpec, size: int, integrator: str) -> Callable[[], Scene] | None:
-    """Return a builder of the coarser scene; None for fixed-size and coarse meshes and effects with vertex indices."""
+    """Return a builder of the coarser scene, None if there is none.
+
+    There is none for fixed-size meshes, the coarsest ones, and effects with vertex indices.
+    """
     half = (size + 1) // 2
     numbered = any(isinstance(e, Selection) and (e.indices or e.every > 1) for e in spec.effects)
     return None if half < COARSEST or numbered else partial(build, spec, half, integrator)

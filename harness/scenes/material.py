@@ -107,7 +107,10 @@ def _relieved(mesh: Mesh, k: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _overlaps(mesh: Mesh) -> NDArray[np.int64]:
-    """Count the BEND springs, one or two, that cover each STRETCH spring; a BEND spring spans two of them."""
+    """Count the BEND springs that cover each STRETCH spring, one or two.
+
+    A BEND spring spans two STRETCH springs.
+    """
     (i, j), (a, b) = (mesh.springs[mesh.families[family]].T for family in (STRETCH, BEND))
     n, name = len(mesh.rest), np.arange(1, len(i) + 1)
     spring = scipy.sparse.coo_array((np.tile(name, 2), (np.r_[i, j], np.r_[j, i])), shape=(n, n)).tocsr()

@@ -58,19 +58,22 @@ class KeyedMotion(Model):
         return tuple(key.time for key in self.keys)
 
     def moved(self, points: Positions, time: float) -> Positions:
-        """Return the positions (q, 3) [m] at a time [s] of points with declared positions (q, 3) [m]."""
+        """Return the positions (q, 3) [m] of declared points at a time [s]."""
         *offset, turn = self._at(time)
         arm = points - self.about
         return points + offset + arm @ (_rotation(self.axis, np.deg2rad(turn)) - np.eye(3)).T
 
     def back(self, points: Positions, time: float) -> Positions:
-        """Return the declared positions (q, 3) [m] of points with positions (q, 3) [m] at a time [s]."""
+        """Return the declared positions (q, 3) [m] of points at a time [s]."""
         *offset, turn = self._at(time)
         arm = points - offset - self.about
         return points - offset + arm @ (_rotation(self.axis, np.deg2rad(turn)) - np.eye(3))
 
     def velocity(self, points: Positions, time: float) -> Positions:
-        """Return the velocity (q, 3) [m/s] of declared points (q, 3) [m] at a time [s], at a key right after it."""
+        """Return the velocity (q, 3) [m/s] of declared points at a time [s].
+
+        At a key frame, the velocity is the limit from the right.
+        """
         (*offset, rise), (*_, turn) = self._slope(time), self._at(time)
         arm = (points - self.about) @ _rotation(self.axis, np.deg2rad(turn)).T
         axis = np.array(self.axis) / np.linalg.norm(self.axis)

@@ -56,7 +56,10 @@ def opened(document: Document, plugin: Plugin, what: str, at: Key) -> Any:
 
 
 def checked(document: Document, plugin: Plugin, what: str, parameters: dict[str, Any], at: Key) -> Any:
-    """Build an effect or a mesh from an imported plug-in class and its parameters; None after recorded mistakes."""
+    """Build an effect or a mesh from a plug-in class and its parameters.
+
+    The class is imported. Return None after recorded mistakes.
+    """
     model = opened(document, plugin, what, (*at, "kind"))
     if model is None:
         return None

@@ -25,7 +25,7 @@ _TURNS = 64
 
 
 def key_times(*motions: KeyedMotion | None) -> list[float]:
-    """Return the start, and the times [s] at which any of these motions has a key frame, sorted."""
+    """Return the sorted key times [s] of the motions, including the start."""
     return sorted({0.0, *(time for motion in motions if motion for time in motion.times)})
 
 

@@ -73,7 +73,10 @@ class Scaled(Rest):
 
 
 class Random(Rest):
-    """Vertices at uniformly random points of a cube about c (start of Chen et al. 2024 for vertex block descent)."""
+    """Vertices at uniformly random points of a cube about c.
+
+    Chen et al. 2024 use this start for vertex block descent.
+    """
 
     kind: Literal["random"] = "random"  # pyright: ignore[reportIncompatibleVariableOverride]
     side: PositiveFloat

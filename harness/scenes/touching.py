@@ -115,7 +115,10 @@ def _pair(x: list[int], edges: bool, mesh: Mesh) -> str:
 
 
 def _part(x: Sequence[int], mesh: Mesh) -> str:
-    """Describe a vertex, an edge or a triangle by its vertices; indices beyond the mesh are those of obstacles."""
+    """Describe a vertex, an edge or a triangle by its vertices.
+
+    Indices beyond those of the mesh are vertices of obstacles.
+    """
     n = len(mesh.rest)
     own = all(i < n for i in x)
     kind = ("vertex", "edge", "triangle")[len(x) - 1]

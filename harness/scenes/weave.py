@@ -42,7 +42,10 @@ class Weave(Model):
         return self
 
     def of(self, mesh: Mesh, springs: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Compute the constants (m,) of springs (m, 2); raise InputError if the surface has no part along the warp."""
+        """Compute the constants (m,) of springs (m, 2).
+
+        Raise InputError if the surface has no part along the warp.
+        """
         if mesh.dimension != 2 or not len(mesh.triangles):
             raise InputError(Mistake("warp and weft need a mesh of triangles; give one number", key="stretch"))
         a, b, c = (mesh.rest[mesh.triangles[:, k]] for k in range(3))

@@ -114,7 +114,9 @@ def fastest(v, out):
 
 @cuda.jit
 def find(vertex, p, v, dt, when, square, frames, bodies, found, rounds, pressed, spaces):
-    """Write the half-spaces of the free rows, one per obstacle; empty if the vertex is not near the obstacle.
+    """Write the half-spaces of the free rows, one per obstacle.
+
+    A half-space is empty if the vertex is not near the obstacle.
 
     See `solvers.contact.half_space.half_space_potential`.
 

@@ -90,7 +90,10 @@ class Edges(NamedTuple):
 
 
 class Given(NamedTuple):
-    """Data of a step on the device: anchor stiffness h (f,) [N/m], centres c (f, 3) [m] and force (f, 3) [N]."""
+    """Data of a step on the device.
+
+    Anchor stiffness h (f,) [N/m], centres c (f, 3) [m] and force (f, 3) [N] of the free rows.
+    """
 
     hold: Any
     centre: Any

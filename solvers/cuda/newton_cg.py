@@ -202,7 +202,7 @@ class _Iterating(DeviceIterating):
         return self.stream.download(self._sums)[:count]
 
     def _search(self, direction: Any) -> bool:
-        """Move to the first point at 1, 1/2, ... of a direction (f, 3) with sufficient decrease; return success."""
+        """Line search by step halving along a direction (f, 3); return success."""
         t, network = 1.0, self._made.uploaded.network
         for _ in range(HALVINGS):
             trial[self._over_all](self._p, direction, t, self._q, self._g, 0, self._partials)
@@ -248,7 +248,10 @@ class _Iterating(DeviceIterating):
 
 @cuda.jit
 def farthest(p, out):
-    """Update out[0] to the largest coordinate of p (n, 3), a maximum that is independent of the order of threads."""
+    """Update out[0] to the largest coordinate of p (n, 3).
+
+    The maximum is independent of the order of threads.
+    """
     most, i = 0.0, cuda.grid(1)
     while i < p.shape[0]:
         for c in range(3):

@@ -22,7 +22,10 @@ from solvers.energies.edges import TINY
 
 @cuda.jit(device=True)
 def along(edges, e, v0, v1, v2):
-    """Return the direction of an entry's edge from its own end, its tension [N] and length [m]; v: from the other."""
+    """Return the direction, tension [N] and length [m] of an entry's edge.
+
+    The direction points away from the entry's own end; v is the vector from the other end.
+    """
     length = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
     k, rest = edges.stiffness[e], edges.rest[e]
     if rest == rest and length > TINY:
@@ -131,7 +134,10 @@ def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
 
     @cuda.jit
     def multiply(edges, hold, linear, x, out, which, partials, now):
-        """Write H x (f, 3) to `out` and store the first stage of x'H x; do nothing if now[ENDED] is not 0."""
+        """Write H x (f, 3) to `out` and store the first stage of x'H x.
+
+        Do nothing if now[ENDED] is not 0.
+        """
         if now[0] != 0.0:
             return
         total, rows = 0.0, x.shape[0]

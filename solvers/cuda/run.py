@@ -56,7 +56,10 @@ class DeviceIterating(Iterating):
 
     @abstractmethod
     def take(self, step: Step) -> None:
-        """Start to solve a step that is on the device; it must not change until the solve has ended."""
+        """Start to solve a step that is on the device.
+
+        Its arrays must not change until the solve has ended.
+        """
 
     @abstractmethod
     def sweep(self, count: int) -> int:
@@ -67,7 +70,10 @@ class DeviceIterating(Iterating):
         """Return the current positions in rows (n, 3) [m], on the device."""
 
     def speeds(self) -> Any:
-        """Return the final velocity in rows (n, 3) [m/s], on the device; None for a method without its own."""
+        """Return the final velocity in rows (n, 3) [m/s], on the device.
+
+        None for a method without its own velocity.
+        """
         return None
 
     def _by_vertices(self, rows: Any) -> Positions:
@@ -121,7 +127,10 @@ class DeviceIterating(Iterating):
         return count, found, ended
 
     def marks(self) -> Marks | None:
-        """Events up to the last copy of positions, already synchronised; None in the simulator, which has no times."""
+        """Events up to the last copy of positions, already synchronised.
+
+        None in the simulator, which has no times.
+        """
         return None if device.simulated() else Marks(self._began, self._up, self._asked, self._down)
 
 

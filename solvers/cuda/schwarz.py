@@ -130,7 +130,10 @@ class Schwarz:
             self._of.invert[self._patches(level)](there, stiff, level.nodes, self._inverses[k])
 
     def apply(self, z: Any, which: int, partials: Any, now: Any) -> None:
-        """Write z (f, 3), and store the first stage of r'z; do nothing if now[0] is not 0."""
+        """Write z (f, 3), and store the first stage of r'z.
+
+        Do nothing if now[0] is not 0.
+        """
         for level, r, coarse in zip(self._levels[1:], self._residuals, self._residuals[1:], strict=False):
             self._of.gather[self._over(level.nodes)](r, coarse, now)
         moved = [z, *self._moved]

@@ -29,7 +29,10 @@ def packed(nodes: int) -> int:
 
 @cuda.jit
 def stiffen(edges, p, stiff):
-    """Write b of all edges at rows p, the six numbers of a symmetric block, to `stiff` (6, m) [N/m]."""
+    """Write b of all edges at rows p to `stiff` (6, m) [N/m].
+
+    The six numbers are those of a symmetric block.
+    """
     e = cuda.grid(1)
     while e < edges.ends.shape[0]:
         i, j, k, rest = edges.ends[e, 0], edges.ends[e, 1], edges.strength[e], edges.length[e]
@@ -165,7 +168,10 @@ def kernels(real: Real, patch: int) -> Kernels:
 
     @cuda.jit
     def gather(r, coarse, now):
-        """Restrict the residual: sum the parts of a level's nodes (N, 3); do nothing if now[0] is not 0."""
+        """Restrict the residual by sums over the parts of a level's nodes (N, 3).
+
+        Do nothing if now[0] is not 0.
+        """
         if now[0] != 0.0:
             return
         i = cuda.grid(1)

@@ -59,7 +59,10 @@ class Lanes(NamedTuple):
 
     @classmethod
     def of(cls, stream: Stream, bundles: Bundles, nobody: int, real: Any) -> Lanes:
-        """Copy the packets to the device; `padding_row` + 1 is the row of the ends of padding springs."""
+        """Copy the packets to the device.
+
+        `padding_row` + 1 is the row of the ends of padding springs.
+        """
         entries = len(bundles.neighbour)
         direction = bundles.direction if len(bundles.direction) else np.zeros((1, 3))
         return cls(
@@ -110,7 +113,10 @@ class Kernels(NamedTuple):
 
 @cache
 def kernels(real: Any) -> Kernels:
-    """Build the kernels of one type; all literals have it, as a float64 literal would promote the arithmetic."""
+    """Build the kernels of one floating-point type.
+
+    All literals have this type, as a float64 literal would promote the arithmetic.
+    """
     zero, one, short = real(0.0), real(1.0), real(SHORT[real])
     tiny = TINY_SQUARED
 
@@ -131,7 +137,10 @@ def kernels(real: Any) -> Kernels:
 
     @cuda.jit(device=True)
     def change(d0, d1, d2, w0, w1, w2, pull, k, name, direction):
-        """Return the change (3) of a spring's force on its first end, its length, and whether it has zero length."""
+        """Return the change (3) of a spring's force on its first end.
+
+        Also return its length, and whether it has zero length.
+        """
         v0, v1, v2 = d0 + w0, d1 + w1, d2 + w2
         begin, end = d0 * d0 + d1 * d1 + d2 * d2, v0 * v0 + v1 * v1 + v2 * v2
         if begin <= short or end <= short:

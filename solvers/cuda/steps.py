@@ -101,7 +101,10 @@ class Uploaded:
         return cls(network, stream, network.upload(stream), places, hold)
 
     def step(self, problem: StepProblem, guess: Positions, *, touches: bool = False) -> Step:
-        """Upload a step problem with an initial guess (n, 3) [m], and with its start for methods with contact."""
+        """Upload a step problem with an initial guess (n, 3) [m].
+
+        For methods with contact, also upload the start of the step.
+        """
         force, up = self.network.parts.force(problem), self.stream.upload
         target, pins, start = up(problem.target), pins_of(problem, self.stream), problem.start
         lagged = (up(start.origin), up(start.expected)) if self.network.parts.dashpots else (target, target)
@@ -173,7 +176,10 @@ def give(places, target, force, pins, given):
 
 @cuda.jit
 def place(places, free, guess, pins, rows):
-    """Write an initial guess (n, 3) to rows; rows from `num_free` on are set to their pins' targets."""
+    """Write an initial guess (n, 3) to rows.
+
+    Rows from `num_free` on are set to their pins' targets.
+    """
     i = cuda.grid(1)
     while i < places.vertex.shape[0]:
         for c in range(3):

@@ -53,7 +53,10 @@ def keep(value, which, partials):
 
 @cuda.jit(device=True, inline="always")
 def of_all(which, partials, count):
-    """Second stage, in a kernel of one block: return the sum of a row's first `count` partials to all threads."""
+    """Second stage: return the sum of a row's first `count` partials to all threads.
+
+    It runs in a kernel of one block.
+    """
     mine, k = 0.0, cuda.threadIdx.x
     while k < count:
         mine += partials[which, k]

@@ -116,7 +116,10 @@ def kernels(real: Any) -> Kernels:
 
     @cuda.jit(device=True)
     def risen_there(d, lane):
-        """Return the energy change in float64 for a step d; lane: its index, displacement, force and the arrays."""
+        """Return the energy change in float64 for a step d.
+
+        `lane` has the lane's index, its displacement and force, and the arrays.
+        """
         t, first, last, at, pull, neighbour, kind, weights, arrows, far, held, u = lane
         return float64(
             risen(

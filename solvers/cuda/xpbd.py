@@ -157,7 +157,10 @@ class PreparedSmallSteps(PreparedXpbd):
 
 
 class _Iterating(DeviceIterating):
-    """State of a solve: reference x (n, 3) [m], displacement u (n, 4) [m], vertex compliance (n,) [m/N]."""
+    """State of an XPBD solve on the device.
+
+    Reference x (n, 3) [m], displacement u (n, 4) [m], vertex compliance (n,) [m/N].
+    """
 
     def __init__(self, made: PreparedXpbd) -> None:
         n, stream = made.system.vertices, made.stream
@@ -203,7 +206,10 @@ class Passes(_Iterating):
 
 
 class SmallSteps(_Iterating):
-    """State of a small-steps solve: the whole step, with one substep per iteration so far, from its start."""
+    """State of a small-steps solve on the device.
+
+    Each solve restarts at the start of the step, with one substep per iteration so far.
+    """
 
     def __init__(self, made: PreparedXpbd) -> None:
         super().__init__(made)

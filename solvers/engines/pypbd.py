@@ -102,7 +102,10 @@ def _pin_threads() -> None:
 
 
 class _Model:
-    """A model and its state. Only vertices that differ from the previous final state are set, one by one."""
+    """A pyPBD model and its state.
+
+    Only vertices that differ from the previous final state are set, one by one.
+    """
 
     def __init__(self, library: Any, network: Network, iterations: int) -> None:
         self._library, self._network = library, network

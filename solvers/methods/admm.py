@@ -146,7 +146,10 @@ class PreparedAdmm(Iterative):
 
 
 class _Iterating(Iterating):
-    """State of an ADMM solve: positions, and the scaled dual variable u (m, 3) [m] of each edge."""
+    """State of an ADMM solve: positions and scaled dual variables.
+
+    The scaled dual variable u (m, 3) [m] has a row per edge.
+    """
 
     def __init__(self, prepared: PreparedAdmm, problem: StepProblem, guess: Positions) -> None:
         self._base, self._measure, edges = prepared.base, prepared.measure, prepared.edges

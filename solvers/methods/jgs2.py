@@ -214,7 +214,7 @@ class _Turns:
         self._shares = csr_array(shares[system.free])
 
     def at(self, p: Positions) -> NDArray[np.float64]:
-        """Return R (f, 3, 3) at positions p (n, 3): the rotations nearest to the sums of n n0'.
+        """Compute the rotations R (f, 3, 3) at positions p (n, 3).
 
         n is the direction of an incident spring, n0 its direction at rest.
         """

@@ -103,7 +103,10 @@ class Lbfgs(Windowed):
 
 
 class _Prepared(Iterative):
-    """L-BFGS with S in place of the factor of Q, prepared; residuals have a metric of their own."""
+    """L-BFGS with S in place of the factor of Q, prepared.
+
+    Residuals are measured by a separate metric.
+    """
 
     def __init__(self, base: PreparedLocalGlobal, metric: Metric, scheme: Scheme, objective: Objective) -> None:
         self._base, self._metric, self._scheme, self._objective = base, metric, scheme, objective

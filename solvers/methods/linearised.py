@@ -78,7 +78,10 @@ class BaraffWitkin:
 
 @dataclass(frozen=True, eq=False)
 class PreparedLinearised(Iterative):
-    """The method, prepared for a system; `system_diagonal` is that of the free part of Q (3 f,) [N/m]."""
+    """Linearised implicit Euler, prepared for a system.
+
+    `system_diagonal` is the diagonal of the free part of Q (3 f,) [N/m].
+    """
 
     residual_of: ClassVar[ResidualOf] = "none"
 

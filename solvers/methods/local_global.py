@@ -47,7 +47,10 @@ def _times(matrix: NDArray[np.float64], x: Positions) -> Positions:
 
 @dataclass(frozen=True)
 class DenseLocalGlobal:
-    """Local-global with NumPy matrices and a dense Cholesky factor, for small meshes and for reading with the paper."""
+    """Local-global with NumPy matrices and a dense Cholesky factor.
+
+    For small meshes, and for comparison with the paper line by line.
+    """
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True

@@ -147,7 +147,10 @@ class Rodas(_Linear):
 
 
 class Told(NamedTuple):
-    """Counts of accepted and rejected steps, the last step size [s], and the reached time of the frame [s]."""
+    """Statistics of adaptive steps in a frame.
+
+    Numbers of accepted and rejected steps, the last step size [s], and the reached time of the frame [s].
+    """
 
     accepted: int
     rejected: int

@@ -7,8 +7,8 @@ springs lose their negative lateral curvature, so B_i is positive definite. A qu
 Contact adds its exact second derivatives, since it acts on single vertices. A projective energy of elements (strain
 limits, dashpots) adds those of the vertex's elements. The paper has no line search. Here a step that would raise the
 energy is replaced by that of the majorant (q_i + sum of k) I, which cannot raise it; hence no sweep raises the
-objective. Energies without such a majorant, that is, energies that are not projective, are not supported. `device:
-cuda` computes the same iterates in `solvers.cuda.device_vbd`. Vertices are processed by colour: no spring, form or
+objective. Energies without such a majorant, that is, energies that are not projective, are not supported.
+`device: cuda` computes the same iterates in `solvers.cuda.device_vbd`. Vertices are processed by colour: no spring, form or
 element joins two of the same colour.
 
     p_{k+1} = w_{k+1} (sweep(p_k) - p_{k-1}) + p_{k-1},    w_1 = 1,  w_2 = 2/(2 - rho^2),  w_{k+1} = 4/(4 - rho^2 w_k),
@@ -179,7 +179,10 @@ class PreparedVertexBlockDescent(Iterative):
         return largest(problem) * float(self.majorant[self.system.unpinned].sum()) ** 0.5
 
     def in_rows(self, x: Positions) -> NDArray[np.float64]:
-        """Pack x (n, 3) into rows of four numbers, followed by the two padding rows of the packets."""
+        """Pack x (n, 3) into rows of four numbers.
+
+        Two padding rows for the packets follow.
+        """
         out = aligned(4 * (len(x) + 2))
         out.reshape(-1, 4)[self.row, :3] = x
         return out

@@ -31,7 +31,10 @@ class Attachments(Selection):
     """Key frames of the motion of all anchors."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """Return the springs as one energy, empty for zero stiffness; raise InputError if they do not fit the mesh."""
+        """Return the springs as one energy, empty for zero stiffness.
+
+        Raise InputError if they do not fit the mesh.
+        """
         vertices = self.chosen(mesh, self.kind)
         if self.to and len(self.to) not in (1, len(vertices)):
             raise InputError(

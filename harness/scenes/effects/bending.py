@@ -18,7 +18,10 @@ SHARP = np.deg2rad(60.0)
 
 
 class Bending(Model):
-    """Bending stiffness of the triangles. The rest state is flat, whatever the shape of the mesh: a tube opens."""
+    """Bending stiffness of the triangles.
+
+    The rest state is flat, whatever the shape of the mesh: a tube opens.
+    """
 
     exact_to: ClassVar[float] = inf
 

@@ -93,7 +93,10 @@ class Contact(Model):
         return Contribution(derived=(derived,), checks=(partial(self._check, mesh),))
 
     def _check(self, mesh: Mesh, start: Positions, pins: Sequence[Pin]) -> None:
-        """Raise InputError for pins or a start (n, 3) [m] inside an obstacle, and for planes without a gap."""
+        """Raise InputError for pins or a start (n, 3) [m] inside an obstacle.
+
+        Also raise it for planes without a gap between them.
+        """
         limit = self.thickness - self.depth
         for k, given in enumerate(self.obstacles):
             obstacle = given.obstacle()

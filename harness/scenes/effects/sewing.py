@@ -68,7 +68,10 @@ class Sewing(Model):
 
 
 def _matched(mesh: Mesh, first: Indices, second: Indices) -> Indices:
-    """Match each vertex of either row with the nearest one of the other, (m, 2), each pair once."""
+    """Match each vertex with the nearest one of the other row, (m, 2).
+
+    Each pair occurs once.
+    """
     from scipy.spatial import cKDTree  # for those who sew
 
     one = np.asarray(cKDTree(mesh.rest[second]).query(mesh.rest[first])[1], np.int64)

@@ -70,7 +70,10 @@ class Mesh:
 
 
 def distinct(vertices: NDArray[np.int64], n: int) -> NDArray[np.int64]:
-    """Sort unique vertices of n; `np.unique` would load `numpy.ma`, a tenth of the time of the command `list`."""
+    """Return the sorted unique vertices of n.
+
+    `np.unique` would load `numpy.ma`, a tenth of the time of the command `list`.
+    """
     there = np.zeros(n, np.bool_)
     there[vertices] = True
     return np.flatnonzero(there)

@@ -92,7 +92,7 @@ def _read_meshio(path: Path) -> Cells:
 
 @lru_cache(maxsize=2)  # a scene builds its mesh several times, and a child takes a while to start
 def _read(path: Path, changed: int, size: int) -> Found:
-    """Read a file; the cache key is its path, its modification time [ns] and its size in bytes."""
+    """Read a mesh file, cached by path, modification time [ns] and size [bytes]."""
     limits = child.Allowance(SECONDS + size / BYTES_PER_SECOND, MEMORY + MEMORY_PER_BYTE * size)
     try:
         return child.call(read, path, limits=limits)

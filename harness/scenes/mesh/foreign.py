@@ -247,7 +247,10 @@ _PARAMETRIC = re.compile(rb"^\$ParametricNodes\b", re.M)
 
 
 def _open_sections(content: bytes, raw: _Raw) -> str:
-    """Find an unclosed section of a Gmsh .msh; the ANSYS format of the same suffix has no sections."""
+    """Find an unclosed section of a Gmsh .msh.
+
+    The ANSYS format of the same suffix has no sections.
+    """
     begun: dict[bytes, int] = {}
     for end, name in _SECTION.findall(content):
         begun[name] = begun.get(name, 0) + (-1 if end else 1)

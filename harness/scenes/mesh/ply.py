@@ -144,7 +144,10 @@ def _first_line(content: bytes, start: int, elements: list[Element]) -> int:
 
 
 class _Rows(NamedTuple):
-    """Rows of an element: scalar columns by name (n,), and the wanted list, (n, k) if all lengths are equal."""
+    """Rows of an element: scalar columns by name (n,) and the requested list.
+
+    The list is an array (n, k) if all lengths are equal.
+    """
 
     columns: dict[str, Array]
     lists: list[Array] | Array

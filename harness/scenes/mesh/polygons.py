@@ -124,7 +124,10 @@ def vertex_areas(rest: Points, polygons: Indices, surface: Surface) -> Points:
 
 
 def repeated_rows(cells: Indices) -> Indices:
-    """Return for each cell (f, k) the first cell with the same vertices in any order, (f,); itself if new."""
+    """Return the first cell with the same vertices for each cell (f, k).
+
+    The order of vertices is ignored; a new cell yields its own index. Shape (f,).
+    """
     rows = np.sort(cells, axis=1)
     order = np.lexsort(rows.T[::-1]) if len(rows) > 1 else np.arange(len(rows))  # stable: the first one leads
     new = np.ones(len(rows), np.bool_)
@@ -144,7 +147,10 @@ class Cover(NamedTuple):
 
 
 def find_covers(rest: Points, polygons: Mapping[int, Indices], surfaces: Mapping[int, Surface]) -> list[Cover]:
-    """Find faces that are part of a larger face: their corners are corners of it, and they lie inside."""
+    """Find faces that are part of a larger face.
+
+    Their corners are corners of the larger face, and they lie inside it.
+    """
     sizes = [k for k in sorted(polygons) if k >= 3 and len(polygons[k])]
     if len(sizes) < 2:
         return []
@@ -183,7 +189,10 @@ def _contains(rest: Points, large: Indices, small: Indices) -> NDArray[np.bool_]
 
 
 def _projected(rest: Points, corners: Indices) -> tuple[Points, Points]:
-    """Project corners (f, k) to the plane of the vector area, (f, k, 2) [m]; and round-off (f,) of twice the area."""
+    """Project corners (f, k) to the plane normal to the vector area.
+
+    Return the projections (f, k, 2) [m] and the round-off (f,) of twice the area.
+    """
     p = rest[corners]
     farthest = np.abs(p).max(axis=(1, 2))
     p = p - p[:, :1]
@@ -235,7 +244,10 @@ def _crosses(flat: Points, slack: Points) -> NDArray[np.bool_]:
 
 
 def _clip_ears(rest: Points, corners: Indices, flat: Points, slack: Points) -> tuple[Indices, NDArray[np.bool_]]:
-    """Clip ears: the triangles (f, k - 2, 3) of faces (f, k), and which faces (f,) run out of ears too early."""
+    """Triangulate faces (f, k) by ear clipping.
+
+    Return the triangles (f, k - 2, 3), and which faces (f,) have corners but no ears left.
+    """
     f, k = corners.shape
     triangles, failed = np.zeros((f, k - 2, 3), np.int64), np.zeros(f, np.bool_)
     around: Indices = np.arange(k, dtype=np.int64)
@@ -289,7 +301,10 @@ def _diagonals(rest: Points, corners: Indices, before: Indices, after: Indices) 
 def _first_of_shortest(
     ears: NDArray[np.bool_], squared: Points, corners: Indices, before: Indices, after: Indices
 ) -> Indices:
-    """Choose of the ears (f, k) the one with the shortest diagonal, ties by the lowest numbers, (f,)."""
+    """Choose the ear with the shortest diagonal, (f,).
+
+    Ties are decided by the lowest vertex numbers.
+    """
     shortest = np.where(ears, squared, np.inf)
     tied = ears & (shortest <= (1.0 + _EQUAL) * shortest.min(axis=1, keepdims=True))
     one, two = (np.take_along_axis(corners, index, axis=1) for index in (before, after))
@@ -303,7 +318,10 @@ def _first_of_shortest(
 def _blocked(
     flat: Points, there: NDArray[np.bool_], a: Indices, b: Indices, c: Indices, slack: Points
 ) -> NDArray[np.bool_]:
-    """Return whether another corner lies in the closed triangle of corners a, b, c (f,), except at its corners."""
+    """Return whether another corner lies in the triangle of corners a, b, c (f,).
+
+    The sides belong to the triangle, its corners do not.
+    """
     rows = np.arange(len(flat))
     p, q, s = (flat[rows, x][:, None] for x in (a, b, c))
     margin = -slack[:, None]

@@ -129,5 +129,8 @@ class Block(Generator):
 
 
 def _owned(n: int) -> Points:
-    """Return the part of the adjacent cells that each vertex on a line has; products over the axes give volumes."""
+    """Return the share of the adjacent cells of each vertex on a line.
+
+    The product over the axes is the volume of a vertex.
+    """
     return np.where((np.arange(n) == 0) | (np.arange(n) == n - 1), 0.5, 1.0)

@@ -20,7 +20,10 @@ NO_TRIANGLES: Indices = np.empty((0, 3), np.int64)
 
 
 def offset_pairs(index: Indices, *offsets: tuple[int, ...]) -> Indices:
-    """Build the pairs (v, v + offset) of a lattice, (k, 2): offset by offset, each in the order of v."""
+    """Build the pairs (v, v + offset) of a lattice, (k, 2).
+
+    They are ordered by offset, then by v.
+    """
     pairs = [NO_PAIRS]
     for offset in offsets:
         steps = list(zip(offset, index.shape, strict=True))
@@ -31,13 +34,19 @@ def offset_pairs(index: Indices, *offsets: tuple[int, ...]) -> Indices:
 
 
 def lattice_triangles(index: Indices) -> Indices:
-    """Build two triangles per cell, (f, 3), split from [r, c] to [r+1, c+1]; their normals are rows x columns."""
+    """Build two triangles per cell of a lattice, (f, 3).
+
+    Cells are split from [r, c] to [r+1, c+1]; the normals are rows x columns.
+    """
     a, b, c, d = (x.ravel() for x in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
     return np.stack([a, c, d, a, d, b], axis=1).reshape(-1, 3)
 
 
 def closed_by_points(rings: Indices, first: int, last: int) -> Indices:
-    """Build the triangles of a lattice of rings (r, k), whose last column equals the first, with two end points."""
+    """Build the triangles of a lattice of rings (r, k) with two end points.
+
+    The last column of the rings equals the first.
+    """
     begin = np.column_stack([np.full(rings.shape[1] - 1, first), rings[0, :-1], rings[0, 1:]])
     end = np.column_stack([np.full(rings.shape[1] - 1, last), rings[-1, 1:], rings[-1, :-1]])
     return np.concatenate([begin, lattice_triangles(rings), end])
@@ -59,13 +68,19 @@ def sides(polygons: Indices) -> Indices:
 
 
 def corner_pairs(polygons: Indices) -> Indices:
-    """Return all pairs of corners of polygons of k corners, (f, k), as (f k (k-1)/2, 2), with repetitions."""
+    """Return all pairs of corners of polygons (f, k).
+
+    Shape (f k (k-1)/2, 2), with repetitions.
+    """
     i, j = np.triu_indices(polygons.shape[1], 1)
     return np.stack([polygons[:, i], polygons[:, j]], axis=2).reshape(-1, 2)
 
 
 def fan(polygons: Indices) -> Indices:
-    """Split polygons of k corners, (f, k), into fans of triangles from their first corner, (f (k-2), 3)."""
+    """Split polygons (f, k) into fans of triangles from their first corner.
+
+    Shape (f (k-2), 3).
+    """
     k = np.arange(1, polygons.shape[1] - 1, dtype=np.int64)
     first = np.repeat(polygons[:, :1], len(k), axis=1)
     return np.stack([first, polygons[:, k], polygons[:, k + 1]], axis=2).reshape(-1, 3)

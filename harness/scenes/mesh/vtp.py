@@ -44,7 +44,10 @@ class Surface(NamedTuple):
 
 
 def read(content: bytes) -> Surface:
-    """Read the contents of a file; raise ValueError, or an exception of the standard library, if it is broken."""
+    """Read the contents of a .vtp file.
+
+    Raise ValueError, or an exception of the standard library, if it is broken.
+    """
     found = _APPENDED.search(content)
     if found:
         end = content.rfind(b"</AppendedData>")
@@ -117,7 +120,10 @@ class _Arrays:
         return np.frombuffer(self._decoded("".join(text.split()).encode(), 0, raw=False), dtype)
 
     def _decoded(self, source: bytes, at: int, *, raw: bool) -> bytes:
-        """Decode the bytes of an array from an offset: a header with the size, then the data or its blocks."""
+        """Decode the bytes of an array from an offset.
+
+        A header with the size precedes the data or its blocks.
+        """
         size = self._header.itemsize
         (count,) = self._numbers(_taken(source, at, size, raw=raw)[0])
         if self._decompress is None:
