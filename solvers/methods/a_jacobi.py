@@ -82,8 +82,8 @@ class AggregatedJacobi:
         """
         if without_contact(system) is not system:
             raise Unsupported(
-                "a-jacobi: Q, of which its matrix is made once, has no rows for what begins to touch (Contact); take "
-                "numba, chebyshev or vbd"
+                "a-jacobi: its matrix is computed once from Q, which does not include contact of vertices (Contact); "
+                "use numba, chebyshev or vbd"
             )
         energies = projective(system, "a-jacobi")
         measure = cast("Idle", CompiledLocalGlobal().prepare(system))

@@ -107,8 +107,8 @@ class AugmentedVertexBlockDescent:
             return usual.prepare(system)
         if any(map(is_bounded, system.energies)):
             raise Unsupported(
-                "avbd: a step may pass no surface that touches, and exact lengths move what a step is; take out "
-                "self-contact and surface-contact, or give springs and strain limits a stiffness in figures"
+                "avbd: does not support surface contact together with length constraints; remove self-contact and "
+                "surface-contact, or give springs and strain limits a numerical stiffness"
             )
         edges, energies, k = joined(system.lengths), system.energies, np.empty(0)
         if self.softened:

@@ -59,8 +59,8 @@ class BaraffWitkin:
         """
         if system.speed is not None:
             raise Unsupported(
-                "baraff-witkin: linearises the one unknown of a step, and this integrator needs its unknowns solved; "
-                "take implicit-euler, bdf2 or midpoint, or a Rosenbrock method: ros2, ros3p, rodas"
+                "baraff-witkin: linearises a single stage per step, and this integrator requires solved stages; "
+                "use implicit-euler, bdf2 or midpoint, or a Rosenbrock method: ros2, ros3p, rodas"
             )
         if met := next((e for e in system.energies if is_contact(e) or is_bounded(e)), None):
             raise Unsupported(

@@ -65,8 +65,8 @@ class NonlinearCG:
         """
         if without_contact(system) is not system:
             raise Unsupported(
-                "pncg: no quadratic model holds along a direction where single vertices begin to press and grip "
-                "(Contact); take lbfgs or newton, or state surface-contact"
+                "pncg: does not support contact of single vertices (Contact), for which no quadratic model is valid "
+                "along a direction; use lbfgs or newton, or surface-contact"
             )
         metric, objective = Metric(system), Objective(system)
         at = preconditioning(self.preconditioner, metric, objective, "pncg")
