@@ -15,18 +15,18 @@ if TYPE_CHECKING:
     from harness.api import (
         IntegratorName,
         OptionKeys,
-        OwnName,
-        Picture,
+        PngImage,
         SceneKeys,
         Simulation,
         SolverName,
         SweepKeys,
-        draw,
+        UserCodeName,
+        draw_picture,
+        load_rows,
         load_scene,
         make_scene,
         open_recording,
-        rows,
-        run,
+        run_config,
     )
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")

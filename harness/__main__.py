@@ -23,7 +23,7 @@ def main() -> None:
             interrupts.exit_process()
         raise
     finally:
-        interrupts.ignore()
+        interrupts.ignore_interrupts()
 
 
 def _prepare_environment() -> None:

@@ -20,21 +20,21 @@ from typing import Any, Unpack, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.base.document import Document, Key, key_text
-from harness.base.errors import InputError, Mistake
+from harness.base.document import ConfigDocument, ConfigKey, format_key
+from harness.base.errors import InputError, InputMistake
 from harness.config import load
-from harness.config.keys import IntegratorName, OptionKeys, OwnName, SceneKeys, SolverName, SweepKeys
-from harness.config.options import DEFAULT_SOLVER, DEFAULT_STOP
-from harness.config.solvers import solvers_of
-from harness.record.base import Replay
-from harness.scenes.bind import build
-from harness.scenes.effects.base import Effect
+from harness.config.keys import IntegratorName, OptionKeys, SceneKeys, SolverName, SweepKeys, UserCodeName
+from harness.config.options import DEFAULT_SOLVER, DEFAULT_STOP_RULE
+from harness.config.solvers import read_solvers
+from harness.record.base import RecordingReplay
+from harness.scenes.bind import build_scene
+from harness.scenes.effects.base import SceneEffect
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.spec import FirstGuess, MeshSource, SceneSpec
-from harness.simulation.step import Step, prepare, simulate, start
+from harness.scenes.spec import InitialGuess, MeshSource, SceneSpec
+from harness.simulation.step import SimulationStep, build_initial_state, prepare, simulate_scene
 from solvers import plugins
 from solvers.problem import Positions, Solver, StopRule
-from solvers.registry import EVERY
+from solvers.registry import SOLVER_TABLE
 
 __all__ = [
     "IntegratorName",
@@ -56,13 +56,13 @@ __all__ = [
 
 def load_scene(path: str | Path) -> SceneSpec:
     """Load a scene from a YAML file, or from an assignment's JSON file; raise InputError."""
-    return load.opened_scene(Path(path))
+    return load.load_scene_in_process(Path(path))
 
 
 def make_scene(
     *,
     mesh: Mapping[str, Any] | MeshSource,
-    effects: Sequence[Mapping[str, Any] | Effect] = (),
+    effects: Sequence[Mapping[str, Any] | SceneEffect] = (),
     folder: str | Path = ".",
     name: str = "scene",
     **fields: Unpack[SceneKeys],
@@ -82,7 +82,7 @@ def make_scene(
     listed = [dict(effect) if isinstance(effect, Mapping) else {"kind": "gravity"} for effect in effects]
     given = dict(mesh) if isinstance(mesh, Mapping) else {"kind": "grid"}
     data = {**fields, "mesh": given, "effects": listed}
-    checked = load.scene_of(Document(Path(folder) / f"{name}.yaml", _plain(data)))
+    checked = load.build_scene_from_document(ConfigDocument(Path(folder) / f"{name}.yaml", _to_plain_data(data)))
     own = tuple(
         made if isinstance(effect, Mapping) else effect for effect, made in zip(effects, checked.effects, strict=True)
     )
@@ -105,13 +105,13 @@ class Simulation:
     def __init__(
         self,
         scene: SceneSpec,
-        solver: SolverName | OwnName | Solver = DEFAULT_SOLVER,
+        solver: SolverName | UserCodeName | Solver = DEFAULT_SOLVER,
         *,
         size: int | None = None,
-        integrator: IntegratorName | OwnName = "implicit-euler",
-        iterations: int = DEFAULT_STOP["iterations"],
-        tolerance: float | None = DEFAULT_STOP["tolerance"],
-        first_guess: FirstGuess | None = None,
+        integrator: IntegratorName | UserCodeName = "implicit-euler",
+        max_iterations: int = DEFAULT_STOP_RULE["iterations"],
+        rtol: float | None = DEFAULT_STOP_RULE["tolerance"],
+        initial_guess: InitialGuess | None = None,
         parameters: Mapping[str, Any] | None = None,
     ) -> None:
         """Build the scene and prepare the solver.
@@ -128,59 +128,62 @@ class Simulation:
         Raises: InputError, and the errors of the solver's preparation.
         """
         size = size if size is not None else scene.default_size
-        self._scene = build(scene, size or 0, integrator)
+        self._scene = build_scene(scene, size or 0, integrator)
         if isinstance(solver, str):
-            solver = _solver(solver, parameters or {}, scene.path)
+            solver = _create_solver(solver, parameters or {}, scene.path)
         self._prepared = prepare(self._scene, solver)
-        self._stop, self._guess = StopRule(iterations, tolerance), first_guess or scene.guess(integrator)
-        self._state = start(self._scene)
+        self._stop, self._guess = (
+            StopRule(max_iterations, rtol),
+            initial_guess or scene.choose_initial_guess(integrator),
+        )
+        self._state = build_initial_state(self._scene)
         self.mesh: Mesh = self._scene.mesh
-        self.last: Step | None = None
+        self.last_step: SimulationStep | None = None
 
     @property
     def time(self) -> float:
         """Simulated time [s]."""
-        return self._scene.time(self._state.index)
+        return self._scene.compute_time(self._state.index)
 
     @property
     def positions(self) -> Positions:
         """Copy of the vertex positions, (n, 3) [m]."""
-        return self._state.now.positions.copy()
+        return self._state.motion.positions.copy()
 
     @property
     def velocity(self) -> Positions:
         """Copy of the vertex velocities, (n, 3) [m/s]."""
-        return self._state.now.velocity.copy()
+        return self._state.motion.velocity.copy()
 
     def step(self) -> Positions:
         """Advance by one step and return the new positions, (n, 3) [m]."""
         frames = self._state.index + 1
-        (self.last,) = simulate(
-            self._scene, self._prepared, self._stop, first_guess=self._guess, frames=frames, state=self._state
+        (self.last_step,) = simulate_scene(
+            self._scene, self._prepared, self._stop, initial_guess=self._guess, frames=frames, initial_state=self._state
         )
-        self._state = self.last.state
+        self._state = self.last_step.state
         return self.positions
 
-    def steps(self, count: int) -> NDArray[np.float64]:
+    def run_steps(self, count: int) -> NDArray[np.float64]:
         """Advance by `count` steps and return all their positions, (count, n, 3) [m]."""
         return np.array([self.step() for _ in range(count)])
 
 
-def _solver(name: str, parameters: Mapping[str, Any], path: Path) -> Solver:
-    document = Document(path, {"solvers": [{"name": name, **parameters}]})
-    found = solvers_of(document)
+def _create_solver(name: str, parameters: Mapping[str, Any], path: Path) -> Solver:
+    document = ConfigDocument(path, {"solvers": [{"name": name, **parameters}]})
+    found = read_solvers(document)
     if document.mistakes:
-        raise document.error()
-    return plugins.load(EVERY[found[0].name])(**found[0].parameters)
+        raise document.build_error()
+    return plugins.load_target(SOLVER_TABLE[found[0].name])(**found[0].parameters)
 
 
-def run(
+def run_config(
     config: str | Path | SweepKeys,
     *,
     name: str = "",
     folder: str | Path = ".",
     results: str | Path = "results",
-    again: bool = False,
+    rerun: bool = False,
 ) -> Any:
     """Run what is missing of a sweep, as `springbench run`, and return its rows.
 
@@ -194,38 +197,40 @@ def run(
     Raises:
         InputError: for any mistake in the config.
     """
-    from harness.base.claim import claimed
-    from harness.base.console import err
-    from harness.base.progress import Lines
+    from harness.base.claim import claim_folder
+    from harness.base.console import get_error_console
+    from harness.base.progress import ProgressLines
     from harness.experiments.sweep import run_sweep
-    from harness.report.named import draw_reports
+    from harness.report.named import run_reports
 
     if isinstance(config, Mapping):
         if not name:
             raise InputError("a sweep that is a mapping needs a name: run({...}, name='mine')")
         path = Path(folder) / f"{name}.yaml"
-        sweep = load.sweep_of(Document(path, _plain(config)))
+        sweep = load.build_sweep_from_document(ConfigDocument(path, _to_plain_data(config)))
     else:
         path = Path(config)
-        sweep = load.load_any(path)
-    place = claimed(Path(results) / sweep.name, path)
-    table = run_sweep(sweep.name, sweep.runs(), place, Lines(err()), lambda line: None, again=again)
-    draw_reports(sweep.reports, table, place, sweep.options.time_limit)
-    return _frame(table)
+        sweep = load.load_config(path)
+    place = claim_folder(Path(results) / sweep.name, path)
+    table = run_sweep(
+        sweep.name, sweep.list_runs(), place, ProgressLines(get_error_console()), lambda line: None, rerun=rerun
+    )
+    run_reports(sweep.reports, table, place, sweep.options.time_limit)
+    return _to_dataframe(table)
 
 
-def _plain(value: Any, at: Key = ()) -> Any:
+def _to_plain_data(value: Any, at: ConfigKey = ()) -> Any:
     """Convert config data to what its file would contain; raise InputError for other objects.
 
     Tuples and arrays become lists, paths become text.
     """
     if isinstance(value, Mapping):
         given = cast(Mapping[Any, Any], value)
-        return {str(key): _plain(one, (*at, str(key))) for key, one in given.items()}
+        return {str(key): _to_plain_data(one, (*at, str(key))) for key, one in given.items()}
     if isinstance(value, np.ndarray | np.generic):
         return cast(Any, value).tolist()
     if isinstance(value, list | tuple):
-        return [_plain(one, (*at, i)) for i, one in enumerate(cast(Sequence[Any], value))]
+        return [_to_plain_data(one, (*at, i)) for i, one in enumerate(cast(Sequence[Any], value))]
     if isinstance(value, Path):
         return str(value)
     if value is None or isinstance(value, str | int | float):
@@ -234,27 +239,27 @@ def _plain(value: Any, at: Key = ()) -> Any:
     came = f"the class {of.__name__}" if of is value else f"an object of {of.__name__}"
     file = Path(getattr(sys.modules.get(of.__module__), "__file__", None) or "mine.py").name
     wanted = f'its name; write the class into a file beside the scenes, and give "./{file}:{of.__name__}"'
-    raise InputError(Mistake(f"came {came}; wanted {wanted}", key=key_text(at)))
+    raise InputError(InputMistake(f"came {came}; wanted {wanted}", key=format_key(at)))
 
 
-def rows(folder: str | Path) -> Any:
+def load_rows(folder: str | Path) -> Any:
     """Load the rows of a sweep's results folder, such as "results/quickstart"; raise InputError.
 
     Returns: a polars DataFrame if polars is installed, else a pandas DataFrame, else a pyarrow table.
     """
-    from harness.base.rows import read
-    from harness.base.shelf import units
+    from harness.base.rows import read_rows
+    from harness.base.shelf import list_units
 
-    return _frame(read(units(Path(folder) / "rows")))
+    return _to_dataframe(read_rows(list_units(Path(folder) / "rows")))
 
 
-def _frame(table: Any) -> Any:
+def _to_dataframe(table: Any) -> Any:
     if find_spec("polars"):
         return import_module("polars").from_arrow(table)
     return table.to_pandas() if find_spec("pandas") else table
 
 
-def open_recording(path: str | Path) -> Replay:
+def open_recording(path: str | Path) -> RecordingReplay:
     """Open a recording; raise InputError if it cannot be read.
 
     Returns: times (k,) [s], positions (k, n, 3) [m] relative to `origin` (3,), springs and scalars. Its method
@@ -266,21 +271,21 @@ def open_recording(path: str | Path) -> Replay:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class PngImage:
     """A PNG image that a notebook displays; content: bytes of the file."""
 
-    png: bytes
+    content: bytes
 
     def _repr_png_(self) -> bytes:
-        return self.png
+        return self.content
 
     def save(self, path: str | Path) -> Path:
         """Write the image to a file (.png) and return its path."""
-        Path(path).write_bytes(self.png)
+        Path(path).write_bytes(self.content)
         return Path(path)
 
 
-def draw(what: str | Path | Replay | Mapping[str, str | Path | Replay]) -> Picture:
+def draw_picture(source: str | Path | RecordingReplay | Mapping[str, str | Path | RecordingReplay]) -> PngImage:
     """Draw the picture of a run from its recording, or a comparison of several recordings.
 
     Args:
@@ -289,17 +294,17 @@ def draw(what: str | Path | Replay | Mapping[str, str | Path | Replay]) -> Pictu
         InputError: if a recording cannot be read.
         RunFailed: if the system cannot draw.
     """
-    from harness.report.comparison import draw_comparison
-    from harness.report.run_picture import draw_run
+    from harness.report.comparison import draw_comparison_picture
+    from harness.report.run_picture import draw_run_picture
 
     with TemporaryDirectory() as folder:
         path = Path(folder) / "picture.png"
-        if isinstance(what, Mapping):
-            draw_comparison({name: _replay(one) for name, one in what.items()}, path)
+        if isinstance(source, Mapping):
+            draw_comparison_picture({name: _load_replay(one) for name, one in source.items()}, path)
         else:
-            draw_run(_replay(what), path)
-        return Picture(path.read_bytes())
+            draw_run_picture(_load_replay(source), path)
+        return PngImage(path.read_bytes())
 
 
-def _replay(one: str | Path | Replay) -> Replay:
-    return one if isinstance(one, Replay) else open_recording(one)
+def _load_replay(one: str | Path | RecordingReplay) -> RecordingReplay:
+    return one if isinstance(one, RecordingReplay) else open_recording(one)

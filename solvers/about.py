@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-LOCAL_GLOBAL = "local-global"
+LOCAL_GLOBAL_FAMILY = "local-global"
 """The family of the method of Liu et al. 2013, whose iterations are the unit for other methods."""
 
-ENGINE = "engine"
+ENGINE_FAMILY = "engine"
 """The family of external programs."""
 
 
 @dataclass(frozen=True, slots=True)
-class Reference:
+class Citation:
     """The publication of a method.
 
     Attributes:
@@ -29,7 +29,7 @@ class Reference:
 
 
 @dataclass(frozen=True, slots=True)
-class About:
+class SolverInfo:
     """The metadata of a method for tables and figures.
 
     Attributes:
@@ -45,15 +45,15 @@ class About:
     """
 
     family: str
-    reference: Reference | None = None
-    own_steps: bool = False
-    first: bool = False
-    to_error: bool = False
-    even: bool = False
-    package: str = ""
+    citation: Citation | None = None
+    is_substepping: bool = False
+    is_family_default: bool = False
+    supports_error_control: bool = False
+    has_fixed_step: bool = False
+    package_name: str = ""
 
 
-LIU_2013 = Reference(
+LIU_2013 = Citation(
     "Liu, Tiantian and Bargteil, Adam W. and O'Brien, James F. and Kavan, Ladislav",
     2013,
     "Fast simulation of mass-spring systems",

@@ -15,29 +15,29 @@ from pathlib import Path
 from types import ModuleType
 
 __path__: list[str] = []
-_PREFIX = f"{__name__}.m"
-_READ: dict[str, bytes] = {}
+_MODULE_PREFIX = f"{__name__}.m"
+_LOADED_CONTENT: dict[str, bytes] = {}
 
 
-class _Files(MetaPathFinder):
+class _FileModuleFinder(MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        if not fullname.startswith(_PREFIX):
+        if not fullname.startswith(_MODULE_PREFIX):
             return None
-        return spec_from_file_location(fullname, bytes.fromhex(fullname.removeprefix(_PREFIX)).decode())
+        return spec_from_file_location(fullname, bytes.fromhex(fullname.removeprefix(_MODULE_PREFIX)).decode())
 
 
-sys.meta_path.append(_Files())
+sys.meta_path.append(_FileModuleFinder())
 
 
-def module(path: Path) -> ModuleType:
+def load_file_module(path: Path) -> ModuleType:
     """Return the module in a file.
 
     The file is executed again if its content has changed since the last call.
     """
-    name, content = f"{_PREFIX}{str(path).encode().hex()}", path.read_bytes()
-    if _READ.get(name, content) != content:
+    name, content = f"{_MODULE_PREFIX}{str(path).encode().hex()}", path.read_bytes()
+    if _LOADED_CONTENT.get(name, content) != content:
         sys.modules.pop(name, None)
-    _READ[name] = content
+    _LOADED_CONTENT[name] = content
     return import_module(name)

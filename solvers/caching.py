@@ -36,57 +36,63 @@ from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
 
 from solvers import sources
-from solvers.linking import rebuilt
+from solvers.linking import rebuild_result
 
-_UNUSED = 3600.0
+_STALE_SECONDS = 3600.0
 """Age [s] of the last use after which the cache folder of other sources is removed; a process that still runs with such
 sources compiles and stores its kernels again."""
 
-_SETTINGS = ("OPT", "BOUNDSCHECK", "LOOP_VECTORIZE", "SLP_VECTORIZE", "DEBUGINFO_DEFAULT", "ENABLE_AVX")
+_CODEGEN_SETTINGS = ("OPT", "BOUNDSCHECK", "LOOP_VECTORIZE", "SLP_VECTORIZE", "DEBUGINFO_DEFAULT", "ENABLE_AVX")
 """Settings in Numba's environment that change the generated code."""
 
 
-_CONFIG: Any = config
+_NUMBA_CONFIG: Any = config
 """Untyped, because the names are defined from the environment."""
 
-_CACHE: Any = _Cache
+_NUMBA_CACHE: Any = _Cache
 """Untyped, because the declared signatures differ from those of its subclasses."""
 
 
-class KernelCache(_CACHE):
+class KernelCache(_NUMBA_CACHE):
     """The compiled code of one kernel, by signature."""
 
     def __init__(self, function: Any, options: Mapping[str, Any]) -> None:
         """Create the cache of a Python function with its compile options."""
-        self._source = function.__code__.co_filename
-        self._module, self._name = function.__module__, function.__qualname__
-        cells = tuple(_told(cell.cell_contents) for cell in function.__closure__ or ())
+        self._source_file = function.__code__.co_filename
+        self._module_name, self._kernel_name = function.__module__, function.__qualname__
+        cells = tuple(_closure_key(cell.cell_contents) for cell in function.__closure__ or ())
         chosen = sorted((key, sorted(v) if isinstance(v, (set, frozenset)) else v) for key, v in options.items())
-        self._fixed = (
+        self._fixed_key = (
             repr(chosen),
             hashlib.sha256(function.__code__.co_code).digest(),
             hashlib.sha256(dumps(cells)).digest() if cells else b"",
             (sys.version, numba.__version__, llvmlite.__version__, np.__version__),
-            tuple(str(getattr(_CONFIG, name, "")) for name in _SETTINGS),
+            tuple(str(getattr(_NUMBA_CONFIG, name, "")) for name in _CODEGEN_SETTINGS),
         )
 
     @property
     def cache_path(self) -> str:
         """Folder of the code compiled from the current sources."""
-        return str(_folder(_home(os.path.dirname(self._source)), self._module, sources.digest([self._source])))
+        return str(
+            _cache_folder(
+                _writable_root(os.path.dirname(self._source_file)),
+                self._module_name,
+                sources.digest_sources([self._source_file]),
+            )
+        )
 
     def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
         """Return the cached code of a signature, or None if there is none."""
         target_context.refresh()
-        key = (sig, target_context.codegen().magic_tuple(), self._fixed)
-        path = self._path(key)
+        key = (sig, target_context.codegen().magic_tuple(), self._fixed_key)
+        path = self._entry_path(key)
         try:
             there, kept = pickle.loads(path.read_bytes())
         except Exception:  # nothing is there, or what is there cannot be read: it is compiled and written anew
             return None
         with suppress(OSError):
             os.utime(path.parent)
-        return rebuilt(target_context, kept) if there == key else None
+        return rebuild_result(target_context, kept) if there == key else None
 
     def save_overload(self, sig: Any, data: CompileResult) -> None:
         """Store the code compiled for a signature, if it is cacheable and the disk has space."""
@@ -94,13 +100,13 @@ class KernelCache(_CACHE):
             return
         for env in data._find_referenced_environments():  # of what it links in
             data.library.codegen.set_env(env.env_name, env)
-        key = (sig, data.target_context.codegen().magic_tuple(), self._fixed)
-        path = self._path(key)
+        key = (sig, data.target_context.codegen().magic_tuple(), self._fixed_key)
+        path = self._entry_path(key)
         with suppress(OSError):
             if not path.parent.exists():
                 path.parent.mkdir(parents=True, exist_ok=True)
-                _clear(path.parent, self._module)
-            _write(path, dumps((key, data._reduce())))
+                _remove_stale(path.parent, self._module_name)
+            _write_atomically(path, dumps((key, data._reduce())))
 
     def enable(self) -> None:
         """Do nothing: the cache is always enabled."""
@@ -112,29 +118,29 @@ class KernelCache(_CACHE):
         """Remove the cached code; `recompile` of a kernel calls this."""
         shutil.rmtree(self.cache_path, ignore_errors=True)
 
-    def _path(self, key: Any) -> Path:
-        name = self._name.replace("<", "").replace(">", "")
+    def _entry_path(self, key: Any) -> Path:
+        name = self._kernel_name.replace("<", "").replace(">", "")
         return Path(self.cache_path) / f"{name}-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
 
 
-def _told(value: Any) -> Any:
+def _closure_key(value: Any) -> Any:
     """Return the cache key of a closed-over value: for a kernel its names, its sources and its own closure."""
     function = getattr(value, "py_func", None)
     if function is None:
         return value
-    cells = (_told(cell.cell_contents) for cell in function.__closure__ or ())
-    return function.__module__, function.__qualname__, sources.digest([function.__code__.co_filename]), *cells
+    cells = (_closure_key(cell.cell_contents) for cell in function.__closure__ or ())
+    return function.__module__, function.__qualname__, sources.digest_sources([function.__code__.co_filename]), *cells
 
 
-def _folder(home: Path, module: str, digest: str) -> Path:
+def _cache_folder(home: Path, module: str, digest: str) -> Path:
     return home / f"{module}-{digest[:16]}"
 
 
 @cache
-def _home(source: str) -> Path:
+def _writable_root(source: str) -> Path:
     """Return the first writable cache folder; `source` is the folder of the source file."""
     users = Path(AppDirs("springbench", appauthor=False).user_cache_dir)
-    for folder in (Path(_CONFIG.CACHE_DIR or os.path.join(source, "__pycache__")), users):
+    for folder in (Path(_NUMBA_CONFIG.CACHE_DIR or os.path.join(source, "__pycache__")), users):
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
@@ -142,15 +148,15 @@ def _home(source: str) -> Path:
     return users
 
 
-def _clear(made: Path, module: str) -> None:
+def _remove_stale(made: Path, module: str) -> None:
     """Remove the code compiled from other sources of a module unless a process has used it recently."""
     for other in made.parent.glob(f"{module}-*"):
         with suppress(OSError):
-            if made.stat().st_mtime - other.stat().st_mtime > _UNUSED:
+            if made.stat().st_mtime - other.stat().st_mtime > _STALE_SECONDS:
                 shutil.rmtree(other, ignore_errors=True)
 
 
-def _write(path: Path, content: bytes) -> None:
+def _write_atomically(path: Path, content: bytes) -> None:
     """Write the whole content or nothing."""
     number, partial = tempfile.mkstemp(dir=path.parent, prefix=".")
     try:

@@ -16,7 +16,7 @@ from solvers.caching import KernelCache
 from solvers.linking import LinkedCompiler
 
 
-def kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator like Numba's `njit` whose disk cache depends on all that the function depends on."""
 
     def compiling(function: Callable[..., Any]) -> Any:
@@ -27,14 +27,14 @@ def kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return compiling
 
 
-_bare: Any = {"_nrt": False, "nogil": True}
-_alone: Any = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-_linked: Any = {**_alone, "pipeline_class": LinkedCompiler}
-inner_options: Any = {**_bare, **_linked}
+_bare_options: Any = {"_nrt": False, "nogil": True}
+_no_wrapper_options: Any = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_linked_options: Any = {**_no_wrapper_options, "pipeline_class": LinkedCompiler}
+jit_inner_options: Any = {**_bare_options, **_linked_options}
 
-kernel: Any = kept(**_bare, no_cfunc_wrapper=True)
-inner: Any = kept(**inner_options)
-part: Any = kept(**_linked)  # an inner one that makes arrays
-inner_closure: Any = njit(**inner_options)  # has no name on disk; kept within what calls it
-inlined_closure: Any = njit(**inner_options, forceinline=True)  # for what takes more arrays than it has work
-inner_in_parallel: Any = kept(**_bare, **_alone, parallel=True)
+jit_kernel: Any = cached_njit(**_bare_options, no_cfunc_wrapper=True)
+jit_inner: Any = cached_njit(**jit_inner_options)
+jit_inner_allocating: Any = cached_njit(**_linked_options)  # an inner one that makes arrays
+jit_closure: Any = njit(**jit_inner_options)  # has no name on disk; kept within what calls it
+jit_inlined_closure: Any = njit(**jit_inner_options, forceinline=True)  # for what takes more arrays than it has work
+jit_inner_parallel: Any = cached_njit(**_bare_options, **_no_wrapper_options, parallel=True)

@@ -14,13 +14,13 @@ import numpy as np
 
 from solvers.problem import Positions, Solution, StepProblem
 
-Device = Literal["cpu", "cuda"]
-SIMULATED = "Numba's simulator, no device"
+DeviceName = Literal["cpu", "cuda"]
+SIMULATOR_NAME = "Numba's simulator, no device"
 """Name of Numba's simulator in rows."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnDevice:
+class DeviceOptions:
     """The option where to compute.
 
     Attributes:
@@ -29,13 +29,13 @@ class OnDevice:
             the parameter existed.
     """
 
-    unstated: ClassVar[frozenset[str]] = frozenset({"device", "precision"})
+    omitted_defaults: ClassVar[frozenset[str]] = frozenset({"device", "precision"})
 
-    device: Device = "cpu"
+    device: DeviceName = "cpu"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Precise(OnDevice):
+class PrecisionOptions(DeviceOptions):
     """The precision of device kernels, float32 by default, with residuals in float64; the processor uses float64."""
 
     precision: Literal["float32", "float64"] | None = None
@@ -46,12 +46,12 @@ class Precise(OnDevice):
             raise ValueError("precision: float32 is for `device: cuda`; the processor computes in float64 here")
 
     @property
-    def real(self) -> type[np.float32] | type[np.float64]:
+    def real_dtype(self) -> type[np.float32] | type[np.float64]:
         """Floating-point type of device kernels."""
         return np.float64 if self.precision == "float64" else np.float32
 
 
-class Event(Protocol):
+class StreamEvent(Protocol):
     """A point on a device's stream."""
 
     def elapsed_time(self, event: Any) -> float:
@@ -59,54 +59,54 @@ class Event(Protocol):
         ...
 
 
-class Marks(NamedTuple):
+class SolveEvents(NamedTuple):
     """The events of a solve: start, data uploaded (up), kernels finished (done), result downloaded (down)."""
 
-    began: Event
-    up: Event
-    done: Event
-    down: Event
+    start_event: StreamEvent
+    upload_event: StreamEvent
+    kernel_event: StreamEvent
+    download_event: StreamEvent
 
 
 @runtime_checkable
-class Remote(Protocol):
+class PreparedDeviceSolver(Protocol):
     """A prepared solver on a device.
 
     Its iterates are copied on request only; timings are taken of the same iterates without copies.
     """
 
     @property
-    def columns(self) -> Mapping[str, Any]:
+    def device_columns(self) -> Mapping[str, Any]:
         """Columns of rows that describe the device."""
         ...
 
-    def state(self) -> dict[str, float | None]:
+    def device_state(self) -> dict[str, float | None]:
         """Return columns of the device's current clocks, power and temperature; None for unavailable ones."""
         ...
 
-    def replay(self, problem: StepProblem, iterations: int) -> tuple[Solution, Marks | None]:
+    def replay_iterations(self, problem: StepProblem, iterations: int) -> tuple[Solution, SolveEvents | None]:
         """Return the solution of a host problem after n iterations, without residual, and its events.
 
         The events are None for a device without a clock.
         """
         ...
 
-    def uncopied(self, problem: StepProblem) -> Iterator[Callable[[], Positions]]:
+    def iterates_without_copy(self, problem: StepProblem) -> Iterator[Callable[[], Positions]]:
         """Yield the iterates of `iterates` when computed, as callables that copy them."""
         ...
 
 
-def told(prepared: object) -> dict[str, Any]:
+def device_columns_of(prepared: object) -> dict[str, Any]:
     """Return the columns that describe a prepared solver's device; empty for one on the processor."""
     usual = getattr(prepared, "usual", prepared)  # of two systems
-    return dict(usual.columns) if isinstance(usual, Remote) else {}
+    return dict(usual.device_columns) if isinstance(usual, PreparedDeviceSolver) else {}
 
 
-_BROKEN: list[str] = []
+_DEVICE_FAILURES: list[str] = []
 
 
-def broken(reason: str = "") -> bool:
+def is_device_lost(reason: str = "") -> bool:
     """Return whether this process has lost its device permanently; a reason records such a loss."""
     if reason:
-        _BROKEN.append(reason)
-    return bool(_BROKEN)
+        _DEVICE_FAILURES.append(reason)
+    return bool(_DEVICE_FAILURES)

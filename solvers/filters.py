@@ -17,14 +17,14 @@ from solvers.problem import Positions
 
 
 @dataclass(frozen=True, slots=True)
-class Decay:
+class ExponentialDecay:
     """Exponential decay of the velocity by `decay_factor` per step."""
 
-    kept: float
+    decay_factor: float
 
     def __call__(self, v: Positions) -> Positions:
         """Return the filtered velocity [m/s], (n, 3)."""
-        return self.kept * v
+        return self.decay_factor * v
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,9 +32,9 @@ class QuadraticDrag:
     """Quadratic drag. mass: m (n,) [kg]; drag_coefficient: c dt (n,) [kg s/m]."""
 
     mass: NDArray[np.float64]
-    coefficient: NDArray[np.float64]
+    drag_coefficient: NDArray[np.float64]
 
     def __call__(self, v: Positions) -> Positions:
         """Return the filtered velocity [m/s], (n, 3)."""
-        drag, mass = self.coefficient * np.linalg.norm(v, axis=1), self.mass
+        drag, mass = self.drag_coefficient * np.linalg.norm(v, axis=1), self.mass
         return v * np.divide(mass, mass + drag, out=np.ones_like(mass), where=drag > 0.0)[:, None]

@@ -9,20 +9,20 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pins:
+class DirichletPins:
     """Dirichlet conditions: `vertices` (q,), sorted and unique; `weight` (q,) [N/m], infinite for an exact pin."""
 
     vertices: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     weight: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
     @property
-    def exact(self) -> NDArray[np.bool_]:
+    def exact_mask(self) -> NDArray[np.bool_]:
         """Mask of the pins that are eliminated instead of penalised, shape (q,)."""
         return np.isinf(self.weight)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lengths:
+class LengthConstraints:
     """Length constraints that hold exactly, from springs and strain limits of infinite stiffness.
 
     Attributes:
@@ -33,6 +33,6 @@ class Lengths:
     """
 
     edges: NDArray[np.int64]
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
+    min_length: NDArray[np.float64]
+    max_length: NDArray[np.float64]
     rest_direction: NDArray[np.float64]

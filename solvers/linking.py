@@ -13,15 +13,15 @@ from llvmlite import binding
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult, compile_result
 
-LINKED = "linked"
+LINKED_KIND = "linked"
 """Mark that distinguishes the reduced form of `LinkedLibrary` from that of Numba's libraries."""
 
-_LIBRARY: Any = JITCodeLibrary
-_COMPILER: Any = Compiler
+_LIBRARY_CLASS: Any = JITCodeLibrary
+_COMPILER_CLASS: Any = Compiler
 """Untyped, because the declared signatures differ from those of their subclasses."""
 
 
-class Linked(_LIBRARY):
+class LinkedLibrary(_LIBRARY_CLASS):
     """Code for linking only: lowered, with everything that it calls, and without an address."""
 
     def finalize(self) -> None:
@@ -38,36 +38,36 @@ class Linked(_LIBRARY):
 
     def serialize_using_object_code(self) -> tuple[str, str, bytes]:
         """Return the code as bitcode, because there is no object code."""
-        return self.name, LINKED, self._get_module_for_linking().as_bitcode()
+        return self.name, LINKED_KIND, self._get_module_for_linking().as_bitcode()
 
     @property
-    def codegen(self) -> _Nowhere:
+    def codegen(self) -> _NullCodegen:
         """A null object for environments of functions; the libraries that link this code set their own."""
-        return _Nowhere()
+        return _NullCodegen()
 
 
-class _Nowhere:
+class _NullCodegen:
     def set_env(self, name: str, env: Any) -> None:
         """Do nothing."""
 
 
-class LinkedCompiler(_COMPILER):
+class LinkedCompiler(_COMPILER_CLASS):
     """Numba's compiler for kernels that are only linked."""
 
     def compile_extra(self, function: Any) -> Any:
         """Compile a function into a `LinkedLibrary`."""
-        self.state.library = Linked(self.state.targetctx.codegen(), function.__qualname__)
+        self.state.library = LinkedLibrary(self.state.targetctx.codegen(), function.__qualname__)
         return super().compile_extra(function)
 
 
-def rebuilt(context: Any, told: Any) -> CompileResult:
+def rebuild_result(context: Any, reduced: Any) -> CompileResult:
     """Rebuild a compile result from the output of its `_reduce`."""
-    (name, kind, content), fndesc, env, signature, objectmode, lifted, annotation, reload_init, envs = told
-    if kind != LINKED:
-        return CompileResult._rebuild(context, *told)
+    (name, kind, content), fndesc, env, signature, objectmode, lifted, annotation, reload_init, envs = reduced
+    if kind != LINKED_KIND:
+        return CompileResult._rebuild(context, *reduced)
     for function in reload_init:
         function()
-    library = Linked(context.codegen(), name)
+    library = LinkedLibrary(context.codegen(), name)
     library._final_module = binding.parse_bitcode(content)
     library._finalized = True
     return compile_result(

@@ -17,12 +17,12 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from solvers.problem import Energy, NotPositiveDefinite, ProjectiveEnergy, Start, System, is_lagged
+from solvers.problem import Energy, NotPositiveDefinite, ProjectiveEnergy, StepStart, System, is_lagged
 
-Dense = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 
-def signed_incidence_matrix_dense(springs: NDArray[np.int64], n: int) -> Dense:
+def signed_incidence_matrix_dense(springs: NDArray[np.int64], n: int) -> FloatArray:
     """Return the dense A of springs (m, 2) over n vertices, shape (m, n)."""
     A = np.zeros((len(springs), n))
     rows, (i, j) = np.arange(len(springs)), springs.T
@@ -40,17 +40,17 @@ def signed_incidence_matrix_sparse(springs: NDArray[np.int64], n: int) -> scipy.
     return scipy.sparse.csr_array(scipy.sparse.coo_array((values, entries), shape=(len(springs), n)))
 
 
-def mass_matrix_dense(mass: ArrayLike) -> Dense:
+def mass_matrix_dense(mass: ArrayLike) -> FloatArray:
     """Return the dense M of masses (n,) [kg], shape (n, n)."""
     return np.diag(np.asarray(mass, float))
 
 
 def mass_matrix_sparse(mass: ArrayLike) -> scipy.sparse.csr_array:
     """Return the sparse M of masses (n,) [kg], shape (n, n), with one entry for each vertex that has mass."""
-    return diagonal(np.asarray(mass, float))
+    return diagonal_matrix(np.asarray(mass, float))
 
 
-def selection_matrix_dense(pinned: NDArray[np.int64], n: int) -> Dense:
+def selection_matrix_dense(pinned: NDArray[np.int64], n: int) -> FloatArray:
     """Return the dense C of pinned vertices (q,), shape (q, n)."""
     C = np.zeros((len(pinned), n))
     C[np.arange(len(pinned)), pinned] = 1.0
@@ -63,15 +63,15 @@ def selection_matrix_sparse(pinned: NDArray[np.int64], n: int) -> scipy.sparse.c
     return scipy.sparse.csr_array(scipy.sparse.coo_array((np.ones(q), (np.arange(q), pinned)), shape=(q, n)))
 
 
-def rest_lengths(rest: Dense, springs: NDArray[np.int64]) -> Dense:
+def rest_lengths(rest: FloatArray, springs: NDArray[np.int64]) -> FloatArray:
     """Return the length r of each spring [m] at the rest positions (n, 3), shape (m,)."""
     i, j = springs.T
     return np.linalg.norm(rest[i] - rest[j], axis=1)
 
 
 def system_matrix_dense(
-    A: Dense, stiffness: ArrayLike, M: Dense, time_step: float, C: Dense, weight: ArrayLike
-) -> Dense:
+    A: FloatArray, stiffness: ArrayLike, M: FloatArray, time_step: float, C: FloatArray, weight: ArrayLike
+) -> FloatArray:
     """Return the dense Q [N/m], shape (n, n).
 
     Args:
@@ -98,12 +98,12 @@ def system_matrix_sparse(
 
     The arguments are those of `system_matrix_dense`.
     """
-    K = diagonal(np.broadcast_to(np.asarray(stiffness, float), len(A.indptr) - 1))
-    W = diagonal(np.broadcast_to(np.asarray(weight, float), len(C.indptr) - 1))
-    return without_zeros(A.T @ K @ A + M / time_step**2 + C.T @ W @ C)
+    K = diagonal_matrix(np.broadcast_to(np.asarray(stiffness, float), len(A.indptr) - 1))
+    W = diagonal_matrix(np.broadcast_to(np.asarray(weight, float), len(C.indptr) - 1))
+    return drop_zeros(A.T @ K @ A + M / time_step**2 + C.T @ W @ C)
 
 
-def assemble(system: System, energies: Iterable[ProjectiveEnergy]) -> scipy.sparse.csr_array:
+def assemble_system_matrix(system: System, energies: Iterable[ProjectiveEnergy]) -> scipy.sparse.csr_array:
     """Return Q of a system, shape (n, n): stiffness of the energies, inertia and penalty pins.
 
     Exact pins do not contribute to Q; the caller selects the rows of `system.free_vertices`.
@@ -115,28 +115,30 @@ def assemble(system: System, energies: Iterable[ProjectiveEnergy]) -> scipy.spar
     Raises:
         NotPositiveDefinite: the positions of some vertices are not determined.
     """
-    n = system.vertices
-    _, vertices, weight = system.penalty
-    held = system.inertia + np.bincount(vertices, weight, minlength=n)
-    Q = without_zeros(reduce(lambda total, share: total + share, shares(system, energies), diagonal(held)))
-    require_determined(system, Q)
+    n = system.num_vertices
+    _, vertices, weight = system.penalty_pins
+    held = system.inertia_diagonal + np.bincount(vertices, weight, minlength=n)
+    Q = drop_zeros(
+        reduce(lambda total, share: total + share, stiffness_shares(system, energies), diagonal_matrix(held))
+    )
+    require_determined_positions(system, Q)
     return Q
 
 
-def shares(system: System, energies: Iterable[ProjectiveEnergy]) -> Iterator[scipy.sparse.csr_array]:
+def stiffness_shares(system: System, energies: Iterable[ProjectiveEnergy]) -> Iterator[scipy.sparse.csr_array]:
     """Yield each energy's contribution A'KA [N/m] to Q, (n, n).
 
     That of a lagged energy depends on the velocity_rate of the steps only.
     """
-    nowhere = np.zeros((system.vertices, 3))
-    start = Start(nowhere, nowhere, 0.0, nowhere, system.rate, 0.0)
+    nowhere = np.zeros((system.num_vertices, 3))
+    start = StepStart(nowhere, nowhere, 0.0, nowhere, system.velocity_rate, 0.0)
     for energy in energies:
         begun: Energy = energy.begin_step(start) if is_lagged(energy) else energy
         if isinstance(begun, ProjectiveEnergy):
-            yield begun.stiffness_matrix(system.vertices)
+            yield begun.stiffness_matrix(system.num_vertices)
 
 
-def require_determined(system: System, Q: scipy.sparse.csr_array) -> None:
+def require_determined_positions(system: System, Q: scipy.sparse.csr_array) -> None:
     """Raise NotPositiveDefinite, with the vertices concerned, if some positions are not determined.
 
     Every connected component of the graph of Q needs a mass or a pin.
@@ -157,19 +159,19 @@ def require_determined(system: System, Q: scipy.sparse.csr_array) -> None:
         )
 
 
-def energy_norm(Q: Dense | scipy.sparse.csr_array, e: Dense) -> float:
+def energy_norm(Q: FloatArray | scipy.sparse.csr_array, e: FloatArray) -> float:
     """Return the energy norm |e|_Q = sqrt(tr(e'Qe)) [J^(1/2)] of a displacement (n, 3) [m]."""
     # If stiffness exceeds inertia by all digits of float64, round-off can make a sum of zero negative.
     return float(np.sqrt(np.maximum(0.0, np.einsum("ij,ij->", e, Q @ e))))
 
 
-def diagonal(values: Dense) -> scipy.sparse.csr_array:
+def diagonal_matrix(values: FloatArray) -> scipy.sparse.csr_array:
     """Return a diagonal matrix [any unit], shape (n, n), without entries for zeros."""
     n = len(values)
-    return without_zeros(scipy.sparse.csr_array(scipy.sparse.dia_array((values[None, :], np.array([0])), shape=(n, n))))
+    return drop_zeros(scipy.sparse.csr_array(scipy.sparse.dia_array((values[None, :], np.array([0])), shape=(n, n))))
 
 
-def without_zeros(matrix: scipy.sparse.csr_array | scipy.sparse.csc_array) -> scipy.sparse.csr_array:
+def drop_zeros(matrix: scipy.sparse.csr_array | scipy.sparse.csc_array) -> scipy.sparse.csr_array:
     """Return the matrix with duplicates summed, columns sorted and explicit zeros dropped."""
     matrix = scipy.sparse.csr_array(matrix)
     matrix.sum_duplicates()

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def aligned(size: int, dtype: Any = np.float64) -> NDArray[Any]:
+def allocate_aligned(size: int, dtype: Any = np.float64) -> NDArray[Any]:
     """Return zeros that start at a cache line, so that no vector of that size or less crosses two lines."""
     bytes_ = np.dtype(dtype).itemsize * size
     raw = np.zeros(bytes_ + 64, np.uint8)
@@ -17,7 +17,7 @@ def aligned(size: int, dtype: Any = np.float64) -> NDArray[Any]:
     return raw[begin : begin + bytes_].view(dtype)
 
 
-def of_machine() -> float:
+def compute_memory_limit() -> float:
     """Return three quarters of the machine's memory [bytes].
 
     The remainder is for other data of a run.
@@ -25,7 +25,7 @@ def of_machine() -> float:
     return 0.75 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
-def in_words(count: float) -> str:
+def format_bytes(count: float) -> str:
     """Return a number of bytes as text with a binary unit."""
     for unit in ("bytes", "KiB", "MiB", "GiB"):
         if count < 1024 or unit == "GiB":

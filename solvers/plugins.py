@@ -23,15 +23,15 @@ from typing import Any
 
 from solvers import beside, sources
 
-PATTERN = r"^(\./[^:]+\.py|[A-Za-z_][\w.]*):[A-Za-z_]\w*$"
+PLUGIN_PATTERN = r"^(\./[^:]+\.py|[A-Za-z_][\w.]*):[A-Za-z_]\w*$"
 """The pattern of names by which a config refers to code."""
 
 
-class Refused(ValueError):
+class InvalidPluginName(ValueError):
     """An error for a name without code, or with code that a config must not name."""
 
 
-class Plugin(str):
+class PluginName(str):
     """A name in a config that refers to third-party code.
 
     Attributes:
@@ -41,46 +41,57 @@ class Plugin(str):
         source_path: source file.
     """
 
-    target: str
-    module: str
-    version: str
-    source: str
+    import_target: str
+    module_name: str
+    code_version: str
+    source_path: str
 
-    def __new__(cls, name: str, target: str = "", module: str = "", version: str = "", source: str = "") -> Plugin:
+    def __new__(
+        cls, name: str, import_target: str = "", module_name: str = "", code_version: str = "", source_path: str = ""
+    ) -> PluginName:
         made = super().__new__(cls, name)
-        made.target, made.module, made.version, made.source = target, module, version, source
+        made.import_target, made.module_name, made.code_version, made.source_path = (
+            import_target,
+            module_name,
+            code_version,
+            source_path,
+        )
         return made
 
-    def identity(self) -> list[str]:
+    def identify_code(self) -> list[str]:
         """Return what distinguishes this code from other code of the same name."""
-        return [str(self), self.module, self.version]
+        return [str(self), self.module_name, self.code_version]
 
 
-class Table(Mapping[str, Any]):
+class PluginTable(Mapping[str, Any]):
     """A mapping from names to import targets: built-in ones, installed ones, and every `PluginName`."""
 
-    def __init__(self, group: str, *shipped: Mapping[str, Any]) -> None:
+    def __init__(self, entry_point_group: str, *builtin_tables: Mapping[str, Any]) -> None:
         """Create a table from an entry-point group and tables of "module:name" or of the objects themselves."""
-        self._group, self.shipped = group, shipped
+        self._entry_point_group, self.builtin_tables = entry_point_group, builtin_tables
 
     def __getitem__(self, name: str) -> Any:
-        if isinstance(name, Plugin):
-            return name.target
-        for table in self.shipped:
+        if isinstance(name, PluginName):
+            return name.import_target
+        for table in self.builtin_tables:
             if name in table:
                 return table[name]
-        return self._installed()[name].value
+        return self._installed_entry_points()[name].value
 
     def __contains__(self, name: object) -> bool:
-        return isinstance(name, Plugin) or any(name in table for table in self.shipped) or name in self._installed()
+        return (
+            isinstance(name, PluginName)
+            or any(name in table for table in self.builtin_tables)
+            or name in self._installed_entry_points()
+        )
 
     def __iter__(self) -> Iterator[str]:
-        return iter(dict.fromkeys(chain(*self.shipped, self._installed())))
+        return iter(dict.fromkeys(chain(*self.builtin_tables, self._installed_entry_points())))
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
 
-    def named(self, name: str, folder: Path) -> str:
+    def resolve_name(self, name: str, folder: Path) -> str:
         """Return the name, as a PluginName if it is not built-in; an unknown name is returned unchanged.
 
         Imports nothing.
@@ -92,69 +103,75 @@ class Table(Mapping[str, Any]):
         Raises:
             InvalidPluginName: the name refers to no code, or to code that a config must not name.
         """
-        if any(name in table for table in self.shipped):
+        if any(name in table for table in self.builtin_tables):
             return name
         if ":" in name:
-            return _written(name, folder)
-        found = self._installed().get(name)
+            return _parse_plugin_name(name, folder)
+        found = self._installed_entry_points().get(name)
         if found is None:
             return name
-        return _of_module(name, found.value, found.dist.version if found.dist else "")
+        return _plugin_of_module(name, found.value, found.dist.version if found.dist else "")
 
-    def _installed(self) -> dict[str, EntryPoint]:
-        return {entry.name: entry for entry in entry_points(group=self._group)}
+    def _installed_entry_points(self) -> dict[str, EntryPoint]:
+        return {entry.name: entry for entry in entry_points(group=self._entry_point_group)}
 
 
-def load(target: str) -> Any:
+def load_target(target: str) -> Any:
     """Import the module, or run the file, of "module:name" or "path.py:name" and return the named object."""
     place, _, name = target.rpartition(":")
-    module = beside.module(Path(place)) if place.endswith(".py") else import_module(place)
+    module = beside.load_file_module(Path(place)) if place.endswith(".py") else import_module(place)
     return getattr(module, name)
 
 
-def identity(name: str) -> str | list[str]:
+def identify_code(name: str) -> str | list[str]:
     """Return what distinguishes the code of a name from other code; a built-in is identified by its name."""
-    return name.identity() if isinstance(name, Plugin) else name
+    return name.identify_code() if isinstance(name, PluginName) else name
 
 
-def found(names: Iterable[str]) -> list[Plugin]:
+def select_plugins(names: Iterable[str]) -> list[PluginName]:
     """Return the names that refer to third-party code."""
-    return [name for name in names if isinstance(name, Plugin)]
+    return [name for name in names if isinstance(name, PluginName)]
 
 
-def _written(name: str, folder: Path) -> Plugin:
+def _parse_plugin_name(name: str, folder: Path) -> PluginName:
     place, _, attribute = name.rpartition(":")
     if not attribute.isidentifier():
-        raise Refused(f"came {name!r}; wanted `module:Name`, or `./file.py:Name` for a file beside the config")
+        raise InvalidPluginName(
+            f"came {name!r}; wanted `module:Name`, or `./file.py:Name` for a file beside the config"
+        )
     if not place.endswith(".py") and "/" not in place:
         if not all(part.isidentifier() for part in place.split(".")):
-            raise Refused(f"came {name!r}; wanted the name of a module in front of the colon")
-        return _of_module(name, name, None)
+            raise InvalidPluginName(f"came {name!r}; wanted the name of a module in front of the colon")
+        return _plugin_of_module(name, name, None)
     if not place.startswith("./"):
-        raise Refused(f"came {name!r}; a file is named from the config's folder on: ./file.py:{attribute}")
+        raise InvalidPluginName(f"came {name!r}; a file is named from the config's folder on: ./file.py:{attribute}")
     home = folder.resolve()
     path = Path(os.path.normpath(home / place))
     if not path.is_relative_to(home) or path.resolve() != path:
-        raise Refused(f"{place} leaves the config's folder, itself or by a link; copy the file beside the config")
+        raise InvalidPluginName(
+            f"{place} leaves the config's folder, itself or by a link; copy the file beside the config"
+        )
     if not path.is_file() or path.suffix != ".py":
-        raise Refused(f"there is no file {place} of Python beside the config")
-    return Plugin(name, f"{path}:{attribute}", place, sources.digest([path])[:12], str(path))
+        raise InvalidPluginName(f"there is no file {place} of Python beside the config")
+    return PluginName(name, f"{path}:{attribute}", place, sources.digest_sources([path])[:12], str(path))
 
 
-def _of_module(name: str, target: str, distribution: str | None) -> Plugin:
+def _plugin_of_module(name: str, target: str, distribution_version: str | None) -> PluginName:
     """Build the PluginName of a module; `distribution_version` is looked up if it is None."""
     module = target.partition(":")[0]
-    source = source_of(module)
+    source = find_module_source(module)
     if source is None:
-        raise Refused(f"{name!r} names the module {module}, which Python does not find; install it beside springbench")
-    if distribution is None:
+        raise InvalidPluginName(
+            f"{name!r} names the module {module}, which Python does not find; install it beside springbench"
+        )
+    if distribution_version is None:
         owners = packages_distributions().get(module.partition(".")[0], [])
-        distribution = version(owners[0]) if owners else ""
-    code = sources.digest([source])[:12] if source.endswith(".py") else ""
-    return Plugin(name, target, module, "+".join(filter(None, (distribution, code))), source)
+        distribution_version = version(owners[0]) if owners else ""
+    code = sources.digest_sources([source])[:12] if source.endswith(".py") else ""
+    return PluginName(name, target, module, "+".join(filter(None, (distribution_version, code))), source)
 
 
-def source_of(module: str) -> str | None:
+def find_module_source(module: str) -> str | None:
     """Return the file of a module without importing its parents; None if there is none."""
     first, *rest = module.split(".")
     try:

@@ -20,15 +20,15 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from solvers.held import Lengths, Pins
+from solvers.held import DirichletPins, LengthConstraints
 
 Positions = NDArray[np.float64]
 """Positions [m], shape (n, 3), float64, C-contiguous."""
-ResidualOf = Literal["returned", "previous", "none"]
+ResidualIterate = Literal["returned", "previous", "none"]
 """The iterate that a residual belongs to: the returned one, or its predecessor; "none" if there is no residual."""
 
 
-class WrongAnswer(Exception):
+class PluginContractError(Exception):
     """An error in a user-supplied solver component; the message begins with the source line."""
 
 
@@ -97,47 +97,47 @@ class System:
     mass: NDArray[np.float64]
     time_step: float
     energies: tuple[Energy, ...] = ()
-    pins: Pins = field(default_factory=Pins)
-    factor: float = 1.0
-    speed: float | None = None
-    lengths: tuple[Lengths, ...] = ()
+    pins: DirichletPins = field(default_factory=DirichletPins)
+    inertia_factor: float = 1.0
+    velocity_factor: float | None = None
+    length_constraints: tuple[LengthConstraints, ...] = ()
 
     @property
-    def rate(self) -> float:
+    def velocity_rate(self) -> float:
         """Velocity per displacement of the stage, sqrt(c)/dt or velocity_factor/dt [1/s]."""
-        return (self.factor**0.5 if self.speed is None else self.speed) / self.time_step
+        return (self.inertia_factor**0.5 if self.velocity_factor is None else self.velocity_factor) / self.time_step
 
     @cached_property
-    def inertia(self) -> NDArray[np.float64]:
+    def inertia_diagonal(self) -> NDArray[np.float64]:
         """Diagonal c m/dt^2 (n,) [N/m] of the inertia term in the system matrix Q."""
-        return self.factor * self.mass / self.time_step**2
+        return self.inertia_factor * self.mass / self.time_step**2
 
     @property
-    def vertices(self) -> int:
+    def num_vertices(self) -> int:
         """Number of vertices n."""
         return len(self.mass)
 
     @cached_property
-    def free(self) -> NDArray[np.int64]:
+    def free_vertices(self) -> NDArray[np.int64]:
         """Vertices that are degrees of freedom, i.e. all except the exactly pinned ones, shape (f,)."""
-        return np.setdiff1d(np.arange(self.vertices), self.pins.vertices[self.pins.exact])
+        return np.setdiff1d(np.arange(self.num_vertices), self.pins.vertices[self.pins.exact_mask])
 
     @cached_property
-    def unpinned(self) -> NDArray[np.bool_]:
+    def unpinned_mask(self) -> NDArray[np.bool_]:
         """Mask of the vertices without any pin, exact or by penalty, shape (n,)."""
-        mask = np.ones(self.vertices, bool)
+        mask = np.ones(self.num_vertices, bool)
         mask[self.pins.vertices] = False
         return mask
 
     @cached_property
-    def penalty(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.float64]]:
+    def penalty_pins(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.float64]]:
         """Penalty pins: their mask within `pins` (q,), their vertices and their weights [N/m]."""
-        soft = ~self.pins.exact
+        soft = ~self.pins.exact_mask
         return soft, self.pins.vertices[soft], self.pins.weight[soft]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Start:
+class StepStart:
     """The state at the start of a step, for lagged energies and for methods that do not minimise.
 
     Attributes:
@@ -158,24 +158,24 @@ class Start:
     positions: Positions
     velocity: Positions
     time: float
-    origin: Positions
-    rate: float
-    until: float = float("nan")
-    ahead: float = 0.0
-    lagged: Positions | None = None
-    acceleration: Positions | None = None
-    kept: NDArray[np.float64] | None = None
-    pressed: Positions | None = None
+    velocity_origin: Positions
+    velocity_rate: float
+    stage_time: float = float("nan")
+    lag_extrapolation: float = 0.0
+    lag_override: Positions | None = None
+    predicted_acceleration: Positions | None = None
+    warm_start: NDArray[np.float64] | None = None
+    normal_force_positions: Positions | None = None
 
     @property
-    def expected(self) -> Positions:
+    def lagged_positions(self) -> Positions:
         """Positions (n, 3) [m] of lagged energies: p^t or `lag_override`, extrapolated by `lag_extrapolation`."""
-        p = self.positions if self.lagged is None else self.lagged
-        return p + self.ahead * self.velocity if self.ahead else p
+        p = self.positions if self.lag_override is None else self.lag_override
+        return p + self.lag_extrapolation * self.velocity if self.lag_extrapolation else p
 
     def velocity_at(self, x: Positions) -> Positions:
         """Return the velocity [m/s] of the stage x, both (n, 3)."""
-        return self.rate * (x - self.origin)
+        return self.velocity_rate * (x - self.velocity_origin)
 
 
 class LaggedEnergy(Energy, Protocol):
@@ -184,7 +184,7 @@ class LaggedEnergy(Energy, Protocol):
     The stiffness of a projective energy may depend on nothing of that start but its rate, because Q is built once.
     """
 
-    def begin_step(self, start: Start) -> Energy:
+    def begin_step(self, start: StepStart) -> Energy:
         """Return the energy of this step."""
         ...
 
@@ -210,49 +210,49 @@ class StepProblem:
     """
 
     system: System
-    target: Positions
-    force: Positions
+    inertial_target: Positions
+    external_force: Positions
     pin_targets: Positions
-    current: Positions
-    first_guess: Positions
-    start: Start
+    current_positions: Positions
+    initial_guess: Positions
+    step_start: StepStart
 
     @cached_property
     def energies(self) -> tuple[Energy, ...]:
         """Energies of the system in their order, with the lagged ones evaluated for this step."""
-        return tuple(e.begin_step(self.start) if is_lagged(e) else e for e in self.system.energies)
+        return tuple(e.begin_step(self.step_start) if is_lagged(e) else e for e in self.system.energies)
 
-    def terms(self, p: Positions) -> dict[str, float]:
+    def evaluate_terms(self, p: Positions) -> dict[str, float]:
         """Return the terms [J] of the objective at p by name: inertia, force, pins, and energies by their class."""
-        s, values, away = self.system, dict[str, float](), p - self.target
+        s, values, away = self.system, dict[str, float](), p - self.inertial_target
         for energy in self.energies:
             name = type(energy).__name__.lower()  # which may be that of one of the three
             name = f"energy {name}" if name in ("inertia", "force", "pins") else name
             values[name] = values.get(name, 0.0) + energy.value(p)
-        values["inertia"] = 0.5 * float(s.inertia @ np.einsum("ij,ij->i", away, away))
-        values["force"] = -float(np.einsum("ij,ij->", p, self.force))
-        soft, vertices, weight = s.penalty
+        values["inertia"] = 0.5 * float(s.inertia_diagonal @ np.einsum("ij,ij->i", away, away))
+        values["force"] = -float(np.einsum("ij,ij->", p, self.external_force))
+        soft, vertices, weight = s.penalty_pins
         sag = p[vertices] - self.pin_targets[soft]
         values["pins"] = 0.5 * float(weight @ np.einsum("ij,ij->i", sag, sag))
         return values
 
     def value(self, p: Positions) -> float:
         """Return the objective g(p) [J]; exactly pinned vertices must be on their targets."""
-        return sum(self.terms(p).values())
+        return sum(self.evaluate_terms(p).values())
 
-    def magnitude(self, p: Positions) -> float:
+    def value_scale(self, p: Positions) -> float:
         """Return the sum of the absolute terms [J], which is the scale of rounding errors in `value`."""
-        return sum(abs(term) for term in self.terms(p).values())
+        return sum(abs(term) for term in self.evaluate_terms(p).values())
 
     def gradient(self, p: Positions) -> Positions:
         """Return the gradient of g at p [N], shape (n, 3), with zero rows at exactly pinned vertices."""
         s = self.system
-        out = s.inertia[:, None] * (p - self.target) - self.force
+        out = s.inertia_diagonal[:, None] * (p - self.inertial_target) - self.external_force
         for energy in self.energies:
             energy.add_gradient(p, out)
-        soft, vertices, weight = s.penalty
+        soft, vertices, weight = s.penalty_pins
         out[vertices] += weight[:, None] * (p[vertices] - self.pin_targets[soft])
-        out[s.pins.vertices[s.pins.exact]] = 0.0
+        out[s.pins.vertices[s.pins.exact_mask]] = 0.0
         return out
 
 
@@ -273,10 +273,10 @@ class StopRule:
         atol: absolute tolerance [J^(1/2)].
     """
 
-    iterations: int = 50
-    tolerance: float | None = None
-    floor: float = 8.0
-    within: float = 0.0
+    max_iterations: int = 50
+    rtol: float | None = None
+    roundoff_floor: float = 8.0
+    atol: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -297,25 +297,25 @@ class Solution:
     """
 
     positions: Positions
-    iterations: int
+    num_iterations: int
     residual: float
-    yardstick: float
-    stopped: str
+    initial_residual: float
+    termination_reason: str
     velocity: Positions | None = None
-    residual_of: ResidualOf = "returned"
-    kept: NDArray[np.float64] | None = None
+    residual_iterate: ResidualIterate = "returned"
+    warm_start: NDArray[np.float64] | None = None
 
 
-class Prepared(Protocol):
+class PreparedSolver(Protocol):
     """A solver after the setup for one system: factorisation, colouring and compilation."""
 
     @property
-    def choice(self) -> str:
+    def description(self) -> str:
         """Automatic decisions of the solver and their reasons in words; empty if there were none."""
         ...
 
     @property
-    def facts(self) -> dict[str, float]:
+    def stats(self) -> dict[str, float]:
         """Exact counts of the setup by name, for example `nnz_system` and `nnz_factor`."""
         ...
 
@@ -334,7 +334,7 @@ class Prepared(Protocol):
         """
         ...
 
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """Return the phases of an iteration by name, if any, as callables that return what they compute."""
         ...
 
@@ -350,10 +350,10 @@ class Solver(Protocol):
         is_monotone: whether the objective increases in no iteration, except by round-off.
     """
 
-    minimises: ClassVar[bool]
-    descends: ClassVar[bool]
+    is_minimiser: ClassVar[bool]
+    is_monotone: ClassVar[bool]
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         """Return the solver set up for a system.
 
         Raises:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from solvers.about import About
-from solvers.plugins import Table, load
+from solvers.about import SolverInfo
+from solvers.plugins import PluginTable
 
 __all__ = ["EVERY", "OPTIONAL", "SOLVERS", "about", "load", "minimises", "name_of"]
 
@@ -41,7 +41,7 @@ SOLVERS = {
     "avbd": "solvers.methods.avbd:AugmentedVertexBlockDescent",
 }
 
-OPTIONAL = {
+OPTIONAL_SOLVERS = {
     "eigen": "solvers.methods.eigen:EigenLocalGlobal",
     "cholmod": "solvers.methods.cholmod:CholmodLocalGlobal",
     "mujoco": "solvers.engines.mujoco:Mujoco",
@@ -51,25 +51,25 @@ OPTIONAL = {
 }
 """Solvers with optional dependencies; they raise an error with the reason if one is missing."""
 
-EVERY = Table("springbench.solvers", SOLVERS, OPTIONAL)
+SOLVER_TABLE = PluginTable("springbench.solvers", SOLVERS, OPTIONAL_SOLVERS)
 """All solvers that a config can name."""
 
 
-def minimises(solver: Any) -> bool:
+def is_minimiser(solver: Any) -> bool:
     """Return whether the iterates converge to a minimum; a solver without `is_minimiser` is scored as if they do."""
     return getattr(solver, "minimises", True)
 
 
-def name_of(solver: Any) -> str:
+def find_solver_name(solver: Any) -> str:
     """Return the name of a solver: the registered one, or else the name of its class."""
     kind: type = solver if isinstance(solver, type) else solver.__class__
-    named = {target: name for name, target in (SOLVERS | OPTIONAL).items()}
+    named = {target: name for name, target in (SOLVERS | OPTIONAL_SOLVERS).items()}
     return named.get(f"{kind.__module__}:{kind.__qualname__}", kind.__name__)
 
 
-def about(solver: Any, name: str) -> About:
+def find_solver_info(solver: Any, name: str) -> SolverInfo:
     """Return the metadata of a solver of this name.
 
     Without any, the solver is a family of its own.
     """
-    return getattr(solver, "about", About(name))
+    return getattr(solver, "about", SolverInfo(name))

@@ -26,19 +26,19 @@ from solvers.problem import Energy, Positions, StepProblem, StopRule
 
 EPS = float(np.finfo(np.float64).eps)
 
-FACTOR = StopRule().floor
+ROUNDOFF_FACTOR = StopRule().roundoff_floor
 """Multiple of the bound up to which a gradient counts as round-off, 8. Solvers that iterate without a limit end at 0.1
 to 0.9 of the bound at the worst vertex of most hard scenes, and at 2 in the worst scene; iterates that have not
 converged are at a hundred or more."""
 
-Terms = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 
 @runtime_checkable
-class Rounded(Energy, Protocol):
+class RoundingBoundEnergy(Energy, Protocol):
     """An energy that provides the absolute terms of its gradient."""
 
-    def add_absolute_terms(self, p: Positions, out: Terms) -> None:
+    def add_absolute_terms(self, p: Positions, out: FloatArray) -> None:
         """Add the absolute terms [N] of the gradient at p (n, 3) [m] to `out` (n,).
 
         Multiplied by eps they bound its rounding error at each vertex, including that of the positions.
@@ -46,57 +46,59 @@ class Rounded(Energy, Protocol):
         ...
 
 
-def gradient_round_off(problem: StepProblem, p: Positions) -> Terms:
+def gradient_roundoff(problem: StepProblem, p: Positions) -> FloatArray:
     """Return the bound delta (n,) [N] of the rounding error of `problem.gradient(p)` at each vertex.
 
     It is zero at exactly pinned vertices and infinite where a term overflows. The positions p are (n, 3) [m].
     """
-    s, size = problem.system, lengths(p)
+    s, size = problem.system, row_norms(p)
     with np.errstate(over="ignore", invalid="ignore"):
-        out = s.inertia * (size + lengths(problem.target)) + lengths(problem.force)
+        out = s.inertia_diagonal * (size + row_norms(problem.inertial_target)) + row_norms(problem.external_force)
         for energy in problem.energies:
-            (energy if isinstance(energy, Rounded) else _Unstated(energy)).add_absolute_terms(p, out)
-        soft, vertices, weight = s.penalty
-        out[vertices] += weight * (size[vertices] + lengths(problem.pin_targets[soft]))
+            (energy if isinstance(energy, RoundingBoundEnergy) else _HessianRoundingBound(energy)).add_absolute_terms(
+                p, out
+            )
+        soft, vertices, weight = s.penalty_pins
+        out[vertices] += weight * (size[vertices] + row_norms(problem.pin_targets[soft]))
         out *= EPS
     out[np.isnan(out)] = np.inf
-    out[s.pins.vertices[s.pins.exact]] = 0.0
+    out[s.pins.vertices[s.pins.exact_mask]] = 0.0
     return out
 
 
-def at_rest(problem: StepProblem, p: Positions, factor: float = FACTOR) -> bool:
+def is_gradient_roundoff(problem: StepProblem, p: Positions, factor: float = ROUNDOFF_FACTOR) -> bool:
     """Return whether the gradient at p (n, 3) [m] is round-off at every free vertex.
 
     It is if it is at most `factor` times the bound, and the bound is finite. A sum over vertices would let the
     round-off of one part hide the gradient of another. Vertices with a penalty pin are included, because
     others depend on them.
     """
-    bound, size = gradient_round_off(problem, p), lengths(problem.gradient(p))
-    return bool(((size <= factor * bound) & np.isfinite(bound))[problem.system.free].all())
+    bound, size = gradient_roundoff(problem, p), row_norms(problem.gradient(p))
+    return bool(((size <= factor * bound) & np.isfinite(bound))[problem.system.free_vertices].all())
 
 
-def within(gradient: Positions, bound: Terms) -> Positions:
+def clip_to_roundoff(gradient: Positions, bound: FloatArray) -> Positions:
     """Return the part of a gradient (n, 3) [N] that is no longer than the bound (n,) [N].
 
     The remainder exceeds round-off. An infinite bound explains no part of the gradient.
     """
-    size = lengths(gradient)
+    size = row_norms(gradient)
     share = np.divide(np.minimum(size, bound), size, out=np.zeros_like(size), where=(size > 0.0) & np.isfinite(bound))
     return share[:, None] * gradient
 
 
-def lengths(x: Positions) -> Terms:
+def row_norms(x: Positions) -> FloatArray:
     """Return the norm of each row (n, 3), shape (n,), also for rows whose squares overflow."""
     return np.hypot(np.hypot(x[:, 0], x[:, 1]), x[:, 2])
 
 
-class _Unstated:
+class _HessianRoundingBound:
     """The rounding bound of an energy without absolute terms, estimated with its Hessian."""
 
     def __init__(self, energy: Energy) -> None:
         self._energy = energy
 
-    def add_absolute_terms(self, p: Positions, out: Terms) -> None:
+    def add_absolute_terms(self, p: Positions, out: FloatArray) -> None:
         own = np.zeros_like(p)
         self._energy.add_gradient(p, own)
-        out += (abs(self._energy.hessian(p)) @ np.repeat(lengths(p), 3)).reshape(-1, 3).sum(axis=1) + lengths(own)
+        out += (abs(self._energy.hessian(p)) @ np.repeat(row_norms(p), 3)).reshape(-1, 3).sum(axis=1) + row_norms(own)

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-INSTALL = "apt-get install --no-install-recommends chromium"
-NEEDED = "SPRINGBENCH_NEEDS_BROWSER"
+INSTALL_COMMAND = "apt-get install --no-install-recommends chromium"
+BROWSER_REQUIRED_VARIABLE = "SPRINGBENCH_NEEDS_BROWSER"
 """Where this is set, a browser that is missing is a failure: CI sets it where it may install one."""
 
-_NAMES = ("chromium", "chromium-browser", "google-chrome")
-_ARGUMENTS = (
+_BROWSER_NAMES = ("chromium", "chromium-browser", "google-chrome")
+_BROWSER_ARGUMENTS = (
     "--no-sandbox",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
@@ -25,15 +25,17 @@ _ARGUMENTS = (
 
 
 @contextmanager
-def chromium() -> Iterator[Any]:
+def launch_chromium() -> Iterator[Any]:
     """Playwright's handle of an installed Chromium; without one the test is skipped, and says how to get it."""
-    binary = next(filter(None, map(shutil.which, _NAMES)), None)
+    binary = next(filter(None, map(shutil.which, _BROWSER_NAMES)), None)
     if binary is None:
-        (pytest.fail if os.environ.get(NEEDED) else pytest.skip)(f"there is no Chromium: {INSTALL}")
+        (pytest.fail if os.environ.get(BROWSER_REQUIRED_VARIABLE) else pytest.skip)(
+            f"there is no Chromium: {INSTALL_COMMAND}"
+        )
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=binary, args=_ARGUMENTS)
+        browser = playwright.chromium.launch(executable_path=binary, args=_BROWSER_ARGUMENTS)
         try:
             yield browser
         finally:

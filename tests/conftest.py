@@ -17,12 +17,12 @@ import harness  # noqa: F401  sets what Numba and OpenMP read when they load
 from tests import slow
 
 # What commands time in tests waits for no other's.
-_LOCKS = tempfile.TemporaryDirectory(prefix="springbench-locks-")
-os.environ["SPRINGBENCH_LOCKS"] = _LOCKS.name
+_LOCK_FOLDER = tempfile.TemporaryDirectory(prefix="springbench-locks-")
+os.environ["SPRINGBENCH_LOCKS"] = _LOCK_FOLDER.name
 
 # Of an app, all whose commands hundreds of tests invoke, Typer's runner makes Click's anew each time, in 40 ms.
-_RUNNER: Any = typer.testing
-_RUNNER._get_command = functools.cache(_RUNNER._get_command)
+_TYPER_TESTING: Any = typer.testing
+_TYPER_TESTING._get_command = functools.cache(_TYPER_TESTING._get_command)
 
 # derandomize: the same examples in every run; no deadline: a slow machine fails no test.
 settings.register_profile("suite", derandomize=True, deadline=None, max_examples=40, database=None)
@@ -31,9 +31,9 @@ settings.register_profile("search", deadline=None, max_examples=2000, database=N
 settings.load_profile("suite")
 
 
-_COMPILES = "solver_contract.py"
+_COMPILING_FILE = "solver_contract.py"
 """It calls nearly all kernels, and has them compiled where they are not there yet."""
-_NEEDS_NONE = ("worker", "bare_", "other_code", "damaged", "full_disk", "plugins", "hostile", "gate_")
+_KERNEL_FREE_PREFIXES = ("worker", "bare_", "other_code", "damaged", "full_disk", "plugins", "hostile", "gate_")
 """Files that need few of them: what runs beside it, so that no kernel is compiled twice at once. The first ones run
 sweeps, whose workers are forks as long as no thread of Numba runs."""
 
@@ -45,7 +45,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     limit: float | None = config.getoption("--find-slow")
     if limit and not hasattr(config, "workerinput"):  # the test runner's processes report to the first
-        config.pluginmanager.register(slow.Finder(limit))
+        config.pluginmanager.register(slow.SlowTestFinder(limit))
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks
@@ -54,12 +54,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     def order(item: pytest.Item) -> int:
         name = item.path.name.removeprefix("test_")
-        if name == _COMPILES:
+        if name == _COMPILING_FILE:
             return -1
-        return next((rank for rank, start in enumerate(_NEEDS_NONE) if name.startswith(start)), len(_NEEDS_NONE))
+        return next(
+            (rank for rank, start in enumerate(_KERNEL_FREE_PREFIXES) if name.startswith(start)),
+            len(_KERNEL_FREE_PREFIXES),
+        )
 
     items.sort(key=order)
-    slow.mark(items)
+    slow.mark_slow_tests(items)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)

@@ -12,48 +12,55 @@ from itertools import pairwise
 
 import numpy as np
 
-from harness.scenes.effects.ether_drag import EtherDrag
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.self_contact import SelfContact
-from harness.scenes.effects.springs import Springs
-from harness.scenes.effects.surface_contact import SurfaceContact
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.obstacles import Sphere
-from harness.simulation.step import prepare, simulate
-from solvers.methods.newton import Newton
+from harness.scenes.effects.ether_drag import EtherDragEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.self_contact import SelfContactEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.effects.surface_contact import SurfaceContactEffect
+from harness.scenes.mesh.grid import GridMesh
+from harness.scenes.obstacles import SphereObstacle
+from harness.simulation.step import prepare, simulate_scene
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import Positions, StopRule
-from tests.scenes import scene
+from tests.scenes import build_test_scene
 
 THICKNESSES = tuple(0.04 / 2**k for k in range(6))
 STIFFNESSES = tuple(1e2 * 16**k for k in range(6))
-SIZE, FRAMES = 7, 20
-BALL = Sphere(center=(0.0, -0.36, 0.0), radius=0.3)
+SHEET_SIZE, FRAME_COUNT = 7, 20
+BALL_OBSTACLE = SphereObstacle(center=(0.0, -0.36, 0.0), radius=0.3)
 
 
-def fallen(thickness: float, stiffness: float) -> Positions:
+def simulate_fall(thickness: float, stiffness: float) -> Positions:
     """Where the sheet is after 0.7 s, (n, 3) [m]."""
-    own = SelfContact(thickness=thickness, stiffness=stiffness)
-    ball = SurfaceContact(thickness=thickness, stiffness=stiffness, obstacles=(BALL,))
-    effects = Springs(stretch=100.0, shear=20.0), Gravity(), EtherDrag(rate=5.0), Pins(at=("corners",)), own, ball
-    made = scene(Grid(), *effects, size=SIZE)
+    own = SelfContactEffect(thickness=thickness, stiffness=stiffness)
+    ball = SurfaceContactEffect(thickness=thickness, stiffness=stiffness, obstacles=(BALL_OBSTACLE,))
+    effects = (
+        SpringsEffect(stretch=100.0, shear=20.0),
+        GravityEffect(),
+        EtherDragEffect(rate=5.0),
+        PinsEffect(at=("corners",)),
+        own,
+        ball,
+    )
+    made = build_test_scene(GridMesh(), *effects, size=SHEET_SIZE)
     rule = StopRule(200, 1e-7)
-    *_, last = simulate(made, prepare(made, Newton()), rule, first_guess="current", frames=FRAMES)
+    *_, last = simulate_scene(made, prepare(made, NewtonSolver()), rule, initial_guess="current", frames=FRAME_COUNT)
     return last.positions
 
 
-def apart(found: list[Positions]) -> list[float]:
+def successive_distances(positions: list[Positions]) -> list[float]:
     """How far each is from the next [m]."""
-    return [float(np.sqrt(np.mean(np.sum((b - a) ** 2, axis=1)))) for a, b in pairwise(found)]
+    return [float(np.sqrt(np.mean(np.sum((b - a) ** 2, axis=1)))) for a, b in pairwise(positions)]
 
 
 def main() -> None:
     """Print both tables."""
     for name, values, found in (
-        ("thickness [m]", THICKNESSES, [fallen(t, 100.0) for t in THICKNESSES]),
-        ("stiffness [N/m]", STIFFNESSES, [fallen(0.02, k) for k in STIFFNESSES]),
+        ("thickness [m]", THICKNESSES, [simulate_fall(t, 100.0) for t in THICKNESSES]),
+        ("stiffness [N/m]", STIFFNESSES, [simulate_fall(0.02, k) for k in STIFFNESSES]),
     ):
-        far = apart(found)
+        far = successive_distances(found)
         print(f"{name:>16}  to the next [mm]  shrinks by")
         for k, (value, one) in enumerate(zip(values, far, strict=False)):
             print(f"{value:16.4g}  {1e3 * one:16.3f}  {far[k - 1] / one if k else np.nan:10.2f}")

@@ -4,31 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from harness.base.progress import Effort
+from harness.base.progress import RunCost
 
 
-class Quiet:
+class SilentDisplay:
     """A display that shows nothing, and is stopped after some units, those that find steps apart."""
 
     def __init__(self, stop_after: int = 10**9) -> None:
         self.finished_units, self._stop_after, self._counts = 0, stop_after, True
         self.titles: list[str] = []
 
-    def begin(self, efforts: Sequence[Effort], at_once: int = 1) -> None: ...
+    def start_sweep(self, costs: Sequence[RunCost], num_concurrent: int = 1) -> None: ...
 
-    def run(self, title: str, ticks: int, effort: Effort) -> Quiet:
+    def start_run(self, title: str, ticks: int, cost: RunCost) -> SilentDisplay:
         self.titles.append(title)
         self._counts = not title.endswith("steps to freeze")
         return self
 
-    def tick(self, phase: str) -> None: ...
+    def report_tick(self, phase: str) -> None: ...
 
-    def finished(self, outcome: str) -> None:
+    def finish_run(self, outcome: str) -> None:
         self.finished_units += self._counts
         if self.finished_units == self._stop_after:
             raise KeyboardInterrupt
 
-    def elsewhere(self, title: str, effort: Effort, outcome: str) -> None:
+    def skip_run(self, title: str, cost: RunCost, outcome: str) -> None:
         self.titles.append(f"{title} {outcome}")
 
-    def end(self) -> None: ...
+    def finish_sweep(self) -> None: ...

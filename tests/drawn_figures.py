@@ -14,61 +14,65 @@ from skimage.measure import block_reduce
 from skimage.metrics import structural_similarity
 
 from harness.report.figures import kinds
-from harness.report.figures.asked import Asked
-from harness.report.figures.canvas import compose
-from harness.report.figures.entry import chosen
+from harness.report.figures.asked import FigureOptions
+from harness.report.figures.canvas import compose_figure
+from harness.report.figures.entry import select_entries
 from tests import figure_results as made
 
-FOLDER = Path(__file__).parent / "looks"
-PART, ALIKE = 24, 0.9
+EXPECTED_FOLDER = Path(__file__).parent / "looks"
+PART_PIXELS, MIN_SIMILARITY = 24, 0.9
 """Pixels of the parts of a sheet that are compared, some four letters, and the structural similarity (Wang et al. 2004)
 that parts of one look have: other rounding of grey edges leaves 0.98, and a curve of another colour 0.8 or less."""
 
-MESHES = ("run", "comparison", "scenes")
+MESH_FIGURE_KINDS = ("run", "comparison", "scenes")
 """Kinds whose pictures are drawn by the system, of the results `made.recorded`."""
 
-RESULTS: dict[str, tuple[str, Callable[[Path], Path]]] = {
-    "convergence": ("block:gap", made.accuracy),
-    "times": ("net:10:current:alone", made.accuracy),
-    "work": ("bdf2", made.accuracy),
-    "winners": ("", made.winners),
-    "profiles": ("performance:1e-3", made.accuracy),
-    "growth": ("net:current", made.accuracy),
-    "liu2013": ("figure-2", made.accuracy),
-    "timing": ("step", made.sweep),
-    "hard": ("map", made.sweep),
-    "ablation": ("", made.ablation),
-    "prices": ("", made.ablation),
-    "speed": ("step", made.speed),
-    "history": ("", made.gates),
-    "engines": ("", made.engines),
+FIGURE_SOURCES: dict[str, tuple[str, Callable[[Path], Path]]] = {
+    "convergence": ("block:gap", made.write_accuracy_results),
+    "times": ("net:10:current:alone", made.write_accuracy_results),
+    "work": ("bdf2", made.write_accuracy_results),
+    "winners": ("", made.write_winner_results),
+    "profiles": ("performance:1e-3", made.write_accuracy_results),
+    "growth": ("net:current", made.write_accuracy_results),
+    "liu2013": ("figure-2", made.write_accuracy_results),
+    "timing": ("step", made.write_sweep_results),
+    "hard": ("map", made.write_sweep_results),
+    "ablation": ("", made.write_ablation_results),
+    "prices": ("", made.write_ablation_results),
+    "speed": ("step", made.write_speed_results),
+    "history": ("", made.write_benchmark_history),
+    "engines": ("", made.write_engine_results),
 }
 
 
-def composed(kind: str, results: Path, asked: Asked, older: Any = ()) -> tuple[Figure, list[Any]]:
-    found = kinds.kind(kind)
-    selectors = asked.selectors or tuple(tuple(one.split(":")) for one in [RESULTS[kind][0]] if one) or found.usual
-    panels = found.draw(chosen(found.panels(results, lambda _: older), selectors))
-    return compose(panels, found.title, asked), panels
+def compose_kind(kind: str, results: Path, options: FigureOptions, find_stale: Any = ()) -> tuple[Figure, list[Any]]:
+    found = kinds.find_figure_kind(kind)
+    selectors = (
+        options.selectors
+        or tuple(tuple(one.split(":")) for one in [FIGURE_SOURCES[kind][0]] if one)
+        or found.default_panels
+    )
+    panels = found.prepare_panels(select_entries(found.list_panels(results, lambda _: find_stale), selectors))
+    return compose_figure(panels, found.title, options), panels
 
 
-def composed_meshes(kind: str, folder: Path, width: float = 60.0) -> tuple[Figure, list[Any]]:
-    found = kinds.kind(kind)
-    panels = found.draw(chosen(found.panels(folder, lambda _: ()), ()))
-    return compose(panels, found.title, Asked(width=width)), panels
+def compose_mesh_kind(kind: str, folder: Path, width: float = 60.0) -> tuple[Figure, list[Any]]:
+    found = kinds.find_figure_kind(kind)
+    panels = found.prepare_panels(select_entries(found.list_panels(folder, lambda _: ()), ()))
+    return compose_figure(panels, found.title, FigureOptions(width_mm=width)), panels
 
 
-def pixels(figure: Figure) -> Image.Image:
+def render_figure(figure: Figure) -> Image.Image:
     agg = FigureCanvasAgg(figure)
     agg.draw()
     return Image.fromarray(np.asarray(agg.buffer_rgba())).convert("RGB")
 
 
-def sheet(figures: Sequence[Figure], size: tuple[int, int]) -> Image.Image:
+def tile_figures(figures: Sequence[Figure], size: tuple[int, int]) -> Image.Image:
     """All figures below and beside each other."""
     whole = Image.new("RGB", size, "white")
     x = y = 0
-    for picture in map(pixels, figures):
+    for picture in map(render_figure, figures):
         if y + picture.height > size[1]:
             x, y = x + picture.width + 10, 0
         whole.paste(picture, (x, y))
@@ -76,8 +80,8 @@ def sheet(figures: Sequence[Figure], size: tuple[int, int]) -> Image.Image:
     return whole
 
 
-def similarity(one: Image.Image, other: Image.Image) -> float:
+def least_similarity(one: Image.Image, other: Image.Image) -> float:
     """Of the part of the pictures that differs most: the mean over a whole sheet would be that of its white."""
     found: Any = structural_similarity(np.asarray(one), np.asarray(other), channel_axis=-1, full=True)
-    parts: Any = (PART, PART)
+    parts: Any = (PART_PIXELS, PART_PIXELS)
     return float(block_reduce(found[1].mean(axis=-1), parts, np.mean, cval=1).min())

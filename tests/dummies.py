@@ -8,13 +8,13 @@ from typing import Any
 
 from harness.base import rows
 
-SOLVERS = ("sparse", "numba", "hybrid", "xpbd", "lbfgs")
+SOLVER_NAMES = ("sparse", "numba", "hybrid", "xpbd", "lbfgs")
 
 
-def dummy_rows(number: int, *, frames: int = 2) -> list[dict[str, Any]]:
+def build_dummy_rows(number: int, *, frames: int = 2) -> list[dict[str, Any]]:
     """The rows of a run: a step for each frame; the residual of the first was not computed, as it happens."""
     shared = {"run_id": f"{number:012x}", "sweep": "dummy", "scene": f"scene{number % 50}", "size": 8 + number % 9}
-    shared |= {"solver": SOLVERS[number % 5], "parameters": "{}", "family": "local-global", "vertices": 64}
+    shared |= {"solver": SOLVER_NAMES[number % 5], "parameters": "{}", "family": "local-global", "vertices": 64}
     shared |= {"springs": 210, "time_step": 1 / 30, "integrator": "implicit-euler", "max_iterations": 50, "threads": 1}
     shared |= {"machine": "00000000", "cpu": "a processor", "cores": 2, "memory_gib": 16.0, "system": "Linux"}
     shared |= {"versions": '{"numpy": "2.4"}', "commit": "0" * 40, "code": "0" * 12, "status": "ok"}
@@ -27,16 +27,16 @@ def dummy_rows(number: int, *, frames: int = 2) -> list[dict[str, Any]]:
     ]
 
 
-def write_dummies(sweep: Path, count: int, *, frames: int = 2, first: int = 0) -> list[Path]:
+def write_dummy_runs(sweep: Path, count: int, *, frames: int = 2, first_number: int = 0) -> list[Path]:
     """Write so many runs' rows into the folder of a sweep, by the writer that runs use."""
     folder = sweep / "rows"
     folder.mkdir(parents=True, exist_ok=True)
     units: list[Path] = []
-    for number in range(first, first + count):
-        units.append(folder / f"scene{number % 50}-{8 + number % 9}-{SOLVERS[number % 5]}-{number:012x}.parquet")
-        rows.write(units[-1], dummy_rows(number, frames=frames))
+    for number in range(first_number, first_number + count):
+        units.append(folder / f"scene{number % 50}-{8 + number % 9}-{SOLVER_NAMES[number % 5]}-{number:012x}.parquet")
+        rows.write_rows(units[-1], build_dummy_rows(number, frames=frames))
     return sorted(units)
 
 
 if __name__ == "__main__":  # python -m tests.dummies FOLDER COUNT: for measurements of `springbench query`
-    write_dummies(Path(sys.argv[1]), int(sys.argv[2]), frames=20)
+    write_dummy_runs(Path(sys.argv[1]), int(sys.argv[2]), frames=20)

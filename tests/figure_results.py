@@ -9,36 +9,45 @@ from typing import Any
 import pyarrow as pa
 
 from harness.base import rows as base_rows
-from harness.base.columns import SCHEMA
-from harness.experiments.ablation.ablation_rows import SCHEMA as ABLATION
+from harness.base.columns import RUN_SCHEMA
+from harness.experiments.ablation.ablation_rows import ABLATION_SCHEMA as ABLATION
 from tests import accuracy_rows as made
 from tests import gate_results
-from tests.recordings import info, record
+from tests.recordings import build_recording_info, write_recording
 
-HERE = {"machine": "abc", "cpu": "A processor", "threads": 1, "commit": "0" * 40, "code": "abc", "status": "ok"}
-SOLVERS = ("dense", "sparse", "numba", "newton", "hybrid", "xpbd")
-EFFECTS = ("springs", "gravity", "pins", "bending", "wind", "dashpots", "contact", "air-drag")
+SHARED_COLUMNS = {
+    "machine": "abc",
+    "cpu": "A processor",
+    "threads": 1,
+    "commit": "0" * 40,
+    "code": "abc",
+    "status": "ok",
+}
+SOLVER_NAMES = ("dense", "sparse", "numba", "newton", "hybrid", "xpbd")
+EFFECT_NAMES = ("springs", "gravity", "pins", "bending", "wind", "dashpots", "contact", "air-drag")
 
 
-def write(path: Path, rows: Any, schema: pa.Schema = SCHEMA) -> None:
+def write_result_rows(path: Path, rows: Any, schema: pa.Schema = RUN_SCHEMA) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    base_rows.write(path, rows, schema)
+    base_rows.write_rows(path, rows, schema)
 
 
-def accuracy(folder: Path) -> Path:
+def write_accuracy_results(folder: Path) -> Path:
     """Two scenes from both first guesses, one of three sizes, and simulations."""
     rows: list[dict[str, Any]] = []
     for size in (10, 24, 48):
-        rows += made.problem("net", size, "early")
+        rows += made.build_snapshot_rows("net", size, "early")
         for solver in ("sparse", "numba", "lbfgs", "newton", "hybrid"):
             for guess in ("current", "inertial"):
-                rows += made.curve("net", size, "early", solver, guess=guess)
-    rows += made.problem("block", 8, "violent")
-    rows += made.curve("block", 8, "violent", "lbfgs", status="time-limit", reason="the limit of 5 s was reached")
-    return made.write(folder, [*rows, *made.work("net", 10), *made.paper(1.3)])
+                rows += made.build_curve_rows("net", size, "early", solver, initial_guess=guess)
+    rows += made.build_snapshot_rows("block", 8, "violent")
+    rows += made.build_curve_rows(
+        "block", 8, "violent", "lbfgs", status="time-limit", reason="the limit of 5 s was reached"
+    )
+    return made.write_accuracy_rows(folder, [*rows, *made.build_work_rows("net", 10), *made.build_liu2013_rows(1.3)])
 
 
-def winners(folder: Path) -> Path:
+def write_winner_results(folder: Path) -> Path:
     """Simulations of five stiffnesses on three meshes: explicit methods pay for stiffness, high orders for steps."""
     rows: list[dict[str, Any]] = []
     methods = (
@@ -53,23 +62,25 @@ def winners(folder: Path) -> Path:
                 for steps in (10, 40, 160):
                     least = 2.0 * number**0.5 if integrator == "own" else 1.0
                     cost = price * max(steps, least) * 1e-6 * size**2
-                    row = made.shared(f"sway-{stiffness}", size, solver=solver, parameters="{}", kind="work")
+                    row = made.build_shared_columns(
+                        f"sway-{stiffness}", size, solver=solver, parameters="{}", kind="work"
+                    )
                     row |= {"integrator": integrator, "time_step": 1.0 / steps, "iterations": 50, "horizon": 1.0}
                     row |= {"minimises": integrator != "own", "family": "explicit" if integrator == "own" else "other"}
                     row |= {"seconds": [cost], "seconds_per_simulated": cost, "cpu_seconds": cost, "vertices": size**2}
                     row |= {"error": (0.3 / steps) ** order, "stiffness_ratio": 900.0 * number / steps**2}
                     rows.append(row)
-    return made.write(folder, rows)
+    return made.write_accuracy_rows(folder, rows)
 
 
-def engines(folder: Path) -> Path:
+def write_engine_results(folder: Path) -> Path:
     """Simulations on two meshes by two engines and two methods of ours; one engine refuses the second mesh."""
     rows: list[dict[str, Any]] = []
     tried = (("hybrid", 1, 1.0), ("velocity-verlet", 2, 2.0), ("mujoco", 4, 30.0), ("pypbd", 1, 5.0))
     for mesh in ("net", "stiff"):
         for solver, order, price in tried:
             for steps in (10, 40, 160):
-                row = made.shared(mesh, 9, solver=solver, parameters="{}", kind="work")
+                row = made.build_shared_columns(mesh, 9, solver=solver, parameters="{}", kind="work")
                 row |= {
                     "integrator": "own",
                     "time_step": 1 / 30,
@@ -82,21 +93,23 @@ def engines(folder: Path) -> Path:
                 if (mesh, solver) == ("stiff", "pypbd"):
                     row |= {"status": "unsupported", "reason": "expresses no such gravity", "error": None}
                 rows.append(row)
-    return made.write(folder, rows)
+    return made.write_accuracy_rows(folder, rows)
 
 
-def sweep(folder: Path, sizes: tuple[int, ...] = (8, 16, 32)) -> Path:
+def write_sweep_results(folder: Path, sizes: tuple[int, ...] = (8, 16, 32)) -> Path:
     """Runs of all solvers at these sizes, judged, of four cases of two families; one of them failed."""
     cases = ("geometry-flat", "geometry-line", "numbers-large", "numbers-small")
     for case in cases:
-        for place, solver in enumerate(SOLVERS):
+        for place, solver in enumerate(SOLVER_NAMES):
             for size in sizes if case == cases[0] else sizes[:1]:
-                write(folder / "rows" / f"{case}-{solver}-{size}.parquet", _run(case, solver, place, size))
+                write_result_rows(
+                    folder / "rows" / f"{case}-{solver}-{size}.parquet", _build_run_rows(case, solver, place, size)
+                )
     return folder
 
 
-def _run(case: str, solver: str, place: int, size: int) -> list[dict[str, Any]]:
-    known = HERE | {"run_id": f"{case}-{solver}-{size}", "scene": case, "size": size, "solver": solver}
+def _build_run_rows(case: str, solver: str, place: int, size: int) -> list[dict[str, Any]]:
+    known = SHARED_COLUMNS | {"run_id": f"{case}-{solver}-{size}", "scene": case, "size": size, "solver": solver}
     known |= {
         "parameters": "{}",
         "vertices": size**2,
@@ -116,29 +129,42 @@ def _run(case: str, solver: str, place: int, size: int) -> list[dict[str, Any]]:
     return [*steps, *(known | {"phase": "prepare", "round": k, "seconds": (9 - 3 * k) * second} for k in range(2))]
 
 
-def ablation(folder: Path) -> Path:
+def write_ablation_results(folder: Path) -> Path:
     """Effects of all costs and changes, some of which nothing can measure."""
-    whole = HERE | {"scene": "cloth", "size": 16, "solver": "hybrid", "vertices": 256, "frames": 10, "rounds": 5}
+    whole = SHARED_COLUMNS | {
+        "scene": "cloth",
+        "size": 16,
+        "solver": "hybrid",
+        "vertices": 256,
+        "frames": 10,
+        "rounds": 5,
+    }
     whole |= {"time_step": 0.01, "seconds": 1.0}
     rows: list[dict[str, Any]] = [whole | {"kind": "whole", "name": ""}]
-    for k, name in enumerate(EFFECTS):
+    for k, name in enumerate(EFFECT_NAMES):
         cost = {"cost": 0.05 * k, "cost_low": 0.05 * k - 0.04, "cost_high": 0.05 * k + 0.03}
         rows.append(whole | cost | {"kind": "without", "name": name, "largest": 10.0 ** (1 - k), "extent": 20.0})
     rows += [whole | {"kind": "error", "name": n, "largest": e} for n, e in (("solver", 3e-5), ("time-step", 2e-2))]
     for solver in ("numba", "newton"):
-        for k, name in enumerate(EFFECTS):
+        for k, name in enumerate(EFFECT_NAMES):
             price = {"price": 1.0 + 0.2 * k, "price_low": 1.0 + 0.18 * k, "price_high": 1.0 + 0.25 * k}
             rows.append(whole | price | {"kind": "price", "name": name, "solver": solver})
     refused = {"kind": "price", "solver": "dense", "status": "unsupported"}
-    rows += [whole | refused | {"name": name} for name in EFFECTS[3:]]
-    write(folder / "ablation" / "cloth.parquet", rows, ABLATION)
+    rows += [whole | refused | {"name": name} for name in EFFECT_NAMES[3:]]
+    write_result_rows(folder / "ablation" / "cloth.parquet", rows, ABLATION)
     return folder
 
 
-def speed(folder: Path) -> Path:
+def write_speed_results(folder: Path) -> Path:
     """A speed report: the machine's limits and three candidates at three sizes, the last by other code."""
     for size in (8, 16, 32):
-        known = HERE | {"scene": "cloth", "size": size, "vertices": size**2, "springs": 4 * size**2, "load": 0.5}
+        known = SHARED_COLUMNS | {
+            "scene": "cloth",
+            "size": size,
+            "vertices": size**2,
+            "springs": 4 * size**2,
+            "load": 0.5,
+        }
         machine = known | {"run_id": f"m{size}", "solver": "machine", "parameters": "{}", "phase": "read", "bytes": 1e3}
         limits = [machine | {"seconds": 1e-6, "working_set": 1e3, "flops": None}]
         limits += [
@@ -146,7 +172,7 @@ def speed(folder: Path) -> Path:
             for k in ("float64", "float32")
         ]
         limits = [row | {"working_set": row.get("working_set") or 0.0} for row in limits]
-        write(folder / "rows" / f"machine-{size}.parquet", limits)
+        write_result_rows(folder / "rows" / f"machine-{size}.parquet", limits)
         for place, (solver, linear) in enumerate((("sparse", None), ("numba", "auto"), ("numba", "supernodal"))):
             parameters = json.dumps({"linear": linear} if linear else {})
             one = known | {"run_id": f"{solver}{linear}{size}", "solver": solver, "parameters": parameters}
@@ -156,24 +182,26 @@ def speed(folder: Path) -> Path:
                 for phase, share in (("prepare", 5.0), ("local", 0.3), ("global", 0.7), ("step", 1.0))
                 for k in range(3)
             ]
-            write(folder / "rows" / f"{solver}-{linear}-{size}.parquet", rows)
+            write_result_rows(folder / "rows" / f"{solver}-{linear}-{size}.parquet", rows)
     return folder
 
 
-def gates(folder: Path) -> Path:
+def write_benchmark_history(folder: Path) -> Path:
     """Thirty results of two gates, one of which became slower by 5 %."""
-    changed, same = gate_results.series(3, 30, (18, 1.05)), gate_results.series(4, 30)
-    return gate_results.write(folder, {"test_step[cloth]": changed, "test_local": same})
+    changed, same = gate_results.build_ratio_series(3, 30, (18, 1.05)), gate_results.build_ratio_series(4, 30)
+    return gate_results.write_benchmark_files(folder, {"test_step[cloth]": changed, "test_local": same})
 
 
-def recorded(folder: Path) -> Path:
+def write_recorded_runs(folder: Path) -> Path:
     """Two runs of one scene with their recordings, of different residuals."""
     (folder / "recordings").mkdir(parents=True)
     for solver, amplitude in (("numba", 0.1), ("newton", 0.05)):
-        for row in (rows := _run("cloth", solver, 1, 6)):
+        for row in (rows := _build_run_rows("cloth", solver, 1, 6)):
             row["vertices"] = 36
-        write(folder / "rows" / f"{solver}.parquet", rows)
+        write_result_rows(folder / "rows" / f"{solver}.parquet", rows)
         properties = {"scene": "cloth", "size": 6, "solver": solver, "milliseconds_per_step": 1.25}
-        of = info(run_id=rows[0]["run_id"], properties=properties)
-        record(folder / "recordings" / f"cloth-6-{solver}-{rows[0]['run_id']}.rrd", of, count=4, amplitude=amplitude)
+        of = build_recording_info(run_id=rows[0]["run_id"], properties=properties)
+        write_recording(
+            folder / "recordings" / f"cloth-6-{solver}-{rows[0]['run_id']}.rrd", of, frame_count=4, amplitude=amplitude
+        )
     return folder

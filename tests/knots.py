@@ -7,7 +7,7 @@ import numpy as np
 from solvers.problem import Positions
 
 
-def determinant(p: Positions) -> int:
+def knot_determinant(p: Positions) -> int:
     """The determinant of the knot of an open rope p (n, 3) whose first and last vertex lie outermost along x: 1 where
     there is none, 3 for the overhand knot (Fox's colourings: Livingston 1993, Knot Theory, chapter 3).
 

@@ -33,51 +33,56 @@ import dask.config
 import psutil
 
 from harness.base import rows
-from harness.config.load import load_any
+from harness.config.load import load_config
 from harness.config.sweep import RunSpec
 from harness.experiments import cluster
-from harness.experiments.code import code, parts
-from harness.experiments.provenance import common
+from harness.experiments.code import collect_source_parts, compute_source_fingerprint
+from harness.experiments.provenance import build_run_columns
 from harness.experiments.sweep import run_sweep
-from tests.displays import Quiet
-from tests.own_solvers import SCENE
+from tests.displays import SilentDisplay
+from tests.own_solvers import SCENE_SOURCE
 
-SOLVERS = ("sparse", "numba", "anderson", "lbfgs", "xpbd")
-SIZES = range(3, 23)
-MOST = 10_000
+SOLVER_NAMES = ("sparse", "numba", "anderson", "lbfgs", "xpbd")
+MESH_SIZES = range(3, 23)
+MAX_CONFIG_RUNS = 10_000
 """Runs of a config."""
-THREADS, FRAMES = 4, 3
+THREAD_COUNT, FRAME_COUNT = 4, 3
 """Threads that all workers share, and steps that a run tells of."""
 
-QUIET = {"distributed.worker.profile.enabled": False, "distributed.admin.system-monitor.interval": "1h"}
+DASK_CONFIG = {"distributed.worker.profile.enabled": False, "distributed.admin.system-monitor.interval": "1h"}
 """What Dask looks at in each worker by itself; here it would be looked at in one process a thousand times."""
 
 
-class Bears(NamedTuple):
+class ProcessUsage(NamedTuple):
     """What a process took: MiB at most, seconds of CPU, and messages that came, and bytes that came
     and went."""
 
-    peak: float
-    cpu: float
-    messages: tuple[int, int] = (0, 0)
+    peak_mib: float
+    cpu_seconds: float
+    message_counts: tuple[int, int] = (0, 0)
 
 
-class Dummy:
+class DummyWorker:
     """In place of a run's process: writes the rows of a run that was not done."""
 
     def __init__(self, ready: object, *, fork: bool) -> None: ...
 
-    def do(self, piece: Any, tick: object, limits: object) -> str:
-        unit = piece.args[0]
-        same = common(unit.run) | {"code": _code(parts(unit.run)), "phase": "step", "status": "ok", "seconds": 1e-3}
-        rows.write(unit.files.rows, [same | {"frame": frame} for frame in range(1, FRAMES + 1)])
+    def run_task(self, function: Any, tick: object, limits: object) -> str:
+        unit = function.args[0]
+        same = build_run_columns(unit.run) | {
+            "code": _cached_fingerprint(collect_source_parts(unit.run)),
+            "phase": "step",
+            "status": "ok",
+            "seconds": 1e-3,
+        }
+        rows.write_rows(unit.files.rows, [same | {"frame": frame} for frame in range(1, FRAME_COUNT + 1)])
         return "1 ms a step"
 
 
-_code = cache(code)
+_cached_fingerprint = cache(compute_source_fingerprint)
 
 
-def scheduler(pipe: Connection) -> None:
+def run_scheduler(pipe: Connection) -> None:
     """Be the scheduler until the pipe ends, and count the messages that come."""
     from distributed import Scheduler
     from distributed.comm import tcp
@@ -112,23 +117,23 @@ def scheduler(pipe: Connection) -> None:
     tcp.TCP.read, tcp.TCP.write, tcp.read_bytes_rw = counting, sending, receiving  # type: ignore[method-assign]
     with suppress(Exception):  # workers that leave in the same second
         asyncio.run(serve())
-    pipe.send(_bears((messages, moved)))
+    pipe.send(_measure_usage((messages, moved)))
 
 
-def workers(pipe: Connection, address: str, count: int) -> None:
+def run_workers(pipe: Connection, address: str, count: int) -> None:
     """Be so many workers until the pipe ends."""
     from distributed import Worker
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    do: Any = cluster._do
+    do: Any = cluster._execute_run
 
     def far(unit: object, folder: Path, *rest: object) -> Any:
         return do(unit, Path("/elsewhere"), *rest)
 
-    cluster._do, cluster.Workers = far, Dummy  # type: ignore[assignment, misc]
+    cluster._execute_run, cluster.IsolatedWorker = far, DummyWorker  # type: ignore[assignment, misc]
 
     async def serve(home: str) -> None:
-        own: Any = {"nthreads": 1, "dashboard": False, "memory_limit": 0, "executor": ThreadPoolExecutor(THREADS)}
+        own: Any = {"nthreads": 1, "dashboard": False, "memory_limit": 0, "executor": ThreadPoolExecutor(THREAD_COUNT)}
         for begun in range(0, count, 50):
             some = range(begun, min(count, begun + 50))
             await asyncio.gather(*(Worker(address, local_directory=f"{home}/{number}", **own) for number in some))
@@ -137,9 +142,9 @@ def workers(pipe: Connection, address: str, count: int) -> None:
 
     if Path("/dev/shm").is_dir():
         tempfile.tempdir = "/dev/shm"
-    with TemporaryDirectory() as home, suppress(Exception), dask.config.set(QUIET):
+    with TemporaryDirectory() as home, suppress(Exception), dask.config.set(DASK_CONFIG):
         asyncio.run(serve(home))
-    pipe.send(_bears())
+    pipe.send(_measure_usage())
 
 
 async def _ended(pipe: Connection) -> None:
@@ -147,67 +152,71 @@ async def _ended(pipe: Connection) -> None:
         await asyncio.sleep(0.2)
 
 
-def _bears(messages: tuple[int, int] = (0, 0)) -> Bears:
+def _measure_usage(messages: tuple[int, int] = (0, 0)) -> ProcessUsage:
     import resource
 
-    return Bears(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, process_time(), messages)
+    return ProcessUsage(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, process_time(), messages)
 
 
-class Over(Exception):
+class TimeIsUp(Exception):
     """The time is over."""
 
 
-class Counting(Quiet):
+class ProgressCounter(SilentDisplay):
     """Prints how far it is at each tenth, and raises Over after so many seconds."""
 
     def __init__(self, runs: int, seconds: float) -> None:
         super().__init__()
         self._tenth, self._began, self._seconds = max(1, runs // 10), monotonic(), seconds
 
-    def finished(self, outcome: str) -> None:
-        super().finished(outcome)
+    def finish_run(self, outcome: str) -> None:
+        super().finish_run(outcome)
         took = monotonic() - self._began
         if not self.finished_units % self._tenth:
             here = psutil.Process().memory_info().rss / 2**20
             print(f"{self.finished_units:,} runs after {took:.0f} s; client {here:.0f} MiB", flush=True)
         if took > self._seconds:
-            raise Over
+            raise TimeIsUp
 
 
-def _part(folder: Path, part: int) -> list[RunSpec]:
+def _build_runs(folder: Path, part: int) -> list[RunSpec]:
     """The runs of a config, of which several make the sweep: none may ask for more than `MOST`."""
-    each = MOST // len(SOLVERS) // len(SIZES)
-    options = {"iterations": list(range(1 + each * part, 1 + each * (part + 1))), "rounds": 1, "frames": FRAMES}
+    each = MAX_CONFIG_RUNS // len(SOLVER_NAMES) // len(MESH_SIZES)
+    options = {"iterations": list(range(1 + each * part, 1 + each * (part + 1))), "rounds": 1, "frames": FRAME_COUNT}
     options |= {"record": False, "pictures": False}
-    asked = {"scenes": ["scene.yaml"], "sizes": list(SIZES), "solvers": list(SOLVERS), "options": options}
+    asked = {"scenes": ["scene.yaml"], "sizes": list(MESH_SIZES), "solvers": list(SOLVER_NAMES), "options": options}
     (folder / "sweep.yaml").write_text(json.dumps(asked))
-    return load_any(folder / "sweep.yaml").runs()
+    return load_config(folder / "sweep.yaml").list_runs()
 
 
-def simulate(count: int, runs: int, folder: Path, seconds: float) -> dict[str, Any]:
+def simulate_cluster(count: int, runs: int, folder: Path, seconds: float) -> dict[str, Any]:
     """Do dummy runs by so many workers, those of so many that are missing; what each process bore for how many, and
     how many a second that allows: on this machine's cores, and where each process has a core of its own."""
-    (folder / "scene.yaml").write_text(SCENE)
+    (folder / "scene.yaml").write_text(SCENE_SOURCE)
     began, context = monotonic(), get_context("spawn")
-    found = [run for part in range(ceil(runs / MOST)) for run in _part(folder, part)][:runs]
+    found = [run for part in range(ceil(runs / MAX_CONFIG_RUNS)) for run in _build_runs(folder, part)][:runs]
     told: dict[str, Any] = {"workers": count, "runs": len(found), "expanded_seconds": monotonic() - began}
     (mine, theirs), (ours, others) = context.Pipe(), context.Pipe()
-    processes = {"scheduler": context.Process(target=scheduler, args=(theirs,))}
+    processes = {"scheduler": context.Process(target=run_scheduler, args=(theirs,))}
     processes["scheduler"].start()
     address = mine.recv()
-    processes["workers"] = context.Process(target=workers, args=(others, address, count))
+    processes["workers"] = context.Process(target=run_workers, args=(others, address, count))
     processes["workers"].start()
     ours.recv()
     told["workers_seconds"] = monotonic() - began - told["expanded_seconds"]
     pids = {"client": os.getpid()} | {name: process.pid or 0 for name, process in processes.items()}
-    before, done, display = {name: _cpu(pid) for name, pid in pids.items()}, monotonic(), Counting(runs, seconds)
+    before, done, display = (
+        {name: _process_cpu_seconds(pid) for name, pid in pids.items()},
+        monotonic(),
+        ProgressCounter(runs, seconds),
+    )
     told["ended"] = "all runs are done"
     try:
-        told["rows"] = len(run_sweep("sweep", found, folder / "r", display, print, on=address))
-    except Over:
+        told["rows"] = len(run_sweep("sweep", found, folder / "r", display, print, scheduler_address=address))
+    except TimeIsUp:
         told["ended"] = f"after {seconds:g} s; the same command, with the same folder, does the rest"
-    took = {name: _cpu(pid) - before[name] for name, pid in pids.items()}
-    told |= {"done": display.finished_units, "seconds": monotonic() - done, "client_bore": _bears()._asdict()}
+    took = {name: _process_cpu_seconds(pid) - before[name] for name, pid in pids.items()}
+    told |= {"done": display.finished_units, "seconds": monotonic() - done, "client_bore": _measure_usage()._asdict()}
     for name, pipe in (("workers", ours), ("scheduler", mine)):
         pipe.send(None)
         told[f"{name}_bore"] = pipe.recv()._asdict()
@@ -220,7 +229,7 @@ def simulate(count: int, runs: int, folder: Path, seconds: float) -> dict[str, A
     return told | {"runs_per_second_idle": 1e3 / here, "runs_per_second_own_cores": 1e3 / max(each.values())}
 
 
-def _cpu(pid: int) -> float:
+def _process_cpu_seconds(pid: int) -> float:
     """Seconds of CPU that a process has taken."""
     times = psutil.Process(pid).cpu_times()
     return times.user + times.system
@@ -236,4 +245,4 @@ if __name__ == "__main__":
     with TemporaryDirectory() as temporary:
         place = given.folder or Path(temporary)
         (place / "r").mkdir(parents=True, exist_ok=True)
-        print(json.dumps(simulate(given.workers, given.runs, place, given.seconds), indent=1))
+        print(json.dumps(simulate_cluster(given.workers, given.runs, place, given.seconds), indent=1))

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csr_array
 
-from solvers.matrices import diagonal, signed_incidence_matrix_sparse, without_zeros
+from solvers.matrices import diagonal_matrix, drop_zeros, signed_incidence_matrix_sparse
 
-STIFFNESS, DT = 1e5, 1 / 30
+SPRING_STIFFNESS, TIME_STEP = 1e5, 1 / 30
 
 
-def network(springs, stiffness, held) -> csr_array:
+def network_matrix(springs, stiffness, vertex_stiffness) -> csr_array:
     """A'KA + diag(held) of springs (m, 2), their stiffness (m,) or one for all, and what holds each vertex (n,)."""
     ends = np.asarray(springs, np.int64).reshape(-1, 2)
-    A = signed_incidence_matrix_sparse(ends, len(held))
+    A = signed_incidence_matrix_sparse(ends, len(vertex_stiffness))
     k = np.broadcast_to(np.asarray(stiffness, float), len(ends))
-    return without_zeros(A.T @ diagonal(k) @ A + diagonal(np.asarray(held, float)))
+    return drop_zeros(A.T @ diagonal_matrix(k) @ A + diagonal_matrix(np.asarray(vertex_stiffness, float)))
 
 
 def grid_springs(*shape: int) -> np.ndarray:
@@ -31,15 +31,15 @@ def grid_springs(*shape: int) -> np.ndarray:
     return np.concatenate(ends)
 
 
-def grid(*shape: int, stiffness=STIFFNESS) -> csr_array:
+def grid_matrix(*shape: int, stiffness=SPRING_STIFFNESS) -> csr_array:
     """A grid of mass 1 in all at dt = 1/30, two corners held by 1e10: a sheet of two numbers, a solid of three."""
     n = int(np.prod(shape))
-    held = np.full(n, 1.0 / n / DT**2)
+    held = np.full(n, 1.0 / n / TIME_STEP**2)
     held[[0, shape[-1] - 1]] += 1e10
-    return network(grid_springs(*shape), stiffness, held)
+    return network_matrix(grid_springs(*shape), stiffness, held)
 
 
-def right_hand_sides(n: int, seed: int = 0) -> np.ndarray:
+def random_right_hand_sides(n: int, seed: int = 0) -> np.ndarray:
     """Three random ones, (n, 3)."""
     return np.random.default_rng(seed).normal(size=(n, 3))
 

@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 
 
-def often(cases: Iterable[Any], kept: Sequence[Any]) -> list[Any]:
+def mark_rare_cases(cases: Iterable[Any], frequent_cases: Sequence[Any]) -> list[Any]:
     """The cases, tuples of several parameters among them, all but the kept ones marked as long.
 
     Raises ValueError for one that is kept and is no case.
     """
     cases = list(cases)
-    if unknown := [case for case in kept if case not in cases]:
+    if unknown := [case for case in frequent_cases if case not in cases]:
         raise ValueError(f"no such cases: {unknown}")
     values = [(case, case if isinstance(case, tuple) else (case,)) for case in cases]
-    return [pytest.param(*of, marks=() if case in kept else pytest.mark.long) for case, of in values]
+    return [pytest.param(*of, marks=() if case in frequent_cases else pytest.mark.long) for case, of in values]

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from harness.config.load import load_any
+from harness.config.load import load_config
 from harness.config.sweep import RunSpec
 from solvers.registry import SOLVERS
 
-SOURCE = '''"""Local-global, by the tree's own."""
+SOLVER_SOURCE = '''"""Local-global, by the tree's own."""
 
 from dataclasses import dataclass, replace
 
@@ -50,7 +50,7 @@ class Prepared:
         pass  # while solving
         return found
 '''
-SCENE = """
+SCENE_SOURCE = """
 mesh: {kind: grid}
 mass: 1
 time_step: 0.03
@@ -58,45 +58,45 @@ frames: 3
 default_size: 4
 effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [top_corners]}]
 """
-SWEEP = "scenes: [scene.yaml]\nsolvers: [mine, sparse]\noptions: {%s}\n"
-OPTIONS = "rounds: 1, iterations: 5, record: false, pictures: false"
+SWEEP_TEMPLATE = "scenes: [scene.yaml]\nsolvers: [mine, sparse]\noptions: {%s}\n"
+SWEEP_OPTIONS = "rounds: 1, iterations: 5, record: false, pictures: false"
 
-_NUMBERS = count()
+_MODULE_NUMBERS = count()
 
 
 @dataclass(frozen=True)
-class Own:
+class PluginSweep:
     """A folder with a solver and a sweep that asks for it. solver, sweep: their files."""
 
-    solver: Path
-    sweep: Path
+    solver_path: Path
+    sweep_path: Path
 
-    def run(self) -> RunSpec:
+    def plugin_run(self) -> RunSpec:
         """The sweep's run of the solver."""
-        return load_any(self.sweep).runs()[0]
+        return load_config(self.sweep_path).list_runs()[0]
 
-    def line(self, code: str) -> str:
+    def source_line(self, code: str) -> str:
         """`file:line` of the only line of the solver that has this code."""
-        (number,) = (i for i, line in enumerate(self.solver.read_text().splitlines(), 1) if code in line)
-        return f"{self.solver.name}:{number}"
+        (number,) = (i for i, line in enumerate(self.solver_path.read_text().splitlines(), 1) if code in line)
+        return f"{self.solver_path.name}:{number}"
 
 
-def own(
+def write_plugin_solver(
     folder: Path,
     monkeypatch: pytest.MonkeyPatch,
     *,
-    solving: str = "pass",
-    preparing: str = "pass",
-    options: str = OPTIONS,
-) -> Own:
+    solve_code: str = "pass",
+    prepare_code: str = "pass",
+    options: str = SWEEP_OPTIONS,
+) -> PluginSweep:
     """The solver `mine` with statements of one's own, while it solves or prepares itself."""
-    name = f"mine{next(_NUMBERS)}"  # a module is imported once by each name
+    name = f"mine{next(_MODULE_NUMBERS)}"  # a module is imported once by each name
     solver, sweep = folder / f"{name}.py", folder / "sweep.yaml"
-    text = SOURCE.replace("pass  # while solving", solving).replace("pass  # while preparing", preparing)
+    text = SOLVER_SOURCE.replace("pass  # while solving", solve_code).replace("pass  # while preparing", prepare_code)
     solver.write_text(text)
-    sweep.write_text(SWEEP % options)
-    (folder / "scene.yaml").write_text(SCENE)
+    sweep.write_text(SWEEP_TEMPLATE % options)
+    (folder / "scene.yaml").write_text(SCENE_SOURCE)
     monkeypatch.setitem(SOLVERS, "mine", f"{name}:Mine")
     monkeypatch.syspath_prepend(folder)
     monkeypatch.delitem(sys.modules, name, raising=False)
-    return Own(solver, sweep)
+    return PluginSweep(solver, sweep)

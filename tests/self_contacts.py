@@ -5,23 +5,26 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.scenes.mesh.stack import Stack
+from harness.scenes.mesh.stack import StackMesh
 from solvers.contact import ways
-from solvers.contact.contacts import padded
+from solvers.contact.contacts import pad_positions
 from solvers.contact.self_contact import SelfContact
-from solvers.contact.surface import Surface
+from solvers.contact.surface import CollisionMesh
 from solvers.methods.anderson import Anderson
 from solvers.methods.chebyshev import Chebyshev
 from solvers.methods.lbfgs import Lbfgs
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, Solver
-from solvers.registry import SOLVERS, load
+from solvers.registry import SOLVERS, load_target
 
-THICKNESS, RANGE = 0.02, 0.03
+CONTACT_THICKNESS, CONTACT_DHAT = 0.02, 0.03
 
-TAKE_SURFACES: dict[str, Solver] = {
-    **{name: load(SOLVERS[name])() for name in ("newton", "newton-cg", "pncg", "lbfgs", "hybrid", "vbd", "sparse")},
-    **{name: load(SOLVERS[name])() for name in ("numba", "anderson", "chebyshev")},
+SURFACE_CONTACT_SOLVERS: dict[str, Solver] = {
+    **{
+        name: load_target(SOLVERS[name])()
+        for name in ("newton", "newton-cg", "pncg", "lbfgs", "hybrid", "vbd", "sparse")
+    },
+    **{name: load_target(SOLVERS[name])() for name in ("numba", "anderson", "chebyshev")},
     "lbfgs float32": Lbfgs(precision="float32"),
     "numba float32": CompiledLocalGlobal(precision="float32"),
     "anderson float32": Anderson(precision="float32"),
@@ -30,28 +33,37 @@ TAKE_SURFACES: dict[str, Solver] = {
 """The solvers that claim contact of surfaces, with the precisions of factors that they know."""
 
 
-def sides(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+def unique_edges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.unique(np.sort(np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1), axis=0)
 
 
-def touching(seed: int = 0, *, size: int = 5, noise: float = 0.004) -> tuple[SelfContact, Positions, NDArray[np.int64]]:
+def build_touching_sheets(
+    seed: int = 0, *, size: int = 5, noise: float = 0.004
+) -> tuple[SelfContact, Positions, NDArray[np.int64]]:
     """The contact of two sheets, positions where they touch, nearly parallel edges among them, and the triangles."""
-    mesh, rng = Stack(apart=0.2).build(size), np.random.default_rng(seed)
-    n = len(mesh.rest) // 2
-    surface = Surface.of(
-        mesh.rest, sides(mesh.triangles), mesh.triangles, rng.uniform(0.5, 2.0, 2 * n), THICKNESS, RANGE
+    mesh, rng = StackMesh(apart=0.2).build_mesh(size), np.random.default_rng(seed)
+    n = len(mesh.rest_positions) // 2
+    surface = CollisionMesh.from_rest_shape(
+        mesh.rest_positions,
+        unique_edges(mesh.triangles),
+        mesh.triangles,
+        rng.uniform(0.5, 2.0, 2 * n),
+        CONTACT_THICKNESS,
+        CONTACT_DHAT,
     )
-    p = mesh.rest.copy()
-    p[n:, 1] = THICKNESS + 0.5 * RANGE
+    p = mesh.rest_positions.copy()
+    p[n:, 1] = CONTACT_THICKNESS + 0.5 * CONTACT_DHAT
     p += noise * rng.normal(size=p.shape)
     return SelfContact(surface), p, mesh.triangles
 
 
-def way(seed: int, p: Positions, size: float) -> Positions:
+def random_displacement(seed: int, p: Positions, size: float) -> Positions:
     return size * np.random.default_rng(seed).normal(size=p.shape)
 
 
-def largest_of_all(contact: SelfContact, p: Positions, d: Positions) -> float:
+def exhaustive_step_size(contact: SelfContact, p: Positions, d: Positions) -> float:
     """The largest step that all pairs allow, those that nothing brings near each other too."""
-    every = contact.surface.within(p, 1e3)
-    return ways.largest(every, padded(p), padded(d - d.mean(axis=0)), 1.0, *ways.scratch())
+    every = contact.collision_mesh.find_proximity_candidates(p, 1e3)
+    return ways.collision_free_step_size(
+        every, pad_positions(p), pad_positions(d - d.mean(axis=0)), 1.0, *ways.allocate_ccd_scratch()
+    )

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent
-LIST = ROOT / "slow.txt"
+TESTS_FOLDER = Path(__file__).parent
+SLOW_LIST = TESTS_FOLDER / "slow.txt"
 
-KINDS = (
+SLOW_NAME_PARTS = (
     *("float16", "float32", "eigen", "cholmod"),  # kernels of their own, and programs in C++
     "cuda/",  # in a simulator, which is Python
     *("newton, absolute", "newton, trust-region", "newton, progressive"),  # what `newton, clamp` does, but for a rule
@@ -34,23 +34,23 @@ KINDS = (
 """Parts of their names."""
 
 
-def named() -> frozenset[str]:
+def read_slow_names() -> frozenset[str]:
     """The lines."""
-    return frozenset(LIST.read_text(encoding="utf-8").split("\n")) - {""}
+    return frozenset(SLOW_LIST.read_text(encoding="utf-8").split("\n")) - {""}
 
 
-def mark(items: list[pytest.Item]) -> None:
+def mark_slow_tests(items: list[pytest.Item]) -> None:
     """Mark the items that are named; those that are long already are in neither run."""
-    slow = named()
+    slow = read_slow_names()
     for item in items:
         if item.get_closest_marker("long"):
             continue
         name = item.nodeid
-        if name in slow or name.partition("::")[0] in slow or any(kind in name for kind in KINDS):
+        if name in slow or name.partition("::")[0] in slow or any(kind in name for kind in SLOW_NAME_PARTS):
             item.add_marker(pytest.mark.slow)
 
 
-class Finder:
+class SlowTestFinder:
     """Adds up what each test takes, and writes the list in the end."""
 
     def __init__(self, limit: float) -> None:
@@ -67,4 +67,4 @@ class Finder:
     def pytest_sessionfinish(self) -> None:
         slow = {name for name, seconds in self._tests.items() if seconds > self._limit}
         alone = {name for name in slow if name.partition("::")[0] not in self._files}
-        LIST.write_text("\n".join(sorted(self._files | alone)) + "\n", encoding="utf-8")
+        SLOW_LIST.write_text("\n".join(sorted(self._files | alone)) + "\n", encoding="utf-8")

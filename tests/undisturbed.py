@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-ATTEMPTS = 50
+MAX_ATTEMPTS = 50
 
-Rest = TypeVar("Rest")
+RunResult = TypeVar("RunResult")
 
 
-def undisturbed(run: Callable[[], tuple[list[dict[str, Any]], Rest]]) -> tuple[list[dict[str, Any]], Rest]:
+def retry_if_preempted(
+    run: Callable[[], tuple[list[dict[str, Any]], RunResult]],
+) -> tuple[list[dict[str, Any]], RunResult]:
     """What a run gives, rows first, once it was not interrupted, or failed: where much time was lost, clocks may
     differ by as much, and a lie about them is told by the mark alone. Raises AssertionError for a machine too busy."""
-    for _ in range(ATTEMPTS):
+    for _ in range(MAX_ATTEMPTS):
         found = run()
         if not any(row.get("interrupted") for row in found[0]):
             return found
-    raise AssertionError(f"interrupted in each of {ATTEMPTS} attempts: another process took this one's time")
+    raise AssertionError(f"interrupted in each of {MAX_ATTEMPTS} attempts: another process took this one's time")

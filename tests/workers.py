@@ -10,75 +10,75 @@ import threading
 from pathlib import Path
 from time import monotonic, sleep
 
-from harness.base.worker import Tick
-from solvers.device import broken
+from harness.base.worker import ProgressCallback
+from solvers.device import is_device_lost
 
 
-def double(number: int, tick: Tick) -> int:
+def double_number(number: int, tick: ProgressCallback) -> int:
     tick("doubling")
     return 2 * number
 
 
-def name(tick: Tick) -> int:
+def worker_pid(tick: ProgressCallback) -> int:
     """Of the worker's process."""
     return os.getpid()
 
 
-def crash(tick: Tick) -> None:
+def crash_process(tick: ProgressCallback) -> None:
     tick("crashing")
     tick("crashing")
     ctypes.string_at(0)
 
 
-def abort(tick: Tick) -> None:
+def abort_process(tick: ProgressCallback) -> None:
     print("I cannot go on", file=sys.stderr)
     os.abort()
 
 
-def leave(tick: Tick) -> None:
+def exit_with_error(tick: ProgressCallback) -> None:
     os._exit(7)
 
 
-def leave_well(tick: Tick) -> None:
+def exit_cleanly(tick: ProgressCallback) -> None:
     os._exit(0)
 
 
-def leave_by_python(tick: Tick) -> None:
+def raise_system_exit(tick: ProgressCallback) -> None:
     sys.exit("I am off")
 
 
-def leave_as_a_generator(tick: Tick) -> None:
+def raise_generator_exit(tick: ProgressCallback) -> None:
     raise GeneratorExit
 
 
-def interrupt(tick: Tick) -> None:
+def raise_keyboard_interrupt(tick: ProgressCallback) -> None:
     raise KeyboardInterrupt
 
 
-def be_killed(tick: Tick) -> None:
+def kill_process(tick: ProgressCallback) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def loop(tick: Tick) -> None:
+def loop_forever(tick: ProgressCallback) -> None:
     while True:
         pass
 
 
-def swell(tick: Tick) -> int:
+def exhaust_memory(tick: ProgressCallback) -> int:
     return len([bytes(2**20) for _ in range(2**11)])
 
 
-def lose_the_device(tick: Tick) -> int:
-    broken("an illegal address")
+def break_device(tick: ProgressCallback) -> int:
+    is_device_lost("an illegal address")
     return os.getpid()
 
 
-def leave_a_thread(tick: Tick) -> int:
+def start_daemon_thread(tick: ProgressCallback) -> int:
     threading.Thread(target=sleep, args=(60.0,), daemon=True).start()
     return os.getpid()
 
 
-def chat(tick: Tick) -> str:
+def flood_stderr(tick: ProgressCallback) -> str:
     """More than any pipe holds."""
     for _ in range(5000):
         print("x" * 99, file=sys.stderr)
@@ -86,7 +86,7 @@ def chat(tick: Tick) -> str:
     return "said"
 
 
-def copy(tick: Tick) -> int:
+def fork_process(tick: ProgressCallback) -> int:
     """Make a copy of the process that goes on as if it were the worker."""
     child = os.fork()
     if child:
@@ -94,15 +94,15 @@ def copy(tick: Tick) -> int:
     return os.getpid()
 
 
-def threads_after(path: Path, tick: Tick) -> int:
+def count_threads_after_recording(path: Path, tick: ProgressCallback) -> int:
     """The threads of this process after one more recording."""
-    from tests.recordings import record
+    from tests.recordings import write_recording
 
-    record(path, count=2)
+    write_recording(path, frame_count=2)
     return len(os.listdir("/proc/self/task"))
 
 
-def log_much(tick: Tick) -> float:
+def time_logging(tick: ProgressCallback) -> float:
     """Processor-light steps that write 18 kB each; the wall seconds of one."""
     began = monotonic()
     for _ in range(200):
@@ -110,7 +110,7 @@ def log_much(tick: Tick) -> float:
     return (monotonic() - began) / 200
 
 
-def leave_processes(how: str, tick: Tick) -> int:
+def start_orphans(how: str, tick: ProgressCallback) -> int:
     """Start a process that outlives this one, unless somebody ends it; its number."""
     import subprocess
 
@@ -123,12 +123,12 @@ def leave_processes(how: str, tick: Tick) -> int:
     return int(shell.stdout)
 
 
-def leave_processes_and_crash(how: str, path: Path, tick: Tick) -> None:
-    path.write_text(str(leave_processes(how, tick)))
+def start_orphans_and_crash(how: str, path: Path, tick: ProgressCallback) -> None:
+    path.write_text(str(start_orphans(how, tick)))
     ctypes.string_at(0)
 
 
-def swell_in_children(tick: Tick) -> None:
+def exhaust_memory_in_children(tick: ProgressCallback) -> None:
     """Four processes, each of them within the limit of one."""
     import subprocess
 
@@ -137,13 +137,13 @@ def swell_in_children(tick: Tick) -> None:
     children[0].wait()
 
 
-def close_all_files(tick: Tick) -> None:
+def close_file_descriptors(tick: ProgressCallback) -> None:
     os.closerange(0, 4096)
 
 
-def leave_the_folder(tick: Tick) -> None:
+def change_folder(tick: ProgressCallback) -> None:
     os.chdir("/")
 
 
-def folder(tick: Tick) -> str:
+def current_folder(tick: ProgressCallback) -> str:
     return os.getcwd()

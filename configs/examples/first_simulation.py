@@ -12,7 +12,7 @@ scene = harness.make_scene(
 )
 
 if __name__ == "__main__":
-    simulation = harness.Simulation(scene, "hybrid", tolerance=1e-6)
-    lowest = simulation.steps(30)[:, :, 1].min(axis=1)
+    simulation = harness.Simulation(scene, "hybrid", rtol=1e-6)
+    lowest = simulation.run_steps(30)[:, :, 1].min(axis=1)
     for k in range(4, 30, 5):
         print(f"after {(k + 1) / 30:.2f} s the lowest vertex is at {lowest[k]:.3f} m")

@@ -10,21 +10,21 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeFloat
 
 import harness
-from harness.base.model import Model
-from harness.scenes.effects.base import Contribution
+from harness.base.model import ConfigModel
+from harness.scenes.effects.base import EffectContribution
 from harness.scenes.mesh.base import Mesh
 
 
-class LinearDrag(Model):
+class LinearDrag(ConfigModel):
     """Drag on every vertex, in proportion to its velocity."""
 
     kind: Literal["linear-drag"] = "linear-drag"
     coefficient: NonNegativeFloat
     """The drag coefficient c [N s/m]."""
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """The drag as a force, of positions p [m], velocities v [m/s] and time t [s]."""
-        return Contribution(forces=(lambda p, v, t: -self.coefficient * v,))
+        return EffectContribution(forces=(lambda p, v, t: -self.coefficient * v,))
 
 
 if __name__ == "__main__":
@@ -32,4 +32,4 @@ if __name__ == "__main__":
     springs, gravity = {"kind": "springs", "stretch": 300.0}, {"kind": "gravity"}
     for c in (0.0, 0.5):
         scene = harness.make_scene(**fall, effects=[springs, gravity, LinearDrag(coefficient=c)])
-        print(f"c = {c}: {harness.Simulation(scene).steps(30)[-1, 0, 1]:.2f} m")
+        print(f"c = {c}: {harness.Simulation(scene).run_steps(30)[-1, 0, 1]:.2f} m")

@@ -9,15 +9,15 @@ import numpy as np
 
 import harness
 from harness.scenes.mesh.base import SHEAR, STRETCH, Mesh
-from harness.scenes.mesh.generator import Generator, Metres
-from harness.scenes.mesh.topology import assemble
+from harness.scenes.mesh.generator import LengthMetres, MeshGenerator
+from harness.scenes.mesh.topology import assemble_mesh
 
 
-class Wheel(Generator):
+class Wheel(MeshGenerator):
     """The hub, vertex 0, and `size` vertices around it; the rim is of stretch springs, the spokes of shear springs."""
 
     kind: Literal["wheel"] = "wheel"
-    radius: Metres = 1.0
+    radius: LengthMetres = 1.0
     SMALLEST: ClassVar[int] = 3
     COUNTS: ClassVar[str] = "vertices of the rim"
     SPRINGS: ClassVar[int] = 2
@@ -30,11 +30,11 @@ class Wheel(Generator):
         rest = np.zeros((size + 1, 3))
         rest[1:, :2] = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         springs = {STRETCH: np.stack([i, np.roll(i, -1)], axis=1), SHEAR: np.stack([0 * i, i], axis=1)}
-        return assemble(rest=rest, springs=springs, resolution=size, parts={"hub": [0]})
+        return assemble_mesh(rest_positions=rest, springs=springs, resolution=size, parts={"hub": [0]})
 
 
 if __name__ == "__main__":
     springs = {"kind": "springs", "stretch": 500.0, "shear": 500.0}
     effects = [springs, {"kind": "gravity"}, {"kind": "pins", "at": ["hub"]}]
     scene = harness.make_scene(mesh=Wheel(radius=0.5), effects=effects, mass=1.0, time_step=0.02, frames=20)
-    print(f"the rim sinks to {harness.Simulation(scene, size=12).steps(20)[:, :, 1].min():.3f} m")
+    print(f"the rim sinks to {harness.Simulation(scene, size=12).run_steps(20)[:, :, 1].min():.3f} m")

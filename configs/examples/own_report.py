@@ -27,8 +27,8 @@ if __name__ == "__main__":
         "sizes": [8],
         "solvers": ["sparse", "lbfgs"],
         "options": {"frames": 3, "iterations": 300, "tolerance": 1e-3, "record": False, "pictures": False, "rounds": 1},
-        "reports": [harness.OwnName("./own_report.py:iterations")],
+        "reports": [harness.UserCodeName("./own_report.py:iterations")],
     }
     here = Path(globals().get("__file__", "configs/examples/own_report.py")).parent  # a notebook is no file
-    rows = harness.run(sweep, name="own-report", folder=here)
+    rows = harness.run_config(sweep, name="own-report", folder=here)
     print(f"{len(rows)} rows, and results/own-report/iterations.png")

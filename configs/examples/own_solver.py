@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import harness
-from solvers.core.formula import Formula
+from solvers.core.formula import FixedPointSolver
 from solvers.problem import Positions
 
 
 @dataclass(frozen=True)
-class HeavyBall(Formula):
+class HeavyBall(FixedPointSolver):
     """The method and its parameter b."""
 
     momentum: float = 0.3
@@ -23,9 +23,9 @@ if __name__ == "__main__":
     sweep: harness.SweepKeys = {
         "scenes": ["../scenes/hanging-cloth.yaml"],
         "sizes": [8],
-        "solvers": ["sparse", harness.OwnName("./own_solver.py:HeavyBall")],
+        "solvers": ["sparse", harness.UserCodeName("./own_solver.py:HeavyBall")],
         "options": {"frames": 3, "iterations": 500, "tolerance": 1e-4, "record": False, "pictures": False, "rounds": 1},
     }
     here = Path(globals().get("__file__", "configs/examples/own_solver.py")).parent  # a notebook is no file
-    rows = harness.run(sweep, name="heavy-ball", folder=here)
+    rows = harness.run_config(sweep, name="heavy-ball", folder=here)
     print(rows.select(["solver", "iterations"]))

@@ -11,46 +11,46 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 
-COMPILING, WAITING, LOOK = "compiling (once)", "waiting for the machine", ""
+COMPILING, WAITING, POLL = "compiling (once)", "waiting for the machine", ""
 """POLL is no activity. It reports that time has passed and that nothing else has happened."""
 
-_BEGIN, _END = "\0begin ", "\0end "
+_BEGIN_PREFIX, _END_PREFIX = "\0begin ", "\0end "
 
-Tick = Callable[[str], None]
+ProgressCallback = Callable[[str], None]
 
 
 @contextmanager
-def aside(tick: Tick, what: str) -> Generator[None]:
+def report_activity(tick: ProgressCallback, activity: str) -> Generator[None]:
     """Report an activity that is not a step while the block runs.
 
     Args:
         tick: progress callback.
         activity: description, such as COMPILING or WAITING.
     """
-    tick(_BEGIN + what)
+    tick(_BEGIN_PREFIX + activity)
     try:
         yield
     finally:
-        tick(_END + what)
+        tick(_END_PREFIX + activity)
 
 
-def begun(said: str) -> str | None:
+def parse_activity_start(message: str) -> str | None:
     """Return the activity that a message starts, or None for any other message."""
-    return said.removeprefix(_BEGIN) if said.startswith(_BEGIN) else None
+    return message.removeprefix(_BEGIN_PREFIX) if message.startswith(_BEGIN_PREFIX) else None
 
 
-def ended(said: str) -> str | None:
+def parse_activity_end(message: str) -> str | None:
     """Return the activity that a message ends, or None for any other message."""
-    return said.removeprefix(_END) if said.startswith(_END) else None
+    return message.removeprefix(_END_PREFIX) if message.startswith(_END_PREFIX) else None
 
 
-def is_step(said: str) -> bool:
+def is_step_event(message: str) -> bool:
     """Return whether a message reports a step, by the name of its phase."""
-    return said != LOOK and not said.startswith("\0")
+    return message != POLL and not message.startswith("\0")
 
 
 @contextmanager
-def compiling_told(tick: Tick) -> Generator[None]:
+def report_compilation(tick: ProgressCallback) -> Generator[None]:
     """Report the compilation of kernels inside the block.
 
     Kernels loaded from the cache are not reported.
@@ -62,13 +62,13 @@ def compiling_told(tick: Tick) -> Generator[None]:
 
         def on_start(self, event: object) -> None:
             if self.depth == 0:
-                tick(_BEGIN + COMPILING)
+                tick(_BEGIN_PREFIX + COMPILING)
             self.depth += 1
 
         def on_end(self, event: object) -> None:
             self.depth -= 1
             if self.depth == 0:
-                tick(_END + COMPILING)
+                tick(_END_PREFIX + COMPILING)
 
     with event.install_listener("numba:compile", Watch()):
         yield

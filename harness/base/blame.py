@@ -10,7 +10,7 @@ from pathlib import Path
 from solvers import sources
 
 
-def said(error: BaseException) -> str:
+def format_error(error: BaseException) -> str:
     """Format the type and the message of an error in one line.
 
     The message has at most 300 characters. An exception of user code may fail to produce its message; a placeholder
@@ -23,7 +23,7 @@ def said(error: BaseException) -> str:
     return f"{type(error).__name__}{f': {words}' if words else ''}"
 
 
-def where(error: BaseException, own: Collection[str]) -> str:
+def locate_error(error: BaseException, user_files: Collection[str]) -> str:
     """Return `file:line` of an error.
 
     The line is the last one in user_files, else the last one in any user code, else the last one. The line that raised
@@ -35,13 +35,13 @@ def where(error: BaseException, own: Collection[str]) -> str:
     Returns: the location, such as `mine.py:12, raised in core.py:40`.
     """
     frames = [(frame.filename, frame.lineno or 0) for frame in traceback.extract_tb(error.__traceback__)]
-    theirs = [frame for frame in frames if not sources.known(frame[0])]
-    blamed = [frame for frame in frames if frame[0] in own] or theirs or frames
+    theirs = [frame for frame in frames if not sources.is_known_source(frame[0])]
+    blamed = [frame for frame in frames if frame[0] in user_files] or theirs or frames
     told = [f"{Path(file).name}:{line}" for file, line in dict.fromkeys((blamed[-1], frames[-1]))]
     return ", raised in ".join(told)
 
 
-def place(dump: str) -> str:
+def parse_fault_location(dump: str) -> str:
     """Return `file:line in function` from a dump of `faulthandler`.
 
     The dump lists the innermost frame first. The first frame in user code is preferred, else the first frame is used.
@@ -51,5 +51,5 @@ def place(dump: str) -> str:
     frames = re.findall(r'File "(.+?)", line (\d+) in (\S+)', dump)
     if not frames:
         return ""
-    file, line, function = next((frame for frame in frames if not sources.known(frame[0])), frames[0])
+    file, line, function = next((frame for frame in frames if not sources.is_known_source(frame[0])), frames[0])
     return f"{Path(file).name}:{line} in {function}"

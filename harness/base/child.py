@@ -23,28 +23,28 @@ from typing import Any, BinaryIO
 
 from harness.base.errors import InputError
 
-_PATIENCE = 10.0
+_TIMEOUT_FACTOR = 10.0
 """Wall seconds allowed per second of processor time, because other processes may occupy the cores."""
 
-_LENGTH = struct.Struct("<Q")
+_LENGTH_HEADER = struct.Struct("<Q")
 
 
 @dataclass(frozen=True, slots=True)
-class Allowance:
+class CallLimits:
     """Limits of one call: processor time [s] and additional memory [bytes]."""
 
-    seconds: float
-    bytes: int
+    cpu_seconds: float
+    memory_bytes: int
 
 
-class NoAnswer(Exception):
+class SandboxError(Exception):
     """The subprocess returned no result.
 
     The message gives the reason as the end of a sentence.
     """
 
 
-def call(function: Callable[..., Any], *arguments: Any, limits: Allowance) -> Any:
+def call_in_sandbox(function: Callable[..., Any], *arguments: Any, limits: CallLimits) -> Any:
     """Call a module-level function in the sandbox, within limits.
 
     Args:
@@ -56,30 +56,30 @@ def call(function: Callable[..., Any], *arguments: Any, limits: Allowance) -> An
         InputError: if the function raises it.
         SandboxError: if the function raises anything else, exceeds a limit, or crashes.
     """
-    child = _Child.running()
+    child = _SandboxProcess.get_running()
     try:
-        child.send((os.getcwd(), function, arguments, limits))
-        kind, answer = child.receive(_PATIENCE * limits.seconds)
+        child.send_message((os.getcwd(), function, arguments, limits))
+        kind, answer = child.receive_message(_TIMEOUT_FACTOR * limits.cpu_seconds)
     except (EOFError, OSError):
-        raise NoAnswer(_why(child.end(), limits)) from None
+        raise SandboxError(_describe_exit(child.stop_process(), limits)) from None
     if kind == "mistakes":
         raise InputError(answer)
     if kind == "error":
-        raise NoAnswer(answer)
+        raise SandboxError(answer)
     return answer
 
 
-def _why(code: int, limits: Allowance) -> str:
+def _describe_exit(code: int, limits: CallLimits) -> str:
     if code in (-signal.SIGXCPU, -signal.SIGKILL):
-        return f"reading it takes more than {limits.seconds:.3g} s"
+        return f"reading it takes more than {limits.cpu_seconds:.3g} s"
     name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
     return f"the library that reads it crashed ({name})"
 
 
-class _Child:
+class _SandboxProcess:
     """A running subprocess that serves calls."""
 
-    _one: _Child | None = None
+    _instance: _SandboxProcess | None = None
 
     def __init__(self) -> None:
         paths = [path or os.getcwd() for path in sys.path]
@@ -95,24 +95,24 @@ class _Child:
         )
 
     @classmethod
-    def running(cls) -> _Child:
+    def get_running(cls) -> _SandboxProcess:
         """Return the subprocess of this process; a fork starts its own."""
-        one = cls._one
+        one = cls._instance
         if one is None or one._owner != os.getpid() or one._process.poll() is not None:
-            one = cls._one = cls()
-            atexit.register(one.end)
+            one = cls._instance = cls()
+            atexit.register(one.stop_process)
         return one
 
     @classmethod
-    def of_this_process(cls) -> int:
+    def current_pid(cls) -> int:
         """Return the id of the subprocess, or 0 if none was started here."""
-        return cls._one._process.pid if cls._one and cls._one._owner == os.getpid() else 0
+        return cls._instance._process.pid if cls._instance and cls._instance._owner == os.getpid() else 0
 
-    def send(self, message: Any) -> None:
+    def send_message(self, message: Any) -> None:
         assert self._process.stdin
-        _write(self._process.stdin, message)
+        _write_message(self._process.stdin, message)
 
-    def receive(self, seconds: float) -> Any:
+    def receive_message(self, seconds: float) -> Any:
         """Receive the next message.
 
         The subprocess is killed after the given number of seconds.
@@ -124,11 +124,11 @@ class _Child:
         timer = Timer(seconds, self._process.kill)
         timer.start()
         try:
-            return _read(self._process.stdout)
+            return _read_message(self._process.stdout)
         finally:
             timer.cancel()
 
-    def end(self) -> int:
+    def stop_process(self) -> int:
         """Stop the subprocess if needed, and return its exit code, negative for a signal."""
         if self._owner != os.getpid():
             return 0
@@ -143,61 +143,63 @@ class _Child:
             return self._process.wait()
 
 
-def _write(pipe: BinaryIO | Any, message: Any) -> None:
+def _write_message(pipe: BinaryIO | Any, message: Any) -> None:
     content = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
-    pipe.write(_LENGTH.pack(len(content)))
+    pipe.write(_LENGTH_HEADER.pack(len(content)))
     pipe.write(content)
     pipe.flush()
 
 
-def _read(pipe: BinaryIO | Any) -> Any:
-    head = pipe.read(_LENGTH.size)
-    if len(head) < _LENGTH.size:
+def _read_message(pipe: BinaryIO | Any) -> Any:
+    head = pipe.read(_LENGTH_HEADER.size)
+    if len(head) < _LENGTH_HEADER.size:
         raise EOFError
-    content = pipe.read(_LENGTH.unpack(head)[0])
+    content = pipe.read(_LENGTH_HEADER.unpack(head)[0])
     return pickle.loads(content)
 
 
-def serve() -> None:
+def serve_calls() -> None:
     """Serve calls until the pipe is closed; this is the main loop of the subprocess.
 
     Output that the called functions print is discarded.
     """
-    without_core_dumps()
+    disable_core_dumps()
     calls, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     nowhere = os.open(os.devnull, os.O_RDWR)
     for standard in range(3):
         os.dup2(nowhere, standard)
     while True:
         try:
-            here, function, arguments, limits = _read(calls)  # which imports the function's module, without limits
+            here, function, arguments, limits = _read_message(
+                calls
+            )  # which imports the function's module, without limits
         except (EOFError, KeyboardInterrupt):
             return
         with suppress(OSError):  # relative paths mean what they mean to the caller
             os.chdir(here)
-        _write(answers, _answer(function, arguments, limits))
+        _write_message(answers, _run_call(function, arguments, limits))
 
 
-def _answer(function: Callable[..., Any], arguments: tuple[Any, ...], limits: Allowance) -> tuple[str, Any]:
+def _run_call(function: Callable[..., Any], arguments: tuple[Any, ...], limits: CallLimits) -> tuple[str, Any]:
     used = resource.getrusage(resource.RUSAGE_SELF)
-    limit(resource.RLIMIT_CPU, used.ru_utime + used.ru_stime + limits.seconds)
-    limit(resource.RLIMIT_DATA, data() + limits.bytes)
+    set_soft_limit(resource.RLIMIT_CPU, used.ru_utime + used.ru_stime + limits.cpu_seconds)
+    set_soft_limit(resource.RLIMIT_DATA, read_data_bytes() + limits.memory_bytes)
     try:
         return "answer", function(*arguments)
     except InputError as error:
         return "mistakes", error.mistakes
     except MemoryError:
-        return "error", f"reading it takes more than {limits.bytes / 2**30:.1f} GiB of memory"
+        return "error", f"reading it takes more than {limits.memory_bytes / 2**30:.1f} GiB of memory"
     except BaseException as error:  # readers raise anything on a broken file; so do panics of compiled libraries
         said = " ".join(str(error).split())[:300]
         return "error", said or type(error).__name__
     finally:
         for what in (resource.RLIMIT_CPU, resource.RLIMIT_DATA):
-            limit(what, resource.RLIM_INFINITY)
+            set_soft_limit(what, resource.RLIM_INFINITY)
 
 
 @contextmanager
-def memory_limited(bytes: int) -> Generator[None]:
+def limit_memory(memory_bytes: int) -> Generator[None]:
     """Limit the additional memory of this process inside the block.
 
     A larger allocation raises MemoryError, or the error of a library.
@@ -206,25 +208,25 @@ def memory_limited(bytes: int) -> Generator[None]:
         memory_bytes: allowed bytes beyond those in use now.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    wanted = data() + bytes
-    limit(resource.RLIMIT_DATA, wanted if soft == resource.RLIM_INFINITY else min(wanted, soft))
+    wanted = read_data_bytes() + memory_bytes
+    set_soft_limit(resource.RLIMIT_DATA, wanted if soft == resource.RLIM_INFINITY else min(wanted, soft))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
 
-def reader() -> int:
+def get_sandbox_pid() -> int:
     """Return the process id of this process's sandbox, or 0 without one."""
-    return _Child.of_this_process()
+    return _SandboxProcess.current_pid()
 
 
-def without_core_dumps() -> None:
+def disable_core_dumps() -> None:
     """Disable core dumps of this process and its children."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def limit(what: int, value: float) -> None:
+def set_soft_limit(resource_id: int, value: float) -> None:
     """Set a soft resource limit and leave the hard limit unchanged.
 
     The next call can therefore use another value.
@@ -233,12 +235,12 @@ def limit(what: int, value: float) -> None:
         resource_id: constant `resource.RLIMIT_*`.
         value: limit in the unit of the resource, or RLIM_INFINITY.
     """
-    hard = resource.getrlimit(what)[1]
+    hard = resource.getrlimit(resource_id)[1]
     soft = int(value) if value != resource.RLIM_INFINITY else hard
-    resource.setrlimit(what, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
+    resource.setrlimit(resource_id, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
 
 
-def data() -> int:
+def read_data_bytes() -> int:
     """Return the data size of this process [bytes], or 0 if unavailable.
 
     RLIMIT_DATA limits this size.

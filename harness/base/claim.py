@@ -11,32 +11,32 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from harness.base.errors import InputError, Mistake
-from harness.base.files import replacing
+from harness.base.errors import InputError, InputMistake
+from harness.base.files import atomic_write
 
-NAME = ".config"
+OWNER_FILE = ".config"
 
 
-_LONGEST = 4096
+_MAX_PATH_BYTES = 4096
 """Maximum length of a config path [bytes]; no path is longer."""
 
 
-def config_of(folder: Path) -> Path | None:
+def read_owner(folder: Path) -> Path | None:
     """Return the config that owns a folder, or None if it cannot be found.
 
     All symbolic links of the path are resolved.
     """
-    note = folder / NAME
+    note = folder / OWNER_FILE
     with suppress(OSError, ValueError):  # what a folder from elsewhere says may be no path at all
         if note.is_file():
             with note.open("rb") as file:
-                said = os.fsdecode(file.read(_LONGEST).strip())
+                said = os.fsdecode(file.read(_MAX_PATH_BYTES).strip())
             if said and (folder / said).is_file():
                 return (folder / said).resolve()
     return None
 
 
-def claimed(folder: Path, config: Path) -> Path:
+def claim_folder(folder: Path, config: Path) -> Path:
     """Create the results folder of a config if needed, and record its owner.
 
     Args:
@@ -47,10 +47,10 @@ def claimed(folder: Path, config: Path) -> Path:
         InputError: if the folder belongs to another config.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    owner = config_of(folder)
+    owner = read_owner(folder)
     if owner and not owner.samefile(config):
         raise InputError(
-            Mistake(
+            InputMistake(
                 f"holds the results of another file of this name, {owner}; rename one of the two, or choose another "
                 "folder with --results",
                 folder,
@@ -58,6 +58,6 @@ def claimed(folder: Path, config: Path) -> Path:
         )
     if owner != config.resolve():
         way = os.path.relpath(config.resolve(), folder.resolve())
-        with replacing(folder / NAME) as partial:
+        with atomic_write(folder / OWNER_FILE) as partial:
             partial.write_bytes(os.fsencode(way) + b"\n")
     return folder

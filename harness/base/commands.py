@@ -11,51 +11,53 @@ import typer
 from typer.core import TyperGroup
 
 from harness.base import places
-from harness.base.console import say, show_log
+from harness.base.console import enable_logging, print_message
 from harness.base.errors import SpringbenchError
-from harness.base.files import MISTAKES, told
+from harness.base.files import USER_ERRNOS, describe_os_error
 
-_RESULTS: Any = {
-    "parser": places.parse,
+_RESULTS_SETTINGS: Any = {
+    "parser": places.parse_location,
     "metavar": "PATH|URL",
     "help": "The folder that holds a folder for each sweep.",
 }
-Results = Annotated[Path, typer.Option(callback=places.everything, **_RESULTS)]
-Rows = Annotated[Path, typer.Option(callback=places.rows_alone, **_RESULTS)]
-Again = Annotated[bool, typer.Option("--again", help="Do all, also what is there.")]
-Changed = Annotated[bool, typer.Option("--changed", help="Do also what is there by other code than today's.")]
-InThisProcess = Annotated[
+ResultsOption = Annotated[Path, typer.Option(callback=places.sync_results, **_RESULTS_SETTINGS)]
+RowsOption = Annotated[Path, typer.Option(callback=places.fetch_rows, **_RESULTS_SETTINGS)]
+RerunOption = Annotated[bool, typer.Option("--again", help="Do all, also what is there.")]
+RerunStaleOption = Annotated[bool, typer.Option("--changed", help="Do also what is there by other code than today's.")]
+InProcessOption = Annotated[
     bool, typer.Option("--here", help="Do all in this process, without limits, as a debugger wants it.")
 ]
-Error = Annotated[
+ErrorOption = Annotated[
     float | None,
     typer.Option(help="For a scene: the error wanted at its end, relative to the displacement; how, is chosen."),
 ]
-Horizon = Annotated[float | None, typer.Option(help="With --error: simulated seconds; all frames if left out.")]
-Check = Annotated[bool, typer.Option("--check", help="With --error: let the reference grade it.")]
-Peers = Annotated[bool, typer.Option("--peers", help="With --error: time other libraries' integrators beside it.")]
+EndTimeOption = Annotated[float | None, typer.Option(help="With --error: simulated seconds; all frames if left out.")]
+VerifyOption = Annotated[bool, typer.Option("--check", help="With --error: let the reference grade it.")]
+CompareOption = Annotated[
+    bool, typer.Option("--peers", help="With --error: time other libraries' integrators beside it.")
+]
 
 
-class Commands(TyperGroup):
+class ErrorReportingGroup(TyperGroup):
     """Command group that reports expected errors as a message and an exit code.
 
     These are the project's own errors and those of the system.
     """
 
     def invoke(self, ctx: Any) -> Any:
-        show_log()
+        enable_logging()
         try:
             return super().invoke(ctx)
         except SpringbenchError as error:
             for mistake in getattr(error, "mistakes", (error,)):
-                say(f"springbench: {mistake}")
+                print_message(f"springbench: {mistake}")
             raise typer.Exit(error.exit_code) from error
         except BrokenPipeError:  # whoever read the answer has read enough
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(1) from None
         except OSError as error:
-            say(f"springbench: {told(error)}")
-            raise typer.Exit(2 if error.errno in MISTAKES else 1) from error
+            print_message(f"springbench: {describe_os_error(error)}")
+            raise typer.Exit(2 if error.errno in USER_ERRNOS else 1) from error
         except MemoryError as error:
-            say("springbench: there is not enough memory for this; take a smaller mesh")
+            print_message("springbench: there is not enough memory for this; take a smaller mesh")
             raise typer.Exit(1) from error

@@ -14,34 +14,34 @@ if TYPE_CHECKING:
     from rich.console import Console, Group
     from rich.table import Column, Table
 
-_LONGEST = 4_000
+_MAX_LINE_LENGTH = 4_000
 """Maximum number of characters of a line; names in untrusted files may have millions."""
-WIDTH = 100
+CONSOLE_WIDTH = 100
 """Maximum width of the project's own tables, in columns."""
-_PIPE = 240
+_PIPE_WIDTH = 240
 """Width of a pipe or a file, in columns. Neither has a width of its own, and no cell should be truncated there."""
 
 
 @cache
-def out() -> Console:
+def get_output_console() -> Console:
     """Return the console of standard output."""
     from rich.console import Console
 
     made = Console()
     if not made.is_terminal:
-        made.width = _PIPE
+        made.width = _PIPE_WIDTH
     return made
 
 
 @cache
-def err() -> Console:
+def get_error_console() -> Console:
     """Return the console of standard error."""
     from rich.console import Console
 
     return Console(stderr=True)
 
 
-def narrow(table: Table, beside: int = 1, width: int = WIDTH) -> Group:
+def split_wide_table(table: Table, key_columns: int = 1, width: int = CONSOLE_WIDTH) -> Group:
     """Split a table into parts of at most `width` characters.
 
     Each part repeats the first key_columns columns and adds as many others as fit. Columns without values are omitted.
@@ -58,16 +58,16 @@ def narrow(table: Table, beside: int = 1, width: int = WIDTH) -> Group:
     from rich.measure import Measurement
     from rich.text import Text
 
-    first, wide = table.columns[:beside], Console(width=1000)
+    first, wide = table.columns[:key_columns], Console(width=1000)
     groups: list[list[Column]] = [[]]
-    for column in table.columns[beside:]:
+    for column in table.columns[key_columns:]:
         if table.row_count and all(cell in ("", "–") for cell in column.cells):
             continue
-        natural = Measurement.get(wide, wide.options, _with(table, [*first, *groups[-1], column])).maximum
+        natural = Measurement.get(wide, wide.options, _select_columns(table, [*first, *groups[-1], column])).maximum
         if groups[-1] and natural > width:
             groups.append([])
         groups[-1].append(column)
-    parts = [_with(table, [*first, *group]) for group in groups]
+    parts = [_select_columns(table, [*first, *group]) for group in groups]
     for part in parts:
         part.width = min(Measurement.get(wide, wide.options, part).maximum, width)
     parts[0].title = table.title
@@ -75,7 +75,7 @@ def narrow(table: Table, beside: int = 1, width: int = WIDTH) -> Group:
     return Group(*parts, *([Constrain(words, width)] if words else []))
 
 
-def _with(table: Table, columns: Sequence[Column]) -> Table:
+def _select_columns(table: Table, columns: Sequence[Column]) -> Table:
     """Return a table with the given columns only, without title and caption."""
     from rich.table import Table
 
@@ -90,7 +90,7 @@ def _with(table: Table, columns: Sequence[Column]) -> Table:
     return part
 
 
-def aligned(lines: Sequence[Sequence[str]]) -> Iterator[str]:
+def format_plain_table(lines: Sequence[Sequence[str]]) -> Iterator[str]:
     """Format lines of cells as a plain table whose first line has the headings.
 
     It is for tables of many thousand lines, of which Rich lays out a thousand per second.
@@ -102,43 +102,43 @@ def aligned(lines: Sequence[Sequence[str]]) -> Iterator[str]:
             yield "  ".join("-" * width for width in widths)
 
 
-def say(line: str) -> None:
+def print_message(line: str) -> None:
     """Print one line to standard error without markup, truncated to 4000 characters."""
     from rich.markup import escape
 
-    err().print(
-        escape(line if len(line) <= _LONGEST else line[:_LONGEST] + " ..."),
+    get_error_console().print(
+        escape(line if len(line) <= _MAX_LINE_LENGTH else line[:_MAX_LINE_LENGTH] + " ..."),
         highlight=False,
         emoji=False,
         soft_wrap=True,
     )
 
 
-def show_log() -> None:
+def enable_logging() -> None:
     """Print the log messages of the project, such as omitted effects, each message once."""
     log = logging.getLogger("springbench")
     if not log.handlers:
-        handler = _Saying()
-        handler.addFilter(_Once())
+        handler = _PrintHandler()
+        handler.addFilter(_DuplicateFilter())
         log.addHandler(handler)
         log.setLevel(logging.INFO)
 
 
-def write_plainly() -> None:
+def reset_error_console() -> None:
     """In a forked process, write to its own standard error with the parent's console width."""
-    width = err().width
-    err.cache_clear()
-    err().width = width
+    width = get_error_console().width
+    get_error_console.cache_clear()
+    get_error_console().width = width
 
 
-class _Saying(logging.Handler):
+class _PrintHandler(logging.Handler):
     """Prints each log message."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        say(record.getMessage())
+        print_message(record.getMessage())
 
 
-class _Once(logging.Filter):
+class _DuplicateFilter(logging.Filter):
     """Drops repeated log messages, because a command builds a scene several times."""
 
     def __init__(self) -> None:

@@ -13,46 +13,46 @@ from itertools import chain
 from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple
 
-from harness.base.workers import Going, Limits, Lost, Piece, Tick, Workers
+from harness.base.workers import IsolatedWorker, ProgressCallback, RunningTask, TaskFailure, TaskFunction, TaskLimits
 
-_LOOK = 0.1
+_POLL_INTERVAL = 0.1
 """Seconds between two polls of busy workers."""
 
 
-class Task(NamedTuple):
+class PoolTask(NamedTuple):
     """One task: function, progress callback, limits, group, and the user code that it runs."""
 
-    piece: Piece
-    tick: Tick
-    limits: Limits
+    function: TaskFunction
+    tick: ProgressCallback
+    limits: TaskLimits
     group: Hashable = None
-    own: frozenset[Hashable] = frozenset()
+    user_code: frozenset[Hashable] = frozenset()
 
 
-Start = Callable[[int], Task | None]
+TaskFactory = Callable[[int], PoolTask | None]
 """Create the task of a given index; None if it is finished already or runs elsewhere."""
 
 
 @dataclass
-class _Member:
-    workers: Workers
+class _PoolWorker:
+    workers: IsolatedWorker
     group: Hashable = None
     number: int = -1
-    going: Going | None = None
+    running_task: RunningTask | None = None
 
-    def end(self) -> None:
+    def stop_worker(self) -> None:
         """Stop the running task and the worker."""
-        if self.going:
-            self.going.close()
-        self.workers.end()
+        if self.running_task:
+            self.running_task.close()
+        self.workers.stop_worker()
 
 
-def done_by(
-    members: int,
-    ready: Callable[[], object],
+def run_tasks(
+    num_workers: int,
+    initialiser: Callable[[], object],
     groups: Iterable[Hashable],
-    start: Start,
-    meanwhile: Callable[[], object] | None = None,
+    create_task: TaskFactory,
+    background_call: Callable[[], object] | None = None,
 ) -> Iterator[tuple[int, Any]]:
     """Run tasks in a pool of workers and yield each result as it is completed.
 
@@ -70,39 +70,41 @@ def done_by(
     """
     left = dict(enumerate(groups))
     with ExitStack() as cleanup:
-        crew = [_Member(Workers(ready)) for _ in range(min(members, len(left)))]
+        crew = [_PoolWorker(IsolatedWorker(initialiser)) for _ in range(min(num_workers, len(left)))]
         for member in crew:
-            cleanup.callback(member.end)
+            cleanup.callback(member.stop_worker)
         while True:
             for member in crew:
-                while member.going is None and left:
-                    number = _next(left, member, [other.group for other in crew if other is not member])
+                while member.running_task is None and left:
+                    number = _select_task(left, member, [other.group for other in crew if other is not member])
                     member.number, member.group = number, left.pop(number)
-                    if task := start(number):
-                        member.going = member.workers.doing(task.piece, task.tick, task.limits, task.own)
-            going = [member for member in crew if member.going]
+                    if task := create_task(number):
+                        member.running_task = member.workers.start_task(
+                            task.function, task.tick, task.limits, task.user_code
+                        )
+            going = [member for member in crew if member.running_task]
             if not going:
                 return
             pipes = list[Connection]()
             for member in going:
-                assert member.going
+                assert member.running_task
                 try:
-                    pipes.append(next(member.going))
+                    pipes.append(next(member.running_task))
                     continue
                 except StopIteration as done:
                     outcome = done.value
-                except Lost as lost:
+                except TaskFailure as lost:
                     outcome = lost
-                member.going = None
+                member.running_task = None
                 yield member.number, outcome
-            if meanwhile:
-                meanwhile()
-                meanwhile = None
+            if background_call:
+                background_call()
+                background_call = None
             elif len(pipes) == len(going):
-                wait(pipes, _LOOK)
+                wait(pipes, _POLL_INTERVAL)
 
 
-def _next(left: dict[int, Hashable], member: _Member, others: list[Hashable]) -> int:
+def _select_task(left: dict[int, Hashable], member: _PoolWorker, others: list[Hashable]) -> int:
     """Select the next task for a worker.
 
     A task of the worker's own group comes first, then one of a group that no other worker runs, then any.

@@ -19,7 +19,7 @@ class RunFailed(SpringbenchError):
 
 
 @dataclass(frozen=True, slots=True)
-class Mistake:
+class InputMistake:
     """One mistake in an input: its problem with a remedy, file, line and key."""
 
     problem: str
@@ -37,14 +37,14 @@ class InputError(SpringbenchError):
 
     exit_code = 2
 
-    def __init__(self, mistakes: Mistake | str | Sequence[Mistake]) -> None:
+    def __init__(self, mistakes: InputMistake | str | Sequence[InputMistake]) -> None:
         if isinstance(mistakes, str):
-            mistakes = Mistake(mistakes)
-        self.mistakes: tuple[Mistake, ...] = (mistakes,) if isinstance(mistakes, Mistake) else tuple(mistakes)
+            mistakes = InputMistake(mistakes)
+        self.mistakes: tuple[InputMistake, ...] = (mistakes,) if isinstance(mistakes, InputMistake) else tuple(mistakes)
         super().__init__("\n".join(map(str, self.mistakes)))
 
 
-def did_you_mean(came: object, allowed: Iterable[str]) -> str:
+def suggest_name(came: object, allowed: Iterable[str]) -> str:
     """Format the allowed names, and the closest one as a suggestion for a typo.
 
     Args:

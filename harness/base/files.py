@@ -11,49 +11,49 @@ from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
 
-from harness.base.errors import InputError, Mistake, SpringbenchError
+from harness.base.errors import InputError, InputMistake, SpringbenchError
 
 
-class CannotWrite(SpringbenchError):
+class WriteError(SpringbenchError):
     """A file cannot be written, for example because the disk is full.
 
     The run itself is valid and may be repeated.
     """
 
 
-_STEM = 100
+_MAX_STEM_LENGTH = 100
 """Maximum length of the stem in a temporary name, which the file system limits."""
 
 
-def partial_name(path: Path) -> Path:
+def partial_path(path: Path) -> Path:
     """Return the temporary name of a file while this process writes it."""
-    return path.with_name(f".{path.stem[:_STEM]}.{os.getpid()}.partial{path.suffix}")
+    return path.with_name(f".{path.stem[:_MAX_STEM_LENGTH]}.{os.getpid()}.partial{path.suffix}")
 
 
-def half_written(path: Path) -> Iterator[Path]:
+def find_partial_files(path: Path) -> Iterator[Path]:
     """Find incomplete temporary files of a path, left by any process."""
-    return path.parent.glob(f".{escape(path.stem[:_STEM])}.*.partial{path.suffix}")
+    return path.parent.glob(f".{escape(path.stem[:_MAX_STEM_LENGTH])}.*.partial{path.suffix}")
 
 
 @contextmanager
-def replacing(path: Path) -> Generator[Path]:
+def atomic_write(path: Path) -> Generator[Path]:
     """Yield a temporary path that replaces the file on success and is removed on failure.
 
     Raises:
         WriteError: for an OSError inside the block.
     """
-    partial = partial_name(path)
+    partial = partial_path(path)
     try:
         yield partial
         os.replace(partial, path)
     except OSError as error:
-        raise cannot_write(path, error) from error
+        raise build_write_error(path, error) from error
     finally:
         with suppress(OSError):  # a folder that is gone tells its own tale
             partial.unlink(missing_ok=True)
 
 
-def open_lock(path: Path, access: int = os.O_RDWR, *, otherwise: str = "") -> int:
+def open_lock_file(path: Path, access: int = os.O_RDWR, *, hint: str = "") -> int:
     """Open a lock file and create it if it is missing.
 
     Symbolic links are not followed, and the call does not block.
@@ -75,22 +75,26 @@ def open_lock(path: Path, access: int = os.O_RDWR, *, otherwise: str = "") -> in
                 os.close(os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o644))
             lock = os.open(path, flags)
     except OSError as error:
-        if not os.path.lexists(path) or error.errno not in _IN_THE_WAY:
+        if not os.path.lexists(path) or error.errno not in _BLOCKING_ERRNOS:
             raise
         mode = os.lstat(path).st_mode
-        what = f"cannot be opened ({reason(error)})" if stat.S_ISREG(mode) else f"is {_kind(mode)}"
-        raise InputError(Mistake(f"{what}; wanted a plain file to lock: remove it{otherwise}", path)) from error
+        what = (
+            f"cannot be opened ({describe_cause(error)})" if stat.S_ISREG(mode) else f"is {_describe_file_type(mode)}"
+        )
+        raise InputError(InputMistake(f"{what}; wanted a plain file to lock: remove it{hint}", path)) from error
     mode = os.fstat(lock).st_mode
     if not stat.S_ISREG(mode):
         os.close(lock)
-        raise InputError(Mistake(f"is {_kind(mode)}; wanted a plain file to lock: remove it{otherwise}", path))
+        raise InputError(
+            InputMistake(f"is {_describe_file_type(mode)}; wanted a plain file to lock: remove it{hint}", path)
+        )
     return lock
 
 
-_IN_THE_WAY = {errno.EACCES, errno.EPERM, errno.EISDIR, errno.ELOOP, errno.ENXIO, errno.ENODEV, errno.EOPNOTSUPP}
+_BLOCKING_ERRNOS = {errno.EACCES, errno.EPERM, errno.EISDIR, errno.ELOOP, errno.ENXIO, errno.ENODEV, errno.EOPNOTSUPP}
 
 
-def _kind(mode: int) -> str:
+def _describe_file_type(mode: int) -> str:
     """Describe the type of a file that is not a regular file."""
     kinds = {stat.S_IFIFO: "a pipe", stat.S_IFLNK: "a link", stat.S_IFDIR: "a folder", stat.S_IFSOCK: "a socket"}
     return kinds.get(stat.S_IFMT(mode), "a device")
@@ -102,35 +106,35 @@ def is_file_name(text: str) -> bool:
     return 0 < size <= 240 and "/" not in text and "\0" not in text and text not in (".", "..")
 
 
-def safe_name(text: str) -> str:
+def sanitise_name(text: str) -> str:
     """Convert a text to a safe file name of letters, digits, `.`, `_` and `-`."""
     return re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._")[:200] or "_"
 
 
-def users_cache(name: str) -> Path:
+def user_cache_dir(name: str) -> Path:
     """Return the user's cache folder for one kind of file; it may not exist."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "springbench" / name
 
 
-MISTAKES = {
+USER_ERRNOS = {
     *(errno.EACCES, errno.EEXIST, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENODEV, errno.ENOENT),
     *(errno.ENOTDIR, errno.ENXIO, errno.EOPNOTSUPP, errno.EPERM, errno.EROFS),
 }
 """Error numbers that indicate a mistake of the user in a path."""
 
 
-def told(error: OSError) -> str:
+def describe_os_error(error: OSError) -> str:
     """Describe a system error as a message with its file and cause."""
     names = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
-    return f"{names or 'a file'}: {reason(error)}"
+    return f"{names or 'a file'}: {describe_cause(error)}"
 
 
-def cannot_write(path: Path, error: Exception) -> CannotWrite:
+def build_write_error(path: Path, error: Exception) -> WriteError:
     """Build the error for a file that cannot be written."""
-    return CannotWrite(f"{path}: cannot be written: {reason(error)}")
+    return WriteError(f"{path}: cannot be written: {describe_cause(error)}")
 
 
-def reason(error: Exception) -> str:
+def describe_cause(error: Exception) -> str:
     """Describe the cause of an error.
 
     The system's words are used if possible, such as `No space left on device`, else the error's own.
@@ -139,11 +143,11 @@ def reason(error: Exception) -> str:
     return os.strerror(number) if number else " ".join(str(error).split()) or type(error).__name__
 
 
-HEAD = 1024
+HEAD_BYTES = 1024
 """Number of leading bytes that `describe_misnamed_file` examines."""
 
 
-def misnamed(head: bytes, size: int) -> str:
+def describe_misnamed_file(head: bytes, size: int) -> str:
     """Describe a file that has the name of a data file but other content.
 
     Args:

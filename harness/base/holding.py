@@ -14,36 +14,36 @@ from pathlib import Path
 from time import monotonic, sleep
 
 from harness.base.errors import InputError
-from harness.base.files import open_lock
+from harness.base.files import open_lock_file
 
-DONE, TAKEN = "was done by another command", "is left to another command"
+DONE_ELSEWHERE, CLAIMED_ELSEWHERE = "was done by another command", "is left to another command"
 
-_PATIENCE = 5.0
+_LOCK_TIMEOUT = 5.0
 """Seconds that the first or the last process may take to clean up."""
 
-_LOOK = 0.2
+_POLL_INTERVAL = 0.2
 """Seconds between two polls of other processes' results."""
 
 
 @contextmanager
-def alone(folder: Path) -> Generator[None]:
+def lock_folder_exclusive(folder: Path) -> Generator[None]:
     """Lock a results folder exclusively, and remove incomplete files before and after.
 
     Raises:
         InputError: if another process has locked the folder.
     """
-    with _opened(folder) as lock:
-        if not _locked(lock, fcntl.LOCK_EX):
+    with _open_folder_lock(folder) as lock:
+        if not _try_lock(lock, fcntl.LOCK_EX):
             raise InputError(f"{folder}: another springbench is running this sweep; wait for it or stop it")
-        _remove_partial(folder)
+        _remove_partial_files(folder)
         try:
             yield
         finally:
-            _remove_partial(folder)  # of workers that were ended
+            _remove_partial_files(folder)  # of workers that were ended
 
 
 @contextmanager
-def together(folder: Path) -> Generator[None]:
+def lock_folder_shared(folder: Path) -> Generator[None]:
     """Lock a results folder together with other processes.
 
     The first and the last process remove incomplete files.
@@ -51,61 +51,61 @@ def together(folder: Path) -> Generator[None]:
     Raises:
         InputError: if one process has locked the folder exclusively.
     """
-    with _opened(folder) as lock:
-        until = monotonic() + _PATIENCE
-        while not (first := _locked(lock, fcntl.LOCK_EX)) and not _locked(lock, fcntl.LOCK_SH):
+    with _open_folder_lock(folder) as lock:
+        until = monotonic() + _LOCK_TIMEOUT
+        while not (first := _try_lock(lock, fcntl.LOCK_EX)) and not _try_lock(lock, fcntl.LOCK_SH):
             if monotonic() > until:
                 raise InputError(f"{folder}: another springbench has it for itself; wait for it or stop it")
             sleep(0.05)
         if first:
-            _remove_partial(folder)
+            _remove_partial_files(folder)
             fcntl.flock(lock, fcntl.LOCK_SH)
         try:
             yield
         finally:
-            if _locked(lock, fcntl.LOCK_EX):
-                _remove_partial(folder)
+            if _try_lock(lock, fcntl.LOCK_EX):
+                _remove_partial_files(folder)
 
 
 @contextmanager
-def _opened(folder: Path) -> Generator[int]:
+def _open_folder_lock(folder: Path) -> Generator[int]:
     """Open the lock file of a folder."""
-    lock = open_lock(folder / ".lock")
-    _LOCKS.add(lock)
+    lock = open_lock_file(folder / ".lock")
+    _OPEN_LOCKS.add(lock)
     try:
         yield lock
     finally:
-        _LOCKS.discard(lock)
+        _OPEN_LOCKS.discard(lock)
         os.close(lock)
 
 
-def _locked(lock: int, how: int) -> bool:
+def _try_lock(lock: int, mode: int) -> bool:
     """Try to lock a file without waiting, and return whether it succeeded."""
     try:
-        fcntl.flock(lock, how | fcntl.LOCK_NB)
+        fcntl.flock(lock, mode | fcntl.LOCK_NB)
     except OSError:
         return False
     return True
 
 
-def _remove_partial(folder: Path) -> None:
+def _remove_partial_files(folder: Path) -> None:
     for partial in folder.glob("*/.*partial*"):
         partial.unlink(missing_ok=True)
 
 
-_LOCKS: set[int] = set()
+_OPEN_LOCKS: set[int] = set()
 
 
-def _let_go() -> None:
+def _close_locks() -> None:
     """Close inherited locks in a forked process, which would otherwise block later processes."""
-    while _LOCKS:
-        os.close(_LOCKS.pop())
+    while _OPEN_LOCKS:
+        os.close(_OPEN_LOCKS.pop())
 
 
-os.register_at_fork(after_in_child=_let_go)
+os.register_at_fork(after_in_child=_close_locks)
 
 
-class Claims:
+class UnitClaims:
     """Claims of this process on units of a shared folder.
 
     The first process to claim a unit computes it.
@@ -116,40 +116,42 @@ class Claims:
 
     def __init__(self, folder: Path, units: Sequence[Path]) -> None:
         """Record the initial state of the units, given as paths of their row files."""
-        self._lock = open_lock(folder / ".claims")
-        self._units = {path: _state(path) for path in units}
+        self._lock = open_lock_file(folder / ".claims")
+        self._units = {path: _file_identity(path) for path in units}
 
-    def take(self, unit: Path) -> str:
+    def try_claim(self, unit: Path) -> str:
         """Claim a unit; return "" on success, else DONE_ELSEWHERE or CLAIMED_ELSEWHERE."""
-        if self._changed(unit):
-            return DONE
+        if self._has_changed(unit):
+            return DONE_ELSEWHERE
         place = int.from_bytes(sha256(unit.name.encode()).digest()[:7])
         try:
             fcntl.lockf(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
         except OSError:
-            return TAKEN
-        return DONE if self._changed(unit) else ""  # it may have been done just before the lock was let go
+            return CLAIMED_ELSEWHERE
+        return (
+            DONE_ELSEWHERE if self._has_changed(unit) else ""
+        )  # it may have been done just before the lock was let go
 
-    def _changed(self, unit: Path) -> bool:
-        return _state(unit) != self._units[unit]
+    def _has_changed(self, unit: Path) -> bool:
+        return _file_identity(unit) != self._units[unit]
 
-    def wait(self, units: Sequence[Path], look: Callable[[], object] = int) -> None:
+    def wait_for_any(self, units: Sequence[Path], poll: Callable[[], object] = int) -> None:
         """Wait until one of the units is finished elsewhere or can be claimed.
 
         Args:
             units: row files of the units.
             poll: called between two checks.
         """
-        while units and all(self.take(unit) == TAKEN for unit in units):
-            look()
-            sleep(_LOOK)
+        while units and all(self.try_claim(unit) == CLAIMED_ELSEWHERE for unit in units):
+            poll()
+            sleep(_POLL_INTERVAL)
 
     def close(self) -> None:
         """Release all claims."""
         os.close(self._lock)
 
 
-def _state(path: Path) -> tuple[int, int] | None:
+def _file_identity(path: Path) -> tuple[int, int] | None:
     """Return inode and modification time [ns] of a file, or None if missing."""
     try:
         there = path.stat()

@@ -19,17 +19,17 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import NoReturn
 
-EXIT_CODE = 130
+INTERRUPT_EXIT_CODE = 130
 """Exit code of a command that Ctrl-C stopped, by shell convention."""
 
-MESSAGE = "springbench: stopped; what is complete is kept, and the same command goes on from there"
+INTERRUPT_MESSAGE = "springbench: stopped; what is complete is kept, and the same command goes on from there"
 
-_RETRY = 0.02
+_RETRY_SECONDS = 0.02
 """Seconds until a deferred interrupt is tried again."""
 _MAX_DEFERRALS = 250
 """Maximum number of retries; an import of more than 5 s is interrupted."""
 
-_IMPORTING = ("importlib._bootstrap", "_frozen_importlib")
+_IMPORT_MODULES = ("importlib._bootstrap", "_frozen_importlib")
 
 _deferrals = 0
 _interrupted = False
@@ -41,20 +41,20 @@ def install_handler() -> None:
     A shell makes a background command ignore Ctrl-C; that setting is left unchanged.
     """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _interrupt)
-        sys.unraisablehook = _raise_again
+        signal.signal(signal.SIGINT, _handle_interrupt)
+        sys.unraisablehook = _reraise_interrupt
         if sys.platform != "win32":
-            signal.signal(signal.SIGALRM, _interrupt)
+            signal.signal(signal.SIGALRM, _handle_interrupt)
 
 
-def ignore() -> None:
+def ignore_interrupts() -> None:
     """Ignore Ctrl-C from here on."""
-    if signal.getsignal(signal.SIGINT) is _interrupt:
+    if signal.getsignal(signal.SIGINT) is _handle_interrupt:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @contextmanager
-def blocked() -> Generator[None]:
+def block_interrupts() -> Generator[None]:
     """Defer Ctrl-C inside the block; processes started there never receive it.
 
     A process that multiprocessing spawns needs its resource tracker, whose start unblocks Ctrl-C: start that before.
@@ -79,25 +79,25 @@ def exit_process() -> NoReturn:
 
     The interpreter's regular exit ends by a signal if Ctrl-C came during `exec`.
     """
-    ignore()
+    ignore_interrupts()
     _kill_workers()
     with suppress(OSError, ValueError):
-        print(MESSAGE, file=sys.stderr, flush=True)
+        print(INTERRUPT_MESSAGE, file=sys.stderr, flush=True)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what fails from here on was interrupted
     atexit._run_exitfuncs()  # pyright: ignore[reportPrivateUsage]
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):
             stream.flush()
-    os._exit(EXIT_CODE)
+    os._exit(INTERRUPT_EXIT_CODE)
 
 
-def _interrupt(number: int, frame: FrameType | None) -> None:
+def _handle_interrupt(number: int, frame: FrameType | None) -> None:
     """Raise KeyboardInterrupt as soon as no module is being imported."""
     global _deferrals, _interrupted
     while frame and sys.platform != "win32" and _deferrals < _MAX_DEFERRALS:
-        if frame.f_globals.get("__name__") in _IMPORTING:
+        if frame.f_globals.get("__name__") in _IMPORT_MODULES:
             _deferrals += 1
-            signal.setitimer(signal.ITIMER_REAL, _RETRY)
+            signal.setitimer(signal.ITIMER_REAL, _RETRY_SECONDS)
             return
         frame = frame.f_back
     _deferrals, _interrupted = 0, True
@@ -113,9 +113,9 @@ def _kill_workers() -> None:
             child.kill()
 
 
-def _raise_again(unraisable: sys.UnraisableHookArgs) -> None:
+def _reraise_interrupt(unraisable: sys.UnraisableHookArgs) -> None:
     """Interrupt again if a KeyboardInterrupt could not be propagated."""
     if unraisable.exc_type is KeyboardInterrupt and sys.platform != "win32":
-        signal.setitimer(signal.ITIMER_REAL, _RETRY)
+        signal.setitimer(signal.ITIMER_REAL, _RETRY_SECONDS)
     else:
         sys.__unraisablehook__(unraisable)

@@ -16,18 +16,18 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
-from harness.base.errors import InputError, Mistake
+from harness.base.errors import InputError, InputMistake
 
-_ROOT = Path(__file__).resolve().parents[2]
+_PROJECT_ROOT = Path(__file__).resolve().parents[2]
 _PACKAGES = ("harness", "solvers")
-_LOOK, _NEARLY = 0.3, 0.25
+_LOAD_SAMPLE_SECONDS, _IDLE_ROUND_UP = 0.3, 0.25
 """Duration of the sample of core usage [s], and the load of a core that still counts as idle."""
 
-_LIBRARIES = ("numpy", "scipy", "numba", "llvmlite", "cholespy", "pyarrow", "rerun-sdk", "pyvista", "vtk")
+_REPORTED_LIBRARIES = ("numpy", "scipy", "numba", "llvmlite", "cholespy", "pyarrow", "rerun-sdk", "pyvista", "vtk")
 
 
 @dataclass(frozen=True, slots=True)
-class Machine:
+class MachineInfo:
     """Properties of the machine that affect speed; they do not identify its owner.
 
     cpu: name of the processor.
@@ -39,24 +39,24 @@ class Machine:
     cpu: str
     cores: int
     memory_gib: float
-    system: str
+    operating_system: str
 
     @property
-    def id(self) -> str:
+    def machine_id(self) -> str:
         """12 hexadecimal digits that depend on processor, cores and memory (rounded to 1 GiB)."""
         text = f"{self.cpu}|{self.cores}|{round(self.memory_gib)}"
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def describe() -> Machine:
+def describe_machine() -> MachineInfo:
     """Describe the machine of this process, with the cores that it may use now."""
     system = f"{platform.system()} {platform.release()} {platform.machine()}"
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return Machine(_cpu(), _cores(), round(memory / 2**30, 1), system)
+    return MachineInfo(_read_cpu_name(), _count_cores(), round(memory / 2**30, 1), system)
 
 
 @cache
-def node() -> str:
+def compute_node_id() -> str:
     """Compute 12 hexadecimal digits that identify this computer.
 
     They distinguish computers of the same kind, and do not reveal its name.
@@ -65,7 +65,7 @@ def node() -> str:
 
 
 @cache
-def _cpu() -> str:
+def _read_cpu_name() -> str:
     # lscpu also names ARM processors, for which the kernel reports only numbers.
     try:
         told = subprocess.run(["lscpu"], env={**os.environ, "LC_ALL": "C"}, capture_output=True, text=True)
@@ -76,24 +76,24 @@ def _cpu() -> str:
     return names[0] if names else platform.machine()
 
 
-def _usable() -> int:
-    return min(_cores(), int(os.environ.get("NUMBA_NUM_THREADS") or _cores()))
+def _count_usable_cores() -> int:
+    return min(_count_cores(), int(os.environ.get("NUMBA_NUM_THREADS") or _count_cores()))
 
 
-def _cores() -> int:
+def _count_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 @cache
-def versions(*more: str) -> dict[str, str]:
+def collect_versions(*more: str) -> dict[str, str]:
     """Collect the versions of Python, the standard set of libraries and more packages.
 
     Absent ones are omitted.
     """
     found = {"python": platform.python_version()}
-    for name in (*_LIBRARIES, *more):
+    for name in (*_REPORTED_LIBRARIES, *more):
         try:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
@@ -102,7 +102,7 @@ def versions(*more: str) -> dict[str, str]:
 
 
 @cache
-def commit(root: Path = _ROOT) -> str:
+def read_commit(root: Path = _PROJECT_ROOT) -> str:
     """Read the commit of a checkout, with `-dirty` if tracked files differ.
 
     The default is the project's own checkout, independent of the working directory. This function never fails.
@@ -124,7 +124,7 @@ def commit(root: Path = _ROOT) -> str:
 
 
 @cache
-def code_hash(root: Path = _ROOT) -> str:
+def hash_sources(root: Path = _PROJECT_ROOT) -> str:
     """Hash the project's Python sources to 12 hexadecimal digits.
 
     It is SHA-256 over their paths and contents.
@@ -138,48 +138,50 @@ def code_hash(root: Path = _ROOT) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Threads:
+class ThreadChoice:
     """Number of threads of BLAS and Numba, and the reason if it was chosen automatically."""
 
-    number: int
-    why: str = ""
+    count: int
+    reason: str = ""
 
 
-def threads(asked: int | Literal["auto"]) -> Threads:
+def choose_threads(requested: int | Literal["auto"]) -> ThreadChoice:
     """Return the requested number of threads.
 
     For "auto" it is the number of idle cores, constant within a process.
     """
-    return _idle() if asked == "auto" else Threads(asked)
+    return _count_idle_cores() if requested == "auto" else ThreadChoice(requested)
 
 
 @cache
-def _idle() -> Threads:
+def _count_idle_cores() -> ThreadChoice:
     """Count the cores that other processes leave idle.
 
     It is computed once, so that all runs use the same number.
     """
     import psutil  # as long to load as the rest of this module
 
-    usable = _usable()
+    usable = _count_usable_cores()
     mine = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(usable)
-    busy = psutil.cpu_percent(_LOOK, percpu=True)
+    busy = psutil.cpu_percent(_LOAD_SAMPLE_SECONDS, percpu=True)
     idle = sum(1.0 - busy[core] / 100 for core in mine if core < len(busy))
-    number = min(usable, max(1, int(idle + _NEARLY)))
+    number = min(usable, max(1, int(idle + _IDLE_ROUND_UP)))
     load = os.getloadavg()[0]
-    return Threads(number, f"threads: {number} of {usable}, for {idle:.1f} cores were idle (load average {load:.1f})")
+    return ThreadChoice(
+        number, f"threads: {number} of {usable}, for {idle:.1f} cores were idle (load average {load:.1f})"
+    )
 
 
-def require_threads(number: int) -> None:
+def check_thread_count(number: int) -> None:
     """Raise InputError if this process may not use the given number of threads."""
-    usable = _usable()
+    usable = _count_usable_cores()
     if not 1 <= number <= usable:
         wanted = f"should be from 1 to {usable}, the cores that this process may use, not {number}"
-        raise InputError(Mistake(wanted, key="threads"))
+        raise InputError(InputMistake(wanted, key="threads"))
 
 
 @contextmanager
-def pinned_threads(threads: int) -> Generator[None]:
+def limit_threads(threads: int) -> Generator[None]:
     """Limit BLAS and Numba's parallel kernels to `threads` threads each inside the block.
 
     The previous limits are restored afterwards.
@@ -192,9 +194,9 @@ def pinned_threads(threads: int) -> Generator[None]:
     import numba
 
     import_module("scipy.linalg")
-    require_threads(threads)
+    check_thread_count(threads)
     before = numba.get_num_threads()
-    with _pools(len(sys.modules)).limit(limits=threads, user_api="blas"):
+    with _load_thread_pools(len(sys.modules)).limit(limits=threads, user_api="blas"):
         numba.set_num_threads(threads)
         try:
             yield
@@ -203,7 +205,7 @@ def pinned_threads(threads: int) -> Generator[None]:
 
 
 @lru_cache(maxsize=1)
-def _pools(modules: int) -> Any:
+def _load_thread_pools(modules: int) -> Any:
     """Return the loaded libraries that have thread pools.
 
     They are loaded with modules, so a new search is needed only if the number of modules has changed. Reading the

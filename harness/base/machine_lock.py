@@ -21,68 +21,68 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, suppre
 from pathlib import Path
 from time import sleep
 
-from harness.base.asides import WAITING, Tick, aside
-from harness.base.errors import InputError, Mistake
-from harness.base.files import open_lock
+from harness.base.asides import WAITING, ProgressCallback, report_activity
+from harness.base.errors import InputError, InputMistake
+from harness.base.files import open_lock_file
 
-_PAUSE = 0.02
+_RETRY_SECONDS = 0.02
 """Seconds between two searches for a free core."""
 
 
 @contextmanager
-def alone(tick: Tick) -> Generator[None]:
+def lock_timing_exclusive(tick: ProgressCallback) -> Generator[None]:
     """Compute alone on the machine; tick reports the waiting time."""
-    with _held("wanted", fcntl.LOCK_SH, tick), _held("used", fcntl.LOCK_EX, tick):
+    with _lock_context("wanted", fcntl.LOCK_SH, tick), _lock_context("used", fcntl.LOCK_EX, tick):
         yield
 
 
 @contextmanager
-def beside(tick: Tick) -> Generator[None]:
+def lock_timing_shared(tick: ProgressCallback) -> Generator[None]:
     """Compute while no run is timed exclusively; tick reports the waiting time."""
-    with _held("wanted", fcntl.LOCK_EX, tick):  # nobody who would be timed waits
-        used = _locked("used", fcntl.LOCK_SH, tick)
+    with _lock_context("wanted", fcntl.LOCK_EX, tick):  # nobody who would be timed waits
+        used = _acquire_lock("used", fcntl.LOCK_SH, tick)
     try:
         yield
     finally:
-        _let_go(used)
+        _release_locks(used)
 
 
-class Turn:
+class TimingSession:
     """Session of one timed run: preparation, timing (`lock_timing_exclusive`), and analysis of its result.
 
     exclusive: whether the run is timed alone. Otherwise it is timed on reserved cores (`reserve_cores`) without waiting
     for other sessions.
     """
 
-    def __init__(self, tick: Tick, *, exclusive: bool) -> None:
+    def __init__(self, tick: ProgressCallback, *, exclusive: bool) -> None:
         self._tick, self._exclusive = tick, exclusive
         self._coming, self._looking = ExitStack(), ExitStack()
 
-    def __enter__(self) -> Turn:
+    def __enter__(self) -> TimingSession:
         if self._exclusive:
-            self._coming.enter_context(_held("wanted", fcntl.LOCK_SH, self._tick))
+            self._coming.enter_context(_lock_context("wanted", fcntl.LOCK_SH, self._tick))
         return self
 
     def __exit__(self, *_: object) -> None:
         self._coming.close()
         self._looking.close()
 
-    def ready(self) -> AbstractContextManager[None]:
+    def lock_for_preparation(self) -> AbstractContextManager[None]:
         """Lock the machine for preparation before the timing."""
-        return _held("used", fcntl.LOCK_SH, self._tick) if self._exclusive else beside(self._tick)
+        return _lock_context("used", fcntl.LOCK_SH, self._tick) if self._exclusive else lock_timing_shared(self._tick)
 
-    def look(self) -> None:
+    def finish_timing(self) -> None:
         """End the priority for timing, and lock for shared computation.
 
         It is called after the timing, or if the run will not be timed.
         """
         self._coming.close()
         self._looking.close()
-        self._looking.enter_context(beside(self._tick))
+        self._looking.enter_context(lock_timing_shared(self._tick))
 
 
 @contextmanager
-def own_cores(number: int, tick: Tick) -> Generator[list[int]]:
+def reserve_cores(number: int, tick: ProgressCallback) -> Generator[list[int]]:
     """Compute on cores that no other process has reserved.
 
     All threads of this process are pinned to them.
@@ -97,31 +97,31 @@ def own_cores(number: int, tick: Tick) -> Generator[list[int]]:
     mine = sorted(os.sched_getaffinity(0))
     if number > len(mine):
         raise ValueError(f"{number} cores of {len(mine)}")
-    with beside(tick):
+    with lock_timing_shared(tick):
         claimed: dict[int, int] = {}
         try:
-            claimed = _free(mine, number)
+            claimed = _claim_free_cores(mine, number)
             if len(claimed) < number:
-                with aside(tick, WAITING):
+                with report_activity(tick, WAITING):
                     while len(claimed) < number:
-                        _let_go(*claimed.values())  # or two that have half of what they want wait for each other
+                        _release_locks(*claimed.values())  # or two that have half of what they want wait for each other
                         claimed = {}
-                        sleep(_PAUSE)
-                        claimed = _free(mine, number)
-            _keep_to(set(claimed))
+                        sleep(_RETRY_SECONDS)
+                        claimed = _claim_free_cores(mine, number)
+            _pin_threads(set(claimed))
             yield sorted(claimed)
         finally:
-            _keep_to(set(mine))
-            _let_go(*claimed.values())
+            _pin_threads(set(mine))
+            _release_locks(*claimed.values())
 
 
-def _free(cores: list[int], most: int) -> dict[int, int]:
+def _claim_free_cores(cores: list[int], limit: int) -> dict[int, int]:
     """Lock free cores, up to a limit, and return their lock files by core."""
     found: dict[int, int] = {}
     for core in cores:
-        if len(found) == most:
+        if len(found) == limit:
             break
-        lock = _opened(f"core-{core}")
+        lock = _open_machine_lock(f"core-{core}")
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             found[core] = lock
@@ -130,7 +130,7 @@ def _free(cores: list[int], most: int) -> dict[int, int]:
     return found
 
 
-def _keep_to(cores: set[int]) -> None:
+def _pin_threads(cores: set[int]) -> None:
     """Pin all threads of this process to the given cores."""
     for thread in os.listdir("/proc/self/task"):
         with suppress(OSError):  # it has ended
@@ -138,35 +138,35 @@ def _keep_to(cores: set[int]) -> None:
 
 
 @contextmanager
-def _held(name: str, how: int, tick: Tick) -> Generator[None]:
-    lock = _locked(name, how, tick)
+def _lock_context(name: str, mode: int, tick: ProgressCallback) -> Generator[None]:
+    lock = _acquire_lock(name, mode, tick)
     try:
         yield
     finally:
-        _let_go(lock)
+        _release_locks(lock)
 
 
-def _locked(name: str, how: int, tick: Tick) -> int:
-    lock = _opened(name)
+def _acquire_lock(name: str, mode: int, tick: ProgressCallback) -> int:
+    lock = _open_machine_lock(name)
     try:
         try:
-            fcntl.flock(lock, how | fcntl.LOCK_NB)
+            fcntl.flock(lock, mode | fcntl.LOCK_NB)
         except BlockingIOError:
-            with aside(tick, WAITING):
-                fcntl.flock(lock, how)
+            with report_activity(tick, WAITING):
+                fcntl.flock(lock, mode)
     except BaseException:
         os.close(lock)
         raise
     return lock
 
 
-def _let_go(*locks: int) -> None:
+def _release_locks(*locks: int) -> None:
     for lock in locks:
         fcntl.flock(lock, fcntl.LOCK_UN)  # copies that this process has made of itself have it open too
         os.close(lock)
 
 
-def _opened(name: str) -> int:
+def _open_machine_lock(name: str) -> int:
     """Open a lock file that all users of the machine may lock.
 
     Raises:
@@ -175,7 +175,7 @@ def _opened(name: str) -> int:
     path = Path(os.environ.get("SPRINGBENCH_LOCKS") or tempfile.gettempdir()) / f"springbench-{name}.lock"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        return open_lock(path, os.O_RDONLY, otherwise=", or set SPRINGBENCH_LOCKS to a folder of your own")
+        return open_lock_file(path, os.O_RDONLY, hint=", or set SPRINGBENCH_LOCKS to a folder of your own")
     except OSError as error:
         problem = f"{path.parent}: expected a folder in which files can be made ({error.strerror})"
-        raise InputError(Mistake(problem, key="SPRINGBENCH_LOCKS")) from error
+        raise InputError(InputMistake(problem, key="SPRINGBENCH_LOCKS")) from error

@@ -17,11 +17,11 @@ from typing import Annotated, Any, TypeVar, cast
 from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler
 from pydantic_core import core_schema
 
-Vector = tuple[float, float, float]
+Vector3 = tuple[float, float, float]
 """Three components x, y, z; y points up."""
 
 
-class Model(BaseModel):
+class ConfigModel(BaseModel):
     """A frozen pydantic model that rejects unknown keys, infinities and NaN."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False, allow_inf_nan=False)
@@ -32,24 +32,24 @@ class Model(BaseModel):
     ) -> dict[str, Any]:
         schema = handler(core_schema)
         fields = handler.resolve_ref_schema(schema).get("properties", {})
-        for name, says in meanings(cls).items():
+        for name, says in read_field_descriptions(cls).items():
             if name in fields:
                 fields[name].setdefault("description", says)
         return schema
 
 
-def meanings(model: type[Model]) -> dict[str, str]:
+def read_field_descriptions(model: type[ConfigModel]) -> dict[str, str]:
     """Read the descriptions of the fields of a model, including inherited ones."""
     found: dict[str, str] = {}
     for base in reversed(model.__mro__):
         file = getattr(sys.modules.get(base.__module__), "__file__", None)
-        if issubclass(base, Model) and file:
-            found |= _stated(file).get(base.__qualname__, {})
+        if issubclass(base, ConfigModel) and file:
+            found |= _parse_field_descriptions(file).get(base.__qualname__, {})
     return found
 
 
 @cache
-def _stated(file: str) -> dict[str, dict[str, str]]:
+def _parse_field_descriptions(file: str) -> dict[str, dict[str, str]]:
     """Parse the strings below the fields of each class of a source file."""
     with open(file, encoding="utf-8") as source:
         classes = [node for node in ast.parse(source.read()).body if isinstance(node, ast.ClassDef)]
@@ -68,7 +68,7 @@ def _stated(file: str) -> dict[str, dict[str, str]]:
 T = TypeVar("T")
 
 
-class _OneOrMany:
+class _ScalarAsTuple:
     """Validator that accepts a single value for a tuple of one."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
@@ -84,4 +84,4 @@ class _OneOrMany:
         return {"anyOf": [array["items"], array]}
 
 
-Many = Annotated[tuple[T, ...], Field(min_length=1), _OneOrMany()]
+OneOrMany = Annotated[tuple[T, ...], Field(min_length=1), _ScalarAsTuple()]

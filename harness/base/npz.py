@@ -14,18 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.base import child
-from harness.base.errors import InputError, Mistake
-from harness.base.files import HEAD, misnamed, reason
+from harness.base.errors import InputError, InputMistake
+from harness.base.files import HEAD_BYTES, describe_cause, describe_misnamed_file
 
-MAX_BYTES = 100_000_000
+MAX_NPZ_BYTES = 100_000_000
 """Maximum size of an array in float64, and of a file [bytes]. A scene writes such numbers as text, which takes 17 times
 as much.
 """
-_SECONDS, _BYTES_PER_SECOND = 5.0, 2e7
-_MEMORY = 2**28 + 3 * MAX_BYTES
+_BASE_SECONDS, _BYTES_PER_SECOND = 5.0, 2e7
+_MEMORY_LIMIT = 2**28 + 3 * MAX_NPZ_BYTES
 
 
-def read_numbers(path: Path, name: str) -> NDArray[np.float64]:
+def read_npz_array(path: Path, name: str) -> NDArray[np.float64]:
     """Read one array of an .npz file as float64.
 
     Args:
@@ -37,24 +37,26 @@ def read_numbers(path: Path, name: str) -> NDArray[np.float64]:
     """
     try:
         if not path.is_file():
-            raise InputError(Mistake("is no file; give the path of an .npz file", path))
+            raise InputError(InputMistake("is no file; give the path of an .npz file", path))
         size = path.stat().st_size
         with path.open("rb") as file:
-            problem = misnamed(file.read(HEAD), size)
+            problem = describe_misnamed_file(file.read(HEAD_BYTES), size)
     except (OSError, ValueError) as error:
-        raise InputError(Mistake(f"cannot be read: {reason(error)}", path)) from None
-    if size > MAX_BYTES:
-        problem = f"has {size:,} bytes; at most {MAX_BYTES:,} are read"
+        raise InputError(InputMistake(f"cannot be read: {describe_cause(error)}", path)) from None
+    if size > MAX_NPZ_BYTES:
+        problem = f"has {size:,} bytes; at most {MAX_NPZ_BYTES:,} are read"
     if problem:
-        raise InputError(Mistake(problem, path))
-    limits = child.Allowance(_SECONDS + MAX_BYTES / _BYTES_PER_SECOND, _MEMORY)
+        raise InputError(InputMistake(problem, path))
+    limits = child.CallLimits(_BASE_SECONDS + MAX_NPZ_BYTES / _BYTES_PER_SECOND, _MEMORY_LIMIT)
     try:
-        return child.call(_extracted, path, name, limits=limits)
-    except child.NoAnswer as error:
-        raise InputError(Mistake(f"cannot be read as an .npz file with an array `{name}`: {error}", path)) from None
+        return child.call_in_sandbox(_extract_array, path, name, limits=limits)
+    except child.SandboxError as error:
+        raise InputError(
+            InputMistake(f"cannot be read as an .npz file with an array `{name}`: {error}", path)
+        ) from None
 
 
-def _extracted(path: Path, name: str) -> NDArray[np.float64]:
+def _extract_array(path: Path, name: str) -> NDArray[np.float64]:
     """Extract an array in the sandbox.
 
     Raise InputError, or errors of the standard library for a broken file.
@@ -65,23 +67,23 @@ def _extracted(path: Path, name: str) -> NDArray[np.float64]:
             found = [info for info in packed.infolist() if info.filename == f"{name}.npy"]
             if len(found) != 1:
                 there = f"; it holds {', '.join(x[:40] for x in names[:5])}" if names else ""
-                raise InputError(Mistake(f"holds {len(found)} arrays `{name}`, wanted one{there}", path))
+                raise InputError(InputMistake(f"holds {len(found)} arrays `{name}`, wanted one{there}", path))
             if found[0].flag_bits & 1:
-                raise InputError(Mistake("is encrypted; store it without a password", path))
-            if found[0].file_size > MAX_BYTES:
-                problem = f"its array `{name}` takes {found[0].file_size:,} bytes; at most {MAX_BYTES:,} are read"
-                raise InputError(Mistake(problem, path))
+                raise InputError(InputMistake("is encrypted; store it without a password", path))
+            if found[0].file_size > MAX_NPZ_BYTES:
+                problem = f"its array `{name}` takes {found[0].file_size:,} bytes; at most {MAX_NPZ_BYTES:,} are read"
+                raise InputError(InputMistake(problem, path))
             content = packed.read(found[0])  # to its end, where the check sum is compared
     except zipfile.BadZipFile as error:
-        raise InputError(Mistake(f"is no whole .npz file ({error}); write it once more", path)) from None
-    return _array(content, Mistake(f"its array `{name}`", path))
+        raise InputError(InputMistake(f"is no whole .npz file ({error}); write it once more", path)) from None
+    return _parse_npy(content, InputMistake(f"its array `{name}`", path))
 
 
-def _array(content: bytes, what: Mistake) -> NDArray[np.float64]:
+def _parse_npy(content: bytes, what: InputMistake) -> NDArray[np.float64]:
     """Parse the content of an .npy file; raise InputError if it is invalid."""
 
     def refuse(problem: str) -> InputError:
-        return InputError(Mistake(f"{what.problem} {problem}", what.file))
+        return InputError(InputMistake(f"{what.problem} {problem}", what.file))
 
     file = io.BytesIO(content)
     try:
@@ -97,8 +99,8 @@ def _array(content: bytes, what: Mistake) -> NDArray[np.float64]:
     count, begun = prod(shape), file.tell()
     if count * dtype.itemsize != len(content) - begun:
         raise refuse(f"promises {count * dtype.itemsize:,} bytes, and {len(content) - begun:,} are there")
-    if 8 * count > MAX_BYTES:
-        raise refuse(f"has {count:,} numbers; at most {MAX_BYTES // 8:,} are read")
+    if 8 * count > MAX_NPZ_BYTES:
+        raise refuse(f"has {count:,} numbers; at most {MAX_NPZ_BYTES // 8:,} are read")
     with np.errstate(over="ignore"):
         numbers = np.frombuffer(content, dtype, count, begun).astype(np.float64)
     if not np.isfinite(numbers).all():

@@ -22,26 +22,26 @@ from typing import Any
 
 import typer
 
-from harness.base.errors import InputError, Mistake, RunFailed
-from harness.base.files import replacing, users_cache
+from harness.base.errors import InputError, InputMistake, RunFailed
+from harness.base.files import atomic_write, user_cache_dir
 
-_BATCH = 500
+_BATCH_SIZE = 500
 """Number of files per transfer."""
-INDEX = ".place.json"
+INDEX_FILE = ".place.json"
 """Name of the index file in the local folder."""
 
-ROWS = ("rows", "accuracy", "ablation")
+ROW_FOLDER_NAMES = ("rows", "accuracy", "ablation")
 """Names of folders with rows, and stems of packed files."""
 
 
-def parse(value: str | Path) -> Path | str:
+def parse_location(value: str | Path) -> Path | str:
     """Parse a path or URL of results; a URL remains text."""
     if "\0" in str(value):
         raise typer.BadParameter("holds NUL, which no path and no URL can")
     return value if isinstance(value, Path) or "://" in value else Path(value)
 
 
-def everything(context: typer.Context, value: Path | str) -> Path:
+def sync_results(context: typer.Context, value: Path | str) -> Path:
     """Download all results before a command, and upload its changes when it ends.
 
     Args:
@@ -51,26 +51,26 @@ def everything(context: typer.Context, value: Path | str) -> Path:
     """
     if isinstance(value, Path):
         return value
-    place = Place.of(value)
-    place.fetch()
-    context.call_on_close(place.send)
+    place = RemoteStorage.from_url(value)
+    place.download_changes()
+    context.call_on_close(place.upload_changes)
     return place.folder
 
 
-def rows_alone(value: Path | str) -> Path:
+def fetch_rows(value: Path | str) -> Path:
     """Download the rows of results, and return the local folder.
 
     It is for a command that writes nothing.
     """
     if isinstance(value, Path):
         return value
-    place = Place.of(value)
-    place.fetch(rows_alone=True)
+    place = RemoteStorage.from_url(value)
+    place.download_changes(only_rows=True)
     return place.folder
 
 
 @dataclass(slots=True)
-class Place:
+class RemoteStorage:
     """A URL and its local folder.
 
     url: as the user gave it.
@@ -82,12 +82,12 @@ class Place:
 
     url: str
     folder: Path
-    system: Any
+    filesystem: Any
     root: str
     index: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
 
     @classmethod
-    def of(cls, url: str) -> Place:
+    def from_url(cls, url: str) -> RemoteStorage:
         """Create the storage of a URL.
 
         Raises:
@@ -99,15 +99,15 @@ class Place:
             system, root = url_to_fs(url)
         except (ValueError, ImportError, TypeError) as error:
             hint = "; pip install 'springbench[s3]'" if url.startswith("s3:") else ""
-            raise InputError(Mistake(f"{error}{hint}", key=url)) from error
-        folder = users_cache("places") / hashlib.sha256(url.rstrip("/").encode()).hexdigest()[:16]
+            raise InputError(InputMistake(f"{error}{hint}", key=url)) from error
+        folder = user_cache_dir("places") / hashlib.sha256(url.rstrip("/").encode()).hexdigest()[:16]
         folder.mkdir(parents=True, exist_ok=True)
         place = cls(url, folder, system, str(root).rstrip("/"))
         with suppress(OSError, ValueError):
-            place.index = json.loads((folder / INDEX).read_text())
+            place.index = json.loads((folder / INDEX_FILE).read_text())
         return place
 
-    def fetch(self, *, rows_alone: bool = False) -> None:
+    def download_changes(self, *, only_rows: bool = False) -> None:
         """Download changed files, and remove local files that were deleted remotely and are unchanged here.
 
         Args:
@@ -116,71 +116,71 @@ class Place:
             InputError: if the storage cannot be read.
         """
         try:
-            self.system.invalidate_cache()
-            there = self._there()
-            wanted = {n: token for n, token in there.items() if not rows_alone or _holds_rows(n)}
+            self.filesystem.invalidate_cache()
+            there = self._list_remote()
+            wanted = {n: token for n, token in there.items() if not only_rows or _is_row_file(n)}
             new = [n for n, token in wanted.items() if self.index.get(n, [""])[0] != token]
-            new = [n for n in new if self._here(n) in ("", self.index.get(n, ["", ""])[1])]
-            for start in range(0, len(new), _BATCH):
-                self._get(new[start : start + _BATCH], there)
+            new = [n for n in new if self._local_token(n) in ("", self.index.get(n, ["", ""])[1])]
+            for start in range(0, len(new), _BATCH_SIZE):
+                self._download_files(new[start : start + _BATCH_SIZE], there)
         except Exception as error:  # of whatever library speaks to it
-            raise InputError(Mistake(f"cannot be read: {_words(error)}", key=self.url)) from error
+            raise InputError(InputMistake(f"cannot be read: {_format_error(error)}", key=self.url)) from error
         for name in [name for name in self.index if name not in there]:
-            if self._here(name) == self.index.pop(name)[1]:
+            if self._local_token(name) == self.index.pop(name)[1]:
                 (self.folder / name).unlink(missing_ok=True)
-        self._remember()
+        self._save_index()
 
-    def _get(self, names: Sequence[str], there: Mapping[str, str]) -> None:
+    def _download_files(self, names: Sequence[str], there: Mapping[str, str]) -> None:
         """Download some files in one transfer; an interrupted transfer is repeated later."""
         with TemporaryDirectory(dir=self.folder, prefix=".partial") as scratch:
             fetched = [Path(scratch) / str(number) for number in range(len(names))]
-            self.system.get([f"{self.root}/{name}" for name in names], [str(path) for path in fetched])
+            self.filesystem.get([f"{self.root}/{name}" for name in names], [str(path) for path in fetched])
             for name, path in zip(names, fetched, strict=True):
                 (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
                 os.replace(path, self.folder / name)
-                self.index[name] = [there[name], self._here(name)]
-        self._remember()
+                self.index[name] = [there[name], self._local_token(name)]
+        self._save_index()
 
-    def send(self) -> None:
+    def upload_changes(self) -> None:
         """Upload changed files, then delete remote files that were deleted here.
 
         Raises:
             RunFailed: if the storage cannot be written; the local files remain, and are uploaded later.
         """
-        names = {path.relative_to(self.folder).as_posix() for path in self.folder.rglob("*") if _is_result(path)}
-        new = [name for name in sorted(names) if self.index.get(name, ["", ""])[1] != self._here(name)]
+        names = {path.relative_to(self.folder).as_posix() for path in self.folder.rglob("*") if _is_result_file(path)}
+        new = [name for name in sorted(names) if self.index.get(name, ["", ""])[1] != self._local_token(name)]
         gone = [name for name in self.index if not (self.folder / name).exists()]
         if not new and not gone:
             return
         try:
-            for start in range(0, len(new), _BATCH):
-                batch = new[start : start + _BATCH]
+            for start in range(0, len(new), _BATCH_SIZE):
+                batch = new[start : start + _BATCH_SIZE]
                 for above in {str(PurePosixPath(f"{self.root}/{name}").parent) for name in batch}:
-                    self.system.makedirs(above, exist_ok=True)
-                self.index |= {name: ["", self._here(name)] for name in batch}
-                self.system.put([str(self.folder / n) for n in batch], [f"{self.root}/{n}" for n in batch])
+                    self.filesystem.makedirs(above, exist_ok=True)
+                self.index |= {name: ["", self._local_token(name)] for name in batch}
+                self.filesystem.put([str(self.folder / n) for n in batch], [f"{self.root}/{n}" for n in batch])
             for name in gone:
-                self.system.rm_file(f"{self.root}/{name}")
+                self.filesystem.rm_file(f"{self.root}/{name}")
                 del self.index[name]
-            self.system.invalidate_cache()
-            there = self._there()
+            self.filesystem.invalidate_cache()
+            there = self._list_remote()
         except Exception as error:  # of whatever library speaks to it
             raise RunFailed(
-                f"{self.url}: cannot be written: {_words(error)}; all is kept in {self.folder}, and the next command "
+                f"{self.url}: cannot be written: {_format_error(error)}; all is kept in {self.folder}, and the next command "
                 "with this URL sends it"
             ) from error
         for name in new:
             self.index[name][0] = there[name]
-        self._remember()
+        self._save_index()
 
-    def _there(self) -> dict[str, str]:
+    def _list_remote(self) -> dict[str, str]:
         """List the remote files with a token that changes when they do."""
-        found: Mapping[str, Mapping[str, Any]] = self.system.find(self.root, detail=True)
+        found: Mapping[str, Mapping[str, Any]] = self.filesystem.find(self.root, detail=True)
         start = len(self.root.strip("/")) + 1
         files = {name.strip("/")[start:]: about for name, about in found.items()}
-        return {name: _token(about) for name, about in files.items() if _is_safe(name)}
+        return {name: _remote_token(about) for name, about in files.items() if _is_safe_name(name)}
 
-    def _here(self, name: str) -> str:
+    def _local_token(self, name: str) -> str:
         """Return a token that changes with a local file, "" if it is missing."""
         try:
             about = (self.folder / name).stat()
@@ -188,33 +188,33 @@ class Place:
             return ""
         return f"{about.st_size} {about.st_mtime_ns}"
 
-    def _remember(self) -> None:
-        with replacing(self.folder / INDEX) as partial:
+    def _save_index(self) -> None:
+        with atomic_write(self.folder / INDEX_FILE) as partial:
             partial.write_text(json.dumps(self.index))
 
 
-def _token(about: Mapping[str, Any]) -> str:
+def _remote_token(about: Mapping[str, Any]) -> str:
     version = next((about[key] for key in ("ETag", "etag", "LastModified", "mtime", "created") if about.get(key)), "")
     return f"{about.get('size')} {version}"
 
 
-def _is_safe(name: str) -> bool:
+def _is_safe_name(name: str) -> bool:
     """Return whether a name stays inside the folder and is not the index."""
     parts = PurePosixPath(name).parts
-    return bool(parts) and ".." not in parts and not name.startswith("/") and name != INDEX
+    return bool(parts) and ".." not in parts and not name.startswith("/") and name != INDEX_FILE
 
 
-_OURS = (INDEX, ".lock", ".claims")
+_INTERNAL_FILES = (INDEX_FILE, ".lock", ".claims")
 
 
-def _is_result(path: Path) -> bool:
-    return path.is_file() and path.name not in _OURS and not any("partial" in part for part in path.parts)
+def _is_result_file(path: Path) -> bool:
+    return path.is_file() and path.name not in _INTERNAL_FILES and not any("partial" in part for part in path.parts)
 
 
-def _holds_rows(name: str) -> bool:
+def _is_row_file(name: str) -> bool:
     path = PurePosixPath(name)
-    return path.suffix == ".parquet" and (path.parent.name in ROWS or path.stem in ROWS)
+    return path.suffix == ".parquet" and (path.parent.name in ROW_FOLDER_NAMES or path.stem in ROW_FOLDER_NAMES)
 
 
-def _words(error: Exception) -> str:
+def _format_error(error: Exception) -> str:
     return " ".join(str(error).split())[:300] or type(error).__name__

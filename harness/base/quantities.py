@@ -22,7 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-SQL = {
+SQL_EXPRESSIONS = {
     "step": "1e3 * median(seconds) filter (phase = 'step')",
     "lower": "1e3 * quantile_cont(seconds, 0.25) filter (phase = 'step')",
     "upper": "1e3 * quantile_cont(seconds, 0.75) filter (phase = 'step')",
@@ -36,7 +36,7 @@ SQL = {
 """Aggregates over the rows of a run, by the names of the fields of `harness.report.timing_table.RunTimes`."""
 
 
-def ms_per_step(seconds: Sequence[float]) -> float:
+def compute_ms_per_step(seconds: Sequence[float]) -> float:
     """Compute the median ms a step from wall times [s].
 
     The times are those of all frames and rounds.
@@ -44,12 +44,12 @@ def ms_per_step(seconds: Sequence[float]) -> float:
     return 1e3 * float(np.median(seconds))
 
 
-def times_as_long(run: float, other: float) -> float:
+def compute_slowdown(run: float, other: float) -> float:
     """Compute the ratio of two runs' times from their ms a step."""
     return run / other
 
 
-def largest_strain(frames: NDArray[np.int64], strains: NDArray[np.float64]) -> float:
+def compute_max_strain(frames: NDArray[np.int64], strains: NDArray[np.float64]) -> float:
     """Compute the largest strain of a run from the strain of each frame.
 
     Args:

@@ -17,20 +17,20 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harness.base.errors import InputError, Mistake
+from harness.base.errors import InputError, InputMistake
 from harness.base.files import is_file_name
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-FILE = "file"
+FILE_COLUMN = "file"
 """Column of a packed file that names the unit."""
 
-_END = 2**15
+_FOOTER_BYTES = 2**15
 """Number of bytes at the end of a file in which its schema is searched."""
 
 
-def packed_file(folder: Path) -> Path:
+def packed_path(folder: Path) -> Path:
     """Return the path of the packed file of a folder of rows.
 
     It may not exist.
@@ -38,7 +38,7 @@ def packed_file(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}.parquet")
 
 
-def folders(above: Path, name: str, depth: str = "**/") -> list[Path]:
+def find_row_folders(above: Path, name: str, depth: str = "**/") -> list[Path]:
     """Find the folders of rows of a given name, including completely packed ones.
 
     Args:
@@ -51,7 +51,7 @@ def folders(above: Path, name: str, depth: str = "**/") -> list[Path]:
     return sorted({*above.glob(f"{depth}{name}/"), *packed})
 
 
-def own_files(folder: Path) -> set[str]:
+def list_unit_files(folder: Path) -> set[str]:
     """List the units of a folder that have a file of their own.
 
     Anything else at the path of such a file counts too.
@@ -63,22 +63,22 @@ def own_files(folder: Path) -> set[str]:
         return set()
 
 
-def packed_units(folder: Path) -> frozenset[str]:
+def list_packed_units(folder: Path) -> frozenset[str]:
     """List the units in the packed file of a folder.
 
     Raises:
         InputError: if it is damaged.
     """
-    path = packed_file(folder)
+    path = packed_path(folder)
     try:
         there = path.stat()
     except (FileNotFoundError, NotADirectoryError):
         return frozenset()
-    return _packed(path, there.st_ino, there.st_mtime_ns, there.st_size)
+    return _read_packed_units(path, there.st_ino, there.st_mtime_ns, there.st_size)
 
 
 @lru_cache(maxsize=16)
-def _packed(path: Path, *state: int) -> frozenset[str]:
+def _read_packed_units(path: Path, *state: int) -> frozenset[str]:
     import pyarrow as pa  # for those who have packed rows
     import pyarrow.parquet as pq
 
@@ -86,29 +86,29 @@ def _packed(path: Path, *state: int) -> frozenset[str]:
         if not path.is_file():
             raise OSError("it is no plain file")
         with path.open("rb") as file:  # pyarrow takes some paths for URLs, and none that is no UTF-8
-            names = pq.read_table(file, columns=[FILE], partitioning=None)[FILE]
+            names = pq.read_table(file, columns=[FILE_COLUMN], partitioning=None)[FILE_COLUMN]
         if names.null_count:
-            raise OSError(f"rows without a {FILE}")
+            raise OSError(f"rows without a {FILE_COLUMN}")
         found = frozenset(map(str, names.cast(pa.string()).unique().to_pylist()))
         if foreign := [name for name in found if not is_file_name(name) or name.startswith(".")]:
             raise OSError(f"{foreign[0]!r} is the name of no unit")
         return found
     except (pa.ArrowException, OSError, KeyError) as error:
-        raise InputError(Mistake(f"holds no packed rows ({error}); take it out of the results", path)) from error
+        raise InputError(InputMistake(f"holds no packed rows ({error}); take it out of the results", path)) from error
 
 
-def units(folder: Path) -> list[Path]:
+def list_units(folder: Path) -> list[Path]:
     """List all units of a folder of rows as paths, sorted by name; raise InputError."""
-    return [folder / f"{name}.parquet" for name in sorted(own_files(folder) | packed_units(folder))]
+    return [folder / f"{name}.parquet" for name in sorted(list_unit_files(folder) | list_packed_units(folder))]
 
 
-def there(unit: Path) -> bool:
+def has_rows(unit: Path) -> bool:
     """Return whether a unit has rows, or something else at its path; raise InputError."""
-    return os.path.lexists(unit) or unit.stem in packed_units(unit.parent)
+    return os.path.lexists(unit) or unit.stem in list_packed_units(unit.parent)
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class UnitGroup:
     """A group of files with one schema.
 
     files: paths of the files.
@@ -117,11 +117,11 @@ class Part:
     """
 
     files: tuple[str, ...]
-    numbers: tuple[int, ...] = ()
-    packed: dict[str, int] | None = None
+    unit_numbers: tuple[int, ...] = ()
+    packed_numbers: dict[str, int] | None = None
 
 
-def parts(asked: Iterable[Path]) -> tuple[list[Part], list[int]]:
+def group_units(paths: Iterable[Path]) -> tuple[list[UnitGroup], list[int]]:
     """Group units by schema.
 
     Args:
@@ -134,30 +134,30 @@ def parts(asked: Iterable[Path]) -> tuple[list[Part], list[int]]:
     packed: dict[Path, dict[str, int]] = {}
     damaged: list[int] = []
     there: dict[Path, frozenset[str]] = {}
-    for number, path in enumerate(asked):
+    for number, path in enumerate(paths):
         folder = path.parent
         if folder not in there:
-            there[folder] = packed_units(folder) - own_files(folder)
+            there[folder] = list_packed_units(folder) - list_unit_files(folder)
         if path.stem in there[folder]:
-            packed.setdefault(packed_file(folder), {})[path.stem] = number
-        elif (kind := _kind(str(path))) is None:
+            packed.setdefault(packed_path(folder), {})[path.stem] = number
+        elif (kind := _read_schema_key(str(path))) is None:
             damaged.append(number)
         else:
             alike.setdefault(kind, []).append((str(path), number))
-    found = [Part(tuple(f for f, _ in files), tuple(n for _, n in files)) for files in alike.values()]
-    return found + [Part((str(path),), packed=names) for path, names in packed.items()], damaged
+    found = [UnitGroup(tuple(f for f, _ in files), tuple(n for _, n in files)) for files in alike.values()]
+    return found + [UnitGroup((str(path),), packed_numbers=names) for path, names in packed.items()], damaged
 
 
-def schema(part: Part) -> pa.Schema:
+def read_group_schema(part: UnitGroup) -> pa.Schema:
     """Read the schema of the rows of a group."""
     import pyarrow.parquet as pq
 
     with open(part.files[0], "rb") as file:
         found = pq.read_schema(file)
-    return found if part.packed is None else found.remove(found.get_field_index(FILE))
+    return found if part.packed_numbers is None else found.remove(found.get_field_index(FILE_COLUMN))
 
 
-def _kind(path: str) -> bytes | None:
+def _read_schema_key(path: str) -> bytes | None:
     """Read a key that files of one schema share.
 
     Only the end of the file is read. It is the schema as pyarrow stores it there, or the path for files of other
@@ -168,8 +168,8 @@ def _kind(path: str) -> bytes | None:
             return None
         with open(path, "rb", buffering=0) as file:
             size = file.seek(0, os.SEEK_END)
-            file.seek(max(0, size - _END))
-            end = file.read(_END)
+            file.seek(max(0, size - _FOOTER_BYTES))
+            end = file.read(_FOOTER_BYTES)
     except OSError:
         return None
     footer = int.from_bytes(end[-8:-4], "little")

@@ -9,29 +9,29 @@ import json
 from dataclasses import asdict
 from typing import Any
 
-from solvers.registry import EVERY, about, load, minimises
+from solvers.registry import SOLVER_TABLE, find_solver_info, is_minimiser, load_target
 
 
-def packages(solver: str) -> tuple[str, ...]:
+def list_packages(solver: str) -> tuple[str, ...]:
     """List the third-party distributions that a solver is an interface to."""
-    if solver not in EVERY:
+    if solver not in SOLVER_TABLE:
         return ()
-    package = about(load(EVERY[solver]), solver).package
+    package = find_solver_info(load_target(SOLVER_TABLE[solver]), solver).package_name
     return (package,) if package else ()
 
 
-def stated(solver: str) -> dict[str, Any]:
+def read_solver_metadata(solver: str) -> dict[str, Any]:
     """Read the columns `family`, `reference`, `minimises` and `own_steps` of a solver.
 
     Empty for an unknown name.
     """
-    if solver not in EVERY:
+    if solver not in SOLVER_TABLE:
         return {}
-    method = load(EVERY[solver])
-    told = about(method, solver)
+    method = load_target(SOLVER_TABLE[solver])
+    told = find_solver_info(method, solver)
     return {
         "family": told.family,
-        "reference": json.dumps(asdict(told.reference), ensure_ascii=False) if told.reference else None,
-        "minimises": minimises(method),
-        "own_steps": told.own_steps,
+        "reference": json.dumps(asdict(told.citation), ensure_ascii=False) if told.citation else None,
+        "minimises": is_minimiser(method),
+        "own_steps": told.is_substepping,
     }

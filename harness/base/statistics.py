@@ -19,27 +19,27 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-RESAMPLES = 4000
+NUM_RESAMPLES = 4000
 """Number of bootstrap resamples; with this number the ends of an interval repeat to a few per cent of its width."""
 
 
-class Interval(NamedTuple):
+class ConfidenceInterval(NamedTuple):
     """An estimate and the ends of its 95 % interval."""
 
-    middle: float
+    estimate: float
     low: float
     high: float
 
 
-def ratio(theirs: ArrayLike, ours: ArrayLike) -> Interval:
+def estimate_ratio(theirs: ArrayLike, ours: ArrayLike) -> ConfidenceInterval:
     """Estimate the ratio theirs / ours of paired times.
 
     Both are (rounds,); the estimate is the median over the rounds.
     """
-    return _resampled((np.asarray(theirs, float) / np.asarray(ours, float),), np.median)
+    return _bootstrap_interval((np.asarray(theirs, float) / np.asarray(ours, float),), np.median)
 
 
-def added(more: ArrayLike) -> Interval:
+def estimate_added_time(more: ArrayLike) -> ConfidenceInterval:
     """Estimate the time that a frame adds.
 
     It is the mean over frames of the median over rounds. The rounds of each frame are resampled separately. Only the
@@ -54,10 +54,10 @@ def added(more: ArrayLike) -> Interval:
     def statistic(*rounds: NDArray[np.float64], axis: int) -> Any:
         return np.mean([np.median(frame, axis=axis) for frame in rounds], axis=0)
 
-    return _resampled(frames, statistic)
+    return _bootstrap_interval(frames, statistic)
 
 
-def least(steps: Iterable[tuple[int, float]]) -> dict[int, float]:
+def compute_min_seconds(steps: Iterable[tuple[int, float]]) -> dict[int, float]:
     """Compute the least time of each frame's step over its rounds [s].
 
     Args:
@@ -70,17 +70,17 @@ def least(steps: Iterable[tuple[int, float]]) -> dict[int, float]:
     return seconds
 
 
-def changed(new: Mapping[int, float], old: Mapping[int, float]) -> Interval:
+def estimate_slowdown(new: Mapping[int, float], old: Mapping[int, float]) -> ConfidenceInterval:
     """Estimate the ratio new / old of times by frame.
 
     The estimate is over the common frames, of which there is at least one.
     """
     frames = sorted(set(new) & set(old))
     logs = np.log([new[frame] / old[frame] for frame in frames])
-    return Interval(*(float(np.exp(end)) for end in _resampled((logs,), np.median)))
+    return ConfidenceInterval(*(float(np.exp(end)) for end in _bootstrap_interval((logs,), np.median)))
 
 
-def _resampled(samples: Sequence[NDArray[np.float64]], statistic: Callable[..., Any]) -> Interval:
+def _bootstrap_interval(samples: Sequence[NDArray[np.float64]], statistic: Callable[..., Any]) -> ConfidenceInterval:
     """Compute a statistic with its bootstrap interval; each sample is resampled separately.
 
     For a single round the interval is the value itself.
@@ -89,13 +89,13 @@ def _resampled(samples: Sequence[NDArray[np.float64]], statistic: Callable[..., 
 
     middle = float(statistic(*samples, axis=-1))
     if len(samples[0]) < 2:
-        return Interval(middle, middle, middle)
+        return ConfidenceInterval(middle, middle, middle)
     found = bootstrap(
         samples,
         statistic,
         vectorized=True,
-        n_resamples=RESAMPLES,
+        n_resamples=NUM_RESAMPLES,
         method="percentile",
         rng=np.random.default_rng(0),
     ).confidence_interval
-    return Interval(middle, float(found.low), float(found.high))
+    return ConfidenceInterval(middle, float(found.low), float(found.high))

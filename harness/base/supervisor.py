@@ -16,19 +16,24 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import NoReturn
 
-from harness.base.child import without_core_dumps
-from harness.base.worker import DUMP, adopt_orphans, has_children, serve, tie
+from harness.base.child import disable_core_dumps
+from harness.base.worker import DUMP_SIGNAL, adopt_orphans, has_children, serve_tasks, tie_to_parent
 
-BUFFER = 2**25
+BUFFER_BYTES = 2**25
 """Maximum number of output bytes that wait for the command; further output is dropped."""
-_GRACE = 2.0
+_GRACE_SECONDS = 2.0
 """Maximum seconds for killing a worker's processes, and for its last output to reach the command."""
-_REAP = 1.0
+_REAP_SECONDS = 1.0
 """Seconds between two searches for ended orphaned processes."""
 
 
-def supervise(
-    calls: Connection, ticks: Connection, said: Connection, dump: Connection, ready: Callable[[], object], parent: int
+def supervise_worker(
+    calls: Connection,
+    ticks: Connection,
+    output_pipe: Connection,
+    dump: Connection,
+    initialiser: Callable[[], object],
+    parent: int,
 ) -> None:
     """Start a worker (`harness.execution.worker_process.serve_tasks`), and end as it ends.
 
@@ -42,27 +47,27 @@ def supervise(
         initialiser: called first in the worker.
         parent: process id of the command.
     """
-    tie(parent, signal.SIGTERM)
+    tie_to_parent(parent, signal.SIGTERM)
     os.setsid()
     adopt_orphans()
-    without_core_dumps()
+    disable_core_dumps()
     output, theirs = os.pipe()
     me = os.getpid()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the command's affair, which ends this
-    signals = {signal.SIGTERM, DUMP}
+    signals = {signal.SIGTERM, DUMP_SIGNAL}
     signal.pthread_sigmask(signal.SIG_BLOCK, signals)
     worker = os.fork()
     if worker == 0:
         os.setsid()
         os.close(output)
-        said.close()
+        output_pipe.close()
         signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)
-        serve(calls, ticks, theirs, dump, ready, me)
+        serve_tasks(calls, ticks, theirs, dump, initialiser, me)
         return
     for end in (calls, ticks, dump):
         end.close()
     os.close(theirs)
-    _Supervisor(worker, output, said.fileno()).run(signals)
+    _Supervisor(worker, output, output_pipe.fileno()).run_until_exit(signals)
 
 
 class _Supervisor:
@@ -78,33 +83,33 @@ class _Supervisor:
         self._waiting = bytearray()
         self._left_out = 0
 
-    def run(self, signals: set[signal.Signals]) -> NoReturn:
+    def run_until_exit(self, signals: set[signal.Signals]) -> NoReturn:
         """Relay the worker's output until it ends, then end likewise.
 
         The exit code or the signal is the same.
         """
-        signal.signal(signal.SIGTERM, self._stop)
-        signal.signal(DUMP, lambda number, frame: os.kill(self._worker, DUMP))
+        signal.signal(signal.SIGTERM, self._handle_stop)
+        signal.signal(DUMP_SIGNAL, lambda number, frame: os.kill(self._worker, DUMP_SIGNAL))
         ended = os.pidfd_open(self._worker)
         for pipe in (self._output, self._command):
             os.set_blocking(pipe, False)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)
-        while not self._passed_on(ended, _REAP):
-            self._reap(sparing=self._worker)
+        while not self._relay_pending(ended, _REAP_SECONDS):
+            self._reap_children(sparing=self._worker)
         _, status = os.waitpid(self._worker, 0)
-        self._end_all()
-        self._pass_on_rest()
+        self._kill_descendants()
+        self._flush_output()
         if os.WIFSIGNALED(status):
             signal.signal(os.WTERMSIG(status), signal.SIG_DFL) if os.WTERMSIG(status) != signal.SIGKILL else None
             os.kill(os.getpid(), os.WTERMSIG(status))
         os._exit(os.waitstatus_to_exitcode(status) & 0xFF)
 
-    def _stop(self, number: int, frame: object) -> NoReturn:
-        self._end_all()
-        self._pass_on_rest()
+    def _handle_stop(self, number: int, frame: object) -> NoReturn:
+        self._kill_descendants()
+        self._flush_output()
         os._exit(0)
 
-    def _passed_on(self, ended: int | None, seconds: float) -> bool:
+    def _relay_pending(self, ended: int | None, seconds: float) -> bool:
         """Relay pending output, and return whether the worker has ended.
 
         The call waits at most the given seconds.
@@ -117,18 +122,18 @@ class _Supervisor:
             poll.register(self._command, select.POLLOUT)
         ready = dict(poll.poll(1e3 * seconds))
         if self._output in ready:
-            self._read()
+            self._read_output()
         if self._waiting:
-            self._write()
+            self._write_output()
         return ended in ready
 
-    def _read(self) -> bool:
+    def _read_output(self) -> bool:
         """Read the worker's pipe, and return whether it had any content."""
         try:
             found = os.read(self._output, 2**20)
         except OSError:
             return False
-        room = max(0, BUFFER - len(self._waiting))
+        room = max(0, BUFFER_BYTES - len(self._waiting))
         if self._left_out and room > len(found):
             self._waiting += f"\n[{self._left_out} bytes are left out]\n".encode()
             self._left_out = 0
@@ -136,7 +141,7 @@ class _Supervisor:
         self._left_out += len(found) - len(found[:room])
         return bool(found)
 
-    def _write(self) -> None:
+    def _write_output(self) -> None:
         try:
             del self._waiting[: os.write(self._command, self._waiting[: 2**20])]
         except BlockingIOError:
@@ -144,15 +149,15 @@ class _Supervisor:
         except OSError:  # the command is gone
             self._waiting.clear()
 
-    def _pass_on_rest(self) -> None:
-        until = time.monotonic() + _GRACE
-        while self._read():
+    def _flush_output(self) -> None:
+        until = time.monotonic() + _GRACE_SECONDS
+        while self._read_output():
             pass
         while self._waiting and time.monotonic() < until:
             select.select([], [self._command], [], 0.1)
-            self._write()
+            self._write_output()
 
-    def _reap(self, sparing: int = 0) -> None:
+    def _reap_children(self, sparing: int = 0) -> None:
         """Reap ended child processes."""
         with suppress(OSError):
             while found := os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT):
@@ -160,16 +165,16 @@ class _Supervisor:
                     return
                 os.waitpid(found.si_pid, os.WNOHANG)
 
-    def _end_all(self) -> None:
+    def _kill_descendants(self) -> None:
         """Kill all descendants, including those started meanwhile."""
         if not has_children():
             return
         import psutil  # for those who left something
 
-        until = time.monotonic() + _GRACE
+        until = time.monotonic() + _GRACE_SECONDS
         while time.monotonic() < until and has_children():
             for process in psutil.Process().children(recursive=True):
                 with suppress(psutil.Error, OSError):
                     process.kill()
-            self._reap()
+            self._reap_children()
             time.sleep(0.001)

@@ -22,19 +22,19 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from harness.base.shelf import FILE, Part, parts
-from harness.base.shelf import schema as schema_of
+from harness.base.shelf import FILE_COLUMN, UnitGroup, group_units
+from harness.base.shelf import read_group_schema as schema_of
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
-Promote = Literal["default", "permissive"]
+PromoteMode = Literal["default", "permissive"]
 
-MEMORY = 2**29
+MEMORY_LIMIT = 2**29
 """Memory limit of DuckDB, beyond its results, in bytes."""
 
 
-class Unfit(Exception):
+class SchemaMismatch(Exception):
     """The units cannot be read together.
 
     damaged_units: indices of units that are not files of rows.
@@ -42,34 +42,34 @@ class Unfit(Exception):
 
     def __init__(self, why: str, damaged: Sequence[int] = ()) -> None:
         super().__init__(why)
-        self.damaged = frozenset(damaged)
+        self.damaged_units = frozenset(damaged)
 
 
 @dataclass(frozen=True, slots=True)
-class Union:
+class RowUnion:
     """Groups of units, with their common schema and the SQL of their rows."""
 
-    parts: list[Part]
+    groups: list[UnitGroup]
     schema: pa.Schema
     sources: list[str]
     """Table expression of each group."""
     columns: list[str]
     """Select list of each group, in the order of the schema."""
 
-    none: str
+    empty_query: str
     """Select list without any group."""
 
     files: list[str]
     """Paths of all groups' files, as DuckDB reads them."""
 
-    def select(self) -> str:
+    def build_query(self) -> str:
         """Build a query for all rows, in the columns of the schema."""
         parts = [f"SELECT {columns} FROM {source}" for columns, source in zip(self.columns, self.sources, strict=True)]
-        return " UNION ALL ".join(parts or [f"SELECT {self.none} WHERE false"])
+        return " UNION ALL ".join(parts or [f"SELECT {self.empty_query} WHERE false"])
 
 
 @contextmanager
-def connected(memory: int = MEMORY) -> Generator[DuckDBPyConnection]:
+def open_connection(memory: int = MEMORY_LIMIT) -> Generator[DuckDBPyConnection]:
     """Open a DuckDB connection that reads only Parquet files.
 
     It uses one thread because other runs may be timed.
@@ -85,12 +85,12 @@ def connected(memory: int = MEMORY) -> Generator[DuckDBPyConnection]:
             connection.execute("SET enable_external_file_cache = false; SET disable_parquet_prefetching = true")
             yield connection
     except (duckdb.Error, pa.ArrowException, OSError, MemoryError) as error:
-        raise Unfit(str(error)) from error
+        raise SchemaMismatch(str(error)) from error
 
 
-def union(
-    connection: DuckDBPyConnection, name: str, asked: Sequence[Path], schema: pa.Schema, promote: Promote
-) -> Union:
+def build_union(
+    connection: DuckDBPyConnection, name: str, paths: Sequence[Path], schema: pa.Schema, promote: PromoteMode
+) -> RowUnion:
     """Build the union of units for DuckDB; the schema's columns come first.
 
     Values come only from inside the files: a folder called `size=64` sets no column.
@@ -105,59 +105,59 @@ def union(
         SchemaMismatch: if the units cannot be read together.
         InputError: for a damaged packed file.
     """
-    found, damaged = parts(asked)
+    found, damaged = group_units(paths)
     if damaged:
-        raise Unfit("not all are files of rows", damaged)
+        raise SchemaMismatch("not all are files of rows", damaged)
     try:
         schemas = [schema_of(part) for part in found]
         whole = pa.unify_schemas([schema, *schemas], promote_options=promote).remove_metadata()
     except (pa.ArrowException, OSError) as error:
-        raise Unfit(str(error)) from error
+        raise SchemaMismatch(str(error)) from error
     names = [name.casefold() for name in whole.names]
-    if len({*names, *_RESERVED}) < len(names) + len(_RESERVED):
-        raise Unfit("columns whose names DuckDB cannot tell apart")
-    types = _types(connection, whole)
+    if len({*names, *_RESERVED_COLUMNS}) < len(names) + len(_RESERVED_COLUMNS):
+        raise SchemaMismatch("columns whose names DuckDB cannot tell apart")
+    types = _read_column_types(connection, whole)
     sources: list[str] = []
     columns: list[str] = []
     files: list[str] = []
     for number, (part, own) in enumerate(zip(found, schemas, strict=True)):
         variable = f"{name}_{number}"
-        literal = _literal(part.files)
+        literal = _check_literal_paths(part.files)
         files += literal
         connection.execute(f"SET VARIABLE {variable} = $files", {"files": literal})
         source = f"read_parquet(getvariable('{variable}'), hive_partitioning = false)"
-        if part.packed is not None:
-            connection.execute(f"SET VARIABLE {variable}_units = $units", {"units": list(part.packed)})
-            source += f" WHERE {FILE} IN (SELECT unnest(getvariable('{variable}_units')))"
+        if part.packed_numbers is not None:
+            connection.execute(f"SET VARIABLE {variable}_units = $units", {"units": list(part.packed_numbers)})
+            source += f" WHERE {FILE_COLUMN} IN (SELECT unnest(getvariable('{variable}_units')))"
         sources.append(source)
-        columns.append(", ".join(_column(field, own, types[field.name]) for field in whole))
-    none = ", ".join(_column(field, pa.schema([]), types[field.name]) for field in whole)
-    return Union(found, whole, sources, columns, none, files)
+        columns.append(", ".join(_format_column(field, own, types[field.name]) for field in whole))
+    none = ", ".join(_format_column(field, pa.schema([]), types[field.name]) for field in whole)
+    return RowUnion(found, whole, sources, columns, none, files)
 
 
-_PATTERN = re.compile(r"[*?\[\\\ud800-\udfff]")
+_GLOB_PATTERN = re.compile(r"[*?\[\\\ud800-\udfff]")
 """Characters that DuckDB interprets as a pattern of several files, and those that UTF-8 lacks."""
 
 
-def _literal(files: Sequence[str]) -> list[str]:
+def _check_literal_paths(files: Sequence[str]) -> list[str]:
     """Return absolute paths, because DuckDB interprets `~` and `file:` at the start.
 
     Raises:
         SchemaMismatch: for a pattern.
     """
     found = [os.path.abspath(file) for file in files]
-    if bad := next((file for file in found if _PATTERN.search(file)), None):
-        raise Unfit(f"{bad!a} would be read as a pattern")
+    if bad := next((file for file in found if _GLOB_PATTERN.search(file)), None):
+        raise SchemaMismatch(f"{bad!a} would be read as a pattern")
     return found
 
 
-def table(
-    asked: Sequence[Path],
+def read_table(
+    paths: Sequence[Path],
     schema: pa.Schema,
-    needed: Sequence[str] = (),
+    required_columns: Sequence[str] = (),
     *,
-    most: int,
-    promote: Promote = "default",
+    max_rows: int,
+    promote: PromoteMode = "default",
 ) -> tuple[pa.Table, NDArray[np.int64]]:
     """Read all rows of units, in their order.
 
@@ -171,41 +171,43 @@ def table(
     Raises:
         SchemaMismatch: if a unit is damaged, empty or too long, or lacks a required column.
     """
-    with connected() as connection:
-        whole = union(connection, "files", asked, schema, promote)
-        if FILE in whole.schema.names:
-            raise Unfit(f"a file has a column {FILE} of its own")
+    with open_connection() as connection:
+        whole = build_union(connection, "files", paths, schema, promote)
+        if FILE_COLUMN in whole.schema.names:
+            raise SchemaMismatch(f"a file has a column {FILE_COLUMN} of its own")
         tables = [whole.schema.empty_table()]
         numbers = [np.empty(0, np.int64)]
         count, checked = 0, False
-        for part, columns, source in zip(whole.parts, whole.columns, whole.sources, strict=True):
-            at = "file_index" if part.packed is None else FILE
-            for batch in connection.sql(f"SELECT {columns}, {at} AS {_AT} FROM {source}").to_arrow_reader(100_000):
+        for part, columns, source in zip(whole.groups, whole.columns, whole.sources, strict=True):
+            at = "file_index" if part.packed_numbers is None else FILE_COLUMN
+            for batch in connection.sql(f"SELECT {columns}, {at} AS {_UNIT_COLUMN} FROM {source}").to_arrow_reader(
+                100_000
+            ):
                 read = pa.table(batch)
-                numbers.append(_numbers(part, read[_AT]))
-                tables.append(read.drop_columns([_AT]).cast(whole.schema))
+                numbers.append(_compute_unit_numbers(part, read[_UNIT_COLUMN]))
+                tables.append(read.drop_columns([_UNIT_COLUMN]).cast(whole.schema))
                 count += len(read)
-                if not checked and count > most:  # only then can a file claim as many
-                    _check_claims(whole.files, most)
+                if not checked and count > max_rows:  # only then can a file claim as many
+                    _check_row_counts(whole.files, max_rows)
                     checked = True
     number = np.concatenate(numbers)
     found = pa.concat_tables(tables)
-    lacking = [name for name in needed if name not in found.column_names or found[name].null_count]
-    if lacking or len(np.unique(number)) < len(asked):
-        raise Unfit(f"no {lacking[0]}" if lacking else "not all have rows")
+    lacking = [name for name in required_columns if name not in found.column_names or found[name].null_count]
+    if lacking or len(np.unique(number)) < len(paths):
+        raise SchemaMismatch(f"no {lacking[0]}" if lacking else "not all have rows")
     if np.all(np.diff(number) >= 0):
         return found, number
     order = np.argsort(number, kind="stable")
     return found.take(order), number[order]
 
 
-def _check_claims(files: Sequence[str], most: int) -> None:
+def _check_row_counts(files: Sequence[str], most: int) -> None:
     if any(pq.read_metadata(file).num_rows > most for file in files):
-        raise Unfit("a file has too many rows")
+        raise SchemaMismatch("a file has too many rows")
 
 
-def heads(
-    asked: Sequence[Path], columns: Sequence[str], schema: pa.Schema, needed: Sequence[str] = ()
+def query_first_rows(
+    paths: Sequence[Path], columns: Sequence[str], schema: pa.Schema, required_columns: Sequence[str] = ()
 ) -> dict[int, dict[str, Any]]:
     """Query columns of the first row of each unit.
 
@@ -220,34 +222,36 @@ def heads(
     Raises:
         SchemaMismatch: if the units cannot be read together.
     """
-    with connected() as connection:
-        whole = union(connection, "files", asked, schema, "default")
+    with open_connection() as connection:
+        whole = build_union(connection, "files", paths, schema, "default")
         found: dict[int, dict[str, Any]] = {}
-        named = ", ".join(f"'{name}': {_quoted(name)}" for name in columns)
-        full = " AND ".join([f"count({_quoted(name)}) = count(*)" for name in needed] or ["true"])
-        for part, stated, source in zip(whole.parts, whole.columns, whole.sources, strict=True):
-            at = "file_index" if part.packed is None else FILE
-            rows = f"SELECT {stated}, {at} AS {_AT}, file_row_number AS {_ROW} FROM {source}"
-            sql = f"SELECT {_AT}, arg_min({{{named}}}, {_ROW}) FROM ({rows}) GROUP BY {_AT} HAVING {full}"
+        named = ", ".join(f"'{name}': {_quote_identifier(name)}" for name in columns)
+        full = " AND ".join([f"count({_quote_identifier(name)}) = count(*)" for name in required_columns] or ["true"])
+        for part, stated, source in zip(whole.groups, whole.columns, whole.sources, strict=True):
+            at = "file_index" if part.packed_numbers is None else FILE_COLUMN
+            rows = f"SELECT {stated}, {at} AS {_UNIT_COLUMN}, file_row_number AS {_ROW_COLUMN} FROM {source}"
+            sql = f"SELECT {_UNIT_COLUMN}, arg_min({{{named}}}, {_ROW_COLUMN}) FROM ({rows}) GROUP BY {_UNIT_COLUMN} HAVING {full}"
             for which, head in connection.execute(sql).fetchall():
-                found[part.numbers[which] if part.packed is None else part.packed[which]] = head
+                found[part.unit_numbers[which] if part.packed_numbers is None else part.packed_numbers[which]] = head
     return found
 
 
-_AT, _ROW = "unit_asked_for", "row_of_the_unit"
-_RESERVED = (_AT, _ROW, "file_index", "file_row_number", "filename")
+_UNIT_COLUMN, _ROW_COLUMN = "unit_asked_for", "row_of_the_unit"
+_RESERVED_COLUMNS = (_UNIT_COLUMN, _ROW_COLUMN, "file_index", "file_row_number", "filename")
 """Reserved column names: the module's own, and those by which DuckDB reports the source of a row."""
 
 
-def _numbers(part: Part, at: Any) -> np.ndarray[Any, np.dtype[np.int64]]:
+def _compute_unit_numbers(part: UnitGroup, at: Any) -> np.ndarray[Any, np.dtype[np.int64]]:
     """Compute the index of each row's unit."""
-    if part.packed is None:
-        return np.asarray(part.numbers, np.int64)[at.to_numpy()]
+    if part.packed_numbers is None:
+        return np.asarray(part.unit_numbers, np.int64)[at.to_numpy()]
     coded = at.combine_chunks().dictionary_encode()
-    return np.array([part.packed[name] for name in coded.dictionary.to_pylist()], np.int64)[coded.indices.to_numpy()]
+    return np.array([part.packed_numbers[name] for name in coded.dictionary.to_pylist()], np.int64)[
+        coded.indices.to_numpy()
+    ]
 
 
-def _types(connection: DuckDBPyConnection, schema: pa.Schema) -> dict[str, str]:
+def _read_column_types(connection: DuckDBPyConnection, schema: pa.Schema) -> dict[str, str]:
     """Read DuckDB's names of the column types."""
     connection.register("empty", schema.empty_table())
     types = connection.execute("SELECT column_name, column_type FROM (DESCRIBE empty)").fetchall()
@@ -255,17 +259,17 @@ def _types(connection: DuckDBPyConnection, schema: pa.Schema) -> dict[str, str]:
     return dict(types)
 
 
-def _column(field: pa.Field[Any], own: pa.Schema, type: str) -> str:
+def _format_column(field: pa.Field[Any], own: pa.Schema, type: str) -> str:
     """Format the select expression of a column for one group.
 
     The group may lack the column, or have another type.
     """
-    name = _quoted(field.name)
+    name = _quote_identifier(field.name)
     at = own.get_field_index(field.name)
     if at >= 0 and own.field(at).type == field.type:
         return name
     return f"CAST({'NULL' if at < 0 else name} AS {type}) AS {name}"
 
 
-def _quoted(name: str) -> str:
+def _quote_identifier(name: str) -> str:
     return '"' + name.replace('"', '""') + '"'

@@ -20,32 +20,32 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, NamedTuple
 
-from harness.base.blame import said, where
-from harness.base.child import data, limit, reader, without_core_dumps
-from harness.base.console import write_plainly
+from harness.base.blame import format_error, locate_error
+from harness.base.child import disable_core_dumps, get_sandbox_pid, read_data_bytes, set_soft_limit
+from harness.base.console import reset_error_console
 from harness.base.errors import SpringbenchError
-from solvers.device import broken
+from solvers.device import is_device_lost
 
-Tick = Callable[[str], None]
-Piece = Callable[[Tick], Any]
+ProgressCallback = Callable[[str], None]
+TaskFunction = Callable[[ProgressCallback], Any]
 """Function of a task. Its argument is the progress callback, which receives the name of the phase after each step. The
 function and its result must pickle.
 """
 
-DUMP = signal.SIGUSR1
+DUMP_SIGNAL = signal.SIGUSR1
 """Signal that makes a worker dump its stack."""
 
-_THOROUGH = 10.0
+_FULL_CHECK_SECONDS = 10.0
 """Seconds between two full garbage collections, which include objects of earlier tasks; a cache may have released
 them."""
 
-_PARENT_DIES, _SUBREAPER = 1, 36
+_PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 """`PR_SET_PDEATHSIG`: Linux sends a process a signal when its parent dies. `PR_SET_CHILD_SUBREAPER`: Linux makes it the
 parent of orphaned descendants.
 """
 
 
-class Limits(NamedTuple):
+class TaskLimits(NamedTuple):
     """Limits of a task; None is unlimited.
 
     wall_seconds: wall time [s].
@@ -53,12 +53,12 @@ class Limits(NamedTuple):
     log_path: file for output that is too long to be shown.
     """
 
-    seconds: float | None = None
-    gib: float | None = None
-    log: Path | None = None
+    wall_seconds: float | None = None
+    memory_gib: float | None = None
+    log_path: Path | None = None
 
 
-class PieceOutcome(NamedTuple):
+class TaskOutcome(NamedTuple):
     """Result of a task.
 
     value: return value.
@@ -68,11 +68,11 @@ class PieceOutcome(NamedTuple):
 
     value: Any
     error: SpringbenchError | str = ""
-    clean: bool = True
+    is_clean: bool = True
 
 
-def serve(
-    calls: Connection, ticks: Connection, output: int, dump: Connection, ready: Callable[[], object], parent: int
+def serve_tasks(
+    calls: Connection, ticks: Connection, output: int, dump: Connection, initialiser: Callable[[], object], parent: int
 ) -> None:
     """Run the tasks that arrive through `calls` until the pipe is closed.
 
@@ -84,7 +84,7 @@ def serve(
         initialiser: called first.
         parent: process id of the parent.
     """
-    tie(parent)
+    tie_to_parent(parent)
     adopt_orphans()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's affair, which ends this
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -96,18 +96,18 @@ def serve(
     sys.stdout, sys.stderr = (
         os.fdopen(standard, "w", buffering=1, errors="backslashreplace", closefd=False) for standard in (1, 2)
     )
-    write_plainly()
+    reset_error_console()
     faulthandler.enable(dump.fileno(), all_threads=False)
-    faulthandler.register(DUMP, dump.fileno(), all_threads=True)
-    without_core_dumps()
-    ready()
+    faulthandler.register(DUMP_SIGNAL, dump.fileno(), all_threads=True)
+    disable_core_dumps()
+    initialiser()
     gc.freeze()  # what the parent had need not be looked through after each piece
     me, here = os.getpid(), os.getcwd()
     looked = monotonic()
     with suppress(EOFError, OSError):  # a piece may have closed what this is asked through
         while (asked := calls.recv()) is not None:
             piece, limits, end = asked
-            answer = _answer(piece, limits, lambda phase: ticks.send_bytes(phase.encode()))
+            answer = _run_task(piece, limits, lambda phase: ticks.send_bytes(phase.encode()))
             if os.getpid() != me:  # a copy of this process that the piece has made
                 os._exit(0)
             with suppress(OSError, ValueError, AttributeError):  # closed by the piece, or put away
@@ -117,20 +117,20 @@ def serve(
             with suppress(OSError):
                 os.chdir(here)
             calls.send(answer)
-            if monotonic() - looked > _THOROUGH:
+            if monotonic() - looked > _FULL_CHECK_SECONDS:
                 looked = monotonic()
                 gc.unfreeze()
             gc.collect()  # now, and not while the next piece is timed
             gc.freeze()  # compiled kernels leave 10^5 objects, which take longer to look through than a short run
 
 
-def tie(parent: int, how: signal.Signals = signal.SIGKILL) -> None:
+def tie_to_parent(parent: int, death_signal: signal.Signals = signal.SIGKILL) -> None:
     """End this child process by a signal when its parent ends.
 
     It is also the first to be killed when memory runs out.
     """
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PARENT_DIES, how)
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, death_signal)
         if os.getppid() != parent:
             os._exit(1)
         with suppress(OSError), open("/proc/self/oom_score_adj", "w") as file:
@@ -140,32 +140,34 @@ def tie(parent: int, how: signal.Signals = signal.SIGKILL) -> None:
 def adopt_orphans() -> None:
     """Make this process the parent of its orphaned descendants."""
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_SUBREAPER, 1)
+        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
-def _answer(piece: Piece, limits: Limits, tick: Tick) -> PieceOutcome:
-    before = threading.active_count(), _processes()
-    if limits.gib is not None:
-        limit(resource.RLIMIT_DATA, data() + limits.gib * 2**30)
+def _run_task(piece: TaskFunction, limits: TaskLimits, tick: ProgressCallback) -> TaskOutcome:
+    before = threading.active_count(), _list_children()
+    if limits.memory_gib is not None:
+        set_soft_limit(resource.RLIMIT_DATA, read_data_bytes() + limits.memory_gib * 2**30)
     try:
         value: Any = piece(tick)
     except SpringbenchError as error:
-        return PieceOutcome(None, error, clean=_as(before) and not broken())
+        return TaskOutcome(None, error, is_clean=_is_clean_after(before) and not is_device_lost())
     except BaseException as error:  # SystemExit and GeneratorExit too: whoever called is not to leave
-        why = f"raised {said(error)} ({where(error, ())})"
-        return PieceOutcome(None, why, clean=isinstance(error, Exception) and _as(before) and not broken())
+        why = f"raised {format_error(error)} ({locate_error(error, ())})"
+        return TaskOutcome(
+            None, why, is_clean=isinstance(error, Exception) and _is_clean_after(before) and not is_device_lost()
+        )
     finally:
-        limit(resource.RLIMIT_DATA, resource.RLIM_INFINITY)
-    return PieceOutcome(value, clean=_as(before) and not broken())
+        set_soft_limit(resource.RLIMIT_DATA, resource.RLIM_INFINITY)
+    return TaskOutcome(value, is_clean=_is_clean_after(before) and not is_device_lost())
 
 
-def _processes() -> set[int]:
+def _list_children() -> set[int]:
     """List the children of this process without the sandbox that reads files."""
     if not has_children():
         return set()
     import psutil  # which takes longer to load than most pieces have
 
-    return {child.pid for child in psutil.Process().children()} - {reader()}
+    return {child.pid for child in psutil.Process().children()} - {get_sandbox_pid()}
 
 
 def has_children() -> bool:
@@ -177,6 +179,6 @@ def has_children() -> bool:
     return True
 
 
-def _as(before: tuple[int, set[int]]) -> bool:
+def _is_clean_after(before: tuple[int, set[int]]) -> bool:
     """Return whether a task left no threads and no processes behind."""
-    return threading.active_count() <= before[0] and _processes() <= before[1]
+    return threading.active_count() <= before[0] and _list_children() <= before[1]

@@ -25,32 +25,32 @@ from time import monotonic
 from typing import Any
 
 from harness.base import interrupts
-from harness.base.asides import LOOK, WAITING, begun, ended, is_step
-from harness.base.blame import place
-from harness.base.files import CannotWrite, replacing
-from harness.base.memory_of_tree import TreeMemory
-from harness.base.supervisor import BUFFER, supervise
-from harness.base.worker import DUMP, Limits, Piece, PieceOutcome, Tick
+from harness.base.asides import POLL, WAITING, is_step_event, parse_activity_end, parse_activity_start
+from harness.base.blame import parse_fault_location
+from harness.base.files import WriteError, atomic_write
+from harness.base.memory_of_tree import ProcessTreeMemory
+from harness.base.supervisor import BUFFER_BYTES, supervise_worker
+from harness.base.worker import DUMP_SIGNAL, ProgressCallback, TaskFunction, TaskLimits, TaskOutcome
 
-Going = Generator[Connection, None, Any]
+RunningTask = Generator[Connection, None, Any]
 """A running task: a generator that yields the connection to wait for, and returns the task's value."""
 
-NO_FORK: set[str] = set()
+FORK_BLOCKERS: set[str] = set()
 """Components started in this process, besides Numba's threads, that do not survive a fork."""
 
-_LOOK = 0.1
+_POLL_INTERVAL = 0.1
 """Seconds between two polls of a busy worker."""
-_LATEST = 1.0
+_OUTPUT_WAIT_SECONDS = 1.0
 """Maximum seconds to wait for a task's last output if the task has closed or stopped the stream."""
-_GRACE = 5.0
+_GRACE_SECONDS = 5.0
 """Seconds that a worker has for dumping its stack, or for ending, before it is killed."""
-_KEPT = 2**14
+_MAX_TAIL_BYTES = 2**14
 """Number of the last output bytes that are stored."""
-_SHOWN = 2**13
+_MAX_PRINTED_BYTES = 2**13
 """Maximum number of output bytes of a task that are shown; longer output goes to a file, up to `BUFFER_BYTES`."""
 
 
-class Lost(Exception):
+class TaskFailure(Exception):
     """A task returned no result.
 
     status: `time-limit` after too long a time, `killed` if its worker was ended from outside, `failed` if it ended its
@@ -63,26 +63,32 @@ class Lost(Exception):
         self.status, self.reason = status, reason
 
 
-class Workers:
+class IsolatedWorker:
     """Runs tasks in an isolated worker process.
 
     initialiser: called first in each worker.
     fork: whether the worker may be a fork of this process, which is safe while no other thread runs here.
     """
 
-    def __init__(self, ready: Callable[[], object] = int, *, fork: bool = True) -> None:
-        self._ready, self._fork = ready, fork
-        self._worker: _Worker | None = None
+    def __init__(self, initialiser: Callable[[], object] = int, *, fork: bool = True) -> None:
+        self._ready, self._fork = initialiser, fork
+        self._worker: _WorkerProcess | None = None
         self._own: frozenset[Hashable] = frozenset()
 
-    def begin(self) -> None:
+    def start_worker(self) -> None:
         """Start a worker if there is none; it initialises itself concurrently."""
-        if self._worker is None or not self._worker.alive:
-            self.end()
-            with interrupts.blocked():  # a worker that has started is known to this, and never receives Ctrl-C
-                self._worker = _Worker(self._ready, fork=self._fork)
+        if self._worker is None or not self._worker.is_ready:
+            self.stop_worker()
+            with interrupts.block_interrupts():  # a worker that has started is known to this, and never receives Ctrl-C
+                self._worker = _WorkerProcess(self._ready, fork=self._fork)
 
-    def do(self, piece: Piece, tick: Tick, limits: Limits, meanwhile: Callable[[], object] = int) -> Any:
+    def run_task(
+        self,
+        function: TaskFunction,
+        tick: ProgressCallback,
+        limits: TaskLimits,
+        background_call: Callable[[], object] = int,
+    ) -> Any:
         """Run a task and wait for its result.
 
         Args:
@@ -95,17 +101,23 @@ class Workers:
             SpringbenchError: if the task raises it.
             TaskFailure: if the task returns no result.
         """
-        going = self.doing(piece, tick, limits)
+        going = self.start_task(function, tick, limits)
         while True:
             try:
                 come = next(going)
             except StopIteration as done:
                 return done.value
-            meanwhile()
-            meanwhile = int
-            wait([come], _LOOK)
+            background_call()
+            background_call = int
+            wait([come], _POLL_INTERVAL)
 
-    def doing(self, piece: Piece, tick: Tick, limits: Limits, own: frozenset[Hashable] = frozenset()) -> Going:
+    def start_task(
+        self,
+        function: TaskFunction,
+        tick: ProgressCallback,
+        limits: TaskLimits,
+        user_code: frozenset[Hashable] = frozenset(),
+    ) -> RunningTask:
         """Start a task that runs concurrently with others.
 
         Args:
@@ -117,107 +129,111 @@ class Workers:
         Returns: generator that yields the connection to wait for, and returns the task's value.
         Raises: as `run_task`.
         """
-        if not self._own <= own:
-            self.end()
-        self.begin()
-        self._own = own
+        if not self._own <= user_code:
+            self.stop_worker()
+        self.start_worker()
+        self._own = user_code
         assert self._worker
         try:
-            answer = yield from self._worker.ask(piece, tick, limits)
+            answer = yield from self._worker.submit_task(function, tick, limits)
         except BaseException:  # it was lost, or somebody wants to leave
             if self._worker:
-                self._worker.kill()
-            self.end()
+                self._worker.kill_process()
+            self.stop_worker()
             raise
-        if not answer.clean:
-            self.end()
+        if not answer.is_clean:
+            self.stop_worker()
         if isinstance(answer.error, str) and answer.error:
-            raise Lost("failed", answer.error)
+            raise TaskFailure("failed", answer.error)
         if answer.error:
             raise answer.error
         return answer.value
 
-    def end(self) -> None:
+    def stop_worker(self) -> None:
         """Stop the worker and release its resources."""
         if self._worker:
-            self._worker.end()
+            self._worker.stop_process()
             self._worker, self._own = None, frozenset[Hashable]()
 
 
-class _Worker:
+class _WorkerProcess:
     """One worker process and its supervisor, as seen from the command."""
 
-    def __init__(self, ready: Callable[[], object], *, fork: bool) -> None:
-        fork = fork and sys.platform == "linux" and not NO_FORK and not _threads_run()
+    def __init__(self, initialiser: Callable[[], object], *, fork: bool) -> None:
+        fork = fork and sys.platform == "linux" and not FORK_BLOCKERS and not _has_numba_threads()
         context: Any = get_context("fork" if fork else "spawn")
         self._calls, calls = context.Pipe()
         (self._ticks, ticks), (self._said, said), (self._dump, dump) = (context.Pipe(duplex=False) for _ in range(3))
         theirs = calls, ticks, said, dump
-        self._process = context.Process(target=supervise, args=(*theirs, ready, os.getpid()))
+        self._process = context.Process(target=supervise_worker, args=(*theirs, initialiser, os.getpid()))
         if not fork:
             resource_tracker.ensure_running()  # which unblocks Ctrl-C
-        with interrupts.blocked():
+        with interrupts.block_interrupts():
             self._process.start()
         for end in theirs:
             end.close()
 
     @property
-    def alive(self) -> bool:
+    def is_ready(self) -> bool:
         """Whether a task can be submitted.
 
         The pipe of an idle worker has nothing to read, not even its end.
         """
         return self._process.is_alive() and not self._calls.poll()
 
-    def ask(self, piece: Piece, tick: Tick, limits: Limits) -> Generator[Connection, None, PieceOutcome]:
+    def submit_task(
+        self, piece: TaskFunction, tick: ProgressCallback, limits: TaskLimits
+    ) -> Generator[Connection, None, TaskOutcome]:
         """Submit a task and return its result at the end; raise TaskFailure."""
-        heard, began = _Heard(self._ticks, self._said, tick, limits.log), monotonic()
-        memory = TreeMemory(self._process.pid or 0, limits.gib) if limits.gib else None
+        heard, began = _TaskOutput(self._ticks, self._said, tick, limits.log_path), monotonic()
+        memory = ProcessTreeMemory(self._process.pid or 0, limits.memory_gib) if limits.memory_gib else None
         try:
             self._calls.send((piece, limits, heard.end))
             while not self._calls.poll():
                 yield self._calls
-                heard.listen()
-                if limits.seconds is not None and monotonic() - began - heard.waited > limits.seconds:
-                    raise self._late(limits.seconds, heard)
-                if memory and memory.exceeded:
-                    self.kill(heard.listen)
-                    raise Lost("failed", f"took more than {limits.gib:g} GiB with the processes it started, {heard}")
+                heard.read_pending()
+                if limits.wall_seconds is not None and monotonic() - began - heard.waited_seconds > limits.wall_seconds:
+                    raise self._handle_timeout(limits.wall_seconds, heard)
+                if memory and memory.is_exceeded:
+                    self.kill_process(heard.read_pending)
+                    raise TaskFailure(
+                        "failed", f"took more than {limits.memory_gib:g} GiB with the processes it started, {heard}"
+                    )
                 if not self._process.is_alive() and not self._calls.poll():  # others may hold the pipe open
                     raise EOFError
             answer = self._calls.recv()
-            heard.listen_to_end(_LATEST)
+            heard.read_to_end(_OUTPUT_WAIT_SECONDS)
             return answer
         except (EOFError, OSError, UnpicklingError):
-            raise self._ended(heard) from None
+            raise self._handle_exit(heard) from None
         finally:
-            heard.close()
+            heard.close_output()
 
-    def _late(self, seconds: float, heard: _Heard) -> Lost:
+    def _handle_timeout(self, seconds: float, heard: _TaskOutput) -> TaskFailure:
         """Request the stack of a worker that exceeds its time limit, and kill it."""
         with suppress(OSError):
-            os.kill(self._process.pid or 0, DUMP)
+            os.kill(self._process.pid or 0, DUMP_SIGNAL)
         dump, more = b"", b""
-        while wait([self._dump], _LOOK if dump else _GRACE) and (more := _come(self._dump)):
+        while wait([self._dump], _POLL_INTERVAL if dump else _GRACE_SECONDS) and (more := _read_available(self._dump)):
             dump += more
-        self.kill(heard.listen)
-        return Lost("time-limit", f"did not end within {seconds:g} s; it was {_at(dump)}{heard}")
+        self.kill_process(heard.read_pending)
+        return TaskFailure("time-limit", f"did not end within {seconds:g} s; it was {_format_location(dump)}{heard}")
 
-    def _ended(self, heard: _Heard) -> Lost:
+    def _handle_exit(self, heard: _TaskOutput) -> TaskFailure:
         """Describe why a worker ended without a result."""
-        self._wait(_GRACE, heard.listen)
-        self.kill(heard.listen)
-        code, at = self._process.exitcode or 0, _at(_come(self._dump))
+        self._wait_for_exit(_GRACE_SECONDS, heard.read_pending)
+        self.kill_process(heard.read_pending)
+        code, at = self._process.exitcode or 0, _format_location(_read_available(self._dump))
         if code >= 0:
-            return Lost("failed", f"ended its process with exit code {code}, {heard}")
+            return TaskFailure("failed", f"ended its process with exit code {code}, {heard}")
         name = signal.Signals(-code).name
         if -code == signal.SIGKILL:
-            return Lost("killed", f"was killed by SIGKILL, as the system does where memory runs out, {heard}")
+            return TaskFailure("killed", f"was killed by SIGKILL, as the system does where memory runs out, {heard}")
         if -code == signal.SIGTERM:
-            return Lost("killed", f"was ended by SIGTERM, {heard}")
-        return Lost("failed", f"crashed by {name} {at}{heard}")
+            return TaskFailure("killed", f"was ended by SIGTERM, {heard}")
+        return TaskFailure("failed", f"crashed by {name} {at}{heard}")
 
-    def kill(self, listen: Callable[[], object] = int) -> None:
+    def kill_process(self, listen: Callable[[], object] = int) -> None:
         """Kill the worker and all its processes at once.
 
         `listen` receives the output that the supervisor still relays.
@@ -226,33 +242,33 @@ class _Worker:
             self._process.terminate()
             with suppress(OSError):
                 os.kill(self._process.pid or 0, signal.SIGCONT)  # for one that was stopped
-            self._wait(_GRACE, listen)
+            self._wait_for_exit(_GRACE_SECONDS, listen)
         if self._process.is_alive():
             self._process.kill()
         self._process.join()
         listen()
 
-    def _wait(self, seconds: float, listen: Callable[[], object]) -> None:
+    def _wait_for_exit(self, seconds: float, listen: Callable[[], object]) -> None:
         """Wait for the worker's exit, at most the given seconds."""
         until = monotonic() + seconds
         while (left := until - monotonic()) > 0 and not wait([self._process.sentinel], min(left, 0.01)):
             listen()
 
-    def end(self) -> None:
+    def stop_process(self) -> None:
         """Request the worker's exit, and kill it if it does not end."""
         with suppress(OSError):
             self._calls.send(None)
-        self._wait(_GRACE, partial(_come, self._said))
-        self.kill()
+        self._wait_for_exit(_GRACE_SECONDS, partial(_read_available, self._said))
+        self.kill_process()
         for pipe in (self._calls, self._ticks, self._said, self._dump):
             pipe.close()
         self._process.close()
 
 
-class _Heard:
+class _TaskOutput:
     """Progress events and output of a task while it runs."""
 
-    def __init__(self, ticks: Connection, said: Connection, tick: Tick, log: Path | None) -> None:
+    def __init__(self, ticks: Connection, said: Connection, tick: ProgressCallback, log: Path | None) -> None:
         self._ticks, self._said, self._tick, self._log = ticks, said, tick, log
         self._phase, self._steps, self._kept, self._all = "", 0, b"", bytearray()
         self._count, self._held, self._ended = 0, bytearray(), False
@@ -261,34 +277,34 @@ class _Heard:
         self._waited = 0.0
 
     @property
-    def waited(self) -> float:
+    def waited_seconds(self) -> float:
         """Seconds that the task has waited for other processes, according to its events."""
         return self._waited + (0.0 if self._waits_since is None else monotonic() - self._waits_since)
 
-    def listen(self) -> None:
+    def read_pending(self) -> None:
         """Forward the events and the output received since the last call."""
         with suppress(EOFError, OSError):
             while self._ticks.poll():
                 phase = self._ticks.recv_bytes().decode(errors="replace")
-                if is_step(phase):
+                if is_step_event(phase):
                     self._phase, self._steps = phase, 1 + (self._steps if phase == self._phase else 0)
-                elif begun(phase) == WAITING:
+                elif parse_activity_start(phase) == WAITING:
                     self._waits_since = monotonic()
-                elif ended(phase) == WAITING:
-                    self._waited, self._waits_since = self.waited, None
+                elif parse_activity_end(phase) == WAITING:
+                    self._waited, self._waits_since = self.waited_seconds, None
                 self._tick(phase)
-        self._tick(LOOK)
-        self._take(_come(self._said))
+        self._tick(POLL)
+        self._add_output(_read_available(self._said))
 
-    def listen_to_end(self, seconds: float) -> None:
+    def read_to_end(self, seconds: float) -> None:
         """Forward the last output of a finished task, waiting at most the given seconds."""
         until = monotonic() + seconds
-        self.listen()
+        self.read_pending()
         while not self._ended and (left := until - monotonic()) > 0:
             wait([self._said], left)
-            self.listen()
+            self.read_pending()
 
-    def _take(self, said: bytes) -> None:
+    def _add_output(self, said: bytes) -> None:
         """Show and store output.
 
         Bytes that may be the start of the end marker are held back until the next ones arrive.
@@ -297,30 +313,30 @@ class _Heard:
         at = self._held.find(self.end)
         self._ended = self._ended or at >= 0
         upto = at if at >= 0 else max(0, len(self._held) - len(self.end))
-        self._pass_on(bytes(self._held[:upto]))
+        self._show_output(bytes(self._held[:upto]))
         self._held = bytearray() if at >= 0 else self._held[upto:]
 
-    def _pass_on(self, said: bytes) -> None:
-        if shown := said[: max(0, _SHOWN - self._count)]:
+    def _show_output(self, said: bytes) -> None:
+        if shown := said[: max(0, _MAX_PRINTED_BYTES - self._count)]:
             sys.stderr.write(shown.decode(errors="replace"))
         self._count += len(said)
-        self._all += said[: BUFFER - len(self._all)] if self._log else b""
-        self._kept = (self._kept + said)[-_KEPT:]
+        self._all += said[: BUFFER_BYTES - len(self._all)] if self._log else b""
+        self._kept = (self._kept + said)[-_MAX_TAIL_BYTES:]
 
-    def close(self) -> None:
+    def close_output(self) -> None:
         """Show the rest of the output. Write output that was too long to the log, and report that."""
-        self._pass_on(bytes(self._held))
+        self._show_output(bytes(self._held))
         self._held.clear()
-        if self._count <= _SHOWN:
+        if self._count <= _MAX_PRINTED_BYTES:
             return
         where = ""
         if self._log:
-            with suppress(OSError, CannotWrite):
+            with suppress(OSError, WriteError):
                 self._log.parent.mkdir(parents=True, exist_ok=True)
-                with replacing(self._log) as partial_name:
+                with atomic_write(self._log) as partial_name:
                     partial_name.write_bytes(self._all)
                 where = f"; {'all of it is' if len(self._all) == self._count else 'the beginning is'} in {self._log}"
-        sys.stderr.write(f"\n[of {self._count} bytes of output the first {_SHOWN} are shown{where}]\n")
+        sys.stderr.write(f"\n[of {self._count} bytes of output the first {_MAX_PRINTED_BYTES} are shown{where}]\n")
 
     def __str__(self) -> str:
         steps = f"after {self._steps} steps of the {self._phase}" if self._steps else "before its first step"
@@ -328,22 +344,22 @@ class _Heard:
         return f"{steps}; it said: {lines[-1].strip()[:300]}" if lines else steps
 
 
-def _come(pipe: Connection) -> bytes:
+def _read_available(pipe: Connection) -> bytes:
     """Read the bytes that are in a pipe now, at most BUFFER_BYTES."""
     found = b""
     with suppress(OSError):
-        while len(found) < BUFFER and pipe.poll() and (more := os.read(pipe.fileno(), 2**16)):
+        while len(found) < BUFFER_BYTES and pipe.poll() and (more := os.read(pipe.fileno(), 2**16)):
             found += more
     return found
 
 
-def _at(dump: bytes) -> str:
+def _format_location(dump: bytes) -> str:
     """Format the location of a worker from its dump: `at file:line in function, `."""
-    found = place(dump.decode(errors="replace"))
+    found = parse_fault_location(dump.decode(errors="replace"))
     return found and f"at {found}, "
 
 
-def _threads_run() -> bool:
+def _has_numba_threads() -> bool:
     """Return whether Numba's threads were started in this process."""
     numba: Any = sys.modules.get("numba")
     if numba is None:

@@ -13,18 +13,18 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from harness.base.files import safe_name
-from harness.base.model import Many, Model
-from harness.config.options import OF_STEPS, Threads, lists, single
+from harness.base.files import sanitise_name
+from harness.base.model import ConfigModel, OneOrMany
+from harness.config.options import STEP_OPTIONS, ThreadCount, build_list_model, build_single_model
 from harness.config.sweep import SolverSpec
-from harness.scenes.spec import FirstGuess, Frames, IntegratorName, SceneSpec, Size
-from solvers.plugins import identity
+from harness.scenes.spec import FrameCount, InitialGuess, IntegratorName, MeshSize, SceneSpec
+from solvers.plugins import identify_code
 
-Moment = Literal["early", "middle", "violent"] | Frames
+SnapshotName = Literal["early", "middle", "violent"] | FrameCount
 """A snapshot of the scene that is found from its own run, or the number of a frame."""
 
 
-def moment_name(moment: str | int) -> str:
+def format_snapshot(moment: str | int) -> str:
     """Format a snapshot for rows: early, middle, violent or frame-k."""
     return f"frame-{moment}" if isinstance(moment, int) else moment
 
@@ -32,38 +32,40 @@ def moment_name(moment: str | int) -> str:
 TimeLimit = Annotated[float, Field(gt=0, le=1e5)]
 
 
-class Study(lists("integrator", "time_step"), single(rounds=3)):
+class AccuracyStudyConfig(build_list_model("integrator", "time_step"), build_single_model(rounds=3)):
     """Fields of every study; all combinations of its lists are measured."""
 
-    scene: Many[str] = ()
+    scene: OneOrMany[str] = ()
     """Names of scenes, the stems of their files; all of them if left out."""
-    size: Many[Size] = ()
+    size: OneOrMany[MeshSize] = ()
     """Mesh sizes; each scene's default if left out."""
-    solver: Many[str] = ()
+    solver: OneOrMany[str] = ()
     """Names of solvers that the config lists; all of them if left out."""
-    threads: Threads = 1
+    threads: ThreadCount = 1
     """Number of threads of Numba and of BLAS; never automatic, because another number is another measurement."""
     time_limit: TimeLimit = 5.0
     """Seconds that a solver may take for one curve, or one simulation."""
 
 
-class CurveStudy(Study, lists(first_guess=("current", "inertial")), single(iterations=2000)):
+class CurveStudyConfig(
+    AccuracyStudyConfig, build_list_model(first_guess=("current", "inertial")), build_single_model(iterations=2000)
+):
     """Convergence of minimising solvers on step snapshots; a curve ends at convergence."""
 
-    moment: Many[Moment] = ("early", "middle", "violent")
+    moment: OneOrMany[SnapshotName] = ("early", "middle", "violent")
     """Steps to take snapshots of: moments found from the scene's run, or numbers of frames."""
     recordings: bool = False
     """Whether the solve from the first initial guess is recorded, to view its iterates on the mesh."""
 
 
-class WorkStudy(Study, lists(*OF_STEPS)):
+class WorkStudyConfig(AccuracyStudyConfig, build_list_model(*STEP_OPTIONS)):
     """Error and wall time of whole trajectories."""
 
     horizon: Annotated[float, Field(gt=0, le=1e4)] = 1.0
     """Simulated time [s]; a multiple of every time step."""
 
 
-class AccuracyFields(Model):
+class AccuracyConfig(ConfigModel):
     """An accuracy config: scenes, solvers and studies."""
 
     description: str = Field(default="", max_length=1000)
@@ -72,14 +74,14 @@ class AccuracyFields(Model):
     """Scene files (*.yaml, or *.json of the assignment), relative to the config."""
     solvers: tuple[str | dict[str, Any], ...] = Field(min_length=1)
     """Solvers: a name, or a mapping of `name` and the solver's parameters."""
-    curves: tuple[CurveStudy, ...] = ()
+    curves: tuple[CurveStudyConfig, ...] = ()
     """Studies of convergence; if two include the same solve, the settings of the first apply."""
-    work: tuple[WorkStudy, ...] = ()
+    work: tuple[WorkStudyConfig, ...] = ()
     """Studies of work; if two include the same simulation, the settings of the first apply."""
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class BenchmarkCase:
     """A scene at a mesh size, with an integrator and a time step.
 
     The time step is that of `scene`.
@@ -90,9 +92,9 @@ class Case:
     size: int
     integrator: IntegratorName
 
-    def identity(self) -> list[Any]:
+    def build_identity(self) -> list[Any]:
         """Build plain data that determines the motion."""
-        return [self.scene.digest, self.size, identity(self.integrator)]
+        return [self.scene.scene_digest, self.size, identify_code(self.integrator)]
 
     @property
     def title(self) -> str:
@@ -101,7 +103,7 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True)
-class How:
+class MeasurementSettings:
     """Measurement settings of a unit, as in `AccuracyStudyConfig`."""
 
     threads: int
@@ -113,35 +115,41 @@ class How:
 class CurveSpec:
     """Specification of the curves of one solver on one step snapshot."""
 
-    case: Case
+    case: BenchmarkCase
     moment: str | int
     solver: SolverSpec
-    first_guesses: tuple[FirstGuess, ...]
+    initial_guesses: tuple[InitialGuess, ...]
     iterations: int
     recordings: bool
-    how: How
+    measurement: MeasurementSettings
 
-    def point(self) -> list[Any]:
+    def describe_point(self) -> list[Any]:
         """Describe what is measured as plain data, without the measurement settings."""
-        return ["curve", *self.case.identity(), self.moment, identity(self.solver.name), dict(self.solver.parameters)]
+        return [
+            "curve",
+            *self.case.build_identity(),
+            self.moment,
+            identify_code(self.solver.name),
+            dict(self.solver.parameters),
+        ]
 
-    def unit_id(self, machine: str) -> str:
+    def compute_unit_id(self, machine: str) -> str:
         """Compute 12 hex digits from everything that determines result and timing."""
-        how = [asdict(self.how), self.first_guesses, self.iterations, self.recordings]
-        return _hash([machine, self.point(), how])
+        how = [asdict(self.measurement), self.initial_guesses, self.iterations, self.recordings]
+        return _compute_hash([machine, self.describe_point(), how])
 
-    def label(self) -> str:
+    def build_file_stem(self) -> str:
         """Build the stem of its file.
 
         It is the same for other measurement settings, so that a new measurement replaces the file.
         """
-        solver = safe_name(self.solver.name)
-        return f"{self.case.scene_name}-{self.case.size}-{self.moment}-{solver}-{_hash(self.point())}"
+        solver = sanitise_name(self.solver.name)
+        return f"{self.case.scene_name}-{self.case.size}-{self.moment}-{solver}-{_compute_hash(self.describe_point())}"
 
-    def problem_label(self) -> str:
+    def build_problem_stem(self) -> str:
         """Build the stem of the file of the step itself."""
-        problem = [*self.case.identity(), self.moment]
-        return f"{self.case.scene_name}-{self.case.size}-{self.moment}-{_hash(problem)}"
+        problem = [*self.case.build_identity(), self.moment]
+        return f"{self.case.scene_name}-{self.case.size}-{self.moment}-{_compute_hash(problem)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,30 +159,30 @@ class WorkSpec:
     Options: the values of `STEP_OPTIONS`, in their order.
     """
 
-    case: Case
+    case: BenchmarkCase
     horizon: float
     solver: SolverSpec
     options: Mapping[str, Any]
-    how: How
+    measurement: MeasurementSettings
 
-    def point(self) -> list[Any]:
+    def describe_point(self) -> list[Any]:
         """Describe what is measured as plain data, without the measurement settings."""
-        stop = [*self.options.values(), self.how.threads]
-        solver = [identity(self.solver.name), dict(self.solver.parameters)]
-        return ["work", *self.case.identity(), self.horizon, *solver, *stop]
+        stop = [*self.options.values(), self.measurement.threads]
+        solver = [identify_code(self.solver.name), dict(self.solver.parameters)]
+        return ["work", *self.case.build_identity(), self.horizon, *solver, *stop]
 
-    def unit_id(self, machine: str) -> str:
+    def compute_unit_id(self, machine: str) -> str:
         """Compute 12 hex digits from everything that determines result and timing."""
-        return _hash([machine, self.point(), asdict(self.how)])
+        return _compute_hash([machine, self.describe_point(), asdict(self.measurement)])
 
-    def label(self) -> str:
+    def build_file_stem(self) -> str:
         """Build the stem of its file.
 
         It is the same for other measurement settings, so that a new measurement replaces the file.
         """
-        return f"{self.case.scene_name}-{self.case.size}-work-{safe_name(self.solver.name)}-{_hash(self.point())}"
+        return f"{self.case.scene_name}-{self.case.size}-work-{sanitise_name(self.solver.name)}-{_compute_hash(self.describe_point())}"
 
 
-def _hash(content: Any) -> str:
+def _compute_hash(content: Any) -> str:
     text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:12]

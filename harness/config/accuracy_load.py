@@ -12,25 +12,34 @@ from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
 
-from harness.base.document import Document, Key, OwnCode, quote
-from harness.base.errors import InputError, Mistake, did_you_mean
+from harness.base.document import ConfigDocument, ConfigKey, UserCodePolicy, quote_value
+from harness.base.errors import InputError, InputMistake, suggest_name
 from harness.base.yaml import read_yaml
-from harness.config.accuracy import AccuracyFields, Case, CurveSpec, CurveStudy, How, Study, WorkSpec, WorkStudy
-from harness.config.expand import check_size
-from harness.config.load import check_name, misfits_of, scenes_of, stated_by
-from harness.config.options import OF_STEPS
-from harness.config.own import MOST, tried
-from harness.config.solvers import solvers_of
+from harness.config.accuracy import (
+    AccuracyConfig,
+    AccuracyStudyConfig,
+    BenchmarkCase,
+    CurveSpec,
+    CurveStudyConfig,
+    MeasurementSettings,
+    WorkSpec,
+    WorkStudyConfig,
+)
+from harness.config.expand import check_mesh_size
+from harness.config.load import check_file_name, check_scene_parts, read_plugin_metadata, read_scenes
+from harness.config.options import STEP_OPTIONS
+from harness.config.own import DEFAULT_LOAD_LIMITS, load_in_sandbox
+from harness.config.solvers import read_solvers
 from harness.config.sweep import SolverSpec
-from harness.scenes.mesh.generator import Generator
+from harness.scenes.mesh.generator import MeshGenerator
 from harness.scenes.spec import SceneSpec
-from solvers.plugins import Plugin, found
+from solvers.plugins import PluginName, select_plugins
 
 MAX_UNITS = 20_000
 
 
 @dataclass(frozen=True, slots=True)
-class Accuracy:
+class AccuracyPlan:
     """A validated accuracy config: its name and its distinct units of work."""
 
     name: str
@@ -38,42 +47,44 @@ class Accuracy:
     work: tuple[WorkSpec, ...]
 
 
-def load_accuracy(path: Path) -> Accuracy:
+def load_accuracy(path: Path) -> AccuracyPlan:
     """Load an accuracy config from a YAML file; raise InputError.
 
     User code that it names is tried first in a worker process (`harness.config.user_code`).
     """
-    return tried(partial(_load, path), _own, _stated, lambda accuracy: MOST)
+    return load_in_sandbox(
+        partial(_load_document, path), _find_plugins, _read_metadata, lambda accuracy: DEFAULT_LOAD_LIMITS
+    )
 
 
-def _own(accuracy: Accuracy) -> list[Plugin]:
+def _find_plugins(accuracy: AccuracyPlan) -> list[PluginName]:
     units = (*accuracy.curves, *accuracy.work)
     named = [name for unit in units for name in (unit.solver.name, unit.case.integrator)]
-    return found([*named, *(plugin for unit in units for plugin, _ in unit.case.scene.own.values())])
+    return select_plugins([*named, *(plugin for unit in units for plugin, _ in unit.case.scene.own.values())])
 
 
-def _stated(accuracy: Accuracy) -> dict[str, Any]:
-    return stated_by({unit.solver.name: None for unit in (*accuracy.curves, *accuracy.work)})
+def _read_metadata(accuracy: AccuracyPlan) -> dict[str, Any]:
+    return read_plugin_metadata({unit.solver.name: None for unit in (*accuracy.curves, *accuracy.work)})
 
 
-def _load(path: Path, own: OwnCode) -> Accuracy:
-    document = replace(read_yaml(path), own=own)
+def _load_document(path: Path, policy: UserCodePolicy) -> AccuracyPlan:
+    document = replace(read_yaml(path), user_code=policy)
     if not {"curves", "work"} & set(document.data):
         problem = "is no accuracy config: it has neither `curves` nor `work`; `springbench run` does scenes and sweeps"
-        raise InputError(Mistake(problem, path))
-    check_name(document)
-    fields = document.check(AccuracyFields, document.data)
-    scenes, solvers = scenes_of(document), solvers_of(document)
+        raise InputError(InputMistake(problem, path))
+    check_file_name(document)
+    fields = document.validate_data(AccuracyConfig, document.data)
+    scenes, solvers = read_scenes(document), read_solvers(document)
     if fields is None or document.mistakes:
-        raise document.error()
+        raise document.build_error()
     for scene in scenes.values():
-        scene.require_even_steps()
-    return expand(document, fields, scenes, solvers)
+        scene.require_fixed_time_step()
+    return expand_studies(document, fields, scenes, solvers)
 
 
-def expand(
-    document: Document, fields: AccuracyFields, scenes: Mapping[str, SceneSpec], solvers: Sequence[SolverSpec]
-) -> Accuracy:
+def expand_studies(
+    document: ConfigDocument, fields: AccuracyConfig, scenes: Mapping[str, SceneSpec], solvers: Sequence[SolverSpec]
+) -> AccuracyPlan:
     """Expand a config into its units of work.
 
     The settings of the first study apply to duplicates.
@@ -86,100 +97,102 @@ def expand(
     Raises:
         InputError: for all mistakes.
     """
-    expansion = _Expansion(document, scenes, solvers)
-    curves = [unit for i, study in enumerate(fields.curves) for unit in expansion.curves(study, ("curves", i))]
-    work = [unit for i, study in enumerate(fields.work) for unit in expansion.work(study, ("work", i))]
+    expansion = _StudyExpansion(document, scenes, solvers)
+    curves = [unit for i, study in enumerate(fields.curves) for unit in expansion.expand_curves(study, ("curves", i))]
+    work = [unit for i, study in enumerate(fields.work) for unit in expansion.expand_work(study, ("work", i))]
     if len(curves) + len(work) > MAX_UNITS:
-        document.report(f"asks for {len(curves) + len(work)} units of work; at most {MAX_UNITS} are allowed")
+        document.add_mistake(f"asks for {len(curves) + len(work)} units of work; at most {MAX_UNITS} are allowed")
     for name, scene in scenes.items():
         sizes = [unit.case.size for unit in (*curves, *work) if unit.case.scene_name == name]
-        document.mistakes.extend(misfits_of(document, name, scene, sizes) if not document.mistakes else [])
+        document.mistakes.extend(check_scene_parts(document, name, scene, sizes) if not document.mistakes else [])
     if document.mistakes:
-        raise document.error()
-    return Accuracy(
+        raise document.build_error()
+    return AccuracyPlan(
         document.path.stem,
-        _distinct(curves),
-        _distinct(work),
+        _remove_duplicates(curves),
+        _remove_duplicates(work),
     )
 
 
 U = TypeVar("U", CurveSpec, WorkSpec)
 
 
-def _distinct(units: Sequence[U]) -> tuple[U, ...]:
+def _remove_duplicates(units: Sequence[U]) -> tuple[U, ...]:
     """Return the first of the units that measure the same."""
     first: dict[str, U] = {}
     for unit in units:
-        first.setdefault(unit.label(), unit)
+        first.setdefault(unit.build_file_stem(), unit)
     return tuple(first.values())
 
 
-class _Expansion:
+class _StudyExpansion:
     """Expands studies, and adds mistakes to the document."""
 
-    def __init__(self, document: Document, scenes: Mapping[str, SceneSpec], solvers: Sequence[SolverSpec]) -> None:
+    def __init__(
+        self, document: ConfigDocument, scenes: Mapping[str, SceneSpec], solvers: Sequence[SolverSpec]
+    ) -> None:
         self.document, self.scenes, self.solvers = document, scenes, solvers
 
-    def curves(self, study: CurveStudy, at: Key) -> Iterator[CurveSpec]:
+    def expand_curves(self, study: CurveStudyConfig, at: ConfigKey) -> Iterator[CurveSpec]:
         """Expand a study into one curve for each problem and minimising solver."""
-        how = How(study.threads, study.rounds, study.time_limit)
+        how = MeasurementSettings(study.threads, study.rounds, study.time_limit)
         if "coarse" in study.first_guess:
             problem = "a curve's clock begins at its first guess, and this one is a solve itself; compare it in a sweep"
-            self.document.report(f"coarse: {problem}", (*at, "first_guess"))
-        solvers = [solver for solver in self._solvers(study, at) if solver.minimises]
-        for case, moment, solver in product(self._cases(study, at), study.moment, solvers):
+            self.document.add_mistake(f"coarse: {problem}", (*at, "first_guess"))
+        solvers = [solver for solver in self._select_solvers(study, at) if solver.is_minimiser]
+        for case, moment, solver in product(self._expand_cases(study, at), study.moment, solvers):
             if isinstance(moment, int) and moment > case.scene.frames:
                 problem = f"frame {moment} is not among the {case.scene.frames} frames of {case.scene_name}"
-                self.document.report(problem, (*at, "moment"))
+                self.document.add_mistake(problem, (*at, "moment"))
             recordings = study.recordings
             yield CurveSpec(case, moment, solver, study.first_guess, study.iterations, recordings, how)
 
-    def work(self, study: WorkStudy, at: Key) -> Iterator[WorkSpec]:
-        how = How(study.threads, study.rounds, study.time_limit)
-        for case in self._cases(study, at):
+    def expand_work(self, study: WorkStudyConfig, at: ConfigKey) -> Iterator[WorkSpec]:
+        how = MeasurementSettings(study.threads, study.rounds, study.time_limit)
+        for case in self._expand_cases(study, at):
             dt = case.scene.time_step
             steps = study.horizon / dt
             if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:  # round-off of the quotient, and no more
                 problem = f"{study.horizon:g} s is no multiple of the time step {dt:.6g} s of {case.scene_name}"
-                self.document.report(problem, (*at, "horizon"))
-            lists = [getattr(study, name) for name in OF_STEPS]
-            for solver, values in product(self._solvers(study, at), product(*lists)):
-                options = dict(zip(OF_STEPS, values, strict=True))
-                options["first_guess"] = options["first_guess"] or case.scene.guess(case.integrator)
+                self.document.add_mistake(problem, (*at, "horizon"))
+            lists = [getattr(study, name) for name in STEP_OPTIONS]
+            for solver, values in product(self._select_solvers(study, at), product(*lists)):
+                options = dict(zip(STEP_OPTIONS, values, strict=True))
+                options["first_guess"] = options["first_guess"] or case.scene.choose_initial_guess(case.integrator)
                 yield WorkSpec(case, study.horizon, solver, options, how)
 
-    def _cases(self, study: Study, at: Key) -> list[Case]:
-        found: list[Case] = []
-        for name in self._named("scene", study.scene, list(self.scenes), at):
+    def _expand_cases(self, study: AccuracyStudyConfig, at: ConfigKey) -> list[BenchmarkCase]:
+        found: list[BenchmarkCase] = []
+        for name in self._select_names("scene", study.scene, list(self.scenes), at):
             scene = self.scenes[name]
             lists: Any = study.integrator, study.time_step
-            for size, (integrator, time_step) in product(self._sizes(name, study, at), product(*lists)):
-                found.append(Case(name, scene.stepped(time_step or scene.time_step), size, integrator))
+            for size, (integrator, time_step) in product(self._select_sizes(name, study, at), product(*lists)):
+                found.append(BenchmarkCase(name, scene.with_time_step(time_step or scene.time_step), size, integrator))
         return found
 
-    def _sizes(self, name: str, study: Study, at: Key) -> Sequence[int]:
+    def _select_sizes(self, name: str, study: AccuracyStudyConfig, at: ConfigKey) -> Sequence[int]:
         """Return the study's mesh sizes, else the scene's default.
 
         0 for a mesh from a file.
         """
         scene = self.scenes[name]
-        if not isinstance(scene.mesh, Generator):
+        if not isinstance(scene.mesh, MeshGenerator):
             return (0,)
         sizes = study.size or ((scene.default_size,) if scene.default_size else ())
         if not sizes:
             problem = f"is missing; the scene {name} needs a mesh size (or give it a default_size)"
-            self.document.report(problem, (*at, "size"))
+            self.document.add_mistake(problem, (*at, "size"))
         for size in sizes:
-            check_size(self.document, name, scene, size, (*at, "size"))
+            check_mesh_size(self.document, name, scene, size, (*at, "size"))
         return sizes
 
-    def _solvers(self, study: Study, at: Key) -> list[SolverSpec]:
-        names = self._named("solver", study.solver, [solver.name for solver in self.solvers], at)
+    def _select_solvers(self, study: AccuracyStudyConfig, at: ConfigKey) -> list[SolverSpec]:
+        names = self._select_names("solver", study.solver, [solver.name for solver in self.solvers], at)
         return [solver for solver in self.solvers if solver.name in names]
 
-    def _named(self, key: str, asked: Sequence[str], known: Sequence[str], at: Key) -> list[str]:
+    def _select_names(self, key: str, asked: Sequence[str], known: Sequence[str], at: ConfigKey) -> list[str]:
         """Return the names that a study selects, or all if it selects none."""
         for name in asked:
             if name not in known:
-                self.document.report(f"came {quote(name)}; expected {did_you_mean(name, known)}", (*at, key))
+                self.document.add_mistake(f"came {quote_value(name)}; expected {suggest_name(name, known)}", (*at, key))
         return [name for name in known if name in asked or not asked]

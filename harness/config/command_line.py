@@ -13,7 +13,7 @@ from typer.core import TyperCommand
 from typer.main import get_command
 
 
-def taking(*names: str) -> type[TyperCommand]:
+def build_command_class(*names: str) -> type[TyperCommand]:
     """Build a command class that also accepts options of a run.
 
     The values are parsed as in a file and passed in `obj` of the command's context.
@@ -27,28 +27,31 @@ def taking(*names: str) -> type[TyperCommand]:
 
         def get_params(self, ctx: Any) -> Any:
             if not self._added:
-                options = _options(names)
+                options = _build_options(names)
                 self._added = tuple(option.name for option in options)
                 self.params = [*self.params, *options]
             return super().get_params(ctx)
 
         def invoke(self, ctx: Any) -> Any:
-            from harness.base.yaml import scalar
+            from harness.base.yaml import parse_scalar
 
             given = {name: ctx.params.pop(name) for name in self._added}
-            ctx.obj = {name: scalar(text) for name, text in given.items() if text is not None}
+            ctx.obj = {name: parse_scalar(text) for name, text in given.items() if text is not None}
             return super().invoke(ctx)
 
     return Taking
 
 
-def _options(names: tuple[str, ...]) -> list[Any]:
+def _build_options(names: tuple[str, ...]) -> list[Any]:
     """Build the options that Typer creates for a function with such parameters."""
-    from harness.config.options import OPTIONS, meaning
+    from harness.config.options import RUN_OPTIONS, describe_option
 
     def function() -> None: ...
 
-    told = {name: typer.Option(help=f"For a scene: {meaning(name)}", metavar="VALUE") for name in names or OPTIONS}
+    told = {
+        name: typer.Option(help=f"For a scene: {describe_option(name)}", metavar="VALUE")
+        for name in names or RUN_OPTIONS
+    }
     stated = [
         Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[str | None, option])
         for name, option in told.items()

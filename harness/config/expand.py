@@ -10,17 +10,17 @@ from itertools import product
 from math import prod
 from typing import Any
 
-from harness.base.document import Document, Key, quote
-from harness.base.errors import did_you_mean
-from harness.config.options import AUTO, OF_ERROR, OF_SCENE, OPTIONS, Chosen
-from harness.config.sweep import Exclude, Include, Kept, RunSpec, SolverSpec, SweepFields
-from harness.scenes.mesh.generator import Generator
+from harness.base.document import ConfigDocument, ConfigKey, quote_value
+from harness.base.errors import suggest_name
+from harness.config.options import AUTO, ERROR_TARGET_OPTIONS, RUN_OPTIONS, SCENE_OPTIONS, RunOptions
+from harness.config.sweep import ExcludeEntry, FixedOptions, IncludeEntry, RunSpec, SolverSpec, SweepConfig
+from harness.scenes.mesh.generator import MeshGenerator
 from harness.scenes.spec import SceneSpec
 
 MAX_RUNS = 10_000
 
 
-class Expansion:
+class GridExpansion:
     """Expands one sweep, and adds mistakes to its document.
 
     name: name of the sweep.
@@ -30,35 +30,35 @@ class Expansion:
 
     def __init__(
         self,
-        document: Document,
+        document: ConfigDocument,
         name: str,
-        fields: SweepFields,
+        fields: SweepConfig,
         scenes: Mapping[str, SceneSpec],
         solvers: Sequence[SolverSpec],
     ) -> None:
         self.document, self.name, self.fields = document, name, fields
         self.scenes, self.solvers = scenes, solvers
 
-    def runs(self) -> tuple[RunSpec, ...]:
+    def expand_runs(self) -> tuple[RunSpec, ...]:
         """Expand the runs without duplicates, those of the grid first; empty if there are mistakes."""
         self._check_names()
-        options = self.fields.options.model_dump(include=set(OPTIONS))
-        self._check_chosen()
-        jobs = [(scene, self._sizes(scene), self.solvers, options) for scene in self.scenes]
-        extra = [job for i, entry in enumerate(self.fields.include) for job in self._included(i, entry, options)]
+        options = self.fields.options.model_dump(include=set(RUN_OPTIONS))
+        self._check_error_target()
+        jobs = [(scene, self._select_sizes(scene), self.solvers, options) for scene in self.scenes]
+        extra = [job for i, entry in enumerate(self.fields.include) for job in self._expand_include(i, entry, options)]
         count = sum(len(s) * len(v) * prod(map(len, o.values())) for _, s, v, o in [*jobs, *extra])
         if count > MAX_RUNS:
-            self.document.report(f"asks for {count} runs; at most {MAX_RUNS} are allowed", ("options",))
+            self.document.add_mistake(f"asks for {count} runs; at most {MAX_RUNS} are allowed", ("options",))
         if self.document.mistakes:
             return ()
-        grid = self._kept([run for job in jobs for run in self._product(*job)])
-        runs = [*grid, *(run for job in extra for run in self._product(*job))]
+        grid = self._apply_exclude([run for job in jobs for run in self._expand_product(*job)])
+        runs = [*grid, *(run for job in extra for run in self._expand_product(*job))]
         if not runs and not self.document.mistakes:
-            self.document.report("leaves no run", ("exclude",))
+            self.document.add_mistake("leaves no run", ("exclude",))
         self._check_frames(runs)
-        return tuple({(run.scene_name, run.identity()): run for run in runs}.values())
+        return tuple({(run.scene_name, run.build_identity()): run for run in runs}.values())
 
-    def _product(
+    def _expand_product(
         self,
         scene_name: str,
         sizes: Sequence[int],
@@ -66,61 +66,63 @@ class Expansion:
         options: Mapping[str, Sequence[Any]],
     ) -> Iterable[RunSpec]:
         scene = self.scenes[scene_name]
-        kept = {name: getattr(self.fields.options, name) for name in Kept.model_fields}
+        kept = {name: getattr(self.fields.options, name) for name in FixedOptions.model_fields}
         for size, solver, values in product(sizes, solvers, product(*options.values())):
             chosen: dict[str, Any] = dict(zip(options, values, strict=True))
             if chosen["accuracy"] is not None:
-                chosen |= {name: Chosen.model_fields[name].default for name in OF_ERROR[:-1]} | {"first_guess": None}
-            chosen["first_guess"] = chosen["first_guess"] or scene.guess(chosen["integrator"])
-            chosen |= {name: getattr(scene, name) for name in OF_SCENE if chosen[name] is None}
+                chosen |= {name: RunOptions.model_fields[name].default for name in ERROR_TARGET_OPTIONS[:-1]} | {
+                    "first_guess": None
+                }
+            chosen["first_guess"] = chosen["first_guess"] or scene.choose_initial_guess(chosen["integrator"])
+            chosen |= {name: getattr(scene, name) for name in SCENE_OPTIONS if chosen[name] is None}
             yield RunSpec.model_construct(
                 sweep=self.name,
                 scene_name=scene_name,
-                scene=scene.stepped(chosen["time_step"]),
+                scene=scene.with_time_step(chosen["time_step"]),
                 size=size,
                 solver=solver,
                 **chosen,
                 **kept,
             )
 
-    def _sizes(self, scene_name: str) -> Sequence[int]:
+    def _select_sizes(self, scene_name: str) -> Sequence[int]:
         """Return the sweep's mesh sizes, else the scene's default.
 
         0 for a mesh from a file.
         """
         scene = self.scenes[scene_name]
-        if not isinstance(scene.mesh, Generator):
+        if not isinstance(scene.mesh, MeshGenerator):
             return (0,)
         sizes = self.fields.sizes or ((scene.default_size,) if scene.default_size else ())
         if not sizes:
             problem = f"is missing; the scene {scene_name} needs a mesh size (or give it a default_size)"
-            self.document.report(problem, ("sizes",))
+            self.document.add_mistake(problem, ("sizes",))
         for i, size in enumerate(sizes):
-            check_size(self.document, scene_name, self.scenes[scene_name], size, ("sizes", i))
+            check_mesh_size(self.document, scene_name, self.scenes[scene_name], size, ("sizes", i))
         return sizes
 
-    def _included(self, i: int, entry: Include, options: Mapping[str, Sequence[Any]]) -> Iterable[Any]:
-        chosen = {key: entry.stated(key) or values[:1] for key, values in options.items()}
+    def _expand_include(self, i: int, entry: IncludeEntry, options: Mapping[str, Sequence[Any]]) -> Iterable[Any]:
+        chosen = {key: entry.get_values(key) or values[:1] for key, values in options.items()}
         solvers = [s for s in self.solvers if s.name in (entry.solver or [s.name])]
         for scene_name in entry.scene or self.scenes:
             if scene_name not in self.scenes:
                 continue
             sizes: Sequence[int] = (0,)
-            if isinstance(self.scenes[scene_name].mesh, Generator):
+            if isinstance(self.scenes[scene_name].mesh, MeshGenerator):
                 sizes = entry.size
                 for k, size in enumerate(sizes):
-                    check_size(self.document, scene_name, self.scenes[scene_name], size, ("include", i, "size", k))
+                    check_mesh_size(self.document, scene_name, self.scenes[scene_name], size, ("include", i, "size", k))
                 if not sizes:
-                    self.document.report(f"is missing; the scene {scene_name} has one", ("include", i, "size"))
+                    self.document.add_mistake(f"is missing; the scene {scene_name} has one", ("include", i, "size"))
             yield scene_name, sizes, solvers, chosen
 
-    def _kept(self, grid: Sequence[RunSpec]) -> list[RunSpec]:
+    def _apply_exclude(self, grid: Sequence[RunSpec]) -> list[RunSpec]:
         """Return the grid points that no entry of `exclude` matches."""
         kept = list(grid)
         for i, entry in enumerate(self.fields.exclude):
-            if not any(_matches(entry, run) for run in grid):
-                self.document.report("matches no run of the grid; correct or remove it", ("exclude", i))
-            kept = [run for run in kept if not _matches(entry, run)]
+            if not any(_is_match(entry, run) for run in grid):
+                self.document.add_mistake("matches no run of the grid; correct or remove it", ("exclude", i))
+            kept = [run for run in kept if not _is_match(entry, run)]
         return kept
 
     def _check_names(self) -> None:
@@ -130,33 +132,33 @@ class Expansion:
                 for key, names in known.items():
                     for name in getattr(entry, key):
                         if name not in names:
-                            problem = f"came {quote(name)}; expected {did_you_mean(name, names)}"
-                            self.document.report(problem, (part, i, key))
+                            problem = f"came {quote_value(name)}; expected {suggest_name(name, names)}"
+                            self.document.add_mistake(problem, (part, i, key))
 
-    def _check_chosen(self) -> None:
+    def _check_error_target(self) -> None:
         """Check that options do not conflict with an error target or with verification."""
         options = self.fields.options
         if None not in options.accuracy:
-            for name in OF_ERROR:
+            for name in ERROR_TARGET_OPTIONS:
                 if name in options.model_fields_set:
-                    self.document.report("is chosen for the `accuracy` asked; leave it out", ("options", name))
+                    self.document.add_mistake("is chosen for the `accuracy` asked; leave it out", ("options", name))
         if options.timing == "rough" and options.record:
             problem = "has no pass after which a recording's colours are known; give `record: false`, or another timing"
-            self.document.report(problem, ("options", "timing"))
+            self.document.add_mistake(problem, ("options", "timing"))
         entries = [options, *self.fields.include]
         if options.judge and any(AUTO in one.tolerance or set(one.accuracy) != {None} for one in entries):
             problem = "grades steps by a tolerance that is stated; give one, and no `accuracy`, or leave `judge` out"
-            self.document.report(problem, ("options", "judge"))
+            self.document.add_mistake(problem, ("options", "judge"))
 
     def _check_frames(self, runs: Sequence[RunSpec]) -> None:
         for i, frame in enumerate(self.fields.options.convergence_frames or ()):
             short = next((run for run in runs if run.frames < frame), None)
             if short:
                 problem = f"frame {frame} is not among the {short.frames} frames of {short.scene_name}"
-                self.document.report(problem, ("options", "convergence_frames", i))
+                self.document.add_mistake(problem, ("options", "convergence_frames", i))
 
 
-def check_size(document: Document, scene_name: str, scene: SceneSpec, size: int, at: Key) -> None:
+def check_mesh_size(document: ConfigDocument, scene_name: str, scene: SceneSpec, size: int, at: ConfigKey) -> None:
     """Add a mistake if a generated mesh does not support a size.
 
     Args:
@@ -167,19 +169,19 @@ def check_size(document: Document, scene_name: str, scene: SceneSpec, size: int,
         at: location of the size in the document.
     """
     mesh = scene.mesh
-    if not isinstance(mesh, Generator):
+    if not isinstance(mesh, MeshGenerator):
         return
-    if size < mesh.SMALLEST:
-        document.report(f"{size} is too small for the scene {scene_name}: {mesh.SMALLEST} at least", at)
-    elif excess := mesh.excess(size):
-        document.report(f"{size} {excess} (scene {scene_name})", at)
+    if size < mesh.MIN_SIZE:
+        document.add_mistake(f"{size} is too small for the scene {scene_name}: {mesh.MIN_SIZE} at least", at)
+    elif excess := mesh.describe_excess(size):
+        document.add_mistake(f"{size} {excess} (scene {scene_name})", at)
 
 
-def _matches(entry: Exclude, run: RunSpec) -> bool:
+def _is_match(entry: ExcludeEntry, run: RunSpec) -> bool:
     named = {"scene": run.scene_name, "size": run.size, "solver": run.solver.name}
-    values = named | {key: getattr(run, key) for key in OPTIONS}
+    values = named | {key: getattr(run, key) for key in RUN_OPTIONS}
     return (
-        all(not entry.stated(key) or value in entry.stated(key) for key, value in values.items())
+        all(not entry.get_values(key) or value in entry.get_values(key) for key, value in values.items())
         and (entry.size_above is None or run.size > entry.size_above)
         and (entry.size_below is None or run.size < entry.size_below)
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NewType, Required, TypedDict, TypeVar
 
-from harness.scenes.spec import FirstGuess
+from harness.scenes.spec import InitialGuess
 
 SolverName = Literal[
     "dense", "sparse", "numba", "anderson", "chebyshev", "lbfgs", "newton", "newton-cg", "hybrid", "xpbd",
@@ -21,12 +21,12 @@ IntegratorName = Literal[
     "esdirk-3", "sdirk-4", "esdirk-4", "own",
 ]  # fmt: skip
 ReportName = Literal["certificates", "medians", "timing"]
-OwnName = NewType("OwnName", str)
+UserCodeName = NewType("UserCodeName", str)
 """Name of user code: `UserCodeName("./mine.py:Mine")`."""
 
 T = TypeVar("T")
-Some = T | Sequence[T]
-Number = float | str
+OneOrSequence = T | Sequence[T]
+NumberOrText = float | str
 """A number, or a fraction such as "1/30"."""
 
 
@@ -36,8 +36,8 @@ class SceneKeys(TypedDict, total=False):
     description: str
     mass: float | None
     mass_per_area: float | None
-    time_step: Required[Number]
-    alternate_time_step: Number | None
+    time_step: Required[NumberOrText]
+    alternate_time_step: NumberOrText | None
     frames: Required[int]
     velocity: Sequence[float]
     start: Mapping[str, Any] | None
@@ -48,20 +48,20 @@ class SceneKeys(TypedDict, total=False):
 class OptionKeys(TypedDict, total=False):
     """Options of a sweep, as in `harness.config.sweep_config.SweepOptions`."""
 
-    iterations: Some[int]
-    tolerance: Some[float | Literal["auto"] | None]
-    integrator: Some[IntegratorName | OwnName]
-    time_step: Some[Number | None]
-    first_guess: Some[FirstGuess | None]
-    threads: Some[int | Literal["auto"]]
-    frames: Some[int | None]
-    rounds: Some[int]
-    accuracy: Some[float | None]
+    max_iterations: OneOrSequence[int]
+    rtol: OneOrSequence[float | Literal["auto"] | None]
+    integrator: OneOrSequence[IntegratorName | UserCodeName]
+    time_step: OneOrSequence[NumberOrText | None]
+    initial_guess: OneOrSequence[InitialGuess | None]
+    threads: OneOrSequence[int | Literal["auto"]]
+    frames: OneOrSequence[int | None]
+    rounds: OneOrSequence[int]
+    error_target: OneOrSequence[float | None]
     convergence_frames: Sequence[int] | None
     strain_range: float | None
     record: bool
     pictures: bool
-    judge: bool
+    verify: bool
     timing: Literal["exclusive", "shared", "rough"]
     time_limit: float | None
     memory_limit: float | None
@@ -73,8 +73,8 @@ class SweepKeys(TypedDict, total=False):
     description: str
     scenes: Required[Sequence[str]]
     sizes: Sequence[int]
-    solvers: Required[Sequence[SolverName | OwnName | Mapping[str, Any]]]
+    solvers: Required[Sequence[SolverName | UserCodeName | Mapping[str, Any]]]
     options: OptionKeys
     exclude: Sequence[Mapping[str, Any]]
     include: Sequence[Mapping[str, Any]]
-    reports: Sequence[ReportName | OwnName]
+    reports: Sequence[ReportName | UserCodeName]

@@ -10,32 +10,34 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from harness.base.document import UNOPENED, Document, Key, OwnCode, is_mapping
+from harness.base.document import SKIP_USER_CODE, ConfigDocument, ConfigKey, UserCodePolicy, is_mapping
 from harness.base.errors import InputError
-from harness.scenes.own import ABOUT
-from solvers.plugins import Plugin, Refused, Table
+from harness.scenes.own import IMPORT_NOTICE
+from solvers.plugins import InvalidPluginName, PluginName, PluginTable
 
 if TYPE_CHECKING:  # for configs that name code of others
-    from harness.base.worker import Tick
+    from harness.base.worker import ProgressCallback
 
 
-class Most(NamedTuple):
+class LoadLimits(NamedTuple):
     """Limits of loading user code: wall time [s] and memory [GiB]."""
 
     seconds: float
-    gib: float
+    memory_gib: float
 
 
-MOST = Most(60.0, 2.0)
+DEFAULT_LOAD_LIMITS = LoadLimits(60.0, 2.0)
 """Limits for importing and binding user code before a command starts. A config may set a shorter time, or another
 amount of memory.
 """
 
 T = TypeVar("T")
-Load = Callable[[OwnCode], T]
+ConfigLoader = Callable[[UserCodePolicy], T]
 
 
-def chosen(document: Document, table: Table, data: Any, tag: str, at: Key) -> tuple[str, dict[str, Any]] | None:
+def resolve_tag(
+    document: ConfigDocument, table: PluginTable, data: Any, tag: str, at: ConfigKey
+) -> tuple[str, dict[str, Any]] | None:
     """Split a mapping into the name under its tag and its other keys.
 
     User code becomes a Plugin.
@@ -50,30 +52,30 @@ def chosen(document: Document, table: Table, data: Any, tag: str, at: Key) -> tu
     """
     if is_mapping(data) and isinstance(data.get(tag), str):
         try:
-            name = table.named(data[tag], document.path.parent)
-        except Refused as error:
-            document.report(str(error), (*at, tag))
+            name = table.resolve_name(data[tag], document.path.parent)
+        except InvalidPluginName as error:
+            document.add_mistake(str(error), (*at, tag))
             return None
-        if isinstance(name, Plugin):
+        if isinstance(name, PluginName):
             return name, {key: value for key, value in data.items() if key != tag}
-    return document.choose(data, table, tag, at)
+    return document.split_by_tag(data, table, tag, at)
 
 
-def given(document: Document, data: Mapping[str, Any]) -> dict[str, Any]:
+def fingerprint_parameters(document: ConfigDocument, data: Mapping[str, Any]) -> dict[str, Any]:
     """Return parameters of user code as in the file, with digests next to file names."""
-    return {key: _with_digest(document, value) for key, value in data.items()}
+    return {key: _add_digest(document, value) for key, value in data.items()}
 
 
-def _with_digest(document: Document, value: Any) -> Any:
+def _add_digest(document: ConfigDocument, value: Any) -> Any:
     path = document.path.parent / value if isinstance(value, str) and value else None
     return [value, hashlib.sha256(path.read_bytes()).hexdigest()] if path and path.is_file() else value
 
 
-def tried(
-    load: Load[T],
-    own: Callable[[T], list[Plugin]],
-    stated: Callable[[T], dict[str, Any]],
-    limits: Callable[[T], Most],
+def load_in_sandbox(
+    load: ConfigLoader[T],
+    find_plugins: Callable[[T], list[PluginName]],
+    read_metadata: Callable[[T], dict[str, Any]],
+    limits: Callable[[T], LoadLimits],
 ) -> T:
     """Load a config without importing its user code, after a trial in a worker process.
 
@@ -89,44 +91,54 @@ def tried(
     Raises:
         InputError: for a mistake, or if the worker process fails.
     """
-    found = load(UNOPENED)
-    names = list(dict.fromkeys(own(found)))
+    found = load(SKIP_USER_CODE)
+    names = list(dict.fromkeys(find_plugins(found)))
     if not names:
         return found
-    return load(OwnCode(opens=False, stated=_elsewhere(partial(_open, load, stated), limits(found), names)))
+    return load(
+        UserCodePolicy(
+            imports_code=False,
+            solver_metadata=_run_in_worker(partial(_load_plugins, load, read_metadata), limits(found), names),
+        )
+    )
 
 
-def _open(load: Load[T], stated: Callable[[T], dict[str, Any]], tick: Tick) -> dict[str, Any]:
-    return stated(load(OwnCode(tell=tick)))
+def _load_plugins(
+    load: ConfigLoader[T], stated: Callable[[T], dict[str, Any]], tick: ProgressCallback
+) -> dict[str, Any]:
+    return stated(load(UserCodePolicy(on_import=tick)))
 
 
-def _elsewhere(piece: Callable[[Tick], Any], limits: Most, names: list[Plugin]) -> Any:
-    from harness.base.workers import Limits, Lost, Workers
+def _run_in_worker(piece: Callable[[ProgressCallback], Any], limits: LoadLimits, names: list[PluginName]) -> Any:
+    from harness.base.workers import IsolatedWorker, TaskFailure, TaskLimits
 
     does = "loading"
 
     def hear(said: str) -> None:
         nonlocal does
-        does = said.removeprefix("\0") if said.startswith((ABOUT, BINDING)) else does
+        does = said.removeprefix("\0") if said.startswith((IMPORT_NOTICE, BINDING_PREFIX)) else does
 
-    workers = Workers()
+    workers = IsolatedWorker()
     try:
-        return workers.do(piece, hear, Limits(*limits))
-    except Lost as lost:
+        return workers.run_task(piece, hear, TaskLimits(*limits))
+    except TaskFailure as lost:
         reason = str(lost).replace(", before its first step", "")
         behind = "" if any(name in does for name in names) else f" with {', '.join(names)}"
         raise InputError(f"{does}{behind} {reason}") from None
     finally:
-        workers.end()
+        workers.stop_worker()
 
 
-def within(seconds: float | None, gib: float | None) -> Most:
+def build_load_limits(seconds: float | None, memory_gib: float | None) -> LoadLimits:
     """Build the load limits from a config's time [s] and memory [GiB].
 
     The time is bounded by the default.
     """
-    return Most(min(MOST.seconds, seconds or MOST.seconds), gib or MOST.gib)
+    return LoadLimits(
+        min(DEFAULT_LOAD_LIMITS.seconds, seconds or DEFAULT_LOAD_LIMITS.seconds),
+        memory_gib or DEFAULT_LOAD_LIMITS.memory_gib,
+    )
 
 
-BINDING = "\0binding "
+BINDING_PREFIX = "\0binding "
 """Prefix of the progress event, followed by the name of a scene, before a scene is bound."""

@@ -11,26 +11,28 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field, create_model
 from pydantic.json_schema import models_json_schema
 
-from harness.base.model import Model
-from harness.config.accuracy import AccuracyFields
-from harness.config.goals import GoalsFields
-from harness.config.solvers import parameters_model
-from harness.config.sweep import SweepFields
-from harness.scenes.effects.effect_names import EFFECTS
-from harness.scenes.mesh.mesh_names import MESHES
+from harness.base.model import ConfigModel
+from harness.config.accuracy import AccuracyConfig
+from harness.config.goals import TargetsConfig
+from harness.config.solvers import build_parameter_model
+from harness.config.sweep import SweepConfig
+from harness.scenes.effects.effect_names import EFFECT_CLASSES
+from harness.scenes.mesh.mesh_names import MESH_CLASSES
 from harness.scenes.spec import SceneFile
-from solvers.plugins import PATTERN
-from solvers.registry import OPTIONAL, SOLVERS, load
+from solvers.plugins import PLUGIN_PATTERN
+from solvers.registry import OPTIONAL_SOLVERS, SOLVERS, load_target
 
 
-def schema() -> dict[str, Any]:
+def build_json_schema() -> dict[str, Any]:
     """Build the schema of all kinds of configs; it lists every mesh, effect and solver."""
-    mesh = _one_of({kind: load(target) for kind, target in MESHES.items()}, "kind")
-    effect = _one_of({kind: load(target) for kind, target in EFFECTS.items()}, "kind")
-    shipped = {**SOLVERS, **OPTIONAL}
-    solver = _one_of({name: parameters_model(name, load(target)) for name, target in shipped.items()}, "name")
+    mesh = _build_tagged_union({kind: load_target(target) for kind, target in MESH_CLASSES.items()}, "kind")
+    effect = _build_tagged_union({kind: load_target(target) for kind, target in EFFECT_CLASSES.items()}, "kind")
+    shipped = {**SOLVERS, **OPTIONAL_SOLVERS}
+    solver = _build_tagged_union(
+        {name: build_parameter_model(name, load_target(target)) for name, target in shipped.items()}, "name"
+    )
     known: Any = Literal[tuple(shipped)]
-    names: Any = known | Annotated[str, Field(pattern=PATTERN)]
+    names: Any = known | Annotated[str, Field(pattern=PLUGIN_PATTERN)]
     scene = create_model(
         "Scene",
         __base__=SceneFile,
@@ -40,9 +42,9 @@ def schema() -> dict[str, Any]:
     listed: Any = list[names | solver]  # pyright: ignore[reportInvalidTypeForm]
     others = [
         create_model(name, __base__=base, solvers=(listed, ...))
-        for name, base in (("Sweep", SweepFields), ("Accuracy", AccuracyFields))
+        for name, base in (("Sweep", SweepConfig), ("Accuracy", AccuracyConfig))
     ]
-    models = (scene, *others, GoalsFields)
+    models = (scene, *others, TargetsConfig)
     _, document = models_json_schema([(model, "validation") for model in models])
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -52,7 +54,7 @@ def schema() -> dict[str, Any]:
     }
 
 
-def _one_of(models: dict[str, type[Model]], tag: str) -> Any:
+def _build_tagged_union(models: dict[str, type[ConfigModel]], tag: str) -> Any:
     """Build a union of models, discriminated by a required key.
 
     The key has the name of the model.
@@ -66,6 +68,6 @@ def _one_of(models: dict[str, type[Model]], tag: str) -> Any:
         f"Own {tag}",
         __config__=ConfigDict(extra="allow"),
         __doc__="Your own: `module:Name`, or `./file.py:Name` beside the config.",
-        **{tag: (Annotated[str, Field(pattern=PATTERN)], ...)},
+        **{tag: (Annotated[str, Field(pattern=PLUGIN_PATTERN)], ...)},
     )
     return Annotated[reduce(lambda one, other: one | other, tagged), Field(discriminator=tag)] | own

@@ -10,22 +10,22 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, SkipValidation
 
-from harness.base.files import safe_name
-from harness.base.model import Many, Model
-from harness.base.stated import packages, stated
-from harness.config.options import OPTIONS, Chosen, lists
-from harness.scenes.spec import SceneSpec, Size, named_in
-from solvers.plugins import Plugin, Table, found, identity
-from solvers.registry import EVERY, load, minimises
+from harness.base.files import sanitise_name
+from harness.base.model import ConfigModel, OneOrMany
+from harness.base.stated import list_packages, read_solver_metadata
+from harness.config.options import RUN_OPTIONS, RunOptions, build_list_model
+from harness.scenes.spec import MeshSize, SceneSpec
+from solvers.plugins import PluginName, PluginTable, identify_code, select_plugins
+from solvers.registry import SOLVER_TABLE, is_minimiser, load_target
 
-REPORTS: dict[str, str] = {
+SHIPPED_REPORTS: dict[str, str] = {
     "certificates": "harness.report.certificates:certificates",
     "medians": "harness.report.medians:medians",
     "timing": "harness.report.timing_plot:timing",
 }
 """The shipped reports by name; each is a function `report(rows, folder)` that returns the files it wrote."""
 
-EVERY_REPORT = Table("springbench.reports", REPORTS)
+REPORT_TABLE = PluginTable("springbench.reports", SHIPPED_REPORTS)
 """All reports that a sweep can name."""
 
 if TYPE_CHECKING:
@@ -34,11 +34,11 @@ else:
     ReportName = named_in(EVERY_REPORT)
 
 
-class Varied(lists(*OPTIONS)):
+class VariedOptions(build_list_model(*RUN_OPTIONS)):
     """Options that a sweep can vary: one value, or a list of values."""
 
 
-class Kept(Model):
+class FixedOptions(ConfigModel):
     """Options that all runs of a sweep share."""
 
     convergence_frames: tuple[Annotated[int, Field(ge=1)], ...] | None = None
@@ -64,37 +64,37 @@ class Kept(Model):
     """Memory [GiB] of a run, beyond what its process uses anyway; null is unlimited."""
 
 
-class Options(Kept, Varied):
+class SweepOptions(FixedOptions, VariedOptions):
     """Options of a sweep's runs."""
 
 
-def _without_defaults(schema: dict[str, Any]) -> None:
+def _remove_defaults(schema: dict[str, Any]) -> None:
     """Remove the defaults of a sweep, which do not apply to entries."""
     for described in schema["properties"].values():
         described.pop("default", None)
 
 
-class Include(Varied):
+class IncludeEntry(VariedOptions):
     """Runs in addition to the grid.
 
     An omitted key selects every scene, every solver, or an option's first value.
     """
 
-    model_config = ConfigDict(json_schema_extra=_without_defaults)
+    model_config = ConfigDict(json_schema_extra=_remove_defaults)
 
-    scene: Many[str] = ()
+    scene: OneOrMany[str] = ()
     """Names of scenes, the stems of their files."""
-    size: Many[Size] = ()
+    size: OneOrMany[MeshSize] = ()
     """Mesh sizes, which need not be among the sweep's."""
-    solver: Many[str] = ()
+    solver: OneOrMany[str] = ()
     """Names of solvers that the sweep lists."""
 
-    def stated(self, key: str) -> tuple[Any, ...]:
+    def get_values(self, key: str) -> tuple[Any, ...]:
         """Return the values of a key, or none if the entry omits it."""
         return getattr(self, key) if key in self.model_fields_set else ()
 
 
-class Exclude(Include):
+class ExcludeEntry(IncludeEntry):
     """Grid points to leave out: those that match all keys of the entry."""
 
     size_above: int | None = None
@@ -103,22 +103,22 @@ class Exclude(Include):
     """Matches sizes smaller than this."""
 
 
-class SweepFields(Model):
+class SweepConfig(ConfigModel):
     """A sweep: scenes, sizes, solvers and options; every combination is a run."""
 
     description: str = Field(default="", max_length=1000)
     """One sentence about the question that the sweep answers."""
     scenes: tuple[str, ...] = Field(min_length=1)
     """Scene files (*.yaml, or *.json of the assignment), relative to the sweep file."""
-    sizes: tuple[Size, ...] = ()
+    sizes: tuple[MeshSize, ...] = ()
     """Mesh sizes; may be left out if every scene has a default size or a mesh from a file."""
     solvers: tuple[str | dict[str, Any], ...] = Field(min_length=1)
     """Solvers: a name, or a mapping of `name` and the solver's parameters."""
-    options: Options = Options()
+    options: SweepOptions = SweepOptions()
     """Options; lists form a grid."""
-    exclude: tuple[Exclude, ...] = ()
+    exclude: tuple[ExcludeEntry, ...] = ()
     """Grid points to leave out."""
-    include: tuple[Include, ...] = ()
+    include: tuple[IncludeEntry, ...] = ()
     """Runs in addition to the grid."""
     reports: tuple[ReportName, ...] = ()
     """Reports on the rows of all runs, in addition to the pictures."""
@@ -134,28 +134,30 @@ class SolverSpec:
 
     name: str
     parameters: Mapping[str, Any]
-    stated: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     @property
-    def columns(self) -> dict[str, Any]:
+    def metadata_columns(self) -> dict[str, Any]:
         """Metadata columns of the solver; the class of user code is not imported for them."""
-        if not isinstance(self.name, Plugin):
-            return stated(self.name)
-        return {name: value for name, value in self.stated.items() if name != "packages"}
+        if not isinstance(self.name, PluginName):
+            return read_solver_metadata(self.name)
+        return {name: value for name, value in self.metadata.items() if name != "packages"}
 
     @property
-    def minimises(self) -> bool:
+    def is_minimiser(self) -> bool:
         """Whether the solver's iterates tend to a minimum, as in `solvers.registry.minimises`."""
-        own = isinstance(self.name, Plugin)
-        return bool(self.stated.get("minimises", True)) if own else minimises(load(EVERY[self.name]))
+        own = isinstance(self.name, PluginName)
+        return bool(self.metadata.get("minimises", True)) if own else is_minimiser(load_target(SOLVER_TABLE[self.name]))
 
     @property
     def packages(self) -> tuple[str, ...]:
         """Third-party distributions that the solver is an interface to."""
-        return tuple(self.stated.get("packages", ())) if isinstance(self.name, Plugin) else packages(self.name)
+        return (
+            tuple(self.metadata.get("packages", ())) if isinstance(self.name, PluginName) else list_packages(self.name)
+        )
 
 
-class RunSpec(Kept, Chosen):
+class RunSpec(FixedOptions, RunOptions):
     """One run, built with `model_construct` from validated values.
 
     size: 0 if the mesh comes from a file. frames, time_step (that of the scene here) and initial_guess are resolved.
@@ -169,7 +171,7 @@ class RunSpec(Kept, Chosen):
     size: int
     solver: SkipValidation[SolverSpec]
 
-    def but(self, **other: Any) -> RunSpec:
+    def replace_options(self, **other: Any) -> RunSpec:
         """Return a copy of the run with other values of some options."""
         return self.model_copy(update=other)
 
@@ -179,36 +181,39 @@ class RunSpec(Kept, Chosen):
         return f"{self.scene_name}{f' {self.size}' if self.size else ''} {self.solver.name}"
 
     @property
-    def passes(self) -> int:
+    def num_passes(self) -> int:
         """Number of passes over the steps: warm-up, timed rounds, and instrumentation."""
         return 1 if self.timing == "rough" else self.rounds + 2
 
-    def identity(self) -> str:
+    def build_identity(self) -> str:
         """Build canonical JSON of everything that determines the run's result and timing on one machine.
 
         Pictures are drawn later from the recording, and limits only determine when a run is stopped; both are excluded.
         """
         left_out = ("sweep", "scene_name", "pictures", "time_limit", "memory_limit")
         settings = {name: value for name, value in self if name not in left_out}
-        settings |= {"scene": self.scene.digest, "solver": [identity(self.solver.name), dict(self.solver.parameters)]}
-        settings["integrator"] = identity(self.integrator)
+        settings |= {
+            "scene": self.scene.scene_digest,
+            "solver": [identify_code(self.solver.name), dict(self.solver.parameters)],
+        }
+        settings["integrator"] = identify_code(self.integrator)
         if self.timing == "exclusive":  # as it always was before there was another
             del settings["timing"]
         if self.accuracy is None:
             del settings["accuracy"]
         return json.dumps(settings, sort_keys=True, separators=(",", ":"))
 
-    def run_id(self, machine: str) -> str:
+    def compute_run_id(self, machine: str) -> str:
         """Compute the run's id on a machine, 12 hex digits of SHA-256.
 
         It is independent of the names of sweep and scene.
         """
-        return hashlib.sha256(f"{machine} {self.identity()}".encode()).hexdigest()[:12]
+        return hashlib.sha256(f"{machine} {self.build_identity()}".encode()).hexdigest()[:12]
 
-    def label(self, machine: str) -> str:
+    def build_file_stem(self, machine: str) -> str:
         """Build the stem of the run's file names."""
-        return f"{self.scene_name}-{self.size}-{safe_name(self.solver.name)}-{self.run_id(machine)}"
+        return f"{self.scene_name}-{self.size}-{sanitise_name(self.solver.name)}-{self.compute_run_id(machine)}"
 
-    def own(self) -> list[Plugin]:
+    def find_plugins(self) -> list[PluginName]:
         """Find the user code of the run: solver, integrator, mesh and effects."""
-        return found([self.solver.name, self.integrator, *(plugin for plugin, _ in self.scene.own.values())])
+        return select_plugins([self.solver.name, self.integrator, *(plugin for plugin, _ in self.scene.own.values())])

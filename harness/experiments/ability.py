@@ -23,71 +23,75 @@ from time import perf_counter, thread_time, time
 import numpy as np
 
 from harness.base import machine
-from harness.base.asides import Tick
-from harness.base.files import CannotWrite, replacing, users_cache
-from harness.base.machine_lock import alone
+from harness.base.asides import ProgressCallback
+from harness.base.files import WriteError, atomic_write, user_cache_dir
+from harness.base.machine_lock import lock_timing_exclusive
 
-NAMES: tuple[str, ...] = ("machine_bandwidth", "machine_flops", "machine_step")
+CALIBRATION_COLUMNS: tuple[str, ...] = ("machine_bandwidth", "machine_flops", "machine_step")
 """Names of the columns."""
 
-_DAY = 86_400.0
-_TRIES = 5
-_OWN = 0.95
+_CACHE_SECONDS = 86_400.0
+_NUM_REPEATS = 5
+_MIN_CPU_SHARE = 0.95
 """Smallest ratio of a thread's CPU time to wall time at which the measurement counts as undisturbed."""
-_BYTES, _MATRIX, _SHEET, _ITERATIONS = 2**26, 512, 32, 10
+_COPY_BYTES, _MATRIX_SIZE, _GRID_SIZE, _NUM_ITERATIONS = 2**26, 512, 32, 10
 
 
-_KNOWN: dict[str, float] = {}
+_CALIBRATION_CACHE: dict[str, float] = {}
 """Figures that this process has measured or loaded."""
 
 
-def of_this_machine(tick: Tick) -> dict[str, float]:
+def calibrate_machine(tick: ProgressCallback) -> dict[str, float]:
     """Return the calibration columns; empty if memory is insufficient.
 
     Args:
         tick: called while this waits for the timing lock.
     """
-    if not _KNOWN:
+    if not _CALIBRATION_CACHE:
         with suppress(MemoryError):  # within a run's limit
-            _KNOWN.update(_found(users_cache("machine") / f"{machine.node()}.json", tick))
-    return dict(_KNOWN)
+            _CALIBRATION_CACHE.update(
+                _load_or_measure(user_cache_dir("machine") / f"{machine.compute_node_id()}.json", tick)
+            )
+    return dict(_CALIBRATION_CACHE)
 
 
-def _found(path: Path, tick: Tick) -> dict[str, float]:
-    versions = machine.versions()
-    about = [machine.describe().id, machine.node(), versions["numpy"], versions["scipy"]]
+def _load_or_measure(path: Path, tick: ProgressCallback) -> dict[str, float]:
+    versions = machine.collect_versions()
+    about = [machine.describe_machine().machine_id, machine.compute_node_id(), versions["numpy"], versions["scipy"]]
     with suppress(OSError, ValueError, KeyError, TypeError):
         known = json.loads(path.read_text())
-        if known["about"] == about and abs(time() - known["when"]) < _DAY:
-            return {name: float(known[name]) for name in NAMES}
-    with alone(tick), machine.pinned_threads(1):
+        if known["about"] == about and abs(time() - known["when"]) < _CACHE_SECONDS:
+            return {name: float(known[name]) for name in CALIBRATION_COLUMNS}
+    with lock_timing_exclusive(tick), machine.limit_threads(1):
         began, used = perf_counter(), thread_time()
-        found = dict(zip(NAMES, (bandwidth(), flops(), step()), strict=True))
+        found = dict(
+            zip(CALIBRATION_COLUMNS, (measure_copy_bandwidth(), measure_flops(), measure_step_seconds()), strict=True)
+        )
         own = (thread_time() - used) / (perf_counter() - began)
-    if own < _OWN:
+    if own < _MIN_CPU_SHARE:
         return found
-    with suppress(CannotWrite, OSError):
+    with suppress(WriteError, OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as partial:
+        with atomic_write(path) as partial:
             partial.write_text(json.dumps({"about": about, "when": time(), **found}))
     return found
 
 
-def bandwidth() -> float:
+def measure_copy_bandwidth() -> float:
     """Measure the bandwidth of an array copy, read plus written [B/s]."""
-    source = np.ones(_BYTES // 8)
+    source = np.ones(_COPY_BYTES // 8)
     target = np.zeros_like(source)
-    return 2 * _BYTES / _least(lambda: np.copyto(target, source))
+    return 2 * _COPY_BYTES / _measure_min_seconds(lambda: np.copyto(target, source))
 
 
-def flops() -> float:
+def measure_flops() -> float:
     """Measure the speed of a matrix product [FLOP/s]."""
-    a = np.random.default_rng(0).normal(size=(_MATRIX, _MATRIX))
+    a = np.random.default_rng(0).normal(size=(_MATRIX_SIZE, _MATRIX_SIZE))
     out = np.empty_like(a)
-    return 2.0 * _MATRIX**3 / _least(lambda: np.matmul(a, a, out=out))
+    return 2.0 * _MATRIX_SIZE**3 / _measure_min_seconds(lambda: np.matmul(a, a, out=out))
 
 
-def step() -> float:
+def measure_step_seconds() -> float:
     """Measure the CPU seconds of a fixed local-global step.
 
     The sheet hangs by one side.
@@ -97,7 +101,7 @@ def step() -> float:
     from scipy.sparse import csr_array, identity
     from scipy.sparse.linalg import splu
 
-    number = np.arange(_SHEET**2).reshape(_SHEET, _SHEET)
+    number = np.arange(_GRID_SIZE**2).reshape(_GRID_SIZE, _GRID_SIZE)
     edges = np.concatenate(
         [
             np.stack([number[:-1].ravel(), number[1:].ravel()], 1),
@@ -106,31 +110,33 @@ def step() -> float:
     )
     count, each = len(edges), np.arange(len(edges))
     ends = np.concatenate([np.ones(count), -np.ones(count)])
-    A = csr_array((ends, (np.concatenate([each, each]), edges.T.ravel())), (count, _SHEET**2))
+    A = csr_array((ends, (np.concatenate([each, each]), edges.T.ravel())), (count, _GRID_SIZE**2))
     stiffness, inertia = 100.0, 900.0  # K [N/m] and M / dt^2, of a mass of 1 kg and a step of 1/30 s
     At = (stiffness * A.T).tocsr()
-    Q = (At @ A + inertia * identity(_SHEET**2, format="csr")).tocsc()
+    Q = (At @ A + inertia * identity(_GRID_SIZE**2, format="csr")).tocsc()
     factor = splu(Q)
     start = (
-        np.stack([*np.meshgrid(np.arange(_SHEET), np.arange(_SHEET)), np.zeros((_SHEET, _SHEET))], -1).reshape(-1, 3)
+        np.stack(
+            [*np.meshgrid(np.arange(_GRID_SIZE), np.arange(_GRID_SIZE)), np.zeros((_GRID_SIZE, _GRID_SIZE))], -1
+        ).reshape(-1, 3)
         * 1.1
     )
     y = inertia * (start - np.array([0.0, 0.0, 9.81 / inertia]))
 
     def iterate() -> None:
         p = start
-        for _ in range(_ITERATIONS):
+        for _ in range(_NUM_ITERATIONS):
             along = A @ p
             p = factor.solve(At @ (along / np.linalg.norm(along, axis=1, keepdims=True)) + y)
 
-    return _least(iterate)
+    return _measure_min_seconds(iterate)
 
 
-def _least(work: Callable[[], object]) -> float:
+def _measure_min_seconds(work: Callable[[], object]) -> float:
     """Return the smallest CPU time of several repetitions after a warm-up [s]."""
     work()
     took = list[float]()
-    for _ in range(_TRIES):
+    for _ in range(_NUM_REPEATS):
         began = thread_time()
         work()
         took.append(thread_time() - began)

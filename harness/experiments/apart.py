@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 from harness.base.errors import RunFailed
 
 if TYPE_CHECKING:
-    from harness.base.worker import Limits, Tick
+    from harness.base.worker import ProgressCallback, TaskLimits
 
 
-def apart(
-    piece: Callable[[Tick], Any],
-    own: Sequence[object],
-    say: Callable[[str], None] = lambda said: None,
-    limits: Limits | None = None,
+def run_isolated(
+    function: Callable[[ProgressCallback], Any],
+    user_code: Sequence[object],
+    print_message: Callable[[str], None] = lambda said: None,
+    limits: TaskLimits | None = None,
 ) -> Any:
     """Return the result of a function, isolated if user code is involved.
 
@@ -28,15 +28,17 @@ def apart(
     Raises:
         RunFailed: the process was lost. Errors of the function are raised unchanged.
     """
-    if not own:
-        return piece(say)
-    from harness.base.asides import is_step
-    from harness.base.workers import Limits, Lost, Workers
+    if not user_code:
+        return function(print_message)
+    from harness.base.asides import is_step_event
+    from harness.base.workers import IsolatedWorker, TaskFailure, TaskLimits
 
-    workers = Workers()
+    workers = IsolatedWorker()
     try:
-        return workers.do(piece, lambda said: say(said) if is_step(said) else None, limits or Limits())
-    except Lost as lost:
-        raise RunFailed(f"the process that runs {', '.join(map(str, own))} {lost}") from None
+        return workers.run_task(
+            function, lambda said: print_message(said) if is_step_event(said) else None, limits or TaskLimits()
+        )
+    except TaskFailure as lost:
+        raise RunFailed(f"the process that runs {', '.join(map(str, user_code))} {lost}") from None
     finally:
-        workers.end()
+        workers.stop_worker()

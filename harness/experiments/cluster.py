@@ -33,51 +33,64 @@ from distributed import Client, Future, KilledWorker
 from distributed.utils import silence_logging_cmgr
 
 from harness.base import machine
-from harness.base.errors import InputError, Mistake, RunFailed
-from harness.base.files import CannotWrite, replacing
-from harness.base.progress import Display, Effort
-from harness.base.workers import Limits, Lost, Tick, Workers
-from harness.config.own import MOST
+from harness.base.errors import InputError, InputMistake, RunFailed
+from harness.base.files import WriteError, atomic_write
+from harness.base.progress import ProgressDisplay, RunCost
+from harness.base.workers import IsolatedWorker, ProgressCallback, TaskFailure, TaskLimits
+from harness.config.own import DEFAULT_LOAD_LIMITS
 from harness.config.sweep import RunSpec
-from harness.experiments.core import TABLES, ready, watched
-from harness.experiments.plan import Files
+from harness.experiments.core import REGISTRY_TABLES, execute_timed, update_registries
+from harness.experiments.plan import RunFiles
 from harness.experiments.run_unit import RunUnit
-from harness.experiments.scheduler import PATIENCE, QUEUED, SILENCE, reach, scheduler
-from solvers.plugins import Plugin, load
+from harness.experiments.scheduler import (
+    CONNECT_TIMEOUT,
+    DASK_LOG_LEVEL,
+    MAX_QUEUE_WAITS,
+    check_address,
+    open_scheduler,
+)
+from solvers.plugins import PluginName, load_target
 
-CLOCKS = 60.0
+MAX_CLOCK_OFFSET = 60.0
 """Difference between the clocks of a worker and the client above which a message is printed [s]."""
 
-_TRIES = 4
+_MAX_ATTEMPTS = 4
 """Largest number of attempts for a run whose worker is lost."""
 
-_GONE = "the scheduler is gone; what was done is kept, and the same command does the rest"
+_SCHEDULER_LOST_MESSAGE = "the scheduler is gone; what was done is kept, and the same command does the rest"
 
-_ASK, _LOOK = 1.0, 0.05
+_WORKER_POLL_SECONDS, _TASK_POLL_SECONDS = 1.0, 0.05
 """Seconds between two queries of the workers; seconds between two queries of the tasks if none has finished."""
 
-_AHEAD = 4
+_QUEUED_TASKS_PER_THREAD = 4
 """Tasks queued at the scheduler per worker thread; more would use its memory without benefit."""
 
 
-class WorkerFacts(NamedTuple):
+class WorkerInfo(NamedTuple):
     """Machine, versions and clock of a worker."""
 
-    machine: str
-    node: str
-    code: str
-    python: str
-    distributed: str
-    clock: float
+    machine_id: str
+    node_id: str
+    source_fingerprint: str
+    python_version: str
+    dask_version: str
+    clock_seconds: float
 
     @classmethod
-    def this(cls) -> WorkerFacts:
+    def from_this_process(cls) -> WorkerInfo:
         """Return the information about this process."""
         python = ".".join(map(str, sys.version_info[:2]))
-        return cls(machine.describe().id, machine.node(), machine.code_hash(), python, version("distributed"), time())
+        return cls(
+            machine.describe_machine().machine_id,
+            machine.compute_node_id(),
+            machine.hash_sources(),
+            python,
+            version("distributed"),
+            time(),
+        )
 
 
-class Done(NamedTuple):
+class ClusterOutcome(NamedTuple):
     """Outcome of a run on a worker.
 
     Attributes:
@@ -87,27 +100,29 @@ class Done(NamedTuple):
         worker_error: why this worker cannot execute runs; empty if it can.
     """
 
-    worker: str
-    told: str = ""
-    left: Mapping[str, bytes] = {}
-    useless: str = ""
+    worker_address: str
+    message: str = ""
+    files: Mapping[str, bytes] = {}
+    worker_error: str = ""
 
 
-class Cluster(NamedTuple):
+class DaskCluster(NamedTuple):
     """Client of the workers, and the ids of their machines."""
 
     client: Client
-    machines: Sequence[str]
+    machine_ids: Sequence[str]
 
-    def do_all(
-        self, folder: Path, display: Display, units: Sequence[RunUnit], another: Callable[[RunUnit], str]
+    def execute_units(
+        self, folder: Path, display: ProgressDisplay, units: Sequence[RunUnit], skip_reason: Callable[[RunUnit], str]
     ) -> None:
         """Execute units on the workers (`execute_on_cluster`)."""
-        do_on(self.client, units, folder, display, another)
+        execute_on_cluster(self.client, units, folder, display, skip_reason)
 
 
 @contextmanager
-def cluster(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> Generator[Cluster]:
+def connect_cluster(
+    scheduler_address: str, runs: Sequence[RunSpec], print_message: Callable[[str], None]
+) -> Generator[DaskCluster]:
     """Connect to the workers of a scheduler, and yield the cluster.
 
     Args:
@@ -118,29 +133,31 @@ def cluster(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> Gen
     Raises:
         InputError: there is no scheduler, or no worker that can execute the runs.
     """
-    with scheduler(on) as address:
+    with open_scheduler(scheduler_address) as address:
         try:
             if isinstance(address, str):
-                reach(address)
-            client = Client(address, timeout=PATIENCE, set_as_default=False)
+                check_address(address)
+            client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
         except (OSError, ValueError) as error:
-            why = f"no scheduler answers within {PATIENCE:g} s ({' '.join(str(error).split())[:200]})"
-            raise InputError(Mistake(f"{on}: {why}; start one with `dask scheduler`", key="--on")) from None
+            why = f"no scheduler answers within {CONNECT_TIMEOUT:g} s ({' '.join(str(error).split())[:200]})"
+            raise InputError(
+                InputMistake(f"{scheduler_address}: {why}; start one with `dask scheduler`", key="--on")
+            ) from None
         # Dask's log would print tracebacks in addition to the message about a lost scheduler.
-        with silence_logging_cmgr(SILENCE), client, client.as_current():
-            for waits in range(0 if address is on else QUEUED, -1, -1):
+        with silence_logging_cmgr(DASK_LOG_LEVEL), client, client.as_current():
+            for waits in range(0 if address is scheduler_address else MAX_QUEUE_WAITS, -1, -1):
                 try:
-                    client.wait_for_workers(1, timeout=PATIENCE)
+                    client.wait_for_workers(1, timeout=CONNECT_TIMEOUT)
                     break
                 except TimeoutError:
                     if not waits:
-                        why = f"the scheduler has no worker; start some with `dask worker {on} --nthreads 1`"
-                        raise InputError(Mistake(f"{on}: {why}", key="--on")) from None
-                    say(f"{on}: no worker has come yet")
-            yield Cluster(client, machines(client, runs, say))
+                        why = f"the scheduler has no worker; start some with `dask worker {scheduler_address} --nthreads 1`"
+                        raise InputError(InputMistake(f"{scheduler_address}: {why}", key="--on")) from None
+                    print_message(f"{scheduler_address}: no worker has come yet")
+            yield DaskCluster(client, check_workers(client, runs, print_message))
 
 
-def machines(client: Client, runs: Sequence[RunSpec], say: Callable[[str], None]) -> list[str]:
+def check_workers(client: Client, runs: Sequence[RunSpec], print_message: Callable[[str], None]) -> list[str]:
     """Check all workers and return the ids of their machines; print which clocks differ.
 
     Args:
@@ -151,15 +168,15 @@ def machines(client: Client, runs: Sequence[RunSpec], say: Callable[[str], None]
     Raises:
         InputError: a worker has other versions, or lacks a plug-in.
     """
-    here = WorkerFacts.this()
+    here = WorkerInfo.from_this_process()
     before = time()
-    plugins = list({plugin for run in runs for plugin in run.own()})
-    answered: Any = client.run(_about, plugins, on_error="return")
+    plugins = list({plugin for run in runs for plugin in run.find_plugins()})
+    answered: Any = client.run(_describe_worker, plugins, on_error="return")
     found: dict[str, Any] = answered
     problems = []
     for worker, said in found.items():
         if isinstance(said, OSError):
-            say(f"the worker {worker} was lost: {said}")
+            print_message(f"the worker {worker} was lost: {said}")
             continue
         if isinstance(said, BaseException):
             problems.append(f"the worker {worker} cannot do runs: {type(said).__name__}: {said}")
@@ -170,43 +187,47 @@ def machines(client: Client, runs: Sequence[RunSpec], say: Callable[[str], None]
             if theirs != ours:
                 problems.append(f"the worker {worker} has another version: {what} {theirs}, here {ours}")
         problems += [f"the worker {worker} has no {name}: {why}" for name, why in missing.items()]
-        off = about.clock - min(max(about.clock, before), time())
-        if abs(off) > CLOCKS:
-            say(f"the clock of {worker} is {abs(off):.0f} s {'ahead' if off > 0 else 'behind'}; its rows tell by it")
+        off = about.clock_seconds - min(max(about.clock_seconds, before), time())
+        if abs(off) > MAX_CLOCK_OFFSET:
+            print_message(
+                f"the clock of {worker} is {abs(off):.0f} s {'ahead' if off > 0 else 'behind'}; its rows tell by it"
+            )
     if problems:
-        raise InputError([Mistake(problem, key="--on") for problem in problems])
+        raise InputError([InputMistake(problem, key="--on") for problem in problems])
     answers = [said for said in found.values() if not isinstance(said, OSError)]
     if not answers:
-        raise InputError(Mistake("all workers were lost; start others", key="--on"))
-    return sorted({about.machine for about, _ in answers})
+        raise InputError(InputMistake("all workers were lost; start others", key="--on"))
+    return sorted({about.machine_id for about, _ in answers})
 
 
-def _about(plugins: Sequence[Plugin]) -> tuple[WorkerFacts, dict[str, str]]:
+def _describe_worker(plugins: Sequence[PluginName]) -> tuple[WorkerInfo, dict[str, str]]:
     """On a worker: return its description, and why plug-ins cannot be imported."""
     missing = dict[str, str]()
     if plugins:
-        _allow_children()
-        process = Workers(fork=False)
+        _allow_child_processes()
+        process = IsolatedWorker(fork=False)
         try:
-            missing = process.do(partial(_missing, plugins), lambda _: None, Limits(*MOST))
-        except Lost as lost:
+            missing = process.run_task(
+                partial(_find_missing_plugins, plugins), lambda _: None, TaskLimits(*DEFAULT_LOAD_LIMITS)
+            )
+        except TaskFailure as lost:
             missing = {", ".join(plugins): f"the process that imports it {lost}"}
         finally:
-            process.end()
-    return WorkerFacts.this(), missing
+            process.stop_worker()
+    return WorkerInfo.from_this_process(), missing
 
 
-def _missing(plugins: Sequence[Plugin], tick: Tick) -> dict[str, str]:
+def _find_missing_plugins(plugins: Sequence[PluginName], tick: ProgressCallback) -> dict[str, str]:
     missing = {}
     for plugin in plugins:
         try:
-            load(plugin.target)
+            load_target(plugin.import_target)
         except Exception as error:
             missing[str(plugin)] = f"{type(error).__name__}: {error}"
     return missing
 
 
-def _allow_children() -> None:
+def _allow_child_processes() -> None:
     """Allow child processes: Dask's nannies start workers as daemons, which may have none.
 
     The children end with their parent.
@@ -214,12 +235,12 @@ def _allow_children() -> None:
     multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
 
 
-def do_on(
+def execute_on_cluster(
     client: Client,
     units: Sequence[RunUnit],
     folder: Path,
-    display: Display,
-    another: Callable[[RunUnit], str] = lambda unit: "",
+    display: ProgressDisplay,
+    skip_reason: Callable[[RunUnit], str] = lambda unit: "",
 ) -> None:
     """Execute units on the workers of a client; their files are written to `folder`.
 
@@ -239,46 +260,46 @@ def do_on(
     left, tries, excluded = list(enumerate(units))[::-1], dict[int, int](), set[str]()
     threads, asked = dict[str, int](), 0.0
     going: dict[Future, tuple[int, RunUnit]] = {}
-    fixed = folder.resolve(), f"rows/{token.name}", machine.code_hash(), [dict(table) for table in TABLES]
-    display.begin([unit.effort for unit in units])
-    looks = display.run(
-        f"{len(units)} runs on {client.scheduler.address if client.scheduler else 'a cluster'}", 1, Effort(amount=0.0)
+    fixed = folder.resolve(), f"rows/{token.name}", machine.hash_sources(), [dict(table) for table in REGISTRY_TABLES]
+    display.start_sweep([unit.cost_estimate for unit in units])
+    looks = display.start_run(
+        f"{len(units)} runs on {client.scheduler.address if client.scheduler else 'a cluster'}", 1, RunCost(amount=0.0)
     )
     try:
         token.touch()
         while left or going:
-            if not threads or monotonic() - asked > _ASK:
-                threads, asked = _threads(client), monotonic()
+            if not threads or monotonic() - asked > _WORKER_POLL_SECONDS:
+                threads, asked = _read_worker_threads(client), monotonic()
             workers = {name: many for name, many in threads.items() if name not in excluded}
-            while left and len(going) < _AHEAD * max(1, sum(workers.values())):
+            while left and len(going) < _QUEUED_TASKS_PER_THREAD * max(1, sum(workers.values())):
                 number, unit = left.pop()
-                if why := another(unit):
-                    display.elsewhere(unit.title, unit.effort, why)
+                if why := skip_reason(unit):
+                    display.skip_run(unit.title, unit.cost_estimate, why)
                     continue
                 key = f"springbench-{unit.run.title.replace(' ', '-')}-{uuid4().hex}"
                 only = list(workers) if excluded and workers else None
-                task = client.submit(_do, unit, *fixed, key=key, pure=False, workers=only)
+                task = client.submit(_execute_run, unit, *fixed, key=key, pure=False, workers=only)
                 going[task] = number, unit
             ended = [task for task in going if task.done()]
             if not ended:
-                sleep(_LOOK)
-            looks.tick("")
-            answers = _answers(client, ended)
+                sleep(_TASK_POLL_SECONDS)
+            looks.report_tick("")
+            answers = _gather_outcomes(client, ended)
             for task in ended:
                 number, unit = going.pop(task)
-                last = tries.get(number, 1) >= _TRIES
-                again = _ended(task, answers.get(task), unit, folder, display, excluded, last=last)
+                last = tries.get(number, 1) >= _MAX_ATTEMPTS
+                again = _finish_task(task, answers.get(task), unit, folder, display, excluded, is_last_attempt=last)
                 if again:
                     tries[number] = tries.get(number, 1) + 1
                     left.append((number, unit))
-            if excluded and not set(_threads(client)) - excluded:
-                raise CannotWrite(f"no worker is of use any more: {', '.join(sorted(excluded))}")
+            if excluded and not set(_read_worker_threads(client)) - excluded:
+                raise WriteError(f"no worker is of use any more: {', '.join(sorted(excluded))}")
     finally:
         token.unlink(missing_ok=True)
-        display.end()
+        display.finish_sweep()
 
 
-def _answers(client: Client, ended: Sequence[Future]) -> dict[Future, Done]:
+def _gather_outcomes(client: Client, ended: Sequence[Future]) -> dict[Future, ClusterOutcome]:
     """Fetch the outcomes of finished tasks together.
 
     Failed tasks are left out; the result is empty if a worker was lost meanwhile.
@@ -289,78 +310,84 @@ def _answers(client: Client, ended: Sequence[Future]) -> dict[Future, Done]:
     except (KilledWorker, CancelledError):
         return {}
     except OSError:
-        raise RunFailed(_GONE) from None
+        raise RunFailed(_SCHEDULER_LOST_MESSAGE) from None
     return dict(zip(finished, found, strict=True))
 
 
-def _ended(
-    task: Future,
-    answer: Done | None,
+def _finish_task(
+    future: Future,
+    outcome: ClusterOutcome | None,
     unit: RunUnit,
     folder: Path,
-    display: Display,
+    display: ProgressDisplay,
     excluded: set[str],
     *,
-    last: bool,
+    is_last_attempt: bool,
 ) -> bool:
     """Store the files of a finished task, and return whether to repeat its run.
 
     `outcome` is the result if it has been fetched already; `is_last_attempt` excludes another attempt.
     """
-    if task.status in ("cancelled", "lost"):
-        raise RunFailed(_GONE)
-    run = display.run(unit.title, 1, unit.effort)
+    if future.status in ("cancelled", "lost"):
+        raise RunFailed(_SCHEDULER_LOST_MESSAGE)
+    run = display.start_run(unit.title, 1, unit.cost_estimate)
     try:
-        done: Done = answer or task.result()
+        done: ClusterOutcome = outcome or future.result()
     except KilledWorker as error:
-        if last:
-            run.finished(unit.lost(Lost("killed", f"its worker was lost again and again: {error}")))
-        return not last
-    if done.useless:
-        excluded.add(done.worker)
-        run.finished(f"is done elsewhere, for {done.worker} {done.useless}")
+        if is_last_attempt:
+            run.finish_run(unit.write_lost_rows(TaskFailure("killed", f"its worker was lost again and again: {error}")))
+        return not is_last_attempt
+    if done.worker_error:
+        excluded.add(done.worker_address)
+        run.finish_run(f"is done elsewhere, for {done.worker_address} {done.worker_error}")
         return True
-    for name, content in sorted(done.left.items(), key=lambda item: item[0].endswith(".parquet")):  # rows last
-        with replacing(folder / name) as partial_name:
+    for name, content in sorted(done.files.items(), key=lambda item: item[0].endswith(".parquet")):  # rows last
+        with atomic_write(folder / name) as partial_name:
             partial_name.write_bytes(content)
-    run.finished(done.told)
+    run.finish_run(done.message)
     return False
 
 
-def _threads(client: Client) -> dict[str, int]:
+def _read_worker_threads(client: Client) -> dict[str, int]:
     """Return the number of threads of each worker. Raises RunFailed."""
     try:
         found: Any = client.nthreads()
     except OSError:
-        raise RunFailed(_GONE) from None
+        raise RunFailed(_SCHEDULER_LOST_MESSAGE) from None
     return found
 
 
-_PROCESSES: list[Workers] = []
+_IDLE_PROCESSES: list[IsolatedWorker] = []
 """Idle processes of this worker, which wait for their next run."""
 
 
-def _do(unit: RunUnit, folder: Path, token: str, code: str, tables: Sequence[Mapping[str, str]]) -> Done:
+def _execute_run(
+    unit: RunUnit, folder: Path, shared_token: str, fingerprint: str, tables: Sequence[Mapping[str, str]]
+) -> ClusterOutcome:
     """On a worker: execute one run in a separate process."""
     me = distributed.get_worker().address
-    if machine.code_hash() != code:
-        return Done(me, useless=f"has other code, {machine.code_hash()} and not {code}")
-    _allow_children()
-    process = _PROCESSES.pop() if _PROCESSES else Workers(partial(ready, tables), fork=False)
+    if machine.hash_sources() != fingerprint:
+        return ClusterOutcome(me, worker_error=f"has other code, {machine.hash_sources()} and not {fingerprint}")
+    _allow_child_processes()
+    process = (
+        _IDLE_PROCESSES.pop() if _IDLE_PROCESSES else IsolatedWorker(partial(update_registries, tables), fork=False)
+    )
     try:
         with TemporaryDirectory(prefix="springbench-") as temporary:
-            shared = (folder / token).exists()
+            shared = (folder / shared_token).exists()
             place = folder if shared else Path(temporary)
             for part in ("rows", "recordings", "pictures"):
                 (place / part).mkdir(exist_ok=True)
-            here = RunUnit(unit.run, Files.of(unit.run, place), None, unit.at_once)
+            here = RunUnit(unit.run, RunFiles.for_run(unit.run, place), None, unit.num_concurrent_runs)
             try:
-                told = process.do(partial(watched, here), lambda _: None, here.limits)
-            except Lost as lost:
-                told = here.lost(lost)
-            made = [] if shared else [here.files.rows, here.files.recording]
-            return Done(me, told, {os.path.relpath(path, place): path.read_bytes() for path in made if path.exists()})
-    except (CannotWrite, OSError) as error:
-        return Done(me, useless=f"cannot write: {error}")
+                told = process.run_task(partial(execute_timed, here), lambda _: None, here.task_limits)
+            except TaskFailure as lost:
+                told = here.write_lost_rows(lost)
+            made = [] if shared else [here.files.rows_path, here.files.recording_path]
+            return ClusterOutcome(
+                me, told, {os.path.relpath(path, place): path.read_bytes() for path in made if path.exists()}
+            )
+    except (WriteError, OSError) as error:
+        return ClusterOutcome(me, worker_error=f"cannot write: {error}")
     finally:
-        _PROCESSES.append(process)
+        _IDLE_PROCESSES.append(process)

@@ -7,25 +7,25 @@ from typing import Any
 
 from harness.config.sweep import RunSpec
 from solvers import sources
-from solvers.plugins import Plugin, source_of
-from solvers.registry import EVERY, load
+from solvers.plugins import PluginName, find_module_source
+from solvers.registry import SOLVER_TABLE, load_target
 
-Part = Path | type | Plugin
+SourcePart = Path | type | PluginName
 """Source file of a solver; imported class of a mesh or an effect; plug-in of the user."""
 
-TO_ERROR = "harness.experiments.asked.kept:keep_to_error"
+ERROR_CONTROL_TARGET = "harness.experiments.asked.kept:keep_to_error"
 """Import target that executes error-controlled runs; other runs do not depend on it."""
 
-_RUN = Path(__file__).with_name("run.py")
+_RUN_MODULE = Path(__file__).with_name("run.py")
 """Module that executes every run."""
 
 
-def solver_class(run: RunSpec) -> Any:
+def load_solver_class(run: RunSpec) -> Any:
     """Import and return the class of a run's solver."""
-    return load(EVERY[run.solver.name])
+    return load_target(SOLVER_TABLE[run.solver.name])
 
 
-def parts(run: RunSpec) -> frozenset[Part]:
+def collect_source_parts(run: RunSpec) -> frozenset[SourcePart]:
     """Return the source parts of a run, without importing solvers or user code.
 
     These are the file of the solver, and the classes of the mesh and the effects. Where the run needs them, there are
@@ -34,27 +34,31 @@ def parts(run: RunSpec) -> frozenset[Part]:
     """
     named = {"mesh": run.scene.mesh, **{f"effects[{i}]": effect for i, effect in enumerate(run.scene.effects)}}
     shipped = [type(part) for place, part in named.items() if place not in run.scene.own]
-    solver = [] if isinstance(run.solver.name, Plugin) else [run.solver.name]
+    solver = [] if isinstance(run.solver.name, PluginName) else [run.solver.name]
     judge = ["newton"] if run.judge else []
     guess = ["hybrid"] if run.first_guess == "coarse" else []
-    kept = [] if run.accuracy is None else [Path(source_of(TO_ERROR.partition(":")[0]) or _RUN)]
-    return frozenset([*map(_file_of, [*solver, *judge, *guess]), *kept, *shipped, *run.own()])
+    kept = (
+        []
+        if run.accuracy is None
+        else [Path(find_module_source(ERROR_CONTROL_TARGET.partition(":")[0]) or _RUN_MODULE)]
+    )
+    return frozenset([*map(_find_solver_file, [*solver, *judge, *guess]), *kept, *shipped, *run.find_plugins()])
 
 
-def code(parts: frozenset[Part]) -> str:
+def compute_source_fingerprint(parts: frozenset[SourcePart]) -> str:
     """Return 12 hexadecimal digits of SHA-256 over all source files of these parts."""
-    return sources.digest([_RUN, *(file for part in parts for file in files(part))])[:12]
+    return sources.digest_sources([_RUN_MODULE, *(file for part in parts for file in list_source_files(part))])[:12]
 
 
-def _file_of(name: str) -> Path:
+def _find_solver_file(name: str) -> Path:
     """Return the file of a solver of this package; it imports the base classes."""
-    return Path(source_of(EVERY[name].partition(":")[0]) or _RUN)
+    return Path(find_module_source(SOLVER_TABLE[name].partition(":")[0]) or _RUN_MODULE)
 
 
-def files(part: Part) -> frozenset[Path]:
+def list_source_files(part: SourcePart) -> frozenset[Path]:
     """Return the source files of a part."""
     if isinstance(part, Path):
         return frozenset([part])
-    if isinstance(part, Plugin):
-        return frozenset([Path(part.source)] if part.source.endswith(".py") else [])
-    return sources.of_class(part)
+    if isinstance(part, PluginName):
+        return frozenset([Path(part.source_path)] if part.source_path.endswith(".py") else [])
+    return sources.find_class_sources(part)

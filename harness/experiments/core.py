@@ -14,23 +14,23 @@ from pathlib import Path
 from typing import Protocol, TypeVar, runtime_checkable
 
 from harness.base import machine
-from harness.base.asides import compiling_told
-from harness.base.crew import Task, done_by
-from harness.base.holding import TAKEN, Claims
-from harness.base.machine_lock import alone
-from harness.base.progress import Display, Effort, Remarks, Run
-from harness.base.workers import Limits, Lost, Tick
-from harness.scenes.effects.effect_names import EFFECTS
-from harness.scenes.mesh.mesh_names import MESHES
+from harness.base.asides import report_compilation
+from harness.base.crew import PoolTask, run_tasks
+from harness.base.holding import CLAIMED_ELSEWHERE, UnitClaims
+from harness.base.machine_lock import lock_timing_exclusive
+from harness.base.progress import ProgressDisplay, RunCost, RunProgress, ThrottledMessages
+from harness.base.workers import ProgressCallback, TaskFailure, TaskLimits
+from harness.scenes.effects.effect_names import EFFECT_CLASSES
+from harness.scenes.mesh.mesh_names import MESH_CLASSES
 from solvers.registry import SOLVERS
 
-TABLES = (SOLVERS, EFFECTS, MESHES)
+REGISTRY_TABLES = (SOLVERS, EFFECT_CLASSES, MESH_CLASSES)
 
-MOST, GIB_EACH = 8, 2.0
+MAX_WORKERS, MEMORY_PER_WORKER_GIB = 8, 2.0
 """Largest number of workers, which are timed one at a time; memory required for each worker [GiB]."""
 
 
-class Unit(Protocol):
+class ExperimentUnit(Protocol):
     """Unit of work that is measured as a whole and stored in one file; picklable."""
 
     @property
@@ -39,21 +39,21 @@ class Unit(Protocol):
         ...
 
     @property
-    def ticks(self) -> int:
+    def num_progress_steps(self) -> int:
         """Number of steps that the unit reports as progress."""
         ...
 
     @property
-    def effort(self) -> Effort:
+    def cost_estimate(self) -> RunCost:
         """Estimated cost, from which the remaining time is predicted."""
         ...
 
     @property
-    def limits(self) -> Limits:
+    def task_limits(self) -> TaskLimits:
         """Limits of time and memory."""
         ...
 
-    def do(self, tick: Tick) -> str:
+    def execute_unit(self, tick: ProgressCallback) -> str:
         """Measure, write the rows and return the outcome as text.
 
         Raises:
@@ -62,54 +62,54 @@ class Unit(Protocol):
         """
         ...
 
-    def lost(self, lost: Lost) -> str:
+    def write_lost_rows(self, task_loss: TaskFailure) -> str:
         """Write the rows of a lost unit, and return the outcome as text."""
         ...
 
 
-U = TypeVar("U", bound=Unit)
+U = TypeVar("U", bound=ExperimentUnit)
 
 
 @runtime_checkable
-class Sharing(Protocol):
+class SelfTimedUnit(Protocol):
     """Unit that acquires the timing lock itself (`harness.execution.timing_lock`).
 
     Any other unit is timed as a whole.
     """
 
     @property
-    def group(self) -> Hashable:
+    def affinity_group(self) -> Hashable:
         """Key of units that share cached results; one worker runs a group where possible."""
         ...
 
 
 @runtime_checkable
-class Foreign(Protocol):
+class PluginUnit(Protocol):
     """Unit that runs user code; a unit without user code runs in another process."""
 
     @property
-    def own(self) -> frozenset[Hashable]:
+    def user_code(self) -> frozenset[Hashable]:
         """Identity of the user code."""
         ...
 
 
-class Filed(Unit, Protocol):
+class StoredUnit(ExperimentUnit, Protocol):
     """Unit that several commands may be about to execute."""
 
     @property
-    def place(self) -> Path:
+    def rows_path(self) -> Path:
         """File of the unit's rows."""
         ...
 
 
-F = TypeVar("F", bound=Filed)
+F = TypeVar("F", bound=StoredUnit)
 
 
-def do_together(
+def execute_unclaimed(
     todo: Sequence[F],
-    claims: Claims,
-    do: Callable[[Sequence[F], Callable[[F], str]], None],
-    say: Callable[[str], None],
+    claims: UnitClaims,
+    execute_batch: Callable[[Sequence[F], Callable[[F], str]], None],
+    print_message: Callable[[str], None],
 ) -> None:
     """Execute the units that no other command executes.
 
@@ -123,29 +123,29 @@ def do_together(
             returns why another command has the unit, or an empty string.
         print_message: prints a remark.
     """
-    remarks = Remarks(say)
+    remarks = ThrottledMessages(print_message)
     while todo:
         left: list[F] = []
 
         def another(unit: F, left: list[F] = left) -> str:
-            why = claims.take(unit.place)
-            if why == TAKEN:
+            why = claims.try_claim(unit.rows_path)
+            if why == CLAIMED_ELSEWHERE:
                 left.append(unit)
             return why
 
-        do(todo, another)
+        execute_batch(todo, another)
         waits = f"waiting for other commands, which have {len(left)} of these at hand"
-        claims.wait([unit.place for unit in left], partial(remarks, waits))
+        claims.wait_for_any([unit.rows_path for unit in left], partial(remarks, waits))
         todo = left
 
 
-def do_all(
+def execute_units(
     todo: Sequence[U],
-    display: Display,
+    display: ProgressDisplay,
     *,
     isolated: bool = True,
-    at_once: int = 1,
-    another: Callable[[U], str] = lambda unit: "",
+    num_workers: int = 1,
+    skip_reason: Callable[[U], str] = lambda unit: "",
 ) -> None:
     """Execute units, in worker processes or in this process.
 
@@ -162,51 +162,58 @@ def do_all(
         InputError: the input is invalid.
         CannotWrite: the rows cannot be written.
     """
-    display.begin([unit.effort for unit in todo], at_once)
-    runs: dict[int, Run] = {}
+    display.start_sweep([unit.cost_estimate for unit in todo], num_workers)
+    runs: dict[int, RunProgress] = {}
 
-    def start(number: int) -> Task | None:
+    def start(number: int) -> PoolTask | None:
         unit = todo[number]
-        if why := another(unit):
-            display.elsewhere(unit.title, unit.effort, why)
+        if why := skip_reason(unit):
+            display.skip_run(unit.title, unit.cost_estimate, why)
             return None
-        run = runs[number] = display.run(unit.title, unit.ticks, unit.effort)
-        own = unit.own if isinstance(unit, Foreign) else frozenset[Hashable]()
-        return Task(partial(watched, unit), run.tick, unit.limits, own=own)
+        run = runs[number] = display.start_run(unit.title, unit.num_progress_steps, unit.cost_estimate)
+        own = unit.user_code if isinstance(unit, PluginUnit) else frozenset[Hashable]()
+        return PoolTask(partial(execute_timed, unit), run.report_tick, unit.task_limits, user_code=own)
 
     try:
         if not isolated:
             for number in range(len(todo)):
                 if task := start(number):
-                    runs.pop(number).finished(task.piece(task.tick))
+                    runs.pop(number).finish_run(task.function(task.tick))
             return
-        groups = [unit.group if isinstance(unit, Sharing) else None for unit in todo]
-        tables = [dict(table) for table in TABLES]
-        for number, outcome in done_by(at_once, partial(ready, tables), groups, start):
-            told: str = todo[number].lost(outcome) if isinstance(outcome, Lost) else outcome
-            runs.pop(number).finished(told)
+        groups = [unit.affinity_group if isinstance(unit, SelfTimedUnit) else None for unit in todo]
+        tables = [dict(table) for table in REGISTRY_TABLES]
+        for number, outcome in run_tasks(num_workers, partial(update_registries, tables), groups, start):
+            told: str = todo[number].write_lost_rows(outcome) if isinstance(outcome, TaskFailure) else outcome
+            runs.pop(number).finish_run(told)
     finally:
-        display.end()
+        display.finish_sweep()
 
 
-def workers_at_once() -> int:
+def choose_num_workers() -> int:
     """Return the number of workers: the number of cores, limited by the available memory."""
-    return max(1, min(machine.describe().cores, MOST, int(machine.describe().memory_gib / GIB_EACH)))
+    return max(
+        1,
+        min(
+            machine.describe_machine().cores,
+            MAX_WORKERS,
+            int(machine.describe_machine().memory_gib / MEMORY_PER_WORKER_GIB),
+        ),
+    )
 
 
-def watched(unit: Unit, tick: Tick) -> str:
+def execute_timed(unit: ExperimentUnit, tick: ProgressCallback) -> str:
     """Execute a unit and return its outcome; compilation is reported through `tick` too."""
-    with compiling_told(tick), nullcontext() if isinstance(unit, Sharing) else alone(tick):
-        return unit.do(tick)
+    with report_compilation(tick), nullcontext() if isinstance(unit, SelfTimedUnit) else lock_timing_exclusive(tick):
+        return unit.execute_unit(tick)
 
 
 def require_threads(numbers: set[int]) -> None:
     """Raise InputError for thread numbers that this machine does not support."""
     for number in numbers:
-        machine.require_threads(number)
+        machine.check_thread_count(number)
 
 
-def ready(tables: Sequence[Mapping[str, str]]) -> None:
+def update_registries(tables: Sequence[Mapping[str, str]]) -> None:
     """Add the registered names of the parent process to a worker's tables."""
-    for table, known in zip(TABLES, tables, strict=True):
+    for table, known in zip(REGISTRY_TABLES, tables, strict=True):
         table.update(known)

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from harness.base.console import say
-from harness.base.errors import InputError, Mistake
+from harness.base.console import print_message
+from harness.base.errors import InputError, InputMistake
 
 
 def figure(
@@ -29,21 +29,23 @@ def figure(
     ] = None,
 ) -> None:
     """Draw a figure for print, with its data as CSV and a script."""
-    from harness.report.figures.asked import asked
-    from harness.report.figures.kinds import kind as find
+    from harness.report.figures.asked import parse_figure_options
+    from harness.report.figures.kinds import find_figure_kind as find
 
-    wanted = asked(width, formats, size, panels, titled=not without_title, transparent=transparent)
+    wanted = parse_figure_options(width, formats, size, panels, has_title=not without_title, is_transparent=transparent)
     found = find(kind)
     if not results.is_dir():
-        raise InputError(Mistake(f"is no folder; wanted one with {found.wanted}", results))
+        raise InputError(InputMistake(f"is no folder; wanted one with {found.required_rows}", results))
 
-    from harness.experiments.older import older_runs
-    from harness.report.figures.make import make
+    from harness.experiments.older import find_stale_runs
+    from harness.report.figures.make import make_figure
 
     folder = output or results / "figures"
-    made = make(kind, found, results, lambda table: older_runs(results, table), folder, wanted)
-    across, up = made.millimetres
-    say(f"{across:g} mm x {up:.0f} mm: {', '.join(made.panels)}")
-    if made.others:
-        say(f"there are {made.others} more panels; name others by --panels: {made.example}")
-    say(f"drawn in {', '.join(path.name for path in made.paths)}, in {folder}")
+    made = make_figure(kind, found, results, lambda table: find_stale_runs(results, table), folder, wanted)
+    across, up = made.size_mm
+    print_message(f"{across:g} mm x {up:.0f} mm: {', '.join(made.panel_names)}")
+    if made.other_panel_count:
+        print_message(
+            f"there are {made.other_panel_count} more panels; name others by --panels: {made.other_panel_example}"
+        )
+    print_message(f"drawn in {', '.join(path.name for path in made.paths)}, in {folder}")

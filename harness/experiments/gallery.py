@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from harness.base.console import say
+from harness.base.console import print_message
 from harness.base.errors import InputError
 
 _SOLVER, _TOLERANCE = "hybrid", "1e-4"
@@ -18,76 +18,78 @@ def gallery(
     output: Annotated[Path, typer.Option("-o", "--output", help="The picture to write (.png).")] = Path("scenes.png"),
 ) -> None:
     """Draw a sheet of scenes, each at its default size and last frame."""
-    from harness.report.contact_sheet import draw_sheet
+    from harness.report.contact_sheet import draw_gallery_sheet
 
     if output.suffix != ".png" or not output.parent.is_dir() or output.is_dir():
         raise InputError(f"--output: came {output}; wanted a file that ends in .png, in a folder that exists")
     tiles: list[Any] = []
     for path in scenes:
-        tiles.append(_tile(path))
-        say(f"[{len(tiles)}/{len(scenes)}] {tiles[-1].name}")
-    draw_sheet(tiles, output, [f"at the last frame, by {_SOLVER} to {_TOLERANCE}", *_strains(tiles)])
-    say(f"the sheet is {output}")
+        tiles.append(_build_tile(path))
+        print_message(f"[{len(tiles)}/{len(scenes)}] {tiles[-1].name}")
+    draw_gallery_sheet(
+        tiles, output, [f"at the last frame, by {_SOLVER} to {_TOLERANCE}", *_format_strain_range(tiles)]
+    )
+    print_message(f"the sheet is {output}")
 
 
-def _strains(tiles: list[Any]) -> list[str]:
+def _format_strain_range(tiles: list[Any]) -> list[str]:
     """Return the legend of the strain colours if all tiles share one range."""
     ranges = {tile.replay.strain_range for tile in tiles}
     return [f"strain: blue −{100 * ranges.pop():g} % or more, orange as much stretched"] if len(ranges) == 1 else []
 
 
-def _tile(path: Path) -> Any:
+def _build_tile(path: Path) -> Any:
     """Simulate a scene and build its tile."""
     import numpy as np
 
     from harness.base import machine
-    from harness.config.load import load_any
-    from harness.record.base import SELF_CONTACT, Replay
-    from harness.record.local_origin import local_origin, store_relative
-    from harness.record.obstacles import declared, listed
-    from harness.record.shading import STRAIN_RANGE
-    from harness.report.contact_sheet import Tile
-    from harness.scenes.bind import build
-    from harness.simulation.measure import Settings, steps
-    from harness.simulation.step import prepare, start
+    from harness.config.load import load_config
+    from harness.record.base import INTERSECTIONS_ENTITY, RecordingReplay
+    from harness.record.local_origin import compute_local_origin, store_relative
+    from harness.record.obstacles import build_obstacles_property, list_obstacles
+    from harness.record.shading import DEFAULT_STRAIN_RANGE
+    from harness.report.contact_sheet import SceneTile
+    from harness.scenes.bind import build_scene
+    from harness.simulation.measure import SteppingSettings, iterate_steps
+    from harness.simulation.step import build_initial_state, prepare
     from solvers.problem import StopRule
-    from solvers.registry import SOLVERS, load
+    from solvers.registry import SOLVERS, load_target
 
-    run = load_any(path, solvers=[_SOLVER]).runs()[0]
-    scene = build(run.scene, run.size)
-    solver = load(SOLVERS[_SOLVER])()
-    first = p = start(scene).now.positions
-    with machine.pinned_threads(1):
-        settings = Settings(StopRule(200, float(_TOLERANCE)), run.first_guess, run.frames, 1)
-        for step in steps(scene, prepare(scene, solver), settings):
+    run = load_config(path, solvers=[_SOLVER]).list_runs()[0]
+    scene = build_scene(run.scene, run.size)
+    solver = load_target(SOLVERS[_SOLVER])()
+    first = p = build_initial_state(scene).motion.positions
+    with machine.limit_threads(1):
+        settings = SteppingSettings(StopRule(200, float(_TOLERANCE)), run.first_guess, run.frames, 1)
+        for step in iterate_steps(scene, prepare(scene, solver), settings):
             p = step.positions
-    origin = local_origin(scene.mesh.rest)
-    replay = Replay(
+    origin = compute_local_origin(scene.mesh.rest_positions)
+    replay = RecordingReplay(
         title=run.scene_name,
         run_id="",
         frames=np.array([0, run.frames]),
-        times=np.array([0.0, scene.time(run.frames)]),
+        times=np.array([0.0, scene.compute_time(run.frames)]),
         positions=np.stack([store_relative(at, origin) for at in (first, p)]),
         triangles=scene.mesh.triangles,
-        springs=scene.springs.edges,
-        rest_lengths=scene.springs.rest_length,
-        pinned=scene.system.pins.vertices,
-        strain_range=run.strain_range or STRAIN_RANGE,
+        springs=scene.all_springs.edges,
+        rest_lengths=scene.all_springs.rest_length,
+        pinned_vertices=scene.system.pins.vertices,
+        strain_range=run.strain_range or DEFAULT_STRAIN_RANGE,
         scalars={},
         properties={
-            **declared(listed(run.scene.effects)),
-            SELF_CONTACT: scene.self_contact,
-            "cpu": machine.describe().cpu,
-            "commit": machine.commit(),
+            **build_obstacles_property(list_obstacles(run.scene.effects)),
+            INTERSECTIONS_ENTITY: scene.has_self_contact,
+            "cpu": machine.describe_machine().cpu,
+            "commit": machine.read_commit(),
         },
         origin=origin,
     )
     kinds = dict.fromkeys(effect.kind for effect in run.scene.effects)
     camera = run.scene.camera
-    return Tile(
+    return SceneTile(
         replay=replay,
         mass=scene.system.mass,
         name=run.scene_name.replace("-", " "),
-        effects=", ".join(kinds).replace("-", " "),
+        effect_words=", ".join(kinds).replace("-", " "),
         angles=(camera.azimuth, camera.elevation) if camera else None,
     )

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from harness.base.commands import Results
-from harness.base.console import aligned
+from harness.base.commands import ResultsOption
+from harness.base.console import format_plain_table
 
 if TYPE_CHECKING:
     from harness.config.sweep import RunSpec
 
-_ALWAYS = ("iterations", "frames", "threads")
+_FIXED_COLUMNS = ("iterations", "frames", "threads")
 """Options that always have a column, even if all runs agree in them."""
 
 
@@ -28,7 +28,7 @@ def list_command(
         Path | None,
         typer.Argument(help="A sweep or a scene (YAML), or an assignment's scene (JSON); all names if left out."),
     ] = None,
-    results: Results = Path("results"),
+    results: ResultsOption = Path("results"),
 ) -> None:
     """Check a config and list its runs with their status.
 
@@ -41,26 +41,30 @@ def list_command(
 
 
 def _print_runs(config: Path, results: Path) -> None:
-    from harness.base.machine import describe
-    from harness.config.load import load_any
-    from harness.experiments.plan import plan
+    from harness.base.machine import describe_machine
+    from harness.config.load import load_config
+    from harness.experiments.plan import plan_runs
 
-    sweep = load_any(config, opens=False)
-    planned = plan(sweep.runs(), results / sweep.name)
-    columns = settings([p.run for p in planned])
+    sweep = load_config(config, imports_code=False)
+    planned = plan_runs(sweep.list_runs(), results / sweep.name)
+    columns = collect_varied_settings([p.run for p in planned])
     lines: list[tuple[str, ...]] = [("run", "scene", "size", "solver", *columns, "state")]
     for number, p in enumerate(planned):
-        there = p.standing
-        state = there.state + (" (by other code)" if there.older else "") + (" (damaged)" if there.damage else "")
+        there = p.completion_status
+        state = (
+            there.status
+            + (" (by other code)" if there.is_stale else "")
+            + (" (damaged)" if there.damage_reason else "")
+        )
         values = (values[number] for values in columns.values())
         what = p.run.scene_name, str(p.run.size), p.run.solver.name
-        lines.append((p.files.rows.stem[-12:], *what, *values, state))
-    for line in aligned(lines):
+        lines.append((p.files.rows_path.stem[-12:], *what, *values, state))
+    for line in format_plain_table(lines):
         print(line)
-    print(f"states are those on this machine, {describe().id:.6}; settings hold on any")
+    print(f"states are those on this machine, {describe_machine().machine_id:.6}; settings hold on any")
 
 
-def settings(runs: Sequence[RunSpec]) -> dict[str, list[str]]:
+def collect_varied_settings(runs: Sequence[RunSpec]) -> dict[str, list[str]]:
     """Return the options and solver parameters that distinguish runs of one scene, size and solver.
 
     Args:
@@ -68,7 +72,7 @@ def settings(runs: Sequence[RunSpec]) -> dict[str, list[str]]:
 
     Returns: a value for each run by column; empty for a parameter that the run's solver does not have.
     """
-    from harness.config.options import OPTIONS
+    from harness.config.options import RUN_OPTIONS
 
     alike: dict[tuple[str, int, str], list[RunSpec]] = {}
     for run in runs:
@@ -77,10 +81,10 @@ def settings(runs: Sequence[RunSpec]) -> dict[str, list[str]]:
     def differ(value: Callable[[RunSpec], Any]) -> bool:
         return any(len({repr(value(run)) for run in group}) > 1 for group in alike.values())
 
-    values: dict[str, Callable[[RunSpec], Any]] = {name: attrgetter(name) for name in OPTIONS}
-    columns = {name: value for name, value in values.items() if name in _ALWAYS or differ(value)}
+    values: dict[str, Callable[[RunSpec], Any]] = {name: attrgetter(name) for name in RUN_OPTIONS}
+    columns = {name: value for name, value in values.items() if name in _FIXED_COLUMNS or differ(value)}
     for key in sorted({key for run in runs for key in run.solver.parameters}):
-        parameter = partial(_parameter, key)
+        parameter = partial(_get_parameter, key)
         if differ(parameter):
             columns[key] = parameter
     return {
@@ -88,15 +92,15 @@ def settings(runs: Sequence[RunSpec]) -> dict[str, list[str]]:
     }
 
 
-def _parameter(key: str, run: RunSpec) -> Any:
+def _get_parameter(key: str, run: RunSpec) -> Any:
     return run.solver.parameters.get(key)
 
 
 def _print_names() -> None:
-    from harness.scenes.effects.effect_names import EVERY as EFFECTS
-    from harness.scenes.mesh.mesh_names import EVERY as MESHES
-    from solvers.integrators import EVERY as INTEGRATORS
-    from solvers.registry import EVERY as SOLVERS
+    from harness.scenes.effects.effect_names import EFFECT_TABLE as EFFECTS
+    from harness.scenes.mesh.mesh_names import MESH_TABLE as MESHES
+    from solvers.integrators import INTEGRATOR_TABLE as INTEGRATORS
+    from solvers.registry import SOLVER_TABLE as SOLVERS
 
     kinds: dict[str, Mapping[str, Any]] = {
         "solvers": SOLVERS,
@@ -106,22 +110,22 @@ def _print_names() -> None:
     }
     for heading, table in kinds.items():
         print(f"\n{heading}, {len(table)}")
-        lines = [(f"  {name}", _summary(target)) for name, target in table.items()]
+        lines = [(f"  {name}", _read_summary(target)) for name, target in table.items()]
         width = max(len(name) for name, _ in lines)
         for name, summary in lines:
             print(f"{name:{width}}  {summary}".rstrip())
     print("\nsolvers/README.md and configs/README.md describe each; `springbench schema` has all parameters")
 
 
-def _summary(target: Any) -> str:
+def _read_summary(target: Any) -> str:
     """Read the first sentence on a class from its source.
 
     Importing a solver would compile kernels.
     """
     if not isinstance(target, str):
-        from solvers.integrators import OWN
+        from solvers.integrators import SUBSTEPPING
 
-        return "for solvers that integrate a step by themselves" if target is OWN else f"order {target.order}"
+        return "for solvers that integrate a step by themselves" if target is SUBSTEPPING else f"order {target.order}"
     module, _, name = target.partition(":")
     spec = find_spec(module)
     if spec is None or not spec.origin:
@@ -130,8 +134,8 @@ def _summary(target: Any) -> str:
     classes = (node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
     said = next((ast.get_docstring(node) or "" for node in classes), "")
     # A class docstring that starts with its parameters leaves the description to the module docstring.
-    return _first_sentence(ast.get_docstring(tree) or "" if said[:1].islower() else said)
+    return _extract_first_sentence(ast.get_docstring(tree) or "" if said[:1].islower() else said)
 
 
-def _first_sentence(text: str) -> str:
+def _extract_first_sentence(text: str) -> str:
     return re.split(r"(?<!et al)\.(?=\s|$)|[:;]\s|\s\(", " ".join(text.split()), maxsplit=1)[0]

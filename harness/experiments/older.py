@@ -11,14 +11,14 @@ from pathlib import Path
 import pyarrow as pa
 
 from harness.base import rows, shelf
-from harness.base.claim import NAME
+from harness.base.claim import OWNER_FILE
 from harness.base.errors import SpringbenchError
-from harness.config.load import load_any
+from harness.config.load import load_config
 from harness.config.sweep import RunSpec
-from harness.experiments.plan import NEEDED, of_other_code
+from harness.experiments.plan import REQUIRED_COLUMNS, find_stale_run_ids
 
 
-def older_runs(folder: Path, table: pa.Table) -> Collection[str]:
+def find_stale_runs(folder: Path, table: pa.Table) -> Collection[str]:
     """Return the ids of stale runs in a table of the folder's rows.
 
     The result is empty where the config is missing or has changed. Plug-ins of the config are not imported.
@@ -27,18 +27,20 @@ def older_runs(folder: Path, table: pa.Table) -> Collection[str]:
         folder: folder of a sweep.
         table: rows of that folder.
     """
-    runs = _runs(folder)
-    return of_other_code(runs, table) & set(map(str, table["run_id"].unique().to_pylist()))
+    runs = _load_runs(folder)
+    return find_stale_run_ids(runs, table) & set(map(str, table["run_id"].unique().to_pylist()))
 
 
-def older_of(folder: Path) -> Collection[str]:
+def find_stale_runs_in_folder(folder: Path) -> Collection[str]:
     """Return the ids of all stale runs in the folder of a sweep."""
-    table = rows.read(shelf.units(folder / "rows"), needed=NEEDED, left_out=lambda mistake: None)
-    return older_runs(folder, table)
+    table = rows.read_rows(
+        shelf.list_units(folder / "rows"), required_columns=REQUIRED_COLUMNS, on_invalid=lambda mistake: None
+    )
+    return find_stale_runs(folder, table)
 
 
-def _runs(folder: Path) -> list[RunSpec]:
-    note = folder / NAME
+def _load_runs(folder: Path) -> list[RunSpec]:
+    note = folder / OWNER_FILE
     if not note.is_file():
         return []
     said = note.read_text(errors="replace").strip()[:4096]
@@ -46,6 +48,6 @@ def _runs(folder: Path) -> list[RunSpec]:
     if not said or "\0" in said or not config.is_file():
         return []
     try:
-        return load_any(config, opens=False).runs()
+        return load_config(config, imports_code=False).list_runs()
     except SpringbenchError:
         return []

@@ -16,33 +16,33 @@ from typing import TYPE_CHECKING, Any
 
 from harness.base import machine, shelf
 from harness.config.sweep import RunSpec
-from harness.experiments.code import code, parts
-from harness.experiments.resume import DONE, MISSING, Standing
-from harness.record.sound import whole_messages
+from harness.experiments.code import collect_source_parts, compute_source_fingerprint
+from harness.experiments.resume import COMPLETED, NOT_STARTED, CompletionStatus
+from harness.record.sound import scan_messages
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-NEEDED = ("run_id", "scene", "size", "solver", "status", "code")
+REQUIRED_COLUMNS = ("run_id", "scene", "size", "solver", "status", "code")
 """Columns that are required to identify a run and its status."""
 
-_TOLD = ("status", "code", "time_limit", "memory_limit")
+_STATUS_COLUMNS = ("status", "code", "time_limit", "memory_limit")
 """Columns that determine the completion status."""
 
-_LIMITED = ("failed", "time-limit", "killed")
+_LIMIT_STATUSES = ("failed", "time-limit", "killed")
 """Statuses of runs that ended because of their limits."""
 
 
 @dataclass(frozen=True, slots=True)
-class Files:
+class RunFiles:
     """Paths of a run's files."""
 
-    rows: Path
-    recording: Path
-    picture: Path
+    rows_path: Path
+    recording_path: Path
+    picture_path: Path
 
     @classmethod
-    def of(cls, run: RunSpec, folder: Path, on: str | None = None) -> Files:
+    def for_run(cls, run: RunSpec, folder: Path, machine_id: str | None = None) -> RunFiles:
         """Return the paths of a run in the folder of its sweep.
 
         Args:
@@ -50,19 +50,19 @@ class Files:
             folder: folder of the sweep.
             machine_id: machine that executes the run; this machine if None.
         """
-        label = run.label(on or machine.describe().id)
+        label = run.build_file_stem(machine_id or machine.describe_machine().machine_id)
         return cls(
             folder / "rows" / f"{label}.parquet",
             folder / "recordings" / f"{label}.rrd",
             folder / "pictures" / f"{label}.png",
         )
 
-    def absolute(self) -> Files:
+    def to_absolute(self) -> RunFiles:
         """Return the files as absolute paths.
 
         A change of the working folder does not affect them.
         """
-        return Files(self.rows.absolute(), self.recording.absolute(), self.picture.absolute())
+        return RunFiles(self.rows_path.absolute(), self.recording_path.absolute(), self.picture_path.absolute())
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,8 +70,8 @@ class PlannedRun:
     """Run of a sweep, its files and its status (`harness.experiments.completion_status.PlannedUnit`)."""
 
     run: RunSpec
-    files: Files
-    standing: Standing
+    files: RunFiles
+    completion_status: CompletionStatus
 
     @property
     def title(self) -> str:
@@ -79,7 +79,7 @@ class PlannedRun:
         return self.run.title
 
 
-def plan(runs: Iterable[RunSpec], folder: Path, machines: Sequence[str | None] = (None,)) -> list[PlannedRun]:
+def plan_runs(runs: Iterable[RunSpec], folder: Path, machine_ids: Sequence[str | None] = (None,)) -> list[PlannedRun]:
     """Return each run with its files and its completion status.
 
     Args:
@@ -87,57 +87,60 @@ def plan(runs: Iterable[RunSpec], folder: Path, machines: Sequence[str | None] =
         folder: folder of the sweep.
         machine_ids: machines that may have executed the runs; None is this machine.
     """
-    code_of = _codes()
+    code_of = _cached_fingerprint()
     planned: list[PlannedRun] = []
-    here = machine.describe().id
-    placed = [(run, [Files.of(run, folder, on or here) for on in machines]) for run in runs]
-    heads = _heads([files.rows for _, some in placed for files in some])
+    here = machine.describe_machine().machine_id
+    placed = [(run, [RunFiles.for_run(run, folder, on or here) for on in machine_ids]) for run in runs]
+    heads = _read_row_heads([files.rows_path for _, some in placed for files in some])
     for run, some in placed:
-        files = next((files for files in some if files.rows in heads), some[0])
-        state, older, damage = MISSING, False, ""
-        there = heads.get(files.rows)
+        files = next((files for files in some if files.rows_path in heads), some[0])
+        state, older, damage = NOT_STARTED, False, ""
+        there = heads.get(files.rows_path)
         if isinstance(there, str):
-            damage = f"{files.rows} {there}"
+            damage = f"{files.rows_path} {there}"
         elif there is not None:
-            state = DONE if there["status"] == "ok" else there["status"]
+            state = COMPLETED if there["status"] == "ok" else there["status"]
             limits = there["time_limit"], there["memory_limit"]
-            if state in _LIMITED and limits != (run.time_limit, run.memory_limit):
-                state = MISSING  # who failed within other limits has said nothing of these
+            if state in _LIMIT_STATUSES and limits != (run.time_limit, run.memory_limit):
+                state = NOT_STARTED  # who failed within other limits has said nothing of these
             older = there["code"] != code_of(run)
-        if state == DONE and run.record:
-            damage = _unfit(files.recording)
-            state = MISSING if damage or not files.recording.exists() else DONE
-        planned.append(PlannedRun(run, files, Standing(state, older, damage)))
+        if state == COMPLETED and run.record:
+            damage = _describe_damage(files.recording_path)
+            state = NOT_STARTED if damage or not files.recording_path.exists() else COMPLETED
+        planned.append(PlannedRun(run, files, CompletionStatus(state, older, damage)))
     return planned
 
 
-def _heads(paths: Sequence[Path]) -> dict[Path, dict[str, Any] | str]:
-    if not any(map(shelf.there, paths)):
+def _read_row_heads(paths: Sequence[Path]) -> dict[Path, dict[str, Any] | str]:
+    if not any(map(shelf.has_rows, paths)):
         return {}
     from harness.base import rows  # brings pyarrow along
 
-    return rows.heads(paths, _TOLD, needed=NEEDED)
+    return rows.read_first_rows(paths, _STATUS_COLUMNS, required_columns=REQUIRED_COLUMNS)
 
 
-def _unfit(recording: Path) -> str:
+def _describe_damage(recording: Path) -> str:
     """Return why a recording is damaged, without reading all of it.
 
     The result is empty if it is intact or missing.
     """
     if not recording.exists():
         return ""
-    whole = recording.is_file() and whole_messages(recording)[0]
+    whole = recording.is_file() and scan_messages(recording)[0]
     return "" if whole else f"{recording} is cut before its end"
 
 
-def _codes() -> Callable[[RunSpec], str]:
+def _cached_fingerprint() -> Callable[[RunSpec], str]:
     """Return a function that computes source fingerprints, cached by the parts of a run."""
-    of_parts = cache(code)
-    return lambda run: of_parts(parts(run))
+    of_parts = cache(compute_source_fingerprint)
+    return lambda run: of_parts(collect_source_parts(run))
 
 
-def of_other_code(runs: Iterable[RunSpec], table: pa.Table) -> set[str]:
+def find_stale_run_ids(runs: Iterable[RunSpec], table: pa.Table) -> set[str]:
     """Return the ids of the runs whose rows come from other source code."""
-    code_of = _codes()
-    here, made = machine.describe().id, dict(zip(*(table[c].to_pylist() for c in ("run_id", "code")), strict=True))
-    return {name for run in runs if made.get(name := run.run_id(here)) != code_of(run)}
+    code_of = _cached_fingerprint()
+    here, made = (
+        machine.describe_machine().machine_id,
+        dict(zip(*(table[c].to_pylist() for c in ("run_id", "code")), strict=True)),
+    )
+    return {name for run in runs if made.get(name := run.compute_run_id(here)) != code_of(run)}

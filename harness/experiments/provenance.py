@@ -10,54 +10,57 @@ from datetime import UTC, datetime
 from typing import Any
 
 from harness.base import machine
-from harness.config.options import OPTIONS
+from harness.config.options import RUN_OPTIONS
 from harness.config.sweep import RunSpec, SolverSpec
 
 
-def common(run: RunSpec) -> dict[str, Any]:
+def build_run_columns(run: RunSpec) -> dict[str, Any]:
     """Return the columns that are equal in all rows of a run."""
     limits = {"time_limit": run.time_limit, "memory_limit": run.memory_limit, "timing": run.timing}
     return (
-        {"run_id": run.run_id(machine.describe().id), "sweep": run.sweep} | asked(run) | limits | provenance(run.solver)
+        {"run_id": run.compute_run_id(machine.describe_machine().machine_id), "sweep": run.sweep}
+        | build_specification_columns(run)
+        | limits
+        | build_provenance_columns(run.solver)
     )
 
 
-def asked(run: RunSpec) -> dict[str, Any]:
+def build_specification_columns(run: RunSpec) -> dict[str, Any]:
     """Return the columns that state the specification of a run."""
     return {
         "scene": run.scene_name,
         "size": run.size,
         "solver": run.solver.name,
         "parameters": json.dumps(dict(run.solver.parameters), sort_keys=True),
-        "own": json.dumps([plugin.identity() for plugin in run.own()]) if run.own() else None,
-        **run.solver.columns,
-        **{option.column: getattr(run, name) for name, option in OPTIONS.items() if option.column},
-        "tolerance": tolerance(run.tolerance),
-        "threads": machine.threads(run.threads).number,
+        "own": json.dumps([plugin.identify_code() for plugin in run.find_plugins()]) if run.find_plugins() else None,
+        **run.solver.metadata_columns,
+        **{option.column: getattr(run, name) for name, option in RUN_OPTIONS.items() if option.column},
+        "tolerance": convert_tolerance(run.tolerance),
+        "threads": machine.choose_threads(run.threads).count,
     }
 
 
-def tolerance(stated: float | str | None) -> float | None:
+def convert_tolerance(value: float | str | None) -> float | None:
     """Return the tolerance as the column stores it: 0 for `auto`."""
-    return 0.0 if isinstance(stated, str) else stated
+    return 0.0 if isinstance(value, str) else value
 
 
-def provenance(solver: SolverSpec | None = None) -> dict[str, Any]:
+def build_provenance_columns(solver: SolverSpec | None = None) -> dict[str, Any]:
     """Return the columns for the machine, the time and the source code of a measurement.
 
     Args:
         solver: solver whose package versions are included, where it is an interface to a package.
     """
-    here = machine.describe()
+    here = machine.describe_machine()
     return {
-        "machine": here.id,
-        "node": machine.node(),
+        "machine": here.machine_id,
+        "node": machine.compute_node_id(),
         "cpu": here.cpu,
         "cores": here.cores,
         "memory_gib": here.memory_gib,
-        "system": here.system,
-        "versions": json.dumps(machine.versions(*(solver.packages if solver else ())), sort_keys=True),
-        "commit": machine.commit(),
-        "code": machine.code_hash(),
+        "system": here.operating_system,
+        "versions": json.dumps(machine.collect_versions(*(solver.packages if solver else ())), sort_keys=True),
+        "commit": machine.read_commit(),
+        "code": machine.hash_sources(),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }

@@ -10,28 +10,30 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from harness.base.console import aligned, say
-from harness.base.errors import InputError, Mistake, RunFailed
+from harness.base.console import format_plain_table, print_message
+from harness.base.errors import InputError, InputMistake, RunFailed
 
 if TYPE_CHECKING:
     from harness.config.accuracy import WorkSpec
     from harness.scenes.bind import Scene
 
 
-def repeat(
+def export_script(
     config: Annotated[Path, typer.Argument(help="An accuracy config (YAML).")],
     point: Annotated[str, typer.Argument(help="A point's name, or its last letters; all are listed if left out.")] = "",
     output: Annotated[Path, typer.Option("-o", "--output", help="The folder for the script and its data.")] = Path(),
 ) -> None:
     """Export a script that repeats one simulation with an external engine alone."""
     from harness.config.accuracy_load import load_accuracy
-    from solvers.registry import EVERY, load
+    from solvers.registry import SOLVER_TABLE, load_target
 
-    engines = {spec.label(): spec for spec in load_accuracy(config).work}
-    engines = {label: spec for label, spec in engines.items() if hasattr(load(EVERY[spec.solver.name]), "script")}
+    engines = {spec.build_file_stem(): spec for spec in load_accuracy(config).work}
+    engines = {
+        label: spec for label, spec in engines.items() if hasattr(load_target(SOLVER_TABLE[spec.solver.name]), "script")
+    }
     if not point:
-        for line in aligned(
-            [("point", "scene", "integrator", "substeps", "parameters"), *map(_line, engines.values())]
+        for line in format_plain_table(
+            [("point", "scene", "integrator", "substeps", "parameters"), *map(_format_point, engines.values())]
         ):
             print(line)
         return
@@ -40,47 +42,49 @@ def repeat(
         problem = (
             f"came {point!r}, which {len(found)} points of outside engines end with; `springbench repeat {config}` "
         )
-        raise InputError(Mistake(f"{problem}lists them", key="POINT"))
+        raise InputError(InputMistake(f"{problem}lists them", key="POINT"))
     if output.exists() and not output.is_dir():
         raise InputError(
-            Mistake(f"{output} is a file; expected a folder, which is made if it is missing", key="--output")
+            InputMistake(f"{output} is a file; expected a folder, which is made if it is missing", key="--output")
         )
-    texts = _written(found[0], engines[found[0]], output)
+    texts = _write_script(found[0], engines[found[0]], output)
     print(texts[f"{found[0]}.py"], end="")
-    say(f"{', '.join(texts)} and {found[0]}.npz are in {output.resolve()}: run `python {found[0]}.py` there")
+    print_message(f"{', '.join(texts)} and {found[0]}.npz are in {output.resolve()}: run `python {found[0]}.py` there")
 
 
-def _line(spec: WorkSpec) -> tuple[str, ...]:
+def _format_point(spec: WorkSpec) -> tuple[str, ...]:
     words = " ".join(f"{key}={value}" for key, value in spec.solver.parameters.items())
-    return spec.label(), spec.case.title, spec.case.integrator, str(spec.options["iterations"]), words
+    return spec.build_file_stem(), spec.case.title, spec.case.integrator, str(spec.options["iterations"]), words
 
 
-def _written(name: str, spec: WorkSpec, folder: Path) -> dict[str, str]:
+def _write_script(name: str, spec: WorkSpec, folder: Path) -> dict[str, str]:
     """Write the script's files next to their data, and return their texts by name."""
     import numpy as np
 
     from harness.base import machine
-    from harness.reference.frozen import bind
-    from harness.simulation.step import prepare, problem, simulate, start
-    from solvers.engines.base import Engine, Network
+    from harness.reference.frozen import build_exact_scene
+    from harness.simulation.step import build_initial_state, build_problem, prepare, simulate_scene
+    from solvers.engines.base import EngineNetwork, ExternalEngine
     from solvers.problem import StopRule, Unsupported
-    from solvers.registry import EVERY, load
+    from solvers.registry import SOLVER_TABLE, load_target
 
-    scene = bind(spec.case.scene, spec.case.size, spec.case.integrator)
-    if acts := _between(scene):
+    scene = build_exact_scene(spec.case.scene, spec.case.size, spec.case.integrator)
+    if acts := _list_external_changes(scene):
         raise RunFailed(f"{name}: between frames springbench sets {' and '.join(acts)}; take another point")
-    engine: Engine = load(EVERY[spec.solver.name])(**spec.solver.parameters)
+    engine: ExternalEngine = load_target(SOLVER_TABLE[spec.solver.name])(**spec.solver.parameters)
     frames, substeps = round(spec.horizon / spec.case.scene.time_step), int(spec.options["iterations"])
-    begun = problem(scene, start(scene), "current")
+    begun = build_problem(scene, build_initial_state(scene), "current")
     try:
-        network = Network.of(scene.system, engine.name, damps=engine.damps)
-        texts = engine.script(name, network, begun, substeps, frames)
-        with machine.pinned_threads(1):
-            run = simulate(scene, prepare(scene, engine), StopRule(substeps), first_guess="current", frames=frames)
+        network = EngineNetwork.from_system(scene.system, engine.solver_name, supports_damping=engine.supports_damping)
+        texts = engine.write_script(name, network, begun, substeps, frames)
+        with machine.limit_threads(1):
+            run = simulate_scene(
+                scene, prepare(scene, engine), StopRule(substeps), initial_guess="current", frames=frames
+            )
             end = [step.positions for step in run][-1]
     except Unsupported as refused:
         raise RunFailed(str(refused)) from refused
-    arrays: dict[str, Any] = {**network.arrays(begun), "end": end}
+    arrays: dict[str, Any] = {**network.export_arrays(begun), "end": end}
     folder.mkdir(parents=True, exist_ok=True)
     np.savez(folder / f"{name}.npz", **arrays)
     for file, text in texts.items():
@@ -88,11 +92,14 @@ def _written(name: str, spec: WorkSpec, folder: Path) -> dict[str, str]:
     return texts
 
 
-def _between(scene: Scene) -> list[str]:
+def _list_external_changes(scene: Scene) -> list[str]:
     """List the quantities that springbench changes in the engine before each frame."""
     there = (
-        ("velocities that drag has slowed (with the integrator own it is a force of the engine's)", scene.filters),
-        ("forces that change", scene.forces),
-        ("pins that move", scene.moving),
+        (
+            "velocities that drag has slowed (with the integrator own it is a force of the engine's)",
+            scene.velocity_filters,
+        ),
+        ("forces that change", scene.varying_forces),
+        ("pins that move", scene.pin_motions),
     )
     return [what for what, some in there if some]

@@ -11,13 +11,13 @@ from harness.base import machine
 if TYPE_CHECKING:
     import pyarrow as pa
 
-DONE, MISSING = "done", "missing"
+COMPLETED, NOT_STARTED = "done", "missing"
 
-_NAMED = 8
+_MAX_LISTED_UNITS = 8
 """Largest number of units that a message lists by name."""
 
 
-class Standing(NamedTuple):
+class CompletionStatus(NamedTuple):
     """Completion status of a unit.
 
     Attributes:
@@ -26,12 +26,12 @@ class Standing(NamedTuple):
         damage_reason: what is wrong with the files; a damaged unit counts as missing.
     """
 
-    state: str
-    older: bool = False
-    damage: str = ""
+    status: str
+    is_stale: bool = False
+    damage_reason: str = ""
 
 
-class Planned(Protocol):
+class PlannedUnit(Protocol):
     """Unit, or the specification of one, with its completion status."""
 
     @property
@@ -40,17 +40,17 @@ class Planned(Protocol):
         ...
 
     @property
-    def standing(self) -> Standing:
+    def completion_status(self) -> CompletionStatus:
         """Completion status of the unit."""
         ...
 
 
-P = TypeVar("P", bound=Planned)
+P = TypeVar("P", bound=PlannedUnit)
 
 
-def standings(
-    asked: Mapping[Path, Callable[[Mapping[str, Any]], bool]], columns: Sequence[str], schema: pa.Schema
-) -> dict[Path, Standing]:
+def read_completion_statuses(
+    matches_request: Mapping[Path, Callable[[Mapping[str, Any]], bool]], columns: Sequence[str], schema: pa.Schema
+) -> dict[Path, CompletionStatus]:
     """Return the completion status of units, by the path of their rows.
 
     Args:
@@ -64,21 +64,26 @@ def standings(
     """
     from harness.base import rows  # brings pyarrow along, for which those who only ask what there is need not wait
 
-    heads, today = rows.heads(asked, [*columns, "code"], schema), machine.code_hash()
-    found: dict[Path, Standing] = {}
-    for path, as_asked in asked.items():
+    heads, today = rows.read_first_rows(matches_request, [*columns, "code"], schema), machine.hash_sources()
+    found: dict[Path, CompletionStatus] = {}
+    for path, as_asked in matches_request.items():
         there = heads.get(path)
         if isinstance(there, str):
-            found[path] = Standing(MISSING, damage=f"{path} {there}")
+            found[path] = CompletionStatus(NOT_STARTED, damage_reason=f"{path} {there}")
         elif there is None or not as_asked(there):
-            found[path] = Standing(MISSING)
+            found[path] = CompletionStatus(NOT_STARTED)
         else:
-            found[path] = Standing(DONE, older=there["code"] != today)
+            found[path] = CompletionStatus(COMPLETED, is_stale=there["code"] != today)
     return found
 
 
-def wanted(
-    planned: Sequence[P], what: str, say: Callable[[str], None], *, again: bool = False, changed: bool = False
+def select_missing_units(
+    planned: Sequence[P],
+    unit_noun: str,
+    print_message: Callable[[str], None],
+    *,
+    rerun: bool = False,
+    rerun_stale: bool = False,
 ) -> list[P]:
     """Return the units to execute, and print a summary of the others.
 
@@ -92,17 +97,17 @@ def wanted(
         rerun_stale: whether to include units whose rows come from other source code.
     """
 
-    def to_do(p: Planned) -> bool:
-        return again or p.standing.state == MISSING or (changed and p.standing.older)
+    def to_do(p: PlannedUnit) -> bool:
+        return rerun or p.completion_status.status == NOT_STARTED or (rerun_stale and p.completion_status.is_stale)
 
     todo = [p for p in planned if to_do(p)]
     if len(todo) < len(planned):
-        say(f"{len(planned) - len(todo)} of {len(planned)} {what} are there already")
-    if older := [p.title for p in planned if p.standing.older and not to_do(p)]:
-        more = f" and {len(older) - _NAMED} more" if len(older) > _NAMED else ""
-        say(f"{len(older)} of them by other code than today's: {', '.join(older[:_NAMED])}{more}")
-        say("--changed does these again, --again does all")
+        print_message(f"{len(planned) - len(todo)} of {len(planned)} {unit_noun} are there already")
+    if older := [p.title for p in planned if p.completion_status.is_stale and not to_do(p)]:
+        more = f" and {len(older) - _MAX_LISTED_UNITS} more" if len(older) > _MAX_LISTED_UNITS else ""
+        print_message(f"{len(older)} of them by other code than today's: {', '.join(older[:_MAX_LISTED_UNITS])}{more}")
+        print_message("--changed does these again, --again does all")
     for p in todo:
-        if p.standing.damage:
-            say(f"{p.standing.damage}; {p.title} is done again")
+        if p.completion_status.damage_reason:
+            print_message(f"{p.completion_status.damage_reason}; {p.title} is done again")
     return todo

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from harness.base import rows
-from harness.base.files import half_written
-from harness.base.progress import Effort
-from harness.base.quantities import ms_per_step
-from harness.base.workers import Limits, Lost, Tick
+from harness.base.files import find_partial_files
+from harness.base.progress import RunCost
+from harness.base.quantities import compute_ms_per_step
+from harness.base.workers import ProgressCallback, TaskFailure, TaskLimits
 from harness.config.sweep import RunSpec
-from harness.experiments.code import code, parts
-from harness.experiments.plan import Files
-from harness.experiments.provenance import common
+from harness.experiments.code import collect_source_parts, compute_source_fingerprint
+from harness.experiments.plan import RunFiles
+from harness.experiments.provenance import build_run_columns
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,9 +30,9 @@ class RunUnit:
     """
 
     run: RunSpec
-    files: Files
-    positions: Path | None = None
-    at_once: int = 1
+    files: RunFiles
+    positions_path: Path | None = None
+    num_concurrent_runs: int = 1
 
     @property
     def title(self) -> str:
@@ -40,65 +40,71 @@ class RunUnit:
         return self.run.title
 
     @property
-    def place(self) -> Path:
+    def rows_path(self) -> Path:
         """File of the run's rows."""
-        return self.files.rows
+        return self.files.rows_path
 
     @property
-    def ticks(self) -> int:
+    def num_progress_steps(self) -> int:
         """Number of steps of all passes."""
-        return self.run.frames * self.run.passes
+        return self.run.frames * self.run.num_passes
 
     @property
-    def effort(self) -> Effort:
+    def cost_estimate(self) -> RunCost:
         """Estimated cost: vertices times steps times iterations."""
-        return Effort(self.run.solver.name, (self.run.size or 32) ** 2 * self.ticks * self.run.iterations)
+        return RunCost(self.run.solver.name, (self.run.size or 32) ** 2 * self.num_progress_steps * self.run.iterations)
 
     @property
-    def limits(self) -> Limits:
+    def task_limits(self) -> TaskLimits:
         """Limits that the sweep sets.
 
         The log file lies in a folder next to that of the rows.
         """
-        log = self.files.rows.parents[1] / "logs" / f"{self.files.rows.stem}.txt"
-        return Limits(self.run.time_limit, self.run.memory_limit, log)
+        log = self.files.rows_path.parents[1] / "logs" / f"{self.files.rows_path.stem}.txt"
+        return TaskLimits(self.run.time_limit, self.run.memory_limit, log)
 
     @property
-    def own(self) -> frozenset[Hashable]:
+    def user_code(self) -> frozenset[Hashable]:
         """Identity of the user code that the run executes."""
-        return frozenset(tuple(plugin.identity()) for plugin in self.run.own())
+        return frozenset(tuple(plugin.identify_code()) for plugin in self.run.find_plugins())
 
     @property
-    def group(self) -> Hashable:
+    def affinity_group(self) -> Hashable:
         """Key of runs that are verified by one reference solution."""
-        return (self.run.scene.digest, self.run.size, self.run.integrator) if self.run.judge else None
+        return (self.run.scene.scene_digest, self.run.size, self.run.integrator) if self.run.judge else None
 
-    def do(self, tick: Tick) -> str:
+    def execute_unit(self, tick: ProgressCallback) -> str:
         """Execute the run and return its outcome as text."""
-        from harness.experiments.run import execute  # brings along all that simulates and records
+        from harness.experiments.run import execute_run  # brings along all that simulates and records
 
-        files = self.files.absolute()  # code of others may change the folder
-        positions = self.positions and self.positions.absolute()
-        return _outcome(execute(self.run, files, tick, positions=positions, at_once=self.at_once))
+        files = self.files.to_absolute()  # code of others may change the folder
+        positions = self.positions_path and self.positions_path.absolute()
+        return _format_outcome(
+            execute_run(self.run, files, tick, positions=positions, num_concurrent_runs=self.num_concurrent_runs)
+        )
 
-    def lost(self, lost: Lost) -> str:
+    def write_lost_rows(self, task_loss: TaskFailure) -> str:
         """Write the row of a lost run, and return the outcome as text."""
-        return _outcome(_abandoned(self.run, self.files, lost.status, str(lost)))
+        return _format_outcome(_write_lost_rows(self.run, self.files, task_loss.status, str(task_loss)))
 
 
-def _abandoned(run: RunSpec, files: Files, status: str, reason: str) -> list[dict[str, Any]]:
+def _write_lost_rows(run: RunSpec, files: RunFiles, status: str, reason: str) -> list[dict[str, Any]]:
     """Write and return the row of a lost run, and remove its partial files."""
-    for earlier in (files.recording, files.picture):
+    for earlier in (files.recording_path, files.picture_path):
         earlier.unlink(missing_ok=True)
-        for half in half_written(earlier):
+        for half in find_partial_files(earlier):
             half.unlink(missing_ok=True)
-    found = [common(run) | {"code": code(parts(run))} | {"phase": "run", "status": status, "reason": reason}]
-    rows.write(files.rows, found)
+    found = [
+        build_run_columns(run)
+        | {"code": compute_source_fingerprint(collect_source_parts(run))}
+        | {"phase": "run", "status": status, "reason": reason}
+    ]
+    rows.write_rows(files.rows_path, found)
     return found
 
 
-def _outcome(found: list[dict[str, Any]]) -> str:
+def _format_outcome(found: list[dict[str, Any]]) -> str:
     if found[0]["status"] != "ok":
         return f"{found[0]['status']}: {found[0]['reason']}"
-    taken = ms_per_step([row["seconds"] for row in found if row["phase"] == "step"])
+    taken = compute_ms_per_step([row["seconds"] for row in found if row["phase"] == "step"])
     return f"{taken:.3g} ms a step"

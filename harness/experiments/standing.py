@@ -9,36 +9,36 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 from harness.config.sweep import RunSpec
-from harness.scenes.bind import build
-from harness.simulation.opinion.second import DISAGREES, second_opinion
-from solvers.plugins import Plugin
+from harness.scenes.bind import build_scene
+from harness.simulation.opinion.second import MISMATCH, verify_terms
+from solvers.plugins import PluginName
 
-SINGLE = "single opinion: the integrator comes from outside, and its formula is written once"
+SELF_CHECK_ONLY = "single opinion: the integrator comes from outside, and its formula is written once"
 
 
 @dataclass(frozen=True, slots=True)
-class _Formulas:
+class _FormulasKey:
     """Cache key: a run's scene and other settings that determine its formulas."""
 
     key: tuple[str | int, ...]
     run: RunSpec = field(compare=False)
 
 
-def standing(run: RunSpec) -> dict[str, str]:
+def build_verification_columns(run: RunSpec) -> dict[str, str]:
     """Return the columns `status`, `second_opinion` and `reason` of a finished run that is verified.
 
     Columns that do not apply are left out.
     """
-    if isinstance(run.integrator, Plugin):
-        return {"status": "ok", "second_opinion": SINGLE}
-    said = opinion(_Formulas((run.scene.digest, run.size, run.integrator), run))
-    if said.startswith(DISAGREES):
+    if isinstance(run.integrator, PluginName):
+        return {"status": "ok", "second_opinion": SELF_CHECK_ONLY}
+    said = verify_formulas(_FormulasKey((run.scene.scene_digest, run.size, run.integrator), run))
+    if said.startswith(MISMATCH):
         return {"status": "disputed", "second_opinion": said, "reason": f"the second opinion {said}"}
     return {"status": "ok", "second_opinion": said}
 
 
 @lru_cache(maxsize=32)
-def opinion(formulas: _Formulas) -> str:
+def verify_formulas(key: _FormulasKey) -> str:
     """Return the verification result for a run's scene, at its size and with its integrator."""
-    run = formulas.run
-    return second_opinion(run.scene, build(run.scene, run.size, run.integrator), run.integrator)
+    run = key.run
+    return verify_terms(run.scene, build_scene(run.scene, run.size, run.integrator), run.integrator)

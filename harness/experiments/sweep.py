@@ -12,48 +12,50 @@ from typing import TYPE_CHECKING
 import pyarrow as pa
 
 from harness.base import holding, machine, rows
-from harness.base.asides import is_step
-from harness.base.errors import InputError, Mistake, RunFailed
-from harness.base.holding import Claims
-from harness.base.progress import Display
-from harness.base.workers import Limits, Lost, Workers
+from harness.base.asides import is_step_event
+from harness.base.errors import InputError, InputMistake, RunFailed
+from harness.base.holding import UnitClaims
+from harness.base.progress import ProgressDisplay
+from harness.base.workers import IsolatedWorker, TaskFailure, TaskLimits
 from harness.config.sweep import RunSpec
-from harness.experiments.core import do_all, do_together, require_threads, workers_at_once
-from harness.experiments.plan import NEEDED, Files, of_other_code, plan
-from harness.experiments.resume import wanted
+from harness.experiments.core import choose_num_workers, execute_unclaimed, execute_units, require_threads
+from harness.experiments.plan import REQUIRED_COLUMNS, RunFiles, find_stale_run_ids, plan_runs
+from harness.experiments.resume import select_missing_units
 from harness.experiments.run_unit import RunUnit
 
 if TYPE_CHECKING:
-    from harness.experiments.cluster import Cluster
+    from harness.experiments.cluster import DaskCluster
 
 
-_FEW = 100
+_MAX_RUNS_TO_PRELOAD = 100
 """Largest number of runs for which the start-up time of the drawing code matters and the rows are small enough to send.
 """
 
 
-def _away(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> AbstractContextManager[Cluster]:
+def _connect_cluster(
+    scheduler_address: str, runs: Sequence[RunSpec], print_message: Callable[[str], None]
+) -> AbstractContextManager[DaskCluster]:
     try:
-        from harness.experiments.cluster import cluster
+        from harness.experiments.cluster import connect_cluster
     except ModuleNotFoundError as error:
-        raise InputError(Mistake(f"needs {error.name}: pip install 'springbench[cluster]'", key="--on")) from None
-    return cluster(on, runs, say)
+        raise InputError(InputMistake(f"needs {error.name}: pip install 'springbench[cluster]'", key="--on")) from None
+    return connect_cluster(scheduler_address, runs, print_message)
 
 
 def run_sweep(
     name: str,
     runs: Sequence[RunSpec],
     folder: Path,
-    display: Display,
-    say: Callable[[str], None],
+    display: ProgressDisplay,
+    print_message: Callable[[str], None],
     *,
-    again: bool = False,
-    changed: bool = False,
+    rerun: bool = False,
+    rerun_stale: bool = False,
     positions: Path | None = None,
     isolated: bool = True,
-    at_once: int | None = None,
-    on: str | None = None,
-    meanwhile: Callable[[], object] = int,
+    num_workers: int | None = None,
+    scheduler_address: str | None = None,
+    background_call: Callable[[], object] = int,
 ) -> pa.Table:
     """Execute the missing runs of a sweep, draw its pictures and return all rows.
 
@@ -75,69 +77,85 @@ def run_sweep(
         InputError: the options contradict each other, or the input is invalid.
         RunFailed: the drawing process was lost.
     """
-    if on and (positions or not isolated):
+    if scheduler_address and (positions or not isolated):
         raise InputError("--positions and --here are of this machine; leave --on out")
     if positions and len(runs) != 1:
         raise InputError(f"--positions stores the positions of one run; this is {len(runs)} runs")
-    if not on:
-        require_threads({machine.threads(run.threads).number for run in runs})
+    if not scheduler_address:
+        require_threads({machine.choose_threads(run.threads).count for run in runs})
     for part in ("rows", "recordings", "pictures"):
         (folder / part).mkdir(parents=True, exist_ok=True)
     with ExitStack() as held:
-        held.enter_context(holding.together(folder))
-        away = held.enter_context(_away(on, runs, say)) if on else None
-        machines = away.machines if away else (None,)
-        claims = held.enter_context(
-            closing(Claims(folder, [Files.of(r, folder, m).rows for r in runs for m in machines]))
+        held.enter_context(holding.lock_folder_shared(folder))
+        away = (
+            held.enter_context(_connect_cluster(scheduler_address, runs, print_message)) if scheduler_address else None
         )
-        planned = plan(runs, folder, machines)
-        todo = wanted(planned, "runs", say, again=again or positions is not None, changed=changed)
-        drawing: Workers | None = None
+        machines = away.machine_ids if away else (None,)
+        claims = held.enter_context(
+            closing(UnitClaims(folder, [RunFiles.for_run(r, folder, m).rows_path for r in runs for m in machines]))
+        )
+        planned = plan_runs(runs, folder, machines)
+        todo = select_missing_units(
+            planned, "runs", print_message, rerun=rerun or positions is not None, rerun_stale=rerun_stale
+        )
+        drawing: IsolatedWorker | None = None
         here = isolated and not away
-        if here and len(runs) <= _FEW and any(p.run.record and p.run.pictures for p in todo):
-            drawing = Workers(_ready_to_draw)
-            held.callback(drawing.end)
-            drawing.begin()
+        if here and len(runs) <= _MAX_RUNS_TO_PRELOAD and any(p.run.record and p.run.pictures for p in todo):
+            drawing = IsolatedWorker(_preload_drawing)
+            held.callback(drawing.stop_worker)
+            drawing.start_worker()
         if todo and not away:
             import_module("harness.experiments.run")  # here, for workers that are forks of this process
             if any(p.run.judge for p in todo):
                 import_module("harness.experiments.standing")
-        many = min(at_once or workers_at_once(), max(1, len(todo)))
+        many = min(num_workers or choose_num_workers(), max(1, len(todo)))
         units = [RunUnit(p.run, p.files, positions, 1 if p.run.timing == "exclusive" else many) for p in todo]
         if away:
-            do_together(units, claims, partial(away.do_all, folder, display), say)
-            planned = plan(runs, folder, machines)
+            execute_unclaimed(units, claims, partial(away.execute_units, folder, display), print_message)
+            planned = plan_runs(runs, folder, machines)
         else:
-            do_here = partial(do_all, display=display, isolated=isolated, at_once=many)
-            do_together(units, claims, lambda some, another: do_here(some, another=another), say)
-        from harness.report.sweep import Pictured, draw_sweep
+            do_here = partial(execute_units, display=display, isolated=isolated, num_workers=many)
+            execute_unclaimed(
+                units, claims, lambda some, skip_reason: do_here(some, skip_reason=skip_reason), print_message
+            )
+        from harness.report.sweep import PictureJob, draw_sweep_pictures
 
-        table = rows.read((p.files.rows for p in planned), needed=NEEDED)
-        pictured = [Pictured(p.run, p.files.recording, p.files.picture) for p in planned]
-        draw = partial(draw_sweep, name, pictured, folder, table, at_once=many, older=of_other_code(runs, table))
+        table = rows.read_rows((p.files.rows_path for p in planned), required_columns=REQUIRED_COLUMNS)
+        pictured = [PictureJob(p.run, p.files.recording_path, p.files.picture_path) for p in planned]
+        draw = partial(
+            draw_sweep_pictures,
+            name,
+            pictured,
+            folder,
+            table,
+            num_concurrent=many,
+            stale_ids=find_stale_run_ids(runs, table),
+        )
         if drawing is None:
-            draw(say)
+            draw(print_message)
             return table
         try:
-            drawing.do(draw, lambda said: say(said) if is_step(said) else None, Limits(), meanwhile)
-        except Lost as lost:
+            drawing.run_task(
+                draw, lambda said: print_message(said) if is_step_event(said) else None, TaskLimits(), background_call
+            )
+        except TaskFailure as lost:
             raise RunFailed(
                 f"the process that draws {lost}; what was measured is kept, and the same command draws it"
             ) from None
     return table
 
 
-def _ready_to_draw() -> None:
+def _preload_drawing() -> None:
     """In the drawing process of a small sweep: load the drawing code.
 
     This takes 1 to 2 s, during the runs.
     """
-    from harness.report.sweep import get_ready
+    from harness.report.sweep import preload_drawing
 
-    get_ready()
+    preload_drawing()
 
 
-def failures(table: pa.Table) -> list[str]:
+def list_failed_runs(table: pa.Table) -> list[str]:
     """Return a line for each failed run: scene, size, solver, status and reason."""
     ended = table.select(["scene", "size", "solver", "status", "reason"]).to_pylist()
     failed = [row for row in ended if row["status"] != "ok"]

@@ -15,28 +15,28 @@ from numpy.typing import NDArray
 
 from solvers.problem import Positions
 
-MOST = 200
+MAX_ARROWS = 200
 """Maximum number of arrows of one force in a frame."""
-COLOURS = {"external": 0xF0E442FF, "contact": 0x56B4E9FF}
+FORCE_COLOURS = {"external": 0xF0E442FF, "contact": 0x56B4E9FF}
 """Arrow colour (0xRRGGBBAA) of each force."""
-HELD = 2000
+MAX_BUFFERED_FRAMES = 2000
 """Number of buffered frames that set the scale; later frames use the same scale."""
-_LONGEST = 0.15
+_MAX_LENGTH_FRACTION = 0.15
 """Length of the longest arrow, as a fraction of the mesh size."""
 
-Points = NDArray[np.float32]
-Times = Callable[[NDArray[np.int64]], Iterable[rr.TimeColumn]]
+PointArray = NDArray[np.float32]
+TimeIndex = Callable[[NDArray[np.int64]], Iterable[rr.TimeColumn]]
 
 
-class Arrows:
+class ForceArrows:
     """Force arrows on a mesh of a given size [m], in an open recording."""
 
     def __init__(self, stream: rr.RecordingStream, size: float) -> None:
         self._stream, self._size = stream, size
-        self._held: dict[str, list[tuple[int, Points, Points]]] = {}
+        self._held: dict[str, list[tuple[int, PointArray, PointArray]]] = {}
         self._scale: dict[str, float] = {}  # metres a newton
 
-    def at(self, frame: int, p: Points, forces: Mapping[str, Positions], times: Times) -> None:
+    def add_frame(self, frame: int, p: PointArray, forces: Mapping[str, Positions], times: TimeIndex) -> None:
         """Buffer the force arrows of one frame.
 
         Args:
@@ -47,19 +47,19 @@ class Arrows:
         """
         for name, force in forces.items():
             acting = np.flatnonzero(np.abs(force).max(axis=1, initial=0.0) > 0.0)
-            acting = acting[:: -(-len(acting) // MOST) or 1]
+            acting = acting[:: -(-len(acting) // MAX_ARROWS) or 1]
             held = self._held.setdefault(name, [])
             if len(acting) or held or name in self._scale:
                 held.append((frame, p[acting], force[acting].astype(np.float32)))
-            if len(held) >= HELD:
-                self._send(name, times)
+            if len(held) >= MAX_BUFFERED_FRAMES:
+                self._send_forces(name, times)
 
-    def close(self, times: Times) -> None:
+    def close(self, times: TimeIndex) -> None:
         """Write all buffered arrows."""
         for name in [*self._held]:
-            self._send(name, times)
+            self._send_forces(name, times)
 
-    def _send(self, name: str, times: Times) -> None:
+    def _send_forces(self, name: str, times: TimeIndex) -> None:
         held = self._held.pop(name)
         if not held:
             return
@@ -70,8 +70,8 @@ class Arrows:
             with np.errstate(over="ignore", invalid="ignore"):
                 lengths = np.linalg.norm(f, axis=1)
             longest = float(lengths[np.isfinite(lengths)].max(initial=0.0))
-            self._scale[name] = _LONGEST * self._size / longest if longest else 0.0
-            look = rr.Arrows3D.from_fields(colors=COLOURS[name], radii=rr.Radius.ui_points(1.25))
+            self._scale[name] = _MAX_LENGTH_FRACTION * self._size / longest if longest else 0.0
+            look = rr.Arrows3D.from_fields(colors=FORCE_COLOURS[name], radii=rr.Radius.ui_points(1.25))
             self._stream.log(entity, look, static=True)
         columns = rr.Arrows3D.columns(origins=np.concatenate(origins), vectors=self._scale[name] * f)
         counts = [len(of_frame) for of_frame in origins]

@@ -18,19 +18,19 @@ if TYPE_CHECKING:
     from harness.scenes.shapes import AnySurface
 
 
-LAYOUT = 2
+LAYOUT_VERSION = 2
 """Version of the layout of entities and columns; recordings of another version are rejected."""
 
 
-SELF_CONTACT = "self_contact"
+INTERSECTIONS_ENTITY = "self_contact"
 """Property of a recording that states whether an effect prevents self-intersection of the mesh."""
 
-SAMPLES = 8
+NUM_SAMPLES = 8
 """Number of sampled frames before the last: a recording wrong in half of its frames passes once in 256 runs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
+class RecordedFrame:
     """One simulated step, as recorded; frame 0 is the initial state.
 
     Attributes:
@@ -49,9 +49,9 @@ class Frame:
     positions: Positions
     energies: Mapping[str, float]
     residual: float
-    iterations: int
+    num_iterations: int
     forces: Mapping[str, Positions] = field(default_factory=dict[str, Positions])
-    intersections: int | None = None
+    num_intersections: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,22 +77,22 @@ class RecordingInfo:
     mesh: Mesh
     springs: NDArray[np.int64]
     rest_lengths: NDArray[np.float64]
-    pinned: NDArray[np.int64]
+    pinned_vertices: NDArray[np.int64]
     time_step: float
     strain_range: float
     properties: Mapping[str, str | int | float | bool]
-    iterates: bool = False
+    is_solve: bool = False
     obstacles: Sequence[AnySurface] = ()
 
 
-class Recorder(Protocol):
+class RunRecorder(Protocol):
     """Writer of the frames of one run, in order, to one complete file or none."""
 
-    def frame(self, frame: Frame) -> None:
+    def record_frame(self, frame: RecordedFrame) -> None:
         """Record one frame."""
         ...
 
-    def convergence(self, frame: int, residuals: Sequence[float], objective: Sequence[float]) -> None:
+    def record_convergence(self, frame: int, residuals: Sequence[float], objective: Sequence[float]) -> None:
         """Record the convergence within one frame.
 
         Args:
@@ -102,7 +102,7 @@ class Recorder(Protocol):
         """
         ...
 
-    def close(self, milliseconds: Mapping[str, Sequence[float]]) -> Path:
+    def finish_recording(self, milliseconds: Mapping[str, Sequence[float]]) -> Path:
         """Write the phase times, finish the file and return its final path.
 
         Args:
@@ -110,7 +110,7 @@ class Recorder(Protocol):
         """
         ...
 
-    def abandon(self) -> None:
+    def abandon_recording(self) -> None:
         """Stop and leave no file under the final name."""
         ...
 
@@ -120,17 +120,17 @@ class FrameSamples:
 
     def __init__(self, last: int) -> None:
         before = range(1, last)
-        self.frames = {*random.sample(before, min(SAMPLES, len(before))), last}
+        self.frames = {*random.sample(before, min(NUM_SAMPLES, len(before))), last}
         self.positions: dict[int, Positions] = {}
 
-    def add(self, frame: int, p: Positions) -> None:
+    def add_frame(self, frame: int, p: Positions) -> None:
         """Copy the positions (n, 3) [m] after a step if its frame is sampled."""
         if frame in self.frames:
             self.positions[frame] = p.copy()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Replay:
+class RecordingReplay:
     """Contents of a recording that has been read back, from which pictures are drawn.
 
     Attributes:
@@ -157,7 +157,7 @@ class Replay:
     triangles: NDArray[np.int64]
     springs: NDArray[np.int64]
     rest_lengths: NDArray[np.float64]
-    pinned: NDArray[np.int64]
+    pinned_vertices: NDArray[np.int64]
     strain_range: float
     scalars: Mapping[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
     properties: Mapping[str, str | int | float | bool]

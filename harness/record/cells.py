@@ -12,7 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 
-def cell(batch: pa.RecordBatch, name: str, row: int = 0) -> NDArray[Any]:
+def read_cell(batch: pa.RecordBatch, name: str, row: int = 0) -> NDArray[Any]:
     """Return all numbers of one row of a component as a flat array.
 
     Args:
@@ -20,20 +20,20 @@ def cell(batch: pa.RecordBatch, name: str, row: int = 0) -> NDArray[Any]:
       name: name of the component.
       row: index of the row.
     """
-    values = scalar(batch, name, row).values
+    values = get_scalar(batch, name, row).values
     while pa.types.is_nested(values.type):
         values = values.flatten()
     return values.to_numpy()
 
 
-def counted(batch: pa.RecordBatch, timeline: str) -> NDArray[Any]:
+def read_timeline(batch: pa.RecordBatch, timeline: str) -> NDArray[Any]:
     """Return a timeline of a batch: frames, iterations, or times [s]."""
-    found = column(batch, timeline)
+    found = get_column(batch, timeline)
     counts: NDArray[np.int64] = found.cast(pa.int64()).to_numpy()
     return counts / 1e9 if pa.types.is_duration(found.type) else counts
 
 
-def column(batch: pa.RecordBatch, name: str) -> Any:
+def get_column(batch: pa.RecordBatch, name: str) -> Any:
     """Return a column, untyped.
 
     pyarrow's stubs do not type arrays that depend on the schema.
@@ -41,12 +41,12 @@ def column(batch: pa.RecordBatch, name: str) -> Any:
     return cast(Any, batch[name])
 
 
-def scalar(batch: pa.RecordBatch, name: str, row: int) -> Any:
+def get_scalar(batch: pa.RecordBatch, name: str, row: int) -> Any:
     """Return one row of a column."""
-    return column(batch, name)[row]
+    return get_column(batch, name)[row]
 
 
-def replaced(batch: pa.RecordBatch, name: str, rows: Sequence[NDArray[Any]]) -> pa.RecordBatch:
+def replace_cells(batch: pa.RecordBatch, name: str, rows: Sequence[NDArray[Any]]) -> pa.RecordBatch:
     """Return the batch with the numbers of a component replaced row by row.
 
     Args:

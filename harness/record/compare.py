@@ -19,11 +19,19 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
 from harness.record import cells, curves
-from harness.record.blueprint import panels, plot, scene_view
-from harness.record.camera import Extent
+from harness.record.blueprint import build_panels, build_plot, build_scene_view
+from harness.record.camera import ViewExtent
 from harness.record.partial import PartialFile
-from harness.record.reader import Source, looked_at, network, open_recording, positions, properties, triangles
-from harness.record.shading import colours, strains, widest
+from harness.record.reader import (
+    RecordingSource,
+    iterate_positions,
+    open_recording,
+    read_convergence_frames,
+    read_network,
+    read_properties,
+    read_triangles,
+)
+from harness.record.shading import compute_strain_colours, compute_strains, widen_range
 
 _QUANTITIES = {
     "/residual/log10": "log10 residual [J^(1/2)]",
@@ -32,15 +40,15 @@ _QUANTITIES = {
     "/energy/springs": "Elastic energy [J]",
     "/iterations": "Iterations of a step",
 }
-_SHOWN = 3
+_MAX_LISTED_PROPERTIES = 3
 """Number of quantities shown at once; the others are in another tab."""
 
 
-_ABREAST = 4
+_MAX_VIEWS_PER_ROW = 4
 """Maximum number of scenes in a row; with this many, each view is higher than wide."""
 
-_STRAINED = ("/scene/mesh", "/scene/springs")
-_PAINTED = (
+_STRAIN_ENTITIES = ("/scene/mesh", "/scene/springs")
+_COLOURED_COMPONENTS = (
     ("Mesh3D:vertex_positions", "Mesh3D:vertex_colors"),
     ("Points3D:positions", "Points3D:colors"),
     ("LineStrips3D:strips", "LineStrips3D:colors"),
@@ -48,7 +56,7 @@ _PAINTED = (
 """Components with positions, and those with the strain colours at these positions."""
 
 
-class Look(NamedTuple):
+class LineStyle(NamedTuple):
     """Line style of a run.
 
     `color` is a colour such as `#0072b2`, which is lightened in side-by-side recordings where it is dark.
@@ -57,7 +65,7 @@ class Look(NamedTuple):
     color: str
 
 
-def side_by_side(out: Path, recordings: Mapping[str, Path], title: str, looks: Mapping[str, Look]) -> None:
+def write_side_by_side(out: Path, recordings: Mapping[str, Path], title: str, styles: Mapping[str, LineStyle]) -> None:
     """Write several recordings side by side on one timeline to one file.
 
     Args:
@@ -74,30 +82,30 @@ def side_by_side(out: Path, recordings: Mapping[str, Path], title: str, looks: M
     try:
         with ExitStack() as opened:
             sources = {name: opened.enter_context(open_recording(path)) for name, path in recordings.items()}
-            longest = max(float(network(source)["strain_range"][0]) for source in sources.values())
-            box: Extent | None = None  # of all of them, so that all are seen alike
-            runs = list[_Run]()
+            longest = max(float(read_network(source)["strain_range"][0]) for source in sources.values())
+            box: ViewExtent | None = None  # of all of them, so that all are seen alike
+            runs = list[_SourceRun]()
             for name, source in sources.items():
-                runs.append(_Run(name, len(runs), source, longest))
-                box = runs[-1].seen_in(source, box, 0.75 if len(sources) == _ABREAST else 1.0)
+                runs.append(_SourceRun(name, len(runs), source, longest))
+                box = runs[-1].widen_extent(source, box, 0.75 if len(sources) == _MAX_VIEWS_PER_ROW else 1.0)
             for run, source in zip(runs, sources.values(), strict=True):
-                _copy(file, run, source, looks[run.name], box)
+                _copy_chunks(file, run, source, styles[run.name], box)
         for frame in sorted(set[int]().union(*(run.curves for run in runs))):
             drawn = {run.name: run.curves[frame] for run in runs if frame in run.curves}
-            colours = curves.colours(_colour(looks[name]) for name in drawn)
-            curves.draw(file.stream, f"/curves/frame_{frame}", drawn, colours)
-        document = rr.TextDocument(_table(title, runs), media_type=rr.MediaType.MARKDOWN)
+            colours = curves.pack_colours(_pack_colour(styles[name]) for name in drawn)
+            curves.draw_curves(file.stream, f"/curves/frame_{frame}", drawn, colours)
+        document = rr.TextDocument(_format_table(title, runs), media_type=rr.MediaType.MARKDOWN)
         file.stream.log("/runs", document, static=True)
-        file.finish(_layout(runs, box))
+        file.finish_file(_build_layout(runs, box))
     finally:
-        file.abandon()
+        file.abandon_file()
 
 
-class _Run:
+class _SourceRun:
     """One source recording: its root entity and the data its views need."""
 
-    def __init__(self, name: str, k: int, source: Source, strain_range: float) -> None:
-        fixed = network(source)
+    def __init__(self, name: str, k: int, source: RecordingSource, strain_range: float) -> None:
+        fixed = read_network(source)
         self.strain_range, self._anew = strain_range, float(fixed["strain_range"][0]) != strain_range
         self._springs = fixed["springs"].reshape(-1, 2).astype(np.int64)
         self._rest_lengths = fixed["rest_lengths"].astype(float)
@@ -105,84 +113,86 @@ class _Run:
         # Entity paths allow few unescaped characters; the number separates names that differ only in the replaced ones.
         self.name, self.root = name, f"/{k + 1}-{re.sub(r'[^A-Za-z0-9_.]+', '-', name)}"
         self.time_step = float(fixed["time_step"][0])
-        self.properties: dict[str, Any] = properties(source)[1]
-        self.triangles = len(triangles(source))
+        self.properties: dict[str, Any] = read_properties(source)[1]
+        self.triangles = len(read_triangles(source))
         self.entities: set[str] = set()
-        self.last = self._vertices = 0
-        self.curves = residuals(source)
+        self.last_frame = self._vertices = 0
+        self.curves = read_residuals(source)
         self.ranges: dict[str, tuple[float, float]] = {}  # the smallest and the largest of what is compared
 
-    def seen_in(self, source: Source, box: Extent | None, aspect: float) -> Extent | None:
+    def widen_extent(self, source: RecordingSource, box: ViewExtent | None, aspect: float) -> ViewExtent | None:
         """Return the extent, widened to the recording's positions, for a given aspect ratio."""
-        for frame, _, p in positions(source):
-            box = box or Extent(p, aspect)
-            box.add(p)
-            self.last = max(self.last, frame)
+        for frame, _, p in iterate_positions(source):
+            box = box or ViewExtent(p, aspect)
+            box.add_positions(p)
+            self.last_frame = max(self.last_frame, frame)
             self._vertices = len(p)
-            self.ends = widest(self.ends, self._strains(p)[0])
+            self.ends = widen_range(self.ends, self._compute_strains(p)[0])
         return box
 
-    def _strains(self, p: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _compute_strains(self, p: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the strains of the springs and of the vertices."""
-        return strains(p.astype(float), self._springs, self._rest_lengths)
+        return compute_strains(p.astype(float), self._springs, self._rest_lengths)
 
-    def measure(self, chunk: Chunk) -> None:
+    def widen_ranges(self, chunk: Chunk) -> None:
         """Widen the range of a compared quantity to the values of a chunk."""
         if chunk.entity_path in _QUANTITIES:
             batch = chunk.to_record_batch()
             if "Scalars:scalars" in batch.schema.names:
-                values = cells.column(batch, "Scalars:scalars").flatten().to_numpy()
+                values = cells.get_column(batch, "Scalars:scalars").flatten().to_numpy()
                 known = values[np.isfinite(values)]
                 low, high = self.ranges.get(chunk.entity_path, (np.inf, -np.inf))
                 self.ranges[chunk.entity_path] = float(known.min(initial=low)), float(known.max(initial=high))
 
-    def coloured(self, chunk: Chunk) -> Chunk:
+    def recolour_chunk(self, chunk: Chunk) -> Chunk:
         """Return a chunk in which strain colours use the common scale."""
-        batch = chunk.to_record_batch() if self._anew and chunk.entity_path in _STRAINED else None
-        for places, painted in _PAINTED if batch else ():
+        batch = chunk.to_record_batch() if self._anew and chunk.entity_path in _STRAIN_ENTITIES else None
+        for places, painted in _COLOURED_COMPONENTS if batch else ():
             if batch and {places, painted} <= set(batch.schema.names):
-                rows = [self._painted(cells.cell(batch, places, k)) for k in range(batch.num_rows)]
-                (chunk,) = Chunk.from_record_batch(cells.replaced(batch, painted, rows))
+                rows = [self._compute_colours(cells.read_cell(batch, places, k)) for k in range(batch.num_rows)]
+                (chunk,) = Chunk.from_record_batch(cells.replace_cells(batch, painted, rows))
         return chunk
 
-    def _painted(self, places: NDArray[np.float32]) -> NDArray[np.uint32]:
+    def _compute_colours(self, places: NDArray[np.float32]) -> NDArray[np.uint32]:
         """Return the colours of vertices, or of springs, for which both end points were recorded."""
         p = places.reshape(-1, 3).astype(float)
         if len(p) == self._vertices:
-            return colours(self._strains(p)[1], self.strain_range)
+            return compute_strain_colours(self._compute_strains(p)[1], self.strain_range)
         length = np.linalg.norm(p[1::2] - p[::2], axis=1)
         with np.errstate(all="ignore"):
             strain = np.where(self._rest_lengths > 0.0, length / self._rest_lengths - 1.0, 0.0)
-        return colours(strain, self.strain_range)
+        return compute_strain_colours(strain, self.strain_range)
 
 
-def _copy(file: PartialFile, run: _Run, source: Source, look: Look, box: Extent | None) -> None:
-    for chunk in source.chunks(content="/**"):
+def _copy_chunks(
+    file: PartialFile, run: _SourceRun, source: RecordingSource, look: LineStyle, box: ViewExtent | None
+) -> None:
+    for chunk in source.iterate_chunks(content="/**"):
         run.entities.add(chunk.entity_path)
-        run.measure(chunk)
-        file.stream.send_chunks(run.coloured(chunk).with_entity_path(run.root + chunk.entity_path))
+        run.widen_ranges(chunk)
+        file.stream.send_chunks(run.recolour_chunk(chunk).with_entity_path(run.root + chunk.entity_path))
     for entity in run.entities & set(_QUANTITIES):
-        lines = rr.SeriesLines(names=run.name, colors=_colour(look), widths=1.5)
+        lines = rr.SeriesLines(names=run.name, colors=_pack_colour(look), widths=1.5)
         file.stream.log(run.root + entity, lines, static=True)
     if box:
-        strip, numbers = box.scale(run.strain_range, run.ends)
+        strip, numbers = box.build_colour_scale(run.strain_range, run.ends)
         file.stream.log(f"{run.root}/scene/scale", strip, static=True)
         file.stream.log(f"{run.root}/scene/scale/numbers", numbers, static=True)
-    file.flush()
+    file.flush_stream()
 
 
-def residuals(source: Source) -> dict[int, list[float]]:
+def read_residuals(source: RecordingSource) -> dict[int, list[float]]:
     """Return the residuals [J^(1/2)] after each iteration of the frames with recorded convergence, by frame."""
     found: dict[int, list[float]] = {}
-    for chunk in source.chunks(content="/convergence/residual", components=["Scalars:scalars"]):
-        frames, _ = looked_at(source, "/convergence/residual")
-        values = cells.column(chunk.to_record_batch(), "Scalars:scalars").flatten().to_numpy()
+    for chunk in source.iterate_chunks(content="/convergence/residual", components=["Scalars:scalars"]):
+        frames, _ = read_convergence_frames(source, "/convergence/residual")
+        values = cells.get_column(chunk.to_record_batch(), "Scalars:scalars").flatten().to_numpy()
         for frame, of in zip(frames.tolist(), values.reshape(-1, len(frames)).T, strict=True):
             found[frame] = of[~np.isnan(of)].tolist()
     return found
 
 
-def on_dark(color: str) -> str:
+def lighten_for_dark(color: str) -> str:
     """Return a colour such as `#0072b2`, mixed with white where it is dark.
 
     The mixture is that of the dark results page.
@@ -192,44 +202,58 @@ def on_dark(color: str) -> str:
     return "#" + "".join(f"{round(part + (255 - part) * by):02x}" for part in parts)
 
 
-def _colour(look: Look) -> int:
-    return int(on_dark(look.color)[1:] + "ff", 16)
+def _pack_colour(look: LineStyle) -> int:
+    return int(lighten_for_dark(look.color)[1:] + "ff", 16)
 
 
-def _layout(runs: list[_Run], box: Extent | None) -> rrb.Blueprint:
+def _build_layout(runs: list[_SourceRun], box: ViewExtent | None) -> rrb.Blueprint:
     entities = set[str]().union(*(run.entities for run in runs))
-    columns = min(len(runs), _ABREAST)
-    scenes = [scene_view(run.root, run.name, box, springs_visible=not run.triangles) for run in runs if box]
-    known, last = [entity for entity in _QUANTITIES if entity in entities], max(run.last for run in runs)
-    plots = [_plot(runs, entity, _QUANTITIES[entity], last, legend=entity == known[0]) for entity in known]
+    columns = min(len(runs), _MAX_VIEWS_PER_ROW)
+    scenes = [build_scene_view(run.root, run.name, box, springs_visible=not run.triangles) for run in runs if box]
+    known, last = [entity for entity in _QUANTITIES if entity in entities], max(run.last_frame for run in runs)
+    plots = [_build_plot(runs, entity, _QUANTITIES[entity], last, legend=entity == known[0]) for entity in known]
     frames = sorted(set[int]().union(*(run.curves for run in runs)))
-    drawn = [curves.view(f"/curves/frame_{frame}", f"Residual in frame {frame}, by iteration") for frame in frames]
+    drawn = [
+        curves.build_curve_view(f"/curves/frame_{frame}", f"Residual in frame {frame}, by iteration")
+        for frame in frames
+    ]
     table = rrb.TextDocumentView(origin="/runs", name="Runs")
     first = runs[0]
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Grid(*scenes, grid_columns=columns),
             # Each group is in a tab of its own over the whole width, so that no title is truncated.
-            rrb.Tabs(*_named({"By frame": plots[:_SHOWN], "Convergence": drawn, "More": plots[_SHOWN:]}), table),
+            rrb.Tabs(
+                *_name_rows(
+                    {
+                        "By frame": plots[:_MAX_LISTED_PROPERTIES],
+                        "Convergence": drawn,
+                        "More": plots[_MAX_LISTED_PROPERTIES:],
+                    }
+                ),
+                table,
+            ),
             row_shares=[2, 1],
         ),
-        *panels(first.time_step),
+        *build_panels(first.time_step),
         auto_views=False,
     )
 
 
-def _named(rows: Mapping[str, Sequence[Any]]) -> Iterator[rrb.Horizontal]:
+def _name_rows(rows: Mapping[str, Sequence[Any]]) -> Iterator[rrb.Horizontal]:
     return (rrb.Horizontal(*views, name=name) for name, views in rows.items() if views)
 
 
-def _plot(runs: list[_Run], entity: str, name: str, last: int, *, legend: bool) -> rrb.TimeSeriesView:
+def _build_plot(runs: list[_SourceRun], entity: str, name: str, last: int, *, legend: bool) -> rrb.TimeSeriesView:
     drawn = [run for run in runs if entity in run.entities]
     ends = [run.ranges[entity] for run in drawn if entity in run.ranges] if legend else []
     low, high = (min(end[0] for end in ends), max(end[1] for end in ends)) if ends else (0.0, 0.0)
-    return plot(name, [f"+ {run.root}{entity}" for run in drawn], last=last, ends=(low, high) if legend else None)
+    return build_plot(
+        name, [f"+ {run.root}{entity}" for run in drawn], last=last, value_range=(low, high) if legend else None
+    )
 
 
-def _table(title: str, runs: list[_Run]) -> str:
+def _format_table(title: str, runs: list[_SourceRun]) -> str:
     """Return the runs' properties as a Markdown table with one column per run."""
     keys = dict.fromkeys(key for run in runs for key in run.properties)
     rows = [[key, *(f"`{run.properties.get(key, '')}`" for run in runs)] for key in keys]

@@ -16,20 +16,20 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 _WIDTH, _HEIGHT = 150.0, 100.0
-_PALE, _RULE = 0xFFFFFFFF, 0x464950FF
-_LINE = 7.0
+_TEXT_COLOUR, _RULE_COLOUR = 0xFFFFFFFF, 0x464950FF
+_LINE_HEIGHT = 7.0
 """Height of a label, the minimum spacing of the labels at the ends of curves."""
-_LOWER = 4.5
+_MIN_LABEL_HEIGHT = 4.5
 """Distance by which the viewer draws a label below its position."""
 
-_DEEPEST = 18
+_MAX_DECADES = 18
 """Maximum number of decades drawn below the largest value."""
 
-Colours = NDArray[np.uint32]
-Points = NDArray[np.float64]
+ColourArray = NDArray[np.uint32]
+PointArray = NDArray[np.float64]
 
 
-def colours(numbers: Iterable[int]) -> Colours:
+def pack_colours(numbers: Iterable[int]) -> ColourArray:
     """Return colours 0xRRGGBBAA as an array.
 
     Rerun reads a list of three or four numbers as the components of one colour.
@@ -37,7 +37,9 @@ def colours(numbers: Iterable[int]) -> Colours:
     return np.array(list(numbers), np.uint32)
 
 
-def draw(stream: rr.RecordingStream, entity: str, curves: Mapping[str, Sequence[float]], colours: Colours) -> None:
+def draw_curves(
+    stream: rr.RecordingStream, entity: str, curves: Mapping[str, Sequence[float]], colours: ColourArray
+) -> None:
     """Log curves over the iterations 1, 2, ... with a logarithmic axis, as a drawing.
 
     Args:
@@ -51,69 +53,69 @@ def draw(stream: rr.RecordingStream, entity: str, curves: Mapping[str, Sequence[
     if not len(known):
         return
     top = math.ceil(math.log10(known.max()) + 1e-9)
-    bottom = max(min(math.floor(math.log10(known.min())), top - 1), top - _DEEPEST)
+    bottom = max(min(math.floor(math.log10(known.min())), top - 1), top - _MAX_DECADES)
     last = max(len(values) for values in found.values())
-    rules, places, words = _axes(bottom, top, last)
-    strips, ends = list[Points](), list[tuple[float, float]]()
+    rules, places, words = _build_axes(bottom, top, last)
+    strips, ends = list[PointArray](), list[tuple[float, float]]()
     for values in found.values():
         fine = np.isfinite(values) & (values >= 10.0**bottom)
-        x = _across(1 + np.flatnonzero(fine), last)
+        x = _scale_iterations(1 + np.flatnonzero(fine), last)
         y = _HEIGHT * (top - np.log10(values[fine])) / (top - bottom)
         strips.append(np.column_stack([x, y]))
         ends.append((float(x[-1]), float(y[-1])) if len(x) else (0.0, _HEIGHT))
     # All lines share one entity and all labels another, since each entity costs about 3 kB.
     radii: Any = [rr.Radius.ui_points(0.5)] * len(rules) + [rr.Radius.ui_points(1.25)] * len(strips)
-    lines = rr.LineStrips2D([*rules, *strips], colors=_painted(len(rules), _RULE, colours), radii=radii)
+    lines = rr.LineStrips2D([*rules, *strips], colors=_append_colour(len(rules), _RULE_COLOUR, colours), radii=radii)
     stream.log(f"{entity}/lines", lines, static=True)
-    beside = np.column_stack([np.full(len(ends), _WIDTH + 14.0), _apart([y for _, y in ends])])
+    beside = np.column_stack([np.full(len(ends), _WIDTH + 14.0), _spread_labels([y for _, y in ends])])
     points = rr.Points2D(
-        np.concatenate([places, beside]) - (0.0, _LOWER),
+        np.concatenate([places, beside]) - (0.0, _MIN_LABEL_HEIGHT),
         labels=[*words, *found],
         show_labels=True,
-        colors=_painted(len(words), _PALE, colours),
+        colors=_append_colour(len(words), _TEXT_COLOUR, colours),
         radii=rr.Radius.ui_points(0.1),
     )
     stream.log(f"{entity}/words", points, static=True)
 
 
-def _painted(count: int, colour: int, others: Colours) -> Colours:
+def _append_colour(count: int, colour: int, others: ColourArray) -> ColourArray:
     return np.concatenate([np.full(count, colour, np.uint32), others])
 
 
-def view(origin: str, name: str) -> rrb.Spatial2DView:
+def build_curve_view(origin: str, name: str) -> rrb.Spatial2DView:
     """Build a view of the drawing."""
     bounds = rrb.VisualBounds2D(x_range=(-18, _WIDTH + 32), y_range=(-8, _HEIGHT + 14))
     return rrb.Spatial2DView(origin=origin, name=name, background=(28, 30, 34), visual_bounds=bounds)
 
 
-def _axes(bottom: int, top: int, last: int) -> tuple[list[Points], Points, list[str]]:
+def _build_axes(bottom: int, top: int, last: int) -> tuple[list[PointArray], PointArray, list[str]]:
     """Return the rules, and the positions and texts of their labels."""
     step = -(-(top - bottom) // 6)
     decades = np.arange(top, bottom - 1, -step)
     rows = _HEIGHT * (top - decades) / (top - bottom)
-    every = _round(last)
+    every = _round_tick_step(last)
     numbers = np.arange(0, last + 1, every) if every < last else np.array([1, last])
-    columns = _across(np.maximum(numbers, 1), last)
+    columns = _scale_iterations(np.maximum(numbers, 1), last)
     rules = [np.array([(0.0, y), (_WIDTH, y)]) for y in rows] + [np.array([(x, 0.0), (x, _HEIGHT)]) for x in columns]
     places = np.array([(-9.0, y) for y in rows] + [(x, _HEIGHT + 9.0) for x in columns])
     return rules, places, [f"1e{decade}" for decade in decades] + [str(max(1, number)) for number in numbers]
 
 
-def _across(iterations: NDArray[np.int64], last: int) -> NDArray[np.float64]:
+def _scale_iterations(iterations: NDArray[np.int64], last: int) -> NDArray[np.float64]:
     return _WIDTH * (iterations - 1) / max(1, last - 1)
 
 
-def _round(last: int) -> int:
+def _round_tick_step(last: int) -> int:
     """Return 1, 2 or 5 times a power of ten, for about five ticks."""
     power = 10 ** math.floor(math.log10(max(1.0, last / 5)))
     return int(next(f * power for f in (1, 2, 5, 10) if f * power * 5 >= last))
 
 
-def _apart(wanted: list[float]) -> list[float]:
+def _spread_labels(wanted: list[float]) -> list[float]:
     """Spread label heights at least one line apart, within the drawing and in order."""
     order, placed = sorted(range(len(wanted)), key=wanted.__getitem__), dict[int, float]()
     height = -math.inf
     for k in order:
-        height = placed[k] = max(wanted[k], height + _LINE)
+        height = placed[k] = max(wanted[k], height + _LINE_HEIGHT)
     over = max(0.0, height - _HEIGHT)
     return [max(0.0, placed[k] - over) if over else placed[k] for k in range(len(wanted))]

@@ -17,13 +17,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-GAP = 4.0
+GAP_FACTOR = 4.0
 """Minimum ratio of radii at a gap: below it, the other vertices still fill a quarter of the view."""
-SHARE = 0.3
+MIN_FRAMED_SHARE = 0.3
 """Minimum fraction of framed vertices: one of three layers that is supported while the others have fallen."""
 
 
-def framed_vertices(start: NDArray[np.floating], moved: NDArray[np.floating]) -> NDArray[np.bool_]:
+def find_framed_vertices(start: NDArray[np.floating], moved: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return a mask (n,) of the vertices that a camera frames.
 
     Args:
@@ -34,13 +34,13 @@ def framed_vertices(start: NDArray[np.floating], moved: NDArray[np.floating]) ->
     reach = np.linalg.norm(start - np.median(start[calm], axis=0), axis=1) + moved
     r = np.sort(reach)
     near = np.maximum(r[:-1], np.linalg.norm(np.ptp(start, axis=0)) / 2)
-    least = math.ceil(SHARE * len(r))
-    gaps = np.flatnonzero(r[1:] > GAP * near) + 1
+    least = math.ceil(MIN_FRAMED_SHARE * len(r))
+    gaps = np.flatnonzero(r[1:] > GAP_FACTOR * near) + 1
     gaps = gaps[gaps >= least]
     return reach <= r[gaps[0] - 1] if len(gaps) else np.full(len(r), True)
 
 
-def outside_words(framed: NDArray[np.bool_]) -> list[str]:
+def describe_outside(framed: NDArray[np.bool_]) -> list[str]:
     """Return a description of how many vertices are not framed; empty where all are."""
     count = int((~framed).sum())
     verb = "is" if count == 1 else "are"

@@ -17,22 +17,22 @@ from numpy.typing import NDArray
 
 from solvers.problem import Positions
 
-KEY = "origin"
+ORIGIN_PROPERTY = "origin"
 """Property of a recording that states its origin [m] in JSON; absent where the origin is zero."""
 
-_LARGEST = 2.0**1000
+_MAX_CELL = 2.0**1000
 """Maximum cell size [m]: the origin of a larger mesh is zero, since cells would overflow."""
 
-CELLS = 8.0
+MIN_DIAGONALS_PER_CELL = 8.0
 """Minimum cell size, in diagonals of the mesh."""
 
 
-def local_origin(rest: Positions) -> NDArray[np.float64]:
+def compute_local_origin(rest: Positions) -> NDArray[np.float64]:
     """Return the origin (3,) [m] for a mesh with rest positions (n, 3) [m]."""
     low, high = rest.min(axis=0), rest.max(axis=0)
     with np.errstate(over="ignore"):
-        size = CELLS * math.hypot(*(high - low)) or 1.0  # a single point
-    if not size < _LARGEST:
+        size = MIN_DIAGONALS_PER_CELL * math.hypot(*(high - low)) or 1.0  # a single point
+    if not size < _MAX_CELL:
         return np.zeros(3)
     cell = 2.0 ** math.ceil(math.log2(size))
     return cell * np.rint((low / 2 + high / 2) / cell) + 0.0  # no negative zero
@@ -44,11 +44,11 @@ def store_relative(p: Positions, origin: NDArray[np.float64]) -> NDArray[np.floa
         return (p - origin).astype(np.float32)
 
 
-def origin_property(origin: NDArray[np.float64]) -> dict[str, str]:
+def build_origin_property(origin: NDArray[np.float64]) -> dict[str, str]:
     """Return the property that states an origin; empty where the origin is zero."""
-    return {KEY: json.dumps(origin.tolist())} if origin.any() else {}
+    return {ORIGIN_PROPERTY: json.dumps(origin.tolist())} if origin.any() else {}
 
 
 def read_origin(properties: Mapping[str, object]) -> NDArray[np.float64]:
     """Return the origin (3,) [m] stated by a recording's properties."""
-    return np.array(json.loads(str(properties.get(KEY, "[0, 0, 0]"))), np.float64)
+    return np.array(json.loads(str(properties.get(ORIGIN_PROPERTY, "[0, 0, 0]"))), np.float64)

@@ -13,32 +13,36 @@ import rerun as rr
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # a scene without obstacles imports none of them
-    from harness.scenes.effects.base import Effect
-    from harness.scenes.motion import KeyedMotion
-    from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
-    from harness.scenes.shapes import AnySurface, Solid
+    from harness.scenes.effects.base import SceneEffect
+    from harness.scenes.motion import KeyFrameMotion
+    from harness.scenes.obstacles import BoxObstacle, CapsuleObstacle, PlaneObstacle, SphereObstacle
+    from harness.scenes.shapes import AnySurface, MeshObstacle
 
 Array = NDArray[np.float64]
 
-KEY = "obstacles"
+OBSTACLES_PROPERTY = "obstacles"
 """Property of a recording that declares its obstacles in JSON, in the format of scene files."""
 
 _COLOUR = (0x9C, 0x97, 0x8D)
-_AROUND = 2.0
+_PLANE_SIZE_FACTOR = 2.0
 """Half the side of the drawn part of a plane, relative to the mesh size plus its distance from the plane."""
 
 
-def listed(effects: Iterable[Effect]) -> tuple[AnySurface, ...]:
+def list_obstacles(effects: Iterable[SceneEffect]) -> tuple[AnySurface, ...]:
     """Return the obstacles of a scene's effects, to be drawn with the mesh."""
     return tuple(one for effect in effects for one in getattr(effect, "obstacles", ()))
 
 
-def declared(obstacles: Sequence[AnySurface]) -> dict[str, str]:
+def build_obstacles_property(obstacles: Sequence[AnySurface]) -> dict[str, str]:
     """Return the property that declares these obstacles; empty where there are none."""
-    return {KEY: f"[{', '.join(one.model_dump_json(exclude_none=True) for one in obstacles)}]"} if obstacles else {}
+    return (
+        {OBSTACLES_PROPERTY: f"[{', '.join(one.model_dump_json(exclude_none=True) for one in obstacles)}]"}
+        if obstacles
+        else {}
+    )
 
 
-class Obstacles:
+class ObstacleRecorder:
     """Obstacles of an open recording.
 
     Args:
@@ -50,34 +54,34 @@ class Obstacles:
 
     def __init__(self, stream: rr.RecordingStream, obstacles: Sequence[AnySurface], rest: Array, origin: Array) -> None:
         self._stream, self._origin = stream, origin
-        self._moving: list[tuple[str, KeyedMotion]] = []
-        self._deforming: list[tuple[str, Solid]] = []
+        self._moving: list[tuple[str, KeyFrameMotion]] = []
+        self._deforming: list[tuple[str, MeshObstacle]] = []
         for k, one in enumerate(obstacles):
             entity = f"/scene/obstacles/{k}-{one.kind}"
             if one.kind == "mesh" and one.frames:
                 self._deforming.append((entity, one))
                 continue
-            stream.log(entity, _SHAPES[one.kind](one, rest, origin), static=True)
+            stream.log(entity, _DRAW_SHAPE[one.kind](one, rest, origin), static=True)
             if one.motion:
                 self._moving.append((entity, one.motion))
 
-    def at(self, time: float) -> None:
+    def record_time(self, time: float) -> None:
         """Record the poses of moving obstacles at a time [s], on the current timelines."""
         for entity, motion in self._moving:
-            base, *ends = motion.moved(self._origin + np.concatenate([np.zeros((1, 3)), np.eye(3)]), time)
+            base, *ends = motion.transform_points(self._origin + np.concatenate([np.zeros((1, 3)), np.eye(3)]), time)
             moved = rr.Transform3D(translation=base - self._origin, mat3x3=(np.array(ends) - base).T)
             self._stream.log(entity, moved)
         for entity, one in self._deforming:
-            points, triangles = one.shape()
-            self._stream.log(entity, _faces(one.placed(points, time) - self._origin, triangles))
+            points, triangles = one.build_surface()
+            self._stream.log(entity, _build_flat_mesh(one.place_points(points, time) - self._origin, triangles))
 
 
-def _sphere(one: Sphere, rest: Array, origin: Array) -> rr.Ellipsoids3D:
+def _draw_sphere(one: SphereObstacle, rest: Array, origin: Array) -> rr.Ellipsoids3D:
     center = np.array(one.center) - origin
     return rr.Ellipsoids3D(centers=[center], radii=[one.radius], colors=[_COLOUR], fill_mode="solid")
 
 
-def _capsule(one: Capsule, rest: Array, origin: Array) -> rr.Capsules3D:
+def _draw_capsule(one: CapsuleObstacle, rest: Array, origin: Array) -> rr.Capsules3D:
     """Build a capsule.
 
     Rerun's capsule extends along z. It is rotated by 180 degrees about the bisector of z and the capsule's axis.
@@ -96,17 +100,17 @@ def _capsule(one: Capsule, rest: Array, origin: Array) -> rr.Capsules3D:
     )
 
 
-def _box(one: Box, rest: Array, origin: Array) -> rr.Boxes3D:
+def _draw_box(one: BoxObstacle, rest: Array, origin: Array) -> rr.Boxes3D:
     sizes = np.subtract(one.high, one.low)
     return rr.Boxes3D(mins=[np.array(one.low) - origin], sizes=[sizes], colors=[_COLOUR], fill_mode="solid")
 
 
-def _plane(one: Plane, rest: Array, origin: Array) -> rr.Mesh3D:
+def _draw_plane(one: PlaneObstacle, rest: Array, origin: Array) -> rr.Mesh3D:
     """Build two triangles around the foot of the perpendicular from the mesh's centre."""
-    foot, x, normal, z = one.model_copy(update={"motion": None}).obstacle().frame(0.0)
+    foot, x, normal, z = one.model_copy(update={"motion": None}).build_obstacle().frame(0.0)
     middle = rest.mean(axis=0)
     height = float((middle - foot) @ normal)
-    half = _AROUND * (float(np.linalg.norm(np.ptp(rest, axis=0))) + abs(height))
+    half = _PLANE_SIZE_FACTOR * (float(np.linalg.norm(np.ptp(rest, axis=0))) + abs(height))
     corners = middle - origin - height * normal + half * np.array([-x - z, z - x, x + z, x - z])
     faces = [[0, 1, 2], [0, 2, 3]]
     return rr.Mesh3D(
@@ -114,13 +118,13 @@ def _plane(one: Plane, rest: Array, origin: Array) -> rr.Mesh3D:
     )
 
 
-def _mesh(one: Solid, rest: Array, origin: Array) -> rr.Mesh3D:
+def _draw_mesh(one: MeshObstacle, rest: Array, origin: Array) -> rr.Mesh3D:
     """Build a mesh with separate vertices for each triangle, so that edges stay sharp."""
-    points, triangles = one.shape()
-    return _faces(points - origin, triangles)
+    points, triangles = one.build_surface()
+    return _build_flat_mesh(points - origin, triangles)
 
 
-def _faces(points: Array, triangles: NDArray[np.int64]) -> rr.Mesh3D:
+def _build_flat_mesh(points: Array, triangles: NDArray[np.int64]) -> rr.Mesh3D:
     corners = points[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -132,10 +136,10 @@ def _faces(points: Array, triangles: NDArray[np.int64]) -> rr.Mesh3D:
     )
 
 
-_SHAPES: dict[str, Callable[[Any, Array, Array], rr.AsComponents]] = {
-    "sphere": _sphere,
-    "capsule": _capsule,
-    "box": _box,
-    "plane": _plane,
-    "mesh": _mesh,
+_DRAW_SHAPE: dict[str, Callable[[Any, Array, Array], rr.AsComponents]] = {
+    "sphere": _draw_sphere,
+    "capsule": _draw_capsule,
+    "box": _draw_box,
+    "plane": _draw_plane,
+    "mesh": _draw_mesh,
 }

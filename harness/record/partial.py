@@ -19,18 +19,18 @@ import rerun.blueprint as rrb
 import rerun_bindings
 
 from harness.base import workers
-from harness.base.files import CannotWrite, cannot_write, partial_name
-from harness.record.sound import trust, whole_messages
+from harness.base.files import WriteError, build_write_error, partial_path
+from harness.record.sound import mark_verified, scan_messages
 
-_PATIENCE = 30
+_FLUSH_TIMEOUT = 30
 """Timeout of a flush [s]."""
 
-_PAGE = 2**16
+_PROBE_BYTES = 2**16
 """Number of bytes in a test write, which fails if the disk is full."""
 
-_broken: list[rr.RecordingStream] = []
+_broken_streams: list[rr.RecordingStream] = []
 """Streams whose writing thread has died."""
-_first = 0
+_first_pid = 0
 """Process that opened the first stream, here or before a fork; streams do not survive a fork."""
 
 
@@ -42,12 +42,12 @@ class PartialFile:
     """
 
     def __init__(self, path: Path, application: str, recording_id: str, title: str) -> None:
-        global _first
+        global _first_pid
         self._path, self._broken = path, False
-        self._partial = partial_name(path)
-        _first = _first or os.getpid()
-        workers.NO_FORK.add("Rerun's streams")
-        if not _broken and os.getpid() == _first:  # else this would wait for ever, or refuse
+        self._partial = partial_path(path)
+        _first_pid = _first_pid or os.getpid()
+        workers.FORK_BLOCKERS.add("Rerun's streams")
+        if not _broken_streams and os.getpid() == _first_pid:  # else this would wait for ever, or refuse
             rerun_bindings.flush_and_cleanup_orphaned_recordings()  # the library keeps two threads of each until then
         rr.set_strict_mode(True)  # without it a wrong shape is swallowed and logged as nothing
         self.stream = rr.RecordingStream(
@@ -61,17 +61,17 @@ class PartialFile:
             path.parent.mkdir(parents=True, exist_ok=True)
             self.stream.save(self._partial)
         except (OSError, RuntimeError) as error:
-            raise self._failure(error) from error
+            raise self._build_write_error(error) from error
         self.stream.send_recording_name(title)
 
-    def flush(self) -> None:
+    def flush_stream(self) -> None:
         """Wait until all logged data is in the file."""
         try:
-            self.stream.flush(timeout_sec=_PATIENCE)
+            self.stream.flush(timeout_sec=_FLUSH_TIMEOUT)
         except Exception as error:
-            raise self._failure(error) from error
+            raise self._build_write_error(error) from error
 
-    def lay_out(self, layout: rrb.Blueprint) -> None:
+    def write_blueprint(self, layout: rrb.Blueprint) -> None:
         """Write the viewer layout; the last layout written takes effect.
 
         Equals the library's `send_blueprint` plus a disconnection. Without it two threads never end, since the stream
@@ -87,49 +87,49 @@ class PartialFile:
         rerun_bindings.send_blueprint(storage, True, True, recording=self.stream.to_native())
         sketch.disconnect()
 
-    def finish(self, layout: rrb.Blueprint) -> Path:
+    def finish_file(self, layout: rrb.Blueprint) -> Path:
         """Close the file, check that it is complete, and give it its final name.
 
         Returns: the final path.
         """
         try:
-            self.lay_out(layout)
-            self.flush()
+            self.write_blueprint(layout)
+            self.flush_stream()
             self.stream.disconnect()
-            if not whole_messages(self._partial)[0]:
+            if not scan_messages(self._partial)[0]:
                 raise OSError("its end is missing")
             os.replace(self._partial, self._path)
-            trust(self._path)
+            mark_verified(self._path)
         except (OSError, RuntimeError, ValueError) as error:
-            raise self._failure(error) from error
+            raise self._build_write_error(error) from error
         finally:
-            self.abandon()
+            self.abandon_file()
         return self._path
 
-    def abandon(self) -> None:
+    def abandon_file(self) -> None:
         """Stop and remove the partial file if it still exists."""
         if not self._broken:
             self.stream.disconnect()
         self._partial.unlink(missing_ok=True)
 
-    def _failure(self, error: Exception) -> CannotWrite:
+    def _build_write_error(self, error: Exception) -> WriteError:
         if not self._broken:
             # The library's writing thread has died (the disk is full). Disconnecting, the clean-up at exit and the
             # stream's destructor may then wait forever for it, so all of them are disabled.
             self._broken = True
-            _broken.append(self.stream)
+            _broken_streams.append(self.stream)
             rr.unregister_shutdown()
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(self.stream))
-        return cannot_write(self._path, self._cause() or error)
+        return build_write_error(self._path, self._find_cause() or error)
 
-    def _cause(self) -> OSError | None:
+    def _find_cause(self) -> OSError | None:
         """Find why the library's writer died.
 
         The library does not report the cause, so a test write to the file repeats the error.
         """
         try:
             with self._partial.open("ab") as file:
-                file.write(bytes(_PAGE))
+                file.write(bytes(_PROBE_BYTES))
                 os.fsync(file.fileno())
         except OSError as error:
             return error

@@ -36,24 +36,24 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from harness.record import blueprint, curves
-from harness.record.arrows import Arrows
-from harness.record.base import LAYOUT, Frame, RecordingInfo
-from harness.record.camera import Extent
-from harness.record.local_origin import local_origin, origin_property, store_relative
-from harness.record.obstacles import Obstacles, declared
+from harness.record.arrows import ForceArrows
+from harness.record.base import LAYOUT_VERSION, RecordedFrame, RecordingInfo
+from harness.record.camera import ViewExtent
+from harness.record.local_origin import build_origin_property, compute_local_origin, store_relative
+from harness.record.obstacles import ObstacleRecorder, build_obstacles_property
 from harness.record.partial import PartialFile
-from harness.record.shading import PIN_COLOUR, Shading, widest
+from harness.record.shading import PIN_COLOUR, StrainShading, widen_range
 
-FLUSH = 20
+FLUSH_INTERVAL = 20
 """Maximum number of frames between flushes, the most that a kill can lose. A chunk costs 1.5 kB, plus 0.5 kB of
 index."""
-_FULL = 100_000
+_MAX_BUFFERED_ROWS = 100_000
 """Maximum number of buffered vertices, summed over the buffered frames."""
 
-_DRAWN = ("/milliseconds/", "/strain/largest", "/residual/log10")
+_STYLED_ENTITIES = ("/milliseconds/", "/strain/largest", "/residual/log10")
 """Scalars that the layout plots; only these get a line style."""
 
-_STRIPS: Any = rr.components.LineStrip3DBatch([]).as_arrow_array().type
+_STRIP_TYPE: Any = rr.components.LineStrip3DBatch([]).as_arrow_array().type
 
 
 class RerunRecorder:
@@ -68,22 +68,22 @@ class RerunRecorder:
 
     def __init__(self, path: Path, info: RecordingInfo) -> None:
         self._info = info
-        self._shading = Shading(info)
-        self._origin = local_origin(info.mesh.rest)
-        self._box = Extent(info.mesh.rest - self._origin)
+        self._shading = StrainShading(info)
+        self._origin = compute_local_origin(info.mesh.rest_positions)
+        self._box = ViewExtent(info.mesh.rest_positions - self._origin)
         self._scalars: dict[str, list[tuple[int, float]]] = {}
         self._styled: dict[str, list[str]] = {}
         self._frames = 0
         self._clock: dict[int, float] = {}  # of each frame [s]
         self._held: list[tuple[int, NDArray[np.float32], NDArray[np.uint32]]] = []
         self._pins: NDArray[np.float32] | None = None
-        self._unseen = 1e-6 * info.mesh.size
+        self._unseen = 1e-6 * info.mesh.bounding_box_diagonal
         self._springs_shown = False
         self._ends = (0.0, 0.0)  # the smallest and the largest strain of a spring
         self._ranges: dict[str, tuple[float, float]] = {}  # of what has a legend, by group
         self._curves: dict[int, tuple[Sequence[float], Sequence[float]]] = {}  # residual and objective, by frame
         self._energies: dict[str, dict[int, float]] = {}
-        self._file = PartialFile(path, blueprint.application(info), info.run_id, info.title)
+        self._file = PartialFile(path, blueprint.format_application_id(info), info.run_id, info.title)
         self._stream = self._file.stream
 
     @property
@@ -91,40 +91,42 @@ class RerunRecorder:
         """The properties of the recording that are constant over its frames."""
         return self._info
 
-    def frame(self, frame: Frame) -> None:
+    def record_frame(self, frame: RecordedFrame) -> None:
         """Record one frame; its arrays are not modified."""
         p = store_relative(frame.positions, self._origin)
         if not self._frames:
-            self._begin()
-            self._box = Extent(self._info.mesh.rest - self._origin, first=p)
-        strain, of_vertex = self._shading.strains(frame.positions)
+            self._open_scene()
+            self._box = ViewExtent(self._info.mesh.rest_positions - self._origin, initial_positions=p)
+        strain, of_vertex = self._shading.compute_strains(frame.positions)
         self._stream.set_time("frame", sequence=frame.index)
         self._stream.set_time("time", duration=frame.time)
         self._clock[frame.index] = frame.time
         # The iterations timeline of a run needs the scene at 0, otherwise it would show no scene at all.
-        self._stream.set_time("iteration", sequence=frame.index if self._info.iterates else 0)
-        self._held.append((frame.index, p, self._shading.colours(of_vertex)))
-        self._obstacles.at(frame.time)
+        self._stream.set_time("iteration", sequence=frame.index if self._info.is_solve else 0)
+        self._held.append((frame.index, p, self._shading.compute_colours(of_vertex)))
+        self._obstacles.record_time(frame.time)
         self._log_pins(p)
         self._log_springs(p, strain)
-        self._arrows.at(frame.index, p, frame.forces, self._at)
-        self._add(frame.index, {f"/energy/{name}": value for name, value in frame.energies.items()})
+        self._arrows.add_frame(frame.index, p, frame.forces, self._build_scene_times)
+        self._add_scalars(frame.index, {f"/energy/{name}": value for name, value in frame.energies.items()})
         for name, value in frame.energies.items():
             self._energies.setdefault(name, {})[frame.index] = value
         largest = float(np.abs(strain).max(initial=0.0))
-        self._ends = widest(self._ends, strain)
-        self._add(frame.index, {"/strain/largest": largest, "/iterations": frame.iterations})
-        crossed = {} if frame.intersections is None else {"/intersections": frame.intersections}
-        self._add(frame.index, crossed | {"/residual": frame.residual, "/residual/log10": _log10(frame.residual)})
+        self._ends = widen_range(self._ends, strain)
+        self._add_scalars(frame.index, {"/strain/largest": largest, "/iterations": frame.num_iterations})
+        crossed = {} if frame.num_intersections is None else {"/intersections": frame.num_intersections}
+        self._add_scalars(
+            frame.index, crossed | {"/residual": frame.residual, "/residual/log10": _log10(frame.residual)}
+        )
         self._frames += 1
-        if len(self._held) >= FLUSH or len(self._held) * len(p) >= _FULL or self._frames == 1:
-            self._box.add(p)
+        if len(self._held) >= FLUSH_INTERVAL or len(self._held) * len(p) >= _MAX_BUFFERED_ROWS or self._frames == 1:
+            self._box.add_positions(p)
             self._send_mesh()
             if self._frames > 1:
                 self._send_scalars()
-            self._file.flush()
+            self._file.flush_stream()
 
-    def convergence(self, frame: int, residuals: Sequence[float], objective: Sequence[float]) -> None:
+    def record_convergence(self, frame: int, residuals: Sequence[float], objective: Sequence[float]) -> None:
         """Record the convergence within one frame.
 
         Args:
@@ -134,17 +136,19 @@ class RerunRecorder:
         """
         self._curves[frame] = residuals, objective
 
-    def solve(self, numbers: Sequence[int], curves: Mapping[str, Sequence[float]]) -> None:
+    def record_solve(self, numbers: Sequence[int], curves: Mapping[str, Sequence[float]]) -> None:
         """Record log10 of curves by name over numbered iterates, in a recording of one solve."""
         for name, values in curves.items():
             entity = f"/solve/{name.replace(' ', '_')}"
-            self._style(entity, f"log10 of the {name}")
+            self._style_series(entity, f"log10 of the {name}")
             logarithms = np.array([_log10(value) for value in values])
-            self._widen("/solve", logarithms)
+            self._widen_range("/solve", logarithms)
             columns = rr.Scalars.columns(scalars=logarithms)
-            self._stream.send_columns(entity, self._times(np.array(numbers)), columns)
+            self._stream.send_columns(entity, self._build_time_columns(np.array(numbers)), columns)
 
-    def close(self, milliseconds: Mapping[str, Sequence[float]], ended: Mapping[str, str] | None = None) -> Path:
+    def finish_recording(
+        self, milliseconds: Mapping[str, Sequence[float]], final_properties: Mapping[str, str] | None = None
+    ) -> Path:
         """Write the phase times and changed properties, finish the file and return its path.
 
         Args:
@@ -152,45 +156,49 @@ class RerunRecorder:
           final_properties: properties that changed at the end of the run.
         """
         if not self._frames:
-            self._begin()
+            self._open_scene()
         self._send_mesh()
         for phase, values in milliseconds.items():
             self._scalars[f"/milliseconds/{phase}"] = list(enumerate(values, start=1))
-            self._widen("/milliseconds", np.array([0.0, *values]))
+            self._widen_range("/milliseconds", np.array([0.0, *values]))
         self._send_scalars()
         self._send_convergence()
         self._send_changes()
-        self._arrows.close(self._at)
+        self._arrows.close(self._build_scene_times)
         self._log_scale()
-        if ended:
-            changed: dict[str, Any] = {name: [value] for name, value in ended.items()}
+        if final_properties:
+            changed: dict[str, Any] = {name: [value] for name, value in final_properties.items()}
             self._stream.send_property("run", rr.AnyValues(**changed))
-        return self._file.finish(blueprint.blueprint(self._info, self._box, max(self._clock, default=0), self._ranges))
+        return self._file.finish_file(
+            blueprint.build_blueprint(self._info, self._box, max(self._clock, default=0), self._ranges)
+        )
 
-    def abandon(self) -> None:
+    def abandon_recording(self) -> None:
         """Stop and remove the partial file; has no effect after `finish_recording`."""
-        self._file.abandon()
+        self._file.abandon_file()
 
-    def _begin(self) -> None:
-        self._log_once()
-        self._obstacles = Obstacles(self._stream, self._info.obstacles, self._info.mesh.rest, self._origin)
-        self._arrows = Arrows(self._stream, self._info.mesh.size)
+    def _open_scene(self) -> None:
+        self._log_static()
+        self._obstacles = ObstacleRecorder(
+            self._stream, self._info.obstacles, self._info.mesh.rest_positions, self._origin
+        )
+        self._arrows = ForceArrows(self._stream, self._info.mesh.bounding_box_diagonal)
 
-    def _log_once(self) -> None:
+    def _log_static(self) -> None:
         info, mesh = self._info, self._info.mesh
-        stated = {**info.properties, **declared(info.obstacles), **origin_property(self._origin)}
+        stated = {**info.properties, **build_obstacles_property(info.obstacles), **build_origin_property(self._origin)}
         facts: dict[str, Any] = {k: [v] for k, v in stated.items()}
         self._stream.send_property("run", rr.AnyValues(**facts))
         network: dict[str, Any] = {
-            "layout": LAYOUT,
+            "layout": LAYOUT_VERSION,
             "time_step": info.time_step,
             "strain_range": info.strain_range,
             "springs": info.springs.ravel().astype(np.uint32),
             "rest_lengths": info.rest_lengths,
-            "pinned": info.pinned.astype(np.uint32),
+            "pinned": info.pinned_vertices.astype(np.uint32),
         }
         self._stream.log("/network", rr.AnyValues(**network), static=True)
-        document = rr.TextDocument(blueprint.run_document(info), media_type=rr.MediaType.MARKDOWN)
+        document = rr.TextDocument(blueprint.format_run_document(info), media_type=rr.MediaType.MARKDOWN)
         self._stream.log("/run", document, static=True)
         self._stream.log("/scene", rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
         if len(mesh.triangles):
@@ -205,17 +213,19 @@ class RerunRecorder:
         frames, positions, coloured = zip(*self._held, strict=True)
         p, colours = np.concatenate(positions), np.concatenate(coloured)
         if len(self._info.mesh.triangles):
-            normals = np.concatenate([self._shading.normals(of_frame) for of_frame in positions])
+            normals = np.concatenate([self._shading.compute_normals(of_frame) for of_frame in positions])
             columns = rr.Mesh3D.columns(vertex_positions=p, vertex_normals=normals, vertex_colors=colours)
         else:
             columns = rr.Points3D.columns(positions=p, colors=colours)
         self._stream.send_columns(
-            "/scene/mesh", self._at(np.array(frames)), columns.partition([len(positions[0])] * len(frames))
+            "/scene/mesh",
+            self._build_scene_times(np.array(frames)),
+            columns.partition([len(positions[0])] * len(frames)),
         )
         self._held.clear()
 
     def _log_pins(self, p: NDArray[np.float32]) -> None:
-        pins = p[self._info.pinned]
+        pins = p[self._info.pinned_vertices]
         with np.errstate(invalid="ignore"):
             moved = np.inf if self._pins is None else np.abs(pins - self._pins).max(initial=0.0)
         if not moved <= self._unseen:  # a penalty lets its vertices move by less; what is not a number is recorded
@@ -225,16 +235,18 @@ class RerunRecorder:
 
     def _log_springs(self, p: NDArray[np.float32], strain: NDArray[np.float64]) -> None:
         springs = self._info.springs
-        due = self._frames % blueprint.spring_cadence(self._info) == 0
+        due = self._frames % blueprint.compute_spring_interval(self._info) == 0
         if due and len(springs):
-            colours, radius = self._shading.colours(strain), rr.Radius.ui_points(1.5)
-            self._stream.log("/scene/springs", rr.LineStrips3D(_segments(p[springs]), colors=colours, radii=radius))
+            colours, radius = self._shading.compute_colours(strain), rr.Radius.ui_points(1.5)
+            self._stream.log(
+                "/scene/springs", rr.LineStrips3D(_build_line_strips(p[springs]), colors=colours, radii=radius)
+            )
         elif self._springs_shown:  # else they would stay where they were, over a mesh that moves on
             self._stream.log("/scene/springs", rr.Clear(recursive=False))
         self._springs_shown = due
 
     def _log_scale(self) -> None:
-        strip, numbers = self._box.scale(self._info.strain_range, self._ends)
+        strip, numbers = self._box.build_colour_scale(self._info.strain_range, self._ends)
         self._stream.log("/scene/scale", strip, static=True)
         self._stream.log("/scene/scale/numbers", numbers, static=True)
 
@@ -248,9 +260,11 @@ class RerunRecorder:
             for which, values in enumerate(self._curves[frame]):
                 table[which, : len(values), k] = values
         names, times = [f"frame {frame}" for frame in frames], [self._clock[frame] for frame in frames]
-        colours = curves.colours(blueprint.COLOURS[k % len(blueprint.COLOURS)] for k in range(len(frames)))
+        colours = curves.pack_colours(
+            blueprint.SERIES_COLOURS[k % len(blueprint.SERIES_COLOURS)] for k in range(len(frames))
+        )
         self._stream.log("/convergence", rr.AnyValues(frames=frames, times=times), static=True)
-        self._file.flush()  # before the values: who reads a file that was cut knows whose they are
+        self._file.flush_stream()  # before the values: who reads a file that was cut knows whose they are
         for name, values in {"residual": table[0], "objective": table[1]}.items():
             self._stream.log(f"/convergence/{name}", rr.SeriesLines(names=names, colors=colours), static=True)
             columns = rr.Scalars.columns(scalars=values.ravel()).partition([len(frames)] * longest)
@@ -259,8 +273,8 @@ class RerunRecorder:
         residuals = {name: table[0, :, k].tolist() for k, name in enumerate(names)}
         lowest = np.nanmin(table[1], axis=0, initial=np.inf)  # infinite where no objective is known
         above = {name: (table[1, :, k] - lowest[k]).tolist() for k, name in enumerate(names)}
-        curves.draw(self._stream, "/curves/residual", residuals, colours)
-        curves.draw(self._stream, "/curves/objective", above, colours)
+        curves.draw_curves(self._stream, "/curves/residual", residuals, colours)
+        curves.draw_curves(self._stream, "/curves/objective", above, colours)
 
     def _send_changes(self) -> None:
         """Write each energy's change from the start, relative to its largest change.
@@ -272,64 +286,64 @@ class RerunRecorder:
             change = values - values[0]
             largest = float(np.nanmax(np.abs(change))) if np.isfinite(change).any() else 0.0
             if largest > 0.0:
-                self._style(f"/energy_change/{name}", f"{name}, of {largest:.2g} J")
-                self._widen("/energy_change", change / largest)
+                self._style_series(f"/energy_change/{name}", f"{name}, of {largest:.2g} J")
+                self._widen_range("/energy_change", change / largest)
                 scaled = rr.Scalars.columns(scalars=change / largest)
-                self._stream.send_columns(f"/energy_change/{name}", self._times(frames), scaled)
+                self._stream.send_columns(f"/energy_change/{name}", self._build_time_columns(frames), scaled)
 
-    def _widen(self, group: str, values: NDArray[np.float64]) -> None:
+    def _widen_range(self, group: str, values: NDArray[np.float64]) -> None:
         known = values[np.isfinite(values)]
         low, high = self._ranges.get(group, (np.inf, -np.inf))
         self._ranges[group] = float(known.min(initial=low)), float(known.max(initial=high))
 
-    def _add(self, frame: int, values: Mapping[str, float]) -> None:
+    def _add_scalars(self, frame: int, values: Mapping[str, float]) -> None:
         for entity, value in values.items():
             self._scalars.setdefault(entity, []).append((frame, value))
 
     def _send_scalars(self) -> None:
         for entity, rows in self._scalars.items():
             if rows:
-                if entity.startswith(_DRAWN):
-                    self._style(entity, entity.rsplit("/", 1)[-1])
+                if entity.startswith(_STYLED_ENTITIES):
+                    self._style_series(entity, entity.rsplit("/", 1)[-1])
                 frames, values = zip(*rows, strict=True)
-                index = self._times(np.array(frames))
+                index = self._build_time_columns(np.array(frames))
                 self._stream.send_columns(entity, index, rr.Scalars.columns(scalars=np.array(values, float)))
                 rows.clear()
 
-    def _times(self, frames: NDArray[np.int64]) -> Iterable[rr.TimeColumn]:
-        if self._info.iterates:
+    def _build_time_columns(self, frames: NDArray[np.int64]) -> Iterable[rr.TimeColumn]:
+        if self._info.is_solve:
             return rr.TimeColumn("frame", sequence=frames), rr.TimeColumn("iteration", sequence=frames)
-        return rr.TimeColumn("frame", sequence=frames), self._seconds(frames)
+        return rr.TimeColumn("frame", sequence=frames), self._build_time_column(frames)
 
-    def _at(self, frames: NDArray[np.int64]) -> Iterable[rr.TimeColumn]:
+    def _build_scene_times(self, frames: NDArray[np.int64]) -> Iterable[rr.TimeColumn]:
         """Build the time columns of scene entities.
 
         On the iterations timeline of a run the scene is static.
         """
-        iterations = frames if self._info.iterates else np.zeros_like(frames)
+        iterations = frames if self._info.is_solve else np.zeros_like(frames)
         return (
             rr.TimeColumn("frame", sequence=frames),
-            self._seconds(frames),
+            self._build_time_column(frames),
             rr.TimeColumn("iteration", sequence=iterations),
         )
 
-    def _seconds(self, frames: NDArray[np.int64]) -> rr.TimeColumn:
+    def _build_time_column(self, frames: NDArray[np.int64]) -> rr.TimeColumn:
         return rr.TimeColumn("time", duration=np.array([self._clock[frame] for frame in frames.tolist()]))
 
-    def _style(self, entity: str, label: str) -> None:
+    def _style_series(self, entity: str, label: str) -> None:
         group, name = entity.rsplit("/", 1)
         names = self._styled.setdefault(group, [])
         if name not in names:
-            colour = blueprint.COLOURS[len(names) % len(blueprint.COLOURS)]
+            colour = blueprint.SERIES_COLOURS[len(names) % len(blueprint.SERIES_COLOURS)]
             names.append(name)
             self._stream.log(entity, rr.SeriesLines(names=label, colors=colour, widths=1.5), static=True)
 
 
-def _segments(ends: NDArray[np.float32]) -> Any:
+def _build_line_strips(ends: NDArray[np.float32]) -> Any:
     """Build line strips of two points each from (m, 2, 3), without a Python loop."""
     points: Any = rr.components.Position3DBatch(ends.reshape(-1, 3)).as_arrow_array()
     offsets: Any = pa.array(np.arange(0, 2 * len(ends) + 1, 2, dtype=np.int32))
-    return pa.ListArray.from_arrays(offsets, points, type=_STRIPS)
+    return pa.ListArray.from_arrays(offsets, points, type=_STRIP_TYPE)
 
 
 def _log10(value: float) -> float:

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.record.base import RecordingInfo
-from solvers.compiling import kept
+from solvers.compiling import cached_njit
 from solvers.problem import Positions
 
-Reals = NDArray[np.float64]
+RealArray = NDArray[np.float64]
 
 STRAIN_COLOURS = ("#125490", "#64a2d6", "#d9d7d2", "#e5863b", "#943404")
 """Colours at strains -range, -range/2, 0, range/2, range: blue compressed, grey at rest, orange stretched.
@@ -28,26 +28,26 @@ They are colour-blind safe, and the middle is grey enough for light and shadow t
 PIN_COLOUR = "#c5299b"
 """Colour of pinned vertices in recordings and pictures: not on any strain scale, clear on light and on dark."""
 
-STRAIN_RANGE = 0.1
+DEFAULT_STRAIN_RANGE = 0.1
 """End of the scale where a run states no strain range."""
-LEAST_RANGE = 1e-3
+MIN_STRAIN_RANGE = 1e-3
 
-LEVELS = 65
+NUM_LEVELS = 65
 NORMAL_STEPS = 32
-NEUTRAL = (128, 128, 128, 255)
+NEUTRAL_COLOUR = (128, 128, 128, 255)
 """Colour of a strain that is NaN."""
 
 
-def palette() -> NDArray[np.uint8]:
+def build_palette() -> NDArray[np.uint8]:
     """Return the colours of the levels, most compressed first, then NEUTRAL_COLOUR: (NUM_LEVELS + 1, 4)."""
     stops = np.array([[int(colour[k : k + 2], 16) for k in (1, 3, 5)] + [255] for colour in STRAIN_COLOURS])
-    at = np.linspace(0, len(stops) - 1, LEVELS)
+    at = np.linspace(0, len(stops) - 1, NUM_LEVELS)
     channels: list[NDArray[np.float64]] = [np.interp(at, range(len(stops)), channel) for channel in stops.T]
     colours = np.stack(channels, axis=1)
-    return np.vstack([np.rint(colours), NEUTRAL]).astype(np.uint8)
+    return np.vstack([np.rint(colours), NEUTRAL_COLOUR]).astype(np.uint8)
 
 
-def strain_range(
+def compute_strain_range(
     positions: Iterable[Positions], springs: NDArray[np.int64], rest_lengths: NDArray[np.float64]
 ) -> float:
     """Return the end of a scale that shows the strains at the given positions.
@@ -59,11 +59,11 @@ def strain_range(
 
     Returns: the range of `round_scale_end` over all strains; DEFAULT_STRAIN_RANGE without springs.
     """
-    found = [strains(p, springs, rest_lengths)[1] for p in positions if len(rest_lengths)]
-    return scale_end(np.concatenate(found)) if found else STRAIN_RANGE
+    found = [compute_strains(p, springs, rest_lengths)[1] for p in positions if len(rest_lengths)]
+    return round_scale_end(np.concatenate(found)) if found else DEFAULT_STRAIN_RANGE
 
 
-def scale_end(strain: NDArray[np.float64]) -> float:
+def round_scale_end(strain: NDArray[np.float64]) -> float:
     """Return the end of a scale: the round number above 99 % of the strains.
 
     A few large strains at a pin thus do not leave all others grey. The result is DEFAULT_STRAIN_RANGE where none is
@@ -71,62 +71,62 @@ def scale_end(strain: NDArray[np.float64]) -> float:
     """
     known = np.abs(strain[np.isfinite(strain)])
     if not len(known):
-        return STRAIN_RANGE
-    wanted = max(float(np.quantile(known, 0.99)), LEAST_RANGE)
+        return DEFAULT_STRAIN_RANGE
+    wanted = max(float(np.quantile(known, 0.99)), MIN_STRAIN_RANGE)
     decade = 10.0 ** np.floor(np.log10(wanted) + 1e-9)
     return float(next(step * decade for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * decade >= 0.999 * wanted))
 
 
-def percent(strain: float, digits: int = 3) -> str:
+def format_percent(strain: float, digits: int = 3) -> str:
     """Format a strain with its sign as a percentage."""
     return f"{100 * strain:+.{digits}g} %".replace("-", "−")
 
 
-def colours(strain: NDArray[np.float64], end: float) -> NDArray[np.uint32]:
+def compute_strain_colours(strain: NDArray[np.float64], end: float) -> NDArray[np.uint32]:
     """Return the colours 0xRRGGBBAA (m,) of strains (m,) on the scale from -end to end."""
     with np.errstate(invalid="ignore"):
-        level = np.rint((np.clip(strain / end, -1, 1) + 1) * (LEVELS - 1) / 2)
-    return _packed()[np.where(np.isnan(level), LEVELS, level).astype(np.intp)]
+        level = np.rint((np.clip(strain / end, -1, 1) + 1) * (NUM_LEVELS - 1) / 2)
+    return _packed_palette()[np.where(np.isnan(level), NUM_LEVELS, level).astype(np.intp)]
 
 
 @cache
-def _packed() -> NDArray[np.uint32]:
-    return palette().view(">u4").astype(np.uint32).ravel()
+def _packed_palette() -> NDArray[np.uint32]:
+    return build_palette().view(">u4").astype(np.uint32).ravel()
 
 
-def widest(ends: tuple[float, float], strain: NDArray[np.float64]) -> tuple[float, float]:
+def widen_range(ends: tuple[float, float], strain: NDArray[np.float64]) -> tuple[float, float]:
     """Return the smallest and the largest of `ends` and the finite strains."""
     known = strain[np.isfinite(strain)]
     return float(known.min(initial=ends[0])), float(known.max(initial=ends[1]))
 
 
-class Shading:
+class StrainShading:
     """Strains, colours and normals of one run's mesh."""
 
     def __init__(self, info: RecordingInfo) -> None:
         self._range, self._triangles = info.strain_range, info.mesh.triangles
         self._springs, self._rest_lengths = info.springs, info.rest_lengths
 
-    def strains(self, p: Positions) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def compute_strains(self, p: Positions) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the strains of springs (m,) and of vertices (n,).
 
         The strain of a vertex is the one of largest magnitude among its springs. It is 0 where a rest length is 0 or a
         vertex has no spring.
         """
-        return strains(p, self._springs, self._rest_lengths)
+        return compute_strains(p, self._springs, self._rest_lengths)
 
-    def colours(self, strain: NDArray[np.float64]) -> NDArray[np.uint32]:
+    def compute_colours(self, strain: NDArray[np.float64]) -> NDArray[np.uint32]:
         """Return the colour of each strain as 0xRRGGBBAA, shape (len(strain),)."""
-        return colours(strain, self._range)
+        return compute_strain_colours(strain, self._range)
 
-    def normals(self, p: NDArray[np.float32]) -> NDArray[np.float32]:
+    def compute_normals(self, p: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the unit vertex normals (n, 3), rounded to 1/32; zero where undefined."""
         normals = np.zeros(p.shape)  # areas of tiny or huge triangles leave the range of single precision
-        _normals(p.astype(np.float64), self._triangles, normals)
+        _normals_kernel(p.astype(np.float64), self._triangles, normals)
         return normals.astype(np.float32)
 
 
-def strains(
+def compute_strains(
     p: Positions, springs: NDArray[np.int64], rest_lengths: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Compute the strains of springs and of vertices.
@@ -139,19 +139,19 @@ def strains(
     Returns: strains of the springs (m,), and for each vertex (n,) the one of largest magnitude among its springs.
     """
     of_spring, of_vertex = np.empty(len(rest_lengths)), np.zeros(len(p))
-    _strains(p.copy(), springs, rest_lengths, of_spring, of_vertex)
+    _strains_kernel(p.copy(), springs, rest_lengths, of_spring, of_vertex)
     return of_spring, of_vertex
 
 
 # Positions are passed as writable copies: a read-only array is another type to Numba and causes another compilation.
 # The kernels release the interpreter lock, so that a concurrent solver need not wait.
-@kept(error_model="numpy", nogil=True)
-def _strains(
+@cached_njit(error_model="numpy", nogil=True)
+def _strains_kernel(
     p: Positions,
     springs: NDArray[np.int64],
-    rest_lengths: Reals,
-    of_spring: Reals,
-    of_vertex: Reals,
+    rest_lengths: RealArray,
+    of_spring: RealArray,
+    of_vertex: RealArray,
 ) -> None:
     for e in range(len(springs)):
         i, j = springs[e, 0], springs[e, 1]
@@ -164,8 +164,8 @@ def _strains(
                 of_vertex[v] = strain
 
 
-@kept(error_model="numpy", nogil=True)
-def _normals(p: Reals, triangles: NDArray[np.int64], out: Reals) -> None:
+@cached_njit(error_model="numpy", nogil=True)
+def _normals_kernel(p: RealArray, triangles: NDArray[np.int64], out: RealArray) -> None:
     for t in range(len(triangles)):
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         ax, ay, az = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]

@@ -22,96 +22,96 @@ from importlib.metadata import version
 from pathlib import Path
 
 from harness.base import child
-from harness.base.errors import InputError, Mistake
-from harness.base.files import users_cache
+from harness.base.errors import InputError, InputMistake
+from harness.base.files import user_cache_dir
 
-_HEADER, _END = 12, 0
+_HEADER_BYTES, _END_KIND = 12, 0
 
-_SECONDS, _BYTES_PER_SECOND = 10.0, 1e7
-_MEMORY, _MEMORY_PER_BYTE = 2**30, 8
+_BASE_SECONDS, _BYTES_PER_SECOND = 10.0, 1e7
+_BASE_MEMORY, _MEMORY_PER_BYTE = 2**30, 8
 """Time [s] and memory [bytes] limits to read a recording, as functions of its size; it is compressed."""
 
-_NOTED = 2**21
+_MAX_NOTES_BYTES = 2**21
 """Size [bytes] of the notes from which on they are discarded."""
 
-_sound: set[bytes] = set()
+_verified_states: set[bytes] = set()
 """Hashes of the file states that have been read successfully."""
 
-_read: dict[Path, int] = {}
+_notes_offset: dict[Path, int] = {}
 """Number of bytes of notes that have been read, by file."""
 
 
-def trust(path: Path, *, noted: bool = True) -> None:
+def mark_verified(path: Path, *, shared: bool = True) -> None:
     """Mark a recording in its present state as readable.
 
     Args:
       path: path of the recording.
       shared: whether other processes see the mark too.
     """
-    _sound.add(state := _state(path))
-    if noted:
+    _verified_states.add(state := _file_state(path))
+    if shared:
         with suppress(OSError):  # then it is found out again
-            notes = _notes()
+            notes = _notes_path()
             notes.parent.mkdir(parents=True, exist_ok=True)
             file = os.open(notes, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
             try:
-                if os.fstat(file).st_size > _NOTED:
+                if os.fstat(file).st_size > _MAX_NOTES_BYTES:
                     os.truncate(file, 0)
                 os.write(file, state)
             finally:
                 os.close(file)
 
 
-def _trusted(path: Path) -> bool:
-    state = _state(path)
-    if state not in _sound:
+def _is_verified(path: Path) -> bool:
+    state = _file_state(path)
+    if state not in _verified_states:
         with suppress(OSError):
-            notes = _notes()
-            size, begin = notes.stat().st_size, _read.get(notes, 0)
+            notes = _notes_path()
+            size, begin = notes.stat().st_size, _notes_offset.get(notes, 0)
             if size != begin:
                 with notes.open("rb") as file:
                     file.seek(begin if size > begin else 0)
                     found = file.read()
-                _sound.update(found[k : k + len(state)] for k in range(0, len(found), len(state)))
-                _read[notes] = size
-    return state in _sound
+                _verified_states.update(found[k : k + len(state)] for k in range(0, len(found), len(state)))
+                _notes_offset[notes] = size
+    return state in _verified_states
 
 
-def _notes() -> Path:
-    return users_cache("recordings") / f"sound-{_library()}"
+def _notes_path() -> Path:
+    return user_cache_dir("recordings") / f"sound-{_read_library_version()}"
 
 
 @cache
-def _library() -> str:
+def _read_library_version() -> str:
     """Return the version of the library that reads recordings; another version may not read them."""
     return version("rerun-sdk")
 
 
-def _state(path: Path) -> bytes:
+def _file_state(path: Path) -> bytes:
     found = path.stat()
     known = found.st_dev, found.st_ino, found.st_mtime_ns, found.st_ctime_ns, found.st_size
     return sha256(repr(known).encode()).digest()[:16]
 
 
-def whole_messages(path: Path) -> tuple[bool, int]:
+def scan_messages(path: Path) -> tuple[bool, int]:
     """Find the end of the last complete message.
 
     Returns: whether the file has its end mark, and the offset [bytes] of the end of its last complete message.
     """
-    size, place = path.stat().st_size, _HEADER
+    size, place = path.stat().st_size, _HEADER_BYTES
     with path.open("rb") as file:
         while place + 16 <= size:
             file.seek(place)
             kind, length = struct.unpack("<QQ", file.read(16))
             if place + 16 + length > size:
                 break
-            if kind == _END:
+            if kind == _END_KIND:
                 return True, size
             place += 16 + length
     return False, place
 
 
-def require_sound(path: Path, read: Callable[[Path], None]) -> None:
+def require_intact(path: Path, read_recording: Callable[[Path], None]) -> None:
     """Require that a recording can be read in a child process within limits.
 
     Args:
@@ -121,12 +121,12 @@ def require_sound(path: Path, read: Callable[[Path], None]) -> None:
     Raises:
       InputError: the recording cannot be read.
     """
-    if _trusted(path):
+    if _is_verified(path):
         return
     size = path.stat().st_size
-    limits = child.Allowance(_SECONDS + size / _BYTES_PER_SECOND, _MEMORY + _MEMORY_PER_BYTE * size)
+    limits = child.CallLimits(_BASE_SECONDS + size / _BYTES_PER_SECOND, _BASE_MEMORY + _MEMORY_PER_BYTE * size)
     try:
-        child.call(read, path, limits=limits)
-    except child.NoAnswer as error:
-        raise InputError(Mistake(f"is damaged: {error}; do its run again", file=path)) from None
-    trust(path)
+        child.call_in_sandbox(read_recording, path, limits=limits)
+    except child.SandboxError as error:
+        raise InputError(InputMistake(f"is damaged: {error}; do its run again", file=path)) from None
+    mark_verified(path)

@@ -24,25 +24,25 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from harness.reference.oracle import symmetric_lu
-from solvers.core.coupled import Coupled
+from harness.reference.oracle import factorise_symmetric_lu
+from solvers.core.coupled import RankUpdateEnergy
 from solvers.linear.block import BlockCholesky
-from solvers.matrices import diagonal
+from solvers.matrices import diagonal_matrix
 from solvers.problem import Positions, StepProblem
 from solvers.round_off import EPS
 
-LARGE = 30_000
+LARGE_SIZE = 30_000
 """Number of unknowns from which on SuperLU would need gigabytes, so that the block Cholesky factor replaces it. The
 factor only guides the search, since the eigenvalue is a product with the Hessian."""
-ROUNDINGS = 3
-SHORT = 1e-4
+NUM_ROUNDINGS = 3
+MAX_STEP_FRACTION = 1e-4
 """Step length relative to the mesh extent above which a step gives no information on a nearby stationary point."""
 SHIFTS = (0.0, *(10.0**k for k in range(-17, 2)))
 """Shifts relative to the Hessian's largest row sum: the first that makes it positive definite is next to the smallest
 eigenvalue."""
 
 
-Solve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+SolveFunction = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 class SplitHessian(NamedTuple):
@@ -56,16 +56,16 @@ class SplitHessian(NamedTuple):
     sparse: csr_array
     columns: NDArray[np.float64]
 
-    def times(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def multiply(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return H x, (3 f,)."""
         return self.sparse @ x + self.columns @ (self.columns.T @ x)
 
-    def bend(self, x: NDArray[np.float64]) -> float:
+    def quadratic_form(self, x: NDArray[np.float64]) -> float:
         """Return x' H x."""
         along = self.columns.T @ x
         return float(x @ (self.sparse @ x) + along @ along)
 
-    def sums(self, x: NDArray[np.float64]) -> float:
+    def absolute_form(self, x: NDArray[np.float64]) -> float:
         """Return an upper bound of |x|' |H| |x|."""
         along = np.abs(self.columns).T @ np.abs(x)
         return float(np.abs(x) @ (abs(self.sparse) @ np.abs(x)) + along @ along)
@@ -76,7 +76,7 @@ class SplitHessian(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Curvature:
+class HessianCurvature:
     """Smallest eigenvalue of the Hessian at a point.
 
     Attributes:
@@ -86,50 +86,52 @@ class Curvature:
       solve: product with the inverse of the Hessian (3 f,), with the smallest shift that makes it positive definite.
     """
 
-    smallest: float
-    doubt: float
+    min_eigenvalue: float
+    eigenvalue_uncertainty: float
     direction: Positions
-    solve: Solve
+    solve: SolveFunction
 
     @property
-    def convex(self) -> bool:
+    def is_convex(self) -> bool:
         """Whether the curvature is positive in all directions, beyond round-off."""
-        return self.smallest > self.doubt
+        return self.min_eigenvalue > self.eigenvalue_uncertainty
 
     @property
-    def falls(self) -> bool:
+    def is_saddle(self) -> bool:
         """Whether it is negative in some direction, beyond round-off: a saddle, where the gradient vanishes."""
-        return self.smallest < -self.doubt
+        return self.min_eigenvalue < -self.eigenvalue_uncertainty
 
     @property
-    def flat(self) -> bool:
+    def is_degenerate(self) -> bool:
         """Whether the smallest eigenvalue is zero within its uncertainty."""
-        return abs(self.smallest) <= self.doubt
+        return abs(self.min_eigenvalue) <= self.eigenvalue_uncertainty
 
 
-def curvature(problem: StepProblem, p: Positions) -> Curvature:
+def compute_curvature(problem: StepProblem, p: Positions) -> HessianCurvature:
     """Compute the curvature at p (n, 3) [m], with exact pins at their targets."""
-    free, direction = problem.system.free, np.zeros_like(p)
+    free, direction = problem.system.free_vertices, np.zeros_like(p)
     if not len(free):
-        return Curvature(np.inf, 0.0, direction, np.copy)
-    H = free_hessian(problem, p)
+        return HessianCurvature(np.inf, 0.0, direction, np.copy)
+    H = build_free_hessian(problem, p)
     if not (np.isfinite(H.sparse.data).all() and np.isfinite(H.columns).all()):
-        return Curvature(np.nan, np.inf, direction, np.copy)
-    x, solve = _softest(H)
-    smallest, rng = H.bend(x), np.random.default_rng(0)
+        return HessianCurvature(np.nan, np.inf, direction, np.copy)
+    x, solve = _compute_softest_mode(H)
+    smallest, rng = H.quadratic_form(x), np.random.default_rng(0)
 
     def change(q: Positions) -> float:
-        return free_hessian(problem, q).bend(x) - smallest
+        return build_free_hessian(problem, q).quadratic_form(x) - smallest
 
-    moved = max(abs(change(p * (1.0 + EPS * rng.integers(-1, 2, p.shape)))) for _ in range(ROUNDINGS))
-    sums = EPS * H.sums(x)
+    moved = max(abs(change(p * (1.0 + EPS * rng.integers(-1, 2, p.shape)))) for _ in range(NUM_ROUNDINGS))
+    sums = EPS * H.absolute_form(x)
     direction[free] = x.reshape(-1, 3)
-    here = Curvature(smallest, 4.0 * (sums + moved), direction, solve)
-    lost = -np.sign(smallest) * change(across(problem, p, here))
-    return replace(here, doubt=here.doubt + 1.1 * max(0.0, float(lost)))
+    here = HessianCurvature(smallest, 4.0 * (sums + moved), direction, solve)
+    lost = -np.sign(smallest) * change(step_across(problem, p, here))
+    return replace(here, eigenvalue_uncertainty=here.eigenvalue_uncertainty + 1.1 * max(0.0, float(lost)))
 
 
-def across(problem: StepProblem, p: Positions, at: Curvature, *, most: float = SHORT) -> Positions:
+def step_across(
+    problem: StepProblem, p: Positions, at: HessianCurvature, *, max_fraction: float = MAX_STEP_FRACTION
+) -> Positions:
     """Return p after Newton's step orthogonal to the softest direction.
 
     Args:
@@ -140,33 +142,33 @@ def across(problem: StepProblem, p: Positions, at: Curvature, *, most: float = S
 
     Returns: positions (n, 3) [m].
     """
-    free, q, x = problem.system.free, p.copy(), at.direction[problem.system.free].ravel()
+    free, q, x = problem.system.free_vertices, p.copy(), at.direction[problem.system.free_vertices].ravel()
     gradient = problem.gradient(p)[free].ravel()
     step = at.solve(gradient - (x @ gradient) * x)
     step -= (x @ step) * x
-    length, most = np.abs(step).max(), most * (float(np.ptp(p, axis=0).max()) or 1.0)
-    q[free] -= (step * min(1.0, most / length) if length else step).reshape(-1, 3)
+    length, max_fraction = np.abs(step).max(), max_fraction * (float(np.ptp(p, axis=0).max()) or 1.0)
+    q[free] -= (step * min(1.0, max_fraction / length) if length else step).reshape(-1, 3)
     return q
 
 
-def free_hessian(problem: StepProblem, p: Positions) -> SplitHessian:
+def build_free_hessian(problem: StepProblem, p: Positions) -> SplitHessian:
     """Assemble the objective's Hessian at p."""
     system = problem.system
-    _, vertices, weight = system.penalty
-    held = system.inertia + np.bincount(vertices, weight, minlength=system.vertices)
-    total, columns = diagonal(np.repeat(held, 3)), [np.empty((*p.shape, 0))]
+    _, vertices, weight = system.penalty_pins
+    held = system.inertia_diagonal + np.bincount(vertices, weight, minlength=system.num_vertices)
+    total, columns = diagonal_matrix(np.repeat(held, 3)), [np.empty((*p.shape, 0))]
     for energy in problem.energies:
-        if isinstance(energy, Coupled):
+        if isinstance(energy, RankUpdateEnergy):
             total = csr_array(total + energy.sparse_hessian(p))
-            columns.append(energy.columns(p))
+            columns.append(energy.low_rank_columns(p))
         else:
             total = csr_array(total + energy.hessian(p))
-    free = (3 * system.free[:, None] + np.arange(3)).ravel()
+    free = (3 * system.free_vertices[:, None] + np.arange(3)).ravel()
     V = np.concatenate(columns, axis=2).reshape(p.size, -1)
     return SplitHessian(csr_array(total[free][:, free]), V[free])
 
 
-def _softest(H: SplitHessian) -> tuple[NDArray[np.float64], Solve]:
+def _compute_softest_mode(H: SplitHessian) -> tuple[NDArray[np.float64], SolveFunction]:
     """Compute the unit eigenvector of a symmetric matrix for its smallest eigenvalue, and a solver.
 
     The solver is the product with the inverse of the matrix, with the smallest shift that makes it positive definite.
@@ -176,7 +178,9 @@ def _softest(H: SplitHessian) -> tuple[NDArray[np.float64], Solve]:
     scale = float(rows.max())
     start = np.random.default_rng(0).normal(size=size)  # the same eigenvector each time
     for shift in SHIFTS:
-        solve = definite(H._replace(sparse=csr_array(H.sparse + diagonal(np.full(size, shift * scale)))))
+        solve = factorise_definite(
+            H._replace(sparse=csr_array(H.sparse + diagonal_matrix(np.full(size, shift * scale))))
+        )
         if solve is not None:
             given: Any = {"shape": H.sparse.shape, "dtype": np.dtype(np.float64)}
             settings: Any = {
@@ -186,13 +190,13 @@ def _softest(H: SplitHessian) -> tuple[NDArray[np.float64], Solve]:
                 "v0": start,
                 "tol": 1e-8,
             }
-            A = LinearOperator(matvec=H.times, **given) if H.columns.size else H.sparse
+            A = LinearOperator(matvec=H.multiply, **given) if H.columns.size else H.sparse
             _, vectors = cast(tuple[Any, NDArray[np.float64]], eigsh(A, **settings))
             return vectors[:, 0], solve
     raise ValueError("a Hessian that no multiple of the identity makes positive definite is not symmetric")
 
 
-def definite(H: SplitHessian) -> Solve | None:
+def factorise_definite(H: SplitHessian) -> SolveFunction | None:
     """Factorise a symmetric 3 x 3 block matrix; None where not positive definite.
 
     The result is the product with its inverse. Not positive definite means that in floating point some pivot of the
@@ -200,17 +204,17 @@ def definite(H: SplitHessian) -> Solve | None:
     (Sylvester's law of inertia).
     """
     S, V = H
-    if S.indptr.size > LARGE:
+    if S.indptr.size > LARGE_SIZE:
         blocks = bsr_array(S, blocksize=(3, 3))
         blocks.sort_indices()
         cholesky = BlockCholesky(csr_array((np.ones(len(blocks.indices)), blocks.indices, blocks.indptr)))
         if not cholesky.factorise(np.array(blocks.data, np.float64)):
             return None
-        inner: Solve = lambda x: cholesky.solve(x.reshape(-1, 3)).ravel()  # noqa: E731
+        inner: SolveFunction = lambda x: cholesky.solve(x.reshape(-1, 3)).ravel()  # noqa: E731
         negative = 0
     else:
         try:
-            factor = symmetric_lu(S)
+            factor = factorise_symmetric_lu(S)
         except RuntimeError:  # a pivot is zero
             return None
         pivots = factor.U.diagonal()

@@ -20,21 +20,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.base.errors import RunFailed
-from harness.scenes.bind import Scene, build
+from harness.scenes.bind import Scene, build_scene
 from harness.scenes.spec import SceneSpec
-from harness.simulation.step import State, Step, guessed, prepare, simulate
+from harness.simulation.step import MotionState, SimulationStep, apply_initial_guess, prepare, simulate_scene
 from solvers.integrators import Motion
-from solvers.problem import Pins, Positions, Solver, Start, StepProblem, StopRule
+from solvers.problem import DirichletPins, Positions, Solver, StepProblem, StepStart, StopRule
 
-MOMENTS = ("early", "middle", "violent")
-CONVERGED = StopRule(500, 1e-12)
+SNAPSHOT_NAMES = ("early", "middle", "violent")
+REFERENCE_STOP_RULE = StopRule(500, 1e-12)
 """Stop rule of the reference run: Newton's method reaches the last digits in one more iteration."""
 
 Arrays = Mapping[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frozen:
+class StepSnapshot:
     """One step of a reference run.
 
     Attributes:
@@ -48,22 +48,24 @@ class Frozen:
 
     frame: int
     problem: StepProblem
-    after: Motion
+    end_motion: Motion
     digest: str
     acceleration: Positions | None = None
 
     @property
-    def state(self) -> State:
+    def state(self) -> MotionState:
         """The state from which the reference run continues."""
-        begun = self.problem.start
-        return State(self.after, Motion(begun.positions, begun.velocity), self.frame, self.acceleration)
+        begun = self.problem.step_start
+        return MotionState(self.end_motion, Motion(begun.positions, begun.velocity), self.frame, self.acceleration)
 
-    def stated(self, first_guess: str) -> StepProblem:
+    def build_problem(self, initial_guess: str) -> StepProblem:
         """Return the problem with an initial guess by name (`harness.simulation.time_loop`)."""
-        return guessed(self.problem, first_guess)
+        return apply_initial_guess(self.problem, initial_guess)
 
 
-def bind(spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, warns: bool = True) -> Scene:
+def build_exact_scene(
+    spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, show_warnings: bool = True
+) -> Scene:
     """Build the scene with all of its pins exact.
 
     Args:
@@ -75,14 +77,14 @@ def bind(spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, warn
     Raises:
       InputError: the scene cannot be built.
     """
-    scene = build(spec, size, integrator, warns=warns)
+    scene = build_scene(spec, size, integrator, log_warnings=show_warnings)
     vertices = scene.system.pins.vertices
-    return replace(scene, system=replace(scene.system, pins=Pins(vertices, np.full(len(vertices), np.inf))))
+    return replace(scene, system=replace(scene.system, pins=DirichletPins(vertices, np.full(len(vertices), np.inf))))
 
 
-def reference_run(
-    scene: Scene, solver: Solver, length: int, wanted: Collection[int] = (), state: State | None = None
-) -> tuple[dict[int, Step], NDArray[np.float64]]:
+def run_reference(
+    scene: Scene, solver: Solver, num_steps: int, frames: Collection[int] = (), initial_state: MotionState | None = None
+) -> tuple[dict[int, SimulationStep], NDArray[np.float64]]:
     """Take converged steps up to a number of steps.
 
     Args:
@@ -98,55 +100,66 @@ def reference_run(
     Raises:
       RunFailed: a step does not converge.
     """
-    kept: dict[int, Step] = {}
-    violence, keep = np.full(length, np.nan), set(wanted)
-    run = simulate(scene, prepare(scene, solver), CONVERGED, first_guess="current", frames=length, state=state)
+    kept: dict[int, SimulationStep] = {}
+    violence, keep = np.full(num_steps, np.nan), set(frames)
+    run = simulate_scene(
+        scene,
+        prepare(scene, solver),
+        REFERENCE_STOP_RULE,
+        initial_guess="current",
+        frames=num_steps,
+        initial_state=initial_state,
+    )
     for step in run:
-        if step.solution.stopped == "iterations" or not np.isfinite(step.positions).all():
+        if step.solution.termination_reason == "iterations" or not np.isfinite(step.positions).all():
             raise RunFailed(f"step {step.index} of the reference run does not converge")
         stated = step.problem
-        violence[step.index - 1] = stated.value(stated.current) - stated.value(step.solution.positions)
-        if not wanted:
-            keep = set(moment_frames(violence[: step.index], length).values())
+        violence[step.index - 1] = stated.value(stated.current_positions) - stated.value(step.solution.positions)
+        if not frames:
+            keep = set(select_snapshot_frames(violence[: step.index], num_steps).values())
         kept[step.index] = step
         kept = {frame: one for frame, one in kept.items() if frame in keep}
     return kept, violence
 
 
-def moment_frames(violence: NDArray[np.float64], length: int) -> dict[str, int]:
+def select_snapshot_frames(violence: NDArray[np.float64], num_steps: int) -> dict[str, int]:
     """Select the frames of SNAPSHOT_NAMES in a run.
 
     Args:
       violence: decrease of the objective [J] of the first steps (frames,).
       num_steps: number of steps of the run.
     """
-    first = min(2, length)
+    first = min(2, num_steps)
     return {
-        "early": max(first, -(-length // 10)),
-        "middle": max(first, (length + 1) // 2),
+        "early": max(first, -(-num_steps // 10)),
+        "middle": max(first, (num_steps + 1) // 2),
         "violent": first + int(np.argmax(violence[first - 1 :])) if len(violence) >= first else 1,
     }
 
 
 _ARRAYS = ("target", "force", "pin_targets", "current")
-_MAYBE = ("lagged", "acceleration", "kept", "pressed")
-_START = tuple(field.name for field in fields(Start) if field.name not in _MAYBE)
+_OPTIONAL_FIELDS = ("lagged", "acceleration", "kept", "pressed")
+_START_FIELDS = tuple(field.name for field in fields(StepStart) if field.name not in _OPTIONAL_FIELDS)
 
 
-def freeze(step: Step, origin: str) -> tuple[Frozen, Arrays]:
+def save_snapshot(step: SimulationStep, origin: str) -> tuple[StepSnapshot, Arrays]:
     """Convert a step to a snapshot and to the arrays that are saved.
 
     Args:
       step: step of the reference run.
       origin: description of the source of the step.
     """
-    problem, now = step.problem, step.state.now
-    system, start = problem.system, problem.start
+    problem, now = step.problem, step.state.motion
+    system, start = problem.system, problem.step_start
     arrays: dict[str, Any] = {name: getattr(problem, name) for name in _ARRAYS}
-    arrays |= {f"start_{name}": getattr(start, name) for name in _START}
-    arrays |= {f"start_{name}": known for name in _MAYBE if (known := getattr(start, name)) is not None}
-    arrays |= {"mass": system.mass, "pins": system.pins.vertices, "gradient": problem.gradient(problem.current)}
-    arrays |= {"time_step": system.time_step, "factor": system.factor, "frame": step.index}
+    arrays |= {f"start_{name}": getattr(start, name) for name in _START_FIELDS}
+    arrays |= {f"start_{name}": known for name in _OPTIONAL_FIELDS if (known := getattr(start, name)) is not None}
+    arrays |= {
+        "mass": system.mass,
+        "pins": system.pins.vertices,
+        "gradient": problem.gradient(problem.current_positions),
+    }
+    arrays |= {"time_step": system.time_step, "factor": system.inertia_factor, "frame": step.index}
     arrays = {name: np.asarray(value) for name, value in arrays.items()}
     content = hashlib.sha256(origin.encode())
     for name, array in arrays.items():
@@ -155,30 +168,32 @@ def freeze(step: Step, origin: str) -> tuple[Frozen, Arrays]:
     ends = {"after_positions": now.positions, "after_velocity": now.velocity, "digest": np.asarray(digest)}
     if (acceleration := step.state.acceleration) is not None:
         ends["after_acceleration"] = acceleration
-    return Frozen(step.index, problem, now, digest, acceleration), arrays | ends
+    return StepSnapshot(step.index, problem, now, digest, acceleration), arrays | ends
 
 
-def thaw(arrays: Arrays, scene: Scene) -> Frozen | None:
+def restore_snapshot(arrays: Arrays, scene: Scene) -> StepSnapshot | None:
     """Restore a saved snapshot for a scene; None where the problem has changed."""
-    if any(f"start_{name}" not in arrays for name in _START):
+    if any(f"start_{name}" not in arrays for name in _START_FIELDS):
         return None
-    system = replace(scene.system, factor=float(arrays["factor"]))
-    begun: dict[str, Any] = {name: arrays[f"start_{name}"] for name in (*_START, *_MAYBE) if f"start_{name}" in arrays}
+    system = replace(scene.system, inertia_factor=float(arrays["factor"]))
+    begun: dict[str, Any] = {
+        name: arrays[f"start_{name}"] for name in (*_START_FIELDS, *_OPTIONAL_FIELDS) if f"start_{name}" in arrays
+    }
     begun |= {name: float(value) for name, value in begun.items() if not value.ndim}
     given = {name: arrays[name] for name in _ARRAYS}
-    problem = StepProblem(system, **given, first_guess=given["current"], start=Start(**begun))
+    problem = StepProblem(system, **given, initial_guess=given["current"], step_start=StepStart(**begun))
     same = (
         system.time_step == arrays["time_step"]
         and np.array_equal(system.mass, arrays["mass"])
         and np.array_equal(system.pins.vertices, arrays["pins"])
-        and agree(problem.gradient(problem.current), arrays["gradient"])
+        and is_equal_to_roundoff(problem.gradient(problem.current_positions), arrays["gradient"])
     )
     after = Motion(arrays["after_positions"], arrays["after_velocity"])
     told = str(arrays["digest"]), arrays.get("after_acceleration")
-    return Frozen(int(arrays["frame"]), problem, after, *told) if same else None
+    return StepSnapshot(int(arrays["frame"]), problem, after, *told) if same else None
 
 
-def agree(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool:
+def is_equal_to_roundoff(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool:
     """Return whether two arrays are equal up to processor-dependent summation order."""
     if found.shape != wanted.shape:
         return False

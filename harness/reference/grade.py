@@ -20,57 +20,57 @@ from typing import Any
 import numpy as np
 
 from harness.base.errors import RunFailed
-from harness.reference.exact import Stationarity
-from harness.simulation.passing import Passing
-from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule
-from solvers.registry import about, minimises, name_of
+from harness.reference.exact import StationarityEvaluator
+from harness.simulation.passing import DelegatingSolver
+from solvers.problem import Positions, PreparedSolver, Solution, Solver, StepProblem, StopRule
+from solvers.registry import find_solver_info, find_solver_name, is_minimiser
 
-SLACK = 10.0
+RESIDUAL_SLACK = 10.0
 """Factor between reported and measured residual: a factor of few digits, or a preconditioner close to Q, is allowed."""
 
-_SAME = 1e-9
+_SAME_POSITION_RTOL = 1e-9
 """Relative difference, in the largest coordinate, of two sums of the same terms after many iterations."""
 
 
-class Graded(Passing):
+class AuditedSolver(DelegatingSolver):
     """A prepared solver whose solutions in some frames are audited in sequence."""
 
-    def __init__(self, prepared: Prepared, solver: Solver, frames: Collection[int]) -> None:
+    def __init__(self, prepared: PreparedSolver, solver: Solver, frames: Collection[int]) -> None:
         """Wrap a prepared solver; `frames` are counted from 1."""
         super().__init__(prepared)
-        self._claims = minimises(solver)
-        own_steps = about(type(solver), name_of(solver)).own_steps
+        self._claims = is_minimiser(solver)
+        own_steps = find_solver_info(type(solver), find_solver_name(solver)).is_substepping
         self._frames, self._done = frames if self._claims or not own_steps else (), 0
         self._begun = -np.inf
         self._name = type(solver).__name__
-        self._stationarity = Stationarity()
+        self._stationarity = StationarityEvaluator()
         self.found: dict[int, dict[str, Any]] = {}
         """Column `graded` of the row of each audited frame."""
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """Return the solver's solution; raises RunFailed where its reported residual is wrong."""
         found = self._prepared.solve(problem, stop)
-        if problem.start.time > self._begun:  # the first unknown of the next frame
-            self._done, self._begun = self._done + 1, problem.start.time
+        if problem.step_start.time > self._begun:  # the first unknown of the next frame
+            self._done, self._begun = self._done + 1, problem.step_start.time
         if self._done in self._frames and np.isfinite(found.positions).all():
-            graded = self._graded(problem, found, stop)
+            graded = self._audit_solution(problem, found, stop)
             self.found[self._done] = max(graded, self.found.get(self._done, graded), key=lambda row: row["graded"])
         return found
 
-    def _graded(self, problem: StepProblem, found: Solution, stop: StopRule) -> dict[str, Any]:
+    def _audit_solution(self, problem: StepProblem, found: Solution, stop: StopRule) -> dict[str, Any]:
         reached, round_off, _ = self._stationarity(problem, found.positions)
         if not self._claims:
             return {"graded": reached}
-        yardstick = self._stationarity.yardstick(problem)
+        yardstick = self._stationarity.compute_initial_residual(problem)
         told, truth = f"{self._name}: reports a residual of {found.residual:.3g} J^(1/2)", reached * yardstick
-        if np.isnan(found.residual) and found.iterations:
+        if np.isnan(found.residual) and found.num_iterations:
             raise RunFailed(f"{told}; wanted |Q^-1 grad g|_Q, which is {truth:.3g} (or `minimises = False`)")
-        claimed = SLACK * found.residual / yardstick + round_off
-        enough = SLACK * max(stop.tolerance or 0.0, stop.within / yardstick if yardstick else 0.0) + round_off
-        if found.stopped != "tolerance":
+        claimed = RESIDUAL_SLACK * found.residual / yardstick + round_off
+        enough = RESIDUAL_SLACK * max(stop.rtol or 0.0, stop.atol / yardstick if yardstick else 0.0) + round_off
+        if found.termination_reason != "tolerance":
             enough = np.inf
         if claimed < reached or enough < reached:  # it may be the residual of the iterate before
-            before = [self._stationarity(problem, p).reached for p in self._before(problem, found)]
+            before = [self._stationarity(problem, p).stationarity for p in self._find_previous_iterate(problem, found)]
             least = min(reached, *before, np.inf)
             if claimed < least:
                 raise RunFailed(f"{told}, where |Q^-1 grad g|_Q is {truth:.3g}")
@@ -80,16 +80,16 @@ class Graded(Passing):
                 )
         return {"graded": reached}
 
-    def _before(self, problem: StepProblem, found: Solution) -> list[Positions]:
+    def _find_previous_iterate(self, problem: StepProblem, found: Solution) -> list[Positions]:
         """Return the iterate before the solution, if the iterates lead to that solution."""
-        if found.iterations < 1:
+        if found.num_iterations < 1:
             return []
-        p = before = problem.first_guess.copy()
+        p = before = problem.initial_guess.copy()
         pins = problem.system.pins
-        p[pins.vertices[pins.exact]] = problem.pin_targets[pins.exact]
-        for count, iterate in enumerate(islice(self._prepared.iterates(problem), found.iterations), 1):
-            if count == found.iterations:
+        p[pins.vertices[pins.exact_mask]] = problem.pin_targets[pins.exact_mask]
+        for count, iterate in enumerate(islice(self._prepared.iterates(problem), found.num_iterations), 1):
+            if count == found.num_iterations:
                 before = p
             p = iterate.copy()
-        same = np.abs(p - found.positions).max(initial=0.0) <= _SAME * np.abs(p).max(initial=0.0)
+        same = np.abs(p - found.positions).max(initial=0.0) <= _SAME_POSITION_RTOL * np.abs(p).max(initial=0.0)
         return [before] if same else []

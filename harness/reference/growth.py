@@ -19,39 +19,39 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from harness.reference.frozen import bind
-from harness.reference.motion import Field, State, moving
-from harness.reference.trajectory import MARGIN, Unpredictable
-from harness.reference.trajectory import PERTURBATION as ROUND_OFF
+from harness.reference.frozen import build_exact_scene
+from harness.reference.motion import OdeField, OdeState, build_ode_scene
+from harness.reference.trajectory import CHECK_PERTURBATION as ROUND_OFF
+from harness.reference.trajectory import REFERENCE_MARGIN, UnpredictableMotion
 from harness.scenes.bind import Scene
 from harness.scenes.spec import SceneSpec
 from harness.simulation import step as steps
-from harness.simulation.step import prepare, simulate
+from harness.simulation.step import prepare, simulate_scene
 from solvers.integrators import Motion
 from solvers.methods.explicit import BlanesMoan6
 from solvers.problem import StopRule, Unsupported
 
-PERTURBATION = 1e-9
+START_PERTURBATION = 1e-9
 """Initial perturbation relative to the mesh size: a thousand times the round-off of a thousand steps."""
-LEAST = 1e-11
+MIN_RELATIVE_ERROR = 1e-11
 """Minimum relative error that can be requested: the round-off of a thousand steps is close to it."""
-AT_REST = "nothing moves up to the horizon, and errors are relative to what does"
-_INTERVAL, _SAMPLES = 1 / 30, 30
+AT_REST_REASON = "nothing moves up to the horizon, and errors are relative to what does"
+_SAMPLE_SECONDS, _MIN_SAMPLES = 1 / 30, 30
 """Maximum interval between two samples [s], and minimum number of samples."""
-_LINEAR = 1e3
+_LINEAR_LIMIT = 1e3
 """Growth factor from which on a difference is rescaled; it is then a millionth of the size."""
-_SURE = 0.5
+_HORIZON_SAFETY = 0.5
 """Fraction of the allowed growth at a recommended horizon, since the samples of that horizon differ."""
-_REFINE, _RTOL = 2, 1e-9
+_NUM_REFINEMENTS, _RTOL = 2, 1e-9
 """Accuracy of the two methods: growth up to 1e-2 then equals that of the reference, and smaller steps do not change
 it."""
 
-Advance = Callable[[int, State], State]
+AdvanceFunction = Callable[[int, OdeState], OdeState]
 """Maps an interval index and the states of both motions at its start, concatenated, to those at its end."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Growth:
+class PerturbationGrowth:
     """Growth of a perturbation over a motion.
 
     Attributes:
@@ -63,28 +63,28 @@ class Growth:
     """
 
     times: NDArray[np.float64]
-    moved: NDArray[np.float64]
-    grown: NDArray[np.float64]
+    displacement: NDArray[np.float64]
+    growth_factor: NDArray[np.float64]
     scale: float
 
     @property
-    def least(self) -> float:
+    def min_error(self) -> float:
         """The smallest relative error that can be reached or measured at the end, including round-off."""
-        return _least(float(self.grown[-1]))
+        return _min_error(float(self.growth_factor[-1]))
 
-    def at(self, times: Sequence[float]) -> NDArray[np.float64]:
+    def interpolate_growth(self, times: Sequence[float]) -> NDArray[np.float64]:
         """Return the growth (k,) at other times [s] by interpolation."""
-        return np.interp(times, self.times, self.grown)
+        return np.interp(times, self.times, self.growth_factor)
 
-    def longest(self, error: float) -> float:
+    def compute_longest_horizon(self, error: float) -> float:
         """Return the longest horizon [s] at which a relative error can reliably be measured.
 
         The error can also be reached there. The result is rounded down to three digits, and 0 where there is none.
         """
-        fine = self.times[self.grown <= _SURE * MARGIN * error]
-        return _rounded(floor, float(fine[-1]), 3) if len(fine) and error >= LEAST else 0.0
+        fine = self.times[self.growth_factor <= _HORIZON_SAFETY * REFERENCE_MARGIN * error]
+        return _round_digits(floor, float(fine[-1]), 3) if len(fine) and error >= MIN_RELATIVE_ERROR else 0.0
 
-    def require(self, error: float, times: Sequence[float] = ()) -> None:
+    def require_predictable(self, error: float, times: Sequence[float] = ()) -> None:
         """Require that a relative error can be measured at some times.
 
         Args:
@@ -95,21 +95,21 @@ class Growth:
           Unpredictable: the perturbation has grown too large at one of the times.
         """
         times = times or [float(self.times[-1])]
-        for t, grown in zip(times, self.at(times), strict=True):
-            if _least(grown) > error:
-                raise Unpredictable(
+        for t, grown in zip(times, self.interpolate_growth(times), strict=True):
+            if _min_error(grown) > error:
+                raise UnpredictableMotion(
                     f"after {t:g} s a perturbation of 1e-12 of the size has grown to {grown:.1e} of the displacement: "
-                    f"an error of {error:g} cannot be reached or measured there; {self._instead(error, _least(grown))}"
+                    f"an error of {error:g} cannot be reached or measured there; {self._suggest_alternative(error, _min_error(grown))}"
                 )
 
-    def _instead(self, error: float, least: float) -> str:
-        longest = self.longest(error)
-        possible = [f"an --error of {_rounded(ceil, least, 2):g} or more"] if least < 1.0 else []
+    def _suggest_alternative(self, error: float, least: float) -> str:
+        longest = self.compute_longest_horizon(error)
+        possible = [f"an --error of {_round_digits(ceil, least, 2):g} or more"] if least < 1.0 else []
         possible += [f"a --horizon of {longest:g} s or less"] if longest else []
         return f"ask for {', or '.join(possible) or 'another scene'}"
 
 
-def growth(spec: SceneSpec, size: int, horizon: float) -> Growth:
+def estimate_growth(spec: SceneSpec, size: int, t_end: float) -> PerturbationGrowth:
     """Estimate the growth of a perturbation of a scene's motion up to an end time.
 
     Args:
@@ -121,72 +121,74 @@ def growth(spec: SceneSpec, size: int, horizon: float) -> Growth:
       Unpredictable: nothing moves, or the motion is not finite.
       Unintegrable: the scene has no equation of motion.
     """
-    samples = max(_SAMPLES, ceil(horizon / _INTERVAL * (1.0 - 1e-9)))
-    scene, begun, advance = _motion(spec, size, horizon / samples)
-    half, length = len(begun) // 2, scene.mesh.size or 1.0
+    samples = max(_MIN_SAMPLES, ceil(t_end / _SAMPLE_SECONDS * (1.0 - 1e-9)))
+    scene, begun, advance = _build_motion(spec, size, t_end / samples)
+    half, length = len(begun) // 2, scene.mesh.bounding_box_diagonal or 1.0
     # The round-off of coordinates far from the origin is larger than 1e-12 of the size.
     unit = max(ROUND_OFF * length, float(np.spacing(np.abs(begun[:half]).max(initial=0.0))))
     nudge = np.zeros_like(begun)
-    nudge[:half] = np.random.default_rng(0).choice([-1.0, 1.0], half) * unit * (PERTURBATION / ROUND_OFF)
-    one, two, first, factor = begun, begun + nudge, float(np.linalg.norm(nudge)), ROUND_OFF / PERTURBATION
+    nudge[:half] = np.random.default_rng(0).choice([-1.0, 1.0], half) * unit * (START_PERTURBATION / ROUND_OFF)
+    one, two, first, factor = begun, begun + nudge, float(np.linalg.norm(nudge)), ROUND_OFF / START_PERTURBATION
     moved, grown = np.zeros(samples), np.ones(samples)
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(samples):
             one, two = np.split(advance(k, np.concatenate((one, two))), 2)
             moved[k], apart = (float(np.linalg.norm((y - one)[:half])) for y in (begun, two))
             if not np.isfinite(moved[k] + apart):
-                raise Unpredictable(f"the motion is not finite {(k + 1) * horizon / samples:.3g} s after its start")
+                raise UnpredictableMotion(f"the motion is not finite {(k + 1) * t_end / samples:.3g} s after its start")
             grown[k] = min(1.0, factor * apart / moved[k]) if moved[k] else 1.0
             if grown[k] >= 1.0 and moved[k] > 1e3 * unit * max(1, half) ** 0.5:
                 break
-            if apart > _LINEAR * first:
+            if apart > _LINEAR_LIMIT * first:
                 two, factor = one + (two - one) * (first / apart), factor * apart / first
     if not moved.max() > unit * max(1, half) ** 0.5:
-        raise Unpredictable(AT_REST)
-    times: NDArray[np.float64] = np.linspace(0.0, horizon, samples + 1)[1:]
-    return Growth(times, moved, grown, float(moved[-1]) / max(1, half) ** 0.5)
+        raise UnpredictableMotion(AT_REST_REASON)
+    times: NDArray[np.float64] = np.linspace(0.0, t_end, samples + 1)[1:]
+    return PerturbationGrowth(times, moved, grown, float(moved[-1]) / max(1, half) ** 0.5)
 
 
-def _motion(spec: SceneSpec, size: int, interval: float) -> tuple[Scene, State, Advance]:
+def _build_motion(spec: SceneSpec, size: int, interval: float) -> tuple[Scene, OdeState, AdvanceFunction]:
     """Build the scene, its start, and the function that advances both motions."""
-    scene = bind(spec.stepped(interval), size, "own", warns=False)
-    if not scene.forces and not scene.moving:
+    scene = build_exact_scene(spec.with_time_step(interval), size, "own", show_warnings=False)
+    if not scene.varying_forces and not scene.pin_motions:
         try:
-            ready = prepare(scene, BlanesMoan6(refine=_REFINE))
+            ready = prepare(scene, BlanesMoan6(refine=_NUM_REFINEMENTS))
         except Unsupported:
             pass
         else:
-            field = Field(scene)
+            field = OdeField(scene)
 
-            def composed(k: int, both: State) -> State:
-                ends = list[State]()
+            def composed(k: int, both: OdeState) -> OdeState:
+                ends = list[OdeState]()
                 for y in np.split(both, 2):
-                    p, v = (part.copy() for part in field.motion(k * interval, y))
-                    begun = steps.State(Motion(p, v), None, k)
-                    (done,) = simulate(scene, ready, StopRule(1), first_guess="current", frames=k + 1, state=begun)
-                    ends += [part[scene.system.free].ravel() for part in done.state.now]
+                    p, v = (part.copy() for part in field.unpack_state(k * interval, y))
+                    begun = steps.MotionState(Motion(p, v), None, k)
+                    (done,) = simulate_scene(
+                        scene, ready, StopRule(1), initial_guess="current", frames=k + 1, initial_state=begun
+                    )
+                    ends += [part[scene.system.free_vertices].ravel() for part in done.state.motion]
                 return np.concatenate(ends)
 
-            return scene, field.start, composed
-    scene = moving(spec, size)
-    field = Field(scene)
-    atol = _RTOL * (scene.mesh.size or 1.0)
+            return scene, field.initial_state, composed
+    scene = build_ode_scene(spec, size)
+    field = OdeField(scene)
+    atol = _RTOL * (scene.mesh.bounding_box_diagonal or 1.0)
 
-    def both(t: float, y: State) -> State:
+    def both(t: float, y: OdeState) -> OdeState:
         return np.concatenate([field(t, part) for part in np.split(y, 2)])
 
-    def integrated(k: int, y: State) -> State:
+    def integrated(k: int, y: OdeState) -> OdeState:
         solved = solve_ivp(both, (k * interval, (k + 1) * interval), y, "DOP853", rtol=_RTOL, atol=atol)
         return np.array(solved.y[:, -1]) if solved.success else np.full_like(y, np.nan)
 
-    return scene, field.start, integrated
+    return scene, field.initial_state, integrated
 
 
-def _least(grown: float) -> float:
-    return max(float(grown) / MARGIN, LEAST)
+def _min_error(grown: float) -> float:
+    return max(float(grown) / REFERENCE_MARGIN, MIN_RELATIVE_ERROR)
 
 
-def _rounded(to_whole: Callable[[float], int], x: float, digits: int) -> float:
+def _round_digits(to_whole: Callable[[float], int], x: float, digits: int) -> float:
     """Round to a number of significant digits."""
     shift = digits - 1 - floor(log10(x))
     return round(to_whole(round(x * 10.0**shift, 6)) * 10.0**-shift, max(shift, 0))

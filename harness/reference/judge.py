@@ -14,22 +14,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.reference.curvature import Curvature, curvature
-from harness.reference.exact import FIRM, Stationarity
-from harness.reference.minimiser import TO_THE_END
-from harness.reference.oracle import Reading, sizes
+from harness.reference.curvature import HessianCurvature, compute_curvature
+from harness.reference.exact import PENALTY_FACTOR, StationarityEvaluator
+from harness.reference.minimiser import UNLIMITED_STOP_RULE
+from harness.reference.oracle import StationarityReading, measure_component_sizes
 from harness.scenes.bind import Scene
-from harness.simulation.step import Step, prepare, simulate
+from harness.simulation.step import SimulationStep, prepare, simulate_scene
 from solvers.problem import Positions, Solver, StepProblem
 
-LOST = 1e-6
+MAX_REFERENCE_STATIONARITY = 1e-6
 """Maximum stationarity beyond round-off at the end of a step of the reference run."""
 
 
-class Judge:
+class StepVerifier:
     """Computes the accuracy columns of each step of one run."""
 
-    def __init__(self, scene: Scene, reference: NDArray[np.float64] | None, *, minimises: bool) -> None:
+    def __init__(self, scene: Scene, reference: NDArray[np.float64] | None, *, is_minimiser: bool) -> None:
         """Create a verifier for a scene.
 
         Args:
@@ -38,11 +38,11 @@ class Judge:
             reference.
           is_minimiser: whether the solver minimises the step's objective.
         """
-        self._stationarity = Stationarity()
-        self._sizes = sizes(scene.system, scene.mesh.rest)
-        self._reference, self._minimises = reference, minimises
+        self._stationarity = StationarityEvaluator()
+        self._sizes = measure_component_sizes(scene.system, scene.mesh.rest_positions)
+        self._reference, self._minimises = reference, is_minimiser
 
-    def __call__(self, step: Step) -> dict[str, Any]:
+    def __call__(self, step: SimulationStep) -> dict[str, Any]:
         """Compute the accuracy columns of a step's row.
 
         Columns: `stationarity`, `attainable`, `beyond`, `minimum` and `flat` (absent for a method that does not
@@ -54,23 +54,27 @@ class Judge:
             away = np.linalg.norm(step.positions - self._reference[step.index - 1], axis=1) / self._sizes
             row["distance"] = float(away.max()) if np.isfinite(away).all() else None
         if self._minimises:
-            readings = [self.stationarity(stated, solution.positions) for stated, solution in step.stages]
-            row["stationarity"], row["attainable"], row["beyond"] = max(readings, key=_worse)
-            found = [self.curvature(stated, solution.positions) for stated, solution in step.stages]
-            row["minimum"], row["flat"] = all(one.convex for one in found), any(one.flat for one in found)
+            readings = [self.measure_stationarity(stated, solution.positions) for stated, solution in step.stages]
+            row["stationarity"], row["attainable"], row["beyond"] = max(readings, key=_rank_reading)
+            found = [self.measure_curvature(stated, solution.positions) for stated, solution in step.stages]
+            row["minimum"], row["flat"] = all(one.is_convex for one in found), any(one.is_degenerate for one in found)
         return row
 
-    def stationarity(self, problem: StepProblem, p: Positions) -> Reading:
+    def measure_stationarity(self, problem: StepProblem, p: Positions) -> StationarityReading:
         """Evaluate the stationarity at p (n, 3) [m] (`harness.reference.exact_lengths`)."""
         return self._stationarity(problem, p)
 
-    def curvature(self, problem: StepProblem, p: Positions) -> Curvature:
+    def measure_curvature(self, problem: StepProblem, p: Positions) -> HessianCurvature:
         """Compute the curvature of the objective, or of a Lagrangian with large penalties."""
-        exact = self._stationarity.exact(problem.system)
-        return curvature(exact.lagrangian(problem, exact.tensions(problem, p), FIRM) if exact else problem, p)
+        exact = self._stationarity.get_exact_lengths(problem.system)
+        return compute_curvature(
+            exact.build_lagrangian(problem, exact.compute_tensions(problem, p), PENALTY_FACTOR) if exact else problem, p
+        )
 
 
-def reference(scene: Scene, solver: Solver, *, first_guess: str, frames: int) -> NDArray[np.float64]:
+def compute_reference_positions(
+    scene: Scene, solver: Solver, *, initial_guess: str, frames: int
+) -> NDArray[np.float64]:
     """Compute positions of a run with steps solved to round-off.
 
     Args:
@@ -81,19 +85,27 @@ def reference(scene: Scene, solver: Solver, *, first_guess: str, frames: int) ->
 
     Returns: positions (frames, n, 3) [m], nan from the first step on that does not end at a stationary point.
     """
-    judge, found = Judge(scene, None, minimises=True), np.full((frames, len(scene.mesh.rest), 3), np.nan)
-    for step in simulate(scene, prepare(scene, solver), TO_THE_END, first_guess=first_guess, frames=frames):
-        if not all(judge.stationarity(stated, s.positions).beyond <= LOST for stated, s in step.stages):
+    judge, found = (
+        StepVerifier(scene, None, is_minimiser=True),
+        np.full((frames, len(scene.mesh.rest_positions), 3), np.nan),
+    )
+    for step in simulate_scene(
+        scene, prepare(scene, solver), UNLIMITED_STOP_RULE, initial_guess=initial_guess, frames=frames
+    ):
+        if not all(
+            judge.measure_stationarity(stated, s.positions).above_roundoff <= MAX_REFERENCE_STATIONARITY
+            for stated, s in step.stages
+        ):
             break
         found[step.index - 1] = step.positions
     return found
 
 
-def _worse(reading: Reading) -> float:
+def _rank_reading(reading: StationarityReading) -> float:
     """Return the key by which a reading is ranked; non-finite readings are the worst."""
-    return reading.beyond if np.isfinite(reading.beyond) else np.inf
+    return reading.above_roundoff if np.isfinite(reading.above_roundoff) else np.inf
 
 
 def is_minimum(problem: StepProblem, p: Positions) -> bool:
     """Return whether the objective is convex at p (n, 3) [m], beyond round-off."""
-    return curvature(problem, p).convex
+    return compute_curvature(problem, p).is_convex

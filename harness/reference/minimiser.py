@@ -21,34 +21,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.base.errors import RunFailed
-from harness.reference.curvature import Curvature, across, curvature, definite, free_hessian
-from harness.reference.oracle import sizes
-from harness.simulation.step import guessed
+from harness.reference.curvature import (
+    HessianCurvature,
+    build_free_hessian,
+    compute_curvature,
+    factorise_definite,
+    step_across,
+)
+from harness.reference.oracle import measure_component_sizes
+from harness.simulation.step import apply_initial_guess
 from solvers.problem import Positions, Solver, StepProblem, StopRule
 from solvers.round_off import EPS
 
-TO_THE_END = StopRule(1000)
+UNLIMITED_STOP_RULE = StopRule(1000)
 """Iterate until round-off prevents any further descent: a tolerance would stop at saddles too."""
-NEAR = 1e-9
+CERTIFIED_RTOL = 1e-9
 """Accuracy of a certified minimum relative to the mesh size; two within a hundred times this distance are one."""
-REFACTORISATIONS = 5
+MAX_REFACTORISATIONS = 5
 
 
-class Uncertified(RunFailed):
+class UncertifiedError(RunFailed):
     """There is no certified minimum to compare with."""
 
 
-MINIMUM, VALLEY, FLAT, SADDLE, ROUGH = "minimum", "valley", "flat", "saddle", "rough"
+MINIMUM, VALLEY, FLAT, SADDLE, INACCURATE = "minimum", "valley", "flat", "saddle", "rough"
 """Kinds of points where Newton's method ends: a certified minimum; one of a continuum of minima; a point where no
 curvature is negative and one is zero within round-off; a saddle; a minimum less accurate than CERTIFIED_RTOL."""
-WALK = 1e-3
+WALK_FRACTION = 1e-3
 """Distance along a continuum at which its points are compared, relative to the mesh size."""
-LEVEL = 64.0
+LEVEL_ROUNDOFF = 64.0
 """Factor on eps and the objective's terms within which two values are equal; for sums of up to 1e5 terms."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Minimum:
+class MinimumCertificate:
     """End point of Newton's method, with its certificate.
 
     Attributes:
@@ -63,31 +69,31 @@ class Minimum:
     """
 
     positions: Positions
-    g: float
-    error: float
-    smallest_eigenvalue: float
-    doubt: float
-    near: NDArray[np.float64]
+    objective: float
+    newton_step_length: float
+    min_eigenvalue: float
+    eigenvalue_uncertainty: float
+    position_tolerance: NDArray[np.float64]
     kind: str
 
     @property
-    def certified(self) -> bool:
+    def is_certified(self) -> bool:
         """Whether this is an isolated minimum, accurate to CERTIFIED_RTOL."""
         return self.kind == MINIMUM
 
     @property
-    def flaw(self) -> str:
+    def describe_flaw(self) -> str:
         """The reason why the minimum is not certified."""
-        curvature = f"the smallest eigenvalue is {self.smallest_eigenvalue:.1e} N/m, give or take {self.doubt:.1e} N/m"
+        curvature = f"the smallest eigenvalue is {self.min_eigenvalue:.1e} N/m, give or take {self.eigenvalue_uncertainty:.1e} N/m"
         return {
             VALLEY: f"the minima are a valley, all as low, to whose points no distance means anything: {curvature}",
             FLAT: f"the curvature along some direction is round-off: {curvature}",
             SADDLE: f"it is a saddle: {curvature}",
-            ROUGH: f"its next step is still {self.error:.1e} m: {curvature}",
+            INACCURATE: f"its next step is still {self.newton_step_length:.1e} m: {curvature}",
         }[self.kind]
 
     @property
-    def name(self) -> str:
+    def minimum_id(self) -> str:
         """6 hex digits that do not change when other minima are found later."""
         return hashlib.sha256(self.positions.tobytes()).hexdigest()[:6]
 
@@ -96,43 +102,43 @@ class Minimum:
 class KnownMinima:
     """The known minima of one problem, lowest first; `reason` states why there is none."""
 
-    minima: tuple[Minimum, ...]
+    minima: tuple[MinimumCertificate, ...]
     reason: str = ""
 
     @property
-    def best(self) -> Minimum:
+    def lowest(self) -> MinimumCertificate:
         """The lowest known minimum; raises UncertifiedError where there is none."""
         if not self.minima:
-            raise Uncertified(self.reason)
+            raise UncertifiedError(self.reason)
         return self.minima[0]
 
-    def branch(self, minimum: Minimum) -> int:
+    def find_index(self, minimum: MinimumCertificate) -> int:
         """Return the index of a minimum, identified by its positions."""
-        return next(i for i, known in enumerate(self.minima) if _same(known, minimum))
+        return next(i for i, known in enumerate(self.minima) if _is_same_minimum(known, minimum))
 
-    def joined(self, found: Minimum) -> KnownMinima:
+    def add_minimum(self, found: MinimumCertificate) -> KnownMinima:
         """Return the known minima with another, if it is new and certified."""
-        if not found.certified or any(_same(known, found) for known in self.minima):
+        if not found.is_certified or any(_is_same_minimum(known, found) for known in self.minima):
             return self
-        return KnownMinima(tuple(sorted((*self.minima, found), key=lambda minimum: minimum.g)))
+        return KnownMinima(tuple(sorted((*self.minima, found), key=lambda minimum: minimum.objective)))
 
 
 def find_minima(problem: StepProblem, solver: Solver) -> KnownMinima:
     """Find the minima that Newton's method reaches from current positions and inertial target."""
-    guesses = (guessed(problem, name).first_guess for name in ("current", "inertial"))
-    return reference(polish(problem, guess, solver) for guess in guesses)
+    guesses = (apply_initial_guess(problem, name).initial_guess for name in ("current", "inertial"))
+    return collect_minima(refine_minimum(problem, guess, solver) for guess in guesses)
 
 
-def reference(found: Iterable[Minimum]) -> KnownMinima:
+def collect_minima(found: Iterable[MinimumCertificate]) -> KnownMinima:
     """Collect the certified minima; where there is none, the reason."""
     known, reason = KnownMinima(()), ""
     for one in found:
-        known = known.joined(one)
-        reason = reason if one.certified else f"no certified minimum: Newton's method ends where {one.flaw}"
+        known = known.add_minimum(one)
+        reason = reason if one.is_certified else f"no certified minimum: Newton's method ends where {one.describe_flaw}"
     return known if known.minima else KnownMinima((), reason)
 
 
-def polish(problem: StepProblem, p: Positions, solver: Solver) -> Minimum:
+def refine_minimum(problem: StepProblem, p: Positions, solver: Solver) -> MinimumCertificate:
     """Find and certify the minimum of the basin of p.
 
     Args:
@@ -140,37 +146,39 @@ def polish(problem: StepProblem, p: Positions, solver: Solver) -> Minimum:
       p: positions (n, 3) [m].
       solver: Newton's method.
     """
-    solution = solver.prepare(problem.system).solve(replace(problem, first_guess=p), TO_THE_END)
-    return certify(problem, solution.positions)
+    solution = solver.prepare(problem.system).solve(replace(problem, initial_guess=p), UNLIMITED_STOP_RULE)
+    return certify_minimum(problem, solution.positions)
 
 
-def certify(problem: StepProblem, p: Positions) -> Minimum:
+def certify_minimum(problem: StepProblem, p: Positions) -> MinimumCertificate:
     """Refine p (n, 3) [m], near a minimum, by Newton steps, and certify it.
 
     The steps continue to round-off. The certificate contains the curvature, the objective and the length of one more
     step at the final point.
     """
-    p = _pinned(problem, p)
-    near = NEAR * sizes(problem.system, p)
-    found = curvature(problem, p)
-    if found.convex:
-        _descend(problem, p, near)
-        found = curvature(problem, p)
-    step = _step(problem, p)
+    p = _place_pins(problem, p)
+    near = CERTIFIED_RTOL * measure_component_sizes(problem.system, p)
+    found = compute_curvature(problem, p)
+    if found.is_convex:
+        _refine_by_newton(problem, p, near)
+        found = compute_curvature(problem, p)
+    step = _newton_step(problem, p)
     p.flags.writeable = False
     length = np.inf if step is None else float(np.linalg.norm(step, axis=1).max(initial=0.0))
-    known = step is not None and bool((np.linalg.norm(step, axis=1) <= near[problem.system.free]).all())
-    kind = MINIMUM if found.convex and known else SADDLE if found.falls else ROUGH
-    if found.flat:
-        kind = VALLEY if _level(problem, p, found, near) else FLAT
-    return Minimum(p, problem.value(p), length, found.smallest, found.doubt, near, kind)
+    known = step is not None and bool((np.linalg.norm(step, axis=1) <= near[problem.system.free_vertices]).all())
+    kind = MINIMUM if found.is_convex and known else SADDLE if found.is_saddle else INACCURATE
+    if found.is_degenerate:
+        kind = VALLEY if _is_continuum(problem, p, found, near) else FLAT
+    return MinimumCertificate(
+        p, problem.value(p), length, found.min_eigenvalue, found.eigenvalue_uncertainty, near, kind
+    )
 
 
-def _descend(problem: StepProblem, p: Positions, near: NDArray[np.float64]) -> None:
+def _refine_by_newton(problem: StepProblem, p: Positions, near: NDArray[np.float64]) -> None:
     """Apply Newton steps to p in place while each halves the previous length."""
-    free = problem.system.free
-    for _ in range(REFACTORISATIONS):
-        solve = definite(free_hessian(problem, p))
+    free = problem.system.free_vertices
+    for _ in range(MAX_REFACTORISATIONS):
+        solve = factorise_definite(build_free_hessian(problem, p))
         if solve is None:
             return
         begun, error = p.copy(), np.inf
@@ -185,38 +193,38 @@ def _descend(problem: StepProblem, p: Positions, near: NDArray[np.float64]) -> N
             return
 
 
-def _step(problem: StepProblem, p: Positions) -> Positions | None:
+def _newton_step(problem: StepProblem, p: Positions) -> Positions | None:
     """Compute Newton's step (f, 3) [m] at p; None where the Hessian has no factor."""
-    free = problem.system.free
-    solve = definite(free_hessian(problem, p)) if len(free) else np.copy
+    free = problem.system.free_vertices
+    solve = factorise_definite(build_free_hessian(problem, p)) if len(free) else np.copy
     return solve(problem.gradient(p)[free].ravel()).reshape(-1, 3) if solve else None
 
 
-def _level(problem: StepProblem, p: Positions, found: Curvature, near: NDArray[np.float64]) -> bool:
+def _is_continuum(problem: StepProblem, p: Positions, found: HessianCurvature, near: NDArray[np.float64]) -> bool:
     """Return whether the minima form a continuum.
 
     The objective is compared on both sides of p along the degenerate direction.
     """
-    lowest, noise = problem.value(p), LEVEL * EPS * problem.magnitude(p)
-    for way in (WALK, -WALK):
-        q = p + way / NEAR * float(near.max()) * found.direction / np.abs(found.direction).max()
-        for _ in range(REFACTORISATIONS):
-            here = curvature(problem, q)
-            if here.falls or not np.isfinite(here.smallest):
+    lowest, noise = problem.value(p), LEVEL_ROUNDOFF * EPS * problem.value_scale(p)
+    for way in (WALK_FRACTION, -WALK_FRACTION):
+        q = p + way / CERTIFIED_RTOL * float(near.max()) * found.direction / np.abs(found.direction).max()
+        for _ in range(MAX_REFACTORISATIONS):
+            here = compute_curvature(problem, q)
+            if here.is_saddle or not np.isfinite(here.min_eigenvalue):
                 return False
-            q = across(problem, q, here, most=WALK)
+            q = step_across(problem, q, here, max_fraction=WALK_FRACTION)
         if not abs(problem.value(q) - lowest) <= noise:
             return False
     return True
 
 
-def _pinned(problem: StepProblem, p: Positions) -> Positions:
+def _place_pins(problem: StepProblem, p: Positions) -> Positions:
     """Return a copy of p with the exactly pinned vertices at their targets."""
     pins, placed = problem.system.pins, p.copy()
-    placed[pins.vertices[pins.exact]] = problem.pin_targets[pins.exact]
+    placed[pins.vertices[pins.exact_mask]] = problem.pin_targets[pins.exact_mask]
     return placed
 
 
-def _same(one: Minimum, other: Minimum) -> bool:
+def _is_same_minimum(one: MinimumCertificate, other: MinimumCertificate) -> bool:
     apart = np.linalg.norm(one.positions - other.positions, axis=1)
-    return bool((apart <= 100.0 * one.near).all())
+    return bool((apart <= 100.0 * one.position_tolerance).all())

@@ -17,29 +17,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.base.errors import RunFailed
-from harness.reference.frozen import bind
+from harness.reference.frozen import build_exact_scene
 from harness.scenes.bind import Scene
 from harness.scenes.spec import SceneSpec
-from harness.simulation.step import start
-from solvers.compiling import kernel
-from solvers.contact.touching import without_contact
-from solvers.energies.springs import TINY, Springs
-from solvers.problem import Positions, Start, is_lagged
+from harness.simulation.step import build_initial_state
+from solvers.compiling import jit_kernel
+from solvers.contact.touching import without_vertex_contact
+from solvers.energies.springs import ZERO_LENGTH, Springs
+from solvers.problem import Positions, StepStart, is_lagged
 
-Reals = NDArray[np.float64]
-State = Reals
+RealArray = NDArray[np.float64]
+OdeState = RealArray
 """Positions [m] and velocities [m/s] of the free vertices, concatenated, shape (6 f,)."""
 
-TICK = 1e-5
+FINITE_DIFFERENCE_SECONDS = 1e-5
 """Interval [s] of the finite difference for the velocity of moving pins, which only damping uses. It is accurate to ten
 digits, but rounds a corner of their path."""
 
 
-class Unintegrable(RunFailed):
+class NotIntegrable(RunFailed):
     """The scene has no ordinary differential equation for all of its free vertices."""
 
 
-class Field:
+class OdeField:
     """F of a scene whose pins are exact."""
 
     def __init__(self, scene: Scene, *, compiled: bool = True) -> None:
@@ -53,85 +53,88 @@ class Field:
           NotIntegrable: the scene has no equations of motion.
         """
         system = scene.system
-        self._scene, self._free, self._system = scene, system.free, system
+        self._scene, self._free, self._system = scene, system.free_vertices, system
         self._mass = system.mass[self._free, None]
         if not (self._mass > 0.0).all():
-            raise Unintegrable("vertices without mass have no acceleration; give them mass or pin them")
-        if not system.pins.exact.all():
-            raise Unintegrable("pins by penalty vibrate faster than can be followed; make them exact")
-        if system.lengths:
-            raise Unintegrable("lengths that are exact make it no differential equation; give them a stiffness")
-        if without_contact(system) is not system:
-            raise Unintegrable("contact is stiff, and its friction begins anew each step; leave it out")
-        x = scene.springs
+            raise NotIntegrable("vertices without mass have no acceleration; give them mass or pin them")
+        if not system.pins.exact_mask.all():
+            raise NotIntegrable("pins by penalty vibrate faster than can be followed; make them exact")
+        if system.length_constraints:
+            raise NotIntegrable("lengths that are exact make it no differential equation; give them a stiffness")
+        if without_vertex_contact(system) is not system:
+            raise NotIntegrable("contact is stiff, and its friction begins anew each step; leave it out")
+        x = scene.all_springs
         arrays = x.edges, x.stiffness, x.rest_length, x.rest_direction
         self._springs = arrays if compiled else None
         self._others = tuple(energy for energy in system.energies if not (compiled and isinstance(energy, Springs)))
-        self._drag = _drag(scene)
-        self._p, self._v = scene.mesh.rest.copy(), np.zeros_like(scene.mesh.rest)
-        self._p[system.pins.vertices] = scene.pins_at(0.0)
+        self._drag = _measure_drag(scene)
+        self._p, self._v = scene.mesh.rest_positions.copy(), np.zeros_like(scene.mesh.rest_positions)
+        self._p[system.pins.vertices] = scene.pin_targets_at(0.0)
 
     @property
-    def start(self) -> State:
+    def initial_state(self) -> OdeState:
         """The initial state of the scene (6 f,)."""
-        return np.concatenate([part[self._free].ravel() for part in start(self._scene).now])
+        return np.concatenate([part[self._free].ravel() for part in build_initial_state(self._scene).motion])
 
-    def motion(self, t: float, y: State) -> tuple[Positions, Positions]:
+    def unpack_state(self, t: float, y: OdeState) -> tuple[Positions, Positions]:
         """Return positions [m] and velocities [m/s] of all vertices, overwritten by the next call."""
         self._p[self._free], self._v[self._free] = y.reshape(2, -1, 3)
-        if self._scene.moving:
-            held, h = self._system.pins.vertices, TICK
-            self._p[held] = self._scene.pins_at(t)
-            self._v[held] = (self._scene.pins_at(t + h) - self._scene.pins_at(t - h)) / (2.0 * h)
+        if self._scene.pin_motions:
+            held, h = self._system.pins.vertices, FINITE_DIFFERENCE_SECONDS
+            self._p[held] = self._scene.pin_targets_at(t)
+            self._v[held] = (self._scene.pin_targets_at(t + h) - self._scene.pin_targets_at(t - h)) / (2.0 * h)
         return self._p, self._v
 
-    def __call__(self, t: float, y: State) -> State:
+    def __call__(self, t: float, y: OdeState) -> OdeState:
         """Evaluate F(t, y)."""
-        p, v = self.motion(t, y)
-        push = np.negative(self._scene.load)
+        p, v = self.unpack_state(t, y)
+        push = np.negative(self._scene.constant_force)
         if self._springs:
             add_springs(p, *self._springs, push)
         if self._others:
-            rate = self._system.rate
-            here = Start(p, v, t, p - v / rate, rate, t)
+            rate = self._system.velocity_rate
+            here = StepStart(p, v, t, p - v / rate, rate, t)
             for energy in self._others:
                 (energy.begin_step(here) if is_lagged(energy) else energy).add_gradient(p, push)
-        for force in self._scene.forces:
+        for force in self._scene.varying_forces:
             push -= force(p, v, t)
         out = np.empty_like(y).reshape(2, -1, 3)
         out[0] = v[self._free]
         out[1] = -push[self._free] / self._mass - self._drag * out[0]
         return out.reshape(-1)
 
-    def witness(self) -> State:
+    def evaluate_fingerprint(self) -> OdeState:
         """Evaluate F at a strained and moving state, as a fingerprint of the equations."""
-        y = self.start
-        return self(0.5, y + 0.01 * (self._scene.mesh.size or 1.0) * np.random.default_rng(1).normal(size=y.shape))
+        y = self.initial_state
+        return self(
+            0.5,
+            y + 0.01 * (self._scene.mesh.bounding_box_diagonal or 1.0) * np.random.default_rng(1).normal(size=y.shape),
+        )
 
 
-def moving(spec: SceneSpec, size: int) -> Scene:
+def build_ode_scene(spec: SceneSpec, size: int) -> Scene:
     """Build a scene with equations of motion; raises NotIntegrable.
 
     Velocity filters without an equation of motion are converted to forces.
     """
-    scene = bind(spec, size)
+    scene = build_exact_scene(spec, size)
     try:
-        Field(scene)
-    except Unintegrable:
-        if not scene.filters:
+        OdeField(scene)
+    except NotIntegrable:
+        if not scene.velocity_filters:
             raise
-        scene = bind(spec, size, "own")
-        Field(scene)
+        scene = build_exact_scene(spec, size, "own")
+        OdeField(scene)
     return scene
 
 
-@kernel
+@jit_kernel
 def add_springs(
     p: Positions,
     edges: NDArray[np.int64],
-    stiffness: Reals,
-    rest_length: Reals,
-    direction: Reals,
+    stiffness: RealArray,
+    rest_length: RealArray,
+    direction: RealArray,
     out: Positions,
 ) -> None:
     """Add the springs' gradient [N] to `out` (n, 3).
@@ -151,7 +154,7 @@ def add_springs(
         x, y, z = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2]
         length = np.sqrt(x * x + y * y + z * z)
         pull = stiffness[e] * (length - rest_length[e])
-        if length > TINY:
+        if length > ZERO_LENGTH:
             fx, fy, fz = pull / length * x, pull / length * y, pull / length * z
         else:
             fx, fy, fz = pull * direction[e, 0], pull * direction[e, 1], pull * direction[e, 2]
@@ -163,10 +166,10 @@ def add_springs(
         out[j, 2] -= fz
 
 
-def _drag(scene: Scene) -> float:
+def _measure_drag(scene: Scene) -> float:
     """Return the rate of the scene's ether drag [1/s]; raises NotIntegrable for any other filter."""
-    v = np.random.default_rng(0).uniform(1.0, 2.0, scene.mesh.rest.shape)
-    kept = reduce(lambda v, filtered: filtered(v), scene.filters, v) / v
+    v = np.random.default_rng(0).uniform(1.0, 2.0, scene.mesh.rest_positions.shape)
+    kept = reduce(lambda v, filtered: filtered(v), scene.velocity_filters, v) / v
     if not kept.min() > 0.0 or np.ptp(kept) > 1e-12 * kept.max():
-        raise Unintegrable("a filter of the velocity that does not scale all of it by one positive factor")
+        raise NotIntegrable("a filter of the velocity that does not scale all of it by one positive factor")
     return -log(float(np.mean(kept))) / scene.system.time_step

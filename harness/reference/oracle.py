@@ -30,22 +30,22 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
 from solvers.linear.multigrid import Multigrid
-from solvers.matrices import assemble, energy_norm
+from solvers.matrices import assemble_system_matrix, energy_norm
 from solvers.problem import Positions, ProjectiveEnergy, StepProblem, System
-from solvers.round_off import FACTOR, gradient_round_off, within
+from solvers.round_off import ROUNDOFF_FACTOR, clip_to_roundoff, gradient_roundoff
 
-LARGEST = 1_500_000
+MAX_DIRECT_NNZ = 1_500_000
 """Entries of Q up to which its factor takes seconds at most: sheets of some 150,000 vertices, solids of 50,000."""
 
-ACCURACY = 1e-9
+MULTIGRID_RTOL = 1e-9
 """Tolerance of conjugate gradients relative to the scaled gradient norm |D^-1/2 g|, D the diagonal of Q. It gives four
 digits of |Q^-1 g|_Q where a heavy pin contributes nearly all of g, and more elsewhere. The limit is
 MAX_CG_ITERATIONS."""
 
-MOST = 500
+MAX_CG_ITERATIONS = 500
 
 
-class Reading(NamedTuple):
+class StationarityReading(NamedTuple):
     """Stationarity of a point.
 
     Attributes:
@@ -54,61 +54,61 @@ class Reading(NamedTuple):
       above_roundoff: the share that round-off does not explain.
     """
 
-    reached: float
-    attainable: float
-    beyond: float
+    stationarity: float
+    roundoff_bound: float
+    above_roundoff: float
 
 
-class Oracle:
+class ReferenceEvaluator:
     """Evaluator of the residuals of step problems of one system."""
 
     def __init__(self, system: System) -> None:
         """Assemble Q; raises NotPositiveDefinite."""
         self._system = system
-        self._Q = stiffness(system)
+        self._Q = assemble_stiffness(system)
         self._known: tuple[StepProblem, float] | None = None
 
     @cached_property
-    def _free(self) -> csr_array:
-        free = self._system.free
+    def _free_matrix(self) -> csr_array:
+        free = self._system.free_vertices
         return csr_array(self._Q[free][:, free])
 
     @cached_property
     def _factor(self) -> Any:
-        return symmetric_lu(self._free)
+        return factorise_symmetric_lu(self._free_matrix)
 
     @cached_property
     def _multigrid(self) -> Multigrid:
-        return Multigrid(self._free)
+        return Multigrid(self._free_matrix)
 
     def _solve(self, right: Positions) -> Positions:
         """Return Q^-1 (f, 3) [m] of a right-hand side (f, 3) [N] of free vertices."""
-        Q = self._free
-        if Q.nnz <= LARGEST:
+        Q = self._free_matrix
+        if Q.nnz <= MAX_DIRECT_NNZ:
             return self._factor.solve(right)
         half = Q.diagonal()[:, None] ** -0.5
         of_all: Any = {"shape": (right.size, right.size), "dtype": np.dtype(np.float64)}  # columns side by side
         product = LinearOperator(matvec=lambda x: (half * (Q @ (half * x.reshape(-1, 3)))).ravel(), **of_all)
-        near = LinearOperator(matvec=lambda r: (self._near(r.reshape(-1, 3) / half) / half).ravel(), **of_all)
-        found, _ = cg(product, (half * right).ravel(), rtol=ACCURACY, maxiter=MOST, M=near)
+        near = LinearOperator(matvec=lambda r: (self._apply_v_cycle(r.reshape(-1, 3) / half) / half).ravel(), **of_all)
+        found, _ = cg(product, (half * right).ravel(), rtol=MULTIGRID_RTOL, maxiter=MAX_CG_ITERATIONS, M=near)
         return half * found.reshape(-1, 3)
 
-    def _near(self, right: Positions) -> Positions:
+    def _apply_v_cycle(self, right: Positions) -> Positions:
         """Apply a V-cycle in float32 to a right-hand side (f, 3)."""
         size = float(np.abs(right).max(initial=0.0)) or 1.0
         self._multigrid.right_hand_side[:, :3] = right / size
-        return size * self._multigrid.apply()[:, :3].astype(np.float64)
+        return size * self._multigrid.apply_cycle()[:, :3].astype(np.float64)
 
-    def residual(self, problem: StepProblem, p: Positions) -> float:
+    def compute_residual(self, problem: StepProblem, p: Positions) -> float:
         """Compute |Q^-1 grad g(p)|_Q [J^(1/2)] over the unpinned vertices."""
-        return self.length(problem.gradient(p))
+        return self.compute_energy_norm(problem.gradient(p))
 
-    def length(self, gradient: Positions) -> float:
+    def compute_energy_norm(self, gradient: Positions) -> float:
         """Compute |Q^-1 g|_Q [J^(1/2)] of a gradient (n, 3) [N]; infinite on overflow.
 
         The norm is over the unpinned vertices.
         """
-        free, e = self._system.free, np.zeros_like(gradient)
+        free, e = self._system.free_vertices, np.zeros_like(gradient)
         if len(free):
             e[free] = self._solve(gradient[free])
         e[self._system.pins.vertices] = 0.0
@@ -116,24 +116,26 @@ class Oracle:
             length = energy_norm(self._Q, e)
         return length if np.isfinite(length) else np.inf
 
-    def floor(self, problem: StepProblem, p: Positions) -> float:
+    def bound_roundoff(self, problem: StepProblem, p: Positions) -> float:
         """Bound the round-off of the residual [J^(1/2)] at p."""
-        return self._floor(gradient_round_off(problem, p))
+        return self._bound_roundoff(gradient_roundoff(problem, p))
 
-    def _floor(self, bound: NDArray[np.float64]) -> float:
+    def _bound_roundoff(self, bound: NDArray[np.float64]) -> float:
         """Bound the residual's round-off [J^(1/2)] from that of the gradient (n,) [N]."""
-        loose = self._system.unpinned
+        loose = self._system.unpinned_mask
         with np.errstate(over="ignore"):
-            return FACTOR * float(np.sqrt(np.sum(bound[loose] ** 2 / self._Q.diagonal()[loose])))
+            return ROUNDOFF_FACTOR * float(np.sqrt(np.sum(bound[loose] ** 2 / self._Q.diagonal()[loose])))
 
-    def yardstick(self, problem: StepProblem) -> float:
+    def compute_initial_residual(self, problem: StepProblem) -> float:
         """Compute the initial residual [J^(1/2)], or its round-off bound if larger."""
         if self._known is None or self._known[0] is not problem:
-            floor = max(self.floor(problem, problem.current), np.finfo(float).tiny)
-            self._known = problem, max(self.residual(problem, problem.current), floor)
+            floor = max(self.bound_roundoff(problem, problem.current_positions), np.finfo(float).tiny)
+            self._known = problem, max(self.compute_residual(problem, problem.current_positions), floor)
         return self._known[1]
 
-    def stationarity(self, problem: StepProblem, p: Positions, yardstick: float | None = None) -> Reading:
+    def measure_stationarity(
+        self, problem: StepProblem, p: Positions, initial_residual: float | None = None
+    ) -> StationarityReading:
         """Measure the stationarity of p.
 
         Args:
@@ -141,25 +143,25 @@ class Oracle:
           p: positions (n, 3) [m].
           initial_residual: residual [J^(1/2)] that the result is relative to; that of the problem if omitted.
         """
-        yardstick = self.yardstick(problem) if yardstick is None else yardstick
-        gradient, bound = problem.gradient(p), gradient_round_off(problem, p)
-        reached = self.length(gradient) / yardstick
-        doubtless = gradient - within(gradient, FACTOR * bound)
-        beyond = min(reached, self.length(doubtless) / yardstick)
-        return Reading(reached, self._floor(bound) / yardstick, beyond)
+        initial_residual = self.compute_initial_residual(problem) if initial_residual is None else initial_residual
+        gradient, bound = problem.gradient(p), gradient_roundoff(problem, p)
+        reached = self.compute_energy_norm(gradient) / initial_residual
+        doubtless = gradient - clip_to_roundoff(gradient, ROUNDOFF_FACTOR * bound)
+        beyond = min(reached, self.compute_energy_norm(doubtless) / initial_residual)
+        return StationarityReading(reached, self._bound_roundoff(bound) / initial_residual, beyond)
 
 
-def stiffness(system: System) -> csr_array:
+def assemble_stiffness(system: System) -> csr_array:
     """Assemble Q (n, n) [N/m] of a system's projective energies; raises NotPositiveDefinite."""
-    return assemble(system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)])
+    return assemble_system_matrix(system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)])
 
 
-def sizes(system: System, p: Positions) -> NDArray[np.float64]:
+def measure_component_sizes(system: System, p: Positions) -> NDArray[np.float64]:
     """Measure the size (n,) [m] of each vertex's component at p (n, 3) [m]."""
-    return component_sizes(stiffness(system), p)
+    return measure_graph_components(assemble_stiffness(system), p)
 
 
-def component_sizes(graph: csr_array, p: Positions) -> NDArray[np.float64]:
+def measure_graph_components(graph: csr_array, p: Positions) -> NDArray[np.float64]:
     """Measure the bounding box diagonal (n,) [m] of each vertex's component of a graph.
 
     A component without extent is assigned the median size of those that have one, and 1 m where none has.
@@ -178,7 +180,7 @@ def component_sizes(graph: csr_array, p: Positions) -> NDArray[np.float64]:
     return size[label]
 
 
-def symmetric_lu(matrix: csr_array) -> Any:
+def factorise_symmetric_lu(matrix: csr_array) -> Any:
     """Factorise a symmetric matrix by SuperLU with diagonal pivots; raises RuntimeError for zero ones."""
     settings: Any = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
     return splu(matrix.tocsc(), **settings)

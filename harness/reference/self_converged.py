@@ -17,38 +17,38 @@ from time import thread_time
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.reference.trajectory import MARGIN, Trajectory, Unpredictable
+from harness.reference.trajectory import REFERENCE_MARGIN, ReferenceTrajectory, UnpredictableMotion
 from harness.scenes.bind import Scene
-from harness.simulation.step import prepare, simulate, start
-from solvers.contact.touching import without_contact
-from solvers.methods.newton import Newton
+from harness.simulation.step import build_initial_state, prepare, simulate_scene
+from solvers.contact.touching import without_vertex_contact
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import Positions, StopRule, System
 
-INTEGRATORS = ("implicit-euler", "bdf2")
+LIMIT_INTEGRATORS = ("implicit-euler", "bdf2")
 """Integrators that support contact."""
-SPENT = 60.0
+MAX_SECONDS = 60.0
 """Limit on the processor time [s] for a reference."""
-LARGEST = 0.05
+MAX_RELATIVE_ERROR = 0.05
 """Relative error for which a reference is always accurate enough."""
-_SOLVED = StopRule(100, 1e-6)
-_APART = 4.0
+_SOLVED_STOP_RULE = StopRule(100, 1e-6)
+_DISAGREEMENT_FACTOR = 4.0
 """Ratio of the distance between two limits to the last change by step halving above which the limits differ."""
 
-Bound = Callable[[float, str], Scene]
+SceneBuilder = Callable[[float, str], Scene]
 """Builds the scene from a step size [s] and the name of an integrator."""
 
 
-class NotConverged(Unpredictable):
+class NotConverged(UnpredictableMotion):
     """The motion has no limit that is known accurately enough."""
 
 
-def touches(system: System) -> bool:
+def has_contact(system: System) -> bool:
     """Return whether a system has contact."""
-    return without_contact(system) is not system
+    return without_vertex_contact(system) is not system
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SelfConverged(Trajectory):
+class SelfConvergedTrajectory(ReferenceTrajectory):
     """Self-converged reference trajectory.
 
     Attributes:
@@ -58,30 +58,30 @@ class SelfConverged(Trajectory):
     """
 
     step: float
-    moved_last: float
+    last_change: float
 
     @property
-    def truth(self) -> str:
+    def reference_kind(self) -> str:
         """The kind of the reference."""
         return "self-converged"
 
     @property
-    def differ(self) -> bool:
+    def has_disagreement(self) -> bool:
         """Whether the integrators differ by more than step halving explains."""
-        return float(self.disagreement[-1]) > _APART * self.moved_last
+        return float(self.disagreement[-1]) > _DISAGREEMENT_FACTOR * self.last_change
 
-    def require(self, error: float) -> None:
+    def require_accuracy(self, error: float) -> None:
         """Raise NotConverged where a relative error cannot be measured at one of the times."""
         for t, apart in zip(self.times, self.disagreement, strict=True):
-            if apart <= MARGIN * error:
+            if apart <= REFERENCE_MARGIN * error:
                 continue
             why = (
                 "the limits of implicit Euler and BDF2 differ: what an impact gives back, and what friction acts "
                 "against, depend on the integrator"
-                if self.differ
-                else f"halving the steps further takes more than {SPENT:g} s"
+                if self.has_disagreement
+                else f"halving the steps further takes more than {MAX_SECONDS:g} s"
             )
-            least = apart / MARGIN
+            least = apart / REFERENCE_MARGIN
             can = f"ask for an error of {least:.1g} or more, or a shorter horizon" if least < 1.0 else "none can be had"
             raise NotConverged(
                 f"contact has no certified reference, and after {t:g} s its self-converged one is known to {apart:.1e} "
@@ -90,7 +90,9 @@ class SelfConverged(Trajectory):
             )
 
 
-def converge(bound: Bound, frame: float, times: Sequence[float], error: float) -> SelfConverged:
+def compute_self_converged(
+    bound: SceneBuilder, frame: float, times: Sequence[float], error: float
+) -> SelfConvergedTrajectory:
     """Compute a self-converged motion at given times.
 
     Args:
@@ -103,26 +105,29 @@ def converge(bound: Bound, frame: float, times: Sequence[float], error: float) -
       NotConverged: not even two step sizes could be compared.
     """
     steps, began = max(1, round(times[-1] / frame)), thread_time()
-    before: dict[str, _Motion] | None = None
-    found: SelfConverged | None = None
+    before: dict[str, _SampledMotion] | None = None
+    found: SelfConvergedTrajectory | None = None
     while True:
-        motions = {name: _motion(bound(times[-1] / steps, name), times, began + SPENT) for name in INTEGRATORS}
+        motions = {
+            name: _sample_motion(bound(times[-1] / steps, name), times, began + MAX_SECONDS)
+            for name in LIMIT_INTEGRATORS
+        }
         if any(motion is None for motion in motions.values()):
             break
         ends = {name: motion for name, motion in motions.items() if motion}
         if before:
-            found = _compared(ends, before, times, times[-1] / steps)
-            wanted = MARGIN * min(error, LARGEST)
-            if found.disagreement.max() <= wanted or (found.differ and found.moved_last <= wanted):
+            found = _compare_motions(ends, before, times, times[-1] / steps)
+            wanted = REFERENCE_MARGIN * min(error, MAX_RELATIVE_ERROR)
+            if found.disagreement.max() <= wanted or (found.has_disagreement and found.last_change <= wanted):
                 break
         before, steps = ends, 2 * steps
     if found is None:
-        raise NotConverged(f"contact has no certified reference, and two motions take longer than {SPENT:g} s")
+        raise NotConverged(f"contact has no certified reference, and two motions take longer than {MAX_SECONDS:g} s")
     return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Motion:
+class _SampledMotion:
     """A sampled motion.
 
     Attributes:
@@ -132,60 +137,62 @@ class _Motion:
       velocities: velocities (k, n, 3) [m/s].
     """
 
-    free: NDArray[np.int64]
-    begin: Positions
+    free_vertices: NDArray[np.int64]
+    start_positions: Positions
     positions: Positions
     velocities: Positions
 
 
-def _motion(scene: Scene, times: Sequence[float], until: float) -> _Motion | None:
+def _sample_motion(scene: Scene, times: Sequence[float], until: float) -> _SampledMotion | None:
     """Sample the motion at the given times; None if the time limit is exceeded."""
     h = scene.system.time_step
     wanted = [round(t / h) for t in times]
     if any(abs(k * h - t) > 1e-9 * times[-1] for k, t in zip(wanted, times, strict=True)):
         raise NotConverged("the times are no whole numbers of steps")
     kept: dict[int, tuple[Positions, Positions]] = {}
-    run = simulate(scene, prepare(scene, Newton()), _SOLVED, first_guess="current", frames=wanted[-1])
+    run = simulate_scene(
+        scene, prepare(scene, NewtonSolver()), _SOLVED_STOP_RULE, initial_guess="current", frames=wanted[-1]
+    )
     for step in run:
         if not np.isfinite(step.positions).all():
             raise NotConverged(f"the motion is not finite from {step.index * h:.3g} s on")
         if step.index in wanted:
-            kept[step.index] = step.positions.copy(), step.state.now.velocity.copy()
+            kept[step.index] = step.positions.copy(), step.state.motion.velocity.copy()
         if thread_time() > until and step.index < wanted[-1]:
             return None
     p, v = (np.array([kept[k][i] for k in wanted]) for i in (0, 1))
-    return _Motion(scene.system.free, start(scene).now.positions, p, v)
+    return _SampledMotion(scene.system.free_vertices, build_initial_state(scene).motion.positions, p, v)
 
 
-def _compared(
-    now: dict[str, _Motion], before: dict[str, _Motion], times: Sequence[float], step: float
-) -> SelfConverged:
-    first, second = (now[name] for name in INTEGRATORS)
-    free = second.free
+def _compare_motions(
+    now: dict[str, _SampledMotion], before: dict[str, _SampledMotion], times: Sequence[float], step: float
+) -> SelfConvergedTrajectory:
+    first, second = (now[name] for name in LIMIT_INTEGRATORS)
+    free = second.free_vertices
 
     def size(x: Positions) -> NDArray[np.float64]:
         return np.linalg.norm(x[:, free], axis=(1, 2))
 
-    moved = size(second.positions - second.begin)
+    moved = size(second.positions - second.start_positions)
     if not moved.all():
         raise NotConverged("nothing moves, and errors are relative to what does")
-    halved = [size(now[name].positions - before[name].positions) for name in INTEGRATORS]
+    halved = [size(now[name].positions - before[name].positions) for name in LIMIT_INTEGRATORS]
     apart = size(first.positions - second.positions)
     most = np.max([*halved, apart], axis=0) / moved
-    return SelfConverged(
+    return SelfConvergedTrajectory(
         times=np.array(times, float),
-        free=free,
+        free_vertices=free,
         positions=second.positions,
         velocities=second.velocities,
-        moved=moved,
+        displacement=moved,
         disagreement=most,
         growth=np.zeros(len(times)),
         step=step,
-        moved_last=float(np.max(halved, axis=0)[-1] / moved[-1]),
+        last_change=float(np.max(halved, axis=0)[-1] / moved[-1]),
     )
 
 
-def told_once(name: str) -> str:
+def describe_self_convergence(name: str) -> str:
     """Return the note that is shown for a scene with contact before anything is measured."""
     return (
         f"{name}: contact has no certified reference; errors are by a self-converged motion (implicit Euler and BDF2, "

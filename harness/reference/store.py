@@ -19,27 +19,36 @@ from typing import Any
 
 import numpy as np
 
-from harness.base.files import replacing
-from harness.reference.frozen import Arrays, Frozen, agree, bind, freeze, moment_frames, reference_run, thaw
-from harness.reference.growth import Growth, growth
-from harness.reference.minimiser import MINIMUM, KnownMinima, Minimum, find_minima, polish
-from harness.reference.motion import Field, moving
-from harness.reference.self_converged import SelfConverged, converge, touches
-from harness.reference.trajectory import Told, Trajectory, integrate
+from harness.base.files import atomic_write
+from harness.reference.frozen import (
+    Arrays,
+    StepSnapshot,
+    build_exact_scene,
+    is_equal_to_roundoff,
+    restore_snapshot,
+    run_reference,
+    save_snapshot,
+    select_snapshot_frames,
+)
+from harness.reference.growth import PerturbationGrowth, estimate_growth
+from harness.reference.minimiser import MINIMUM, KnownMinima, MinimumCertificate, find_minima, refine_minimum
+from harness.reference.motion import OdeField, build_ode_scene
+from harness.reference.self_converged import SelfConvergedTrajectory, compute_self_converged, has_contact
+from harness.reference.trajectory import ProgressFunction, ReferenceTrajectory, integrate_motion
 from harness.scenes.bind import Scene
 from harness.scenes.spec import IntegratorName, SceneSpec
-from harness.simulation.step import Step
-from solvers.methods.newton import Newton
+from harness.simulation.step import SimulationStep
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import Positions, Solver
 
-_CERTIFICATE = ("positions", "g", "error", "smallest_eigenvalue", "doubt", "near")
+_CERTIFICATE_FIELDS = ("positions", "g", "error", "smallest_eigenvalue", "doubt", "near")
 """Stored fields of a minimum: the complete certificate of the stored point."""
-_INTEGRATED = tuple(f.name for f in fields(Trajectory) if f.name != "growth")
+_TRAJECTORY_FIELDS = tuple(f.name for f in fields(ReferenceTrajectory) if f.name != "growth")
 """Stored fields of a trajectory; the growth of perturbations has its own file."""
 
 
 @dataclass(frozen=True, slots=True)
-class Store:
+class ReferenceStore:
     """Store of all references in one folder, shared by all users of the same scenes.
 
     Attributes:
@@ -48,9 +57,11 @@ class Store:
     """
 
     folder: Path
-    solver: Solver = field(default_factory=Newton)
+    solver: Solver = field(default_factory=NewtonSolver)
 
-    def moments(self, spec: SceneSpec, size: int, integrator: IntegratorName = "implicit-euler") -> dict[str, Frozen]:
+    def load_snapshots(
+        self, spec: SceneSpec, size: int, integrator: IntegratorName = "implicit-euler"
+    ) -> dict[str, StepSnapshot]:
         """Load or compute the snapshots SNAPSHOT_NAMES of the scene's `frames` steps.
 
         Args:
@@ -62,20 +73,20 @@ class Store:
           InputError: the scene cannot be built.
           RunFailed: a step of the reference run does not converge.
         """
-        asked = _Asked(spec, size, integrator)
+        asked = _ReferenceRequest(spec, size, integrator)
         path = self.folder / f"run-{asked.name}.npz"
-        violence = _read(path)["violence"] if path.exists() else np.empty(0)
-        moments = moment_frames(violence, spec.frames)
-        known = self._known(asked, moments.values()) if len(violence) == spec.frames else {}
+        violence = _read_arrays(path)["violence"] if path.exists() else np.empty(0)
+        moments = select_snapshot_frames(violence, spec.frames)
+        known = self._load_known_snapshots(asked, moments.values()) if len(violence) == spec.frames else {}
         if not set(moments.values()) <= set(known):
-            steps, violence = reference_run(asked.scene, self.solver, spec.frames)
-            _write(path, {"violence": violence})
-            known, moments = self._keep(asked, steps), moment_frames(violence, spec.frames)
+            steps, violence = run_reference(asked.scene, self.solver, spec.frames)
+            _write_arrays(path, {"violence": violence})
+            known, moments = self._save_steps(asked, steps), select_snapshot_frames(violence, spec.frames)
         return {moment: known[frame] for moment, frame in moments.items()}
 
-    def frames(
+    def load_frames(
         self, spec: SceneSpec, size: int, frames: Collection[int], integrator: IntegratorName = "implicit-euler"
-    ) -> dict[int, Frozen]:
+    ) -> dict[int, StepSnapshot]:
         """Load or compute the snapshots of given frames.
 
         A run continues from the last stored snapshot before the first missing one.
@@ -90,44 +101,52 @@ class Store:
           InputError: the scene cannot be built.
           RunFailed: a step of the reference run does not converge.
         """
-        asked = _Asked(spec, size, integrator)
-        known = self._known(asked, frames)
+        asked = _ReferenceRequest(spec, size, integrator)
+        known = self._load_known_snapshots(asked, frames)
         if missing := set(frames) - set(known):
             there = range(min(missing) - 1, 0, -1)
-            before = next((one for frame in there for one in self._known(asked, [frame]).values()), None)
+            before = next((one for frame in there for one in self._load_known_snapshots(asked, [frame]).values()), None)
             state = before.state if before else None
-            steps, _ = reference_run(asked.scene, self.solver, max(missing), missing, state)
-            known |= self._keep(asked, steps)
+            steps, _ = run_reference(asked.scene, self.solver, max(missing), missing, state)
+            known |= self._save_steps(asked, steps)
         return {frame: known[frame] for frame in frames}
 
-    def reference(self, frozen: Frozen) -> KnownMinima:
+    def find_minima(self, frozen: StepSnapshot) -> KnownMinima:
         """Load the known minima of a problem, or find them.
 
         `lowest` of the result raises UncertifiedError if there is none.
         """
         path = self.folder / f"minima-{frozen.digest}.npz"
-        if path.exists() and (stored := _read(path)).keys() >= set(_CERTIFICATE):  # else by code that certified less
-            return _minima(stored)
+        if path.exists() and (stored := _read_arrays(path)).keys() >= set(
+            _CERTIFICATE_FIELDS
+        ):  # else by code that certified less
+            return _build_minima(stored)
         found = find_minima(frozen.problem, self.solver)
         if found.minima:
-            self._remember(frozen, found)
+            self._save_minima(frozen, found)
         return found
 
-    def classify(self, frozen: Frozen, p: Positions) -> Minimum:
+    def classify_minimum(self, frozen: StepSnapshot, p: Positions) -> MinimumCertificate:
         """Find the minimum in whose basin p (n, 3) [m] is.
 
         A new certified minimum is added to the known ones, and becomes the reference if it is the lowest. Its index is
         `find_minima(snapshot).find_index(minimum)` where it is certified.
         """
-        found, known = polish(frozen.problem, p, self.solver), self.reference(frozen)
-        joined = known.joined(found)
+        found, known = refine_minimum(frozen.problem, p, self.solver), self.find_minima(frozen)
+        joined = known.add_minimum(found)
         if joined is not known:
-            self._remember(frozen, joined)
-        return joined.minima[joined.branch(found)] if found.certified else found
+            self._save_minima(frozen, joined)
+        return joined.minima[joined.find_index(found)] if found.is_certified else found
 
-    def trajectory(
-        self, spec: SceneSpec, size: int, times: Sequence[float], *, error: float, told: Told | None = None
-    ) -> Trajectory:
+    def load_trajectory(
+        self,
+        spec: SceneSpec,
+        size: int,
+        times: Sequence[float],
+        *,
+        error: float,
+        report_progress: ProgressFunction | None = None,
+    ) -> ReferenceTrajectory:
         """Load or compute a reference trajectory at given times.
 
         It is the same for every step size of the scene. With contact it is self-converged, starting with steps of about
@@ -145,23 +164,25 @@ class Store:
           NotIntegrable: the scene has no equations of motion.
           UnpredictableMotion: the reference would not be accurate enough.
         """
-        name = _named(spec, size, times)
-        if touches(bind(spec, size).system):
-            return self._converged(self.folder / f"converged-{name}.npz", spec, size, times, error)
-        seen = self.growth(spec, size, times[-1])
-        seen.require(error, times)
-        scene = moving(spec, size)
-        witness, path = Field(scene).witness(), self.folder / f"trajectory-{name}.npz"
-        stored: dict[str, Any] = dict(_read(path)) if path.exists() else {}
-        if stored and agree(stored.pop("witness"), witness):
-            found = Trajectory(**{key: stored[key] for key in _INTEGRATED}, growth=seen.at(times))
+        name = _build_motion_name(spec, size, times)
+        if has_contact(build_exact_scene(spec, size).system):
+            return self._load_self_converged(self.folder / f"converged-{name}.npz", spec, size, times, error)
+        seen = self.load_growth(spec, size, times[-1])
+        seen.require_predictable(error, times)
+        scene = build_ode_scene(spec, size)
+        witness, path = OdeField(scene).evaluate_fingerprint(), self.folder / f"trajectory-{name}.npz"
+        stored: dict[str, Any] = dict(_read_arrays(path)) if path.exists() else {}
+        if stored and is_equal_to_roundoff(stored.pop("witness"), witness):
+            found = ReferenceTrajectory(
+                **{key: stored[key] for key in _TRAJECTORY_FIELDS}, growth=seen.interpolate_growth(times)
+            )
         else:
-            found = replace(integrate(scene, times, told), growth=seen.at(times))
-            _write(path, {key: getattr(found, key) for key in _INTEGRATED} | {"witness": witness})
-        found.require(error)
+            found = replace(integrate_motion(scene, times, report_progress), growth=seen.interpolate_growth(times))
+            _write_arrays(path, {key: getattr(found, key) for key in _TRAJECTORY_FIELDS} | {"witness": witness})
+        found.require_accuracy(error)
         return found
 
-    def growth(self, spec: SceneSpec, size: int, horizon: float) -> Growth:
+    def load_growth(self, spec: SceneSpec, size: int, t_end: float) -> PerturbationGrowth:
         """Load or estimate the growth of a perturbation up to an end time [s].
 
         Args:
@@ -173,78 +194,82 @@ class Store:
           UnpredictableMotion: nothing moves, or the motion is not finite.
           NotIntegrable: the scene has no equations of motion.
         """
-        witness = Field(moving(spec, size)).witness()
-        path = self.folder / f"growth-{_named(spec, size, [horizon])}.npz"
-        stored: dict[str, Any] = dict(_read(path)) if path.exists() else {}
-        if stored and agree(stored.pop("witness"), witness):
-            return Growth(scale=float(stored.pop("scale")), **stored)
-        found = growth(spec, size, horizon)
-        arrays = {f.name: np.asarray(getattr(found, f.name)) for f in fields(Growth)}
-        _write(path, arrays | {"witness": witness})
+        witness = OdeField(build_ode_scene(spec, size)).evaluate_fingerprint()
+        path = self.folder / f"growth-{_build_motion_name(spec, size, [t_end])}.npz"
+        stored: dict[str, Any] = dict(_read_arrays(path)) if path.exists() else {}
+        if stored and is_equal_to_roundoff(stored.pop("witness"), witness):
+            return PerturbationGrowth(scale=float(stored.pop("scale")), **stored)
+        found = estimate_growth(spec, size, t_end)
+        arrays = {f.name: np.asarray(getattr(found, f.name)) for f in fields(PerturbationGrowth)}
+        _write_arrays(path, arrays | {"witness": witness})
         return found
 
-    def _converged(self, path: Path, spec: SceneSpec, size: int, times: Sequence[float], error: float) -> SelfConverged:
+    def _load_self_converged(
+        self, path: Path, spec: SceneSpec, size: int, times: Sequence[float], error: float
+    ) -> SelfConvergedTrajectory:
         """Load the self-converged trajectory if stored for such an error, else compute it.
 
         Its fingerprint is its first step.
         """
-        witness = next(iter(reference_run(bind(spec, size), self.solver, 1, [1])[0].values())).positions
-        stored: dict[str, Any] = dict(_read(path)) if path.exists() else {}
-        known = bool(stored) and agree(stored.pop("witness"), witness)
+        witness = next(iter(run_reference(build_exact_scene(spec, size), self.solver, 1, [1])[0].values())).positions
+        stored: dict[str, Any] = dict(_read_arrays(path)) if path.exists() else {}
+        known = bool(stored) and is_equal_to_roundoff(stored.pop("witness"), witness)
         if known and float(stored.pop("error")) <= error:
             plain = {key: stored.pop(key).item() for key in ("step", "moved_last")}
-            found = SelfConverged(**stored, **plain)
+            found = SelfConvergedTrajectory(**stored, **plain)
         else:
-            found = converge(lambda h, name: bind(spec.stepped(h), size, name), spec.time_step, times, error)
-            arrays = {f.name: np.asarray(getattr(found, f.name)) for f in fields(SelfConverged)}
-            _write(path, arrays | {"witness": witness, "error": np.asarray(error)})
-        found.require(error)
+            found = compute_self_converged(
+                lambda h, name: build_exact_scene(spec.with_time_step(h), size, name), spec.time_step, times, error
+            )
+            arrays = {f.name: np.asarray(getattr(found, f.name)) for f in fields(SelfConvergedTrajectory)}
+            _write_arrays(path, arrays | {"witness": witness, "error": np.asarray(error)})
+        found.require_accuracy(error)
         return found
 
-    def _known(self, asked: _Asked, frames: Iterable[int]) -> dict[int, Frozen]:
+    def _load_known_snapshots(self, asked: _ReferenceRequest, frames: Iterable[int]) -> dict[int, StepSnapshot]:
         """Load those of the snapshots that are on disk and match the present scene."""
-        paths = [path for path in (self._problem(asked, frame) for frame in frames) if path.exists()]
-        thawed = [thaw(_read(path), asked.scene) for path in paths]
+        paths = [path for path in (self._snapshot_path(asked, frame) for frame in frames) if path.exists()]
+        thawed = [restore_snapshot(_read_arrays(path), asked.scene) for path in paths]
         return {one.frame: one for one in thawed if one}
 
-    def _problem(self, asked: _Asked, frame: int) -> Path:
+    def _snapshot_path(self, asked: _ReferenceRequest, frame: int) -> Path:
         return self.folder / f"problem-{asked.name}-{frame}.npz"
 
-    def _keep(self, asked: _Asked, steps: dict[int, Step]) -> dict[int, Frozen]:
-        kept: dict[int, Frozen] = {}
+    def _save_steps(self, asked: _ReferenceRequest, steps: dict[int, SimulationStep]) -> dict[int, StepSnapshot]:
+        kept: dict[int, StepSnapshot] = {}
         for frame, step in steps.items():
-            kept[frame], arrays = freeze(step, asked.name)
-            _write(self._problem(asked, frame), arrays)
+            kept[frame], arrays = save_snapshot(step, asked.name)
+            _write_arrays(self._snapshot_path(asked, frame), arrays)
         return kept
 
-    def _remember(self, frozen: Frozen, known: KnownMinima) -> None:
-        arrays = {name: np.array([getattr(minimum, name) for minimum in known.minima]) for name in _CERTIFICATE}
-        _write(self.folder / f"minima-{frozen.digest}.npz", arrays)
+    def _save_minima(self, frozen: StepSnapshot, known: KnownMinima) -> None:
+        arrays = {name: np.array([getattr(minimum, name) for minimum in known.minima]) for name in _CERTIFICATE_FIELDS}
+        _write_arrays(self.folder / f"minima-{frozen.digest}.npz", arrays)
 
 
-class _Asked:
+class _ReferenceRequest:
     """A scene of one size with one integrator, and its name in file names."""
 
     def __init__(self, spec: SceneSpec, size: int, integrator: IntegratorName) -> None:
-        self.scene: Scene = bind(spec, size, integrator)
-        self.name = f"{spec.digest[:12]}-{size}-{integrator}"
+        self.scene: Scene = build_exact_scene(spec, size, integrator)
+        self.name = f"{spec.scene_digest[:12]}-{size}-{integrator}"
 
 
-def _named(spec: SceneSpec, size: int, times: Sequence[float]) -> str:
+def _build_motion_name(spec: SceneSpec, size: int, times: Sequence[float]) -> str:
     """Return the part of a file name that identifies a motion.
 
     It consists of the scene without its step size, its size, and the times.
     """
-    return f"{spec.stepped(1.0).digest[:12]}-{size}-{'-'.join(f'{t:.9g}' for t in times)}"
+    return f"{spec.with_time_step(1.0).scene_digest[:12]}-{size}-{'-'.join(f'{t:.9g}' for t in times)}"
 
 
-def _minima(arrays: Arrays) -> KnownMinima:
+def _build_minima(arrays: Arrays) -> KnownMinima:
     numbers = (arrays[name].tolist() for name in ("g", "error", "smallest_eigenvalue", "doubt"))
     columns = zip(arrays["positions"], *numbers, arrays["near"], strict=True)
-    return KnownMinima(tuple(Minimum(*values, kind=MINIMUM) for values in columns))
+    return KnownMinima(tuple(MinimumCertificate(*values, kind=MINIMUM) for values in columns))
 
 
-def _read(path: Path) -> Arrays:
+def _read_arrays(path: Path) -> Arrays:
     with np.load(path, allow_pickle=False) as stored:
         arrays = dict(stored)
     for array in arrays.values():
@@ -252,7 +277,7 @@ def _read(path: Path) -> Arrays:
     return arrays
 
 
-def _write(path: Path, arrays: Arrays) -> None:
+def _write_arrays(path: Path, arrays: Arrays) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as partial:
+    with atomic_write(path) as partial:
         np.savez(partial, allow_pickle=False, **arrays)

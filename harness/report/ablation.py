@@ -17,39 +17,41 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-from harness.base.rows import read as read_rows
+from harness.base.rows import read_rows as read_rows
 
-Row = Mapping[str, Any]
+ResultRow = Mapping[str, Any]
 
-CAPTION = "CPU time: mean over frames of medians over rounds; displacements in mean rest lengths, energy of the largest"
+ABLATION_CAPTION = (
+    "CPU time: mean over frames of medians over rounds; displacements in mean rest lengths, energy of the largest"
+)
 
-PRICES = (
+OVERHEAD_CAPTION = (
     "CPU time, medians over rounds; ≥ lower bound of reading the effect's numbers once; confidence intervals in rows"
 )
 
 
-def read(path: Path) -> list[dict[str, Any]]:
+def read_ablation(path: Path) -> list[dict[str, Any]]:
     """Return the rows of an ablation file."""
     return read_rows([path], pa.schema([])).to_pylist()
 
 
-def of_kind(rows: Sequence[Row], kind: str) -> list[Row]:
+def select_kind(rows: Sequence[ResultRow], kind: str) -> list[ResultRow]:
     """Return the rows of one kind, in their order."""
     return [row for row in rows if row["kind"] == kind]
 
 
-def known_error(rows: Sequence[Row]) -> tuple[float, str]:
+def largest_known_error(rows: Sequence[ResultRow]) -> tuple[float, str]:
     """Return the largest known error of the scene and its source.
 
     Returns: the displacement error [mean rest lengths] and a phrase that names its source; (nan, "") if no error is
     known.
     """
-    known = [(row["largest"], row["name"]) for row in of_kind(rows, "error") if row["status"] == "ok"]
+    known = [(row["largest"], row["name"]) for row in select_kind(rows, "error") if row["status"] == "ok"]
     size, name = max(known, default=(float("nan"), ""))
     return size, {"solver": "the solver's own error", "time-step": "the time step's error", "": ""}[name]
 
 
-def verdict(row: Row, rows: Sequence[Row]) -> str:
+def describe_effect(row: ResultRow, rows: Sequence[ResultRow]) -> str:
     """Describe the cost and the influence of one effect in a sentence.
 
     Args:
@@ -58,23 +60,23 @@ def verdict(row: Row, rows: Sequence[Row]) -> str:
     """
     if row["status"] == "impossible":
         return f"the scene is impossible without it ({row['reason']})"
-    (whole,) = of_kind(rows, "whole")
-    price, moved = _price(row, whole["seconds"]), row["largest"]
+    (whole,) = select_kind(rows, "whole")
+    price, moved = _describe_cost(row, whole["seconds"]), row["largest"]
     if not moved:
         return f"{price}, changes nothing at all: leave it out"
-    moves = f"{price}, moves vertices by {_figure(moved)} rest lengths"
+    moves = f"{price}, moves vertices by {_format_two_digits(moved)} rest lengths"
     if moved > row["extent"]:
         return f"{moves}, further than the mesh is large: without it this is another scene"
-    error, whose = known_error(rows)
+    error, whose = largest_known_error(rows)
     if not whose:
         return f"{moves}; by how much the scene is wrong anyway is not known"
     if moved <= error:
-        return f"{moves}, less than {whose} of {_figure(error)}: this scene does not call for it at this accuracy"
-    return f"{moves}, more than {whose} of {_figure(error)}: this scene calls for it"
+        return f"{moves}, less than {whose} of {_format_two_digits(error)}: this scene does not call for it at this accuracy"
+    return f"{moves}, more than {whose} of {_format_two_digits(error)}: this scene calls for it"
 
 
-def _price(row: Row, whole: float) -> str:
-    share, low, high = (row[key] / whole for key in ("cost", "cost_low", "cost_high"))
+def _describe_cost(row: ResultRow, full_run: float) -> str:
+    share, low, high = (row[key] / full_run for key in ("cost", "cost_low", "cost_high"))
     if low <= 0.0 <= high:
         return f"no time that could be measured ({100 * low:+.1f} to {100 * high:+.1f} %)"
     if share < 0.0:
@@ -82,18 +84,18 @@ def _price(row: Row, whole: float) -> str:
     return f"{100 * share:.0f} % of the time" if share >= 0.095 else f"{100 * share:.1f} % of the time"
 
 
-def _figure(value: float) -> str:
+def _format_two_digits(value: float) -> str:
     """Format a number with two significant digits, and without an exponent from 100 on."""
     return f"{value:.2g}" if value < 100 else f"{value:.0f}"
 
 
-def _relative(value: float) -> str:
+def _format_energy_change(value: float) -> str:
     return f"{100 * value:.1f} %" if value < 10.0 else f"{value:.2g} x"
 
 
-def ablation_table(rows: Sequence[Row]) -> Table:
+def build_ablation_table(rows: Sequence[ResultRow]) -> Table:
     """Build a table with one row per effect: its cost, and what changes without it."""
-    (whole,) = of_kind(rows, "whole")
+    (whole,) = select_kind(rows, "whole")
     headings = (
         "without",
         "CPU ms a step",
@@ -106,17 +108,17 @@ def ablation_table(rows: Sequence[Row]) -> Table:
         "energy",
         "centre",
     )
-    table = Table(box=SIMPLE_HEAD, caption=CAPTION)
+    table = Table(box=SIMPLE_HEAD, caption=ABLATION_CAPTION)
     for i, heading in enumerate(headings):
         table.add_column(heading, justify="right" if i else "left")
     size = f"{whole['bytes'] / 1024:,.0f}"
-    table.add_row("nothing", f"{1e3 * whole['seconds']:.3g}", "100", "", size, _count(whole["nnz_factor"], ""))
-    for row in of_kind(rows, "without"):
+    table.add_row("nothing", f"{1e3 * whole['seconds']:.3g}", "100", "", size, _format_count(whole["nnz_factor"], ""))
+    for row in select_kind(rows, "without"):
         if row["status"] != "ok":
             table.add_row(escape(row["name"]), row["status"])
             continue
         share = [100 * row[key] / whole["seconds"] for key in ("cost", "cost_low", "cost_high")]
-        fill = "" if row["nnz_factor"] is None else _count(whole["nnz_factor"] - row["nnz_factor"], "+")
+        fill = "" if row["nnz_factor"] is None else _format_count(whole["nnz_factor"] - row["nnz_factor"], "+")
         table.add_row(
             escape(row["name"]),
             f"{1e3 * row['cost']:.3g}",
@@ -124,47 +126,54 @@ def ablation_table(rows: Sequence[Row]) -> Table:
             f"{share[1]:.1f} to {share[2]:.1f}",
             f"{(whole['bytes'] - row['bytes']) / 1024:+,.0f}",
             fill,
-            _figure(row["largest"]),
-            _figure(row["rms"]),
-            _relative(row["energy"]),
-            _figure(row["centre"]),
+            _format_two_digits(row["largest"]),
+            _format_two_digits(row["rms"]),
+            _format_energy_change(row["energy"]),
+            _format_two_digits(row["centre"]),
         )
-    for row in of_kind(rows, "error"):
+    for row in select_kind(rows, "error"):
         ok = row["status"] == "ok"
-        found = (_figure(row["largest"]), _figure(row["rms"]), _relative(row["energy"]), _figure(row["centre"]))
+        found = (
+            _format_two_digits(row["largest"]),
+            _format_two_digits(row["rms"]),
+            _format_energy_change(row["energy"]),
+            _format_two_digits(row["centre"]),
+        )
         table.add_row(f"error of the {row['name']}", *[""] * 5, *found) if ok else table.add_row(
             f"error of the {row['name']}", row["status"]
         )
     return table
 
 
-def price_table(rows: Sequence[Row]) -> Table:
+def build_overhead_table(rows: Sequence[ResultRow]) -> Table:
     """Build a table of overheads with one row per effect and one column per solver.
 
     Each overhead is followed by its lower bound.
     """
-    found = {(row["name"], row["solver"]): row for row in of_kind(rows, "price")}
+    found = {(row["name"], row["solver"]): row for row in select_kind(rows, "price")}
     effects, solvers = (list(dict.fromkeys(key[k] for key in found)) for k in (0, 1))
-    table = Table(box=SIMPLE_HEAD, title="an iteration with the effect over one without", caption=PRICES)
+    table = Table(box=SIMPLE_HEAD, title="an iteration with the effect over one without", caption=OVERHEAD_CAPTION)
     for i, heading in enumerate(("effect", *solvers)):
         table.add_column(heading, justify="right" if i else "left")
     for effect in effects:
         cells = [found[effect, solver] for solver in solvers]
-        table.add_row(escape(effect), *(_priced(row) if row["status"] == "ok" else row["status"] for row in cells))
+        table.add_row(
+            escape(effect), *(_format_overhead(row) if row["status"] == "ok" else row["status"] for row in cells)
+        )
     return table
 
 
-def _priced(row: Row) -> str:
+def _format_overhead(row: ResultRow) -> str:
     return f"{row['price']:.2f} ≥{row['price_bound']:.2f}"
 
 
-def sentences(rows: Sequence[Row]) -> list[str]:
+def summarise_ablation(rows: Sequence[ResultRow]) -> list[str]:
     """Return sentences on all effects, on suggested effects, and on errors that are unknown."""
-    said = [f"{row['name']}: {verdict(row, rows)}" for row in of_kind(rows, "without")]
-    said += [f"not listed: {row['name']}: {row['reason']}" for row in of_kind(rows, "suggestion")]
-    unknown = [row for row in of_kind(rows, "error") if row["status"] != "ok"]
+    said = [f"{row['name']}: {describe_effect(row, rows)}" for row in select_kind(rows, "without")]
+    said += [f"not listed: {row['name']}: {row['reason']}" for row in select_kind(rows, "suggestion")]
+    unknown = [row for row in select_kind(rows, "error") if row["status"] != "ok"]
     return said + [f"error of the {row['name']}: unknown ({row['reason']})" for row in unknown]
 
 
-def _count(number: int | None, sign: str) -> str:
+def _format_count(number: int | None, sign: str) -> str:
     return "" if number is None else f"{number:{sign},}"

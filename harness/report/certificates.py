@@ -13,10 +13,10 @@ from pathlib import Path
 import pyarrow as pa
 from pyarrow import csv
 
-from harness.base.files import replacing
-from harness.report.sql import answers
+from harness.base.files import atomic_write
+from harness.report.sql import query_records
 
-_QUERY = """
+_CERTIFICATE_QUERY = """
 select scene, size, max(vertices) as vertices, solver, parameters, any_value(status) as status, max(frame) as frames,
     count(distinct frame) filter (phase = 'step' and intersections = 0) as free,
     count(distinct frame) filter (phase = 'step' and stopped in ('tolerance', 'floor')) as converged,
@@ -24,7 +24,7 @@ select scene, size, max(vertices) as vertices, solver, parameters, any_value(sta
 from rows_of group by run_id, scene, size, solver, parameters order by scene, size, solver, parameters, frames"""
 
 
-def certificates(rows: pa.Table, folder: Path) -> list[Path]:
+def write_certificates(rows: pa.Table, folder: Path) -> list[Path]:
     """Write certificates.csv and return its path.
 
     The columns are: the run, its status, its frames, the number of intersection-free frames, the number of steps that
@@ -36,6 +36,6 @@ def certificates(rows: pa.Table, folder: Path) -> list[Path]:
         folder: folder that the file is written to.
     """
     path = folder / "certificates.csv"
-    with replacing(path) as partial:
-        csv.write_csv(pa.Table.from_pylist(answers(_QUERY, rows)), partial)
+    with atomic_write(path) as partial:
+        csv.write_csv(pa.Table.from_pylist(query_records(_CERTIFICATE_QUERY, rows)), partial)
     return [path]

@@ -16,15 +16,15 @@ from typing import NamedTuple
 
 import pyarrow as pa
 
-from harness.report.page import count, factor
-from harness.report.sql import answer
-from solvers.device import SIMULATED
+from harness.report.page import format_count, format_factor
+from harness.report.sql import query_table
+from solvers.device import SIMULATOR_NAME
 
-ALIKE = 1.05
+SIMILAR_TIME_RATIO = 1.05
 """Times within this factor count as equal: neither side is faster."""
 
 
-class Run(NamedTuple):
+class DeviceRun(NamedTuple):
     """One run of a sweep.
 
     Attributes:
@@ -34,26 +34,28 @@ class Run(NamedTuple):
         has_converged: whether all steps ended at their tolerance.
     """
 
-    place: str
+    computer: str
     scene: str
     size: int
-    tolerance: float | None
+    residual_rtol: float | None
     solver: str
-    asked: bool
+    device_requested: bool
     device: str | None
     vertices: int | None
     status: str
     reason: str | None
     seconds: float | None
-    reached: bool | None
+    has_converged: bool | None
 
     @property
-    def got_there(self) -> bool:
+    def reached_target(self) -> bool:
         """Whether the steps had a target residual and all of them reached it."""
-        return bool(self.status == "ok" and self.tolerance and self.reached and self.vertices and self.seconds)
+        return bool(
+            self.status == "ok" and self.residual_rtol and self.has_converged and self.vertices and self.seconds
+        )
 
 
-_RUNS = """
+_RUNS_QUERY = """
 select coalesce(any_value(machine), '') || coalesce(any_value(node), ''), any_value(scene), any_value("size"),
     any_value(tolerance), any_value(solver), coalesce(any_value(parameters) like '%"device": "cuda"%', false),
     any_value(device), any_value(vertices),
@@ -64,149 +66,157 @@ from rows_of group by run_id order by any_value("size"), any_value(solver), run_
 """
 
 
-class Pair(NamedTuple):
+class DevicePair(NamedTuple):
     """The fastest run on each side for one residual and one mesh.
 
     A side is None if none of its runs reached the residual.
     """
 
     vertices: int
-    there: Run | None
-    here: Run | None
+    device_run: DeviceRun | None
+    cpu_run: DeviceRun | None
 
     @property
-    def ratio(self) -> float | None:
+    def speedup(self) -> float | None:
         """The processor's time divided by the device's; None unless both sides reached the residual."""
-        if self.there and self.here and self.there.seconds and self.here.seconds:
-            return self.here.seconds / self.there.seconds
+        if self.device_run and self.cpu_run and self.device_run.seconds and self.cpu_run.seconds:
+            return self.cpu_run.seconds / self.device_run.seconds
         return None
 
 
-Panel = tuple[str, float]
+ScenePanel = tuple[str, float]
 """A scene, and the residual tolerance of its steps."""
 
 
-def runs(table: pa.Table) -> list[Run]:
+def read_device_runs(table: pa.Table) -> list[DeviceRun]:
     """Return the runs of a sweep from its rows (schema: `harness.results.run_schema.RUN_SCHEMA`).
 
     The list is empty if no run requested a device.
     """
-    found = [_on_one(Run(*row)) for row in answer(_RUNS, table)]
-    return found if any(run.asked for run in found) else []
+    found = [_mark_simulator_run(DeviceRun(*row)) for row in query_table(_RUNS_QUERY, table)]
+    return found if any(run.device_requested for run in found) else []
 
 
-def _on_one(run: Run) -> Run:
+def _mark_simulator_run(run: DeviceRun) -> DeviceRun:
     """Mark a run in the simulator as unsupported.
 
     Its times are not those of a device.
     """
-    return run._replace(status="unsupported", reason=SIMULATED) if run.device == SIMULATED else run
+    return run._replace(status="unsupported", reason=SIMULATOR_NAME) if run.device == SIMULATOR_NAME else run
 
 
-def pairs(found: Sequence[Run]) -> dict[Panel, list[Pair]]:
+def pair_fastest_runs(all_runs: Sequence[DeviceRun]) -> dict[ScenePanel, list[DevicePair]]:
     """Return device pairs by scene and tolerance, in order of the number of vertices.
 
     Only computers with a successful run on a device count.
     """
-    places = {run.place for run in found if run.asked and run.status == "ok"}
-    groups: dict[Panel, dict[tuple[str, int], list[Run]]] = defaultdict(lambda: defaultdict(list))
-    for run in found:
-        if run.place in places and run.got_there:
-            groups[run.scene, run.tolerance or 0.0][run.place, run.vertices or 0].append(run)
+    places = {run.computer for run in all_runs if run.device_requested and run.status == "ok"}
+    groups: dict[ScenePanel, dict[tuple[str, int], list[DeviceRun]]] = defaultdict(lambda: defaultdict(list))
+    for run in all_runs:
+        if run.computer in places and run.reached_target:
+            groups[run.scene, run.residual_rtol or 0.0][run.computer, run.vertices or 0].append(run)
     order = sorted(groups, key=lambda panel: (panel[0], -panel[1]))
     return {
-        panel: sorted((_pair(at, mine) for (_, at), mine in groups[panel].items()), key=lambda p: p.vertices)
+        panel: sorted((_build_pair(at, mine) for (_, at), mine in groups[panel].items()), key=lambda p: p.vertices)
         for panel in order
     }
 
 
-def _pair(vertices: int, mine: Sequence[Run]) -> Pair:
+def _build_pair(vertices: int, runs_of_mesh: Sequence[DeviceRun]) -> DevicePair:
     there, here = (
-        min((run for run in mine if run.asked == on), key=lambda run: run.seconds or 0.0, default=None)
+        min(
+            (run for run in runs_of_mesh if run.device_requested == on),
+            key=lambda run: run.seconds or 0.0,
+            default=None,
+        )
         for on in (True, False)
     )
-    return Pair(vertices, there, here)
+    return DevicePair(vertices, there, here)
 
 
-def pays_from(compared: Sequence[Pair]) -> Pair | None:
+def find_break_even(device_pairs: Sequence[DevicePair]) -> DevicePair | None:
     """Return the smallest mesh from which on the device is faster, or None.
 
     Only meshes where both sides converged count.
     """
-    both = [pair for pair in compared if pair.ratio is not None]
+    both = [pair for pair in device_pairs if pair.speedup is not None]
     first = None
     for pair in reversed(both):
-        if (pair.ratio or 0.0) <= ALIKE:
+        if (pair.speedup or 0.0) <= SIMILAR_TIME_RATIO:
             break
         first = pair
     return first
 
 
-def told(table: pa.Table, config: str) -> list[str]:
+def summarise_table(table: pa.Table, config: str) -> list[str]:
     """Summarise the device runs of a sweep's rows in sentences.
 
     Args:
         table: rows of the sweep.
         config: path of the sweep's config; "" if it no longer exists.
     """
-    return words(runs(table), config)
+    return summarise_runs(read_device_runs(table), config)
 
 
-def words(found: Sequence[Run], config: str) -> list[str]:
+def summarise_runs(all_runs: Sequence[DeviceRun], config: str) -> list[str]:
     """Summarise runs in sentences; empty if no run of the sweep requested a device.
 
     Args:
         all_runs: runs of the sweep.
         config: path of the sweep's config; "" if it no longer exists.
     """
-    asked = [run for run in found if run.asked]
+    asked = [run for run in all_runs if run.device_requested]
     if not asked:
         return []
     if not any(run.status == "ok" for run in asked):
         return [
-            f"No run on a device ended well, so nothing is said of what one saves ({_why(asked)}). Where there is a "
+            f"No run on a device ended well, so nothing is said of what one saves ({_most_common_reason(asked)}). Where there is a "
             f"device, `.venv/bin/springbench run {config or 'CONFIG'}` fills this in."
         ]
-    said = [_said(panel, compared) for panel, compared in pairs(found).items()]
+    said = [_describe_panel(panel, compared) for panel, compared in pair_fastest_runs(all_runs).items()]
     return [*said, *_without_time(asked)]
 
 
-def _why(runs: Sequence[Run]) -> str:
+def _most_common_reason(runs: Sequence[DeviceRun]) -> str:
     """Return the most common reason or status of these runs."""
     return Counter(run.reason or run.status for run in runs).most_common(1)[0][0]
 
 
-def _said(panel: Panel, compared: Sequence[Pair]) -> str:
+def _describe_panel(panel: ScenePanel, device_pairs: Sequence[DevicePair]) -> str:
     scene, tolerance = panel
     begun = f"{scene}, to {tolerance:g} of the residual at a step's start"
-    both = [pair for pair in compared if pair.ratio is not None]
+    both = [pair for pair in device_pairs if pair.speedup is not None]
     if not both:
-        got = ", ".join(sorted({"the device" if pair.there else "the processor" for pair in compared}))
+        got = ", ".join(sorted({"the device" if pair.device_run else "the processor" for pair in device_pairs}))
         return f"{begun}: at no size did both sides get there ({got} alone), so nothing is compared."
-    first, last = pays_from(compared), both[-1]
+    first, last = find_break_even(device_pairs), both[-1]
     if first:
-        told = f"a device pays from {count(first.vertices)} vertices on, {_faster(first)}"
-        told += f", and {_faster(last)} at {count(last.vertices)}" if last is not first else ""
+        told = f"a device pays from {format_count(first.vertices)} vertices on, {_describe_speedup(first)}"
+        told += f", and {_describe_speedup(last)} at {format_count(last.vertices)}" if last is not first else ""
         told += "" if first is not both[0] else ", the smallest that was measured"
     else:
-        told = f"a device does not pay up to {count(last.vertices)} vertices, where both got there: {_faster(last)}"
-    alone = [f"{count(p.vertices)} ({'device' if p.there else 'processor'})" for p in compared if p.ratio is None]
+        told = f"a device does not pay up to {format_count(last.vertices)} vertices, where both got there: {_describe_speedup(last)}"
+    alone = [
+        f"{format_count(p.vertices)} ({'device' if p.device_run else 'processor'})"
+        for p in device_pairs
+        if p.speedup is None
+    ]
     return f"{begun}: {told}" + (f"; one side alone got there at {', '.join(alone)}" if alone else "") + "."
 
 
-def _faster(pair: Pair) -> str:
+def _describe_speedup(pair: DevicePair) -> str:
     """Describe the speedup of a pair in which both sides converged."""
-    assert pair.there
-    assert pair.here
-    assert pair.ratio is not None
-    how = f"takes {factor(1 / pair.ratio)} times the time of"
-    if pair.ratio > ALIKE:
-        how = f"is {factor(pair.ratio)} times as fast as"
-    return f"{pair.there.solver} there {how} {pair.here.solver} on the processor"
+    assert pair.device_run
+    assert pair.cpu_run
+    assert pair.speedup is not None
+    how = f"takes {format_factor(1 / pair.speedup)} times the time of"
+    if pair.speedup > SIMILAR_TIME_RATIO:
+        how = f"is {format_factor(pair.speedup)} times as fast as"
+    return f"{pair.device_run.solver} there {how} {pair.cpu_run.solver} on the processor"
 
 
-def _without_time(asked: Sequence[Run]) -> Iterator[str]:
+def _without_time(asked: Sequence[DeviceRun]) -> Iterator[str]:
     """Describe the runs on a device that have no time."""
     failed = [run for run in asked if run.status != "ok"]
     if failed:
-        yield f"{len(failed)} of {len(asked)} runs on a device have no time: {_why(failed)}."
+        yield f"{len(failed)} of {len(asked)} runs on a device have no time: {_most_common_reason(failed)}."

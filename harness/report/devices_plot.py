@@ -17,39 +17,59 @@ from matplotlib.ticker import NullFormatter
 
 from harness.base import rows, shelf
 from harness.base.errors import InputError
-from harness.report.devices import Pair, pairs, pays_from, runs, words
-from harness.report.page import axes, count, header, new_page, quantity, save, text, ticks
-from harness.report.site.provenance import config_of
-from harness.report.style import FASTER, HEIGHT, INK, MUTED, RC, RULE, WIDTH, marks
+from harness.report.devices import DevicePair, find_break_even, pair_fastest_runs, read_device_runs, summarise_runs
+from harness.report.page import (
+    add_axes,
+    draw_header,
+    draw_text,
+    format_count,
+    format_quantity,
+    new_page,
+    save_page,
+    tick_formatter,
+)
+from harness.report.site.provenance import find_config
+from harness.report.style import (
+    FASTER_COLOUR,
+    MUTED_COLOUR,
+    PAGE_HEIGHT,
+    PAGE_RC,
+    PAGE_WIDTH,
+    RULE_COLOUR,
+    TEXT_COLOUR,
+    assign_solver_styles,
+)
 
-_LEFT, _TOP, _GAP, _COLUMNS = 84, 150, 96, 2
-_SIDES = (("device", FASTER, "-"), ("processor", INK, (0, (5, 2))))
+_PANELS_LEFT, _PANELS_TOP, _PANEL_GAP, _MAX_COLUMNS = 84, 150, 96, 2
+_SIDE_STYLES = (("device", FASTER_COLOUR, "-"), ("processor", TEXT_COLOUR, (0, (5, 2))))
 
 
-def draw_devices(results: Path) -> Iterator[tuple[Path | None, list[str]]]:
+def draw_device_speedups(results: Path) -> Iterator[tuple[Path | None, list[str]]]:
     """Draw `pictures/devices.png` for each sweep that requested a device.
 
     Args:
         results: folder of results, or the folder of one sweep.
     Yields: the picture, or None if no run on a device reached its residual; and sentences on the sweep's rows.
     """
-    for folder in shelf.folders(results, "rows"):
+    for folder in shelf.find_row_folders(results, "rows"):
         try:
-            found = runs(rows.read(shelf.units(folder), left_out=lambda mistake: None))
+            found = read_device_runs(rows.read_rows(shelf.list_units(folder), on_invalid=lambda mistake: None))
         except InputError:
             continue  # the page tells of damaged rows
-        if said := words(found, config_of(folder.parent)):
+        if said := summarise_runs(found, find_config(folder.parent)):
             picture = folder.parent / "pictures" / "devices.png"
-            compared = pairs(found)
+            compared = pair_fastest_runs(found)
             picture.unlink(missing_ok=True)  # rows that are gone may have drawn it
             if compared:
                 picture.parent.mkdir(exist_ok=True)
                 devices = sorted({run.device for run in found if run.device})
-                draw(compared, picture, folder.parent.resolve().name, devices)
+                draw_pairs(compared, picture, folder.parent.resolve().name, devices)
             yield picture if compared else None, said
 
 
-def draw(compared: dict[tuple[str, float], list[Pair]], path: Path, title: str, facts: Sequence[str]) -> None:
+def draw_pairs(
+    pairs_by_panel: dict[tuple[str, float], list[DevicePair]], path: Path, title: str, facts: Sequence[str]
+) -> None:
     """Draw the fastest runs of both sides as a PNG file.
 
     The picture is PAGE_WIDTH pixels wide and at most PAGE_HEIGHT high.
@@ -60,41 +80,41 @@ def draw(compared: dict[tuple[str, float], list[Pair]], path: Path, title: str, 
         title: title of the picture.
         facts: phrases below the title.
     """
-    columns = min(_COLUMNS, len(compared))
-    lines = ceil(len(compared) / columns)
-    width = (WIDTH - _LEFT - 40 - _GAP * (columns - 1)) / columns
-    tall = (HEIGHT - _TOP - 60 - _GAP * (lines - 1)) / lines
-    with matplotlib.rc_context(RC):
+    columns = min(_MAX_COLUMNS, len(pairs_by_panel))
+    lines = ceil(len(pairs_by_panel) / columns)
+    width = (PAGE_WIDTH - _PANELS_LEFT - 40 - _PANEL_GAP * (columns - 1)) / columns
+    tall = (PAGE_HEIGHT - _PANELS_TOP - 60 - _PANEL_GAP * (lines - 1)) / lines
+    with matplotlib.rc_context(PAGE_RC):
         page = new_page()
-        header(
+        draw_header(
             page, title, [*facts, "seconds of a step, the best of each side", "upright: from there on a device pays"]
         )
-        for k, ((scene, tolerance), mine) in enumerate(compared.items()):
+        for k, ((scene, tolerance), mine) in enumerate(pairs_by_panel.items()):
             line, column = divmod(k, columns)
-            left, top = _LEFT + column * (width + _GAP), _TOP + line * (tall + _GAP)
-            text(page, left, top - 16, f"{scene}, to a residual of {tolerance:g}", size=12, weight="bold")
-            _panel(axes(page, left, top, width, tall), mine)
-        save(page, path)
+            left, top = _PANELS_LEFT + column * (width + _PANEL_GAP), _PANELS_TOP + line * (tall + _PANEL_GAP)
+            draw_text(page, left, top - 16, f"{scene}, to a residual of {tolerance:g}", size=12, weight="bold")
+            _draw_panel(add_axes(page, left, top, width, tall), mine)
+        save_page(page, path)
 
 
-def _panel(ax: Axes, mine: Sequence[Pair]) -> None:
-    looks = marks(run.solver for pair in mine for run in (pair.there, pair.here) if run)
+def _draw_panel(ax: Axes, panel_pairs: Sequence[DevicePair]) -> None:
+    looks = assign_solver_styles(run.solver for pair in panel_pairs for run in (pair.device_run, pair.cpu_run) if run)
     ax.set_xscale("log")
     ax.set_yscale("log")
-    for (side, color, dash), of in zip(_SIDES, ("there", "here"), strict=True):
-        ended = [(pair.vertices, run) for pair in mine if (run := getattr(pair, of))]
+    for (side, color, dash), of in zip(_SIDE_STYLES, ("there", "here"), strict=True):
+        ended = [(pair.vertices, run) for pair in panel_pairs if (run := getattr(pair, of))]
         ax.plot([n for n, _ in ended], [run.seconds for _, run in ended], color=color, ls=dash, lw=1.6, label=side)
         for n, run in ended:
             ax.plot(n, run.seconds, marker=looks[run.solver].marker, color=color, ls="", markersize=7)
             ax.annotate(
                 run.solver, (n, run.seconds), xytext=(6, -11), textcoords="offset points", fontsize=8, color=color
             )
-    if first := pays_from(mine):
-        ax.axvline(first.vertices, color=FASTER, lw=1.0, alpha=0.5)
-    ax.set_xticks(sorted({pair.vertices for pair in mine}))
-    ax.xaxis.set_major_formatter(ticks(lambda value: count(round(value))))
+    if first := find_break_even(panel_pairs):
+        ax.axvline(first.vertices, color=FASTER_COLOUR, lw=1.0, alpha=0.5)
+    ax.set_xticks(sorted({pair.vertices for pair in panel_pairs}))
+    ax.xaxis.set_major_formatter(tick_formatter(lambda value: format_count(round(value))))
     ax.xaxis.set_minor_formatter(NullFormatter())
-    ax.yaxis.set_major_formatter(ticks(quantity))
-    ax.grid(axis="y", color=RULE)
-    ax.set_xlabel("vertices", color=MUTED)
+    ax.yaxis.set_major_formatter(tick_formatter(format_quantity))
+    ax.grid(axis="y", color=RULE_COLOUR)
+    ax.set_xlabel("vertices", color=MUTED_COLOUR)
     ax.legend(frameon=False, loc="upper left")

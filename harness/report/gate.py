@@ -18,9 +18,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from harness.base.console import narrow
-from harness.base.errors import InputError, Mistake
-from harness.report.stored import CANNOT_TELL
+from harness.base.console import split_wide_table
+from harness.base.errors import InputError, InputMistake
+from harness.report.stored import INCONCLUSIVE_EXIT_CODE
 
 RATIO_MARGIN = 0.10
 """Margin beyond both intervals: those of two runs of the same code differed by up to 4 % on a loaded machine."""
@@ -29,50 +29,50 @@ OTHER_MACHINE_MARGIN = 0.25
 MINIMUM_MARGIN = 0.5
 """Margin for minima: those of two runs differ by 4 % on an idle machine; another process on the core doubles them."""
 
-_MOST = 2**25
+_MAX_FILE_BYTES = 2**25
 """Maximum size of a stored file [bytes]; each time of each benchmark takes 20."""
 
-REGRESSIONS = ("slower", "vanished")
+REGRESSION_VERDICTS = ("slower", "vanished")
 
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
-class Ratio(BaseModel):
+class TimeRatio(BaseModel):
     """A median ratio of times and its 95 % interval."""
 
-    median: Positive
-    low: Positive
-    high: Positive
+    median: PositiveFloat
+    low: PositiveFloat
+    high: PositiveFloat
 
     @model_validator(mode="after")
-    def _in_order(self) -> Ratio:
+    def _check_interval_order(self) -> TimeRatio:
         if not self.low <= self.median <= self.high:
             raise ValueError(f"the median {self.median:g} lies outside of its interval")
         return self
 
 
-class Extra(BaseModel):
+class BenchmarkExtra(BaseModel):
     """Additional data of a benchmark, besides its times."""
 
-    ratio: Ratio | None = None
+    ratio: TimeRatio | None = None
 
 
-class Stats(BaseModel):
+class BenchmarkStats(BaseModel):
     """The times of a benchmark [s]."""
 
-    min: Positive
+    min: PositiveFloat
 
 
-class Benchmark(BaseModel):
+class BenchmarkRecord(BaseModel):
     """One benchmark of a file."""
 
     fullname: str
-    extra_info: Extra
-    stats: Stats
+    extra_info: BenchmarkExtra
+    stats: BenchmarkStats
 
 
-class Commit(BaseModel):
+class CommitInfo(BaseModel):
     """The version of the measured code; `time` is that of the commit, ISO 8601."""
 
     id: str = "unknown"
@@ -80,7 +80,7 @@ class Commit(BaseModel):
     dirty: bool = False
 
 
-class Stored(BaseModel):
+class StoredBenchmarks(BaseModel):
     """The compared part of a pytest-benchmark file; unknown keys are ignored.
 
     Attributes:
@@ -88,24 +88,24 @@ class Stored(BaseModel):
     """
 
     datetime: str = ""
-    commit_info: Commit = Commit()
+    commit_info: CommitInfo = CommitInfo()
     machine_info: Mapping[str, Any]
-    benchmarks: list[Benchmark] = Field(min_length=1)
+    benchmarks: list[BenchmarkRecord] = Field(min_length=1)
 
     @property
-    def by_name(self) -> dict[str, Benchmark]:
+    def benchmarks_by_name(self) -> dict[str, BenchmarkRecord]:
         """The benchmarks by the names of their tests."""
         return {benchmark.fullname: benchmark for benchmark in self.benchmarks}
 
     @property
-    def machine(self) -> tuple[Any, ...]:
+    def machine_key(self) -> tuple[Any, ...]:
         """The properties that determine speed: the processor, its number of cores and the usable cores."""
         told = self.machine_info.get("cpu")
         cpu = cast(Mapping[str, Any], told) if isinstance(told, Mapping) else dict[str, Any]()
         return (cpu.get("brand_raw"), cpu.get("count"), self.machine_info.get("affinity"))
 
 
-def compare(base: Path, new: Path, console: Console) -> int:
+def compare_benchmarks(base: Path, new: Path, console: Console) -> int:
     """Print a table of the changes from `base` to `new`.
 
     Args:
@@ -117,27 +117,29 @@ def compare(base: Path, new: Path, console: Console) -> int:
     Raises:
         InputError: if pytest-benchmark did not write one of the files.
     """
-    old, now = read_stored(base), read_stored(new)
-    if not old.by_name.keys() & now.by_name.keys():
+    old, now = read_stored_benchmarks(base), read_stored_benchmarks(new)
+    if not old.benchmarks_by_name.keys() & now.benchmarks_by_name.keys():
         console.print(f"cannot tell: {base} and {new} have no benchmark in common", markup=False)
-        return CANNOT_TELL
-    same = old.machine == now.machine
+        return INCONCLUSIVE_EXIT_CODE
+    same = old.machine_key == now.machine_key
     table = Table("benchmark", "old", "new", "change", "verdict", box=SIMPLE_HEAD)
     verdicts: list[str] = []
-    for name in old.by_name | now.by_name:
-        before, after = old.by_name.get(name), now.by_name.get(name)
-        change, verdict = _judged(before, after, same)
+    for name in old.benchmarks_by_name | now.benchmarks_by_name:
+        before, after = old.benchmarks_by_name.get(name), now.benchmarks_by_name.get(name)
+        change, verdict = _classify_change(before, after, same)
         verdicts.append(verdict)
-        table.add_row(*map(escape, (name.rpartition("::")[2], _figure(before), _figure(after), change, verdict)))
-    console.print(narrow(table))
+        table.add_row(
+            *map(escape, (name.rpartition("::")[2], _format_time(before), _format_time(after), change, verdict))
+        )
+    console.print(split_wide_table(table))
     if not same:
         console.print("The files come from different machines: minima are not judged, ratios with a wider margin.")
-    bad = sum(verdict in REGRESSIONS for verdict in verdicts)
+    bad = sum(verdict in REGRESSION_VERDICTS for verdict in verdicts)
     console.print(f"{bad} of {len(verdicts)} became slower or vanished" if bad else "nothing became slower")
     return 1 if bad else 0
 
 
-def _judged(old: Benchmark | None, new: Benchmark | None, same_machine: bool) -> tuple[str, str]:
+def _classify_change(old: BenchmarkRecord | None, new: BenchmarkRecord | None, same_machine: bool) -> tuple[str, str]:
     """Return the change and its class: slower, vanished, faster, unchanged, new, or not judged."""
     if old is None or new is None:
         return "", "new" if old is None else "vanished"
@@ -156,7 +158,7 @@ def _judged(old: Benchmark | None, new: Benchmark | None, same_machine: bool) ->
     return f"{change - 1:+.1%}", "slower" if slower else "faster" if faster else "unchanged"
 
 
-def _figure(benchmark: Benchmark | None) -> str:
+def _format_time(benchmark: BenchmarkRecord | None) -> str:
     """Format the ratio with its interval, or the minimum if there is no ratio."""
     if benchmark is None:
         return ""
@@ -166,7 +168,7 @@ def _figure(benchmark: Benchmark | None) -> str:
     return f"{ratio.median:.3f} [{ratio.low:.3f}, {ratio.high:.3f}]"
 
 
-def read_stored(path: Path) -> Stored:
+def read_stored_benchmarks(path: Path) -> StoredBenchmarks:
     """Read the benchmarks of a pytest-benchmark file.
 
     Raises:
@@ -175,15 +177,15 @@ def read_stored(path: Path) -> Stored:
     wanted = "wanted a file that pytest-benchmark stored; `pytest tests/bench --benchmark-only` makes one"
     try:
         if path.exists() and not path.is_file():
-            raise InputError(Mistake(f"is no file; {wanted}", path))
+            raise InputError(InputMistake(f"is no file; {wanted}", path))
         with path.open("rb") as file:
-            content = file.read(_MOST + 1)
-        if len(content) > _MOST:
-            raise InputError(Mistake(f"has more than {_MOST:,} bytes; {wanted}", path))
-        return Stored.model_validate_json(content)
+            content = file.read(_MAX_FILE_BYTES + 1)
+        if len(content) > _MAX_FILE_BYTES:
+            raise InputError(InputMistake(f"has more than {_MAX_FILE_BYTES:,} bytes; {wanted}", path))
+        return StoredBenchmarks.model_validate_json(content)
     except OSError as error:
-        raise InputError(Mistake(f"cannot be read ({error.strerror}); {wanted}", path)) from error
+        raise InputError(InputMistake(f"cannot be read ({error.strerror}); {wanted}", path)) from error
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         key = ".".join(map(str, first["loc"]))
-        raise InputError(Mistake(f"{first['msg']}; {wanted}", path, key=key)) from error
+        raise InputError(InputMistake(f"{first['msg']}; {wanted}", path, key=key)) from error

@@ -27,32 +27,32 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-from harness.base.errors import InputError, Mistake
-from harness.report.gate import Benchmark, Stored, read_stored
+from harness.base.errors import InputError, InputMistake
+from harness.report.gate import BenchmarkRecord, StoredBenchmarks, read_stored_benchmarks
 
-FEWEST = 6
+MIN_RESULTS = 6
 """Minimum number of results for change detection: two segments, and their noise."""
-SHORTEST = 2
+MIN_SEGMENT_RESULTS = 2
 """Minimum number of results in a segment: a single deviating result is an outlier."""
-PENALTY = 5.0
+CHANGE_PENALTY = 5.0
 """Penalty of a change, in units of log(n).
 
 The modified BIC (Zhang and Siegmund 2007) has about 3; then 14 of 200 series of 30 results of pure noise show a change.
 With 5 it is 1 of 400 series, and 99 of 100 steps of five times the noise are located within one commit.
 """
-FLOOR = 0.005
+NOISE_FLOOR = 0.005
 """Minimum noise of the logarithm: results are rounded, and may coincide by chance."""
-CHANGED = "*"
+DIRTY_MARK = "*"
 """Suffix of a commit whose files were modified."""
 
-_INTERVAL = 2 * 1.96
+_INTERVAL_SIGMAS = 2 * 1.96
 """Width of a 95 % interval [standard deviations]."""
 
-Array = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class StoredResult:
+class BenchmarkPoint:
     """A stored benchmark result.
 
     `value`, `low` and `high` are the ratio to the baseline, or all three the minimum time [s].
@@ -65,7 +65,7 @@ class StoredResult:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GateHistory:
+class BenchmarkHistory:
     """Results of a benchmark on one kind of machine, in the order of their commits.
 
     Attributes:
@@ -73,105 +73,107 @@ class GateHistory:
         segment_starts: first index of each segment; 0 is first, the others are changes.
     """
 
-    gate: str
-    machine: str
-    ratio: bool
-    points: tuple[StoredResult, ...]
-    starts: tuple[int, ...]
+    benchmark_name: str
+    machine_words: str
+    is_ratio: bool
+    points: tuple[BenchmarkPoint, ...]
+    segment_starts: tuple[int, ...]
 
     @property
-    def levels(self) -> list[float]:
+    def segment_levels(self) -> list[float]:
         """The geometric mean of each segment."""
-        ends = (*self.starts[1:], len(self.points))
+        ends = (*self.segment_starts[1:], len(self.points))
         return [
             math.exp(float(np.mean([math.log(p.value) for p in self.points[a:b]])))
-            for a, b in zip(self.starts, ends, strict=True)
+            for a, b in zip(self.segment_starts, ends, strict=True)
         ]
 
     @property
-    def changes(self) -> list[tuple[int, float]]:
+    def level_changes(self) -> list[tuple[int, float]]:
         """The index and the ratio of new to old level of each change."""
-        levels = self.levels
-        return [(at, new / old) for at, old, new in zip(self.starts[1:], levels, levels[1:], strict=False)]
+        levels = self.segment_levels
+        return [(at, new / old) for at, old, new in zip(self.segment_starts[1:], levels, levels[1:], strict=False)]
 
 
-def stored_files(places: Iterable[Path]) -> list[Path]:
+def find_stored_files(paths: Iterable[Path]) -> list[Path]:
     """Return the pytest-benchmark files in these folders, and the files among the paths.
 
     Raises:
         InputError: if a path does not exist.
     """
     found: list[Path] = []
-    for place in places:
+    for place in paths:
         if not place.exists():
-            raise InputError(Mistake("is not there; wanted a folder of pytest-benchmark, or a file of it", place))
+            raise InputError(InputMistake("is not there; wanted a folder of pytest-benchmark, or a file of it", place))
         found += sorted(place.rglob("*.json")) if place.is_dir() else [place]
     return found
 
 
-def history(files: Sequence[Path]) -> list[GateHistory]:
+def read_histories(files: Sequence[Path]) -> list[BenchmarkHistory]:
     """Read the benchmark histories in stored files, the largest change first.
 
     Raises:
         InputError: if pytest-benchmark did not write one of the files.
     """
-    return histories(map(read_stored, files))
+    return build_histories(map(read_stored_benchmarks, files))
 
 
-def histories(stored: Iterable[Stored]) -> list[GateHistory]:
+def build_histories(stored: Iterable[StoredBenchmarks]) -> list[BenchmarkHistory]:
     """Build the benchmark histories of stored results, the largest change first."""
-    points: dict[tuple[str, str, bool], list[StoredResult]] = defaultdict(list)
+    points: dict[tuple[str, str, bool], list[BenchmarkPoint]] = defaultdict(list)
     for one in sorted(stored, key=lambda s: (s.commit_info.time or s.datetime, s.datetime)):
         for benchmark in one.benchmarks:
-            key = benchmark.fullname.rpartition("::")[2], _machine(one), benchmark.extra_info.ratio is not None
-            points[key].append(_point(one, benchmark))
-    found = [GateHistory(*key, tuple(of_gate), changes(of_gate)) for key, of_gate in points.items()]
-    return sorted(found, key=lambda s: (-max((abs(math.log(r)) for _, r in s.changes), default=0.0), s.gate))
-
-
-def _machine(stored: Stored) -> str:
-    cpu, cores, usable = stored.machine
-    return f"{cpu or 'unknown processor'}, {usable or cores or '?'} cores"
-
-
-def _point(stored: Stored, benchmark: Benchmark) -> StoredResult:
-    commit = stored.commit_info.id[:7] + (CHANGED if stored.commit_info.dirty else "")
-    ratio, least = benchmark.extra_info.ratio, benchmark.stats.min
-    return (
-        StoredResult(commit, ratio.median, ratio.low, ratio.high)
-        if ratio
-        else StoredResult(commit, least, least, least)
+            key = benchmark.fullname.rpartition("::")[2], _describe_machine(one), benchmark.extra_info.ratio is not None
+            points[key].append(_build_point(one, benchmark))
+    found = [BenchmarkHistory(*key, tuple(of_gate), detect_changes(of_gate)) for key, of_gate in points.items()]
+    return sorted(
+        found, key=lambda s: (-max((abs(math.log(r)) for _, r in s.level_changes), default=0.0), s.benchmark_name)
     )
 
 
-def changes(points: Sequence[StoredResult]) -> tuple[int, ...]:
+def _describe_machine(stored: StoredBenchmarks) -> str:
+    cpu, cores, usable = stored.machine_key
+    return f"{cpu or 'unknown processor'}, {usable or cores or '?'} cores"
+
+
+def _build_point(stored: StoredBenchmarks, benchmark: BenchmarkRecord) -> BenchmarkPoint:
+    commit = stored.commit_info.id[:7] + (DIRTY_MARK if stored.commit_info.dirty else "")
+    ratio, least = benchmark.extra_info.ratio, benchmark.stats.min
+    return (
+        BenchmarkPoint(commit, ratio.median, ratio.low, ratio.high)
+        if ratio
+        else BenchmarkPoint(commit, least, least, least)
+    )
+
+
+def detect_changes(points: Sequence[BenchmarkPoint]) -> tuple[int, ...]:
     """Return the starts of the segments.
 
     The result is (0,) if nothing changed or there are too few results.
     """
-    if len(points) < FEWEST:
+    if len(points) < MIN_RESULTS:
         return (0,)
     from ruptures import Pelt
 
-    y: Array = np.log([p.value for p in points])
-    sigma = max(noise(y), float(np.median([math.log(p.high / p.low) for p in points])) / _INTERVAL)
-    fitted: Any = Pelt(model="l2", min_size=SHORTEST, jump=1).fit(y / sigma)
-    found: list[int] = fitted.predict(pen=PENALTY * math.log(len(y)))
+    y: FloatArray = np.log([p.value for p in points])
+    sigma = max(estimate_noise(y), float(np.median([math.log(p.high / p.low) for p in points])) / _INTERVAL_SIGMAS)
+    fitted: Any = Pelt(model="l2", min_size=MIN_SEGMENT_RESULTS, jump=1).fit(y / sigma)
+    found: list[int] = fitted.predict_target(pen=CHANGE_PENALTY * math.log(len(y)))
     return (0, *found[:-1])
 
 
-def noise(y: Array) -> float:
+def estimate_noise(y: FloatArray) -> float:
     """Estimate the noise of results around their segment's mean from the median difference of neighbours."""
     apart = np.abs(np.diff(y))
-    return max(float(np.median(apart)) / (0.6745 * math.sqrt(2)), FLOOR)
+    return max(float(np.median(apart)) / (0.6745 * math.sqrt(2)), NOISE_FLOOR)
 
 
-def history_table(found: Sequence[GateHistory]) -> Table:
+def build_history_table(gate_histories: Sequence[BenchmarkHistory]) -> Table:
     """Build a table of the benchmarks, their last level and their changes."""
     table = Table("gate", "results", "now", "changes", box=SIMPLE_HEAD)
-    for series in found:
-        told = [f"{100 * (r - 1):+.1f} % at {series.points[k].commit}" for k, r in series.changes]
-        few = f"too few to tell; wanted {FEWEST}" if len(series.points) < FEWEST else "none"
-        now = f"{series.levels[-1]:.3g}" if series.ratio else f"{1e3 * series.levels[-1]:.3g} ms"
-        table.add_row(escape(series.gate), str(len(series.points)), now, ", ".join(told) or few)
+    for series in gate_histories:
+        told = [f"{100 * (r - 1):+.1f} % at {series.points[k].commit}" for k, r in series.level_changes]
+        few = f"too few to tell; wanted {MIN_RESULTS}" if len(series.points) < MIN_RESULTS else "none"
+        now = f"{series.segment_levels[-1]:.3g}" if series.is_ratio else f"{1e3 * series.segment_levels[-1]:.3g} ms"
+        table.add_row(escape(series.benchmark_name), str(len(series.points)), now, ", ".join(told) or few)
     return table

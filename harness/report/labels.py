@@ -8,14 +8,14 @@ from collections.abc import Sequence
 
 from matplotlib.axes import Axes
 
-LINE = 17
+LABEL_SPACING = 17
 """Distance between labels [pixels]."""
 
-End = tuple[float, float, str, str]
+LineEnd = tuple[float, float, str, str]
 """The end of a line in data coordinates, its label and its colour."""
 
 
-def direct_labels(ax: Axes, ends: Sequence[End]) -> None:
+def draw_direct_labels(ax: Axes, ends: Sequence[LineEnd]) -> None:
     """Draw labels to the right of the lines' ends.
 
     Labels that would overlap are moved apart.
@@ -27,7 +27,7 @@ def direct_labels(ax: Axes, ends: Sequence[End]) -> None:
     for column in sorted({x for x, *_ in ends}):
         here = sorted((end for end in ends if end[0] == column), key=lambda end: end[1])
         wanted = ax.transData.transform([(x, y) for x, y, *_ in here])
-        at = spread(wanted[:, 1].tolist(), ax.bbox.y0 + 6, ax.bbox.y1 - 6)
+        at = spread_heights(wanted[:, 1].tolist(), ax.bbox.y0 + 6, ax.bbox.y1 - 6)
         for (x, y, words, color), height in zip(here, at, strict=True):
             # In fractions of the figure, because pixels have another meaning in vector formats.
             x_share, y_share = ax.figure.transFigure.inverted().transform((wanted[0, 0] + 16, height))
@@ -44,7 +44,7 @@ def direct_labels(ax: Axes, ends: Sequence[End]) -> None:
             )
 
 
-def spread(wanted: Sequence[float], bottom: float, top: float) -> list[float]:
+def spread_heights(targets: Sequence[float], bottom: float, top: float) -> list[float]:
     """Return sorted heights [pixels] that are at least LABEL_SPACING apart.
 
     They are moved up from below, then down from the top.
@@ -54,10 +54,10 @@ def spread(wanted: Sequence[float], bottom: float, top: float) -> list[float]:
         bottom: lower limit [pixels].
         top: upper limit [pixels].
     """
-    at = list(wanted)
+    at = list(targets)
     for k in range(1, len(at)):
-        at[k] = max(at[k], at[k - 1] + LINE)
+        at[k] = max(at[k], at[k - 1] + LABEL_SPACING)
     at[-1] = min(at[-1], top)
     for k in reversed(range(len(at) - 1)):
-        at[k] = max(min(at[k], at[k + 1] - LINE), bottom)
+        at[k] = max(min(at[k], at[k + 1] - LABEL_SPACING), bottom)
     return at

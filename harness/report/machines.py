@@ -10,29 +10,29 @@ from collections.abc import Iterable
 
 import pyarrow as pa
 
-from harness.report.sql import answer
+from harness.report.sql import query_table
 
-COMPARE = (
+COMPARISON_NOTE = (
     "compare times only on one machine; across machines compare ratios of such times, iterations, residuals and errors"
 )
 """Rule that holds for all rows."""
 
-_SHOWN = 8
+_MAX_LISTED = 8
 """Maximum number of machines with a line of their own."""
 
-COLUMNS = ("cpu", "cores", "machine_bandwidth", "machine_flops", "machine_step")
+MACHINE_COLUMNS = ("cpu", "cores", "machine_bandwidth", "machine_flops", "machine_step")
 """Columns that describe a machine."""
 
-KNOWN = ("machine", "node", *COLUMNS)
+FOOTER_COLUMNS = ("machine", "node", *MACHINE_COLUMNS)
 """All columns that the footer of a table needs."""
 
-Place = tuple[str | None, str | None]
+MachineKey = tuple[str | None, str | None]
 """The ids of a machine's kind and of the computer."""
 
 
-def names(places: Iterable[Place]) -> dict[Place, str]:
+def assign_machine_names(machine_keys: Iterable[MachineKey]) -> dict[MachineKey, str]:
     """Assign short names to machines; rows without a machine get none."""
-    known = sorted({(machine, node) for machine, node in places if machine}, key=str)
+    known = sorted({(machine, node) for machine, node in machine_keys if machine}, key=str)
     kinds = [machine for machine, _ in known]
     return {
         (machine, node): f"{machine:.6}{f'-{node:.4}' if node and kinds.count(machine) > 1 else ''}"
@@ -40,20 +40,22 @@ def names(places: Iterable[Place]) -> dict[Place, str]:
     }
 
 
-def foot(table: pa.Table) -> list[str]:
+def machine_footer(table: pa.Table) -> list[str]:
     """Return the footer lines of a table of rows.
 
     They list its machines, and which numbers may be compared.
     """
-    able = ", ".join(f'any_value("{name}")' for name in COLUMNS)
-    found = answer(f"select machine, node, {able} from rows_of where machine is not null group by all", table)
-    known = names((machine, node) for machine, node, *_ in found)
-    told = sorted(f"machine {known[machine, node]}: {_able(*about)}" for machine, node, *about in found)
-    more = [f"and {len(told) - _SHOWN} more machines"] if len(told) > _SHOWN else []
-    return [*told[:_SHOWN], *more, COMPARE]
+    able = ", ".join(f'any_value("{name}")' for name in MACHINE_COLUMNS)
+    found = query_table(f"select machine, node, {able} from rows_of where machine is not null group by all", table)
+    known = assign_machine_names((machine, node) for machine, node, *_ in found)
+    told = sorted(f"machine {known[machine, node]}: {_describe_machine(*about)}" for machine, node, *about in found)
+    more = [f"and {len(told) - _MAX_LISTED} more machines"] if len(told) > _MAX_LISTED else []
+    return [*told[:_MAX_LISTED], *more, COMPARISON_NOTE]
 
 
-def _able(cpu: str | None, cores: int | None, bandwidth: float | None, flops: float | None, step: float | None) -> str:
+def _describe_machine(
+    cpu: str | None, cores: int | None, bandwidth: float | None, flops: float | None, step: float | None
+) -> str:
     """Describe a machine and its measured performance."""
     words = [cpu or "unknown processor", f"{cores} core{'s' if cores != 1 else ''}" if cores else ""]
     if bandwidth and flops and step:

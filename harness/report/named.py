@@ -13,16 +13,16 @@ from typing import Protocol
 import pyarrow as pa
 
 from harness.base.errors import RunFailed, SpringbenchError
-from harness.base.worker import Limits, Tick
-from harness.base.workers import Lost, Workers
-from harness.config.sweep import EVERY_REPORT
-from solvers.plugins import Plugin, load
+from harness.base.worker import ProgressCallback, TaskLimits
+from harness.base.workers import IsolatedWorker, TaskFailure
+from harness.config.sweep import REPORT_TABLE
+from solvers.plugins import PluginName, load_target
 
-_SECONDS, _GIB = 600.0, 2.0
+_TIME_LIMIT, _MEMORY_LIMIT = 600.0, 2.0
 """Limits of a plug-in report: wall time [s] and memory [GiB]."""
 
 
-class Report(Protocol):
+class ReportFunction(Protocol):
     """A report: a function that writes files."""
 
     def __call__(self, rows: pa.Table, folder: Path) -> Iterable[Path]:
@@ -30,7 +30,7 @@ class Report(Protocol):
         ...
 
 
-def draw_reports(names: Iterable[str], table: pa.Table, folder: Path, seconds: float | None = None) -> list[Path]:
+def run_reports(names: Iterable[str], table: pa.Table, folder: Path, seconds: float | None = None) -> list[Path]:
     """Run the named reports and return the files that they wrote.
 
     Plug-in reports run in a process of their own.
@@ -45,27 +45,27 @@ def draw_reports(names: Iterable[str], table: pa.Table, folder: Path, seconds: f
     """
     drawn: list[Path] = []
     for name in names:
-        if isinstance(name, Plugin):
-            drawn += _elsewhere(name, table, folder, seconds)
+        if isinstance(name, PluginName):
+            drawn += _run_in_worker(name, table, folder, seconds)
         else:
-            report: Report = load(EVERY_REPORT[name])
+            report: ReportFunction = load_target(REPORT_TABLE[name])
             drawn += report(table, folder)
     return drawn
 
 
-def _elsewhere(name: Plugin, table: pa.Table, folder: Path, seconds: float | None) -> list[Path]:
-    workers = Workers()
+def _run_in_worker(name: PluginName, table: pa.Table, folder: Path, seconds: float | None) -> list[Path]:
+    workers = IsolatedWorker()
     try:
-        limits = Limits(min(_SECONDS, seconds or _SECONDS), _GIB, folder / "logs" / "reports.txt")
-        return workers.do(partial(_reported, name, table, folder.absolute()), _quiet, limits)
-    except (Lost, SpringbenchError) as error:
+        limits = TaskLimits(min(_TIME_LIMIT, seconds or _TIME_LIMIT), _MEMORY_LIMIT, folder / "logs" / "reports.txt")
+        return workers.run_task(partial(_run_plugin_report, name, table, folder.absolute()), _ignore_progress, limits)
+    except (TaskFailure, SpringbenchError) as error:
         raise RunFailed(f"the report {name} failed: {error}") from None
     finally:
-        workers.end()
+        workers.stop_worker()
 
 
-def _reported(name: Plugin, table: pa.Table, folder: Path, tick: Tick) -> list[Path]:
-    report: Report = load(name.target)
+def _run_plugin_report(name: PluginName, table: pa.Table, folder: Path, tick: ProgressCallback) -> list[Path]:
+    report: ReportFunction = load_target(name.import_target)
     wrote: object = report(table, folder)
     paths: list[object] = list(wrote) if isinstance(wrote, list | tuple) else [None]  # pyright: ignore[reportUnknownArgumentType]
     if not all(isinstance(path, Path | str) for path in paths):
@@ -73,5 +73,5 @@ def _reported(name: Plugin, table: pa.Table, folder: Path, tick: Tick) -> list[P
     return [Path(str(path)) for path in paths]
 
 
-def _quiet(said: str) -> None:
+def _ignore_progress(message: str) -> None:
     pass

@@ -12,7 +12,7 @@ from functools import cache
 
 from harness.base.errors import RunFailed
 
-_TRY = """
+_PROBE_SCRIPT = """
 from vtkmodules.vtkRenderingCore import vtkRenderWindow
 import vtkmodules.vtkRenderingOpenGL2
 window = vtkRenderWindow()
@@ -21,36 +21,36 @@ window.SetSize(8, 8)
 window.Render()
 raise SystemExit(not window.SupportsOpenGL())
 """
-_SECONDS = 60
+_PROBE_TIMEOUT = 60
 
-_TRIES = list["subprocess.Popen[bytes]"]()
+_PROBES = list["subprocess.Popen[bytes]"]()
 """The child process of the probe, if it was started."""
 
 
-def begin() -> None:
+def start_opengl_probe() -> None:
     """Start the probe in the background."""
-    if _TRIES or problem.cache_info().currsize:
+    if _PROBES or find_opengl_problem.cache_info().currsize:
         return
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
     nowhere = subprocess.DEVNULL
-    _TRIES.append(subprocess.Popen([sys.executable, "-c", _TRY], stdout=nowhere, stderr=nowhere))
+    _PROBES.append(subprocess.Popen([sys.executable, "-c", _PROBE_SCRIPT], stdout=nowhere, stderr=nowhere))
 
 
 @cache
-def problem() -> str | None:
+def find_opengl_problem() -> str | None:
     """Return why scenes cannot be drawn and how to fix it; None if drawing works.
 
     Without a display VTK is configured to draw through EGL. The result is computed once per process.
     """
-    begin()
-    child = _TRIES.pop()
+    start_opengl_probe()
+    child = _PROBES.pop()
     try:
-        ended = f"exit code {child.wait(_SECONDS)}"
+        ended = f"exit code {child.wait(_PROBE_TIMEOUT)}"
     except subprocess.TimeoutExpired:
         child.kill()
         child.wait()
-        ended = f"no answer within {_SECONDS} s"
+        ended = f"no answer within {_PROBE_TIMEOUT} s"
     if child.returncode == 0:
         return None
     return (
@@ -59,8 +59,8 @@ def problem() -> str | None:
     )
 
 
-def require() -> None:
+def require_opengl() -> None:
     """Raise RunFailed, with the command that installs what is missing, if OpenGL cannot draw."""
-    message = problem()
+    message = find_opengl_problem()
     if message is not None:
         raise RunFailed(message)

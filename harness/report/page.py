@@ -21,20 +21,30 @@ from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 from PIL import Image
 
-from harness.base.files import replacing
-from harness.record.base import Replay
-from harness.record.shading import PIN_COLOUR, percent
-from harness.report.style import DPI, HEIGHT, INK, MUTED, PAGE, STRAIN_MAP, WIDTH
+from harness.base.files import atomic_write
+from harness.record.base import RecordingReplay
+from harness.record.shading import PIN_COLOUR, format_percent
+from harness.report.style import (
+    BACKGROUND_COLOUR,
+    MUTED_COLOUR,
+    PAGE_DPI,
+    PAGE_HEIGHT,
+    PAGE_WIDTH,
+    STRAIN_MAP,
+    TEXT_COLOUR,
+)
 
 
 def new_page() -> Figure:
     """Create an empty page, to be drawn on within `matplotlib.rc_context(RC)`."""
-    page = Figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI, facecolor=PAGE)
+    page = Figure(figsize=(PAGE_WIDTH / PAGE_DPI, PAGE_HEIGHT / PAGE_DPI), dpi=PAGE_DPI, facecolor=BACKGROUND_COLOUR)
     FigureCanvasAgg(page)
     return page
 
 
-def text(page: Figure, x: float, y: float, words: str, *, size: float, color: str = INK, **more: Any) -> None:
+def draw_text(
+    page: Figure, x: float, y: float, words: str, *, size: float, color: str = TEXT_COLOUR, **text_options: Any
+) -> None:
     """Draw text with its baseline at pixel (x, y) from the upper left corner.
 
     Args:
@@ -44,31 +54,33 @@ def text(page: Figure, x: float, y: float, words: str, *, size: float, color: st
         words: text.
         size: font size [points].
         color: colour of the text.
-        **more: further keywords of `Figure.text`.
+        **text_options: further keywords of `Figure.text`.
     """
-    page.text(x / WIDTH, 1 - y / HEIGHT, words, size=size, color=color, **more)
+    page.text(x / PAGE_WIDTH, 1 - y / PAGE_HEIGHT, words, size=size, color=color, **text_options)
 
 
-def axes(page: Figure, left: float, top: float, width: float, height: float) -> Axes:
+def add_axes(page: Figure, left: float, top: float, width: float, height: float) -> Axes:
     """Add axes in a rectangle given in pixels from the upper left corner."""
-    return page.add_axes((left / WIDTH, 1 - (top + height) / HEIGHT, width / WIDTH, height / HEIGHT))
+    return page.add_axes(
+        (left / PAGE_WIDTH, 1 - (top + height) / PAGE_HEIGHT, width / PAGE_WIDTH, height / PAGE_HEIGHT)
+    )
 
 
-def ticks(words: Callable[[float], str]) -> FuncFormatter:
+def tick_formatter(format_value: Callable[[float], str]) -> FuncFormatter:
     """Build a tick formatter from a function that formats a value."""
 
     def written(value: float, _: int | None) -> str:
-        return words(value)
+        return format_value(value)
 
     return FuncFormatter(written)
 
 
-def paste(page: Figure, pixels: NDArray[np.uint8], left: int, top: int) -> None:
+def paste_picture(page: Figure, pixels: NDArray[np.uint8], left: int, top: int) -> None:
     """Paste a picture pixel for pixel, with its upper left corner at (left, top)."""
-    page.figimage(pixels, xo=left, yo=HEIGHT - top - pixels.shape[0], origin="upper")
+    page.figimage(pixels, xo=left, yo=PAGE_HEIGHT - top - pixels.shape[0], origin="upper")
 
 
-def save(page: Figure, path: Path, *, used: float = HEIGHT) -> None:
+def save_page(page: Figure, path: Path, *, used_height: float = PAGE_HEIGHT) -> None:
     """Write the page as PNG atomically: an interrupted run leaves the whole file or none.
 
     Args:
@@ -78,24 +90,24 @@ def save(page: Figure, path: Path, *, used: float = HEIGHT) -> None:
     Raises:
         CannotWrite: if the file cannot be written.
     """
-    with replacing(path) as partial:
-        page.savefig(partial, format="png", dpi=DPI)
-        if used < HEIGHT:
+    with atomic_write(path) as partial:
+        page.savefig(partial, format="png", dpi=PAGE_DPI)
+        if used_height < PAGE_HEIGHT:
             with Image.open(partial) as whole:
-                part = whole.crop((0, 0, WIDTH, ceil(used)))
+                part = whole.crop((0, 0, PAGE_WIDTH, ceil(used_height)))
             part.save(partial, format="png")
 
 
-def header(page: Figure, headline: str, facts: Sequence[str], *, letters: int = 56) -> None:
+def draw_header(page: Figure, headline: str, facts: Sequence[str], *, max_letters: int = 56) -> None:
     """Draw the title in the upper left corner and a line of facts below.
 
     The title is shortened to `max_letters`.
     """
-    text(page, 40, 50, shorten(headline, letters), size=21, weight="bold")
-    text(page, 41, 82, "   ·   ".join(facts), size=11.5, color=MUTED)
+    draw_text(page, 40, 50, shorten_words(headline, max_letters), size=21, weight="bold")
+    draw_text(page, 41, 82, "   ·   ".join(facts), size=11.5, color=MUTED_COLOUR)
 
 
-def strain_scale(page: Figure, limit: float, ends: tuple[float, float], *, pins: bool) -> None:
+def draw_strain_scale(page: Figure, limit: float, ends: tuple[float, float], *, pins: bool) -> None:
     """Draw the colour bar of strains in the upper right corner.
 
     Ticks in percent are below it, labels above.
@@ -108,29 +120,29 @@ def strain_scale(page: Figure, limit: float, ends: tuple[float, float], *, pins:
         pins: whether to draw the legend entry of pinned vertices.
     """
     left, top, width = 1180, 50, 380
-    bar = axes(page, left, top, width, 12)
+    bar = add_axes(page, left, top, width, 12)
     bar.imshow(np.linspace(0, 1, 512)[None], cmap=STRAIN_MAP, aspect="auto", interpolation="bilinear")
     bar.set_axis_off()
     for place, word, end, align in ((0.0, "compressed", ends[0], "left"), (1.0, "stretched", ends[1], "right")):
-        told = f"{word}, to {percent(end)}" if end else f"{word}: none"
-        text(page, left + place * width, top - 8, told, size=9.5, ha=align)
-    text(page, left + width / 2, top - 8, "at rest", size=9.5, ha="center")
+        told = f"{word}, to {format_percent(end)}" if end else f"{word}: none"
+        draw_text(page, left + place * width, top - 8, told, size=9.5, ha=align)
+    draw_text(page, left + width / 2, top - 8, "at rest", size=9.5, ha="center")
     for place, beyond, tip in ((0.0, ends[0] < -limit, -14), (1.0, ends[1] > limit, 14)):
         if beyond:
             at = left + place * width
             corners = [(at, top), (at, top + 12), (at + tip, top + 6)]
-            shape = [(x / WIDTH, 1 - y / HEIGHT) for x, y in corners]
+            shape = [(x / PAGE_WIDTH, 1 - y / PAGE_HEIGHT) for x, y in corners]
             page.add_artist(Polygon(shape, closed=True, color=STRAIN_MAP(place), transform=page.transFigure))
     for place in (0.0, 0.25, 0.5, 0.75, 1.0):
         align = {0.0: "left", 1.0: "right"}.get(place, "center")
-        label = percent(limit * (2 * place - 1)) if place != 0.5 else "0"
-        text(page, left + place * width, top + 31, label, size=9, color=MUTED, ha=align)
+        label = format_percent(limit * (2 * place - 1)) if place != 0.5 else "0"
+        draw_text(page, left + place * width, top + 31, label, size=9, color=MUTED_COLOUR, ha=align)
     if pins:
-        text(page, left - 40, top + 12, "pinned", size=10, ha="right")
-        text(page, left - 100, top + 11, "●", size=11, color=PIN_COLOUR, ha="right")
+        draw_text(page, left - 40, top + 12, "pinned", size=10, ha="right")
+        draw_text(page, left - 100, top + 11, "●", size=11, color=PIN_COLOUR, ha="right")
 
 
-def headline(replay: Replay) -> str:
+def scene_headline(replay: RecordingReplay) -> str:
     """Return the scene and its size as a headline."""
     scene, size = replay.properties.get("scene"), replay.properties.get("size")
     if scene is None:
@@ -138,34 +150,34 @@ def headline(replay: Replay) -> str:
     return f"{scene}, size {size}" if size else str(scene)
 
 
-def clock(replay: Replay, frame: int) -> str:
+def format_frame_time(replay: RecordingReplay, frame: int) -> str:
     """Format the time of a recorded frame."""
     return f"{replay.times[frame]:.2f} s"
 
 
-def count(number: int) -> str:
+def format_count(number: int) -> str:
     """Format an integer with thin spaces between thousands."""
     return f"{number:,}".replace(",", "\u2009")
 
 
-def quantity(value: float) -> str:
+def format_quantity(value: float) -> str:
     """Format a number to three significant digits, with an exponent only from 1e7 on."""
     if value >= 1e7:
         return f"{value:.1e}"
-    return f"{value:.3g}" if value < 1000 else count(round(value))
+    return f"{value:.3g}" if value < 1000 else format_count(round(value))
 
 
-def factor(value: float) -> str:
+def format_factor(value: float) -> str:
     """Format a ratio to two significant digits, or to an integer from 100 on."""
-    return f"{value:.2g}" if value < 100 else quantity(value)
+    return f"{value:.2g}" if value < 100 else format_quantity(value)
 
 
-def shorten(words: str, limit: int) -> str:
+def shorten_words(words: str, limit: int) -> str:
     """Shorten text to `limit` characters, with an ellipsis at the end."""
     return words if len(words) <= limit else words[: limit - 1].rstrip() + "…"
 
 
-def step_words(dt: float) -> str:
+def format_time_step(dt: float) -> str:
     """Format a time step [s], such as 1/30 s.
 
     It is given in milliseconds if it is not the inverse of an integer.

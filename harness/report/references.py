@@ -11,27 +11,29 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from harness.base.files import replacing
+from harness.base.files import atomic_write
 
 
-def cited(reference: str | None) -> str:
+def format_citation(reference: str | None) -> str:
     """Format a reference as a line: family names, year, title, doi; empty for none."""
     if not reference:
         return ""
     found = json.loads(reference)
-    *others, last = _families(found)
+    *others, last = _family_names(found)
     names = f"{', '.join(others)} and {last}" if others else last
     doi = f", doi:{found['doi']}" if found["doi"] else ""
     return f"{names} {found['year']}, {found['title']}{doi}"
 
 
-def bibtex(references: Iterable[str | None]) -> str:
+def format_bibtex(references: Iterable[str | None]) -> str:
     """Format one BibTeX entry per distinct reference, sorted by key.
 
     The text is Unicode, for biber and recent BibTeX.
     """
-    known = sorted({reference for reference in references if reference}, key=lambda r: (_key(json.loads(r)), r))
-    entries, keys = list[str](), [_key(json.loads(reference)) for reference in known]
+    known = sorted(
+        {reference for reference in references if reference}, key=lambda r: (_citation_key(json.loads(r)), r)
+    )
+    entries, keys = list[str](), [_citation_key(json.loads(reference)) for reference in known]
     for k, reference in enumerate(known):
         found = json.loads(reference)
         letter = chr(ord("a") + keys[:k].count(keys[k])) if keys.count(keys[k]) > 1 else ""
@@ -51,14 +53,14 @@ def write_bibtex(path: Path, references: Iterable[str | None]) -> Path:
     Raises:
         CannotWrite: if the file cannot be written.
     """
-    with replacing(path) as partial:
-        partial.write_text(bibtex(references), encoding="utf-8")
+    with atomic_write(path) as partial:
+        partial.write_text(format_bibtex(references), encoding="utf-8")
     return path
 
 
-def _families(found: dict[str, Any]) -> list[str]:
-    return [author.split(",")[0].strip() for author in found["authors"].split(" and ")]
+def _family_names(entry: dict[str, Any]) -> list[str]:
+    return [author.split(",")[0].strip() for author in entry["authors"].split(" and ")]
 
 
-def _key(found: dict[str, Any]) -> str:
-    return re.sub(r"[^a-z]", "", _families(found)[0].lower()) + str(found["year"])
+def _citation_key(entry: dict[str, Any]) -> str:
+    return re.sub(r"[^a-z]", "", _family_names(entry)[0].lower()) + str(entry["year"])

@@ -19,26 +19,26 @@ import pyvista as pv
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFilter
 
-from harness.record.base import Replay
+from harness.record.base import RecordingReplay
 from harness.record.shading import PIN_COLOUR
 from harness.report import opengl
-from harness.report.solids import solids
-from harness.report.style import INK, PAGE, STRAIN_MAP
+from harness.report.solids import build_obstacle_meshes
+from harness.report.style import BACKGROUND_COLOUR, STRAIN_MAP, TEXT_COLOUR
 
-Points = NDArray[np.floating]
-Dots = tuple[Points, str]
-_HALF_ANGLE = np.radians(12.0)  # of the camera's view, vertically: long enough a lens for calm perspective
-_MARGIN = 0.06  # of the view, left free at each side
-_TUBES = 20_000  # springs; beyond that they are drawn as lines
-_MESH_LINES = 350  # pixels of the view for each vertex; with fewer, lines would hide the colours
+PointArray = NDArray[np.floating]
+ColouredPoints = tuple[PointArray, str]
+_HALF_FIELD_OF_VIEW = np.radians(12.0)  # of the camera's view, vertically: long enough a lens for calm perspective
+_VIEW_MARGIN = 0.06  # of the view, left free at each side
+_MAX_TUBES = 20_000  # springs; beyond that they are drawn as lines
+_PIXELS_PER_VERTEX = 350  # pixels of the view for each vertex; with fewer, lines would hide the colours
 _SUPERSAMPLING = 3  # a pixel is the mean of 3 x 3: faster than VTK's own anti-aliasing in software
-_JOINT = "#8a8d92"  # vertices of a network without triangles
-_SOLID = "#c9c3b8"  # obstacles
-_SHADE = "#d3d0ca"  # where the ground is fully in shadow
-_MATERIAL: dict[str, Any] = {"ambient": 0.62, "diffuse": 0.44, "specular": 0.06, "specular_power": 18.0}
+_JOINT_COLOUR = "#8a8d92"  # vertices of a network without triangles
+_OBSTACLE_COLOUR = "#c9c3b8"  # obstacles
+_SHADOW_COLOUR = "#d3d0ca"  # where the ground is fully in shadow
+_MATERIAL_OPTIONS: dict[str, Any] = {"ambient": 0.62, "diffuse": 0.44, "specular": 0.06, "specular_power": 18.0}
 
 
-def spring_strain(replay: Replay, frame: int) -> NDArray[np.float64]:
+def compute_spring_strain(replay: RecordingReplay, frame: int) -> NDArray[np.float64]:
     """Compute the strain, length / rest length - 1, of each spring.
 
     Args:
@@ -53,9 +53,9 @@ def spring_strain(replay: Replay, frame: int) -> NDArray[np.float64]:
     return np.divide(stretch, rest, out=np.zeros(len(rest)), where=rest > 0)
 
 
-def vertex_strain(replay: Replay, frame: int) -> NDArray[np.float64]:
+def compute_vertex_strain(replay: RecordingReplay, frame: int) -> NDArray[np.float64]:
     """Return the signed strain of the most strained spring at each vertex, shape (n,)."""
-    strain = np.repeat(spring_strain(replay, frame), 2)
+    strain = np.repeat(compute_spring_strain(replay, frame), 2)
     ends = replay.springs.ravel()
     by_size = np.argsort(np.abs(strain))
     out = np.zeros(replay.positions.shape[1])
@@ -63,13 +63,13 @@ def vertex_strain(replay: Replay, frame: int) -> NDArray[np.float64]:
     return out
 
 
-def spacing(replay: Replay) -> float:
+def mean_rest_length(replay: RecordingReplay) -> float:
     """Return the mean rest length [m], or 1 if there are no springs."""
     return float(replay.rest_lengths.mean()) if len(replay.rest_lengths) else 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class CameraView:
     """A camera with y up.
 
     Attributes:
@@ -80,27 +80,33 @@ class View:
         box_high: upper corner of that box (3,) [m].
     """
 
-    position: Points
-    target: Points
-    ground: float
-    low: Points
-    high: Points
+    position: PointArray
+    target: PointArray
+    ground_height: float
+    box_low: PointArray
+    box_high: PointArray
 
-    def scaled(self, by: float) -> View:
+    def scale_view(self, factor: float) -> CameraView:
         """Return the view of a scene whose coordinates are multiplied by `factor`."""
-        return View(by * self.position, by * self.target, by * self.ground, by * self.low, by * self.high)
+        return CameraView(
+            factor * self.position,
+            factor * self.target,
+            factor * self.ground_height,
+            factor * self.box_low,
+            factor * self.box_high,
+        )
 
-    def near(self, p: Points) -> Points:
+    def select_nearby(self, p: PointArray) -> PointArray:
         """Return the points (n, 3) in the box or within its diagonal of it.
 
         If there are none, all points are returned.
         """
-        around = _extent(np.stack([self.low, self.high]))
-        inside = ((p >= self.low - around) & (p <= self.high + around)).all(axis=1)
+        around = _box_diagonal(np.stack([self.box_low, self.box_high]))
+        inside = ((p >= self.box_low - around) & (p <= self.box_high + around)).all(axis=1)
         return p[inside] if inside.any() else p
 
 
-def natural_angles(points: Points, areas: Points) -> tuple[float, float]:
+def choose_view_angles(points: PointArray, areas: PointArray) -> tuple[float, float]:
     """Choose azimuth and elevation [degrees] of a three-quarter view.
 
     Args:
@@ -113,26 +119,26 @@ def natural_angles(points: Points, areas: Points) -> tuple[float, float]:
 
     def shown(azimuth: float) -> float:
         # The front view gets a bonus, so that the choice between similar views does not depend on round-off.
-        return float(np.abs(areas @ _towards(azimuth, elevation)).sum()) * (1.05 if azimuth == corner else 1.0)
+        return float(np.abs(areas @ _view_direction(azimuth, elevation)).sum()) * (1.05 if azimuth == corner else 1.0)
 
     return max((corner, -corner, 180.0 - corner, corner - 180.0), key=shown), elevation
 
 
-def area_vectors(replay: Replay, frame: int) -> Points:
+def compute_area_vectors(replay: RecordingReplay, frame: int) -> PointArray:
     """Compute half the cross product of two edges of each triangle [m^2], shape (f, 3)."""
     p = replay.positions[frame].astype(np.float64)
     a, b, c = (p[corner] for corner in replay.triangles.T)
     return np.cross(b - a, c - a) / 2.0
 
 
-def _towards(azimuth: float, elevation: float) -> Points:
+def _view_direction(azimuth: float, elevation: float) -> PointArray:
     """Return the unit vector from the scene to the viewer at these angles [degrees]."""
     azimuth, elevation = np.radians(azimuth), np.radians(elevation)
     level = np.cos(elevation)
     return np.array([np.sin(azimuth) * level, np.sin(elevation), np.cos(azimuth) * level])
 
 
-def frame_all(points: Points, *, aspect: float, angles: tuple[float, float]) -> View:
+def fit_camera(points: PointArray, *, aspect: float, angles: tuple[float, float]) -> CameraView:
     """Compute the closest camera that sees all points.
 
     A point with camera coordinates (a, b, c), c towards the viewer, is visible from (ea, eb, ec) if
@@ -147,9 +153,9 @@ def frame_all(points: Points, *, aspect: float, angles: tuple[float, float]) -> 
         angles: azimuth and elevation [degrees] of the viewer.
     """
     axes = _camera_axes(angles)
-    ground = _ground(points)
-    a, b, c = axes @ np.concatenate([points, _cast(points, ground)]).astype(np.float64).T
-    tan = (1.0 - 2.0 * _MARGIN) * np.tan(_HALF_ANGLE)
+    ground = _ground_height(points)
+    a, b, c = axes @ np.concatenate([points, _project_shadow(points, ground)]).astype(np.float64).T
+    tan = (1.0 - 2.0 * _VIEW_MARGIN) * np.tan(_HALF_FIELD_OF_VIEW)
     eye, distance = np.zeros(3), 0.0
     for k, (side, slope) in enumerate([(a, aspect * tan), (b, tan)]):
         above, below = (side + slope * c).max(), (slope * c - side).max()
@@ -158,38 +164,38 @@ def frame_all(points: Points, *, aspect: float, angles: tuple[float, float]) -> 
     middle = (c.min() + c.max()) / 2.0
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     eye[2] = max(distance, middle + 1e-3 * (float(np.linalg.norm(high - low)) or 1.0))
-    return View(eye @ axes, np.array([eye[0], eye[1], middle]) @ axes, ground, low, high)
+    return CameraView(eye @ axes, np.array([eye[0], eye[1], middle]) @ axes, ground, low, high)
 
 
-def _camera_axes(angles: tuple[float, float]) -> Points:
+def _camera_axes(angles: tuple[float, float]) -> PointArray:
     """Return the directions right, up and towards the viewer as rows (3, 3)."""
-    towards = _towards(*angles)
+    towards = _view_direction(*angles)
     right = np.cross([0.0, 1.0, 0.0], towards)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(towards, right), towards])
 
 
-def _ground(points: Points) -> float:
+def _ground_height(points: PointArray) -> float:
     """Return the height [m] of the plane that receives the shadow of points (q, 3)."""
-    return float(points[:, 1].min() - 0.02 * _extent(points))
+    return float(points[:, 1].min() - 0.02 * _box_diagonal(points))
 
 
-def shape(points: Points, angles: tuple[float, float]) -> float:
+def view_aspect(points: PointArray, angles: tuple[float, float]) -> float:
     """Return width / height of points (q, 3) [m] and their shadow.
 
     They are seen from far away at these angles.
     """
-    whole = np.concatenate([points, _cast(points, _ground(points))])
+    whole = np.concatenate([points, _project_shadow(points, _ground_height(points))])
     across, up, _ = np.ptp(_camera_axes(angles) @ whole.astype(np.float64).T, axis=1)
     return float(across / max(up, 1e-30))
 
 
-def _extent(p: Points) -> float:
+def _box_diagonal(p: PointArray) -> float:
     """Return the diagonal of the points' bounding box [m], at least 1e-30."""
     return max(float(np.linalg.norm(np.ptp(p, axis=0).astype(np.float64))), 1e-30)
 
 
-def _cast(p: Points, ground: float) -> Points:
+def _project_shadow(p: PointArray, ground: float) -> PointArray:
     """Project points (q, 3) onto the ground along the light from the upper left."""
     fall = p[:, 1] - ground
     return np.stack([p[:, 0] + 0.18 * fall, np.full(len(p), ground), p[:, 2] - 0.22 * fall], axis=1)
@@ -204,20 +210,20 @@ def _is_closed(triangles: NDArray[np.int64]) -> bool:
     return bool((np.unique(edges @ [triangles.max() + 1, 1], return_counts=True)[1] == 2).all())
 
 
-def _balls(at: Points, radius: float) -> pv.PolyData:
+def _make_spheres(at: PointArray, radius: float) -> pv.PolyData:
     """Make a sphere at each point (q, 3)."""
     ball = pv.Sphere(radius=radius, theta_resolution=16, phi_resolution=12)
     return cast(pv.PolyData, pv.PolyData(at).glyph(geom=ball, orient=False, scale=False))
 
 
-class _Sizes(NamedTuple):
+class _SceneSizes(NamedTuple):
     """Diagonal of the framed box and mean rest length, in picture units."""
 
     extent: float
     spacing: float
 
 
-class Studio:
+class OffscreenRenderer:
     """One off-screen window, reused for all frames; a context manager.
 
     Args:
@@ -230,9 +236,14 @@ class Studio:
     """
 
     def __init__(
-        self, width: int, height: int, *, mesh_lines: int = _MESH_LINES, background: str | None = PAGE
+        self,
+        width: int,
+        height: int,
+        *,
+        mesh_lines: int = _PIXELS_PER_VERTEX,
+        background: str | None = BACKGROUND_COLOUR,
     ) -> None:
-        opengl.require()
+        opengl.require_opengl()
         self._mesh_lines, self._page = mesh_lines, background
         self._pixels, self._height = width * height, height
         size = [_SUPERSAMPLING * width, _SUPERSAMPLING * height]
@@ -245,7 +256,7 @@ class Studio:
             light = pv.Light(position=place, intensity=strength, light_type="camera light")
             self._plotter.add_light(light)
 
-    def __enter__(self) -> Studio:
+    def __enter__(self) -> OffscreenRenderer:
         return self
 
     def __exit__(
@@ -253,8 +264,13 @@ class Studio:
     ) -> None:
         self._plotter.close()
 
-    def draw(
-        self, replay: Replay, frame: int, view: View, more: Sequence[pv.PolyData] = (), dots: Sequence[Dots] = ()
+    def render_frame(
+        self,
+        replay: RecordingReplay,
+        frame: int,
+        view: CameraView,
+        extra_solids: Sequence[pv.PolyData] = (),
+        coloured_points: Sequence[ColouredPoints] = (),
     ) -> NDArray[np.uint8]:
         """Render a recorded frame, which must be finite.
 
@@ -270,35 +286,35 @@ class Studio:
         plotter.clear_actors()
         # Scaling by a power of two is exact: scenes of all sizes render alike, and scenes of size 1 are unchanged.
         unit = 2.0 ** -round(math.log2(float(np.linalg.norm(view.position - view.target))))
-        view = view.scaled(unit)
+        view = view.scale_view(unit)
         plotter.camera.position = tuple(view.position)
         plotter.camera.focal_point = tuple(view.target)
         plotter.camera.up = (0.0, 1.0, 0.0)
-        plotter.camera.view_angle = 2.0 * np.degrees(_HALF_ANGLE)
+        plotter.camera.view_angle = 2.0 * np.degrees(_HALF_FIELD_OF_VIEW)
         p = np.ascontiguousarray(unit * replay.positions[frame].astype(np.float64), np.float32)
-        sizes = _Sizes(_extent(view.near(p)), unit * spacing(replay))
+        sizes = _SceneSizes(_box_diagonal(view.select_nearby(p)), unit * mean_rest_length(replay))
         if self._page is not None:
-            self._shadow(replay, p, view, sizes, self._page)
+            self._add_shadow(replay, p, view, sizes, self._page)
         if len(replay.triangles):
-            self._surface(replay, frame, p)
+            self._add_surface(replay, frame, p)
         else:
-            self._springs(replay, frame, p, sizes)
-        self._dots(replay, sizes, p[replay.pinned], PIN_COLOUR)
-        for at, colour in dots:
-            self._dots(replay, sizes, unit * at, colour)
-        for solid in (*solids(replay, frame), *more):
+            self._add_springs(replay, frame, p, sizes)
+        self._add_points(replay, sizes, p[replay.pinned_vertices], PIN_COLOUR)
+        for at, colour in coloured_points:
+            self._add_points(replay, sizes, unit * at, colour)
+        for solid in (*build_obstacle_meshes(replay, frame), *extra_solids):
             shape = solid.copy()
             shape.points = unit * np.asarray(solid.points, np.float64)
-            plotter.add_mesh(shape, color=_SOLID, smooth_shading=solid.n_cells > 6, **_MATERIAL)
+            plotter.add_mesh(shape, color=_OBSTACLE_COLOUR, smooth_shading=solid.n_cells > 6, **_MATERIAL_OPTIONS)
         plotter.reset_camera_clipping_range()
         plotter.render()
         clear = self._page is None
         pixels = np.asarray(plotter.screenshot(None, return_img=True, transparent_background=clear))
         return np.asarray(Image.fromarray(pixels if clear else pixels[..., :3]).reduce(_SUPERSAMPLING))
 
-    def _surface(self, replay: Replay, frame: int, p: NDArray[np.float32]) -> None:
+    def _add_surface(self, replay: RecordingReplay, frame: int, p: NDArray[np.float32]) -> None:
         mesh = pv.PolyData.from_regular_faces(p, replay.triangles)
-        mesh.point_data["strain"] = vertex_strain(replay, frame)
+        mesh.point_data["strain"] = compute_vertex_strain(replay, frame)
         limit = replay.strain_range
         self._plotter.add_mesh(
             mesh,
@@ -308,36 +324,40 @@ class Studio:
             smooth_shading=True,
             split_sharp_edges=_is_closed(replay.triangles),
             feature_angle=50.0,
-            **_MATERIAL,
+            **_MATERIAL_OPTIONS,
             show_edges=len(p) * self._mesh_lines <= self._pixels,
-            edge_color=INK,
+            edge_color=TEXT_COLOUR,
             edge_opacity=0.14,
             line_width=1.5,
             show_scalar_bar=False,
         )
 
-    def _springs(self, replay: Replay, frame: int, p: NDArray[np.float32], sizes: _Sizes) -> None:
-        m, radius = len(replay.springs), self._tube(sizes)
+    def _add_springs(self, replay: RecordingReplay, frame: int, p: NDArray[np.float32], sizes: _SceneSizes) -> None:
+        m, radius = len(replay.springs), self._tube_radius(sizes)
         if not m:
-            self._plotter.add_mesh(_balls(p, 1.5 * radius), color=_JOINT, smooth_shading=True, **_MATERIAL)
+            self._plotter.add_mesh(
+                _make_spheres(p, 1.5 * radius), color=_JOINT_COLOUR, smooth_shading=True, **_MATERIAL_OPTIONS
+            )
             return
         lines = pv.PolyData(p, lines=np.c_[np.full(m, 2), replay.springs].ravel())
-        lines.cell_data["strain"] = spring_strain(replay, frame)
+        lines.cell_data["strain"] = compute_spring_strain(replay, frame)
         look: dict[str, Any] = {
             "scalars": "strain",
             "cmap": STRAIN_MAP,
             "clim": (-replay.strain_range, replay.strain_range),
             "show_scalar_bar": False,
-            **_MATERIAL,
+            **_MATERIAL_OPTIONS,
         }
-        if m > _TUBES:
+        if m > _MAX_TUBES:
             self._plotter.add_mesh(lines, line_width=1.5, **look)
             return
         tubes = cast(pv.PolyData, lines.tube(radius=radius, n_sides=12))
         self._plotter.add_mesh(tubes, smooth_shading=True, **look)
-        self._plotter.add_mesh(_balls(p, 1.5 * radius), color=_JOINT, smooth_shading=True, **_MATERIAL)
+        self._plotter.add_mesh(
+            _make_spheres(p, 1.5 * radius), color=_JOINT_COLOUR, smooth_shading=True, **_MATERIAL_OPTIONS
+        )
 
-    def _tube(self, sizes: _Sizes) -> float:
+    def _tube_radius(self, sizes: _SceneSizes) -> float:
         """Return the radius of a spring's tube.
 
         It is thin relative to its length and the scene, but at least about a pixel.
@@ -345,19 +365,21 @@ class Studio:
         thin = min(0.07 * sizes.spacing, 0.007 * sizes.extent)
         return max(thin, 1.1 * sizes.extent / self._height)
 
-    def _dots(self, replay: Replay, sizes: _Sizes, at: Points, colour: str) -> None:
+    def _add_points(self, replay: RecordingReplay, sizes: _SceneSizes, at: PointArray, colour: str) -> None:
         if len(at):
             spaced = min(0.3 * sizes.spacing, 0.009 * sizes.extent)
-            radius = max(spaced, 0.004 * sizes.extent, 0.0 if len(replay.triangles) else 2.2 * self._tube(sizes))
-            self._plotter.add_mesh(_balls(at, radius), color=colour, smooth_shading=True, **_MATERIAL)
+            radius = max(spaced, 0.004 * sizes.extent, 0.0 if len(replay.triangles) else 2.2 * self._tube_radius(sizes))
+            self._plotter.add_mesh(_make_spheres(at, radius), color=colour, smooth_shading=True, **_MATERIAL_OPTIONS)
 
-    def _shadow(self, replay: Replay, p: NDArray[np.float32], view: View, sizes: _Sizes, behind: str) -> None:
+    def _add_shadow(
+        self, replay: RecordingReplay, p: NDArray[np.float32], view: CameraView, sizes: _SceneSizes, background: str
+    ) -> None:
         """Add a soft shadow on the ground.
 
         The scene is projected from the light, as a blurred texture on an unlit plane.
         """
-        ground = view.ground
-        flat, near = (_cast(points, ground)[:, [0, 2]] for points in (p, view.near(p)))
+        ground = view.ground_height
+        flat, near = (_project_shadow(points, ground)[:, [0, 2]] for points in (p, view.select_nearby(p)))
         centre = (near.min(axis=0) + near.max(axis=0)) / 2
         side = 1.5 * float(np.ptp(near, axis=0).max()) + 0.2 * sizes.extent
         pixels = 384
@@ -371,7 +393,7 @@ class Studio:
             for ends in at[replay.springs].reshape(-1, 4).tolist():
                 pen.line(ends, fill=255, width=3)
         dark = np.asarray(stencil.filter(ImageFilter.GaussianBlur(11)), np.float32)[..., None] / 255
-        page, shade = (np.array(pv.Color(c).int_rgb, np.float32) for c in (behind, _SHADE))
+        page, shade = (np.array(pv.Color(c).int_rgb, np.float32) for c in (background, _SHADOW_COLOUR))
         texture = pv.Texture((page + dark * (shade - page)).round().astype(np.uint8))
         plane = pv.Plane(center=(centre[0], ground, centre[1]), direction=(0, 1, 0), i_size=side, j_size=side)
         corner = (plane.points[:, [0, 2]] - centre) / side + 0.5

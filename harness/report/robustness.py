@@ -24,75 +24,94 @@ from rich.table import Table
 
 from harness.base import rows, shelf
 from harness.base.errors import InputError
-from harness.config.options import OPTIONS
-from solvers.registry import OPTIONAL, SOLVERS
+from harness.config.options import RUN_OPTIONS
+from solvers.registry import OPTIONAL_SOLVERS, SOLVERS
 
-SLACK = 1.1
+TOLERANCE_SLACK = 1.1
 """Factor on the tolerance, because the reference evaluator and a solver factorise the same matrix differently.
 
 Of 1372 runs of configs/hard none changes its outcome at 1.0, and 8 become correct at 2.2. All 7902 steps that their
 solver reported as converged were converged.
 """
-ASKED = 1e-6
+DEFAULT_RTOL = 1e-6
 """Tolerance that scores a run for which none was requested."""
-SAME = 1e-2
+SAME_MOTION_DISTANCE = 1e-2
 """Share of the rest shape's size: a motion within this distance of the reference counts as the same.
 
 Steps are solved to 1e-6 of their displacement, and instability amplifies that error. The limit lies in a gap: of 670
 runs of configs/hard that end at minima, 595 stay within 0.5 % and 71 deviate by more than 2 %. Half the limit would
 remove 2 of the correct runs, twice the limit would add 2.
 """
-CLOSE = 0.05
+CLOSE_MOTION_DISTANCE = 0.05
 """Share of the rest shape's size: required distance of a method that does not minimise, roughly what is visible.
 
 A convention: of its 240 runs of configs/hard, 97 are within it, 73 within half of it and 104 within twice.
 """
 
 
-class Outcome(NamedTuple):
+class RunOutcome(NamedTuple):
     """The outcome of a run: label, colour and description."""
 
-    words: str
+    label: str
     color: str
-    meaning: str
+    description: str
 
 
-RIGHT = Outcome("right", "#3a9e72", "stationary to the tolerance, a certified minimum, and the motion of the reference")
-OTHER = Outcome(
+CORRECT = RunOutcome(
+    "right", "#3a9e72", "stationary to the tolerance, a certified minimum, and the motion of the reference"
+)
+OTHER_MINIMUM = RunOutcome(
     "another minimum", "#8fcbad", "a certified minimum in every step, and another motion than the reference, or none"
 )
-VALLEY = Outcome(
+DEGENERATE_MINIMUM = RunOutcome(
     "in a valley", "#c9c27a", "stationary, where some curvature cannot be told from zero: minima that are a continuum"
 )
-SADDLE = Outcome("no minimum", "#b9a3d6", "stationary, but where the objective falls some way: a saddle")
-SHORT = Outcome("not converged", "#f2c45f", "finite, and not yet stationary, or not close to the reference")
-WRONG = Outcome("silently wrong", "#e0683c", "said of a step that it had converged, which the oracle finds untrue")
-DIVERGED = Outcome("diverged", "#d1495b", "not finite any more, or far beyond the energy of its scene")
-GROWN = Outcome("energy growth", "#c98ba6", "finite, with more energy than the scene can have given it")
-LATE = Outcome("too slow", "#7b7f87", "did not end within its time limit")
-FAILED = Outcome("failed", "#23262b", "ended with an error")
-DISPUTED = Outcome("disputed", "#8a6d4b", "the second opinion finds the formulas of the steps themselves wrong")
-REFUSED = Outcome("refused", "#d9d9d6", "refused before it began, with a reason")
-OUTCOMES = (RIGHT, OTHER, VALLEY, SADDLE, SHORT, WRONG, GROWN, DIVERGED, LATE, FAILED, DISPUTED, REFUSED)
+SADDLE_POINT = RunOutcome("no minimum", "#b9a3d6", "stationary, but where the objective falls some way: a saddle")
+NOT_CONVERGED = RunOutcome("not converged", "#f2c45f", "finite, and not yet stationary, or not close to the reference")
+SILENTLY_WRONG = RunOutcome(
+    "silently wrong", "#e0683c", "said of a step that it had converged, which the oracle finds untrue"
+)
+DIVERGED = RunOutcome("diverged", "#d1495b", "not finite any more, or far beyond the energy of its scene")
+ENERGY_GROWTH = RunOutcome("energy growth", "#c98ba6", "finite, with more energy than the scene can have given it")
+TIMED_OUT = RunOutcome("too slow", "#7b7f87", "did not end within its time limit")
+FAILED = RunOutcome("failed", "#23262b", "ended with an error")
+FORMULA_MISMATCH = RunOutcome(
+    "disputed", "#8a6d4b", "the second opinion finds the formulas of the steps themselves wrong"
+)
+UNSUPPORTED = RunOutcome("refused", "#d9d9d6", "refused before it began, with a reason")
+RUN_OUTCOMES = (
+    CORRECT,
+    OTHER_MINIMUM,
+    DEGENERATE_MINIMUM,
+    SADDLE_POINT,
+    NOT_CONVERGED,
+    SILENTLY_WRONG,
+    ENERGY_GROWTH,
+    DIVERGED,
+    TIMED_OUT,
+    FAILED,
+    FORMULA_MISMATCH,
+    UNSUPPORTED,
+)
 
-_CLAIMS = ("tolerance", "floor")
+_CONVERGED_REASONS = ("tolerance", "floor")
 """Termination reasons with which a solver claims convergence."""
-_ENDED = {
-    "time-limit": LATE,
-    "unsupported": REFUSED,
+_OUTCOME_OF_STATUS = {
+    "time-limit": TIMED_OUT,
+    "unsupported": UNSUPPORTED,
     "diverged": DIVERGED,
-    "energy-growth": GROWN,
+    "energy-growth": ENERGY_GROWTH,
     "failed": FAILED,
     "killed": FAILED,
-    "disputed": DISPUTED,
+    "disputed": FORMULA_MISMATCH,
 }
 
-_WHOLE = ("disputed", "energy-growth")
+_COMPLETED_STATUSES = ("disputed", "energy-growth")
 """Statuses of runs that were completed and have a row for each step."""
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class VerifiedRun:
     """The outcome of one verified run.
 
     Attributes:
@@ -112,29 +131,29 @@ class Judged:
 
     case: str
     solver: str
-    outcome: Outcome
-    worst: float | None
-    graded: str
+    outcome: RunOutcome
+    worst_error: float | None
+    error_kind: str
     reason: str
-    reference: str = ""
+    citation: str = ""
     run_id: str = ""
     cpu: str = ""
     commit: str = ""
-    name: str = ""
+    solver_name: str = ""
 
     @property
-    def figure(self) -> str:
+    def error_text(self) -> str:
         """The worst error: a power of ten, or a percentage of the scene's size."""
-        if self.worst is None:
+        if self.worst_error is None:
             return ""
-        if self.graded == "distance":
-            return f"{100 * self.worst:.0f} %" if self.worst < 9.99 else ">999 %"
-        if not math.isfinite(self.worst):
-            return str(self.worst)
-        return "0" if self.worst == 0.0 else f"1e{round(math.log10(self.worst))}"
+        if self.error_kind == "distance":
+            return f"{100 * self.worst_error:.0f} %" if self.worst_error < 9.99 else ">999 %"
+        if not math.isfinite(self.worst_error):
+            return str(self.worst_error)
+        return "0" if self.worst_error == 0.0 else f"1e{round(math.log10(self.worst_error))}"
 
 
-def read_cells(folder: Path) -> list[Judged]:
+def read_verified_runs(folder: Path) -> list[VerifiedRun]:
     """Read the outcomes of the runs in a sweep's folder.
 
     They are ordered by case and solver; of repeated runs the newest counts. Units with invalid values are omitted; the
@@ -143,9 +162,9 @@ def read_cells(folder: Path) -> list[Judged]:
     Raises:
         InputError: if no run was verified.
     """
-    files = shelf.units(folder / "rows")
+    files = shelf.list_units(folder / "rows")
     needed = "run_id", "scene", "size", "solver", "phase", "status", "started"
-    table = rows.read(files, needed=needed, left_out=lambda mistake: None).to_pylist()
+    table = rows.read_rows(files, required_columns=needed, on_invalid=lambda mistake: None).to_pylist()
     runs: dict[str, list[dict[str, Any]]] = {}
     for row in table:
         if row["phase"] == "run" or (row["phase"] == "step" and row["round"] == 0):
@@ -155,69 +174,80 @@ def read_cells(folder: Path) -> list[Judged]:
     if any(row["stationarity"] is not None and row["beyond"] is None for row in table):
         raise InputError(f"{folder}: holds runs that another version judged; run the sweep again")
     firsts = [run[0] for run in runs.values()]
-    cells: dict[tuple[str, str], Judged] = {}
+    cells: dict[tuple[str, str], VerifiedRun] = {}
     for run in sorted(runs.values(), key=lambda run: run[0]["started"]):
-        case, solver = _case(run[0], firsts), _solver(run[0], firsts)
-        outcome, worst, graded, reason = judged(run)
+        case, solver = _case_name(run[0], firsts), _solver_label(run[0], firsts)
+        outcome, worst, graded, reason = classify_run(run)
         run_id, reference = run[0]["run_id"], run[0]["reference"] or ""
         made = run[0]["cpu"] or "", run[0]["commit"] or ""
         named = *made, run[0]["solver"]
-        cells[case, solver] = Judged(case, solver, outcome, worst, graded, reason, reference, run_id, *named)
-    order = {name: k for k, name in enumerate(dict.fromkeys([*SOLVERS, *OPTIONAL, *(r["solver"] for r in firsts)]))}
-    return sorted(cells.values(), key=lambda cell: (_numbered(cell.case), order[cell.name], cell.solver))
+        cells[case, solver] = VerifiedRun(case, solver, outcome, worst, graded, reason, reference, run_id, *named)
+    order = {
+        name: k for k, name in enumerate(dict.fromkeys([*SOLVERS, *OPTIONAL_SOLVERS, *(r["solver"] for r in firsts)]))
+    }
+    return sorted(cells.values(), key=lambda cell: (_natural_sort_key(cell.case), order[cell.solver_name], cell.solver))
 
 
-def _numbered(name: str) -> list[tuple[int, str]]:
+def _natural_sort_key(name: str) -> list[tuple[int, str]]:
     """Return a key that sorts names with numbers naturally, 8 before 16."""
     return [(len(part.lstrip("0")) if k % 2 else 0, part) for k, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
-def judged(run: Sequence[dict[str, Any]]) -> tuple[Outcome, float | None, str, str]:
+def classify_run(run: Sequence[dict[str, Any]]) -> tuple[RunOutcome, float | None, str, str]:
     """Classify a run from its rows, one per step.
 
     Returns: outcome, worst error, kind of that error, and the reason why the run is not correct.
     """
     first = run[0]
     if first["status"] != "ok":
-        where = f"frame {first['frame']}: " if first["frame"] and first["status"] not in _WHOLE else ""
-        return _ENDED.get(first["status"], FAILED), None, "", where + (first["reason"] or first["status"])
+        where = f"frame {first['frame']}: " if first["frame"] and first["status"] not in _COMPLETED_STATUSES else ""
+        return _OUTCOME_OF_STATUS.get(first["status"], FAILED), None, "", where + (first["reason"] or first["status"])
     farthest = max((away for row in run if (away := row["distance"]) is not None), default=None)
     lost = any(row["distance"] is None for row in run)
     if all(row["stationarity"] is None for row in run):
-        near = farthest is not None and not lost and farthest <= CLOSE
+        near = farthest is not None and not lost and farthest <= CLOSE_MOTION_DISTANCE
         why = "" if near else "there is no reference" if lost else "away from the reference"
-        return (RIGHT if near else SHORT), farthest, "distance", why
+        return (CORRECT if near else NOT_CONVERGED), farthest, "distance", why
     beyond = [math.nan if row["beyond"] is None else row["beyond"] for row in run]
     worst = max(beyond, key=lambda value: (math.isnan(value), value))
-    missed = [row for row, by in zip(run, beyond, strict=True) if not by <= SLACK * (row["tolerance"] or ASKED)]
+    missed = [
+        row
+        for row, by in zip(run, beyond, strict=True)
+        if not by <= TOLERANCE_SLACK * (row["tolerance"] or DEFAULT_RTOL)
+    ]
     if missed:
-        claimed = sum(row["stopped"] in _CLAIMS for row in missed)
+        claimed = sum(row["stopped"] in _CONVERGED_REASONS for row in missed)
         said = f", {claimed} of which said they had met it" if claimed else ""
         why = f"{len(missed)} of {len(run)} steps missed the tolerance{said}"
-        return (WRONG if claimed else SHORT), worst, "stationarity", why
+        return (SILENTLY_WRONG if claimed else NOT_CONVERGED), worst, "stationarity", why
     none = [row for row in run if not row["minimum"]]
     if none:
         if all(row["flat"] for row in none):
-            return VALLEY, worst, "stationarity", f"in {len(none)} of {len(run)} steps some curvature is round-off"
-        return SADDLE, worst, "stationarity", "the Hessian is not positive definite"
+            return (
+                DEGENERATE_MINIMUM,
+                worst,
+                "stationarity",
+                f"in {len(none)} of {len(run)} steps some curvature is round-off",
+            )
+        return SADDLE_POINT, worst, "stationarity", "the Hessian is not positive definite"
     if lost or farthest is None:
-        return OTHER, worst, "stationarity", "there is no reference to compare the motion with"
-    if farthest > SAME:
-        return OTHER, worst, "stationarity", f"up to {100 * farthest:.2g} % of the size from the reference"
-    return RIGHT, worst, "stationarity", ""
+        return OTHER_MINIMUM, worst, "stationarity", "there is no reference to compare the motion with"
+    if farthest > SAME_MOTION_DISTANCE:
+        return OTHER_MINIMUM, worst, "stationarity", f"up to {100 * farthest:.2g} % of the size from the reference"
+    return CORRECT, worst, "stationarity", ""
 
 
-_OPTIONS = ("size", *(option.column for option in OPTIONS.values() if option.column))
+_OPTION_COLUMNS = ("size", *(option.column for option in RUN_OPTIONS.values() if option.column))
 
 
-def _case(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
+def _case_name(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
     """Return the scene with the options in which the runs of that scene differ."""
     own = [other for other in runs if other["scene"] == row["scene"]]
-    varied = [str(row[key]) for key in _OPTIONS if any(other[key] != row[key] for other in own)]
+    varied = [str(row[key]) for key in _OPTION_COLUMNS if any(other[key] != row[key] for other in own)]
     return " ".join([row["scene"], *varied])
 
 
-def _solver(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
+def _solver_label(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
     """Return the solver's name with the parameters in which its runs differ."""
     stated = {run["parameters"] or "{}" for run in runs if run["solver"] == row["solver"]}
     others = [json.loads(text) for text in stated]
@@ -227,7 +257,7 @@ def _solver(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Score:
+class SolverScore:
     """Score of one solver over all cases.
 
     Attributes:
@@ -238,47 +268,52 @@ class Score:
     """
 
     solver: str
-    counts: tuple[int, ...]
-    right: float | None
-    finite: float | None
-    worst: Judged
+    outcome_counts: tuple[int, ...]
+    correct_share: float | None
+    finite_share: float | None
+    worst_run: VerifiedRun
 
 
-def scores(cells: Sequence[Judged]) -> list[Score]:
+def score_solvers(cells: Sequence[VerifiedRun]) -> list[SolverScore]:
     """Compute a score for each solver, in the order of the cells."""
-    found: list[Score] = []
+    found: list[SolverScore] = []
     for solver in dict.fromkeys(cell.solver for cell in cells):
         own = [cell for cell in cells if cell.solver == solver]
-        of = {outcome: sum(cell.outcome == outcome for cell in own) for outcome in OUTCOMES}
-        claimed = len(own) - of[REFUSED]
-        right, broken = of[RIGHT], of[DIVERGED] + of[FAILED]
+        of = {outcome: sum(cell.outcome == outcome for cell in own) for outcome in RUN_OUTCOMES}
+        claimed = len(own) - of[UNSUPPORTED]
+        right, broken = of[CORRECT], of[DIVERGED] + of[FAILED]
         shares = (right / claimed, 1.0 - broken / claimed) if claimed else (None, None)
         worst = max(
-            own, key=lambda cell: -1.0 if cell.worst is None else math.inf if math.isnan(cell.worst) else cell.worst
+            own,
+            key=lambda cell: (
+                -1.0 if cell.worst_error is None else math.inf if math.isnan(cell.worst_error) else cell.worst_error
+            ),
         )
-        found.append(Score(solver, tuple(of.values()), *shares, worst))
+        found.append(SolverScore(solver, tuple(of.values()), *shares, worst))
     return found
 
 
-def percent(share: float | None) -> str:
+def format_share(share: float | None) -> str:
     """Format a share in percent; empty for None."""
     return "" if share is None else f"{share:.0%}"
 
 
-def summary(cells: Sequence[Judged]) -> Table:
+def build_score_table(cells: Sequence[VerifiedRun]) -> Table:
     """Build a table of scores with one row per solver.
 
     Columns are counts of the outcomes that occur, shares, and the worst error.
     """
-    found = scores(cells)
-    there = [k for k, _ in enumerate(OUTCOMES) if any(score.counts[k] for score in found)]
+    found = score_solvers(cells)
+    there = [k for k, _ in enumerate(RUN_OUTCOMES) if any(score.outcome_counts[k] for score in found)]
     table = Table(box=SIMPLE_HEAD, caption_justify="left")
     table.caption = "none of these are times: they may be compared across machines"
     table.add_column("solver", vertical="bottom")
-    for words in (*(OUTCOMES[k].words for k in there), "part right", "part finite", "worst residual"):
+    for words in (*(RUN_OUTCOMES[k].label for k in there), "part right", "part finite", "worst residual"):
         table.add_column("\n".join(words.rsplit(" ", 1)), justify="right", vertical="bottom")
     for score in found:
-        worst = "" if score.worst.worst is None else f"{score.worst.worst:.1e}"
-        counts = (str(score.counts[k]) for k in there)
-        table.add_row(escape(score.solver), *counts, percent(score.right), percent(score.finite), worst)
+        worst = "" if score.worst_run.worst_error is None else f"{score.worst_run.worst_error:.1e}"
+        counts = (str(score.outcome_counts[k]) for k in there)
+        table.add_row(
+            escape(score.solver), *counts, format_share(score.correct_share), format_share(score.finite_share), worst
+        )
     return table

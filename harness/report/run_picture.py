@@ -19,32 +19,40 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from harness.record.base import Replay
-from harness.record.framing import outside_words
-from harness.report.frames import drawable_frames, largest_strain, shown_limit, strain_ends
-from harness.report.origin import made_by
+from harness.record.base import RecordingReplay
+from harness.record.framing import describe_outside
+from harness.report.frames import find_drawable_frames, max_recorded_strain, strain_extremes, strain_scale_limit
+from harness.report.origin import draw_provenance
 from harness.report.page import (
-    clock,
-    count,
-    header,
-    headline,
+    draw_header,
+    draw_strain_scale,
+    draw_text,
+    format_count,
+    format_frame_time,
+    format_quantity,
     new_page,
-    paste,
-    quantity,
-    save,
-    shorten,
-    strain_scale,
-    text,
+    paste_picture,
+    save_page,
+    scene_headline,
+    shorten_words,
 )
-from harness.report.render import Studio, area_vectors, frame_all, natural_angles, shape
-from harness.report.self_contact import self_contact_words
-from harness.report.solids import framed, seen
-from harness.report.style import HEIGHT, INK, MUTED, PAGE, RC, RULE, WIDTH
+from harness.report.render import OffscreenRenderer, choose_view_angles, compute_area_vectors, fit_camera, view_aspect
+from harness.report.self_contact import describe_self_intersection
+from harness.report.solids import framed_vertex_mask, points_to_frame
+from harness.report.style import (
+    BACKGROUND_COLOUR,
+    MUTED_COLOUR,
+    PAGE_HEIGHT,
+    PAGE_RC,
+    PAGE_WIDTH,
+    RULE_COLOUR,
+    TEXT_COLOUR,
+)
 
-_LEFT, _TOP, _RIGHT, _HEIGHT = 36, 114, WIDTH - 36, 750
-_WIDEST, _SLIMMEST = 1180, 420  # of the final frame; the earlier ones have the rest
-_RULE, _GAP, _CAPTION = 44, 12, 24
-_EARLIER = 4  # any grid that they are put in is full
+_FRAMES_LEFT, _FRAMES_TOP, _FRAMES_RIGHT, _FRAMES_HEIGHT = 36, 114, PAGE_WIDTH - 36, 750
+_MAX_FINAL_WIDTH, _MIN_FINAL_WIDTH = 1180, 420  # of the final frame; the earlier ones have the rest
+_RULE_GAP, _TILE_GAP, _CAPTION_HEIGHT = 44, 12, 24
+_EARLIER_FRAMES = 4  # any grid that they are put in is full
 
 
 class PixelBox(NamedTuple):
@@ -56,7 +64,7 @@ class PixelBox(NamedTuple):
     height: int
 
 
-def layout(final: float, whole: float, earlier: int) -> tuple[PixelBox, list[PixelBox]]:
+def layout_frames(final: float, full_run: float, earlier: int) -> tuple[PixelBox, list[PixelBox]]:
     """Lay out the final frame and the earlier ones.
 
     Scenes of the given aspect ratios fill their boxes.
@@ -68,27 +76,32 @@ def layout(final: float, whole: float, earlier: int) -> tuple[PixelBox, list[Pix
     Returns: the box of the final frame, and those of the earlier ones.
     """
     if not earlier:
-        return PixelBox(_LEFT, _TOP, _RIGHT - _LEFT, _HEIGHT), []
-    main = PixelBox(_LEFT, _TOP, int(min(max(_HEIGHT * final, _SLIMMEST), _WIDEST)), _HEIGHT)
-    start = main.left + main.width + _RULE
-    room = _RIGHT - start
+        return PixelBox(_FRAMES_LEFT, _FRAMES_TOP, _FRAMES_RIGHT - _FRAMES_LEFT, _FRAMES_HEIGHT), []
+    main = PixelBox(
+        _FRAMES_LEFT,
+        _FRAMES_TOP,
+        int(min(max(_FRAMES_HEIGHT * final, _MIN_FINAL_WIDTH), _MAX_FINAL_WIDTH)),
+        _FRAMES_HEIGHT,
+    )
+    start = main.left + main.width + _RULE_GAP
+    room = _FRAMES_RIGHT - start
 
     def tile(columns: int) -> tuple[float, int, int]:
         rows = ceil(earlier / columns)
-        width = (room - (columns - 1) * _GAP) // columns
-        height = (_HEIGHT - rows * _CAPTION) // rows
-        return min(float(width), whole * height), width, min(height, int(width / min(whole, 1.0)))
+        width = (room - (columns - 1) * _TILE_GAP) // columns
+        height = (_FRAMES_HEIGHT - rows * _CAPTION_HEIGHT) // rows
+        return min(float(width), full_run * height), width, min(height, int(width / min(full_run, 1.0)))
 
     columns = max(range(1, earlier + 1), key=lambda c: tile(c)[0])
     _, width, height = tile(columns)
     places = [divmod(k, columns) for k in range(earlier)]
     return main, [
-        PixelBox(start + column * (width + _GAP), _TOP + row * (height + _CAPTION), width, height)
+        PixelBox(start + column * (width + _TILE_GAP), _FRAMES_TOP + row * (height + _CAPTION_HEIGHT), width, height)
         for row, column in places
     ]
 
 
-def draw_run(replay: Replay, path: Path, *, camera: tuple[float, float] | None = None) -> None:
+def draw_run_picture(replay: RecordingReplay, path: Path, *, camera: tuple[float, float] | None = None) -> None:
     """Draw the picture of a run as a PNG file of PAGE_WIDTH x PAGE_HEIGHT pixels.
 
     If positions become non-finite, the picture states it and shows the frames before.
@@ -100,64 +113,70 @@ def draw_run(replay: Replay, path: Path, *, camera: tuple[float, float] | None =
     Raises:
         RunFailed: if the system cannot draw.
     """
-    good = drawable_frames(replay)
-    shown = np.unique(np.linspace(0, len(good) - 1, _EARLIER + 1).round().astype(int)) if len(good) else good
+    good = find_drawable_frames(replay)
+    shown = np.unique(np.linspace(0, len(good) - 1, _EARLIER_FRAMES + 1).round().astype(int)) if len(good) else good
     if len(shown):
-        replay = replace(replay, strain_range=shown_limit([replay] * len(shown), shown.tolist()))
-    with matplotlib.rc_context(RC):
+        replay = replace(replay, strain_range=strain_scale_limit([replay] * len(shown), shown.tolist()))
+    with matplotlib.rc_context(PAGE_RC):
         page = new_page()
-        header(page, headline(replay), [*_facts(replay), *(_warnings(replay, shown.tolist()) if len(shown) else [])])
-        strain_scale(page, replay.strain_range, strain_ends([replay]), pins=len(replay.pinned) > 0)
-        made_by(page, [replay], HEIGHT - 12)
+        draw_header(
+            page,
+            scene_headline(replay),
+            [*_collect_facts(replay), *(_collect_warnings(replay, shown.tolist()) if len(shown) else [])],
+        )
+        draw_strain_scale(page, replay.strain_range, strain_extremes([replay]), pins=len(replay.pinned_vertices) > 0)
+        draw_provenance(page, [replay], PAGE_HEIGHT - 12)
         if len(shown):
-            _frames(page, replay, shown, camera)
+            _draw_frames(page, replay, shown, camera)
         total = len(replay.frames)
         if len(good) < total:
-            _notice(page, replay, len(good))
-        save(page, path)
+            _draw_blow_up_notice(page, replay, len(good))
+        save_page(page, path)
 
 
-def _warnings(replay: Replay, shown: list[int]) -> list[str]:
-    return [*outside_words(framed(replay, shown)), *self_contact_words(replay, shown)]
+def _collect_warnings(replay: RecordingReplay, shown: list[int]) -> list[str]:
+    return [*describe_outside(framed_vertex_mask(replay, shown)), *describe_self_intersection(replay, shown)]
 
 
-def _facts(replay: Replay) -> list[str]:
+def _collect_facts(replay: RecordingReplay) -> list[str]:
     known = replay.properties
-    facts = [shorten(str(known.get("solver", "")), 48)] if "solver" in known else []
-    facts.append(f"{count(replay.positions.shape[1])} vertices, {count(len(replay.springs))} springs")
+    facts = [shorten_words(str(known.get("solver", "")), 48)] if "solver" in known else []
+    facts.append(f"{format_count(replay.positions.shape[1])} vertices, {format_count(len(replay.springs))} springs")
     if "milliseconds_per_step" in known:
-        facts.append(f"{quantity(float(known['milliseconds_per_step']))} ms a step")
-    if np.isfinite(strain := largest_strain(replay)):
+        facts.append(f"{format_quantity(float(known['milliseconds_per_step']))} ms a step")
+    if np.isfinite(strain := max_recorded_strain(replay)):
         facts.append(f"largest strain {100 * strain:.3g} %")
     return facts
 
 
-def _frames(page: Figure, replay: Replay, shown: NDArray[np.int64], camera: tuple[float, float] | None) -> None:
+def _draw_frames(
+    page: Figure, replay: RecordingReplay, shown: NDArray[np.int64], camera: tuple[float, float] | None
+) -> None:
     *earlier, final = (int(k) for k in shown)
-    points = replay.positions[shown][:, framed(replay, shown)].reshape(-1, 3)
-    angles = natural_angles(points, area_vectors(replay, final)) if camera is None else camera
-    last, every = seen(replay, [final]), seen(replay, (*earlier, final))
-    main, tiles = layout(shape(last, angles), shape(every, angles), len(earlier))
-    close = frame_all(last, aspect=main.width / main.height, angles=angles)
-    with Studio(main.width, main.height) as studio:
-        paste(page, studio.draw(replay, final, close), main.left, main.top)
-    text(page, main.left + 4, main.top + main.height - 4, clock(replay, final), size=11.5)
+    points = replay.positions[shown][:, framed_vertex_mask(replay, shown)].reshape(-1, 3)
+    angles = choose_view_angles(points, compute_area_vectors(replay, final)) if camera is None else camera
+    last, every = points_to_frame(replay, [final]), points_to_frame(replay, (*earlier, final))
+    main, tiles = layout_frames(view_aspect(last, angles), view_aspect(every, angles), len(earlier))
+    close = fit_camera(last, aspect=main.width / main.height, angles=angles)
+    with OffscreenRenderer(main.width, main.height) as studio:
+        paste_picture(page, studio.render_frame(replay, final, close), main.left, main.top)
+    draw_text(page, main.left + 4, main.top + main.height - 4, format_frame_time(replay, final), size=11.5)
     if not tiles:
         return
-    whole = frame_all(every, aspect=tiles[0].width / tiles[0].height, angles=angles)
-    x, ends = (tiles[0].left - _RULE / 2) / WIDTH, (main.top + 4, main.top + main.height - 4)
-    page.add_artist(Line2D([x, x], [1 - y / HEIGHT for y in ends], color=RULE, linewidth=0.8))
-    with Studio(tiles[0].width, tiles[0].height) as studio:
+    whole = fit_camera(every, aspect=tiles[0].width / tiles[0].height, angles=angles)
+    x, ends = (tiles[0].left - _RULE_GAP / 2) / PAGE_WIDTH, (main.top + 4, main.top + main.height - 4)
+    page.add_artist(Line2D([x, x], [1 - y / PAGE_HEIGHT for y in ends], color=RULE_COLOUR, linewidth=0.8))
+    with OffscreenRenderer(tiles[0].width, tiles[0].height) as studio:
         for frame, tile in zip(earlier, tiles, strict=True):
-            paste(page, studio.draw(replay, frame, whole), tile.left, tile.top)
-            words = clock(replay, frame)
-            text(page, tile.left + 4, tile.top + tile.height + 14, words, size=10, color=MUTED)
+            paste_picture(page, studio.render_frame(replay, frame, whole), tile.left, tile.top)
+            words = format_frame_time(replay, frame)
+            draw_text(page, tile.left + 4, tile.top + tile.height + 14, words, size=10, color=MUTED_COLOUR)
 
 
-def _notice(page: Figure, replay: Replay, good: int) -> None:
+def _draw_blow_up_notice(page: Figure, replay: RecordingReplay, good: int) -> None:
     """Draw a notice with the frame from which on positions cannot be drawn."""
     words = f"not finite from frame {int(replay.frames[good])} on"
     below = f"shown: up to the last finite frame, {int(replay.frames[good - 1])}" if good else "no frame can be drawn"
-    middle, y = WIDTH / 2, _TOP + 40 if good else _TOP + _HEIGHT / 2
-    box = {"facecolor": PAGE, "edgecolor": INK, "linewidth": 1.0, "boxstyle": "round,pad=0.6"}
-    text(page, middle, y, f"Positions are {words}\n{below}", size=13, ha="center", va="center", bbox=box)
+    middle, y = PAGE_WIDTH / 2, _FRAMES_TOP + 40 if good else _FRAMES_TOP + _FRAMES_HEIGHT / 2
+    box = {"facecolor": BACKGROUND_COLOUR, "edgecolor": TEXT_COLOUR, "linewidth": 1.0, "boxstyle": "round,pad=0.6"}
+    draw_text(page, middle, y, f"Positions are {words}\n{below}", size=13, ha="center", va="center", bbox=box)

@@ -17,32 +17,32 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from harness.record.base import Replay
-from harness.report.origin import made_by
-from harness.report.page import header, new_page, paste, save, text
-from harness.report.render import Studio, area_vectors, frame_all, natural_angles
-from harness.report.solids import seen
-from harness.report.style import HEIGHT, INK, MUTED, RC, WIDTH, numbered
+from harness.record.base import RecordingReplay
+from harness.report.origin import draw_provenance
+from harness.report.page import draw_header, draw_text, new_page, paste_picture, save_page
+from harness.report.render import OffscreenRenderer, choose_view_angles, compute_area_vectors, fit_camera
+from harness.report.solids import points_to_frame
+from harness.report.style import MUTED_COLOUR, PAGE_HEIGHT, PAGE_RC, PAGE_WIDTH, TEXT_COLOUR, indexed_style
 
-_LEFT, _TOP, _GAP, _ROW = 36, 114, 40, 24
-_LEGEND, _TALL = 420, 750
-_LETTERS = 52
-_LINES = 120
+_VIEW_LEFT, _VIEW_TOP, _COLUMN_GAP, _LEGEND_ROW_HEIGHT = 36, 114, 40, 24
+_LEGEND_WIDTH, _VIEW_HEIGHT = 420, 750
+_LINE_LETTERS = 52
+_PIXELS_PER_VERTEX = 120
 """Pixels per vertex above which mesh lines are drawn: selections are recognised by their place on the mesh."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Choice:
+class VertexSelection:
     """Vertices (q,) that an effect selects, and their description."""
 
     name: str
-    how: str
+    description: str
     vertices: NDArray[np.int64]
 
 
-def draw_scene(
-    replay: Replay,
-    choices: Sequence[Choice],
+def draw_scene_preview(
+    replay: RecordingReplay,
+    selections: Sequence[VertexSelection],
     facts: Sequence[str],
     notes: Sequence[tuple[str, str]],
     path: Path,
@@ -61,34 +61,36 @@ def draw_scene(
     Raises:
         RunFailed: if the system cannot draw.
     """
-    wide, p = WIDTH - 2 * _LEFT - _GAP - _LEGEND, replay.positions[0]
-    angles = camera or natural_angles(p, area_vectors(replay, 0))
-    dots = [(p[one.vertices], numbered(k).color) for k, one in enumerate(choices)]
-    with matplotlib.rc_context(RC), Studio(wide, _TALL, mesh_lines=_LINES) as studio:
+    wide, p = PAGE_WIDTH - 2 * _VIEW_LEFT - _COLUMN_GAP - _LEGEND_WIDTH, replay.positions[0]
+    angles = camera or choose_view_angles(p, compute_area_vectors(replay, 0))
+    dots = [(p[one.vertices], indexed_style(k).color) for k, one in enumerate(selections)]
+    with matplotlib.rc_context(PAGE_RC), OffscreenRenderer(wide, _VIEW_HEIGHT, mesh_lines=_PIXELS_PER_VERTEX) as studio:
         page = new_page()
-        header(page, replay.title, facts)
-        view = frame_all(seen(replay, [0]), aspect=wide / _TALL, angles=angles)
-        paste(page, studio.draw(replay, 0, view, dots=dots), _LEFT, _TOP)
-        x, y = WIDTH - _LEFT - _LEGEND, _TOP + _ROW
-        for k, one in enumerate(choices):
-            text(page, x, y, "●", size=13, color=numbered(k).color)
-            text(page, x + 24, y, f"{one.name}: {_vertices(len(one.vertices))}", size=12, color=INK)
-            y = _paragraph(page, one.how, x + 24, y + 19) + 12
-        y += _ROW
+        draw_header(page, replay.title, facts)
+        view = fit_camera(points_to_frame(replay, [0]), aspect=wide / _VIEW_HEIGHT, angles=angles)
+        paste_picture(page, studio.render_frame(replay, 0, view, coloured_points=dots), _VIEW_LEFT, _VIEW_TOP)
+        x, y = PAGE_WIDTH - _VIEW_LEFT - _LEGEND_WIDTH, _VIEW_TOP + _LEGEND_ROW_HEIGHT
+        for k, one in enumerate(selections):
+            draw_text(page, x, y, "●", size=13, color=indexed_style(k).color)
+            draw_text(
+                page, x + 24, y, f"{one.name}: {_format_vertex_count(len(one.vertices))}", size=12, color=TEXT_COLOUR
+            )
+            y = _draw_paragraph(page, one.description, x + 24, y + 19) + 12
+        y += _LEGEND_ROW_HEIGHT
         for kind, words in notes:
-            text(page, x, y, kind, size=11, color=INK)
-            y = _paragraph(page, words, x, y + 19) + 12
-        made_by(page, [replay], HEIGHT - 12)
-        save(page, path)
+            draw_text(page, x, y, kind, size=11, color=TEXT_COLOUR)
+            y = _draw_paragraph(page, words, x, y + 19) + 12
+        draw_provenance(page, [replay], PAGE_HEIGHT - 12)
+        save_page(page, path)
 
 
-def _vertices(count: int) -> str:
+def _format_vertex_count(count: int) -> str:
     return f"{count:,} {'vertex' if count == 1 else 'vertices'}"
 
 
-def _paragraph(page: Figure, words: str, x: float, y: float) -> float:
+def _draw_paragraph(page: Figure, words: str, x: float, y: float) -> float:
     """Draw small text in a few lines, and return the y position below it."""
-    for line in wrap(words, _LETTERS, max_lines=6, placeholder=" …"):
-        text(page, x, y, line, size=9.5, color=MUTED)
+    for line in wrap(words, _LINE_LETTERS, max_lines=6, placeholder=" …"):
+        draw_text(page, x, y, line, size=9.5, color=MUTED_COLOUR)
         y += 16
     return y

@@ -14,7 +14,7 @@ import duckdb
 import pyarrow as pa
 
 
-def answer(question: str, table: pa.Table, known: Mapping[str, Any] | None = None) -> list[tuple[Any, ...]]:
+def query_table(sql: str, table: pa.Table, parameters: Mapping[str, Any] | None = None) -> list[tuple[Any, ...]]:
     """Return the rows that a query selects from `rows_of`, the table.
 
     Args:
@@ -22,21 +22,21 @@ def answer(question: str, table: pa.Table, known: Mapping[str, Any] | None = Non
         table: table that the query calls `rows_of`.
         parameters: values of the query's parameters by name.
     """
-    with _asked(table) as cursor:
-        return cursor.execute(question, known).fetchall()
+    with _register_table(table) as cursor:
+        return cursor.execute(sql, parameters).fetchall()
 
 
-def answers(question: str, table: pa.Table) -> list[dict[str, Any]]:
+def query_records(sql: str, table: pa.Table) -> list[dict[str, Any]]:
     """Return the rows that a query selects from `rows_of` as dictionaries by column name."""
-    with _asked(table) as cursor:
-        done = cursor.execute(question)
+    with _register_table(table) as cursor:
+        done = cursor.execute(sql)
         names = [column[0] for column in done.description or ()]
         return [dict(zip(names, row, strict=True)) for row in done.fetchall()]
 
 
 @contextmanager
-def _asked(table: pa.Table) -> Generator[duckdb.DuckDBPyConnection]:
-    with _database().cursor() as cursor:
+def _register_table(table: pa.Table) -> Generator[duckdb.DuckDBPyConnection]:
+    with _shared_connection().cursor() as cursor:
         cursor.register("rows_of", table)
         try:
             yield cursor
@@ -45,6 +45,6 @@ def _asked(table: pa.Table) -> Generator[duckdb.DuckDBPyConnection]:
 
 
 @cache
-def _database() -> duckdb.DuckDBPyConnection:
+def _shared_connection() -> duckdb.DuckDBPyConnection:
     # One thread only, so that no other thread disturbs later timings in this process.
     return duckdb.connect(config={"threads": 1})

@@ -14,32 +14,32 @@ from typing import Any, NamedTuple
 
 import pyarrow as pa
 
-from harness.base.crew import Task, done_by
-from harness.base.machine_lock import beside
-from harness.base.progress import Remarks
-from harness.base.workers import Limits, Lost, Tick
-from harness.config.options import OPTIONS
+from harness.base.crew import PoolTask, run_tasks
+from harness.base.machine_lock import lock_timing_shared
+from harness.base.progress import ThrottledMessages
+from harness.base.workers import ProgressCallback, TaskFailure, TaskLimits
+from harness.config.options import RUN_OPTIONS
 from harness.config.sweep import RunSpec
 from harness.report.references import write_bibtex
 
 
-class Pictured(NamedTuple):
+class PictureJob(NamedTuple):
     """A run, and the paths of its recording and its picture."""
 
     run: RunSpec
-    recording: Path
-    picture: Path
+    recording_path: Path
+    picture_path: Path
 
 
-def draw_sweep(
+def draw_sweep_pictures(
     name: str,
-    pictured: Sequence[Pictured],
+    jobs: Sequence[PictureJob],
     folder: Path,
     table: pa.Table,
-    say: Callable[[str], None],
+    print_message: Callable[[str], None],
     *,
-    at_once: int = 1,
-    older: Collection[str] = (),
+    num_concurrent: int = 1,
+    stale_ids: Collection[str] = (),
 ) -> None:
     """Draw the pictures and comparisons that are missing or older than one of their recordings.
 
@@ -53,145 +53,160 @@ def draw_sweep(
         stale_ids: ids of runs that were executed by other code than the current version.
     """
     write_bibtex(folder / "references.bib", table["reference"].to_pylist())
-    drawn = [p for p in pictured if p.run.record and p.recording.exists()]
-    wanting = [p for p in drawn if p.run.pictures and _stale(p.picture, [p.recording])]
-    groups = [group for group in compared(drawn, folder) if group.old_recording or group.old_picture]
+    drawn = [p for p in jobs if p.run.record and p.recording_path.exists()]
+    wanting = [p for p in drawn if p.run.pictures and _is_outdated(p.picture_path, [p.recording_path])]
+    groups = [group for group in group_by_scene(drawn, folder) if group.needs_recording or group.needs_picture]
 
     def times() -> None:
-        if any(p.run.pictures for p in pictured):
-            from harness.report.timing_plot import draw_timing
+        if any(p.run.pictures for p in jobs):
+            from harness.report.timing_plot import draw_timing_plot
 
-            with beside(_silent):
-                draw_timing(table, folder / "pictures" / "timing.png", name, older)
+            with lock_timing_shared(_ignore_progress):
+                draw_timing_plot(table, folder / "pictures" / "timing.png", name, stale_ids)
 
-    missing = _loaded() if wanting or any(group.old_picture for group in groups) else None
+    missing = _load_drawing() if wanting or any(group.needs_picture for group in groups) else None
     if missing:
-        say(missing)
+        print_message(missing)
     if wanting and not missing:
-        say(f"drawing the pictures of {len(wanting)} runs")
-        _draw_runs(wanting, say, at_once, times)
+        print_message(f"drawing the pictures of {len(wanting)} runs")
+        _draw_run_pictures(wanting, print_message, num_concurrent, times)
     else:
         times()
-    _draw_groups(groups, say, pictures=not missing)
+    _draw_group_comparisons(groups, print_message, pictures=not missing)
 
 
-def get_ready() -> None:
+def preload_drawing() -> None:
     """Load the drawing modules in this process, in parts.
 
     No part is loaded while a timing runs.
     """
     from harness.report import opengl
 
-    with beside(_silent):
-        opengl.begin()
+    with lock_timing_shared(_ignore_progress):
+        opengl.start_opengl_probe()
         import_module("harness.report.timing_plot")  # with Matplotlib
-        opengl.problem()
+        opengl.find_opengl_problem()
     for name in ("harness.record.reader", "pyvista", "harness.report.run_picture"):
-        with beside(_silent):
+        with lock_timing_shared(_ignore_progress):
             import_module(name)
 
 
-def _loaded() -> str | None:
+def _load_drawing() -> str | None:
     """Load the drawing modules for forked processes; return why drawing is impossible, or None."""
     from harness.report import opengl
 
-    opengl.begin()
+    opengl.start_opengl_probe()
     import_module("harness.report.run_picture")
-    return opengl.problem()
+    return opengl.find_opengl_problem()
 
 
-def _draw_runs(
-    wanting: Sequence[Pictured], say: Callable[[str], None], at_once: int, meanwhile: Callable[[], None]
+def _draw_run_pictures(
+    pending_jobs: Sequence[PictureJob],
+    print_message: Callable[[str], None],
+    num_concurrent: int,
+    run_meanwhile: Callable[[], None],
 ) -> None:
     """Draw the pictures of runs in parallel processes, and report why a process was lost."""
-    done, remarks = 0, Remarks(say)
+    done, remarks = 0, ThrottledMessages(print_message)
 
     def tick(said: str) -> None:
-        remarks(f"{done} of {len(wanting)} pictures are drawn")
+        remarks(f"{done} of {len(pending_jobs)} pictures are drawn")
 
-    tasks = [Task(partial(_draw, p), tick, Limits()) for p in wanting]
-    for number, outcome in done_by(at_once, int, [None] * len(tasks), lambda number: tasks[number], meanwhile):
+    tasks = [PoolTask(partial(_draw_job, p), tick, TaskLimits()) for p in pending_jobs]
+    for number, outcome in run_tasks(
+        num_concurrent, int, [None] * len(tasks), lambda number: tasks[number], run_meanwhile
+    ):
         done += 1
-        if isinstance(outcome, Lost):
-            say(f"{wanting[number].picture} is not drawn: its process {outcome}")
+        if isinstance(outcome, TaskFailure):
+            print_message(f"{pending_jobs[number].picture_path} is not drawn: its process {outcome}")
 
 
-def _draw_groups(groups: Sequence[Compared], say: Callable[[str], None], *, pictures: bool) -> None:
+def _draw_group_comparisons(
+    groups: Sequence[SolverGroup], print_message: Callable[[str], None], *, pictures: bool
+) -> None:
     """Create the side-by-side recordings of groups, and their pictures if `pictures` is true."""
     if not groups:
         return
-    from harness.record.compare import Look, side_by_side
+    from harness.record.compare import LineStyle, write_side_by_side
     from harness.record.reader import read_replay
-    from harness.report.comparison import draw_comparison
-    from harness.report.style import shades
+    from harness.report.comparison import draw_comparison_picture
+    from harness.report.style import assign_label_shades
 
-    remarks = Remarks(say)
+    remarks = ThrottledMessages(print_message)
     for number, group in enumerate(groups):
         remarks(f"{number} of {len(groups)} comparisons of solvers are drawn")
-        with beside(_silent):
-            if group.old_recording:
-                found = shades((name, p.run.solver.name) for name, p in group.runs.items())
-                looks = {name: Look(mark.color) for name, mark in found.items()}
-                side_by_side(group.recording, group.recordings, group.label.replace("-", " "), looks)
-            if group.old_picture and pictures:
-                draw_comparison({name: read_replay(path) for name, path in group.recordings.items()}, group.picture)
+        with lock_timing_shared(_ignore_progress):
+            if group.needs_recording:
+                found = assign_label_shades((name, p.run.solver.name) for name, p in group.jobs_by_label.items())
+                looks = {name: LineStyle(mark.color) for name, mark in found.items()}
+                write_side_by_side(
+                    group.recording_path, group.recording_paths, group.group_label.replace("-", " "), looks
+                )
+            if group.needs_picture and pictures:
+                draw_comparison_picture(
+                    {name: read_replay(path) for name, path in group.recording_paths.items()}, group.picture_path
+                )
 
 
-def _draw(p: Pictured, tick: Tick) -> None:
+def _draw_job(p: PictureJob, tick: ProgressCallback) -> None:
     from harness.record.reader import read_replay
-    from harness.report.run_picture import draw_run
+    from harness.report.run_picture import draw_run_picture
 
     camera = p.run.scene.camera
-    with beside(tick):
-        draw_run(read_replay(p.recording), p.picture, camera=(camera.azimuth, camera.elevation) if camera else None)
+    with lock_timing_shared(tick):
+        draw_run_picture(
+            read_replay(p.recording_path), p.picture_path, camera=(camera.azimuth, camera.elevation) if camera else None
+        )
 
 
-def _silent(said: str) -> None:
+def _ignore_progress(message: str) -> None:
     pass
 
 
-def _stale(made: Path, sources: Iterable[Path]) -> bool:
+def _is_outdated(target: Path, sources: Iterable[Path]) -> bool:
     """Return whether a file is missing, or older than one of its sources."""
-    return not made.exists() or any(made.stat().st_mtime_ns < source.stat().st_mtime_ns for source in sources)
+    return not target.exists() or any(target.stat().st_mtime_ns < source.stat().st_mtime_ns for source in sources)
 
 
 @dataclass(frozen=True, slots=True)
-class Compared:
+class SolverGroup:
     """Runs that differ only in their solver or its settings.
 
     `jobs_by_label` has them by these differences; the paths are those of the files that compare them.
     """
 
-    label: str
-    runs: dict[str, Pictured]
-    recording: Path
-    picture: Path
+    group_label: str
+    jobs_by_label: dict[str, PictureJob]
+    recording_path: Path
+    picture_path: Path
 
     @property
-    def recordings(self) -> dict[str, Path]:
+    def recording_paths(self) -> dict[str, Path]:
         """The recordings of the runs by label."""
-        return {name: p.recording for name, p in self.runs.items()}
+        return {name: p.recording_path for name, p in self.jobs_by_label.items()}
 
     @property
-    def old_recording(self) -> bool:
+    def needs_recording(self) -> bool:
         """Whether the side-by-side recording has to be made."""
-        return _stale(self.recording, self.recordings.values())
+        return _is_outdated(self.recording_path, self.recording_paths.values())
 
     @property
-    def old_picture(self) -> bool:
+    def needs_picture(self) -> bool:
         """Whether the comparison picture has to be drawn."""
-        return next(iter(self.runs.values())).run.pictures and _stale(self.picture, self.recordings.values())
+        return next(iter(self.jobs_by_label.values())).run.pictures and _is_outdated(
+            self.picture_path, self.recording_paths.values()
+        )
 
 
-def compared(drawn: list[Pictured], folder: Path) -> list[Compared]:
+def group_by_scene(drawn: list[PictureJob], folder: Path) -> list[SolverGroup]:
     """Group runs by scene and size; only groups of two or more runs are returned."""
-    alike: dict[str, list[Pictured]] = {}
+    alike: dict[str, list[PictureJob]] = {}
     for p in drawn:
         alike.setdefault(f"{p.run.scene_name}-{p.run.size}", []).append(p)
     return [
-        Compared(
+        SolverGroup(
             label,
-            {_distinct(p, some): p for p in some},
+            {_distinct_label(p, some): p for p in some},
             folder / "recordings" / f"{label}-solvers.rrd",
             folder / "pictures" / f"{label}-solvers.png",
         )
@@ -200,16 +215,16 @@ def compared(drawn: list[Pictured], folder: Path) -> list[Compared]:
     ]
 
 
-def _distinct(p: Pictured, group: list[Pictured]) -> str:
+def _distinct_label(p: PictureJob, group: list[PictureJob]) -> str:
     """Return the solver's name with its varying parameters and options.
 
     These are the ones in which the group's runs of this solver differ.
     """
 
     def settings(run: RunSpec) -> dict[str, Any]:
-        return {**run.solver.parameters, **{option: getattr(run, option) for option in OPTIONS}}
+        return {**run.solver.parameters, **{option: getattr(run, option) for option in RUN_OPTIONS}}
 
     own = [settings(other.run) for other in group if other.run.solver.name == p.run.solver.name]
     varied = [(k, v) for k, v in settings(p.run).items() if any(k not in other or other[k] != v for other in own)]
-    short = {name: option.short for name, option in OPTIONS.items()}
+    short = {name: option.short_format for name, option in RUN_OPTIONS.items()}
     return ", ".join([p.run.solver.name, *(short.get(k, f"{k} {{}}").format(v) for k, v in varied)])

@@ -19,13 +19,13 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from harness.base.columns import SCHEMA
-from harness.base.quantities import SQL
-from harness.report.machines import foot
-from harness.report.machines import names as machine_names
-from harness.report.page import quantity, step_words
-from harness.report.references import cited
-from harness.report.sql import answer
+from harness.base.columns import RUN_SCHEMA
+from harness.base.quantities import SQL_EXPRESSIONS
+from harness.report.machines import assign_machine_names as machine_names
+from harness.report.machines import machine_footer
+from harness.report.page import format_quantity, format_time_step
+from harness.report.references import format_citation
+from harness.report.sql import query_table
 
 
 class RunTimes(NamedTuple):
@@ -52,14 +52,14 @@ class RunTimes(NamedTuple):
     scene: str
     size: int
     solver: str
-    machine: str | None
-    node: str | None
+    machine_id: str | None
+    node_id: str | None
     vertices: int | None
     springs: int | None
     status: str
     reason: str | None
-    settings: str
-    parameters: str | None
+    options_json: str
+    parameters_json: str | None
     cold: float | None
     warm: float | None
     step: float | None
@@ -68,35 +68,35 @@ class RunTimes(NamedTuple):
     least: float | None
     local: float | None
     global_: float | None
-    iterations: float | None
-    stopped: str | None
+    num_iterations: float | None
+    termination_reason: str | None
     residual: float | None
-    largest_strain: float | None
-    strain_99: float | None
-    interrupted: bool | None
-    adds_up: bool | None
+    max_strain: float | None
+    strain_p99: float | None
+    preempted: bool | None
+    phases_consistent: bool | None
     frames: int | None
     integrator: str | None
     time_step: float | None
-    asked: float | None
+    error_requested: float | None
     worst_residual: float | None
-    round_off: float | None
-    distance: float | None
+    roundoff_residual: float | None
+    reference_distance: float | None
     modulus_exponent: int | None
-    left: float | None
+    max_stationarity_audit: float | None
 
 
-ROUND_OFF = 1e-12
+ROUNDOFF_RATIO = 1e-12
 """Share of a step's initial residual, and of the square root of the step's largest energy, that may be round-off.
 
 It is the round-off of 1e-16, amplified by the matrix.
 """
 
-_ENERGIES = ", ".join(
-    ["yardstick", *(f"sqrt(abs({name}))" for name in SCHEMA.names if name.startswith("energy_")), "0.0"]
+_ENERGY_COLUMNS = ", ".join(
+    ["yardstick", *(f"sqrt(abs({name}))" for name in RUN_SCHEMA.names if name.startswith("energy_")), "0.0"]
 )
 
-_SUMMARY = f"""
+_SUMMARY_QUERY = f"""
 select run_id, any_value(scene), any_value("size"), any_value(solver), any_value(machine), any_value(node),
     any_value(vertices), any_value(springs),
     coalesce(any_value(status) filter (status <> 'ok'), 'ok'), any_value(reason) filter (status <> 'ok'),
@@ -105,57 +105,57 @@ select run_id, any_value(scene), any_value("size"), any_value(solver), any_value
     any_value(parameters),
     1e3 * min(seconds) filter (phase = 'prepare' and round = 0),
     1e3 * median(seconds) filter (phase = 'prepare' and round > 0),
-    {SQL["step"]}, {SQL["lower"]}, {SQL["upper"]}, {SQL["least"]},
+    {SQL_EXPRESSIONS["step"]}, {SQL_EXPRESSIONS["lower"]}, {SQL_EXPRESSIONS["upper"]}, {SQL_EXPRESSIONS["least"]},
     1e3 * median(seconds) filter (phase = 'local'),
     1e3 * median(seconds) filter (phase = 'global'),
-    {SQL["iterations"]},
+    {SQL_EXPRESSIONS["iterations"]},
     arg_min(stopped, list_position(['iterations', 'stalled', 'tolerance', 'floor'], stopped)) filter (
         stopped <> 'iterations' or not coalesce(own_steps, false) and coalesce(iterations >= max_iterations, true)),
-    {SQL["residual"]}, {SQL["largest_strain"]}, {SQL["strain_99"]},
+    {SQL_EXPRESSIONS["residual"]}, {SQL_EXPRESSIONS["largest_strain"]}, {SQL_EXPRESSIONS["strain_99"]},
     bool_or(interrupted) filter (phase = 'step'), bool_and(adds_up),
-    max(frame), any_value(integrator), any_value(time_step), any_value(asked), {SQL["worst_residual"]},
-    {ROUND_OFF} * max(greatest({_ENERGIES})),
+    max(frame), any_value(integrator), any_value(time_step), any_value(asked), {SQL_EXPRESSIONS["worst_residual"]},
+    {ROUNDOFF_RATIO} * max(greatest({_ENERGY_COLUMNS})),
     case when bool_and(distance is not null) filter (phase = 'step') then max(distance) end,
     any_value(modulus_exponent), max(graded) filter (not minimises)
 from rows_of group by run_id order by min(place)
 """
 
 
-def runs(table: pa.Table) -> list[RunTimes]:
+def read_run_times(table: pa.Table) -> list[RunTimes]:
     """Return the runs in a table of rows, in the order of their first rows.
 
     The rows have the schema `harness.results.run_schema.RUN_SCHEMA`.
     """
     numbered = table.append_column("place", pa.array(np.arange(len(table))))
-    return [RunTimes(*row) for row in answer(_SUMMARY, numbered)]
+    return [RunTimes(*row) for row in query_table(_SUMMARY_QUERY, numbered)]
 
 
-def _stated(run: RunTimes) -> dict[str, Any]:
+def _effective_options(run: RunTimes) -> dict[str, Any]:
     """Return a run's options.
 
     With a requested error, these are only that error and the options that were set.
     """
-    options = json.loads(run.settings)
+    options = json.loads(run.options_json)
     return {key: value for key, value in options.items() if value is not None or options["asked"] is None}
 
 
-def labels(found: Sequence[RunTimes]) -> dict[str, str]:
+def label_runs(timed_runs: Sequence[RunTimes]) -> dict[str, str]:
     """Return a label by run id: the solver with its varying settings.
 
     These are the settings in which the solver's runs of the scene differ. If there are several machines, the label
     includes the machine, so that each label denotes one curve or table row.
     """
-    parameters: dict[str, dict[str, Any]] = {run.run_id: json.loads(run.parameters or "{}") for run in found}
-    settings = {run.run_id: _stated(run) | parameters[run.run_id] for run in found}
-    places = machine_names((run.machine, run.node) for run in found)
-    on = {run.run_id: places.get((run.machine, run.node), "unknown") for run in found if len(places) > 1}
+    parameters: dict[str, dict[str, Any]] = {run.run_id: json.loads(run.parameters_json or "{}") for run in timed_runs}
+    settings = {run.run_id: _effective_options(run) | parameters[run.run_id] for run in timed_runs}
+    places = machine_names((run.machine_id, run.node_id) for run in timed_runs)
+    on = {run.run_id: places.get((run.machine_id, run.node_id), "unknown") for run in timed_runs if len(places) > 1}
     values: dict[tuple[str, str, str], set[str]] = defaultdict(set)
     stated: dict[tuple[str, str], set[str]] = defaultdict(set)
-    for run in found:
+    for run in timed_runs:
         stated[run.scene, run.solver] |= parameters[run.run_id].keys()
         for key, value in settings[run.run_id].items():
             values[run.scene, run.solver, key].add(str(value))
-    for run in found:  # what some state and others leave out, for they have it as usual
+    for run in timed_runs:  # what some state and others leave out, for they have it as usual
         own = parameters[run.run_id]
         for key in stated[run.scene, run.solver] - own.keys() if own else ():
             values[run.scene, run.solver, key].add("")
@@ -163,17 +163,17 @@ def labels(found: Sequence[RunTimes]) -> dict[str, str]:
         run.run_id: ", ".join(
             [run.solver]
             + [
-                f"{key} {step_words(value) if key == 'dt' else value}"
+                f"{key} {format_time_step(value) if key == 'dt' else value}"
                 for key, value in settings[run.run_id].items()
                 if len(values[run.scene, run.solver, key]) > 1
             ]
             + ([f"machine {on[run.run_id]}"] if on else [])
         )
-        for run in found
+        for run in timed_runs
     }
 
 
-_NUMBERS = (
+_NUMBER_HEADINGS = (
     "prepare\ncold",
     "\nwarm",
     "\nstep",
@@ -187,20 +187,22 @@ _NUMBERS = (
     "99 %\nbelow",
 )
 
-WIDTH = 100
+TABLE_WIDTH = 100
 """Maximum width of a line [characters], unless its numbers need more."""
 
-_NAMES = 12
+_MIN_NAME_WIDTH = 12
 """Width at which names of solvers and scenes are folded if space is short [characters]."""
 
-INTERRUPTED = "! the process was interrupted while steps were timed: its least time is nearest to the truth"
-APART = "~ local and global, timed alone, do not add up to an iteration within 15 %"
-OTHER = "† by other code than today's"
+PREEMPTED_NOTE = "! the process was interrupted while steps were timed: its least time is nearest to the truth"
+INCONSISTENT_NOTE = "~ local and global, timed alone, do not add up to an iteration within 15 %"
+STALE_MARK_NOTE = "† by other code than today's"
 """Meanings of the marks in the table."""
-SHARED = "timed beside others, up to {} at once, each on cores of its own: slower than alone by what they share"
+SHARED_TIMING_NOTE = (
+    "timed beside others, up to {} at once, each on cores of its own: slower than alone by what they share"
+)
 
 
-def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
+def build_summary_table(table: pa.Table, stale_ids: Collection[str] = ()) -> Table:
     """Build a table with one line per run.
 
     It has the identification, the status and the times [ms], with marks on doubtful values.
@@ -209,8 +211,8 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
         table: rows of the sweep.
         stale_ids: ids of runs that were executed by other code than the current version; they are marked.
     """
-    found = runs(table)
-    names, scenes = labels(found), {run.scene for run in found}
+    found = read_run_times(table)
+    names, scenes = label_runs(found), {run.scene for run in found}
     what, above = f"{scenes.pop()}: " if len(scenes) == 1 else "", list[str]()
     out = Table(
         title=f"{escape(what)}times in milliseconds, medians over the rounds and over the steps",
@@ -221,8 +223,10 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
         pad_edge=False,
     )
     out.add_column("\nsize", justify="right", min_width=4)
-    out.add_column("\nsolver", overflow="fold", min_width=min(_NAMES, max(map(len, names.values()), default=0)))
-    for name in _NUMBERS:
+    out.add_column(
+        "\nsolver", overflow="fold", min_width=min(_MIN_NAME_WIDTH, max(map(len, names.values()), default=0))
+    )
+    for name in _NUMBER_HEADINGS:
         out.add_column(name, justify="left" if name == "\nstopped" else "right", no_wrap=True)
     for run in found:
         if not what and (not above or above[-1] != run.scene):
@@ -232,51 +236,61 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
         out.add_row(
             str(run.size) if run.size else "–",
             escape(names[run.run_id]),
-            *(_number(value, quantity) for value in (run.cold, run.warm)),
-            _number(run.step, quantity) + ("!" if run.interrupted else ""),
-            _number(run.least, quantity),
-            *(_number(value, quantity) + _apart(run, value) for value in (run.local, run.global_)),
-            _number(run.iterations, quantity),
-            _ended(run) + ("[yellow]†[/]" if run.run_id in other_code else ""),
-            _number(run.residual, "{:.1e}".format),
+            *(_format_number(value, format_quantity) for value in (run.cold, run.warm)),
+            _format_number(run.step, format_quantity) + ("!" if run.preempted else ""),
+            _format_number(run.least, format_quantity),
             *(
-                _number(strain, lambda strain: f"{100 * strain:.3g} %")
-                for strain in (run.largest_strain, run.strain_99)
+                _format_number(value, format_quantity) + _inconsistency_mark(run, value)
+                for value in (run.local, run.global_)
+            ),
+            _format_number(run.num_iterations, format_quantity),
+            _format_ending(run) + ("[yellow]†[/]" if run.run_id in stale_ids else ""),
+            _format_number(run.residual, "{:.1e}".format),
+            *(
+                _format_number(strain, lambda strain: f"{100 * strain:.3g} %")
+                for strain in (run.max_strain, run.strain_p99)
             ),
         )
-    marks = {INTERRUPTED: any(run.interrupted for run in found), APART: any(_apart(run, run.local) for run in found)}
+    marks = {
+        PREEMPTED_NOTE: any(run.preempted for run in found),
+        INCONSISTENT_NOTE: any(_inconsistency_mark(run, run.local) for run in found),
+    }
     shared = [
         n for how, n in zip(*(table[c].to_pylist() for c in ("timing", "at_once")), strict=True) if how == "shared"
     ]
-    marks[OTHER] = any(run.run_id in other_code for run in found)
-    marks[SHARED.format(max(shared, default=0))] = bool(shared)
-    out.caption = Text("\n".join([*(words for words, there in marks.items() if there), *_methods(table), *foot(table)]))
+    marks[STALE_MARK_NOTE] = any(run.run_id in stale_ids for run in found)
+    marks[SHARED_TIMING_NOTE.format(max(shared, default=0))] = bool(shared)
+    out.caption = Text(
+        "\n".join(
+            [*(words for words, there in marks.items() if there), *_describe_methods(table), *machine_footer(table)]
+        )
+    )
     longest = max(map(len, [*names.values(), *scenes]), default=0)
     # Lines longer than a narrow terminal keep their numbers; Rich would replace them by ellipses.
     most = Measurement.get(wide := Console(width=1000), wide.options, out).maximum
-    out.width = max(min(most, WIDTH), most - max(0, longest - _NAMES))
+    out.width = max(min(most, TABLE_WIDTH), most - max(0, longest - _MIN_NAME_WIDTH))
     return out
 
 
-def _ended(run: RunTimes) -> str:
+def _format_ending(run: RunTimes) -> str:
     """Return the termination reason of a successful run, otherwise its status."""
-    return escape(run.stopped or "ok") if run.status == "ok" else f"[bold red]{escape(run.status)}[/]"
+    return escape(run.termination_reason or "ok") if run.status == "ok" else f"[bold red]{escape(run.status)}[/]"
 
 
-def _apart(run: RunTimes, value: float | None) -> str:
+def _inconsistency_mark(run: RunTimes, value: float | None) -> str:
     """Return the mark of phases that do not add up to an iteration."""
-    return "~" if value is not None and run.adds_up is False else ""
+    return "~" if value is not None and run.phases_consistent is False else ""
 
 
-def _methods(table: pa.Table) -> list[str]:
+def _describe_methods(table: pa.Table) -> list[str]:
     """Return the citation of each solver."""
     known = dict(zip(*(table[name].to_pylist() for name in ("solver", "reference")), strict=True))
     solvers: dict[str, list[str]] = defaultdict(list)
     for solver, reference in known.items():
         if reference:
             solvers[reference].append(solver)
-    return [f"{', '.join(names)}: {cited(reference)}" for reference, names in solvers.items()]
+    return [f"{', '.join(names)}: {format_citation(reference)}" for reference, names in solvers.items()]
 
 
-def _number(value: Any, words: Callable[[Any], str]) -> str:
+def _format_number(value: Any, words: Callable[[Any], str]) -> str:
     return "–" if value is None else words(value)

@@ -19,25 +19,25 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.base.errors import InputError, Mistake
+from harness.base.errors import InputError, InputMistake
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.mesh.cells import network
+from harness.scenes.mesh.cells import build_spring_network
 from harness.scenes.mesh.obj import read_obj
-from harness.scenes.mesh.scene_json import line_of, read_scene_json
-from harness.scenes.mesh.topology import NO_PAIRS, NO_TRIANGLES, Indices, Points, fan
+from harness.scenes.mesh.scene_json import find_key_line, read_assignment_json
+from harness.scenes.mesh.topology import NO_PAIRS, NO_TRIANGLES, IndexArray, PointArray, fan_triangles
 
-TIME_STEP = 1 / 30
+ASSIGNMENT_TIME_STEP = 1 / 30
 """Time step dt [s]."""
-ITERATIONS = 50
+ASSIGNMENT_ITERATIONS = 50
 """Local-global iterations per step; there is no other stop rule."""
-PIN_WEIGHT = 1e10
+ASSIGNMENT_PIN_WEIGHT = 1e10
 """Penalty weight of a pin [N/m]; pins fix vertices at their rest positions."""
-FORCE = (0.0, -9.8, 0.0)
+ASSIGNMENT_FORCE = (0.0, -9.8, 0.0)
 """External force on every vertex [N], independent of its mass."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Assignment:
+class AssignmentScene:
     """A scene of the assignment.
 
     Attributes:
@@ -47,13 +47,13 @@ class Assignment:
         pinned_vertices: (q,), zero-based, in file order.
     """
 
-    obj: Path
+    obj_path: Path
     mesh: Mesh
     stiffness: float
-    pins: NDArray[np.int64]
+    pinned_vertices: NDArray[np.int64]
 
 
-def read_assignment(path: Path) -> Assignment:
+def read_assignment_scene(path: Path) -> AssignmentScene:
     """Read a scene from a JSON file and the OBJ file that it names.
 
     A vertex that no face uses remains in the mesh, without mass unless `m` is given.
@@ -61,34 +61,36 @@ def read_assignment(path: Path) -> Assignment:
     Raises:
         InputError: with the file, line and key of each mistake.
     """
-    scene = read_scene_json(path)
+    scene = read_assignment_json(path)
     obj = path.parent / scene.obj
     cells = replace(read_obj(obj), segments=NO_PAIRS)
     if not cells.polygons:
-        raise InputError(Mistake("has no faces (f lines), so there are no springs", obj))
-    mesh = network(cells, "face_pairs", obj)
-    fans = np.concatenate([NO_TRIANGLES, *map(fan, cells.polygons.values())])  # as the assignment's code cuts faces
+        raise InputError(InputMistake("has no faces (f lines), so there are no springs", obj))
+    mesh = build_spring_network(cells, "face_pairs", obj)
+    fans = np.concatenate(
+        [NO_TRIANGLES, *map(fan_triangles, cells.polygons.values())]
+    )  # as the assignment's code cuts faces
     if len(fans) == len(mesh.triangles):  # else faces repeat others, which count once
         mesh = replace(mesh, triangles=fans)
-    pins = _pins(scene.b, len(mesh.rest), path)
+    pins = _to_zero_based_pins(scene.b, len(mesh.rest_positions), path)
     if scene.m is None:
-        mass = voronoi_areas(mesh.rest, mesh.triangles)
+        mass = compute_voronoi_areas(mesh.rest_positions, mesh.triangles)
         if not mass.any():
             problem = "is missing, and the faces of the OBJ file have no area to take masses from"
-            raise InputError(Mistake(problem, path, key="m"))
+            raise InputError(InputMistake(problem, path, key="m"))
     else:
-        mass = np.full(len(mesh.rest), float(scene.m))
-    return Assignment(obj, replace(mesh, mass=mass, shares=mass / mass.sum()), scene.k, pins)
+        mass = np.full(len(mesh.rest_positions), float(scene.m))
+    return AssignmentScene(obj, replace(mesh, mass=mass, mass_fractions=mass / mass.sum()), scene.k, pins)
 
 
-def voronoi_areas(rest: Points, triangles: Indices) -> Points:
+def compute_voronoi_areas(rest_positions: PointArray, triangles: IndexArray) -> PointArray:
     """Compute the mixed Voronoi area of each vertex, (n,) [m^2].
 
     Args:
         rest_positions: (n, 3) [m].
         triangles: (f, 3); triangles without area contribute nothing.
     """
-    corners = rest[triangles]
+    corners = rest_positions[triangles]
     edges = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)  # edge k lies opposite corner k
     squared = np.einsum("fkx,fkx->fk", edges, edges)
     doubled = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)[:, None]
@@ -96,13 +98,13 @@ def voronoi_areas(rest: Points, triangles: Indices) -> Points:
     flat = doubled == 0
     nearest = squared * dots / np.where(flat, 1, doubled) / 8
     share = np.roll(nearest, 1, axis=1) + np.roll(nearest, -1, axis=1)
-    obtuse = cast(Points, np.where(dots < 0, doubled / 4, doubled / 8))
+    obtuse = cast(PointArray, np.where(dots < 0, doubled / 4, doubled / 8))
     share = np.where(np.any(dots < 0, axis=1, keepdims=True), obtuse, share)
     share = np.where(flat, 0.0, share)
-    return np.bincount(triangles.ravel(), share.ravel(), minlength=len(rest)).astype(np.float64, copy=False)
+    return np.bincount(triangles.ravel(), share.ravel(), minlength=len(rest_positions)).astype(np.float64, copy=False)
 
 
-def _pins(one_based: list[int], n: int, path: Path) -> NDArray[np.int64]:
+def _to_zero_based_pins(one_based: list[int], n: int, path: Path) -> NDArray[np.int64]:
     """Convert pins to zero-based vertices; reject missing vertices and repetitions, which would double a penalty."""
     seen: set[int] = set()
     mistakes: list[tuple[int, str]] = []
@@ -113,6 +115,6 @@ def _pins(one_based: list[int], n: int, path: Path) -> NDArray[np.int64]:
             mistakes.append((position, f"vertex {vertex} is pinned twice; name each vertex once"))
         seen.add(vertex)
     if mistakes:
-        line = line_of(path, "b")
-        raise InputError([Mistake(problem, path, line, f"b.{at}") for at, problem in mistakes[:20]])
+        line = find_key_line(path, "b")
+        raise InputError([InputMistake(problem, path, line, f"b.{at}") for at, problem in mistakes[:20]])
     return np.array(one_based, np.int64) - 1

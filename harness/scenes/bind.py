@@ -11,29 +11,29 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.base.errors import InputError, Mistake
+from harness.base.errors import InputError, InputMistake
 from harness.scenes import own
-from harness.scenes.effects.base import Contribution, Force, Pin, Steady, VelocityFilter
+from harness.scenes.effects.base import ConstantForceField, EffectContribution, ForceFunction, PinGroup, VelocityFilter
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.mesh.topology import by_area
-from harness.scenes.motion import KeyedMotion
-from harness.scenes.selection import Selection
+from harness.scenes.mesh.topology import lump_areas
+from harness.scenes.motion import KeyFrameMotion
+from harness.scenes.selection import VertexSelection
 from harness.scenes.spec import SceneSpec
-from harness.scenes.start import Rest
+from harness.scenes.start import RestStart
 from solvers import integrators
 from solvers.energies.springs import Springs
-from solvers.integrators import IMPLICIT_EULER, find
-from solvers.matrices import assemble
-from solvers.problem import NotPositiveDefinite, Pins, Positions, ProjectiveEnergy, System
+from solvers.integrators import IMPLICIT_EULER, find_integrator
+from solvers.matrices import assemble_system_matrix
+from solvers.problem import DirichletPins, NotPositiveDefinite, Positions, ProjectiveEnergy, System
 
 if TYPE_CHECKING:  # for those who have any
-    from harness.scenes.intersections import Apart
+    from harness.scenes.intersections import IntersectionCheck
 
 _LOG = logging.getLogger("springbench")
-AT_REST = Rest()
-COARSEST = 9
+REST_START = RestStart()
+MIN_COARSENING_SIZE = 9
 """Smallest mesh size that is coarsened for nested iteration: below it, a solve costs next to nothing."""
-LONG = 1.0
+LONG_TIME_STEP = 1.0
 """Time steps [s] above this value cause a warning: most motion ends within a few of them."""
 
 
@@ -59,63 +59,63 @@ class Scene:
 
     mesh: Mesh
     system: System
-    load: Positions
-    forces: tuple[Force, ...]
-    filters: tuple[VelocityFilter, ...]
+    constant_force: Positions
+    varying_forces: tuple[ForceFunction, ...]
+    velocity_filters: tuple[VelocityFilter, ...]
     pin_targets: Positions
-    velocity: tuple[float, float, float]
+    initial_velocity: tuple[float, float, float]
     integrator: integrators.AnyIntegrator = IMPLICIT_EULER
-    moving: tuple[tuple[NDArray[np.int64], KeyedMotion], ...] = ()
-    start: Rest = AT_REST
-    apart: tuple[Apart, ...] = ()
+    pin_motions: tuple[tuple[NDArray[np.int64], KeyFrameMotion], ...] = ()
+    start: RestStart = REST_START
+    intersection_checks: tuple[IntersectionCheck, ...] = ()
 
     @property
-    def self_contact(self) -> bool:
+    def has_self_contact(self) -> bool:
         """Whether an effect prevents self-intersection of the mesh."""
-        return any(one.beside is None for one in self.apart)
+        return any(one.obstacle_positions is None for one in self.intersection_checks)
 
-    alternate: Scene | None = None
-    halved: Callable[[], Scene] | None = None
+    alternate_scene: Scene | None = None
+    build_coarser: Callable[[], Scene] | None = None
 
-    def at(self, index: int) -> Scene:
+    def scene_of_step(self, step_index: int) -> Scene:
         """Return the scene of the step that follows step `step_index`."""
-        return self.alternate if self.alternate and index % 2 else self
+        return self.alternate_scene if self.alternate_scene and step_index % 2 else self
 
-    def time(self, index: int) -> float:
+    def compute_time(self, step_index: int) -> float:
         """Return the time [s] at which step `step_index` ends and the next starts; 0 is the start."""
-        if not self.alternate:
-            return index * self.system.time_step
-        return (index + 1) // 2 * self.system.time_step + index // 2 * self.alternate.system.time_step
+        if not self.alternate_scene:
+            return step_index * self.system.time_step
+        return (step_index + 1) // 2 * self.system.time_step + step_index // 2 * self.alternate_scene.system.time_step
 
-    def pins_at(self, time: float) -> Positions:
+    def pin_targets_at(self, time: float) -> Positions:
         """Return the pin targets at a time [s], (q, 3) [m]."""
-        if not self.moving:
+        if not self.pin_motions:
             return self.pin_targets
         targets = self.pin_targets.copy()
-        for rows, motion in self.moving:
-            targets[rows] = motion.moved(self.pin_targets[rows], time)
+        for rows, motion in self.pin_motions:
+            targets[rows] = motion.transform_points(self.pin_targets[rows], time)
         return targets
 
-    def pins_moving(self, time: float) -> Positions:
+    def pin_velocities_at(self, time: float) -> Positions:
         """Return the velocities of the pin targets at a time [s], (q, 3) [m/s]."""
         velocity = np.zeros_like(self.pin_targets)
-        for rows, motion in self.moving:
-            velocity[rows] = motion.velocity(self.pin_targets[rows], time)
+        for rows, motion in self.pin_motions:
+            velocity[rows] = motion.compute_velocity(self.pin_targets[rows], time)
         return velocity
 
     @cached_property
-    def springs(self) -> Springs:
+    def all_springs(self) -> Springs:
         """All springs with stiffness, by effect and in mesh order; then length constraints with infinite stiffness."""
-        exact = [x for x in self.system.lengths if (x.low == x.high).all()]
-        return Springs.joined(
+        exact = [x for x in self.system.length_constraints if (x.min_length == x.max_length).all()]
+        return Springs.from_parts(
             [
                 *(energy for energy in self.system.energies if isinstance(energy, Springs)),
-                *(Springs(x.edges, np.full(len(x.low), np.inf), x.high, x.rest_direction) for x in exact),
+                *(Springs(x.edges, np.full(len(x.min_length), np.inf), x.max_length, x.rest_direction) for x in exact),
             ]
         )
 
 
-def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, warns: bool = True) -> Scene:
+def build_scene(spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, log_warnings: bool = True) -> Scene:
     """Build a scene for a mesh size and an integrator.
 
     Args:
@@ -127,113 +127,119 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, war
     Raises:
         InputError: if the parts of the scene do not fit together.
     """
-    spec = spec.opened()
-    mesh, method = _mesh(spec, size), find(integrator)
-    mass = _mass(spec, mesh)
-    parts = [_bound(spec, i, mesh, mass).by(method) for i in range(len(spec.effects))]
-    _single(spec, parts)
-    _ends(parts, method, integrator)
-    pins, targets, moving = _pins(parts, mesh)
+    spec = spec.load_plugins()
+    mesh, method = _build_mesh(spec, size), find_integrator(integrator)
+    mass = _compute_vertex_masses(spec, mesh)
+    parts = [_build_contribution(spec, i, mesh, mass).adapt_to_integrator(method) for i in range(len(spec.effects))]
+    _require_unique(spec, parts)
+    _require_end_of_step_stages(parts, method, integrator)
+    pins, targets, moving = _merge_pins(parts, mesh)
     energies = tuple(energy for part in parts for energy in part.energies)
-    energies += tuple(energy for part in parts for derive in part.derived for energy in derive(energies))
+    energies += tuple(energy for part in parts for derive in part.derived_energies for energy in derive(energies))
     forces = [force for part in parts for force in part.forces]
-    lengths = tuple(one for part in parts for one in part.lengths)
-    load = np.zeros_like(mesh.rest)
+    lengths = tuple(one for part in parts for one in part.length_constraints)
+    load = np.zeros_like(mesh.rest_positions)
     for force in forces:
-        if isinstance(force, Steady):
+        if isinstance(force, ConstantForceField):
             load += force.force
     load.flags.writeable = False
-    system = System(mass, spec.time_step, energies, pins, method.factor, method.speed, lengths)
-    _require_determined(system, mesh)
-    start = spec.start or AT_REST
-    _check(parts, start.positions(mesh.rest))
-    if warns:
-        _doubt(spec)
+    system = System(mass, spec.time_step, energies, pins, method.inertia_factor, method.velocity_factor, lengths)
+    _require_determined_positions(system, mesh)
+    start = spec.start or REST_START
+    _check_start(parts, start.compute_positions(mesh.rest_positions))
+    if log_warnings:
+        _warn_unusual(spec)
     other = spec.alternate_time_step
     return Scene(
         mesh=mesh,
         system=system,
-        load=load,
-        forces=tuple(force for force in forces if not isinstance(force, Steady)),
-        filters=tuple(one for part in parts for one in part.filters),
+        constant_force=load,
+        varying_forces=tuple(force for force in forces if not isinstance(force, ConstantForceField)),
+        velocity_filters=tuple(one for part in parts for one in part.velocity_filters),
         pin_targets=targets,
-        velocity=spec.velocity,
+        initial_velocity=spec.velocity,
         integrator=method,
-        moving=moving,
+        pin_motions=moving,
         start=start,
-        apart=tuple(one for part in parts for one in part.apart),
-        alternate=None if other in (None, spec.time_step) else build(spec.stepped(other), size, integrator),
-        halved=_halved(spec, size, integrator),
+        intersection_checks=tuple(one for part in parts for one in part.intersection_checks),
+        alternate_scene=None
+        if other in (None, spec.time_step)
+        else build_scene(spec.with_time_step(other), size, integrator),
+        build_coarser=_make_coarser_builder(spec, size, integrator),
     )
 
 
-def _halved(spec: SceneSpec, size: int, integrator: str) -> Callable[[], Scene] | None:
+def _make_coarser_builder(spec: SceneSpec, size: int, integrator: str) -> Callable[[], Scene] | None:
     """Return a builder of the coarser scene, None if there is none.
 
     There is none for fixed-size meshes, the coarsest ones, and effects with vertex indices.
     """
     half = (size + 1) // 2
-    numbered = any(isinstance(e, Selection) and (e.indices or e.every > 1) for e in spec.effects)
-    return None if half < COARSEST or numbered else partial(build, spec, half, integrator)
+    numbered = any(isinstance(e, VertexSelection) and (e.indices or e.every > 1) for e in spec.effects)
+    return None if half < MIN_COARSENING_SIZE or numbered else partial(build_scene, spec, half, integrator)
 
 
-def _mesh(spec: SceneSpec, size: int) -> Mesh:
+def _build_mesh(spec: SceneSpec, size: int) -> Mesh:
     if "mesh" not in spec.own:
-        return spec.mesh.build(size)
+        return spec.mesh.build_mesh(size)
     plugin, _ = spec.own["mesh"]
     try:
-        with own.blaming(plugin, "generate"):
-            made: Any = spec.mesh.build(size)
-        return own.sound(plugin, made)
+        with own.attribute_errors(plugin, "generate"):
+            made: Any = spec.mesh.build_mesh(size)
+        return own.check_plugin_mesh(plugin, made)
     except InputError as error:
         raise InputError([replace(one, key=one.key or "mesh") for one in error.mistakes]) from error
 
 
-def _bound(spec: SceneSpec, i: int, mesh: Mesh, mass: NDArray[np.float64]) -> Contribution:
+def _build_contribution(spec: SceneSpec, i: int, mesh: Mesh, mass: NDArray[np.float64]) -> EffectContribution:
     effect, (plugin, _) = spec.effects[i], spec.own.get(f"effects[{i}]", (None, None))
     try:
         given = mesh, mass, spec.time_step
-        bound = effect.bind(*given) if plugin is None else own.bound(plugin, effect, *given)
+        bound = (
+            effect.build_contribution(*given)
+            if plugin is None
+            else own.build_checked_contribution(plugin, effect, *given)
+        )
     except InputError as error:
         raise InputError([replace(mistake, key=f"effects[{i}]") for mistake in error.mistakes]) from error
-    if bound.empty:
+    if bound.is_empty:
         _LOG.info("effects[%d] (%s) does nothing with these parameters and is left out", i, spec.effects[i].kind)
     return bound
 
 
-def _check(parts: list[Contribution], start: Positions) -> None:
+def _check_start(parts: list[EffectContribution], start: Positions) -> None:
     """Raise InputError if an effect is incompatible with the start (n, 3) [m] or the pins."""
     pins = [pin for part in parts for pin in part.pins]
     for i, part in enumerate(parts):
         try:
-            for check in part.checks:
+            for check in part.scene_checks:
                 check(start, pins)
         except InputError as error:
             raise InputError([replace(mistake, key=f"effects[{i}]") for mistake in error.mistakes]) from error
 
 
-def _single(spec: SceneSpec, parts: list[Contribution]) -> None:
+def _require_unique(spec: SceneSpec, parts: list[EffectContribution]) -> None:
     """Raise InputError if two effects provide a feature that a scene can have only once."""
     first: dict[str, int] = {}
     for i, part in enumerate(parts):
-        for what in part.once:
+        for what in part.exclusive_features:
             if first.setdefault(what, i) != i:
                 problem = f"{what} is there already, as effects[{first[what]}]; the two would add up, so keep one"
-                raise InputError(Mistake(problem, key=f"effects[{i}]"))
+                raise InputError(InputMistake(problem, key=f"effects[{i}]"))
 
 
-def _ends(parts: list[Contribution], method: integrators.AnyIntegrator, name: str) -> None:
+def _require_end_of_step_stages(parts: list[EffectContribution], method: integrators.AnyIntegrator, name: str) -> None:
     """Raise InputError if an effect requires stages at the end of the step and the integrator has others."""
     there = [n for n, known in integrators.INTEGRATORS.items() if getattr(known, "when", 0.0) == 1.0 and n != "own"]
     for i, part in enumerate(parts):
-        if part.ends and getattr(method, "when", 0.0) != 1.0:
-            problem = f"{part.ends[0]}, and {name} has other unknowns; take {' or '.join(there)}"
-            raise InputError(Mistake(problem, key=f"effects[{i}]"))
+        if part.end_of_step_reasons and getattr(method, "when", 0.0) != 1.0:
+            problem = f"{part.end_of_step_reasons[0]}, and {name} has other unknowns; take {' or '.join(there)}"
+            raise InputError(InputMistake(problem, key=f"effects[{i}]"))
 
 
-def _doubt(spec: SceneSpec) -> None:
+def _warn_unusual(spec: SceneSpec) -> None:
     """Warn about valid but unusual values."""
-    if spec.time_step > LONG:
+    if spec.time_step > LONG_TIME_STEP:
         _LOG.warning("%s: a time step of %g s is long; is it meant in seconds?", spec.path.name, spec.time_step)
     for i, effect in enumerate(spec.effects):
         k = spec.effects.index(effect)
@@ -241,38 +247,40 @@ def _doubt(spec: SceneSpec) -> None:
             _LOG.warning("%s: effects[%d] repeats effects[%d] (%s); both act", spec.path.name, i, k, effect.kind)
 
 
-def _mass(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:
+def _compute_vertex_masses(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:
     if spec.mass is not None and spec.mass_per_area is not None:
-        raise InputError(Mistake("is given beside `mass`; leave out one of them", key="mass_per_area"))
+        raise InputError(InputMistake("is given beside `mass`; leave out one of them", key="mass_per_area"))
     if spec.mass is not None:
-        return spec.mass * mesh.shares
+        return spec.mass * mesh.mass_fractions
     if spec.mass_per_area is not None:
         if mesh.dimension != 2 or not len(mesh.triangles):
-            raise InputError(Mistake("needs a surface, and this mesh is none; give `mass`", key="mass_per_area"))
-        return spec.mass_per_area * (by_area(mesh.rest, mesh.triangles) if mesh.areas is None else mesh.areas)
+            raise InputError(InputMistake("needs a surface, and this mesh is none; give `mass`", key="mass_per_area"))
+        return spec.mass_per_area * (
+            lump_areas(mesh.rest_positions, mesh.triangles) if mesh.vertex_areas is None else mesh.vertex_areas
+        )
     if mesh.mass is None:
-        raise InputError(Mistake("is missing; this mesh brings no masses, so give the total [kg]", key="mass"))
+        raise InputError(InputMistake("is missing; this mesh brings no masses, so give the total [kg]", key="mass"))
     return mesh.mass
 
 
-def _require_determined(system: System, mesh: Mesh) -> None:
+def _require_determined_positions(system: System, mesh: Mesh) -> None:
     """Raise InputError if a vertex without mass has an undetermined position."""
     if system.mass.all():
         return
     try:
-        assemble(system, [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)])
+        assemble_system_matrix(system, [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)])
     except NotPositiveDefinite as error:
-        numbers = mesh.in_file(*error.vertices) if error.vertices else ""
-        raise InputError(Mistake(f"{error}{numbers}", key="mesh")) from error
+        numbers = mesh.format_file_numbers(*error.vertices) if error.vertices else ""
+        raise InputError(InputMistake(f"{error}{numbers}", key="mesh")) from error
 
 
-def _pins(
-    parts: list[Contribution], mesh: Mesh
-) -> tuple[Pins, Positions, tuple[tuple[NDArray[np.int64], KeyedMotion], ...]]:
+def _merge_pins(
+    parts: list[EffectContribution], mesh: Mesh
+) -> tuple[DirichletPins, Positions, tuple[tuple[NDArray[np.int64], KeyFrameMotion], ...]]:
     """Merge all pins by vertex, with targets and motions; duplicates must agree."""
-    pins: list[Pin] = [pin for part in parts for pin in part.pins]
+    pins: list[PinGroup] = [pin for part in parts for pin in part.pins]
     if not pins:
-        return Pins(), np.empty((0, 3)), ()
+        return DirichletPins(), np.empty((0, 3)), ()
     vertices = np.concatenate([pin.vertices for pin in pins])
     weight = np.concatenate([np.full(len(pin.vertices), pin.weight) for pin in pins])
     targets = np.concatenate([pin.targets for pin in pins])
@@ -289,7 +297,7 @@ def _pins(
         vertex = int(vertices[clash][0])
         raise InputError(
             f"pins: vertex {vertex} is pinned twice, by effects[{one}] and effects[{two}], to different "
-            f"places, with different weights or with different motions{mesh.in_file(vertex)}"
+            f"places, with different weights or with different motions{mesh.format_file_numbers(vertex)}"
         )
     moving = ((np.flatnonzero(motion[first] == k), path) for k, path in enumerate(motions) if path is not None)
-    return Pins(unique, weight[first]), targets[first], tuple(moving)
+    return DirichletPins(unique, weight[first]), targets[first], tuple(moving)

@@ -19,19 +19,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Crossing = tuple[tuple[int, int], tuple[int, int, int]]
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+Intersection = tuple[tuple[int, int], tuple[int, int, int]]
 
-_ROUND = 64.0 * np.finfo(np.float64).eps
+_ROUNDOFF = 64.0 * np.finfo(np.float64).eps
 """Round-off relative to the coordinates of the pair: a larger gap along a unit axis is significant."""
 
-_AT_ONCE = 200_000
+_PAIRS_PER_CHUNK = 200_000
 """Number of pairs tested per chunk."""
 
 
 @dataclass(frozen=True, eq=False)
-class Apart:
+class IntersectionCheck:
     """Primitives that must not intersect.
 
     Attributes:
@@ -40,21 +40,25 @@ class Apart:
         obstacle_positions: returns the obstacle vertices (o, 3) [m] at a time [s].
     """
 
-    pairs: tuple[tuple[Indices, Indices], ...]
-    beside: Callable[[float], Array] | None = None
+    edges_and_triangles: tuple[tuple[IndexArray, IndexArray], ...]
+    obstacle_positions: Callable[[float], FloatArray] | None = None
 
-    def crossings(self, p: Array, time: float) -> list[Crossing]:
+    def find_intersections(self, p: FloatArray, time: float) -> list[Intersection]:
         """Return the edges that intersect triangles.
 
         Args:
             p: positions of the mesh (n, 3) [m].
             time: [s].
         """
-        every = p if self.beside is None else np.concatenate([p, self.beside(time)])
-        return [found for edges, triangles in self.pairs for found in crossings(every, edges, triangles)]
+        every = p if self.obstacle_positions is None else np.concatenate([p, self.obstacle_positions(time)])
+        return [
+            found
+            for edges, triangles in self.edges_and_triangles
+            for found in find_edge_triangle_intersections(every, edges, triangles)
+        ]
 
 
-def crossings(p: Array, edges: Indices, triangles: Indices) -> list[Crossing]:
+def find_edge_triangle_intersections(p: FloatArray, edges: IndexArray, triangles: IndexArray) -> list[Intersection]:
     """Return the edges that intersect triangles, with those triangles, sorted.
 
     Args:
@@ -62,30 +66,32 @@ def crossings(p: Array, edges: Indices, triangles: Indices) -> list[Crossing]:
         edges: (m, 2).
         triangles: (f, 3).
     """
-    found: list[Crossing] = []
+    found: list[Intersection] = []
     if not (len(edges) and len(triangles)):
         return found
     if not np.isfinite(p).all():
         raise ValueError("positions should be finite to tell whether they intersect")
-    for e, t in _near(p, edges, triangles):
-        open_ = np.flatnonzero(~_apart(p, edges[e], triangles[t]))
+    for e, t in _overlapping_box_pairs(p, edges, triangles):
+        open_ = np.flatnonzero(~_has_separating_axis(p, edges[e], triangles[t]))
         for k in open_.tolist():
             edge, corners = edges[e[k]].tolist(), triangles[t[k]].tolist()
-            if meets([_exact(p[i]) for i in edge], [_exact(p[i]) for i in corners]):
+            if edge_intersects_triangle([_to_fractions(p[i]) for i in edge], [_to_fractions(p[i]) for i in corners]):
                 found.append(((edge[0], edge[1]), (corners[0], corners[1], corners[2])))
     return sorted(found)
 
 
-def _near(p: Array, edges: Indices, triangles: Indices) -> Iterator[tuple[Indices, Indices]]:
+def _overlapping_box_pairs(
+    p: FloatArray, edges: IndexArray, triangles: IndexArray
+) -> Iterator[tuple[IndexArray, IndexArray]]:
     """Yield chunks of edges and triangles, by index, that share no vertex and have overlapping boxes."""
     a, b = p[edges], p[triangles]
     middle, centre = a.mean(axis=1), b.mean(axis=1)
     half = np.linalg.norm(a - middle[:, None], axis=2).max(axis=1)
     wide = np.linalg.norm(b - centre[:, None], axis=2).max(axis=1)
     tree: Any = cKDTree(centre)
-    reach = (half + float(wide.max())) * (1.0 + 1e-9) + _ROUND * float(np.abs(p).max())
+    reach = (half + float(wide.max())) * (1.0 + 1e-9) + _ROUNDOFF * float(np.abs(p).max())
     low, high, below, above = a.min(axis=1), a.max(axis=1), b.min(axis=1), b.max(axis=1)
-    step = max(1, _AT_ONCE // 64)
+    step = max(1, _PAIRS_PER_CHUNK // 64)
     for first in range(0, len(edges), step):
         part = slice(first, first + step)
         lists: list[list[int]] = tree.query_ball_point(middle[part], reach[part]).tolist()
@@ -96,7 +102,7 @@ def _near(p: Array, edges: Indices, triangles: Indices) -> Iterator[tuple[Indice
         yield e[over], t[over]
 
 
-def _apart(p: Array, edges: Indices, triangles: Indices) -> NDArray[np.bool_]:
+def _has_separating_axis(p: FloatArray, edges: IndexArray, triangles: IndexArray) -> NDArray[np.bool_]:
     """Return which pairs (k, 2) and (k, 3) have a separating axis, beyond round-off."""
     if not len(edges):
         return np.empty(0, bool)
@@ -113,44 +119,46 @@ def _apart(p: Array, edges: Indices, triangles: Indices) -> NDArray[np.bool_]:
         unit = axis / np.where(length > 0.0, length, 1.0)[:, None]
         one, two = np.einsum("kij,kj->ki", a, unit), np.einsum("kij,kj->ki", b, unit)
         gap = np.maximum(one.min(axis=1) - two.max(axis=1), two.min(axis=1) - one.max(axis=1))
-        apart |= gap > _ROUND * size
+        apart |= gap > _ROUNDOFF * size
     return apart
 
 
-Point = tuple[Fraction, Fraction, Fraction]
+ExactPoint = tuple[Fraction, Fraction, Fraction]
 
 
-def _exact(x: Array) -> Point:
+def _to_fractions(x: FloatArray) -> ExactPoint:
     return Fraction(float(x[0])), Fraction(float(x[1])), Fraction(float(x[2]))
 
 
-def meets(edge: list[Point], triangle: list[Point]) -> bool:
+def edge_intersects_triangle(edge: list[ExactPoint], triangle: list[ExactPoint]) -> bool:
     """Return whether an edge (two points) and a triangle (three points) intersect, in rational arithmetic."""
     a, b = edge
     u, v, w = triangle
-    above, below = _volume(u, v, w, a), _volume(u, v, w, b)
+    above, below = _signed_volume(u, v, w, a), _signed_volume(u, v, w, b)
     if above * below > 0:
         return False
     if above != 0 or below != 0:
-        turns = [_volume(a, b, one, two) for one, two in ((u, v), (v, w), (w, u))]
+        turns = [_signed_volume(a, b, one, two) for one, two in ((u, v), (v, w), (w, u))]
         return min(turns) >= 0 or max(turns) <= 0
     # Coplanar points, or a degenerate triangle: they intersect if their projections along each axis overlap.
-    return all(_flat_meet(_seen(edge, k), _seen(triangle, k)) for k in range(3))
+    return all(
+        _convex_polygons_overlap(_project_along_axis(edge, k), _project_along_axis(triangle, k)) for k in range(3)
+    )
 
 
-def _volume(a: Point, b: Point, c: Point, d: Point) -> Fraction:
+def _signed_volume(a: ExactPoint, b: ExactPoint, c: ExactPoint, d: ExactPoint) -> Fraction:
     (u0, u1, u2), (v0, v1, v2), (w0, w1, w2) = (tuple(x - y for x, y in zip(q, a, strict=True)) for q in (b, c, d))
     return u0 * (v1 * w2 - v2 * w1) - u1 * (v0 * w2 - v2 * w0) + u2 * (v0 * w1 - v1 * w0)
 
 
-Flat = tuple[Fraction, Fraction]
+ExactPoint2D = tuple[Fraction, Fraction]
 
 
-def _seen(points: list[Point], axis: int) -> list[Flat]:
+def _project_along_axis(points: list[ExactPoint], axis: int) -> list[ExactPoint2D]:
     return [(q[axis - 1], q[axis - 2]) for q in points]
 
 
-def _flat_meet(edge: list[Flat], triangle: list[Flat]) -> bool:
+def _convex_polygons_overlap(edge: list[ExactPoint2D], triangle: list[ExactPoint2D]) -> bool:
     """Return whether convex polygons in the plane overlap: no line along a side separates them."""
     sides = [*pairwise([*triangle, triangle[0]]), (edge[0], edge[1])]
     for (a, b), swap in product(sides, (False, True)):

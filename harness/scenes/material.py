@@ -41,22 +41,22 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from harness.base.errors import InputError, Mistake, did_you_mean
+from harness.base.errors import InputError, InputMistake, suggest_name
 from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
-from harness.scenes.weave import Weave
+from harness.scenes.weave import OrthotropicStiffness
 
-Scale = Callable[[Mesh, str, int | None], NDArray[np.float64] | float]
+ScalingRule = Callable[[Mesh, str, int | None], NDArray[np.float64] | float]
 """(mesh, family, reference size) -> factor of a family's constant: one for all springs, or one per spring."""
 
 
-def spring_stiffness(
+def compute_spring_stiffness(
     mesh: Mesh,
     *,
-    rule: str,
-    stretch: float | Weave,
-    shear: float | Weave,
+    scaling_rule: str,
+    stretch: float | OrthotropicStiffness,
+    shear: float | OrthotropicStiffness,
     bend: float,
-    reference: int | None = None,
+    reference_size: int | None = None,
 ) -> NDArray[np.float64]:
     """Compute the stiffness of each spring, (m,) [N/m].
 
@@ -71,28 +71,34 @@ def spring_stiffness(
         InputError: for an unknown rule, for a constant that is negative or not finite (except as above), for a rule
             that does not fit the mesh, and for a reference size that is missing or unused.
     """
-    if rule not in RULES:
-        raise InputError(Mistake(f"unknown rule {rule!r}; wanted {did_you_mean(rule, RULES)}", key="rule"))
-    if reference is not None and rule != "liu2013":
-        raise InputError(Mistake(f"has no meaning for the rule {rule}; leave it out", key="reference"))
+    if scaling_rule not in SCALING_RULES:
+        raise InputError(
+            InputMistake(
+                f"unknown rule {scaling_rule!r}; wanted {suggest_name(scaling_rule, SCALING_RULES)}", key="rule"
+            )
+        )
+    if reference_size is not None and scaling_rule != "liu2013":
+        raise InputError(InputMistake(f"has no meaning for the rule {scaling_rule}; leave it out", key="reference"))
     k = np.zeros(len(mesh.springs))
     for family, constant in ((STRETCH, stretch), (SHEAR, shear), (BEND, bend)):
-        of = mesh.families[family]
-        if isinstance(constant, Weave):
-            k[of] = constant.of(mesh, mesh.springs[of]) * RULES[rule](mesh, family, reference)
+        of = mesh.spring_families[family]
+        if isinstance(constant, OrthotropicStiffness):
+            k[of] = constant.compute_stiffness(mesh, mesh.springs[of]) * SCALING_RULES[scaling_rule](
+                mesh, family, reference_size
+            )
             continue
         if not 0 <= constant < np.inf and (family == BEND or constant != np.inf):
-            raise InputError(Mistake(f"{constant} is no stiffness; wanted a finite number >= 0", key=family))
-        k[of] = constant * RULES[rule](mesh, family, reference)
-    return _relieved(mesh, k) if rule == "continuum" else k
+            raise InputError(InputMistake(f"{constant} is no stiffness; wanted a finite number >= 0", key=family))
+        k[of] = constant * SCALING_RULES[scaling_rule](mesh, family, reference_size)
+    return _subtract_bend_stiffness(mesh, k) if scaling_rule == "continuum" else k
 
 
-def _relieved(mesh: Mesh, k: NDArray[np.float64]) -> NDArray[np.float64]:
+def _subtract_bend_stiffness(mesh: Mesh, k: NDArray[np.float64]) -> NDArray[np.float64]:
     """Subtract the stretch stiffness of skip-one springs from the springs along the lines."""
-    if not k[mesh.families[BEND]].any():
+    if not k[mesh.spring_families[BEND]].any():
         return k
-    along = mesh.families[STRETCH]
-    added = 2 * _overlaps(mesh) * k[mesh.families[BEND]].max()
+    along = mesh.spring_families[STRETCH]
+    added = 2 * _count_overlapping_bends(mesh) * k[mesh.spring_families[BEND]].max()
     if (added > k[along]).any():
         worst = int(np.argmax(added - k[along]))
         had, more = k[along][worst], added[worst]
@@ -101,57 +107,61 @@ def _relieved(mesh: Mesh, k: NDArray[np.float64]) -> NDArray[np.float64]:
             f"its springs alone would resist stretch by {more:.4g} N/m at a spacing of {mesh.spacing:.4g} m, and "
             f"`stretch` is {had:.4g} N/m; wanted a spacing of at least {least:.4g} m, less `bend` or more `stretch`"
         )
-        raise InputError(Mistake(problem, key="bend"))
+        raise InputError(InputMistake(problem, key="bend"))
     k[along] -= added
     return k
 
 
-def _overlaps(mesh: Mesh) -> NDArray[np.int64]:
+def _count_overlapping_bends(mesh: Mesh) -> NDArray[np.int64]:
     """Count the BEND springs that cover each STRETCH spring, one or two.
 
     A BEND spring spans two STRETCH springs.
     """
-    (i, j), (a, b) = (mesh.springs[mesh.families[family]].T for family in (STRETCH, BEND))
-    n, name = len(mesh.rest), np.arange(1, len(i) + 1)
+    (i, j), (a, b) = (mesh.springs[mesh.spring_families[family]].T for family in (STRETCH, BEND))
+    n, name = len(mesh.rest_positions), np.arange(1, len(i) + 1)
     spring = scipy.sparse.coo_array((np.tile(name, 2), (np.r_[i, j], np.r_[j, i])), shape=(n, n)).tocsr()
     bend, middle = cast(scipy.sparse.csr_array, spring[a] * spring[b]).nonzero()
     under = [np.asarray(spring[end[bend], middle]) for end in (a, b)]
     return np.bincount(np.concatenate(under) - 1, minlength=len(i))
 
 
-def _fixed(mesh: Mesh, family: str, reference: int | None) -> float:
+def _fixed_scale(mesh: Mesh, family: str, reference: int | None) -> float:
     return 1.0
 
 
-def _continuum(mesh: Mesh, family: str, reference: int | None) -> NDArray[np.float64] | float:
+def _continuum_scale(mesh: Mesh, family: str, reference: int | None) -> NDArray[np.float64] | float:
     if family == BEND:
         return 16 / mesh.spacing**2
     if mesh.dimension > 1:
         return 1.0 if mesh.dimension == 2 else mesh.spacing
-    lengths = mesh.rest_lengths[mesh.families[family]]
+    lengths = mesh.rest_lengths[mesh.spring_families[family]]
     if not lengths.all():
         problem = "continuum divides by rest lengths, and a spring joins two vertices in one place; use fixed"
-        raise InputError(Mistake(problem, key="rule"))
+        raise InputError(InputMistake(problem, key="rule"))
     return 1 / lengths
 
 
-def _liu2013(mesh: Mesh, family: str, reference: int | None) -> float:
+def _liu2013_scale(mesh: Mesh, family: str, reference: int | None) -> float:
     if reference is None or reference < 2:
         problem = f"came {reference}; liu2013 needs the mesh size, at least 2, at which the constants hold"
-        raise InputError(Mistake(problem, key="reference"))
+        raise InputError(InputMistake(problem, key="reference"))
     if mesh.resolution < 2:
         problem = f"liu2013 needs a mesh that has a size of at least 2, this one has {mesh.resolution or 'none'}"
-        raise InputError(Mistake(problem + "; use fixed or continuum", key="rule"))
+        raise InputError(InputMistake(problem + "; use fixed or continuum", key="rule"))
     return (mesh.resolution - 1) / (reference - 1)
 
 
-def modulus_exponent(rule: str, dimension: int) -> int:
+def compute_modulus_exponent(scaling_rule: str, dimension: int) -> int:
     """Return the exponent of the spacing h in the material modulus of a mesh.
 
     The modulus is EA of a chain (k h), E t of a sheet (k) and E of a solid (k / h), for springs of stiffness k along
     its lines. With `continuum` it does not depend on h.
     """
-    return {"continuum": 0, "fixed": 2 - dimension, "liu2013": 1 - dimension}[rule]
+    return {"continuum": 0, "fixed": 2 - dimension, "liu2013": 1 - dimension}[scaling_rule]
 
 
-RULES: dict[str, Scale] = {"fixed": _fixed, "continuum": _continuum, "liu2013": _liu2013}
+SCALING_RULES: dict[str, ScalingRule] = {
+    "fixed": _fixed_scale,
+    "continuum": _continuum_scale,
+    "liu2013": _liu2013_scale,
+}

@@ -9,115 +9,117 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, model_validator
 
-from harness.base.model import Model, Vector
-from harness.scenes.motion import KeyedMotion
-from solvers.contact.energy import Obstacle
+from harness.base.model import ConfigModel, Vector3
+from harness.scenes.motion import KeyFrameMotion
+from solvers.contact.energy import ConvexObstacle
 
-Array = NDArray[np.float64]
-Length = Annotated[PositiveFloat, Field(le=1e9)]
+FloatArray = NDArray[np.float64]
+ObstacleLength = Annotated[PositiveFloat, Field(le=1e9)]
 
 
-class _Moving(Model):
-    motion: KeyedMotion | None = None
+class _MovingObstacle(ConfigModel):
+    motion: KeyFrameMotion | None = None
     """Key frames of the obstacle's motion; it stays solid at any speed."""
 
-    def _obstacle(self, origin: Vector, axes: Array, low: Array, high: Array, radius: float) -> Obstacle:
+    def _build_rounded_box(
+        self, origin: Vector3, axes: FloatArray, low: FloatArray, high: FloatArray, radius: float
+    ) -> ConvexObstacle:
         """Build a rounded box with the given axes (3, 3), one per row."""
         frame = np.concatenate([[origin], axes])
         motion = self.motion
         if motion is None:
-            return Obstacle(low, high, radius, lambda time: frame)
+            return ConvexObstacle(low, high, radius, lambda time: frame)
 
         @lru_cache(maxsize=2)  # a step's end is the start of the next one
-        def moved(time: float) -> Array:
-            o, *ends = motion.moved(np.concatenate([frame[:1], frame[:1] + axes]), time)
+        def moved(time: float) -> FloatArray:
+            o, *ends = motion.transform_points(np.concatenate([frame[:1], frame[:1] + axes]), time)
             return np.concatenate([[o], np.array(ends) - o])
 
-        return Obstacle(low, high, radius, moved)
+        return ConvexObstacle(low, high, radius, moved)
 
 
-class Plane(_Moving):
+class PlaneObstacle(_MovingObstacle):
     """An infinite plane, solid below."""
 
     kind: Literal["plane"] = "plane"
-    point: Vector = (0.0, 0.0, 0.0)
+    point: Vector3 = (0.0, 0.0, 0.0)
     """Any point of the plane [m]."""
-    normal: Vector = (0.0, 1.0, 0.0)
+    normal: Vector3 = (0.0, 1.0, 0.0)
     """Outward normal, of any length but zero."""
 
     @model_validator(mode="after")
-    def _directed(self) -> Plane:
+    def _check_normal(self) -> PlaneObstacle:
         if not any(self.normal):
             raise ValueError("the normal should have a direction; it is zero")
         return self
 
-    def obstacle(self) -> Obstacle:
+    def build_obstacle(self) -> ConvexObstacle:
         """Return the obstacle in the solvers' form."""
         low, high = np.full(3, -np.inf), np.array([np.inf, 0.0, np.inf])
-        return self._obstacle(self.point, _about(self.normal), low, high, 0.0)
+        return self._build_rounded_box(self.point, _orthonormal_axes(self.normal), low, high, 0.0)
 
 
-class Sphere(_Moving):
+class SphereObstacle(_MovingObstacle):
     """A ball."""
 
     kind: Literal["sphere"] = "sphere"
-    center: Vector = (0.0, 0.0, 0.0)
+    center: Vector3 = (0.0, 0.0, 0.0)
     """Centre [m]."""
-    radius: Length
+    radius: ObstacleLength
     """Radius [m]."""
 
-    def obstacle(self) -> Obstacle:
+    def build_obstacle(self) -> ConvexObstacle:
         """Return the obstacle in the solvers' form."""
-        return self._obstacle(self.center, np.eye(3), np.zeros(3), np.zeros(3), self.radius)
+        return self._build_rounded_box(self.center, np.eye(3), np.zeros(3), np.zeros(3), self.radius)
 
 
-class Capsule(_Moving):
+class CapsuleObstacle(_MovingObstacle):
     """All points within a radius of a segment."""
 
     kind: Literal["capsule"] = "capsule"
-    ends: tuple[Vector, Vector]
+    ends: tuple[Vector3, Vector3]
     """Two distinct ends of the segment [m]."""
-    radius: Length
+    radius: ObstacleLength
     """Radius [m]."""
 
     @model_validator(mode="after")
-    def _long(self) -> Capsule:
+    def _check_ends(self) -> CapsuleObstacle:
         if self.ends[0] == self.ends[1]:
             raise ValueError("the ends should lie apart; use a sphere")
         return self
 
-    def obstacle(self) -> Obstacle:
+    def build_obstacle(self) -> ConvexObstacle:
         """Return the obstacle in the solvers' form."""
         first, last = self.ends
         x, y, z = np.array(last) - first
         high = np.array([0.0, np.linalg.norm([x, y, z]), 0.0])
-        return self._obstacle(first, _about((x, y, z)), np.zeros(3), high, self.radius)
+        return self._build_rounded_box(first, _orthonormal_axes((x, y, z)), np.zeros(3), high, self.radius)
 
 
-class Box(_Moving):
+class BoxObstacle(_MovingObstacle):
     """An axis-parallel box; a motion with one key frame rotates it."""
 
     kind: Literal["box"] = "box"
-    low: Vector
+    low: Vector3
     """The corner with the smallest coordinates [m]."""
-    high: Vector
+    high: Vector3
     """The corner with the largest coordinates [m]."""
 
     @model_validator(mode="after")
-    def _solid(self) -> Box:
+    def _check_corners(self) -> BoxObstacle:
         if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
             raise ValueError("each coordinate of `high` should lie above that of `low`")
         return self
 
-    def obstacle(self) -> Obstacle:
+    def build_obstacle(self) -> ConvexObstacle:
         """Return the obstacle in the solvers' form."""
-        return self._obstacle((0.0, 0.0, 0.0), np.eye(3), np.array(self.low), np.array(self.high), 0.0)
+        return self._build_rounded_box((0.0, 0.0, 0.0), np.eye(3), np.array(self.low), np.array(self.high), 0.0)
 
 
-AnyObstacle = Annotated[Plane | Sphere | Capsule | Box, Field(discriminator="kind")]
+AnyObstacle = Annotated[PlaneObstacle | SphereObstacle | CapsuleObstacle | BoxObstacle, Field(discriminator="kind")]
 
 
-def _about(direction: Vector) -> Array:
+def _orthonormal_axes(direction: Vector3) -> FloatArray:
     """Build right-handed orthonormal axes (3, 3), the second along a direction."""
     y = np.array(direction) / np.linalg.norm(direction)
     x = np.cross(y, np.eye(3)[np.abs(y).argmin()])

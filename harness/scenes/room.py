@@ -14,23 +14,27 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from harness.scenes.motion import KeyedMotion
-from solvers.contact.energy import Obstacle
+from harness.scenes.motion import KeyFrameMotion
+from solvers.contact.energy import ConvexObstacle
 from solvers.problem import Positions
 
-_PARTS, _ALL = 512, 4096
+_MIN_STEP_FRACTION_PER_KEY, _MIN_STEP_FRACTION_TOTAL = 512, 4096
 """Shortest steps relative to the interval between two key times, and to the whole; thinner overlaps are missed."""
-_TURNS = 64
+_ROTATING_PLANE_SAMPLES = 64
 """Total number of sample times for rotating planes."""
 
 
-def key_times(*motions: KeyedMotion | None) -> list[float]:
+def merge_key_times(*motions: KeyFrameMotion | None) -> list[float]:
     """Return the sorted key times [s] of the motions, including the start."""
-    return sorted({0.0, *(time for motion in motions if motion for time in motion.times)})
+    return sorted({0.0, *(time for motion in motions if motion for time in motion.key_times)})
 
 
-def nearest(
-    obstacle: Obstacle, taken: KeyedMotion | None, targets: Positions, motion: KeyedMotion | None, limit: float
+def find_first_violation(
+    obstacle: ConvexObstacle,
+    obstacle_motion: KeyFrameMotion | None,
+    points: Positions,
+    point_motion: KeyFrameMotion | None,
+    min_distance: float,
 ) -> tuple[float, NDArray[np.float64]] | None:
     """Find the first time at which points are closer to an obstacle than a minimum distance.
 
@@ -44,31 +48,35 @@ def nearest(
     Returns:
         The time [s] and all distances (q,) [m] at that time, None if there is no such time.
     """
-    times = key_times(taken, motion)
-    shortest = (times[-1] - times[0]) / _ALL
+    times = merge_key_times(obstacle_motion, point_motion)
+    shortest = (times[-1] - times[0]) / _MIN_STEP_FRACTION_TOTAL
 
     def place(time: float) -> Positions:
-        return motion.moved(targets, time) if motion else targets
+        return point_motion.transform_points(points, time) if point_motion else points
 
     def look(time: float) -> NDArray[np.float64]:
-        return obstacle.distance(place(time), time)
+        return obstacle.signed_distance(place(time), time)
 
     for begin, end in pairwise(times):
-        speed = motion.speed(begin, end, targets) if motion else 0.0
-        if taken:
-            speed += taken.speed(begin, end, place(begin), slack=speed * (end - begin))
+        speed = point_motion.bound_speed(begin, end, points) if point_motion else 0.0
+        if obstacle_motion:
+            speed += obstacle_motion.bound_speed(begin, end, place(begin), slack=speed * (end - begin))
         time = begin
         while time < end:
             distance = look(time)
             least = float(distance.min(initial=np.inf))
-            if least < limit:
+            if least < min_distance:
                 return time, distance
-            time += max((least - limit) / speed if speed else np.inf, (end - begin) / _PARTS, shortest)
+            time += max(
+                (least - min_distance) / speed if speed else np.inf,
+                (end - begin) / _MIN_STEP_FRACTION_PER_KEY,
+                shortest,
+            )
     distance = look(times[-1])
-    return (times[-1], distance) if distance.min(initial=np.inf) < limit else None
+    return (times[-1], distance) if distance.min(initial=np.inf) < min_distance else None
 
 
-def gap(planes: Sequence[Obstacle], time: float) -> float:
+def largest_gap_radius(planes: Sequence[ConvexObstacle], time: float) -> float:
     """Return the radius [m] of the largest ball between half-spaces, at most 1; negative if they overlap."""
     frames = [plane.frame(time) for plane in planes]
     normals, offsets = np.array([f[2] for f in frames]), np.array([f[2] @ f[0] for f in frames])
@@ -79,11 +87,11 @@ def gap(planes: Sequence[Obstacle], time: float) -> float:
     return float(found.x[3]) if found.x is not None else -np.inf
 
 
-def looks(motions: Sequence[KeyedMotion | None]) -> Iterator[float]:
+def sample_times(motions: Sequence[KeyFrameMotion | None]) -> Iterator[float]:
     """Yield sample times [s] of motions: their key times, and intermediate times if they rotate."""
-    times = key_times(*motions)
-    straight = all(motion.straight for motion in motions if motion)
-    between = 1 if straight else max(1, _TURNS // max(1, len(times) - 1))
+    times = merge_key_times(*motions)
+    straight = all(motion.is_piecewise_linear for motion in motions if motion)
+    between = 1 if straight else max(1, _ROTATING_PLANE_SAMPLES // max(1, len(times) - 1))
     for begin, end in pairwise(times):
         yield from np.linspace(begin, end, between, endpoint=False).tolist()
     yield times[-1]

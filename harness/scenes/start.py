@@ -11,68 +11,68 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, NonNegativeInt, PositiveFloat, model_validator
 
-from harness.base.errors import InputError, Mistake
-from harness.base.model import Many, Model, Vector
+from harness.base.errors import InputError, InputMistake
+from harness.base.model import ConfigModel, OneOrMany, Vector3
 from solvers.problem import Positions
 
 _AXES = {"x": 0, "y": 1, "z": 2}
-Axis = Literal["x", "y", "z"]
+AxisName = Literal["x", "y", "z"]
 
 
-class Rest(Model):
+class RestStart(ConfigModel):
     """The rest shape, optionally with a spin."""
 
     kind: Literal["rest"] = "rest"
-    spin: Vector = (0.0, 0.0, 0.0)
+    spin: Vector3 = (0.0, 0.0, 0.0)
     """Angular velocity about the mean position [rad/s]."""
 
-    def positions(self, rest: Positions) -> Positions:
+    def compute_positions(self, rest_positions: Positions) -> Positions:
         """Return the initial positions (n, 3) [m]; raise InputError if the mesh lacks a named vertex."""
-        return rest
+        return rest_positions
 
-    def velocity(self, p: Positions) -> Positions:
+    def compute_spin_velocity(self, p: Positions) -> Positions:
         """Return the velocity of the spin (n, 3) [m/s] at positions p (n, 3) [m]."""
         return np.cross(self.spin, p - p.mean(axis=0))
 
 
-class Collapsed(Rest):
+class CollapsedStart(RestStart):
     """All vertices at one point, the mean of the rest positions."""
 
     kind: Literal["collapsed"] = "collapsed"  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    def positions(self, rest: Positions) -> Positions:
+    def compute_positions(self, rest_positions: Positions) -> Positions:
         """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m]."""
-        return np.tile(rest.mean(axis=0), (len(rest), 1))
+        return np.tile(rest_positions.mean(axis=0), (len(rest_positions), 1))
 
 
-class Flattened(Rest):
+class FlattenedStart(RestStart):
     """Flattened to a plane or, with two axes, to a line."""
 
     kind: Literal["flattened"] = "flattened"  # pyright: ignore[reportIncompatibleVariableOverride]
-    along: Many[Axis]
+    along: OneOrMany[AxisName]
     """Coordinates that are set to their mean for all vertices."""
 
-    def positions(self, rest: Positions) -> Positions:
+    def compute_positions(self, rest_positions: Positions) -> Positions:
         """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m]."""
-        p, columns = rest.copy(), [_AXES[axis] for axis in self.along]
-        p[:, columns] = rest[:, columns].mean(axis=0)
+        p, columns = rest_positions.copy(), [_AXES[axis] for axis in self.along]
+        p[:, columns] = rest_positions[:, columns].mean(axis=0)
         return p
 
 
-class Scaled(Rest):
+class ScaledStart(RestStart):
     """c + factors (p - c): shrunk, enlarged, or mirrored for a negative factor."""
 
     kind: Literal["scaled"] = "scaled"  # pyright: ignore[reportIncompatibleVariableOverride]
-    factors: Vector
+    factors: Vector3
     """Factors along x, y and z."""
 
-    def positions(self, rest: Positions) -> Positions:
+    def compute_positions(self, rest_positions: Positions) -> Positions:
         """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m]."""
-        c = rest.mean(axis=0)
-        return c + np.array(self.factors) * (rest - c)
+        c = rest_positions.mean(axis=0)
+        return c + np.array(self.factors) * (rest_positions - c)
 
 
-class Random(Rest):
+class RandomStart(RestStart):
     """Vertices at uniformly random points of a cube about c.
 
     Chen et al. 2024 use this start for vertex block descent.
@@ -83,13 +83,13 @@ class Random(Rest):
     """Side of the cube [m]."""
     seed: NonNegativeInt = 0
 
-    def positions(self, rest: Positions) -> Positions:
+    def compute_positions(self, rest_positions: Positions) -> Positions:
         """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m]."""
-        shift = np.random.default_rng(self.seed).uniform(-0.5, 0.5, rest.shape)
-        return rest.mean(axis=0) + self.side * shift
+        shift = np.random.default_rng(self.seed).uniform(-0.5, 0.5, rest_positions.shape)
+        return rest_positions.mean(axis=0) + self.side * shift
 
 
-class Perturbed(Rest):
+class PerturbedStart(RestStart):
     """Each coordinate perturbed by a normal random number."""
 
     kind: Literal["perturbed"] = "perturbed"  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -97,12 +97,12 @@ class Perturbed(Rest):
     """Standard deviation [m]."""
     seed: NonNegativeInt = 0
 
-    def positions(self, rest: Positions) -> Positions:
+    def compute_positions(self, rest_positions: Positions) -> Positions:
         """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m]."""
-        return rest + self.deviation * np.random.default_rng(self.seed).normal(size=rest.shape)
+        return rest_positions + self.deviation * np.random.default_rng(self.seed).normal(size=rest_positions.shape)
 
 
-class Merged(Rest):
+class MergedStart(RestStart):
     """Some vertices moved to the position of another."""
 
     kind: Literal["merged"] = "merged"  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -110,20 +110,23 @@ class Merged(Rest):
     """The vertex that stays, followed by those that are moved to it."""
 
     @model_validator(mode="after")
-    def _differ(self) -> Merged:
+    def _check_vertices(self) -> MergedStart:
         if len(set(self.vertices)) < len(self.vertices):
             raise ValueError("names a vertex twice")
         return self
 
-    def positions(self, rest: Positions) -> Positions:
+    def compute_positions(self, rest_positions: Positions) -> Positions:
         """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m]."""
-        if max(self.vertices) >= len(rest):
-            problem = f"came {max(self.vertices)}; the mesh has the vertices 0 to {len(rest) - 1}"
-            raise InputError(Mistake(problem, key="start.vertices"))
-        p = rest.copy()
-        p[list(self.vertices[1:])] = rest[self.vertices[0]]
+        if max(self.vertices) >= len(rest_positions):
+            problem = f"came {max(self.vertices)}; the mesh has the vertices 0 to {len(rest_positions) - 1}"
+            raise InputError(InputMistake(problem, key="start.vertices"))
+        p = rest_positions.copy()
+        p[list(self.vertices[1:])] = rest_positions[self.vertices[0]]
         return p
 
 
-AnyStart = Annotated[Rest | Collapsed | Flattened | Scaled | Random | Perturbed | Merged, Field(discriminator="kind")]
+AnyStart = Annotated[
+    RestStart | CollapsedStart | FlattenedStart | ScaledStart | RandomStart | PerturbedStart | MergedStart,
+    Field(discriminator="kind"),
+]
 """A start as declared by a scene; `kind` selects its type."""

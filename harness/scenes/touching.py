@@ -9,23 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.base.errors import InputError
-from harness.scenes.intersections import Crossing
+from harness.scenes.intersections import Intersection
 from harness.scenes.mesh.base import STRETCH, Mesh
-from harness.scenes.motion import KeyedMotion
-from solvers.contact.self_contact import PairContact
-from solvers.matrices import assemble
-from solvers.problem import Energy, Pins, Positions, ProjectiveEnergy, System
+from harness.scenes.motion import KeyFrameMotion
+from solvers.contact.self_contact import BarrierContact
+from solvers.matrices import assemble_system_matrix
+from solvers.problem import DirichletPins, Energy, Positions, ProjectiveEnergy, System
 
-_STIFF = 0.1
+_STIFFNESS_FRACTION = 0.1
 """Barrier stiffness as a fraction of the resistance of inertia and springs at a vertex."""
 
-_NAMED = 3
+_MAX_NAMED_PAIRS = 3
 """Maximum number of pairs that a message names."""
 
-ENDS = ("keeps apart what it finds at the end of a step",)
+END_OF_STEP_REASON = ("keeps apart what it finds at the end of a step",)
 
 
-def outline(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def collision_primitives(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the edges (m, 2) and faces (f, 3) of the mesh that can collide.
 
     Edges are the sides of triangles, and stretch springs between other vertices. Faces are the triangles, and such
@@ -34,17 +34,17 @@ def outline(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """
     triangles = mesh.triangles
     sides = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
-    inside = np.zeros(len(mesh.rest), bool)
+    inside = np.zeros(len(mesh.rest_positions), bool)
     inside[triangles] = True
-    ropes = mesh.springs[mesh.families.get(STRETCH, np.empty(0, np.int64))]
+    ropes = mesh.springs[mesh.spring_families.get(STRETCH, np.empty(0, np.int64))]
     ropes = ropes[~inside[ropes].all(axis=1) & (ropes[:, 0] != ropes[:, 1])]
     ropes = np.unique(np.sort(ropes, axis=1), axis=0)
     edges = np.unique(np.concatenate([np.sort(sides, axis=1), ropes]), axis=0)
     return edges, np.concatenate([triangles, ropes[:, [0, 1, 1]]])
 
 
-def resisting(
-    given: float | None, mass: NDArray[np.float64], time_step: float, energies: Sequence[Energy]
+def compute_barrier_stiffness(
+    stiffness: float | None, mass: NDArray[np.float64], time_step: float, energies: Sequence[Energy]
 ) -> NDArray[np.float64]:
     """Compute the barrier stiffness of each vertex.
 
@@ -57,14 +57,14 @@ def resisting(
     Returns:
         Stiffness (n,) [N/m].
     """
-    if given is not None:
-        return np.full(len(mass), given)
+    if stiffness is not None:
+        return np.full(len(mass), stiffness)
     projective = [energy for energy in energies if isinstance(energy, ProjectiveEnergy)]
-    held = System(mass, time_step, pins=Pins(np.arange(len(mass)), np.full(len(mass), np.inf)))
-    return _STIFF * np.asarray(assemble(held, projective).diagonal(), np.float64)
+    held = System(mass, time_step, pins=DirichletPins(np.arange(len(mass)), np.full(len(mass), np.inf)))
+    return _STIFFNESS_FRACTION * np.asarray(assemble_system_matrix(held, projective).diagonal(), np.float64)
 
 
-class PinLike(Protocol):
+class PinTargets(Protocol):
     """Interface of pins (`harness.scenes.effects.effect_interface`)."""
 
     @property
@@ -83,49 +83,57 @@ class PinLike(Protocol):
         ...
 
     @property
-    def motion(self) -> KeyedMotion | None:
+    def motion(self) -> KeyFrameMotion | None:
         """Motion of the targets."""
         ...
 
 
-def require_still(who: str, start: Positions, pins: Sequence[PinLike]) -> None:
+def require_fixed_exact_pins(effect_name: str, start: Positions, pins: Sequence[PinTargets]) -> None:
     """Raise InputError for exact pins that move."""
     for pin in pins:
         moves = pin.motion is not None or not np.array_equal(pin.targets, start[pin.vertices])
         if np.isinf(pin.weight) and moves:
             raise InputError(
-                f"{who}: exact pins that move, or do not start where they hold, would carry the mesh through what it "
+                f"{effect_name}: exact pins that move, or do not start where they hold, would carry the mesh through what it "
                 "meets; give these pins a weight"
             )
 
 
-def require_open(who: str, energy: PairContact, start: Positions, thickness: float, mesh: Mesh) -> None:
+def require_intersection_free(
+    effect_name: str, energy: BarrierContact, start: Positions, min_distance: float, mesh: Mesh
+) -> None:
     """Raise InputError if pairs start closer than `min_distance` [m], at the start (n, 3) [m]."""
-    if closed := energy.closed(start):
-        near = "; ".join(f"{_pair(x.tolist(), two, mesh)} {apart:.3g} m apart" for x, two, apart in closed[:_NAMED])
+    if closed := energy.find_violated_pairs(start):
+        near = "; ".join(
+            f"{_describe_pair(x.tolist(), two, mesh)} {apart:.3g} m apart"
+            for x, two, apart in closed[:_MAX_NAMED_PAIRS]
+        )
         raise InputError(
-            f"{who}: {len(closed)} pairs start nearer than the thickness of {thickness:g} m: {near}; move them apart, "
+            f"{effect_name}: {len(closed)} pairs start nearer than the thickness of {min_distance:g} m: {near}; move them apart, "
             "or take a smaller thickness"
         )
 
 
-def _pair(x: list[int], edges: bool, mesh: Mesh) -> str:
+def _describe_pair(x: list[int], edges: bool, mesh: Mesh) -> str:
     one, two = (x[:2], x[2:]) if edges else (x[:1], x[1:])
-    return f"{_part(one, mesh)} and {_part(two, mesh)}"
+    return f"{_describe_primitive(one, mesh)} and {_describe_primitive(two, mesh)}"
 
 
-def _part(x: Sequence[int], mesh: Mesh) -> str:
+def _describe_primitive(x: Sequence[int], mesh: Mesh) -> str:
     """Describe a vertex, an edge or a triangle by its vertices.
 
     Indices beyond those of the mesh are vertices of obstacles.
     """
-    n = len(mesh.rest)
+    n = len(mesh.rest_positions)
     own = all(i < n for i in x)
     kind = ("vertex", "edge", "triangle")[len(x) - 1]
-    return f"{kind} {'-'.join(str(i if own else i - n) for i in x)}{mesh.in_file(*x) if own else ' of the obstacles'}"
+    return f"{kind} {'-'.join(str(i if own else i - n) for i in x)}{mesh.format_file_numbers(*x) if own else ' of the obstacles'}"
 
 
-def told(crossed: list[Crossing], mesh: Mesh) -> str:
+def describe_intersections(intersections: list[Intersection], mesh: Mesh) -> str:
     """Describe the first intersections in words; indices beyond the mesh are those of obstacles."""
-    words = "; ".join(f"{_part(e, mesh)} through {_part(t, mesh)}" for e, t in crossed[:_NAMED])
-    return f"{len(crossed)} times: {words}"
+    words = "; ".join(
+        f"{_describe_primitive(e, mesh)} through {_describe_primitive(t, mesh)}"
+        for e, t in intersections[:_MAX_NAMED_PAIRS]
+    )
+    return f"{len(intersections)} times: {words}"

@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import NonNegativeFloat, model_validator
 
-from harness.base.errors import InputError, Mistake
-from harness.base.model import Model, Vector
+from harness.base.errors import InputError, InputMistake
+from harness.base.model import ConfigModel, Vector3
 from harness.scenes.mesh.base import Mesh
 
-_ACROSS = 1e-6
+_MIN_TANGENT_FRACTION = 1e-6
 """Smallest tangential part of the warp direction, relative to its length, that counts as nonzero."""
 
 
-class Weave(Model):
+class OrthotropicStiffness(ConfigModel):
     """Stiffness of a woven cloth along and between its threads, in the unit of `stretch`."""
 
     warp: NonNegativeFloat
@@ -32,40 +32,43 @@ class Weave(Model):
     """Stiffness along the weft, across the warp."""
     bias: NonNegativeFloat
     """Stiffness at 45 degrees to both."""
-    direction: Vector
+    direction: Vector3
     """Direction of the warp in the rest shape, of any length but zero; on curved meshes its tangential part."""
 
     @model_validator(mode="after")
-    def _directed(self) -> Weave:
+    def _check_direction(self) -> OrthotropicStiffness:
         if not any(self.direction):
             raise ValueError("the direction of the warp should not be zero")
         return self
 
-    def of(self, mesh: Mesh, springs: NDArray[np.int64]) -> NDArray[np.float64]:
+    def compute_stiffness(self, mesh: Mesh, springs: NDArray[np.int64]) -> NDArray[np.float64]:
         """Compute the constants (m,) of springs (m, 2).
 
         Raise InputError if the surface has no part along the warp.
         """
         if mesh.dimension != 2 or not len(mesh.triangles):
-            raise InputError(Mistake("warp and weft need a mesh of triangles; give one number", key="stretch"))
-        a, b, c = (mesh.rest[mesh.triangles[:, k]] for k in range(3))
-        area, normals = np.cross(b - a, c - a), np.zeros_like(mesh.rest)
+            raise InputError(InputMistake("warp and weft need a mesh of triangles; give one number", key="stretch"))
+        a, b, c = (mesh.rest_positions[mesh.triangles[:, k]] for k in range(3))
+        area, normals = np.cross(b - a, c - a), np.zeros_like(mesh.rest_positions)
         for k in range(3):
             np.add.at(normals, mesh.triangles[:, k], area)
         i, j = springs.T
         normal = normals[i] + normals[j]
         normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
         warp = np.array(self.direction) / np.linalg.norm(self.direction)
-        along, edge = (_flat(x, normal) for x in (np.tile(warp, (len(i), 1)), mesh.rest[j] - mesh.rest[i]))
+        along, edge = (
+            _project_to_tangent(x, normal)
+            for x in (np.tile(warp, (len(i), 1)), mesh.rest_positions[j] - mesh.rest_positions[i])
+        )
         size = np.linalg.norm(along, axis=1)
-        if len(bad := np.flatnonzero(size < _ACROSS)):
+        if len(bad := np.flatnonzero(size < _MIN_TANGENT_FRACTION)):
             where = f"the warp stands upright on the mesh at the spring {i[bad[0]]}-{j[bad[0]]}"
-            raise InputError(Mistake(f"{where}; give a direction along the cloth", key="stretch"))
+            raise InputError(InputMistake(f"{where}; give a direction along the cloth", key="stretch"))
         product = size * np.linalg.norm(edge, axis=1)
         cosine = np.einsum("ij,ij->i", along, edge) / np.where(product > 0.0, product, 1.0)
         twice = 2.0 * np.minimum(cosine**2, 1.0) - 1.0
         return np.where(twice >= 0.0, self.warp, self.weft) * twice**2 + self.bias * (1.0 - twice**2)
 
 
-def _flat(x: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
+def _project_to_tangent(x: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
     return x - np.einsum("ij,ij->i", x, normal)[:, None] * normal

@@ -25,46 +25,46 @@ from harness.scenes.bind import Scene
 from solvers.integrators import Motion
 from solvers.problem import Positions, StopRule, Unsupported
 
-PART = 0.1
+LOCAL_ERROR_SHARE = 0.1
 """Share of the local error that residuals may add to it."""
-FIRST = 1e-10
+FIRST_STEP_RTOL = 1e-10
 """Relative tolerance of the steps without a history, with respect to the residual at their start."""
-_NOTHING = 1e-300
+_TINY = 1e-300
 """Smallest tolerance [J^(1/2)]: a scene at rest is solved to round-off, which ends its solve at once."""
 
 
 @dataclass(frozen=True, slots=True)
-class Auto:
+class AutoTolerance:
     """`tolerance: auto` with a maximum number of iterations."""
 
-    iterations: int
+    max_iterations: int
 
 
-Stop = StopRule | Auto
+StopCriterion = StopRule | AutoTolerance
 
 
-def stop_rule(iterations: int, tolerance: float | str | None) -> Stop:
+def build_stop_rule(max_iterations: int, rtol: float | str | None) -> StopCriterion:
     """Build the stop rule from a run's options."""
-    return Auto(iterations) if isinstance(tolerance, str) else StopRule(iterations, tolerance)
+    return AutoTolerance(max_iterations) if isinstance(rtol, str) else StopRule(max_iterations, rtol)
 
 
 @dataclass(frozen=True, slots=True)
-class Stated:
+class ConstantStopRule:
     """One stop rule for all steps."""
 
     rule: StopRule
 
-    def done(self, after: Motion, error: Motion | None) -> None:
+    def record_step(self, after: Motion, error: Motion | None) -> None:
         """Record the end of a step."""
 
 
-class LocalErrors:
+class LocalErrorStopRule:
     """Stop rule from the local errors of the previous steps of one motion.
 
     `rule` is that of the next step.
     """
 
-    def __init__(self, auto: Auto, scene: Scene, now: Motion, frames: int) -> None:
+    def __init__(self, auto: AutoTolerance, scene: Scene, now: Motion, frames: int) -> None:
         """Start with no history.
 
         Args:
@@ -76,31 +76,31 @@ class LocalErrors:
         Raises:
           Unsupported: the step size is not constant.
         """
-        if scene.alternate:
+        if scene.alternate_scene:
             raise Unsupported("tolerance: auto differences steps of one length, and the scene alternates two; give one")
         system, order = scene.system, scene.integrator.order
-        self._iterations, self._span, self._order = auto.iterations, frames * system.time_step, order
-        self._step, self._rate, self._free = system.time_step, system.rate, system.free
+        self._iterations, self._span, self._order = auto.max_iterations, frames * system.time_step, order
+        self._step, self._rate, self._free = system.time_step, system.velocity_rate, system.free_vertices
         self._mass = system.mass[self._free, None]
         self._past = deque([now.velocity], order + 2)
-        self.rule = StopRule(auto.iterations, FIRST)
+        self.rule = StopRule(auto.max_iterations, FIRST_STEP_RTOL)
 
-    def done(self, after: Motion, error: Motion | None) -> None:
+    def record_step(self, after: Motion, error: Motion | None) -> None:
         """Record the end of a step and its embedded error estimate, if any."""
         self._past.append(after.velocity)
         if len(self._past) < self._order + 2:
             return
         differences = np.diff(np.array(self._past), self._order, axis=0) / factorial(self._order + 1)
-        least = self._size(self._step * differences[-1], differences[1] - differences[0])
+        least = self._error_norm(self._step * differences[-1], differences[1] - differences[0])
         if error is not None:
-            least = min(least, self._size(*error))
-        within = PART * least / (1.0 / self._rate + self._span)
-        self.rule = StopRule(self._iterations, within=max(within, _NOTHING))
+            least = min(least, self._error_norm(*error))
+        within = LOCAL_ERROR_SHARE * least / (1.0 / self._rate + self._span)
+        self.rule = StopRule(self._iterations, atol=max(within, _TINY))
 
-    def _size(self, moved: Positions, sped: Positions) -> float:
+    def _error_norm(self, moved: Positions, sped: Positions) -> float:
         """Return the norm [kg^(1/2) m] of e_p [m] and e_v [m/s], (n, 3), combined."""
-        return self._norm(moved) + self._span * self._norm(sped)
+        return self._mass_norm(moved) + self._span * self._mass_norm(sped)
 
-    def _norm(self, x: Positions) -> float:
+    def _mass_norm(self, x: Positions) -> float:
         """Return |x|_M over the free vertices."""
         return float(np.sqrt((self._mass * x[self._free] ** 2).sum()))

@@ -22,40 +22,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.base.errors import RunFailed
-from solvers.problem import Prepared, StepProblem
+from solvers.problem import PreparedSolver, StepProblem
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
-SHARE, LEAST, CALL = 0.03, 1e-3, 5e-6
+CLOCK_RTOL, CLOCK_ATOL_SECONDS, CALL_OVERHEAD_SECONDS = 0.03, 1e-3, 5e-6
 """Relative and absolute [s] difference allowed between two clocks, and time [s] to read them once, including the call
 in between: a tenth of the shortest steps."""
-COLD = 1.5
+PREEMPTED_FACTOR = 1.5
 """Time that may be missing, relative to the lost time: caches are cold after a preemption."""
 
-ITERATION_SHARE = 0.15
+PHASE_SUM_RTOL = 0.15
 """Relative difference between an iteration's time and the sum of its phases from which on their rows are flagged."""
 
 
-class ClocksDisagree(RunFailed):
+class ClockMismatch(RunFailed):
     """Two clocks measured different times."""
 
 
-def measured_again(measure: Callable[P, T]) -> Callable[P, T]:
+def retry_on_mismatch(measure: Callable[P, T]) -> Callable[P, T]:
     """Repeat a measurement once if its clocks disagree; a second ClockMismatch is raised."""
 
     @wraps(measure)
     def twice(*arguments: P.args, **named: P.kwargs) -> T:
         try:
             return measure(*arguments, **named)
-        except ClocksDisagree:
+        except ClockMismatch:
             return measure(*arguments, **named)
 
     return twice
 
 
 @dataclass
-class Watch:
+class PhaseWatch:
     """Sum of wall and CPU time over repeated contexts.
 
     Attributes:
@@ -68,56 +68,60 @@ class Watch:
       start_times: the three clocks at the start of the present context [s].
     """
 
-    threads: int = 1
-    wall: float = 0.0
-    entered: int = 0
-    process: float = 0.0
-    thread: float = 0.0
-    began: list[float] = field(default_factory=list[float])
+    num_threads: int = 1
+    wall_seconds: float = 0.0
+    num_entries: int = 0
+    process_seconds: float = 0.0
+    thread_seconds: float = 0.0
+    start_times: list[float] = field(default_factory=list[float])
 
     def __enter__(self) -> None:
-        self.began = [process_time(), thread_time(), clock_gettime(CLOCK_MONOTONIC_RAW)]
+        self.start_times = [process_time(), thread_time(), clock_gettime(CLOCK_MONOTONIC_RAW)]
 
     def __exit__(self, *_: object) -> None:
         wall, thread, process = clock_gettime(CLOCK_MONOTONIC_RAW), thread_time(), process_time()
-        self.process += process - self.began[0]
-        self.thread += thread - self.began[1]
-        self.wall += wall - self.began[2]
-        self.entered += 1
+        self.process_seconds += process - self.start_times[0]
+        self.thread_seconds += thread - self.start_times[1]
+        self.wall_seconds += wall - self.start_times[2]
+        self.num_entries += 1
 
     @property
-    def lost(self) -> float:
+    def preempted_seconds(self) -> float:
         """Seconds in which the process did not compute."""
-        return max(0.0, self.wall - max(self.thread, self.process / self.threads))
+        return max(0.0, self.wall_seconds - max(self.thread_seconds, self.process_seconds / self.num_threads))
 
     @property
-    def tolerance(self) -> float:
+    def max_difference(self) -> float:
         """Difference [s] allowed to another clock."""
-        return max(SHARE * self.wall, LEAST, CALL * self.entered)
+        return max(CLOCK_RTOL * self.wall_seconds, CLOCK_ATOL_SECONDS, CALL_OVERHEAD_SECONDS * self.num_entries)
 
-    def columns(self, what: str, seconds: Iterable[float]) -> dict[str, Any]:
+    def build_columns(self, what: str, seconds: Iterable[float]) -> dict[str, Any]:
         """Build the check columns of the rows with given times; raises ClockMismatch."""
         told = sum(seconds)
-        if not -self.tolerance <= self.wall - told <= self.tolerance + COLD * self.lost:  # so that NaN fails too
-            raise ClocksDisagree(
-                f"the times of {what} add up to {told:.6g} s, where another clock saw {self.wall:.6g} s go by, "
-                f"{self.lost:.3g} s of them without computing: one of the two does not measure what it says"
+        if (
+            not -self.max_difference
+            <= self.wall_seconds - told
+            <= self.max_difference + PREEMPTED_FACTOR * self.preempted_seconds
+        ):  # so that NaN fails too
+            raise ClockMismatch(
+                f"the times of {what} add up to {told:.6g} s, where another clock saw {self.wall_seconds:.6g} s go by, "
+                f"{self.preempted_seconds:.3g} s of them without computing: one of the two does not measure what it says"
             )
         return {
-            "pass_seconds": self.wall,
+            "pass_seconds": self.wall_seconds,
             "summed_seconds": told,
-            "cpu_seconds": self.process,
-            "interrupted": self.lost > max(SHARE * self.wall, LEAST),
+            "cpu_seconds": self.process_seconds,
+            "interrupted": self.preempted_seconds > max(CLOCK_RTOL * self.wall_seconds, CLOCK_ATOL_SECONDS),
         }
 
 
-class Clock:
+class Stopwatch:
     """Stopwatch for successive pieces of work, each also timed by a watch.
 
     `seconds` is the time of the last one [s].
     """
 
-    def __init__(self, watch: Watch) -> None:
+    def __init__(self, watch: PhaseWatch) -> None:
         self.watch, self.seconds, self._began = watch, 0.0, 0.0
 
     def __enter__(self) -> None:
@@ -129,7 +133,7 @@ class Clock:
         self.watch.__exit__()
 
 
-def working(prepared: Prepared, problem: StepProblem) -> dict[str, Callable[[], object]]:
+def check_phases(prepared: PreparedSolver, problem: StepProblem) -> dict[str, Callable[[], object]]:
     """Return a solver's phases after checking that each computes.
 
     The returned array of each phase is overwritten with NaN, and a second call must restore it.
@@ -137,7 +141,7 @@ def working(prepared: Prepared, problem: StepProblem) -> dict[str, Callable[[], 
     Raises:
       RunFailed: a phase does nothing.
     """
-    phases = prepared.phases(problem)
+    phases = prepared.iteration_phases(problem)
     for phase, call in phases.items():
         given: Any = call()
         if not isinstance(given, np.ndarray):
@@ -147,7 +151,7 @@ def working(prepared: Prepared, problem: StepProblem) -> dict[str, Callable[[], 
             known = np.isfinite(array).any()
             array.fill(np.nan)
             again = call()
-            does = bool(np.isfinite(np.asarray(again)).any()) or not known or not len(problem.system.free)
+            does = bool(np.isfinite(np.asarray(again)).any()) or not known or not len(problem.system.free_vertices)
         if not does:
             raise RunFailed(f"the phase {phase} does nothing; it should compute, and return the array that it wrote")
     return phases

@@ -16,14 +16,14 @@ from scipy.sparse import csr_array
 
 from harness.scenes.bind import Scene
 from solvers.integrators import Motion
-from solvers.problem import Positions, Prepared
+from solvers.problem import Positions, PreparedSolver
 
-_NEAREST = 12
+_NUM_NEIGHBOURS = 12
 """Number of vertices that a value is interpolated from: the corners of a cell of a block and adjacent vertices."""
 
 
 @dataclass(frozen=True, eq=False)
-class Coarser:
+class CoarseLevel:
     """A scene on a coarser mesh with a prepared solver.
 
     Attributes:
@@ -34,12 +34,12 @@ class Coarser:
     """
 
     scene: Scene
-    prepared: Prepared
-    restrict: csr_array
-    prolong: csr_array
+    prepared: PreparedSolver
+    restriction: csr_array
+    prolongation: csr_array
 
     @classmethod
-    def of(cls, fine: Scene, coarse: Scene, prepared: Prepared) -> Coarser:
+    def from_scenes(cls, fine: Scene, coarse: Scene, prepared: PreparedSolver) -> CoarseLevel:
         """Build the transfer between two scenes that differ only in mesh size.
 
         Args:
@@ -47,28 +47,28 @@ class Coarser:
           coarse: scene on the coarser mesh.
           prepared: solver prepared for the coarser scene.
         """
-        a, b = fine.mesh.rest, coarse.mesh.rest
-        return cls(coarse, prepared, interpolation(a, b), interpolation(b, a))
+        a, b = fine.mesh.rest_positions, coarse.mesh.rest_positions
+        return cls(coarse, prepared, build_interpolation(a, b), build_interpolation(b, a))
 
-    def down(self, motion: Motion) -> Motion:
+    def restrict_motion(self, motion: Motion) -> Motion:
         """Restrict a motion to the vertices of the coarser mesh."""
-        return Motion(self.restrict @ motion.positions, self.restrict @ motion.velocity)
+        return Motion(self.restriction @ motion.positions, self.restriction @ motion.velocity)
 
-    def up(self, displacement: Positions) -> Positions:
+    def prolong_displacement(self, displacement: Positions) -> Positions:
         """Prolong a displacement [m] of the coarser mesh's vertices to the finer mesh, (n, 3)."""
-        return self.prolong @ displacement
+        return self.prolongation @ displacement
 
 
-def interpolation(known: Positions, wanted: Positions) -> csr_array:
+def build_interpolation(sources: Positions, targets: Positions) -> csr_array:
     """Build the interpolation weights (targets, sources) between rest positions, each (n, 3) [m]."""
     from scipy.spatial import cKDTree  # for those who need it
 
-    tree: Any = cKDTree(known)
-    found = tree.query(wanted, k=min(_NEAREST, len(known)))
-    distance, near = (np.reshape(x, (len(wanted), -1)) for x in found)
+    tree: Any = cKDTree(sources)
+    found = tree.query(targets, k=min(_NUM_NEIGHBOURS, len(sources)))
+    distance, near = (np.reshape(x, (len(targets), -1)) for x in found)
     scale = np.maximum(distance.max(axis=1), np.finfo(np.float64).tiny)[:, None]
     inverse = 1.0 / np.maximum(distance / scale, 1e-4) ** 4
-    away = (known[near] - wanted[:, None, :]) / scale[:, :, None]
+    away = (sources[near] - targets[:, None, :]) / scale[:, :, None]
     linear = np.concatenate([np.ones((*near.shape, 1)), away], axis=2)
     normal = np.einsum("nki,nk,nkj->nij", linear, inverse, linear)
     # Points on a line or in a plane leave directions undetermined, which need no weights.
@@ -76,4 +76,4 @@ def interpolation(known: Positions, wanted: Positions) -> csr_array:
     first = np.asarray(pseudo_inverse(normal, rcond=1e-13, hermitian=True), np.float64)[:, :, 0]
     weights = inverse * np.einsum("nki,ni->nk", linear, first)
     start = np.arange(0, near.size + 1, near.shape[1])
-    return csr_array((weights.ravel(), near.ravel(), start), shape=(len(wanted), len(known)))
+    return csr_array((weights.ravel(), near.ravel(), start), shape=(len(targets), len(sources)))

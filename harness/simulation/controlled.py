@@ -27,38 +27,38 @@ import numpy as np
 
 from harness.base.errors import RunFailed
 from harness.scenes.bind import Scene
-from harness.simulation.stages import Done, Stages
-from harness.simulation.step import FIRST_GUESSES, prepare, start
+from harness.simulation.stages import StageSequence, StepResult
+from harness.simulation.step import INITIAL_GUESSES, build_initial_state, prepare
 from solvers.integrators import Motion, RungeKutta
-from solvers.problem import Positions, Prepared, Solution, Solver, StopRule, Unsupported
+from solvers.problem import Positions, PreparedSolver, Solution, Solver, StopRule, Unsupported
 
-SAFETY, DECREASE, LEAST = 0.9, 0.1, 1e-10
+STEP_SAFETY, MIN_STEP_FACTOR, MIN_ERROR_RATIO = 0.9, 0.1, 1e-10
 """Safety factor on the step size; smallest factor by which one rejected step shrinks it; lower bound on error
 ratios."""
-ALGEBRAIC = 0.1
+ALGEBRAIC_ERROR_SHARE = 0.1
 """Share of the tolerance that the residuals of the stages may add to a step's error estimate."""
-FACTORS = 2**28
+MAX_FACTOR_BYTES = 2**28
 """Memory limit [bytes] of cached factors; the two used last are always cached."""
-SHORTEST = 1e-9
+MIN_RELATIVE_STEP = 1e-9
 """Minimum step size [s]."""
-TRIES = 200
+MAX_SOLVE_ITERATIONS = 200
 """Maximum number of iterations of a solve; a step that needs more is rejected."""
-_STALLED = 10.0
+_STALL_FACTOR = 10.0
 """Factor on the requested residual up to which a stalled solve is accepted."""
-_FINEST = 60
+_MAX_LEVEL = 60
 """Maximum level: times are multiples of 2^-60 of the end time."""
 
 
-class TooSlow(Exception):
+class TimeBudgetExceeded(Exception):
     """The limit on processor time is exceeded."""
 
 
-class Stuck(RunFailed):
+class StepSizeUnderflow(RunFailed):
     """The error tolerance would need steps below the minimum step size."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Path:
+class Trajectory:
     """A motion within an error tolerance.
 
     Attributes:
@@ -74,17 +74,17 @@ class Path:
     """
 
     positions: Positions
-    accepted: int
-    rejected: int
-    factorisations: int
-    iterations: int
-    steps: tuple[float, float]
-    seconds: float
-    frames: tuple[float, ...]
-    processor: float
+    num_accepted_steps: int
+    num_rejected_steps: int
+    num_factorisations: int
+    num_iterations: int
+    step_size_range: tuple[float, float]
+    wall_seconds: float
+    frame_seconds: tuple[float, ...]
+    cpu_seconds: float
 
 
-class Follower(Protocol):
+class Stepper(Protocol):
     """Integrator of a motion to an error tolerance, or with a fixed step size.
 
     `order` is the order of convergence of the error, `has_fixed_step` states whether the step size is fixed. A setting
@@ -92,18 +92,18 @@ class Follower(Protocol):
     largest step size.
     """
 
-    even: ClassVar[bool] = False
+    has_fixed_step: ClassVar[bool] = False
 
     @property
     def order(self) -> int:
         """The order of convergence of the error."""
         ...
 
-    def first(self, tolerance: float) -> float:
+    def initial_setting(self, tolerance: float) -> float:
         """Return the initial setting for an error tolerance [m] of the steps."""
-        return 1.0 if self.even else tolerance
+        return 1.0 if self.has_fixed_step else tolerance
 
-    def changed(self, setting: float, ratio: float, order: float | None = None) -> float:
+    def scale_setting(self, setting: float, ratio: float, order: float | None = None) -> float:
         """Return the setting at which the final error is scaled by about a given ratio.
 
         The error of a step of size h is of order h^(order + 1). Fixed step sizes are not increased beyond the largest.
@@ -114,11 +114,11 @@ class Follower(Protocol):
           order: measured order of convergence; the theoretical one if omitted.
         """
         order = order or self.order
-        if self.even:
+        if self.has_fixed_step:
             return max(1.0, setting * ratio ** (-1.0 / order))
         return setting * ratio ** ((order + 1.0) / order)
 
-    def follow(self, setting: float, *, limit: float = inf) -> Path:
+    def integrate_motion(self, setting: float, *, cpu_limit: float = inf) -> Trajectory:
         """Integrate the motion up to the end time.
 
         Args:
@@ -132,36 +132,39 @@ class Follower(Protocol):
         ...
 
 
-class _Ladder:
+class _StepSizeLevels:
     """Scenes and prepared solvers by step size; the oldest beyond MAX_FACTOR_BYTES are discarded."""
 
     def __init__(self, bound: Callable[[float], Scene], solver: Solver, horizon: float) -> None:
         self._bound, self._solver, self._horizon = bound, solver, horizon
-        self._kept = OrderedDict[int, tuple[Scene, Prepared]]()
+        self._kept = OrderedDict[int, tuple[Scene, PreparedSolver]]()
         self.made = 0
 
-    def length(self, level: int) -> float:
+    def compute_step_size(self, level: int) -> float:
         """Return the step size [s] of a level."""
         return self._horizon * 0.5**level
 
-    def at(self, level: int) -> tuple[Scene, Prepared]:
+    def prepare_level(self, level: int) -> tuple[Scene, PreparedSolver]:
         if level not in self._kept:
-            scene = self._bound(self.length(level))
+            scene = self._bound(self.compute_step_size(level))
             self._kept[level] = scene, prepare(scene, self._solver)
             self.made += 1
         self._kept.move_to_end(level)
-        while len(self._kept) > 2 and sum(_bytes(prepared) for _, prepared in self._kept.values()) > FACTORS:
+        while (
+            len(self._kept) > 2
+            and sum(_estimate_factor_bytes(prepared) for _, prepared in self._kept.values()) > MAX_FACTOR_BYTES
+        ):
             self._kept.popitem(last=False)
         return self._kept[level]
 
 
-def _bytes(prepared: Prepared) -> float:
+def _estimate_factor_bytes(prepared: PreparedSolver) -> float:
     """Estimate the memory of a solver's factors: an index and a number for each entry."""
-    return 12.0 * sum(count for name, count in prepared.facts.items() if name.startswith("nnz") and "factor" in name)
+    return 12.0 * sum(count for name, count in prepared.stats.items() if name.startswith("nnz") and "factor" in name)
 
 
 @dataclass(frozen=True, eq=False)
-class Implicit(Follower):
+class AdaptiveImplicitStepper(Stepper):
     """Adaptive stepping by an integrator with an embedded error estimate.
 
     Attributes:
@@ -171,137 +174,139 @@ class Implicit(Follower):
       frames: number of frames up to the end time.
     """
 
-    bound: Callable[[float], Scene]
+    build_scene: Callable[[float], Scene]
     solver: Solver
-    horizon: float
+    t_end: float
     frames: int
 
     @property
     def order(self) -> int:
         """The order of convergence of the integrator."""
-        return self.bound(self.horizon / self.frames).integrator.order
+        return self.build_scene(self.t_end / self.frames).integrator.order
 
-    def follow(self, setting: float, *, limit: float = inf) -> Path:
+    def integrate_motion(self, setting: float, *, cpu_limit: float = inf) -> Trajectory:
         """Integrate the motion; raises Unsupported for an integrator without an error estimate and for velocity
         filters.
         """
-        return _Following(self, setting, limit).path()
+        return _AdaptiveIntegration(self, setting, cpu_limit).run_to_end()
 
 
-class _Following:
+class _AdaptiveIntegration:
     """One motion with steps of the levels."""
 
-    def __init__(self, asked: Implicit, tolerance: float, limit: float) -> None:
+    def __init__(self, asked: AdaptiveImplicitStepper, tolerance: float, limit: float) -> None:
         self._asked, self._tolerance, self._limit, self._cpu = asked, tolerance, limit, thread_time()
-        self._ladder = _Ladder(asked.bound, asked.solver, asked.horizon)
-        self._span = asked.horizon / asked.frames
-        self._level = ceil(log2(max(1.0, asked.horizon / self._span)))
-        scene, _ = self._ladder.at(self._level)
+        self._ladder = _StepSizeLevels(asked.build_scene, asked.solver, asked.t_end)
+        self._span = asked.t_end / asked.frames
+        self._level = ceil(log2(max(1.0, asked.t_end / self._span)))
+        scene, _ = self._ladder.prepare_level(self._level)
         method = scene.integrator
-        if not isinstance(method, RungeKutta) or not method.embedded:
+        if not isinstance(method, RungeKutta) or not method.embedded_order:
             raise Unsupported("the integrator tells no error of its steps")
-        if scene.filters:
+        if scene.velocity_filters:
             raise Unsupported("a filter of the velocity acts once a step, and no error tells of it")
-        self._method, self._power = method, 1.0 + min(method.order, method.embedded)
-        self._now, self._acceleration, self._ticks = start(scene).now, None, 0
-        self._free, self._mass = scene.system.free, float(scene.system.mass[scene.system.free].mean())
+        self._method, self._power = method, 1.0 + min(method.order, method.embedded_order)
+        self._now, self._acceleration, self._ticks = build_initial_state(scene).motion, None, 0
+        self._free, self._mass = scene.system.free_vertices, float(scene.system.mass[scene.system.free_vertices].mean())
         self._seen, self._before = [self._now.positions], (1.0, scene.system.time_step)
         self._accepted = self._rejected = self._iterations = 0
         self._lengths = inf, 0.0
         self._began, self._reached = perf_counter(), list[float]()
 
-    def path(self) -> Path:
+    def run_to_end(self) -> Trajectory:
         """Integrate to the end and return the motion."""
-        while self._ticks < 1 << _FINEST:
-            self._one()
+        while self._ticks < 1 << _MAX_LEVEL:
+            self._try_step()
             if thread_time() - self._cpu > self._limit:
-                raise TooSlow
+                raise TimeBudgetExceeded
         counts = self._accepted, self._rejected, self._ladder.made, self._iterations
-        shared, processor = shares(self._reached), thread_time() - self._cpu
-        return Path(np.array(self._seen), *counts, self._lengths, self._reached[-1], shared, processor)
+        shared, processor = share_frame_seconds(self._reached), thread_time() - self._cpu
+        return Trajectory(np.array(self._seen), *counts, self._lengths, self._reached[-1], shared, processor)
 
-    def _one(self) -> None:
+    def _try_step(self) -> None:
         """Try one step."""
-        scene, prepared = self._ladder.at(self._level)
-        h, time = scene.system.time_step, self._time(self._ticks)
-        done = Stages(scene, self._now, self._acceleration, time).done(prepared, self._stop(h), FIRST_GUESSES["motion"])
-        self._iterations += sum(done.counts)
-        ratio = self._ratio(done)
+        scene, prepared = self._ladder.prepare_level(self._level)
+        h, time = scene.system.time_step, self._tick_time(self._ticks)
+        done = StageSequence(scene, self._now, self._acceleration, time).solve_stages(
+            prepared, self._build_stop_rule(h), INITIAL_GUESSES["motion"]
+        )
+        self._iterations += sum(done.iteration_counts)
+        ratio = self._error_ratio(done)
         if not ratio <= 1.0:
             self._rejected += 1
-            allowed = SAFETY * ratio ** (-1.0 / self._power) if isfinite(ratio) else 0.5
-            self._level += ceil(log2(1.0 / min(0.5, max(DECREASE, allowed))))
-            if self._ladder.length(self._level) < SHORTEST:
-                raise self._stuck(ratio, time)
+            allowed = STEP_SAFETY * ratio ** (-1.0 / self._power) if isfinite(ratio) else 0.5
+            self._level += ceil(log2(1.0 / min(0.5, max(MIN_STEP_FACTOR, allowed))))
+            if self._ladder.compute_step_size(self._level) < MIN_RELATIVE_STEP:
+                raise self._build_underflow_error(ratio, time)
             return
         self._accepted += 1
         self._lengths = min(self._lengths[0], h), max(self._lengths[1], h)
-        self._ticks += 1 << (_FINEST - self._level)
-        self._show(done.end.motion, time, h)
+        self._ticks += 1 << (_MAX_LEVEL - self._level)
+        self._add_frames(done.end.motion, time, h)
         self._now, self._acceleration = done.end.motion, done.end.acceleration
-        self._follow(max(ratio, LEAST), h)
+        self._choose_step_size(max(ratio, MIN_ERROR_RATIO), h)
 
-    def _follow(self, ratio: float, h: float) -> None:
+    def _choose_step_size(self, ratio: float, h: float) -> None:
         """Choose the next step's level after a step of size h [s]."""
         (before, other), power = self._before, self._power
-        change = SAFETY * min(ratio ** (-1.0 / power), h / other * (before / ratio**2) ** (1.0 / power))
+        change = STEP_SAFETY * min(ratio ** (-1.0 / power), h / other * (before / ratio**2) ** (1.0 / power))
         self._before = ratio, h
         if change < 0.6:
             self._level += 1
-        elif change >= 2.0 and self._level and self._ticks % (1 << (_FINEST - self._level + 1)) == 0:
+        elif change >= 2.0 and self._level and self._ticks % (1 << (_MAX_LEVEL - self._level + 1)) == 0:
             self._level -= 1
 
-    def _time(self, ticks: int) -> float:
-        return self._asked.horizon * (ticks / (1 << _FINEST))
+    def _tick_time(self, ticks: int) -> float:
+        return self._asked.t_end * (ticks / (1 << _MAX_LEVEL))
 
-    def _stop(self, h: float) -> StopRule:
+    def _build_stop_rule(self, h: float) -> StopRule:
         """Build the stop rule from the share of the error estimate that residuals may cause.
 
         A residual is at least rate |dp|_M. It adds rate h |dp| to the positions, and rate times as much to the
         velocities.
         """
-        speed = self._method.speed
-        part = ALGEBRAIC * self._tolerance / (speed * (1.0 + speed * self._span / h))
-        return StopRule(TRIES, within=part * speed / h * (3.0 * len(self._free) * self._mass) ** 0.5)
+        speed = self._method.velocity_factor
+        part = ALGEBRAIC_ERROR_SHARE * self._tolerance / (speed * (1.0 + speed * self._span / h))
+        return StopRule(MAX_SOLVE_ITERATIONS, atol=part * speed / h * (3.0 * len(self._free) * self._mass) ** 0.5)
 
-    def _ratio(self, done: Done) -> float:
+    def _error_ratio(self, done: StepResult) -> float:
         """Return the step's error relative to the tolerance; infinite where a solve did not converge."""
-        error, within = done.end.error, self._stop(self._ladder.length(self._level)).within
-        if error is None or not all(_solved(solution, within) for _, solution in done.stages):
+        error, within = done.end.error, self._build_stop_rule(self._ladder.compute_step_size(self._level)).atol
+        if error is None or not all(_is_solved(solution, within) for _, solution in done.stages):
             return inf
         with np.errstate(over="ignore", invalid="ignore"):
             squares = sum(float((part[self._free] ** 2).sum()) for part in (error[0], self._span * error[1]))
         found = (squares / max(1, 3 * len(self._free))) ** 0.5 / self._tolerance
         return found if isfinite(found) else inf
 
-    def _show(self, after: Motion, time: float, h: float) -> None:
+    def _add_frames(self, after: Motion, time: float, h: float) -> None:
         """Add the frames that end within a step."""
-        until, reached = self._time(self._ticks), perf_counter() - self._began
+        until, reached = self._tick_time(self._ticks), perf_counter() - self._began
         while len(self._seen) <= self._asked.frames and (len(self._seen) * self._span) <= until * (1.0 + 1e-12):
             part = min(1.0, (len(self._seen) * self._span - time) / h)
-            self._seen.append(hermite(self._now, after, h, part))
+            self._seen.append(interpolate_hermite(self._now, after, h, part))
             self._reached.append(reached)
 
-    def _stuck(self, ratio: float, time: float) -> Stuck:
+    def _build_underflow_error(self, ratio: float, time: float) -> StepSizeUnderflow:
         cause = "is not solved" if ratio == inf else f"errs by {ratio:.2g} times what it may"
-        return Stuck(
-            f"frame {len(self._seen)}, after {time:.6g} s: even a step of {SHORTEST:g} s {cause}; up to there "
+        return StepSizeUnderflow(
+            f"frame {len(self._seen)}, after {time:.6g} s: even a step of {MIN_RELATIVE_STEP:g} s {cause}; up to there "
             f"{self._accepted} steps kept to {self._tolerance:.2g} m: forces are too sudden there, or round-off is "
             "larger; ask for a larger --error or a shorter --horizon"
         )
 
 
-def _solved(solution: Solution, within: float) -> bool:
+def _is_solved(solution: Solution, atol: float) -> bool:
     """Return whether a solve ended with a small enough residual.
 
     A stalled solve is allowed a larger one, since round-off may prevent any further reduction.
     """
-    if solution.stopped == "stalled":
-        return solution.residual <= _STALLED * within
-    return solution.stopped != "iterations"
+    if solution.termination_reason == "stalled":
+        return solution.residual <= _STALL_FACTOR * atol
+    return solution.termination_reason != "iterations"
 
 
-def shares(reached: Sequence[float]) -> tuple[float, ...]:
+def share_frame_seconds(reached: Sequence[float]) -> tuple[float, ...]:
     """Return the wall time [s] of each frame from the cumulative times.
 
     Frames of one step share its time equally.
@@ -311,7 +316,7 @@ def shares(reached: Sequence[float]) -> tuple[float, ...]:
     return tuple(float(gone[steps == step].mean()) for step in steps)
 
 
-def hermite(before: Motion, after: Motion, h: float, part: float) -> Positions:
+def interpolate_hermite(before: Motion, after: Motion, h: float, part: float) -> Positions:
     """Interpolate positions within a step by cubic Hermite polynomials of the motions at both ends.
 
     Args:

@@ -26,43 +26,43 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.record.shading import strains
+from harness.record.shading import compute_strains
 from harness.scenes.bind import Scene
-from harness.simulation.step import Step, start
-from solvers.energies.augmented import joined, off, penalties
-from solvers.matrices import assemble
+from harness.simulation.step import SimulationStep, build_initial_state
+from solvers.energies.augmented import compute_penalty_stiffness, concatenate_constraints, length_errors
+from solvers.matrices import assemble_system_matrix
 from solvers.problem import Energy, Positions, ProjectiveEnergy, StepProblem, is_lagged
-from solvers.round_off import FACTOR, gradient_round_off
+from solvers.round_off import ROUNDOFF_FACTOR, gradient_roundoff
 
-GROWTH = 1.0
+GROWTH_LIMIT = 1.0
 """Ratio of gain to available energy above which energy has grown without a source. Converged steps of implicit Euler
 gained nothing on the shipped scenes, 50 iterations of local-global at most 0.07. Midpoint gains 2 to 300,000 where its
 step size is too large."""
 
-UNCERTAINTY = 10.0
+ROUNDOFF_SAFETY = 10.0
 """Factor on the work of sources, which is estimated from the ends of steps. Motions faster than a step may receive more
 work, or at another time. Dormand and Prince's method of order 8 gains 2.3 times the work of gusts taken as constant
 within frames."""
 
-BLOW_UP = 1e6
+BLOW_UP_FACTOR = 1e6
 """Ratio of gain to available energy above which a motion has diverged: it is a thousand times as fast as possible."""
 
 
-class Balance(NamedTuple):
+class EnergyGain(NamedTuple):
     """Energy balance after a step: gain [J] that no source explains, and available energy [J]."""
 
-    gained: float
-    available: float
+    gain: float
+    available_energy: float
 
-    def exceeds(self, times: float) -> bool:
+    def is_above(self, ratio: float) -> bool:
         """Return whether the gain is NaN or more than a ratio of the available energy."""
-        return not self.gained <= times * self.available
+        return not self.gain <= ratio * self.available_energy
 
     def __str__(self) -> str:
-        return f"{self.gained:.2g} J more than its sources give, where {self.available:.2g} J are available"
+        return f"{self.gain:.2g} J more than its sources give, where {self.available_energy:.2g} J are available"
 
 
-class Growth(NamedTuple):
+class EnergyGrowth(NamedTuple):
     """Energy growth without a source.
 
     Attributes:
@@ -70,17 +70,19 @@ class Growth(NamedTuple):
       max_ratio: largest ratio of gain to available energy.
     """
 
-    first: int
-    times: float
+    first_frame: int
+    max_ratio: float
 
     @classmethod
-    def of(cls, by_frame: Mapping[int, Mapping[str, Any]]) -> Growth | None:
+    def from_rows(cls, by_frame: Mapping[int, Mapping[str, Any]]) -> EnergyGrowth | None:
         """Build from a run's columns by frame; None where its energy has not grown."""
-        balances = {frame: Balance(row["energy_gained"], row["energy_available"]) for frame, row in by_frame.items()}
-        grown = {frame: balance for frame, balance in balances.items() if balance.exceeds(GROWTH)}
+        balances = {frame: EnergyGain(row["energy_gained"], row["energy_available"]) for frame, row in by_frame.items()}
+        grown = {frame: balance for frame, balance in balances.items() if balance.is_above(GROWTH_LIMIT)}
         if not grown:
             return None
-        return cls(min(grown), max(b.gained / b.available if b.available else np.inf for b in grown.values()))
+        return cls(
+            min(grown), max(b.gain / b.available_energy if b.available_energy else np.inf for b in grown.values())
+        )
 
 
 class EnergyBalance:
@@ -88,148 +90,161 @@ class EnergyBalance:
 
     def __init__(self, scene: Scene) -> None:
         system = scene.system
-        self._scene, self._now = scene, start(scene).now
+        self._scene, self._now = scene, build_initial_state(scene).motion
         self._first = self._now.positions
         self._when = float(getattr(scene.integrator, "when", 1.0))
-        self._free, self._exact = system.free, system.pins.vertices[system.pins.exact]
-        self._mass, self._load = np.where(system.unpinned, system.mass, 0.0)[self._free], scene.load[self._free]
-        self._lengths = joined(system.lengths)
-        self._penalties = penalties(system, self._lengths)
+        self._free, self._exact = system.free_vertices, system.pins.vertices[system.pins.exact_mask]
+        self._mass, self._load = (
+            np.where(system.unpinned_mask, system.mass, 0.0)[self._free],
+            scene.constant_force[self._free],
+        )
+        self._lengths = concatenate_constraints(system.length_constraints)
+        self._penalties = compute_penalty_stiffness(system, self._lengths)
         self._potentials = np.empty(0)
         self._at_start = self._given = self._released = self._sources = 0.0
 
-    def after(self, step: Step) -> Balance:
+    def add_step(self, step: SimulationStep) -> EnergyGain:
         """Return the balance after the next step."""
         with np.errstate(over="ignore", invalid="ignore"):
-            return self._after(step)
+            return self._compute_gain(step)
 
-    def _after(self, step: Step) -> Balance:
+    def _compute_gain(self, step: SimulationStep) -> EnergyGain:
         stated, x, p = step.problem, step.solution.positions, step.positions
         moved = p - self._now.positions
         if step.index == 1:
-            self._begin(stated, x, moved)
-        before, after = self._potentials, self._of_each(stated, x, p, self._scene.time(step.index))
-        self._sources += self._work(step, before, after, moved)
+            self._set_initial_energy(stated, x, moved)
+        before, after = self._potentials, self._potential_energies(stated, x, p, self._scene.compute_time(step.index))
+        self._sources += self._source_work(step, before, after, moved)
         self._released = max(self._released, -float(np.minimum(after, 0.0).sum()))
-        available = self._given + self._released + UNCERTAINTY * self._sources
-        speed = step.state.now.velocity, moved / stated.system.time_step
-        kinetic, stored = max(map(self._kinetic, speed)), float(after.sum())
+        available = self._given + self._released + ROUNDOFF_SAFETY * self._sources
+        speed = step.state.motion.velocity, moved / stated.system.time_step
+        kinetic, stored = max(map(self._kinetic_energy, speed)), float(after.sum())
         low = float(np.minimum(np.minimum(before, after), 0.0).sum())
-        if not stored <= GROWTH * available and not _largest_strain(self._scene, p) <= 1.0:
+        if not stored <= GROWTH_LIMIT * available and not _compute_max_strain(self._scene, p) <= 1.0:
             low = stored
-        self._potentials, self._now = after, step.state.now
+        self._potentials, self._now = after, step.state.motion
         gained = kinetic + low - self._at_start - self._sources
-        if gained > GROWTH * available:
-            gained -= _round_off(stated, x, step.index)
-        return Balance(gained, available)
+        if gained > GROWTH_LIMIT * available:
+            gained -= _bound_roundoff(stated, x, step.index)
+        return EnergyGain(gained, available)
 
-    def _begin(self, stated: StepProblem, x: Positions, moved: Positions) -> None:
+    def _set_initial_energy(self, step_problem: StepProblem, x: Positions, moved: Positions) -> None:
         """Set the energy of the start.
 
         An energy may be infinite there, since its obstacle is already where it is at the step's end. It then starts
         with the value for which its work is zero.
         """
-        potentials = self._of_each(stated, self._first, self._first, 0.0)
-        for k, energy in enumerate(stated.energies):
+        potentials = self._potential_energies(step_problem, self._first, self._first, 0.0)
+        for k, energy in enumerate(step_problem.energies):
             if not np.isfinite(potentials[k]):
-                potentials[k] = energy.value(x) - self._along(energy, x, moved)
-        kinetic, load = self._kinetic(self._now.velocity), np.einsum("ij,ij->i", self._load, self._load)
+                potentials[k] = energy.value(x) - self._directional_derivative(energy, x, moved)
+        kinetic, load = self._kinetic_energy(self._now.velocity), np.einsum("ij,ij->i", self._load, self._load)
         in_one_step = np.divide(load, self._mass, out=np.zeros_like(load), where=self._mass > 0.0).sum()
         self._potentials, self._at_start = potentials, kinetic + float(potentials.sum())
-        self._given = kinetic + float(np.abs(potentials).sum() + 0.5 * stated.system.time_step**2 * in_one_step)
+        self._given = kinetic + float(np.abs(potentials).sum() + 0.5 * step_problem.system.time_step**2 * in_one_step)
 
-    def _kinetic(self, velocity: Positions) -> float:
+    def _kinetic_energy(self, velocity: Positions) -> float:
         v = velocity[self._free]
         return 0.5 * float(self._mass @ np.einsum("ij,ij->i", v, v))
 
-    def _of_each(self, stated: StepProblem, x: Positions, p: Positions, time: float) -> NDArray[np.float64]:
+    def _potential_energies(
+        self, step_problem: StepProblem, x: Positions, p: Positions, time: float
+    ) -> NDArray[np.float64]:
         """Return the potentials [J] of energies, penalty pins, load and exact lengths.
 
         Evaluated for a step's solution x and end p, both (n, 3) [m], at a time [s].
         """
-        soft, vertices, weight = stated.system.penalty
-        away = p[vertices] - self._scene.pins_at(time)[soft]
+        soft, vertices, weight = step_problem.system.penalty_pins
+        away = p[vertices] - self._scene.pin_targets_at(time)[soft]
         return np.array(
             [
-                *(e.value(x if is_lagged(made) else p) for made, e in _pairs(stated)),
+                *(e.value(x if is_lagged(made) else p) for made, e in _pair_energies(step_problem)),
                 0.5 * self._when * weight @ np.einsum("ij,ij->i", away, away),
                 -_dot(self._load, (p - self._first)[self._free]),
-                0.5 * self._penalties @ off(self._lengths, p) ** 2,
+                0.5 * self._penalties @ length_errors(self._lengths, p) ** 2,
             ]
         )
 
-    def _work(self, step: Step, before: NDArray[np.float64], after: NDArray[np.float64], moved: Positions) -> float:
+    def _source_work(
+        self, step: SimulationStep, before: NDArray[np.float64], after: NDArray[np.float64], moved: Positions
+    ) -> float:
         """Return the work [J] of sources in a step between potentials before and after it."""
         scene, stated, x, free = self._scene, step.problem, step.solution.positions, self._free
         work = list[float]()
-        for k, (made, energy) in enumerate(_pairs(stated)):
+        for k, (made, energy) in enumerate(_pair_energies(stated)):
             if is_lagged(made):
-                work.append(after[k] - self._along(energy, x, moved) - before[k])
-        if scene.forces:
-            taken = [_dot((one.force - scene.load)[free], moved[free]) for one, _ in step.stages]
-            work.append(min(float(np.mean(taken)), self._work_of_forces(step, moved)))
-        if scene.filters:
-            work.append(self._kinetic(stated.start.velocity) - self._kinetic(self._now.velocity))
-        if scene.moving:
-            soft, vertices, weight = stated.system.penalty
-            led = scene.pins_at(scene.time(step.index)) - scene.pins_at(scene.time(step.index - 1))
+                work.append(after[k] - self._directional_derivative(energy, x, moved) - before[k])
+        if scene.varying_forces:
+            taken = [_dot((one.external_force - scene.constant_force)[free], moved[free]) for one, _ in step.stages]
+            work.append(min(float(np.mean(taken)), self._force_work(step, moved)))
+        if scene.velocity_filters:
+            work.append(self._kinetic_energy(stated.step_start.velocity) - self._kinetic_energy(self._now.velocity))
+        if scene.pin_motions:
+            soft, vertices, weight = stated.system.penalty_pins
+            led = scene.pin_targets_at(scene.compute_time(step.index)) - scene.pin_targets_at(
+                scene.compute_time(step.index - 1)
+            )
             work.append(_dot(weight[:, None] * (stated.pin_targets[soft] - x[vertices]), led[soft]))
-            work[-1] = max(work[-1], _dot(self._pull(stated, x)[vertices], led[soft]))  # where they are taken as exact
+            work[-1] = max(
+                work[-1], _dot(self._conservative_gradient(stated, x)[vertices], led[soft])
+            )  # where they are taken as exact
         if moved[self._exact].any():
-            work.append(_dot(self._pull(stated, x)[self._exact], moved[self._exact]))
+            work.append(_dot(self._conservative_gradient(stated, x)[self._exact], moved[self._exact]))
             if len(self._penalties):  # tensions are what balances the gradient of all else
                 work.append(_dot(stated.gradient(x), moved))
         return float(sum(max(0.0, one) for one in work))
 
-    def _work_of_forces(self, step: Step, moved: Positions) -> float:
+    def _force_work(self, step: SimulationStep, moved: Positions) -> float:
         """Return the work [J] of changing forces at the mean velocity of a step.
 
         A drag evaluated at the start of a step, which reverses the motion, gives more. That is an effect of the method
         and not a source.
         """
-        p, mean = self._now.positions, 0.5 * (self._now.velocity + step.state.now.velocity)
-        times = self._scene.time(step.index - 1), self._scene.time(step.index)
+        p, mean = self._now.positions, 0.5 * (self._now.velocity + step.state.motion.velocity)
+        times = self._scene.compute_time(step.index - 1), self._scene.compute_time(step.index)
         return max(
-            sum(_dot(force(p, mean, time)[self._free], moved[self._free]) for force in self._scene.forces)
+            sum(_dot(force(p, mean, time)[self._free], moved[self._free]) for force in self._scene.varying_forces)
             for time in times
         )
 
     @staticmethod
-    def _pull(stated: StepProblem, x: Positions) -> Positions:
+    def _conservative_gradient(step_problem: StepProblem, x: Positions) -> Positions:
         """Return the gradient (n, 3) [N] at x of the energies without lag."""
         gradient = np.zeros_like(x)
-        for made, energy in _pairs(stated):
+        for made, energy in _pair_energies(step_problem):
             if not is_lagged(made):
                 energy.add_gradient(x, gradient)
         return gradient
 
-    def _along(self, energy: Energy, x: Positions, moved: Positions) -> float:
+    def _directional_derivative(self, energy: Energy, x: Positions, moved: Positions) -> float:
         """Return grad e(x) . (p' - p) [J] over the free vertices."""
         gradient = np.zeros_like(x)
         energy.add_gradient(x, gradient)
         return _dot(gradient[self._free], moved[self._free])
 
 
-def _pairs(stated: StepProblem) -> zip[tuple[Energy, Energy]]:
+def _pair_energies(step_problem: StepProblem) -> zip[tuple[Energy, Energy]]:
     """Return pairs of each energy of the system and its state in the step problem."""
-    return zip(stated.system.energies, stated.energies, strict=True)
+    return zip(step_problem.system.energies, step_problem.energies, strict=True)
 
 
 def _dot(a: Positions, b: Positions) -> float:
     return float(np.einsum("ij,ij->", a, b))
 
 
-def _largest_strain(scene: Scene, p: Positions) -> float:
+def _compute_max_strain(scene: Scene, p: Positions) -> float:
     """Return the largest strain of the springs at p (n, 3) [m]."""
-    return float(np.abs(strains(p, scene.springs.edges, scene.springs.rest_length)[0]).max(initial=0.0))
+    return float(np.abs(compute_strains(p, scene.all_springs.edges, scene.all_springs.rest_length)[0]).max(initial=0.0))
 
 
-def _round_off(stated: StepProblem, x: Positions, steps: int) -> float:
+def _bound_roundoff(step_problem: StepProblem, x: Positions, steps: int) -> float:
     """Return a bound on the accumulated round-off [J]; 0 where it overflows.
 
     In each step, (FACTOR delta_i)^2 / Q_ii is the energy of the round-off at vertex i.
     """
-    free = stated.system.free
-    Q = assemble(stated.system, [e for e in stated.system.energies if isinstance(e, ProjectiveEnergy)])
-    each = float(np.sum((FACTOR * gradient_round_off(stated, x)[free]) ** 2 / Q.diagonal()[free]))
+    free = step_problem.system.free_vertices
+    Q = assemble_system_matrix(
+        step_problem.system, [e for e in step_problem.system.energies if isinstance(e, ProjectiveEnergy)]
+    )
+    each = float(np.sum((ROUNDOFF_FACTOR * gradient_roundoff(step_problem, x)[free]) ** 2 / Q.diagonal()[free]))
     return steps**2 * each if np.isfinite(each) else 0.0

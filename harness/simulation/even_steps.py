@@ -11,14 +11,20 @@ from typing import ClassVar
 import numpy as np
 
 from harness.scenes.bind import Scene
-from harness.simulation.algebraic import Auto
-from harness.simulation.controlled import TRIES, Follower, Path, TooSlow, shares
-from harness.simulation.step import prepare, simulate, start
+from harness.simulation.algebraic import AutoTolerance
+from harness.simulation.controlled import (
+    MAX_SOLVE_ITERATIONS,
+    Stepper,
+    TimeBudgetExceeded,
+    Trajectory,
+    share_frame_seconds,
+)
+from harness.simulation.step import build_initial_state, prepare, simulate_scene
 from solvers.problem import Solver
 
 
 @dataclass(frozen=True, eq=False)
-class ImplicitEven(Follower):
+class FixedImplicitStepper(Stepper):
     """Stepping by an integrator with a fixed step size.
 
     Attributes:
@@ -28,31 +34,38 @@ class ImplicitEven(Follower):
       frames: number of frames up to the end time; the setting is the number of steps of each, at least one.
     """
 
-    bound: Callable[[float], Scene]
+    build_scene: Callable[[float], Scene]
     solver: Solver
-    horizon: float
+    t_end: float
     frames: int
 
-    even: ClassVar[bool] = True
+    has_fixed_step: ClassVar[bool] = True
 
     @property
     def order(self) -> int:
         """The order of convergence of the integrator."""
-        return self.bound(self.horizon / self.frames).integrator.order
+        return self.build_scene(self.t_end / self.frames).integrator.order
 
-    def follow(self, setting: float, *, limit: float = inf) -> Path:
+    def integrate_motion(self, setting: float, *, cpu_limit: float = inf) -> Trajectory:
         """Integrate the motion; raises Unsupported as the solver does."""
         cpu, parts = thread_time(), ceil(setting)
-        scene = self.bound(self.horizon / (self.frames * parts))
-        ready, seen, reached, iterations = prepare(scene, self.solver), [start(scene).now.positions], list[float](), 0
+        scene = self.build_scene(self.t_end / (self.frames * parts))
+        ready, seen, reached, iterations = (
+            prepare(scene, self.solver),
+            [build_initial_state(scene).motion.positions],
+            list[float](),
+            0,
+        )
         began, steps = perf_counter(), self.frames * parts
-        for step in simulate(scene, ready, Auto(TRIES), first_guess="motion", frames=steps):
-            iterations += step.iterations
+        for step in simulate_scene(
+            scene, ready, AutoTolerance(MAX_SOLVE_ITERATIONS), initial_guess="motion", frames=steps
+        ):
+            iterations += step.num_iterations
             if step.index % parts == 0:
                 seen.append(step.positions)
                 reached.append(perf_counter() - began)
-            if thread_time() - cpu > limit:
-                raise TooSlow
+            if thread_time() - cpu > cpu_limit:
+                raise TimeBudgetExceeded
         h = scene.system.time_step
-        shared, processor = shares(reached), thread_time() - cpu
-        return Path(np.array(seen), steps, 0, 1, iterations, (h, h), reached[-1], shared, processor)
+        shared, processor = share_frame_seconds(reached), thread_time() - cpu
+        return Trajectory(np.array(seen), steps, 0, 1, iterations, (h, h), reached[-1], shared, processor)

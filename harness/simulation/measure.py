@@ -19,31 +19,31 @@ import numba
 import numpy as np
 
 from harness.scenes.bind import Scene
-from harness.simulation.algebraic import Stop
-from harness.simulation.clock import Clock, Watch, working
-from harness.simulation.contract import Contract
-from harness.simulation.on_device import on_device
-from harness.simulation.step import Step, prepare, simulate, start
-from solvers.problem import Positions, Prepared, Solver
+from harness.simulation.algebraic import StopCriterion
+from harness.simulation.clock import PhaseWatch, Stopwatch, check_phases
+from harness.simulation.contract import SolverContract
+from harness.simulation.on_device import wrap_device_solver
+from harness.simulation.step import SimulationStep, build_initial_state, prepare, simulate_scene
+from solvers.problem import Positions, PreparedSolver, Solver
 
 PHASE_REPEATS = 3
 """Number of timings of the local and the global step in each frame, after warm-up calls."""
 
-ITERATION = "iteration"
+ITERATION_PHASE = "iteration"
 """Phase that the others should add up to: the time of a whole solve divided by its iterations, measured next to
 theirs."""
 
 NO_CLOCK: AbstractContextManager[None] = nullcontext()
 
-LARGEST = 1e150
+MAX_COORDINATE = 1e150
 """Magnitude [m] from which on coordinates count as not finite: their squares, and so all energies, are infinite."""
 
 
-class Diverged(Exception):
+class DivergenceError(Exception):
     """Positions are no longer finite; the message states since when."""
 
 
-class StepFailed(Exception):
+class StepError(Exception):
     """The step of a frame failed; the error is the cause of this one."""
 
     def __init__(self, frame: int) -> None:
@@ -52,7 +52,7 @@ class StepFailed(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Timing:
+class TimingSample:
     """One measured time.
 
     Attributes:
@@ -68,22 +68,22 @@ class Timing:
     frame: int | None
     round: int
     seconds: float
-    calls: int = 1
-    device: dict[str, float | None] = field(default_factory=dict[str, float | None])
+    num_calls: int = 1
+    device_columns: dict[str, float | None] = field(default_factory=dict[str, float | None])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Settings:
+class SteppingSettings:
     """Settings of time stepping: stop criterion, initial guess, numbers of frames and rounds."""
 
-    stop: Stop
-    first_guess: str
+    stop_criterion: StopCriterion
+    initial_guess: str
     frames: int
     rounds: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class RunMeasurement:
     """Result of the timed passes.
 
     Attributes:
@@ -94,19 +94,21 @@ class Measured:
       clock: without timed passes, the stopwatch of the steps of the instrumentation pass.
     """
 
-    prepared: Prepared
-    timings: list[Timing]
-    watches: dict[tuple[str, int | None], Watch]
-    final: Positions | None
+    prepared: PreparedSolver
+    timings: list[TimingSample]
+    watches: dict[tuple[str, int | None], PhaseWatch]
+    final_positions: Positions | None
     clock: AbstractContextManager[None] = NO_CLOCK
 
     @staticmethod
-    def pass_of(timing: Timing) -> int | None:
+    def get_round(timing: TimingSample) -> int | None:
         """Return the round of a time's watch."""
         return timing.round if timing.phase == "step" else None
 
 
-def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[str], None]) -> Measured:
+def measure_run(
+    scene: Scene, solver: Solver, settings: SteppingSettings, tick: Callable[[str], None]
+) -> RunMeasurement:
     """Prepare the solver cold and warm, then time phases and steps.
 
     Args:
@@ -121,12 +123,12 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
       StepError: a step failed.
       RunFailed: the solver violates its contract.
     """
-    timings: list[Timing] = []
-    watches: dict[tuple[str, int | None], Watch] = {}
-    contract = Contract(scene.system, solver)
+    timings: list[TimingSample] = []
+    watches: dict[tuple[str, int | None], PhaseWatch] = {}
+    contract = SolverContract(scene.system, solver)
 
-    def watch(phase: str, round: int | None = None) -> Watch:
-        return watches.setdefault((phase, round), Watch(numba.get_num_threads()))
+    def watch(phase: str, round: int | None = None) -> PhaseWatch:
+        return watches.setdefault((phase, round), PhaseWatch(numba.get_num_threads()))
 
     prepared = None
     for round in range(settings.rounds + 1):
@@ -135,74 +137,74 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
             began = perf_counter()
             prepared = prepare(scene, solver)
             seconds = perf_counter() - began
-        timings.append(Timing("prepare", None, round, seconds))
+        timings.append(TimingSample("prepare", None, round, seconds))
     assert prepared is not None
 
-    remote = on_device(prepared)
+    remote = wrap_device_solver(prepared)
     prepared = remote or prepared
-    for step in steps(scene, contract.checked(prepared), settings):
+    for step in iterate_steps(scene, contract.wrap_prepared(prepared), settings):
         if remote:
-            remote.keep(step)
-        phases = working(prepared, step.problem)
+            remote.record_counts(step)
+        phases = check_phases(prepared, step.problem)
         for phase, call in phases.items():
             with watch(phase):
                 stamps = [perf_counter()]
                 for _ in range(PHASE_REPEATS):
                     call()
                     stamps.append(perf_counter())
-            timings += [Timing(phase, step.index, round, b - a) for round, (a, b) in enumerate(pairwise(stamps))]
+            timings += [TimingSample(phase, step.index, round, b - a) for round, (a, b) in enumerate(pairwise(stamps))]
         if phases:
-            with watch(ITERATION):
+            with watch(ITERATION_PHASE):
                 began = perf_counter()
-                done = max(1, prepared.solve(step.problem, step.stop).iterations)
+                done = max(1, prepared.solve(step.problem, step.stop_rule).num_iterations)
                 seconds = perf_counter() - began
-            timings.append(Timing(ITERATION, step.index, 0, seconds / done, done))
+            timings.append(TimingSample(ITERATION_PHASE, step.index, 0, seconds / done, done))
         tick("warm up and phases")
 
-    final = start(scene).now.positions
+    final = build_initial_state(scene).motion.positions
     for round in range(settings.rounds):
-        clock, found = Clock(watch("step", round)), list[Timing]()
+        clock, found = Stopwatch(watch("step", round)), list[TimingSample]()
         replayed = remote.again() if remote else None
-        for step in steps(scene, replayed or prepared, settings, clock):
-            told = replayed.told() if replayed else {}
-            found.append(Timing("step", step.index, round, clock.seconds, device=told))
+        for step in iterate_steps(scene, replayed or prepared, settings, clock):
+            told = replayed.collect_timings() if replayed else {}
+            found.append(TimingSample("step", step.index, round, clock.seconds, device_columns=told))
             final = step.positions
             tick("timed pass")
-        state = remote.usual.state() if remote else {}
-        timings += [replace(timing, device=timing.device | state) for timing in found]
-    return Measured(prepared, timings, watches, final)
+        state = remote.usual.device_state() if remote else {}
+        timings += [replace(timing, device_columns=timing.device_columns | state) for timing in found]
+    return RunMeasurement(prepared, timings, watches, final)
 
 
-class _Steps(Clock):
+class _StepStopwatch(Stopwatch):
     """Stopwatch that records the times of successive steps."""
 
-    def __init__(self, watch: Watch, timings: list[Timing]) -> None:
+    def __init__(self, watch: PhaseWatch, timings: list[TimingSample]) -> None:
         super().__init__(watch)
         self._timings = timings
 
     def __exit__(self, *raised: object) -> None:
         super().__exit__(*raised)
-        self._timings.append(Timing("step", self.watch.entered, 0, self.seconds))
+        self._timings.append(TimingSample("step", self.watch.num_entries, 0, self.seconds))
 
 
-def roughly(scene: Scene, solver: Solver) -> Measured:
+def prepare_untimed(scene: Scene, solver: Solver) -> RunMeasurement:
     """Prepare once, for an instrumentation pass without timed passes.
 
     The clock of that pass is `RunMeasurement.clock`. Writes of the solver to its inputs are not checked. Raises
     Unsupported, NotPositiveDefinite.
     """
-    preparing, stepping = (Watch(numba.get_num_threads()) for _ in range(2))
-    clock = Clock(preparing)
+    preparing, stepping = (PhaseWatch(numba.get_num_threads()) for _ in range(2))
+    clock = Stopwatch(preparing)
     with clock:
         prepared = prepare(scene, solver)
-    timings = [Timing("prepare", None, 0, clock.seconds)]
-    watches: dict[tuple[str, int | None], Watch] = {("prepare", None): preparing, ("step", 0): stepping}
-    return Measured(prepared, timings, watches, None, _Steps(stepping, timings))
+    timings = [TimingSample("prepare", None, 0, clock.seconds)]
+    watches: dict[tuple[str, int | None], PhaseWatch] = {("prepare", None): preparing, ("step", 0): stepping}
+    return RunMeasurement(prepared, timings, watches, None, _StepStopwatch(stepping, timings))
 
 
-def steps(
-    scene: Scene, prepared: Prepared, settings: Settings, clock: AbstractContextManager[None] = NO_CLOCK
-) -> Iterator[Step]:
+def iterate_steps(
+    scene: Scene, prepared: PreparedSolver, settings: SteppingSettings, clock: AbstractContextManager[None] = NO_CLOCK
+) -> Iterator[SimulationStep]:
     """Iterate over the run's steps, each computed within the clock.
 
     Args:
@@ -214,18 +216,20 @@ def steps(
     Raises:
       StepError: a step failed, or, caused by DivergenceError, a position is not finite.
     """
-    run = simulate(scene, prepared, settings.stop, first_guess=settings.first_guess, frames=settings.frames)
+    run = simulate_scene(
+        scene, prepared, settings.stop_criterion, initial_guess=settings.initial_guess, frames=settings.frames
+    )
     for frame in range(1, settings.frames + 1):
         try:
             with clock:
                 step = next(run)
-            if not np.abs(step.positions).max(initial=0.0) < LARGEST:  # so that NaN counts too
-                raise Diverged(f"positions are not finite from frame {frame} on")
+            if not np.abs(step.positions).max(initial=0.0) < MAX_COORDINATE:  # so that NaN counts too
+                raise DivergenceError(f"positions are not finite from frame {frame} on")
         except Exception as error:
-            raise StepFailed(frame) from error
+            raise StepError(frame) from error
         yield step
 
 
-def digest(p: Positions) -> str:
+def hash_positions(p: Positions) -> str:
     """Return the SHA-256 of positions (n, 3), to compare two passes bitwise."""
     return hashlib.sha256(np.ascontiguousarray(p).tobytes()).hexdigest()

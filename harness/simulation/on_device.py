@@ -10,72 +10,79 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from harness.simulation.passing import Passing
-from harness.simulation.step import Step, Turns
-from solvers.device import Marks, Remote
-from solvers.problem import Prepared, Solution, StepProblem, StopRule
+from harness.simulation.passing import DelegatingSolver
+from harness.simulation.step import AlternatingSolver, SimulationStep
+from solvers.device import PreparedDeviceSolver, SolveEvents
+from solvers.problem import PreparedSolver, Solution, StepProblem, StopRule
 
 
-class OnDevice(Passing):
+class DevicePreparedSolver(DelegatingSolver):
     """A prepared solver on a device that records the number of iterations of each solve."""
 
-    def __init__(self, prepared: Prepared, usual: Remote) -> None:
+    def __init__(self, prepared: PreparedSolver, usual: PreparedDeviceSolver) -> None:
         """Wrap a prepared solver; `usual` is the one of the scene's own system, of two."""
         super().__init__(prepared)
         self.usual = usual
         self._counts = list[int]()
 
-    def keep(self, step: Step) -> None:
+    def record_counts(self, step: SimulationStep) -> None:
         """Record the iteration counts of a step; steps are added in order."""
-        self._counts += step.counts
+        self._counts += step.iteration_counts
 
-    def again(self) -> Replayed:
+    def again(self) -> ReplayingDeviceSolver:
         """Return a solver that repeats the same iteration counts from the first step on."""
-        return Replayed(self._prepared, self._counts)
+        return ReplayingDeviceSolver(self._prepared, self._counts)
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """Return the solver's solution."""
         return self._prepared.solve(problem, stop)
 
 
-class Replayed(Passing):
+class ReplayingDeviceSolver(DelegatingSolver):
     """A prepared solver on a device with a given number of iterations in each solve."""
 
-    def __init__(self, prepared: Prepared, counts: Sequence[int]) -> None:
+    def __init__(self, prepared: PreparedSolver, counts: Sequence[int]) -> None:
         super().__init__(prepared)
         self._left, self._told = iter(counts), dict[str, float]()
 
-    def told(self) -> dict[str, float | None]:
+    def collect_timings(self) -> dict[str, float | None]:
         """Return the timing columns since the last call: times [s] by events on the device."""
         found, self._told = self._told, {}
         return {**found}
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """Return the solution after the given number of iterations, without a residual."""
-        one: Any = self._prepared.of(problem) if isinstance(self._prepared, Turns) else self._prepared
+        one: Any = (
+            self._prepared.select_solver(problem) if isinstance(self._prepared, AlternatingSolver) else self._prepared
+        )
         found, marks = one.replay(problem, next(self._left))
-        for name, value in seconds(marks).items():
+        for name, value in compute_event_seconds(marks).items():
             self._told[name] = self._told.get(name, 0.0) + value
         return found
 
 
-def on_device(prepared: Prepared) -> OnDevice | None:
+def wrap_device_solver(prepared: PreparedSolver) -> DevicePreparedSolver | None:
     """Wrap a prepared solver for replay on its device; None on the processor."""
-    usual = prepared.usual if isinstance(prepared, Turns) else prepared
-    return OnDevice(prepared, usual) if isinstance(usual, Remote) else None
+    usual = prepared.usual if isinstance(prepared, AlternatingSolver) else prepared
+    return DevicePreparedSolver(prepared, usual) if isinstance(usual, PreparedDeviceSolver) else None
 
 
-def seconds(marks: Marks | None) -> dict[str, float]:
+def compute_event_seconds(marks: SolveEvents | None) -> dict[str, float]:
     """Compute the times [s] of a step's kernels and transfers by events on the stream.
 
     Returns: columns; empty without events.
     """
     if marks is None:
         return {}
-    copies = marks.began.elapsed_time(marks.up) + marks.done.elapsed_time(marks.down)  # in milliseconds
-    return {"kernel_seconds": 1e-3 * marks.up.elapsed_time(marks.done), "transfer_seconds": 1e-3 * copies}
+    copies = marks.start_event.elapsed_time(marks.upload_event) + marks.kernel_event.elapsed_time(
+        marks.download_event
+    )  # in milliseconds
+    return {
+        "kernel_seconds": 1e-3 * marks.upload_event.elapsed_time(marks.kernel_event),
+        "transfer_seconds": 1e-3 * copies,
+    }
 
 
-def columns(prepared: Prepared) -> dict[str, Any]:
+def build_device_columns(prepared: PreparedSolver) -> dict[str, Any]:
     """Build the device columns of a prepared solver; empty for one on the processor."""
-    return dict(prepared.usual.columns) if isinstance(prepared, OnDevice) else {}
+    return dict(prepared.usual.device_columns) if isinstance(prepared, DevicePreparedSolver) else {}

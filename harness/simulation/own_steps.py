@@ -15,13 +15,19 @@ from typing import ClassVar, Protocol, runtime_checkable
 import numpy as np
 
 from harness.scenes.bind import Scene
-from harness.simulation.controlled import Follower, Path, Stuck, TooSlow, shares
-from harness.simulation.step import State, problem, start
+from harness.simulation.controlled import (
+    Stepper,
+    StepSizeUnderflow,
+    TimeBudgetExceeded,
+    Trajectory,
+    share_frame_seconds,
+)
+from harness.simulation.step import MotionState, build_initial_state, build_problem
 from solvers.integrators import Motion
 from solvers.problem import Positions, Solver, StepProblem, Unsupported
 
 
-class _Stepping(Protocol):
+class _SubsteppingSolver(Protocol):
     """A prepared solver with substeps."""
 
     @property
@@ -30,12 +36,12 @@ class _Stepping(Protocol):
         ...
 
     @property
-    def evaluations(self) -> int:
+    def num_evaluations(self) -> int:
         """The number of force evaluations in a step."""
         ...
 
     @property
-    def factorisations(self) -> int:
+    def num_factorisations(self) -> int:
         """The number of factorisations in a tried step, 0 for explicit methods."""
         ...
 
@@ -53,10 +59,10 @@ class _Stepping(Protocol):
 
 
 @runtime_checkable
-class Controlled(_Stepping, Protocol):
+class AdaptiveSubstepping(_SubsteppingSolver, Protocol):
     """A solver with adaptive steps within a frame."""
 
-    def within(self, tolerance: float) -> Controlled:
+    def with_tolerance(self, tolerance: float) -> AdaptiveSubstepping:
         """Return the solver with an error tolerance [m] of each step.
 
         Raises:
@@ -66,16 +72,16 @@ class Controlled(_Stepping, Protocol):
 
 
 @runtime_checkable
-class Even(_Stepping, Protocol):
+class FixedSubstepping(_SubsteppingSolver, Protocol):
     """A solver with fixed steps within a frame, of the largest stable size."""
 
-    def refined(self, times: float) -> Even:
+    def with_refined_substeps(self, refinement_factor: float) -> FixedSubstepping:
         """Return the solver with the number of steps multiplied by a factor."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
-class Own(Follower):
+class AdaptiveSubstepper(Stepper):
     """Stepping by a solver with adaptive substeps within frames.
 
     The step of the scene is a frame, and its integrator is `own`.
@@ -88,78 +94,82 @@ class Own(Follower):
     @property
     def order(self) -> int:
         """The order of convergence of the solver."""
-        return self._order
+        return self._convergence_order
 
     @cached_property
-    def _order(self) -> int:
-        return self._prepared(1.0)[1].order
+    def _convergence_order(self) -> int:
+        return self._prepare_pieces(1.0)[1].order
 
-    def follow(self, setting: float, *, limit: float = inf) -> Path:
+    def integrate_motion(self, setting: float, *, cpu_limit: float = inf) -> Trajectory:
         """Integrate the motion.
 
         Raises Unsupported as the solver does, and for quantities that change within a frame where the error estimate
         would not detect it.
         """
         cpu = thread_time()
-        scene, ready, pieces = self._prepared(setting)
-        state, began = start(scene), perf_counter()
+        scene, ready, pieces = self._prepare_pieces(setting)
+        state, began = build_initial_state(scene), perf_counter()
         reached = list[float]()
-        seen, h, told = [state.now.positions], None, np.zeros((self.frames * pieces, 3))
+        seen, h, told = [state.motion.positions], None, np.zeros((self.frames * pieces, 3))
         for k in range(len(told)):
-            stated = problem(scene, state, "current")
+            stated = build_problem(scene, state, "current")
             try:
                 p, v, each = ready.step(stated, h)
             except RuntimeError as error:
-                raise Stuck(f"frame {k // pieces + 1}, after {scene.time(k):.6g} s: {error}") from error
+                raise StepSizeUnderflow(
+                    f"frame {k // pieces + 1}, after {scene.compute_time(k):.6g} s: {error}"
+                ) from error
             told[k] = each[:3]
-            h, state = float(told[k, 2]), State(Motion(p, v), None, k + 1)
+            h, state = float(told[k, 2]), MotionState(Motion(p, v), None, k + 1)
             if (k + 1) % pieces == 0:
                 seen.append(p)
                 reached.append(perf_counter() - began)
-            if thread_time() - cpu > limit:
-                raise TooSlow
+            if thread_time() - cpu > cpu_limit:
+                raise TimeBudgetExceeded
         accepted, rejected = (int(count) for count in told[:, :2].sum(axis=0))
-        evaluations = (accepted + rejected) * ready.evaluations
+        evaluations = (accepted + rejected) * ready.num_evaluations
         mean = scene.system.time_step * len(told) / accepted
-        counts = accepted, rejected, (accepted + rejected) * ready.factorisations, evaluations
-        return Path(np.array(seen), *counts, (mean, mean), reached[-1], shares(reached), thread_time() - cpu)
+        counts = accepted, rejected, (accepted + rejected) * ready.num_factorisations, evaluations
+        return Trajectory(
+            np.array(seen), *counts, (mean, mean), reached[-1], share_frame_seconds(reached), thread_time() - cpu
+        )
 
-    def _prepared(self, setting: float) -> tuple[Scene, _Stepping, int]:
+    def _prepare_pieces(self, setting: float) -> tuple[Scene, _SubsteppingSolver, int]:
         """Return the scene, the prepared solver and the number of pieces of each frame."""
-        if changes := _changes(self.scene):
+        if changes := _list_time_dependence(self.scene):
             raise Unsupported(f"takes {' and '.join(changes)} as even within a frame, which is of order 1")
         ready = self.solver.prepare(self.scene.system)
-        if not isinstance(ready, Controlled):
+        if not isinstance(ready, AdaptiveSubstepping):
             raise Unsupported("the method chooses no steps by an error")
-        return self.scene, ready.within(setting), 1
+        return self.scene, ready.with_tolerance(setting), 1
 
 
 @dataclass(frozen=True, eq=False)
-class OwnEven(Own):
+class FixedSubstepper(AdaptiveSubstepper):
     """Stepping by a solver with a fixed substep size.
 
     Quantities that change within a frame are taken as constant within each of a number of pieces, which is of order 1.
     `build_scene` builds the scene with a given step size [s].
     """
 
-    bound: Callable[[float], Scene]
+    build_scene: Callable[[float], Scene]
 
-    even: ClassVar[bool] = True
+    has_fixed_step: ClassVar[bool] = True
 
     @cached_property
-    def _order(self) -> int:
-        return 1 if _changes(self.scene) else self._prepared(1.0)[1].order
+    def _convergence_order(self) -> int:
+        return 1 if _list_time_dependence(self.scene) else self._prepare_pieces(1.0)[1].order
 
-    def _prepared(self, setting: float) -> tuple[Scene, _Stepping, int]:
-        pieces = ceil(setting) if _changes(self.scene) else 1
-        scene = self.bound(self.scene.system.time_step / pieces) if pieces > 1 else self.scene
+    def _prepare_pieces(self, setting: float) -> tuple[Scene, _SubsteppingSolver, int]:
+        pieces = ceil(setting) if _list_time_dependence(self.scene) else 1
+        scene = self.build_scene(self.scene.system.time_step / pieces) if pieces > 1 else self.scene
         ready = self.solver.prepare(scene.system)
-        if not isinstance(ready, Even):
+        if not isinstance(ready, FixedSubstepping):
             raise Unsupported("the number of its steps in a frame cannot be set")
-        return scene, ready.refined(setting if pieces == 1 else 1.0), pieces
+        return scene, ready.with_refined_substeps(setting if pieces == 1 else 1.0), pieces
 
 
-def _changes(scene: Scene) -> list[str]:
+def _list_time_dependence(scene: Scene) -> list[str]:
     """List the quantities that substepping solvers take as constant within a frame although they change."""
-    there = ("forces of place, speed and time", scene.forces), ("moving pins", scene.moving)
+    there = ("forces of place, speed and time", scene.varying_forces), ("moving pins", scene.pin_motions)
     return [what for what, some in there if some]

@@ -4,32 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from solvers.problem import Positions, Prepared, StepProblem
+from solvers.problem import Positions, PreparedSolver, StepProblem
 
 
-class Passing:
+class DelegatingSolver:
     """Delegates the members of a prepared solver, except `solve`, which subclasses define."""
 
-    def __init__(self, prepared: Prepared) -> None:
+    def __init__(self, prepared: PreparedSolver) -> None:
         self._prepared = prepared
 
     @property
-    def choice(self) -> str:
+    def description(self) -> str:
         """The solver's description."""
-        return self._prepared.choice
+        return self._prepared.description
 
     @property
-    def facts(self) -> dict[str, float]:
+    def stats(self) -> dict[str, float]:
         """The solver's statistics."""
-        return self._prepared.facts
+        return self._prepared.stats
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         """Return the solver's iterates."""
         return self._prepared.iterates(problem)
 
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """Return the solver's phases of an iteration."""
-        return self._prepared.phases(problem)
+        return self._prepared.iteration_phases(problem)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """Return the solver's residual at p."""

@@ -16,14 +16,14 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.scenes.bind import Scene
-from solvers.contact.friction_rounds import FrictionRounds, solve_with_friction
-from solvers.integrators import End, Motion, Solved, Staged, Unknown
-from solvers.problem import Positions, Prepared, Solution, Start, StepProblem, StopRule, Unsupported
+from solvers.contact.friction_rounds import FrictionConvergence, solve_with_friction
+from solvers.integrators import Motion, Stage, StagedIntegrator, StageSolution, StepEnd
+from solvers.problem import Positions, PreparedSolver, Solution, StepProblem, StepStart, StopRule, Unsupported
 
-Guess = Callable[[StepProblem], StepProblem]
+GuessFunction = Callable[[StepProblem], StepProblem]
 
 
-class Done(NamedTuple):
+class StepResult(NamedTuple):
     """Result of a step.
 
     Attributes:
@@ -34,27 +34,27 @@ class Done(NamedTuple):
     """
 
     stages: tuple[tuple[StepProblem, Solution], ...]
-    end: End
-    counts: tuple[int, ...]
-    friction: FrictionRounds | None
+    end: StepEnd
+    iteration_counts: tuple[int, ...]
+    friction_rounds: FrictionConvergence | None
 
 
-class Stages:
+class StageSequence:
     """The stages of one step of a scene, from a filtered motion at a time."""
 
     def __init__(self, scene: Scene, now: Motion, acceleration: Positions | None, time: float) -> None:
         """Start a step; `acceleration` (n, 3) [m/s^2] may be unknown (None)."""
         method = scene.integrator
-        assert isinstance(method, Staged)
+        assert isinstance(method, StagedIntegrator)
         self.scene, self.time, pins = scene, time, scene.system.pins
-        self._exact, self._held = pins.exact, pins.vertices[pins.exact]
-        self.now = self._carried(now, time)
-        if acceleration is None and method.starts:
-            acceleration = self._acceleration()
-        self._unknowns = method.step(self.now, acceleration, scene.system.time_step)
-        self._again = method.order - 2 if scene.forces or any(map(_lags, scene.system.energies)) else 0
+        self._exact, self._held = pins.exact_mask, pins.vertices[pins.exact_mask]
+        self.now = self._apply_pins(now, time)
+        if acceleration is None and method.needs_start_acceleration:
+            acceleration = self._compute_acceleration()
+        self._unknowns = method.iterate_stages(self.now, acceleration, scene.system.time_step)
+        self._again = method.order - 2 if scene.varying_forces or any(map(_is_lagged, scene.system.energies)) else 0
 
-    def done(self, prepared: Prepared, stop: StopRule, guess: Guess) -> Done:
+    def solve_stages(self, prepared: PreparedSolver, stop: StopRule, guess: GuessFunction) -> StepResult:
         """Solve all stages of the step.
 
         Args:
@@ -63,28 +63,28 @@ class Stages:
           guess: function that sets the initial guess of a problem.
         """
         found, counts, unknown = list[tuple[StepProblem, Solution]](), list[int](), next(self._unknowns)
-        friction = list[FrictionRounds]()
+        friction = list[FrictionConvergence]()
         while True:
-            solved = solve_with_friction(prepared, guess(self.stated(unknown)), stop)
-            counts += solved.counts
+            solved = solve_with_friction(prepared, guess(self.build_problem(unknown)), stop)
+            counts += solved.iteration_counts
             for _ in range(self._again):
                 x = solved.solution.positions
-                solved = solve_with_friction(prepared, replace(self.stated(unknown, x), first_guess=x), stop)
-                counts += solved.counts
+                solved = solve_with_friction(prepared, replace(self.build_problem(unknown, x), initial_guess=x), stop)
+                counts += solved.iteration_counts
             stated, solution = solved.problem, solved.solution
             found.append((stated, solution))
-            friction += [solved.friction] if solved.friction else []
+            friction += [solved.convergence] if solved.convergence else []
             try:
-                unknown = self._unknowns.send(self._solved(stated, solution))
+                unknown = self._unknowns.send(self._finish_stage(stated, solution))
             except StopIteration as ended:
-                worst = FrictionRounds(*map(max, zip(*friction, strict=True))) if friction else None
-                return Done(tuple(found), self._ended(ended.value), tuple(counts), worst)
+                worst = FrictionConvergence(*map(max, zip(*friction, strict=True))) if friction else None
+                return StepResult(tuple(found), self._finish_step(ended.value), tuple(counts), worst)
 
-    def first(self) -> StepProblem:
+    def build_first_problem(self) -> StepProblem:
         """Build the problem of the first stage."""
-        return self.stated(next(self._unknowns))
+        return self.build_problem(next(self._unknowns))
 
-    def stated(self, unknown: Unknown, expected: Positions | None = None) -> StepProblem:
+    def build_problem(self, stage: Stage, expected: Positions | None = None) -> StepProblem:
         """Build a stage's problem, with the current positions as initial guess.
 
         Args:
@@ -92,65 +92,73 @@ class Stages:
           expected: expected solution (n, 3) [m]; extrapolated from the motion if omitted.
         """
         scene, system = self.scene, self.scene.system
-        until = self.time + unknown.when * system.time_step
-        held, moving = scene.pins_at(until), scene.pins_moving(until)
-        unknown.origin[self._held] = held[self._exact] - moving[self._exact] / system.rate
+        until = self.time + stage.stage_fraction * system.time_step
+        held, moving = scene.pin_targets_at(until), scene.pin_velocities_at(until)
+        stage.velocity_origin[self._held] = held[self._exact] - moving[self._exact] / system.velocity_rate
         if expected is None:
-            expected = unknown.target.copy()
-            if unknown.acceleration is not None:
-                expected += (system.time_step**2 / system.factor) * unknown.acceleration
+            expected = stage.inertial_target.copy()
+            if stage.predicted_acceleration is not None:
+                expected += (system.time_step**2 / system.inertia_factor) * stage.predicted_acceleration
             expected[system.pins.vertices] = held
         current = self.now.positions.copy()
         current[system.pins.vertices] = held
-        begun = Start(
-            *(self.now.positions, self.now.velocity, self.time, unknown.origin, system.rate, until),
-            lagged=expected,
-            acceleration=unknown.acceleration,
+        begun = StepStart(
+            *(self.now.positions, self.now.velocity, self.time, stage.velocity_origin, system.velocity_rate, until),
+            lag_override=expected,
+            predicted_acceleration=stage.predicted_acceleration,
         )
-        v = begun.velocity_at(expected) if scene.forces else expected
-        force = reduce(lambda total, effect: total + effect(expected, v, until), scene.forces, scene.load)
-        return StepProblem(system, unknown.target, force, held, current, current, begun)
+        v = begun.velocity_at(expected) if scene.varying_forces else expected
+        force = reduce(
+            lambda total, effect: total + effect(expected, v, until), scene.varying_forces, scene.constant_force
+        )
+        return StepProblem(system, stage.inertial_target, force, held, current, current, begun)
 
-    def _solved(self, stated: StepProblem, solution: Solution) -> Solved:
+    def _finish_stage(self, step_problem: StepProblem, solution: Solution) -> StageSolution:
         system, x = self.scene.system, solution.positions
-        acceleration = (system.factor / system.time_step**2) * (x - stated.target)
+        acceleration = (system.inertia_factor / system.time_step**2) * (x - step_problem.inertial_target)
         acceleration[self._held] = 0.0
-        return Solved(x, stated.start.velocity_at(x), acceleration)
+        return StageSolution(x, step_problem.step_start.velocity_at(x), acceleration)
 
-    def _ended(self, end: End) -> End:
+    def _finish_step(self, end: StepEnd) -> StepEnd:
         """Set the positions and velocities of exact pins at the end of the step."""
-        return end._replace(motion=self._carried(end.motion, self.time + self.scene.system.time_step))
+        return end._replace(motion=self._apply_pins(end.motion, self.time + self.scene.system.time_step))
 
-    def _carried(self, motion: Motion, time: float) -> Motion:
+    def _apply_pins(self, motion: Motion, time: float) -> Motion:
         if not len(self._held):
             return motion
         p, v = (part.copy() for part in motion)
-        p[self._held] = self.scene.pins_at(time)[self._exact]
-        v[self._held] = self.scene.pins_moving(time)[self._exact]
+        p[self._held] = self.scene.pin_targets_at(time)[self._exact]
+        v[self._held] = self.scene.pin_velocities_at(time)[self._exact]
         return Motion(p, v)
 
-    def _acceleration(self) -> Positions:
+    def _compute_acceleration(self) -> Positions:
         """Compute the initial acceleration (n, 3) [m/s^2], zero at exact pins; raises Unsupported."""
         (p, v), system = self.now, self.scene.system
-        require_mass(self.scene)
-        begun = Start(p, v, self.time, p - v / system.rate, system.rate, self.time)
-        force = reduce(lambda total, effect: total + effect(p, v, self.time), self.scene.forces, self.scene.load)
-        held = self.scene.pins_at(self.time)
+        require_masses(self.scene)
+        begun = StepStart(p, v, self.time, p - v / system.velocity_rate, system.velocity_rate, self.time)
+        force = reduce(
+            lambda total, effect: total + effect(p, v, self.time), self.scene.varying_forces, self.scene.constant_force
+        )
+        held = self.scene.pin_targets_at(self.time)
         pull = StepProblem(system, p, force, held, p, p, begun).gradient(p)
         mass = system.mass[:, None]
         return np.divide(pull, -mass, out=np.zeros_like(p), where=mass > 0.0)
 
 
-def require_mass(scene: Scene) -> None:
+def require_masses(scene: Scene) -> None:
     """Raise Unsupported if an integrator needs the acceleration of a massless vertex."""
     method, system = scene.integrator, scene.system
-    if isinstance(method, Staged) and method.starts and not system.mass[system.free].all():
+    if (
+        isinstance(method, StagedIntegrator)
+        and method.needs_start_acceleration
+        and not system.mass[system.free_vertices].all()
+    ):
         raise Unsupported(
             "the integrator starts from the acceleration, and vertices without mass have none; give them mass, or use "
             "one that does not need it: sdirk-2, sdirk-3, sdirk-4, implicit-euler, bdf2, midpoint"
         )
 
 
-def _lags(energy: object) -> bool:
+def _is_lagged(energy: object) -> bool:
     """Return whether an energy depends on the expected solution of a stage."""
     return getattr(energy, "lagged", False)

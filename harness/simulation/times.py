@@ -12,29 +12,29 @@ from typing import Any
 
 import numpy as np
 
-from harness.simulation.clock import ITERATION_SHARE
-from harness.simulation.measure import ITERATION, Measured, Timing
+from harness.simulation.clock import PHASE_SUM_RTOL
+from harness.simulation.measure import ITERATION_PHASE, RunMeasurement, TimingSample
 
 
-def rows(measured: Measured) -> list[dict[str, Any]]:
+def build_timing_rows(measured: RunMeasurement) -> list[dict[str, Any]]:
     """Build the timing columns, one row for each time; raises ClockMismatch."""
-    groups: dict[tuple[str, int | None], list[Timing]] = defaultdict(list)
+    groups: dict[tuple[str, int | None], list[TimingSample]] = defaultdict(list)
     for timing in measured.timings:
-        groups[timing.phase, measured.pass_of(timing)].append(timing)
-    adds_up, found = _adds_up(measured.timings), list[dict[str, Any]]()
+        groups[timing.phase, measured.get_round(timing)].append(timing)
+    adds_up, found = _check_phase_sums(measured.timings), list[dict[str, Any]]()
     for (phase, _), timings in groups.items():
         told: list[dict[str, Any]] = [
             {"phase": phase, "frame": t.frame, "round": t.round, "seconds": t.seconds, "adds_up": adds_up.get(phase)}
-            | t.device
+            | t.device_columns
             for t in timings
         ]
-        watch = measured.watches[phase, measured.pass_of(timings[0])]
-        seen = watch.columns(phase, (row["seconds"] * t.calls for row, t in zip(told, timings, strict=True)))
+        watch = measured.watches[phase, measured.get_round(timings[0])]
+        seen = watch.build_columns(phase, (row["seconds"] * t.num_calls for row, t in zip(told, timings, strict=True)))
         found += [row | seen for row in told]
     return found
 
 
-def _adds_up(timings: list[Timing]) -> dict[str, bool]:
+def _check_phase_sums(timings: list[TimingSample]) -> dict[str, bool]:
     """Check whether all phases together take as long as an iteration; empty without phases."""
     by_frame: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for t in timings:
@@ -43,14 +43,14 @@ def _adds_up(timings: list[Timing]) -> dict[str, bool]:
     medians = {
         phase: np.array([np.median(times) for _, times in sorted(frames.items())]) for phase, frames in by_frame.items()
     }
-    if ITERATION not in medians:
+    if ITERATION_PHASE not in medians:
         return {}
-    iteration = medians.pop(ITERATION)
+    iteration = medians.pop(ITERATION_PHASE)
     ratio = float(np.median(sum(medians.values()) / iteration))
-    return dict.fromkeys([*medians, ITERATION], bool(abs(ratio - 1.0) <= ITERATION_SHARE))
+    return dict.fromkeys([*medians, ITERATION_PHASE], bool(abs(ratio - 1.0) <= PHASE_SUM_RTOL))
 
 
-def milliseconds(measured: Measured, frames: int) -> dict[str, list[float]]:
+def compute_milliseconds(measured: RunMeasurement, frames: int) -> dict[str, list[float]]:
     """Compute the median over the rounds of each phase in each frame [ms]."""
     by_phase: dict[str, list[list[float]]] = {}
     for t in measured.timings:

@@ -7,12 +7,12 @@ from itertools import islice
 
 from scipy.sparse import csr_array
 
-from solvers.matrices import assemble, energy_norm
-from solvers.problem import Positions, Prepared, ProjectiveEnergy, StepProblem, System
+from solvers.matrices import assemble_system_matrix, energy_norm
+from solvers.problem import Positions, PreparedSolver, ProjectiveEnergy, StepProblem, System
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Convergence:
+class ConvergenceTrace:
     """Convergence of a solve at the iterates 1, 2, ...
 
     Attributes:
@@ -29,7 +29,7 @@ class EnergyNorm:
 
     def __init__(self, system: System) -> None:
         projective = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
-        self._Q: csr_array = assemble(system, projective)
+        self._Q: csr_array = assemble_system_matrix(system, projective)
         self._pinned = system.pins.vertices
 
     def __call__(self, e: Positions) -> float:
@@ -39,7 +39,9 @@ class EnergyNorm:
         return energy_norm(self._Q, e)
 
 
-def trace(prepared: Prepared, problem: StepProblem, norm: EnergyNorm, iterations: int) -> Convergence:
+def trace_convergence(
+    prepared: PreparedSolver, problem: StepProblem, norm: EnergyNorm, iterations: int
+) -> ConvergenceTrace:
     """Trace the convergence of a solve over a number of iterations.
 
     Args:
@@ -49,9 +51,9 @@ def trace(prepared: Prepared, problem: StepProblem, norm: EnergyNorm, iterations
       iterations: number of iterations.
     """
     residuals, objective = list[float](), list[float]()
-    previous = problem.first_guess.copy()
+    previous = problem.initial_guess.copy()
     for p in islice(prepared.iterates(problem), iterations):
         residuals.append(norm(p - previous))
         objective.append(problem.value(p))
         previous[:] = p
-    return Convergence(residuals, objective)
+    return ConvergenceTrace(residuals, objective)

@@ -13,20 +13,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kernel
-from solvers.contact.boxes import larger, put_boxes, smaller
-from solvers.contact.closest import cross, dot, minus
-from solvers.contact.contacts import padded
-from solvers.vectors.eights import loaded, ratio, root, rows, stored, where
+from solvers.compiling import jit_inner, jit_kernel
+from solvers.contact.boxes import componentwise_max, componentwise_min, store_aabbs
+from solvers.contact.closest import cross3, dot3, subtract3
+from solvers.contact.contacts import pad_positions
+from solvers.vectors.eights import divide_packet, gather_rows, load_packet, sqrt_packet, store_packet, where
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
 
-_THIN = 1e-12
+_MIN_WIDTH_RATIO = 1e-12
 """Minimum squared width relative to the squared length of a cluster, below which it has no plane."""
 
 
-class Rest(NamedTuple):
+class RestClusters(NamedTuple):
     """Clusters at rest, padded to multiples of eight.
 
     Attributes:
@@ -37,17 +37,17 @@ class Rest(NamedTuple):
         extents: radius rho, and largest distance of a vertex from the plane [m], (m, 4).
     """
 
-    vertices: Indices
-    plane: Array
-    weights: Array
-    centre: Array
-    t1: Array
-    t2: Array
-    normal: Array
-    size: Array
+    vertices: IndexArray
+    plane_coordinates: FloatArray
+    weights: FloatArray
+    centre: FloatArray
+    t1: FloatArray
+    t2: FloatArray
+    normal: FloatArray
+    extents: FloatArray
 
 
-class Lie(NamedTuple):
+class ClusterPose(NamedTuple):
     """Poses of clusters at a position.
 
     Attributes:
@@ -56,14 +56,14 @@ class Lie(NamedTuple):
         fit_residual: largest y_i in the plane, and normal to it [m], (m, 4).
     """
 
-    centre: Array
-    f1: Array
-    f2: Array
-    normal: Array
-    rest: Array
+    centre: FloatArray
+    f1: FloatArray
+    f2: FloatArray
+    normal: FloatArray
+    fit_residual: FloatArray
 
 
-def rest(x: Array, members: Indices, many: int) -> Rest:
+def build_rest_clusters(x: FloatArray, members: IndexArray, num_clusters: int) -> RestClusters:
     """Fit the planes of clusters at rest.
 
     Args:
@@ -72,11 +72,11 @@ def rest(x: Array, members: Indices, many: int) -> Rest:
         num_clusters: number of clusters.
     """
     patch, vertex = np.unique(members, axis=0).T
-    count = np.bincount(patch, minlength=many)
+    count = np.bincount(patch, minlength=num_clusters)
     slot = np.arange(len(patch)) - np.repeat(np.cumsum(count) - count, count)
-    wide, eights = int(count.max()), 8 * (-(-many // 8))
+    wide, eights = int(count.max()), 8 * (-(-num_clusters // 8))
     vertices, own = np.zeros((eights, wide), np.int64), np.zeros((eights, wide), bool)
-    vertices[:many] = vertex[np.cumsum(count) - count][:, None]
+    vertices[:num_clusters] = vertex[np.cumsum(count) - count][:, None]
     vertices[patch, slot], own[patch, slot] = vertex, True
     share = own / np.maximum(1, own.sum(axis=1, keepdims=True))
     centre = np.einsum("mk,mkx->mx", share, x[vertices])
@@ -85,17 +85,17 @@ def rest(x: Array, members: Indices, many: int) -> Rest:
     t1, t2, normal = (np.ascontiguousarray(axes[:, :, k]) for k in (2, 1, 0))
     along = x[vertices] - centre[:, None]
     plane = np.stack([np.einsum("mkx,mx->mk", along, t) for t in (t1, t2)], axis=1)
-    fit = [1.0 / np.where(spread[:, k] > _THIN * spread[:, 2], spread[:, k], np.inf) for k in (2, 1)]
+    fit = [1.0 / np.where(spread[:, k] > _MIN_WIDTH_RATIO * spread[:, 2], spread[:, k], np.inf) for k in (2, 1)]
     weights = np.stack([1.0 / np.maximum(1, own.sum(axis=1)), *fit])
     size = np.zeros((eights, 3))
     size[:, 0] = np.linalg.norm(off, axis=2).max(axis=1)
     size[:, 1] = np.abs(np.einsum("mkx,mx->mk", off, normal)).max(axis=1)
     by_slot = np.ascontiguousarray(plane.transpose(2, 1, 0))
-    return Rest(vertices, by_slot, weights, *(padded(a) for a in (centre, t1, t2, normal, size)))
+    return RestClusters(vertices, by_slot, weights, *(pad_positions(a) for a in (centre, t1, t2, normal, size)))
 
 
-@kernel
-def lie(known, x, leaf, boxes, tile, out):
+@jit_kernel
+def fit_affine(rest_clusters, x, leaf, boxes, tile, out):
     """Fit the poses of clusters, and write their boxes to the leaves of a tree.
 
     Args:
@@ -106,45 +106,51 @@ def lie(known, x, leaf, boxes, tile, out):
         tile: scratch (3 k, 8).
         out: poses, overwritten.
     """
-    many, width, last = len(known.centre), known.vertices.shape[1], len(known.vertices) - 1
+    many, width, last = len(rest_clusters.centre), rest_clusters.vertices.shape[1], len(rest_clusters.vertices) - 1
     for first in range(0, many, 8):
-        o = rows(x, known.vertices, first, last, 0)
+        o = gather_rows(x, rest_clusters.vertices, first, last, 0)
         zero = 0.0 * o[0]
         centre, f1, f2 = (zero, zero, zero), (zero, zero, zero), (zero, zero, zero)
         low, high = (zero, zero, zero), (zero, zero, zero)
         for k in range(width):
-            p = minus(rows(x, known.vertices, first, last, k), o)
+            p = subtract3(gather_rows(x, rest_clusters.vertices, first, last, k), o)
             for axis in range(3):
-                stored(p[axis], tile, 24 * k + 8 * axis)
+                store_packet(p[axis], tile, 24 * k + 8 * axis)
             at = 2 * many * k + first
             centre = centre[0] + p[0], centre[1] + p[1], centre[2] + p[2]
-            f1, f2 = added(f1, loaded(known.plane, at), p), added(f2, loaded(known.plane, at + many), p)
-            low, high = smaller(low, p), larger(high, p)
+            f1, f2 = (
+                add_scaled(f1, load_packet(rest_clusters.plane_coordinates, at), p),
+                add_scaled(f2, load_packet(rest_clusters.plane_coordinates, at + many), p),
+            )
+            low, high = componentwise_min(low, p), componentwise_max(high, p)
         # Repeated vertices contribute nothing: their p is zero.
-        centre = _times(loaded(known.weights, first), centre)
-        f1, f2 = _times(loaded(known.weights, many + first), f1), _times(loaded(known.weights, 2 * many + first), f2)
-        e1 = unit(f1)
-        e2 = unit(added(f2, 0.0 - dot(f2, e1), e1))
-        n = cross(e1, e2)
+        centre = _scale_vector(load_packet(rest_clusters.weights, first), centre)
+        f1, f2 = (
+            _scale_vector(load_packet(rest_clusters.weights, many + first), f1),
+            _scale_vector(load_packet(rest_clusters.weights, 2 * many + first), f2),
+        )
+        e1 = normalise_vectors(f1)
+        e2 = normalise_vectors(add_scaled(f2, 0.0 - dot3(f2, e1), e1))
+        n = cross3(e1, e2)
         along, across = zero, zero
         for k in range(width):
-            p = loaded(tile, 24 * k), loaded(tile, 24 * k + 8), loaded(tile, 24 * k + 16)
+            p = load_packet(tile, 24 * k), load_packet(tile, 24 * k + 8), load_packet(tile, 24 * k + 16)
             at = 2 * many * k + first
-            y = added(minus(p, centre), 0.0 - loaded(known.plane, at), f1)
-            y = added(y, 0.0 - loaded(known.plane, at + many), f2)
-            a, b, c = dot(e1, y), dot(e2, y), dot(n, y)
-            along, across = _most(along, a * a + b * b), _most(across, c * c)
-        put((centre[0] + o[0], centre[1] + o[1], centre[2] + o[2]), tile, first, out.centre)
-        put(f1, tile, first, out.f1)
-        put(f2, tile, first, out.f2)
-        put(n, tile, first, out.normal)
-        put((root(along), root(across), zero), tile, first, out.rest)
+            y = add_scaled(subtract3(p, centre), 0.0 - load_packet(rest_clusters.plane_coordinates, at), f1)
+            y = add_scaled(y, 0.0 - load_packet(rest_clusters.plane_coordinates, at + many), f2)
+            a, b, c = dot3(e1, y), dot3(e2, y), dot3(n, y)
+            along, across = _packet_max(along, a * a + b * b), _packet_max(across, c * c)
+        store_vectors((centre[0] + o[0], centre[1] + o[1], centre[2] + o[2]), tile, first, out.centre)
+        store_vectors(f1, tile, first, out.f1)
+        store_vectors(f2, tile, first, out.f2)
+        store_vectors(n, tile, first, out.normal)
+        store_vectors((sqrt_packet(along), sqrt_packet(across), zero), tile, first, out.fit_residual)
         low, high = (low[0] + o[0], low[1] + o[1], low[2] + o[2]), (high[0] + o[0], high[1] + o[1], high[2] + o[2])
-        put_boxes(low, high, boxes, leaf + first // 8)
+        store_aabbs(low, high, boxes, leaf + first // 8)
 
 
-@kernel
-def spread(vertices, pairs, known, p, q, way, tile, low, high):
+@jit_kernel
+def max_cluster_displacement(vertices, pairs, rest_clusters, p, q, displacement, tile, low, high):
     """Return the largest relative displacement [m] of two vertices in any cluster pair.
 
     The bound is the diagonal of the box of their displacements.
@@ -159,54 +165,64 @@ def spread(vertices, pairs, known, p, q, way, tile, low, high):
         tile: scratch of at least (3, 8).
     """
     for i in range(len(p)):
-        way[i, 0], way[i, 1], way[i, 2] = q[i, 0] - p[i, 0], q[i, 1] - p[i, 1], q[i, 2] - p[i, 2]
+        displacement[i, 0], displacement[i, 1], displacement[i, 2] = (
+            q[i, 0] - p[i, 0],
+            q[i, 1] - p[i, 1],
+            q[i, 2] - p[i, 2],
+        )
     for first in range(0, len(vertices), 8):
-        x = rows(way, vertices, first, first + 7, 0)
+        x = gather_rows(displacement, vertices, first, first + 7, 0)
         least, most = x, x
         for k in range(1, vertices.shape[1]):
-            x = rows(way, vertices, first, first + 7, k)
-            least, most = smaller(x, least), larger(x, most)
-        put(least, tile, first, low)
-        put(most, tile, first, high)
+            x = gather_rows(displacement, vertices, first, first + 7, k)
+            least, most = componentwise_min(x, least), componentwise_max(x, most)
+        store_vectors(least, tile, first, low)
+        store_vectors(most, tile, first, high)
     square = 0.0
-    for first in range(0, known, 8):
-        a, b = rows(low, pairs, first, known - 1, 0), rows(low, pairs, first, known - 1, 1)
-        c, d = rows(high, pairs, first, known - 1, 0), rows(high, pairs, first, known - 1, 1)
-        wide = minus(larger(c, d), smaller(a, b))
-        stored(dot(wide, wide), tile, 0)
+    for first in range(0, rest_clusters, 8):
+        a, b = (
+            gather_rows(low, pairs, first, rest_clusters - 1, 0),
+            gather_rows(low, pairs, first, rest_clusters - 1, 1),
+        )
+        c, d = (
+            gather_rows(high, pairs, first, rest_clusters - 1, 0),
+            gather_rows(high, pairs, first, rest_clusters - 1, 1),
+        )
+        wide = subtract3(componentwise_max(c, d), componentwise_min(a, b))
+        store_packet(dot3(wide, wide), tile, 0)
         for lane in range(8):
             square = max(square, tile[0, lane])
     return np.sqrt(square)
 
 
-@inner
-def put(v, tile, first, out):
+@jit_inner
+def store_vectors(v, tile, first, out):
     """Store a vector packet in the rows of eight clusters."""
     for axis in range(3):
-        stored(v[axis], tile, 8 * axis)
+        store_packet(v[axis], tile, 8 * axis)
     for lane in range(8):
         for axis in range(3):
             out[first + lane, axis] = tile[axis, lane]
 
 
-@inner
-def unit(v):
+@jit_inner
+def normalise_vectors(v):
     """Return a packet of vectors scaled to unit length."""
-    size = root(dot(v, v))
-    return ratio(v[0], size), ratio(v[1], size), ratio(v[2], size)
+    size = sqrt_packet(dot3(v, v))
+    return divide_packet(v[0], size), divide_packet(v[1], size), divide_packet(v[2], size)
 
 
-@inner
-def _times(t, v):
+@jit_inner
+def _scale_vector(t, v):
     return t * v[0], t * v[1], t * v[2]
 
 
-@inner
-def added(v, t, w):
+@jit_inner
+def add_scaled(v, t, w):
     """Return v + t w."""
     return v[0] + t * w[0], v[1] + t * w[1], v[2] + t * w[2]
 
 
-@inner
-def _most(a, b):
+@jit_inner
+def _packet_max(a, b):
     return where(a > b, a, b)

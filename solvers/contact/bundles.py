@@ -7,14 +7,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.contact.energy import Contact, Planes
-from solvers.contact.touching import ContactEnergy
+from solvers.contact.energy import ContactPlanes, HalfSpaceContact
+from solvers.contact.touching import VertexContactEnergy
 from solvers.kernels.half_spaces import HalfSpaces
-from solvers.kernels.springs import Bundles
+from solvers.kernels.springs import SpringPackets
 from solvers.vectors.springs import LANES
 
 
-def half_spaces(contacts: list[ContactEnergy], row: NDArray[np.int64], bundles: Bundles, unknowns: int) -> HalfSpaces:
+def pack_half_spaces(
+    contacts: list[VertexContactEnergy], row: NDArray[np.int64], spring_packets: SpringPackets, num_unknowns: int
+) -> HalfSpaces:
     """Pack the half-spaces of the current step.
 
     Args:
@@ -23,14 +25,20 @@ def half_spaces(contacts: list[ContactEnergy], row: NDArray[np.int64], bundles: 
         spring_packets: packets of the springs.
         num_unknowns: number of rows that are unknowns.
     """
-    known = [contact for contact in contacts if isinstance(contact, Contact)]
-    fields = [np.concatenate(field) for field in zip(*(contact.planes for contact in known), strict=True)]
-    slip = np.concatenate([np.full(len(contact.planes.vertices), contact.slip) for contact in known])
-    return of_planes(Planes(*fields), slip, row, bundles, unknowns, both=False)
+    known = [contact for contact in contacts if isinstance(contact, HalfSpaceContact)]
+    fields = [np.concatenate(field) for field in zip(*(contact.active_planes for contact in known), strict=True)]
+    slip = np.concatenate([np.full(len(contact.active_planes.vertices), contact.smoothing_length) for contact in known])
+    return pack_contact_planes(ContactPlanes(*fields), slip, row, spring_packets, num_unknowns, is_two_sided=False)
 
 
-def of_planes(
-    planes: Planes, slip: NDArray[np.float64], row: NDArray[np.int64], bundles: Bundles, unknowns: int, *, both: bool
+def pack_contact_planes(
+    planes: ContactPlanes,
+    smoothing_length: NDArray[np.float64],
+    row: NDArray[np.int64],
+    spring_packets: SpringPackets,
+    num_unknowns: int,
+    *,
+    is_two_sided: bool,
 ) -> HalfSpaces:
     """Pack contact planes.
 
@@ -45,9 +53,9 @@ def of_planes(
     vertices, normal, offset, anchor, stiffness, grip = planes
     rows = row[vertices]
     order = np.argsort(rows, kind="stable")
-    order = order[rows[order] < unknowns]
+    order = order[rows[order] < num_unknowns]
     count = np.bincount(rows[order], minlength=len(row) + 2)
-    near = count[bundles.own // 4].reshape(-1, LANES).max(axis=1, initial=0) > 0
+    near = count[spring_packets.row_offset // 4].reshape(-1, LANES).max(axis=1, initial=0) > 0
     first = np.concatenate([[0], np.cumsum(count)])
-    ordered: Any = (np.ascontiguousarray(x[order]) for x in (normal, anchor, offset, stiffness, grip, slip))
-    return HalfSpaces(first, near, *ordered, both=both)
+    ordered: Any = (np.ascontiguousarray(x[order]) for x in (normal, anchor, offset, stiffness, grip, smoothing_length))
+    return HalfSpaces(first, near, *ordered, is_two_sided=is_two_sided)

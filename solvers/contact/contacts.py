@@ -13,18 +13,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kernel
-from solvers.contact.closest import dot, edge_edge_way, point_triangle_way
-from solvers.vectors.eights import bits, lowest, rows, stored
+from solvers.compiling import jit_inner, jit_kernel
+from solvers.contact.closest import dot3, edge_edge_distance_vector, point_triangle_distance_vector
+from solvers.vectors.eights import gather_rows, lowest_set_bit, mask_to_bits, store_packet
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
 
-POINTS, POINT_EDGE, POINT_TRIANGLE, EDGES = 2, 3, 4, 5
+POINT_POINT, POINT_EDGE, POINT_TRIANGLE, EDGE_EDGE = 2, 3, 4, 5
 """Kinds of collisions."""
 
 
-class Pairs(NamedTuple):
+class Candidates(NamedTuple):
     """Candidate pairs: point-triangle pairs, then edge-edge pairs.
 
     Attributes:
@@ -37,16 +37,16 @@ class Pairs(NamedTuple):
         dhat: barrier activation distance beyond the minimum distance [m].
     """
 
-    vertices: Indices
-    points: int
-    scale: Array
-    stiffness: Array
-    parallel: Array
-    thickness: float
-    reach: float
+    vertices: IndexArray
+    num_point_triangle: int
+    distance_scale: FloatArray
+    stiffness: FloatArray
+    mollifier_threshold: FloatArray
+    min_distance: float
+    dhat: float
 
 
-class Contacts(NamedTuple):
+class Collisions(NamedTuple):
     """Active collisions.
 
     Attributes:
@@ -62,19 +62,19 @@ class Contacts(NamedTuple):
         dhat: barrier activation distance beyond the minimum distance [m].
     """
 
-    vertices: Indices
-    kind: Indices
-    weights: Array
-    between: Array
-    stiffness: Array
-    scale: Array
-    parallel: Array
-    crossed: Array
-    thickness: float
-    reach: float
+    vertices: IndexArray
+    kind: IndexArray
+    coefficients: FloatArray
+    distance_vector: FloatArray
+    stiffness: FloatArray
+    distance_scale: FloatArray
+    mollifier_threshold: FloatArray
+    cross_squarednorm: FloatArray
+    min_distance: float
+    dhat: float
 
 
-def room(many: int, thickness: float, reach: float) -> Contacts:
+def allocate_collisions(capacity: int, min_distance: float, dhat: float) -> Collisions:
     """Allocate uninitialised collisions.
 
     Args:
@@ -82,21 +82,21 @@ def room(many: int, thickness: float, reach: float) -> Contacts:
         min_distance: minimum distance [m].
         dhat: barrier activation distance [m].
     """
-    return Contacts(
-        vertices=np.empty((many, 4), np.int64),
-        kind=np.empty(many, np.int64),
-        weights=np.empty((many, 4)),
-        between=np.empty((many, 3)),
-        stiffness=np.empty(many),
-        scale=np.empty(many),
-        parallel=np.empty(many),
-        crossed=np.empty(many),
-        thickness=thickness,
-        reach=reach,
+    return Collisions(
+        vertices=np.empty((capacity, 4), np.int64),
+        kind=np.empty(capacity, np.int64),
+        coefficients=np.empty((capacity, 4)),
+        distance_vector=np.empty((capacity, 3)),
+        stiffness=np.empty(capacity),
+        distance_scale=np.empty(capacity),
+        mollifier_threshold=np.empty(capacity),
+        cross_squarednorm=np.empty(capacity),
+        min_distance=min_distance,
+        dhat=dhat,
     )
 
 
-def in_range(pairs: Pairs, x: Array, space: Contacts) -> Contacts:
+def build_collisions(candidates: Candidates, x: FloatArray, buffer: Collisions) -> Collisions:
     """Build the active collisions at a position.
 
     Args:
@@ -107,14 +107,14 @@ def in_range(pairs: Pairs, x: Array, space: Contacts) -> Contacts:
     Returns:
         Collisions that are views of the buffer.
     """
-    slots = np.empty(1 << (2 * len(pairs.vertices)).bit_length(), np.int32)
-    count = gather(pairs, x, np.empty((9, 8)), slots, space)
-    written: Any = (a[:count] for a in space[:-2])
-    return Contacts(*written, thickness=pairs.thickness, reach=pairs.reach)
+    slots = np.empty(1 << (2 * len(candidates.vertices)).bit_length(), np.int32)
+    count = gather_collisions(candidates, x, np.empty((9, 8)), slots, buffer)
+    written: Any = (a[:count] for a in buffer[:-2])
+    return Collisions(*written, min_distance=candidates.min_distance, dhat=candidates.dhat)
 
 
-@kernel
-def gather(pairs, x, tile, slots, out):
+@jit_kernel
+def gather_collisions(candidates, x, tile, slots, out):
     """Write the active collisions to `out`, and return their number.
 
     Args:
@@ -125,62 +125,65 @@ def gather(pairs, x, tile, slots, out):
         out: collisions of at least the number of candidates.
     """
     slots[:] = -1
-    count, end, edges = 0, pairs.points, False
-    limit = (pairs.thickness + pairs.reach) ** 2
+    count, end, edges = 0, candidates.num_point_triangle, False
+    limit = (candidates.min_distance + candidates.dhat) ** 2
     for _ in range(2):
-        begin, end = (end, len(pairs.vertices)) if edges else (0, end)
+        begin, end = (end, len(candidates.vertices)) if edges else (0, end)
         for first in range(begin, end, 8):
-            left = eight(pairs.vertices, x, first, end - 1, edges, limit, tile)
+            left = compute_packet_distances(candidates.vertices, x, first, end - 1, edges, limit, tile)
             while left != 0:
-                lane = lowest(left)
+                lane = lowest_set_bit(left)
                 left &= left - 1
                 if first + lane < end:
-                    count = take(pairs, first + lane, edges, tile, lane, slots, out, count)
+                    count = insert_collision(candidates, first + lane, edges, tile, lane, slots, out, count)
         edges = True
     return count
 
 
-@inner
-def eight(vertices, x, first, last, edges, limit, tile):
+@jit_inner
+def compute_packet_distances(vertices, x, first, last, edges, limit, tile):
     """Return as bits which of eight pairs have |z|^2 below a limit.
 
     The rows of the tile (9, 8) get c, z, |z|^2 and |u x v|^2. Lanes beyond `last` repeat that pair.
     """
-    a, b = rows(x, vertices, first, last, 0), rows(x, vertices, first, last, 1)
-    c, d = rows(x, vertices, first, last, 2), rows(x, vertices, first, last, 3)
+    a, b = gather_rows(x, vertices, first, last, 0), gather_rows(x, vertices, first, last, 1)
+    c, d = gather_rows(x, vertices, first, last, 2), gather_rows(x, vertices, first, last, 3)
     if edges:
-        c0, c1, c2, c3, z, area = edge_edge_way(a, b, c, d)
+        c0, c1, c2, c3, z, area = edge_edge_distance_vector(a, b, c, d)
     else:
-        c0, c1, c2, c3, z = point_triangle_way(a, b, c, d)
+        c0, c1, c2, c3, z = point_triangle_distance_vector(a, b, c, d)
         area = 0.0 * c0
-    squared = dot(z, z)
-    stored(c0, tile, 0)
-    stored(c1, tile, 8)
-    stored(c2, tile, 16)
-    stored(c3, tile, 24)
-    stored(z[0], tile, 32)
-    stored(z[1], tile, 40)
-    stored(z[2], tile, 48)
-    stored(squared, tile, 56)
-    stored(area, tile, 64)
-    return bits(squared < limit)
+    squared = dot3(z, z)
+    store_packet(c0, tile, 0)
+    store_packet(c1, tile, 8)
+    store_packet(c2, tile, 16)
+    store_packet(c3, tile, 24)
+    store_packet(z[0], tile, 32)
+    store_packet(z[1], tile, 40)
+    store_packet(z[2], tile, 48)
+    store_packet(squared, tile, 56)
+    store_packet(area, tile, 64)
+    return mask_to_bits(squared < limit)
 
 
-@inner
-def take(pairs, e, edges, tile, lane, slots, out, count):
+@jit_inner
+def insert_collision(candidates, e, edges, tile, lane, slots, out, count):
     """Add a pair if it is active, merging equal point-point and point-edge ones; return the new count."""
-    scale = pairs.scale[e]
-    if scale < 1.0 and not tile[7, lane] < (scale * (pairs.thickness + pairs.reach)) ** 2:
+    scale = candidates.distance_scale[e]
+    if scale < 1.0 and not tile[7, lane] < (scale * (candidates.min_distance + candidates.dhat)) ** 2:
         return count
-    x, c0, c1, c2, c3 = pairs.vertices[e], tile[0, lane], tile[1, lane], tile[2, lane], tile[3, lane]
+    x, c0, c1, c2, c3 = candidates.vertices[e], tile[0, lane], tile[1, lane], tile[2, lane], tile[3, lane]
     one, two = c0 != 0.0 and c1 != 0.0, c2 != 0.0 and c3 != 0.0
-    sign, parallel = 1.0, pairs.parallel[e] if tile[8, lane] < pairs.parallel[e] else 0.0
+    sign, parallel = (
+        1.0,
+        candidates.mollifier_threshold[e] if tile[8, lane] < candidates.mollifier_threshold[e] else 0.0,
+    )
     if parallel > 0.0 or (edges and one and two):
-        kind, i, a, b, s, t = EDGES, x[0], x[1], x[2], c1, c2
+        kind, i, a, b, s, t = EDGE_EDGE, x[0], x[1], x[2], c1, c2
     elif edges and one:
         kind, i, a, b, s, t, sign = POINT_EDGE, x[2] if c3 == 0.0 else x[3], x[0], x[1], -c0, -c1, -1.0
     elif edges:
-        kind, i, a, b, s, t = POINT_EDGE if two else POINTS, x[0] if c1 == 0.0 else x[1], x[2], x[3], c2, c3
+        kind, i, a, b, s, t = POINT_EDGE if two else POINT_POINT, x[0] if c1 == 0.0 else x[1], x[2], x[3], c2, c3
     else:
         i, a, b, s, t = x[0], x[1], x[2], c1, c2
         kind = POINT_TRIANGLE
@@ -189,8 +192,8 @@ def take(pairs, e, edges, tile, lane, slots, out, count):
                 a, s, b, t = x[3], c3, x[2], c2
             elif c2 == 0.0:
                 b, t = x[3], c3
-            kind = POINT_EDGE if s != 0.0 and t != 0.0 else POINTS
-    if kind == POINTS:
+            kind = POINT_EDGE if s != 0.0 and t != 0.0 else POINT_POINT
+    if kind == POINT_POINT:
         a = a if s != 0.0 else b
         if a < i:
             i, a, sign = a, i, -sign
@@ -204,11 +207,11 @@ def take(pairs, e, edges, tile, lane, slots, out, count):
             k = slots[slot]
             known = out.vertices[k]
             if known[0] == i and known[1] == a and known[2] == b:
-                out.stiffness[k] += pairs.stiffness[e]
+                out.stiffness[k] += candidates.stiffness[e]
                 return count
             slot = (slot + 1) & (len(slots) - 1)
         slots[slot] = count
-    found, c, z = out.vertices[count], out.weights[count], out.between[count]
+    found, c, z = out.vertices[count], out.coefficients[count], out.distance_vector[count]
     if kind <= POINT_EDGE:
         found[0], found[1], found[2], found[3] = i, a, b, b
         c[0], c[1], c[2], c[3] = 1.0, s, t, 0.0
@@ -216,20 +219,20 @@ def take(pairs, e, edges, tile, lane, slots, out, count):
         found[0], found[1], found[2], found[3] = x[0], x[1], x[2], x[3]
         c[0], c[1], c[2], c[3] = c0, c1, c2, c3
     z[0], z[1], z[2] = sign * tile[4, lane], sign * tile[5, lane], sign * tile[6, lane]
-    out.kind[count], out.stiffness[count], out.scale[count] = kind, pairs.stiffness[e], scale
-    out.parallel[count], out.crossed[count] = parallel, tile[8, lane]
+    out.kind[count], out.stiffness[count], out.distance_scale[count] = kind, candidates.stiffness[e], scale
+    out.mollifier_threshold[count], out.cross_squarednorm[count] = parallel, tile[8, lane]
     return count + 1
 
 
-def padded(p: Array) -> Array:
+def pad_positions(p: FloatArray) -> FloatArray:
     """Return positions (n, 3) padded to (n, 4): a row then fits one vector load."""
     x = np.empty((len(p), 4))
-    pad(p, x)
+    copy_padded(p, x)
     return x
 
 
-@kernel
-def pad(p, x):
+@jit_kernel
+def copy_padded(p, x):
     """Copy positions p (n, 3) to x (n, 4), with a zero last column.
 
     NumPy takes seven times as long for such short rows.

@@ -26,19 +26,19 @@ import scipy
 from numpy.typing import NDArray
 
 from solvers.contact import planes as contact_planes
-from solvers.contact.friction_rounds import ROUNDS
-from solvers.contact.law import LAW
-from solvers.contact.planes import HalfSpaces, Rounded
-from solvers.contact.touching import ContactRows
-from solvers.energies.elements import Elements, Law
-from solvers.problem import Positions, Start
+from solvers.contact.friction_rounds import MAX_FRICTION_ITERATIONS
+from solvers.contact.law import HALF_SPACE_LAW
+from solvers.contact.planes import RoundedBox, SeparatingPlanes
+from solvers.contact.touching import PenaltyRows
+from solvers.energies.elements import ElementLaw, Elements
+from solvers.problem import Positions, StepStart
 from solvers.round_off import EPS
 
-Array = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Obstacle:
+class ConvexObstacle:
     """Rounded box: all points within a radius of a box in a moving frame.
 
     Attributes:
@@ -48,12 +48,12 @@ class Obstacle:
             all times for a static obstacle.
     """
 
-    low: Array
-    high: Array
+    low: FloatArray
+    high: FloatArray
     radius: float
-    frame: Callable[[float], Array]
+    frame: Callable[[float], FloatArray]
 
-    def distance(self, p: Positions, time: float) -> Array:
+    def signed_distance(self, p: Positions, time: float) -> FloatArray:
         """Return the signed distances (n,) [m] of points (n, 3) from the surface, negative inside.
 
         Args:
@@ -67,7 +67,7 @@ class Obstacle:
         return np.where(outside > 0.0, outside, -inside) - self.radius
 
 
-class Planes(NamedTuple):
+class ContactPlanes(NamedTuple):
     """Half-spaces of vertices.
 
     Attributes:
@@ -81,18 +81,18 @@ class Planes(NamedTuple):
 
     vertices: NDArray[np.int64]
     normal: Positions
-    offset: Array
-    anchor: Positions
-    stiffness: Array
-    grip: Array
+    offset: FloatArray
+    friction_anchor: Positions
+    stiffness: FloatArray
+    friction_limit: FloatArray
 
 
-_VECTORS, _NUMBERS = np.empty((0, 3)), np.empty(0)
-_NONE = Planes(np.empty(0, np.int64), _VECTORS, _NUMBERS, _VECTORS, _NUMBERS, _NUMBERS)
+_NO_VECTORS, _NO_VALUES = np.empty((0, 3)), np.empty(0)
+_NO_PLANES = ContactPlanes(np.empty(0, np.int64), _NO_VECTORS, _NO_VALUES, _NO_VECTORS, _NO_VALUES, _NO_VALUES)
 
 
 @dataclass(frozen=True, eq=False)
-class Contact:
+class HalfSpaceContact:
     """Contact of all vertices with obstacles.
 
     Attributes:
@@ -108,131 +108,156 @@ class Contact:
         smoothing_length: s of the current step [m].
     """
 
-    obstacles: tuple[Obstacle, ...]
-    thickness: float
+    obstacles: tuple[ConvexObstacle, ...]
+    min_distance: float
     friction: float
-    stiffness: Array
-    creep: float
-    margin: float
+    stiffness: FloatArray
+    eps_v: float
+    safety_margin: float
     time_step: float
-    friction_rounds: int = ROUNDS
-    planes: Planes = field(default=_NONE)
-    slip: float = 0.0
+    friction_iterations: int = MAX_FRICTION_ITERATIONS
+    active_planes: ContactPlanes = field(default=_NO_PLANES)
+    smoothing_length: float = 0.0
 
-    law: ClassVar[Law] = LAW
+    element_law: ClassVar[ElementLaw] = HALF_SPACE_LAW
 
     @cached_property
     def elements(self) -> Elements:
         """Half-spaces of the current step as elements; none before a step."""
-        p, count = self.planes, len(self.planes.vertices)
-        numbers = p.normal, p.offset, p.anchor, p.stiffness, p.grip, np.full(count, self.slip)
+        p, count = self.active_planes, len(self.active_planes.vertices)
+        numbers = (
+            p.normal,
+            p.offset,
+            p.friction_anchor,
+            p.stiffness,
+            p.friction_limit,
+            np.full(count, self.smoothing_length),
+        )
         return Elements(p.vertices[:, None], np.ones((count, 1)), np.column_stack(numbers))
 
-    def idle(self) -> bool:
+    def has_no_active_collisions(self) -> bool:
         """Return whether no vertex can collide in this step."""
-        return not len(self.planes.vertices)
+        return not len(self.active_planes.vertices)
 
     @cached_property
-    def _near(self) -> tuple[Array, Array]:
+    def _activation_boxes(self) -> tuple[FloatArray, FloatArray]:
         """Corners of the activation region of each obstacle, in its frame, (o, 3) [m]."""
-        reach = np.array([[one.radius + self.thickness + self.margin] for one in self.obstacles])
+        reach = np.array([[one.radius + self.min_distance + self.safety_margin] for one in self.obstacles])
         return np.array([o.low for o in self.obstacles]) - reach, np.array([o.high for o in self.obstacles]) + reach
 
-    def frames(self, time: float) -> Array:
+    def compute_frames(self, time: float) -> FloatArray:
         """Return the obstacles' frames at a step's start and end, (o, 2, 4, 3)."""
         return np.array([(one.frame(time), one.frame(time + self.time_step)) for one in self.obstacles])
 
     @cached_property
-    def _resting(self) -> Array | None:
+    def _static_frames(self) -> FloatArray | None:
         """Frames in all steps if no obstacle moves, else None."""
         rest = all(one.frame(0.0) is one.frame(1.0) for one in self.obstacles)
-        return self.frames(0.0) if rest else None
+        return self.compute_frames(0.0) if rest else None
 
-    def begin_step(self, start: Start) -> Contact:
+    def begin_step(self, start: StepStart) -> HalfSpaceContact:
         """Return the energy of a step.
 
         While no obstacle is near, a single box test finds that the energy is inactive.
         """
         p, v = (x if x.flags.carray else np.array(x, order="C") for x in (start.positions, start.velocity))
-        frames = self.frames(start.time) if self._resting is None else self._resting
+        frames = self.compute_frames(start.time) if self._static_frames is None else self._static_frames
         touched = np.empty(len(frames), np.bool_)
-        way = contact_planes.near(p, v, self.time_step, frames, *self._near, touched)
+        way = contact_planes.find_nearby_obstacles(p, v, self.time_step, frames, *self._activation_boxes, touched)
         if way < 0.0:
             return self
-        lasts = start.until - start.time
-        when, x = lasts / self.time_step, start.pressed
-        found = [self._planes(p, v, self.obstacles[k], frames[k], way, when, x) for k in np.flatnonzero(touched)]
-        planes = Planes(*(np.concatenate(part) for part in zip(*found, strict=True)))
-        return replace(self, planes=planes, slip=self.creep * lasts)
+        lasts = start.stage_time - start.time
+        when, x = lasts / self.time_step, start.normal_force_positions
+        found = [self._build_planes(p, v, self.obstacles[k], frames[k], way, when, x) for k in np.flatnonzero(touched)]
+        planes = ContactPlanes(*(np.concatenate(part) for part in zip(*found, strict=True)))
+        return replace(self, active_planes=planes, smoothing_length=self.eps_v * lasts)
 
-    def _planes(
+    def _build_planes(
         self,
         p: Positions,
         v: Positions,
-        obstacle: Obstacle,
-        frames: Array,
-        way: float,
-        when: float,
-        pressed: Positions | None,
-    ) -> Planes:
+        obstacle: ConvexObstacle,
+        frames: FloatArray,
+        max_displacement: float,
+        stage_fraction: float,
+        normal_force_positions: Positions | None,
+    ) -> ContactPlanes:
         """Build the half-spaces of one obstacle.
 
         stage_fraction: time of the stage within the step, 1 at its end; normal_force_positions: where friction's normal
         forces are evaluated (n, 3) [m], None for the step's start.
         """
-        n, body = len(p), Rounded(obstacle.low, obstacle.high, obstacle.radius + self.thickness)
-        found = HalfSpaces(np.empty(n, np.int64), np.empty((n, 3)), np.empty(n), np.empty((n, 3)))
-        k = contact_planes.planes(p, v, self.time_step, frames, body, self.margin + way, found, np.empty((5, 3)))
-        vertices, normal, offset, carried = found.vertices[:k], found.normal[:k], found.offset[:k], found.carried[:k]
+        n, body = len(p), RoundedBox(obstacle.low, obstacle.high, obstacle.radius + self.min_distance)
+        found = SeparatingPlanes(np.empty(n, np.int64), np.empty((n, 3)), np.empty(n), np.empty((n, 3)))
+        k = contact_planes.build_separating_planes(
+            p, v, self.time_step, frames, body, self.safety_margin + max_displacement, found, np.empty((5, 3))
+        )
+        vertices, normal, offset, carried = (
+            found.vertices[:k],
+            found.normal[:k],
+            found.offset[:k],
+            found.comoving_position[:k],
+        )
         here, stiffness = p[vertices], self.stiffness[vertices]
-        before = _dots(normal, here)
-        depth, offset = when * (offset - _dots(normal, carried)), before + when * (offset - before)
-        if pressed is not None:
-            depth = offset - _dots(normal, pressed[vertices])
+        before = _row_dots(normal, here)
+        depth, offset = (
+            stage_fraction * (offset - _row_dots(normal, carried)),
+            before + stage_fraction * (offset - before),
+        )
+        if normal_force_positions is not None:
+            depth = offset - _row_dots(normal, normal_force_positions[vertices])
         grip = self.friction * stiffness * np.maximum(0.0, depth)
-        return Planes(vertices, normal, offset, here + when * (carried - here), stiffness, grip)
+        return ContactPlanes(vertices, normal, offset, here + stage_fraction * (carried - here), stiffness, grip)
 
     def friction_gradient(self, p: Positions) -> Positions | None:
         """Return the gradient of friction alone [N], (n, 3); None without contact."""
-        if self.idle():
+        if self.has_no_active_collisions():
             return None
         out = np.zeros_like(p)
         self._add_friction_gradient(p, out)
         return out
 
-    def gap(self, p: Positions) -> Array:
+    def compute_gaps(self, p: Positions) -> FloatArray:
         """Return the gaps n.x - d [m], (k,)."""
-        return _dots(self.planes.normal, p[self.planes.vertices]) - self.planes.offset
+        return _row_dots(self.active_planes.normal, p[self.active_planes.vertices]) - self.active_planes.offset
 
-    def _slipped(self, p: Positions) -> tuple[NDArray[np.int64], Positions, Array]:
+    def _tangential_displacements(self, p: Positions) -> tuple[NDArray[np.int64], Positions, FloatArray]:
         """Return the half-spaces with friction (q,), and u (q, 3) and |u| (q,) [m] there."""
-        grips, planes = np.flatnonzero(self.planes.grip), self.planes
-        u, n = p[planes.vertices[grips]] - planes.anchor[grips], planes.normal[grips]
-        u -= _dots(u, n)[:, None] * n
-        return grips, u, np.sqrt(_dots(u, u))
+        grips, planes = np.flatnonzero(self.active_planes.friction_limit), self.active_planes
+        u, n = p[planes.vertices[grips]] - planes.friction_anchor[grips], planes.normal[grips]
+        u -= _row_dots(u, n)[:, None] * n
+        return grips, u, np.sqrt(_row_dots(u, u))
 
     def value(self, p: Positions) -> float:
         """Return the energy [J] at p (n, 3)."""
-        if self.idle():
+        if self.has_no_active_collisions():
             return 0.0
-        grips, _, length = self._slipped(p)
-        rounded = np.where(length <= self.slip, 0.5 * length**2 / self.slip, length - 0.5 * self.slip)
-        pressed = self.planes.stiffness @ np.minimum(0.0, self.gap(p)) ** 2
-        return 0.5 * float(pressed) + float(self.planes.grip[grips] @ rounded)
+        grips, _, length = self._tangential_displacements(p)
+        rounded = np.where(
+            length <= self.smoothing_length,
+            0.5 * length**2 / self.smoothing_length,
+            length - 0.5 * self.smoothing_length,
+        )
+        pressed = self.active_planes.stiffness @ np.minimum(0.0, self.compute_gaps(p)) ** 2
+        return 0.5 * float(pressed) + float(self.active_planes.friction_limit[grips] @ rounded)
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient [N] at p to `out`, (n, 3) each."""
-        if self.idle():
+        if self.has_no_active_collisions():
             return
-        planes, gap = self.planes, self.gap(p)
+        planes, gap = self.active_planes, self.compute_gaps(p)
         np.add.at(out, planes.vertices, (planes.stiffness * np.minimum(0.0, gap))[:, None] * planes.normal)
         self._add_friction_gradient(p, out)
 
     def _add_friction_gradient(self, p: Positions, out: Positions) -> None:
-        planes, (grips, u, length) = self.planes, self._slipped(p)
-        np.add.at(out, planes.vertices[grips], (planes.grip[grips] / np.maximum(self.slip, length))[:, None] * u)
+        planes, (grips, u, length) = self.active_planes, self._tangential_displacements(p)
+        np.add.at(
+            out,
+            planes.vertices[grips],
+            (planes.friction_limit[grips] / np.maximum(self.smoothing_length, length))[:, None] * u,
+        )
 
-    def add_absolute_terms(self, p: Positions, out: Array) -> None:
+    def add_absolute_terms(self, p: Positions, out: FloatArray) -> None:
         """Add the absolute values of the gradient's terms, for the rounding-error bound.
 
         These are k (|x| + |d|) of penalties that are active, or may be by round-off, and F/max(s, |u|) (|x| + |a|) of
@@ -242,29 +267,33 @@ class Contact:
             p: positions (n, 3) [m].
             out: sums (n,) [N], updated (`solvers.round_off`).
         """
-        if self.idle():
+        if self.has_no_active_collisions():
             return
-        planes, size = self.planes, np.sqrt(_dots(p, p))[self.planes.vertices]
+        planes, size = self.active_planes, np.sqrt(_row_dots(p, p))[self.active_planes.vertices]
         reach = size + np.abs(planes.offset)
-        presses = self.gap(p) <= EPS * reach
+        presses = self.compute_gaps(p) <= EPS * reach
         np.add.at(out, planes.vertices, np.where(presses, planes.stiffness * reach, 0.0))
-        grips, _, length = self._slipped(p)
-        anchor = planes.anchor[grips]
-        friction = planes.grip[grips] / np.maximum(self.slip, length) * (size[grips] + np.sqrt(_dots(anchor, anchor)))
+        grips, _, length = self._tangential_displacements(p)
+        anchor = planes.friction_anchor[grips]
+        friction = (
+            planes.friction_limit[grips]
+            / np.maximum(self.smoothing_length, length)
+            * (size[grips] + np.sqrt(_row_dots(anchor, anchor)))
+        )
         np.add.at(out, planes.vertices[grips], friction)
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
         """Return the Hessian [N/m], (3n, 3n), with blocks of vertices in contact."""
-        rows, n = self.rows(p, p, cautious=False), len(p)
+        rows, n = self.build_penalty_rows(p, p, majorise=False), len(p)
         blocks = np.zeros((n, 3, 3))
-        np.add.at(blocks, rows.vertices, _outer(rows.weight, rows.direction))
+        np.add.at(blocks, rows.vertices, _outer_products(rows.stiffness, rows.direction))
         held = np.zeros(n, bool)
         held[rows.vertices] = True
         columns = np.flatnonzero(held)
         indptr = np.concatenate([[0], np.cumsum(held)])
         return scipy.sparse.csr_array(scipy.sparse.bsr_array((blocks[columns], columns, indptr), shape=(3 * n, 3 * n)))
 
-    def rows(self, p: Positions, trial: Positions, *, cautious: bool) -> ContactRows:
+    def build_penalty_rows(self, p: Positions, trial: Positions, *, majorise: bool) -> PenaltyRows:
         """Build the penalty rows of active contacts and of friction.
 
         Args:
@@ -272,14 +301,14 @@ class Contact:
             trial: trial positions (n, 3) [m]; penalties active at p or there are included.
             majorise: whether friction majorises the energy; its stiffness is exact otherwise.
         """
-        planes, gap = self.planes, self.gap(p)
-        pressed = np.flatnonzero((gap < 0.0) | (self.gap(trial) < 0.0))
-        grips, u, length = self._slipped(p)
-        normal, weight = planes.normal[grips], planes.grip[grips] / np.maximum(self.slip, length)
-        sticks = length <= self.slip
-        along = np.divide(u, length[:, None], out=_across(normal), where=~sticks[:, None])
-        both = sticks | cautious
-        return ContactRows(
+        planes, gap = self.active_planes, self.compute_gaps(p)
+        pressed = np.flatnonzero((gap < 0.0) | (self.compute_gaps(trial) < 0.0))
+        grips, u, length = self._tangential_displacements(p)
+        normal, weight = planes.normal[grips], planes.friction_limit[grips] / np.maximum(self.smoothing_length, length)
+        sticks = length <= self.smoothing_length
+        along = np.divide(u, length[:, None], out=_perpendicular_units(normal), where=~sticks[:, None])
+        both = sticks | majorise
+        return PenaltyRows(
             planes.vertices[np.concatenate([pressed, grips, grips[both]])],
             np.concatenate([planes.normal[pressed], np.cross(normal, along), along[both]]),
             np.concatenate([planes.stiffness[pressed], weight, weight[both]]),
@@ -287,17 +316,17 @@ class Contact:
         )
 
 
-def _dots(a: Positions, b: Positions) -> Array:
+def _row_dots(a: Positions, b: Positions) -> FloatArray:
     return np.einsum("ij,ij->i", a, b)
 
 
-def _outer(weight: Array, direction: Positions) -> Array:
+def _outer_products(weight: FloatArray, direction: Positions) -> FloatArray:
     """Return w dd' of each row, (r, 3, 3)."""
     return weight[:, None, None] * direction[:, :, None] * direction[:, None, :]
 
 
-def _across(normal: Positions) -> Positions:
+def _perpendicular_units(normal: Positions) -> Positions:
     """Return a unit vector perpendicular to each normal, (k, 3)."""
     least = np.eye(3)[np.abs(normal).argmin(axis=1)]
     across = np.cross(normal, least)
-    return across / np.sqrt(_dots(across, across))[:, None]
+    return across / np.sqrt(_row_dots(across, across))[:, None]

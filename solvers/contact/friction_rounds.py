@@ -21,12 +21,12 @@ from typing import NamedTuple, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 
-from solvers.problem import Energy, Positions, Prepared, Solution, StepProblem, StopRule, System
+from solvers.problem import Energy, Positions, PreparedSolver, Solution, StepProblem, StopRule, System
 
-ROUNDS = 20
+MAX_FRICTION_ITERATIONS = 20
 """Default maximum number of solves of a step."""
 
-TOLERANCE = 1e-4
+FRICTION_RTOL = 1e-4
 """Change relative to the largest friction force below which the iteration has converged."""
 
 PERIOD, RETURN = 4, 1e-2
@@ -40,18 +40,18 @@ class FrictionEnergy(Energy, Protocol):
     """An energy whose friction depends on `Start.pressed`."""
 
     friction: float
-    friction_rounds: int
+    friction_iterations: int
 
     def friction_gradient(self, p: Positions) -> Positions | None:
         """Return the gradient of friction alone [N] at p (n, 3); None where it is zero."""
         ...
 
 
-class FrictionRounds(NamedTuple):
+class FrictionConvergence(NamedTuple):
     """Number of iterations of a step, and the last change of friction relative to its largest component."""
 
-    rounds: int
-    change: float
+    num_iterations: int
+    relative_change: float
 
 
 class FrictionSolve(NamedTuple):
@@ -66,11 +66,11 @@ class FrictionSolve(NamedTuple):
 
     problem: StepProblem
     solution: Solution
-    counts: tuple[int, ...]
-    friction: FrictionRounds | None
+    iteration_counts: tuple[int, ...]
+    convergence: FrictionConvergence | None
 
 
-def solve_with_friction(prepared: Prepared, problem: StepProblem, stop: StopRule) -> FrictionSolve:
+def solve_with_friction(prepared: PreparedSolver, problem: StepProblem, stop: StopRule) -> FrictionSolve:
     """Solve a step until friction has the normal forces of the solution; once without friction.
 
     Args:
@@ -79,22 +79,22 @@ def solve_with_friction(prepared: Prepared, problem: StepProblem, stop: StopRule
         stop: stop rule of each solve.
     """
     solution = prepared.solve(problem, stop)
-    rounds = _most_rounds(problem.system)
+    rounds = _max_friction_iterations(problem.system)
     if not rounds:
-        return FrictionSolve(problem, solution, (solution.iterations,), None)
-    counts, guess = [solution.iterations], problem.first_guess
+        return FrictionSolve(problem, solution, (solution.num_iterations,), None)
+    counts, guess = [solution.num_iterations], problem.initial_guess
     earlier = deque[_Round](maxlen=PERIOD)
     while True:
         x = solution.positions
-        following = replace(problem, first_guess=x, start=replace(problem.start, pressed=x))
-        change, acting = _friction_change(problem, following, x)
+        following = replace(problem, initial_guess=x, step_start=replace(problem.step_start, normal_force_positions=x))
+        change, acting = _relative_friction_change(problem, following, x)
         ended = len(counts) >= rounds or _is_cycle_at_largest(earlier, x, acting)
-        if not change > TOLERANCE or ended:  # not a number where the solve diverged
-            problem = problem if len(counts) == 1 else replace(problem, first_guess=guess)
-            return FrictionSolve(problem, solution, tuple(counts), FrictionRounds(len(counts), change))
+        if not change > FRICTION_RTOL or ended:  # not a number where the solve diverged
+            problem = problem if len(counts) == 1 else replace(problem, initial_guess=guess)
+            return FrictionSolve(problem, solution, tuple(counts), FrictionConvergence(len(counts), change))
         earlier.append(_Round(x, acting))
         problem, solution = following, prepared.solve(following, stop)
-        counts.append(solution.iterations)
+        counts.append(solution.num_iterations)
 
 
 def has_friction(energy: Energy) -> TypeGuard[FrictionEnergy]:
@@ -102,9 +102,9 @@ def has_friction(energy: Energy) -> TypeGuard[FrictionEnergy]:
     return getattr(energy, "friction", 0.0) > 0.0 and hasattr(energy, "friction_rounds")
 
 
-def _most_rounds(system: System) -> int:
+def _max_friction_iterations(system: System) -> int:
     """Return the maximum number of friction iterations of all energies, 0 without friction."""
-    return max((energy.friction_rounds for energy in system.energies if has_friction(energy)), default=0)
+    return max((energy.friction_iterations for energy in system.energies if has_friction(energy)), default=0)
 
 
 class _Round(NamedTuple):
@@ -118,27 +118,27 @@ def _is_cycle_at_largest(earlier: deque[_Round], x: Positions, acting: float) ->
     """Return whether x (n, 3) [m] returns to an iterate before the last, and none since then had more friction."""
     if len(earlier) < 2:
         return False
-    moved = _largest(x - earlier[-1].positions)
+    moved = _largest_component(x - earlier[-1].positions)
     for period in range(2, len(earlier) + 1):
-        if _largest(x - earlier[-period].positions) <= RETURN * moved:
+        if _largest_component(x - earlier[-period].positions) <= RETURN * moved:
             return acting >= (1.0 - RETURN) * max(one.acting for one in list(earlier)[-period:])
     return False
 
 
-def _friction_change(problem: StepProblem, following: StepProblem, x: Positions) -> tuple[float, float]:
+def _relative_friction_change(problem: StepProblem, following: StepProblem, x: Positions) -> tuple[float, float]:
     """Return the relative change of friction at x (n, 3) between two problems, and its largest component [N] before."""
     before, after = (
         [energy.friction_gradient(x) for energy in each.energies if has_friction(energy)]
         for each in (problem, following)
     )
-    size = max(map(_largest, (*before, *after)))
+    size = max(map(_largest_component, (*before, *after)))
     change = max(
-        _largest(a if b is None else b) if a is None or b is None else _largest(b - a)
+        _largest_component(a if b is None else b) if a is None or b is None else _largest_component(b - a)
         for a, b in zip(before, after, strict=True)
     )
-    return change / size if size else 0.0, max(map(_largest, before))
+    return change / size if size else 0.0, max(map(_largest_component, before))
 
 
-def _largest(force: Positions | None) -> float:
+def _largest_component(force: Positions | None) -> float:
     """Return the largest component, 0 without a force."""
     return 0.0 if force is None else float(np.abs(force).max(initial=0.0))

@@ -16,38 +16,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.contact import ways
-from solvers.contact.boxes import Gaps, Limits
-from solvers.contact.contacts import Pairs, padded
-from solvers.contact.ways import LEFT, unevenness
+from solvers.contact.boxes import ClearanceBounds, CollisionQuery
+from solvers.contact.contacts import Candidates, pad_positions
+from solvers.contact.ways import MIN_GAP_FRACTION, max_relative_displacement
 from solvers.problem import Positions
 
-Array = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
-ROUND = 8.0 * np.finfo(np.float64).eps
+ROUNDOFF_INFLATION = 8.0 * np.finfo(np.float64).eps
 """Inflation of bounding boxes, relative to the largest coordinate."""
 
 
-WIDE = 1.5
+CACHE_INFLATION = 1.5
 """Query radius relative to the activation distance. A larger one makes each evaluation slower by more than the rarer
 broad phases save."""
-_MANY = 3
+_MAX_CACHES = 3
 """Maximum number of cached positions: of a step these are its start, the inertial prediction and the solution."""
 
 
-class Surfaces(Protocol):
+class CandidateSource(Protocol):
     """Interface of a set of primitives among which candidate pairs are found."""
 
     @property
-    def thickness(self) -> float:
+    def min_distance(self) -> float:
         """Minimum distance of all pairs [m]."""
         ...
 
     @property
-    def reach(self) -> float:
+    def dhat(self) -> float:
         """Barrier activation distance beyond the minimum distance [m]."""
         ...
 
-    def clear(self, p: Positions, q: Positions, limits: Limits) -> Gaps | None:
+    def compute_clearance_bounds(self, p: Positions, q: Positions, query: CollisionQuery) -> ClearanceBounds | None:
         """Return lower bounds of the distances at q, if no pair violates a limit.
 
         The limits apply to the linear displacement from p to q.
@@ -62,7 +62,7 @@ class Surfaces(Protocol):
         """
         ...
 
-    def unevenness(self, p: Positions, q: Positions) -> float:
+    def max_relative_displacement(self, p: Positions, q: Positions) -> float:
         """Return the largest relative displacement of two vertices that are close to each other at rest.
 
         Args:
@@ -74,11 +74,11 @@ class Surfaces(Protocol):
         """
         ...
 
-    def within(self, p: Positions, reach: float) -> Pairs:
+    def find_proximity_candidates(self, p: Positions, inflation_radius: float) -> Candidates:
         """Return the pairs closer than `inflation_radius` [m] at p (n, 3) [m]."""
         ...
 
-    def on_way(self, x: Array, y: Array, limits: Limits, edges: bool) -> Pairs:
+    def find_ccd_candidates(self, x: FloatArray, y: FloatArray, query: CollisionQuery, edges: bool) -> Candidates:
         """Return the pairs that may violate a limit on the linear displacement from x to y.
 
         Args:
@@ -93,37 +93,43 @@ class Surfaces(Protocol):
         ...
 
 
-class Kept(NamedTuple):
+class CachedCandidates(NamedTuple):
     """Pairs closer than `radius` [m] at `positions` (n, 3).
 
     far_radius [m]: lower bound of the distances of pairs not close at rest, where known to exceed `radius`.
     """
 
-    p: Positions
-    reach: float
-    pairs: Pairs
-    far: float = 0.0
+    positions: Positions
+    radius: float
+    candidates: Candidates
+    far_radius: float = 0.0
 
     @classmethod
-    def nothing(cls, surface: Surfaces, p: Positions, gaps: Gaps) -> Kept:
+    def without_candidates(cls, source: CandidateSource, p: Positions, gaps: ClearanceBounds) -> CachedCandidates:
         """Return a cache entry without pairs, with clearance bounds at p (n, 3)."""
         none = np.empty(0)
-        pairs = Pairs(np.empty((0, 4), np.int64), 0, none, none, none, surface.thickness, surface.reach)
-        return cls(p, min(gaps), pairs, gaps.far)
+        pairs = Candidates(np.empty((0, 4), np.int64), 0, none, none, none, source.min_distance, source.dhat)
+        return cls(p, min(gaps), pairs, gaps.far_clearance)
 
     @property
-    def idle(self) -> bool:
+    def is_empty(self) -> bool:
         """Whether there are no pairs within the radius."""
-        return not len(self.pairs.vertices)
+        return not len(self.candidates.vertices)
 
-    def covers(self, p: Positions, limit: float) -> bool:
+    def covers_positions(self, p: Positions, limit: float) -> bool:
         """Return whether these include all pairs closer than a limit [m] at p (n, 3)."""
-        if self.p.shape != p.shape:
+        if self.positions.shape != p.shape:
             return False
-        moved = unevenness(self.p, p) if self.idle else 2.0 * _apart(self.p, p)
-        return moved <= self.reach - limit
+        moved = (
+            max_relative_displacement(self.positions, p)
+            if self.is_empty
+            else 2.0 * _max_displacement_from_mean(self.positions, p)
+        )
+        return moved <= self.radius - limit
 
-    def followed(self, surface: Surfaces, p: Positions, q: Positions, moved: tuple[float, float]) -> Kept | None:
+    def revalidate_at(
+        self, source: CandidateSource, p: Positions, q: Positions, displacements: tuple[float, float]
+    ) -> CachedCandidates | None:
         """Return the entry valid at q, if the displacement from p is collision-free.
 
         Args:
@@ -135,39 +141,45 @@ class Kept(NamedTuple):
         Returns:
             The entry, or None if gaps may close on the way or a pair may be active at q.
         """
-        if _idle(surface, self.reach, moved):
+        if _stays_inactive(source, self.radius, displacements):
             return self
-        if self.far <= self.reach or not _idle(surface, self.far, moved):
+        if self.far_radius <= self.radius or not _stays_inactive(source, self.far_radius, displacements):
             return None
-        before, after = moved[0], surface.unevenness(self.p, q)
+        before, after = displacements[0], source.max_relative_displacement(self.positions, q)
         if before > after:
-            before = surface.unevenness(self.p, p)
-        if not _idle(surface, self.reach, (before, after)):
+            before = source.max_relative_displacement(self.positions, p)
+        if not _stays_inactive(source, self.radius, (before, after)):
             return None
-        return self._replace(p=q, reach=min(self.reach - after, self.far - moved[1]), far=0.0)
+        return self._replace(
+            positions=q, radius=min(self.radius - after, self.far_radius - displacements[1]), far_radius=0.0
+        )
 
 
-def _idle(surface: Surfaces, gap: float, moved: tuple[float, float]) -> bool:
+def _stays_inactive(source: CandidateSource, gap: float, displacements: tuple[float, float]) -> bool:
     """Return whether gaps of at least `gap` [m] stay open and remain inactive at the end of a displacement.
 
     displacements: maximum relative displacements [m] of its start and of its end with respect to the cached position.
     """
-    return moved[1] <= gap - surface.thickness - surface.reach and _open(gap - surface.thickness, moved)
+    return displacements[1] <= gap - source.min_distance - source.dhat and _keeps_gaps_open(
+        gap - source.min_distance, displacements
+    )
 
 
-def _open(gap: float, moved: tuple[float, float]) -> bool:
+def _keeps_gaps_open(gap: float, displacements: tuple[float, float]) -> bool:
     """Return whether these displacements leave the required fraction of a gap [m]."""
-    most = (1.0 - LEFT) * gap
-    return (1.0 + LEFT) * moved[0] <= most and moved[1] + LEFT * moved[0] <= most
+    most = (1.0 - MIN_GAP_FRACTION) * gap
+    return (1.0 + MIN_GAP_FRACTION) * displacements[0] <= most and displacements[1] + MIN_GAP_FRACTION * displacements[
+        0
+    ] <= most
 
 
-def idle(surface: Surfaces, kept: list[Kept], p: Positions) -> bool:
+def has_no_active_collisions(source: CandidateSource, caches: list[CachedCandidates], p: Positions) -> bool:
     """Return whether no pair is known to be active at p (n, 3), by the caches alone."""
-    limit = surface.thickness + surface.reach
-    return any(one.idle and one.covers(p, limit) for one in kept)
+    limit = source.min_distance + source.dhat
+    return any(one.is_empty and one.covers_positions(p, limit) for one in caches)
 
 
-def pairs(surface: Surfaces, kept: list[Kept], p: Positions) -> Pairs:
+def find_candidates(source: CandidateSource, caches: list[CachedCandidates], p: Positions) -> Candidates:
     """Return all pairs that are active at p (n, 3), and possibly more.
 
     Args:
@@ -175,20 +187,26 @@ def pairs(surface: Surfaces, kept: list[Kept], p: Positions) -> Pairs:
         caches: cached candidates, updated.
         p: positions (n, 3) [m].
     """
-    limit = surface.thickness + surface.reach
-    for one in kept:
-        if one.covers(p, limit):
-            return one.pairs
-    reach = WIDE * limit + _round(p)
-    if kept and all(one.idle for one in kept) and (gaps := surface.clear(p, p, Limits(reach, surface.thickness, 0.0))):
-        found = Kept.nothing(surface, p.copy(), gaps)
+    limit = source.min_distance + source.dhat
+    for one in caches:
+        if one.covers_positions(p, limit):
+            return one.candidates
+    reach = CACHE_INFLATION * limit + _roundoff_margin(p)
+    if (
+        caches
+        and all(one.is_empty for one in caches)
+        and (gaps := source.compute_clearance_bounds(p, p, CollisionQuery(reach, source.min_distance, 0.0)))
+    ):
+        found = CachedCandidates.without_candidates(source, p.copy(), gaps)
     else:
-        found = Kept(p.copy(), reach, surface.within(p, reach))
-    _keep([one for one in kept if one.idle], found, kept)
-    return found.pairs
+        found = CachedCandidates(p.copy(), reach, source.find_proximity_candidates(p, reach))
+    _store_cache([one for one in caches if one.is_empty], found, caches)
+    return found.candidates
 
 
-def largest_step(surface: Surfaces, kept: list[Kept], p: Positions, way: Positions) -> float:
+def find_collision_free_step_size(
+    source: CandidateSource, caches: list[CachedCandidates], p: Positions, displacement: Positions
+) -> float:
     """Return the largest step size up to 1 that keeps all gaps open.
 
     Args:
@@ -200,50 +218,57 @@ def largest_step(surface: Surfaces, kept: list[Kept], p: Positions, way: Positio
     Returns:
         Step size in [0, 1]; 0 if a gap is closed at p, or if the displacement is not finite.
     """
-    q, closed, free = p + way, surface.thickness, False
-    alone = bool(kept) and all(one.idle for one in kept)
-    for one in kept:
-        if one.idle and one.p.shape == p.shape and (after := unevenness(one.p, q)) <= max(one.reach, one.far):
-            moved = unevenness(one.p, p), after
-            free = free or _open(one.reach - closed, moved)
-            if alone and (found := one.followed(surface, p, q, moved)):
-                kept[:] = kept if found is one else [found, one]
+    q, closed, free = p + displacement, source.min_distance, False
+    alone = bool(caches) and all(one.is_empty for one in caches)
+    for one in caches:
+        if (
+            one.is_empty
+            and one.positions.shape == p.shape
+            and (after := max_relative_displacement(one.positions, q)) <= max(one.radius, one.far_radius)
+        ):
+            moved = max_relative_displacement(one.positions, p), after
+            free = free or _keeps_gaps_open(one.radius - closed, moved)
+            if alone and (found := one.revalidate_at(source, p, q, moved)):
+                caches[:] = caches if found is one else [found, one]
                 return 1.0
     if free and not alone:
         return 1.0
-    if not np.isfinite(way).all():
+    if not np.isfinite(displacement).all():
         return 0.0
-    rounded = _round(p)
-    reach = WIDE * (closed + surface.reach) + rounded
-    if alone and (gaps := surface.clear(p, q, Limits(reach, closed, LEFT))):
-        kept[:] = [Kept.nothing(surface, q, gaps), *kept[:1]]
+    rounded = _roundoff_margin(p)
+    reach = CACHE_INFLATION * (closed + source.dhat) + rounded
+    if alone and (gaps := source.compute_clearance_bounds(p, q, CollisionQuery(reach, closed, MIN_GAP_FRACTION))):
+        caches[:] = [CachedCandidates.without_candidates(source, q, gaps), *caches[:1]]
         return 1.0
     if free:
         return 1.0
-    way = way - way.mean(axis=0)
-    fast = float(np.sqrt(np.einsum("ij,ij->i", way, way)).max(initial=0.0))
-    x, along, scratch, most = padded(p), padded(way), ways.scratch(), 1.0
-    for one in kept:
-        if one.p.shape == p.shape and 2.0 * (_apart(one.p, p) + fast) <= one.reach - closed:
-            return ways.largest(one.pairs, x, along, most, *scratch)
+    displacement = displacement - displacement.mean(axis=0)
+    fast = float(np.sqrt(np.einsum("ij,ij->i", displacement, displacement)).max(initial=0.0))
+    x, along, scratch, most = pad_positions(p), pad_positions(displacement), ways.allocate_ccd_scratch(), 1.0
+    for one in caches:
+        if (
+            one.positions.shape == p.shape
+            and 2.0 * (_max_displacement_from_mean(one.positions, p) + fast) <= one.radius - closed
+        ):
+            return ways.collision_free_step_size(one.candidates, x, along, most, *scratch)
     for edges in (False, True):  # edges are looked up along what points leave of the way
-        limits = Limits(closed + rounded, closed, LEFT, 2.0 * most * fast)
-        near = surface.on_way(x, x + most * along, limits, edges)
-        most = ways.largest(near, x, along, most, *scratch)
+        limits = CollisionQuery(closed + rounded, closed, MIN_GAP_FRACTION, 2.0 * most * fast)
+        near = source.find_ccd_candidates(x, x + most * along, limits, edges)
+        most = ways.collision_free_step_size(near, x, along, most, *scratch)
     return most
 
 
-def _keep(before: list[Kept], found: Kept, kept: list[Kept]) -> None:
+def _store_cache(before: list[CachedCandidates], found: CachedCandidates, caches: list[CachedCandidates]) -> None:
     """Store a new entry in front of the previous ones."""
-    kept[:] = [found, *before[: _MANY - 1]]
+    caches[:] = [found, *before[: _MAX_CACHES - 1]]
 
 
-def _round(p: Positions) -> float:
+def _roundoff_margin(p: Positions) -> float:
     """Return the inflation of bounding boxes [m]."""
-    return ROUND * float(np.abs(p).max(initial=0.0))
+    return ROUNDOFF_INFLATION * float(np.abs(p).max(initial=0.0))
 
 
-def _apart(p: Positions, q: Positions) -> float:
+def _max_displacement_from_mean(p: Positions, q: Positions) -> float:
     """Return the largest displacement [m] of a vertex from p to q, (n, 3) each, relative to the mean displacement."""
     way = q - p
     way -= way.mean(axis=0)

@@ -11,17 +11,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from solvers.compiling import inner
-from solvers.contact.blocks import row
+from solvers.compiling import jit_inner
+from solvers.contact.blocks import row_offset
 
-MOLLIFIED = 1e-3
+MOLLIFIER_THRESHOLD_SCALE = 1e-3
 """Threshold of |u x v|^2 relative to |u|^2 |v|^2 at rest, below which edges are nearly parallel (Li et al. 2020)."""
 
-_LEAST = 1e-200
+_MIN_MOLLIFIER_VALUE = 1e-200
 """Values of m below this exert no force."""
 
 
-class Crossed(NamedTuple):
+class EdgeCrossProduct(NamedTuple):
     """Two edges: u, v, |u|^2, u v, |v|^2 and c = |u x v|^2."""
 
     u: tuple[float, float, float]
@@ -32,27 +32,27 @@ class Crossed(NamedTuple):
     c: float
 
 
-@inner
-def crossed(p, x):
+@jit_inner
+def compute_edge_cross_product(p, x):
     """Return the cross product data of two edges with the vertices x (4,)."""
     a, b, c, d = x[0], x[1], x[2], x[3]
     u0, u1, u2 = p[b, 0] - p[a, 0], p[b, 1] - p[a, 1], p[b, 2] - p[a, 2]
     v0, v1, v2 = p[d, 0] - p[c, 0], p[d, 1] - p[c, 1], p[d, 2] - p[c, 2]
     w0, w1, w2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
     uu, uv, vv = u0 * u0 + u1 * u1 + u2 * u2, u0 * v0 + u1 * v1 + u2 * v2, v0 * v0 + v1 * v1 + v2 * v2
-    return Crossed((u0, u1, u2), (v0, v1, v2), uu, uv, vv, w0 * w0 + w1 * w1 + w2 * w2)
+    return EdgeCrossProduct((u0, u1, u2), (v0, v1, v2), uu, uv, vv, w0 * w0 + w1 * w1 + w2 * w2)
 
 
-@inner
-def mollifier(c, e):
+@jit_inner
+def edge_edge_mollifier(c, e):
     """Return m and its first two derivatives with respect to c."""
     if not c < e:
         return 1.0, 0.0, 0.0
     return (2.0 - c / e) * c / e, 2.0 * (1.0 - c / e) / e, -2.0 / (e * e)
 
 
-@inner
-def bending(edges, factor, energy, keep, dc):
+@jit_inner
+def compute_mollifier_hessian_weights(edges, factor, energy, negative_fraction, dc):
     """Return the mollifier's Hessian weights, and write c' to dc (12,).
 
     The rotation of its own edges is excluded; see `add_edge_rotation_hessian`.
@@ -77,17 +77,17 @@ def bending(edges, factor, energy, keep, dc):
         wi, wj = u[j] * v[a] - u[a] * v[j], u[a] * v[i] - u[i] * v[a]
         bu, bv = 2.0 * (v[i] * wj - v[j] * wi), 2.0 * (u[j] * wi - u[i] * wj)
         dc[a], dc[3 + a], dc[6 + a], dc[9 + a] = -bu, bu, -bv, bv
-    mixed, bent = keep * f1 * m1, keep * f * m2
-    share, rest = 0.0, 1.0 - keep
-    if m > _LEAST and rest > 0.0 and f1 != 0.0:
+    mixed, bent = negative_fraction * f1 * m1, negative_fraction * f * m2
+    share, rest = 0.0, 1.0 - negative_fraction
+    if m > _MIN_MOLLIFIER_VALUE and rest > 0.0 and f1 != 0.0:
         share = m * f2 / (f1 * f1)
         bent += rest * m1 * m1 / share
         share *= rest * f1 * f1
     return mixed, bent, share
 
 
-@inner
-def add_turning(edges, weight, keep, H):
+@jit_inner
+def add_edge_rotation_hessian(edges, weight, negative_fraction, H):
     """Add the Hessian of the rotation of edges to packed rows H (`contact.potentials.hessian_blocks`).
 
     Args:
@@ -101,19 +101,19 @@ def add_turning(edges, weight, keep, H):
     for a in range(3):
         for b in range(3):
             same = 1.0 if a == b else 0.0
-            huu, hvv = turned(edges, weight, keep, a, b)
-            hvu = weight * ((1.0 + keep) * u[b] * v[a] - uv * same - keep * v[b] * u[a])
+            huu, hvv = compute_edge_rotation_entries(edges, weight, negative_fraction, a, b)
+            hvu = weight * ((1.0 + negative_fraction) * u[b] * v[a] - uv * same - negative_fraction * v[b] * u[a])
             # By edges, in the blocks of their ends.
             for i, j, h in ((0, 0, huu), (1, 0, -huu), (1, 1, huu), (2, 2, hvv), (3, 2, -hvv), (3, 3, hvv)):
-                H[row(i, a) + 3 * j + b] += h
+                H[row_offset(i, a) + 3 * j + b] += h
             for i, j, h in ((2, 0, hvu), (2, 1, -hvu), (3, 0, -hvu), (3, 1, hvu)):
-                H[row(i, a) + 3 * j + b] += h
+                H[row_offset(i, a) + 3 * j + b] += h
 
 
-@inner
-def turned(edges, weight, keep, a, b):
+@jit_inner
+def compute_edge_rotation_entries(edges, weight, negative_fraction, a, b):
     """Return entry (a, b) of the diagonal blocks of both edges' ends."""
     u, v, uu, _, vv, c = edges
-    w, rest, same = np.sqrt(c), 1.0 - keep, 1.0 if a == b else 0.0
+    w, rest, same = np.sqrt(c), 1.0 - negative_fraction, 1.0 if a == b else 0.0
     more_u, more_v = rest * w * np.sqrt(vv / uu), rest * w * np.sqrt(uu / vv)
     return weight * ((vv + more_u) * same - v[a] * v[b]), weight * ((uu + more_v) * same - u[a] * u[b])

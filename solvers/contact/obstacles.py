@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.contact import boxes, ways
-from solvers.contact.barrier import distances
-from solvers.contact.boxes import Gaps, Limits
-from solvers.contact.contacts import Pairs, padded
-from solvers.contact.mollifier import MOLLIFIED
-from solvers.contact.trees import Tree, found
+from solvers.contact.barrier import compute_distances
+from solvers.contact.boxes import ClearanceBounds, CollisionQuery
+from solvers.contact.contacts import Candidates, pad_positions
+from solvers.contact.mollifier import MOLLIFIER_THRESHOLD_SCALE
+from solvers.contact.trees import BVH, find_candidate_pairs
 from solvers.problem import Positions
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
 
 
-class Side(NamedTuple):
+class MeshPrimitives(NamedTuple):
     """Primitives of one side, by global vertex indices.
 
     Attributes:
@@ -28,13 +28,13 @@ class Side(NamedTuple):
         edge_lengths: at rest [m], (m,).
     """
 
-    points: Tree
-    edges: Tree
-    triangles: Tree
-    length: Array
+    points: BVH
+    edges: BVH
+    triangles: BVH
+    edge_lengths: FloatArray
 
     @classmethod
-    def of(cls, rest: Positions, edges: Indices, triangles: Indices, first: int = 0) -> Self:
+    def from_rest_shape(cls, rest: Positions, edges: IndexArray, triangles: IndexArray, first_vertex: int = 0) -> Self:
         """Build the primitives of a shape.
 
         Args:
@@ -44,14 +44,18 @@ class Side(NamedTuple):
             first_vertex: global index of the first vertex.
         """
         points = np.unique(np.append(edges.ravel(), triangles.ravel())).astype(np.int64)
-        trees = Tree.of(rest, points[:, None]), Tree.of(rest, edges), Tree.of(rest, triangles)
-        length = np.linalg.norm(rest[trees[1].corners[:, 0]] - rest[trees[1].corners[:, 1]], axis=1)
-        one, two, three = (tree._replace(corners=tree.corners + first) for tree in trees)
+        trees = (
+            BVH.from_primitives(rest, points[:, None]),
+            BVH.from_primitives(rest, edges),
+            BVH.from_primitives(rest, triangles),
+        )
+        length = np.linalg.norm(rest[trees[1].primitives[:, 0]] - rest[trees[1].primitives[:, 1]], axis=1)
+        one, two, three = (tree._replace(primitives=tree.primitives + first_vertex) for tree in trees)
         return cls(one, two, three, length)
 
 
 @dataclass(frozen=True, eq=False)
-class Against:
+class ObstacleCollisionMesh:
     """A mesh and obstacles, whose vertices follow those of the mesh.
 
     Attributes:
@@ -62,56 +66,60 @@ class Against:
         dhat: barrier activation distance beyond the minimum distance [m].
     """
 
-    mesh: Side
-    others: Side
-    stiffness: Array
-    thickness: float
-    reach: float
+    mesh: MeshPrimitives
+    obstacles: MeshPrimitives
+    stiffness: FloatArray
+    min_distance: float
+    dhat: float
 
-    def clear(self, p: Positions, q: Positions, limits: Limits) -> Gaps | None:
+    def compute_clearance_bounds(self, p: Positions, q: Positions, query: CollisionQuery) -> ClearanceBounds | None:
         """Return clearance bounds at q from one box around each side, or None."""
         n = len(self.stiffness)
-        return Gaps(limits.reach, limits.reach) if boxes.apart((0, n), (n, len(p)), p, q, limits) else None
+        return (
+            ClearanceBounds(query.inflation_radius, query.inflation_radius)
+            if boxes.are_aabbs_separated((0, n), (n, len(p)), p, q, query)
+            else None
+        )
 
-    def unevenness(self, p: Positions, q: Positions) -> float:
+    def max_relative_displacement(self, p: Positions, q: Positions) -> float:
         """Return the largest relative displacement [m] of any two vertices."""
-        return ways.unevenness(p, q)
+        return ways.max_relative_displacement(p, q)
 
-    def within(self, p: Positions, reach: float) -> Pairs:
+    def find_proximity_candidates(self, p: Positions, inflation_radius: float) -> Candidates:
         """Return the pairs closer than `inflation_radius` [m] at p (n, 3) [m]."""
-        x, limits = padded(p), Limits(reach, reach, 0.0, 0.0)
-        one, two = (self.on_way(x, x, limits, edges) for edges in (False, True))
+        x, limits = pad_positions(p), CollisionQuery(inflation_radius, inflation_radius, 0.0, 0.0)
+        one, two = (self.find_ccd_candidates(x, x, limits, edges) for edges in (False, True))
         pairs = one._replace(
             vertices=np.concatenate([one.vertices, two.vertices]),
-            scale=np.concatenate([one.scale, two.scale]),
+            distance_scale=np.concatenate([one.distance_scale, two.distance_scale]),
             stiffness=np.concatenate([one.stiffness, two.stiffness]),
-            parallel=np.concatenate([one.parallel, two.parallel]),
+            mollifier_threshold=np.concatenate([one.mollifier_threshold, two.mollifier_threshold]),
         )
-        close = distances(pairs, p) < reach
+        close = compute_distances(pairs, p) < inflation_radius
         return pairs._replace(
             vertices=pairs.vertices[close],
-            points=int(close[: pairs.points].sum()),
-            scale=pairs.scale[close],
+            num_point_triangle=int(close[: pairs.num_point_triangle].sum()),
+            distance_scale=pairs.distance_scale[close],
             stiffness=pairs.stiffness[close],
-            parallel=pairs.parallel[close],
+            mollifier_threshold=pairs.mollifier_threshold[close],
         )
 
-    def on_way(self, x: Array, y: Array, limits: Limits, edges: bool) -> Pairs:
+    def find_ccd_candidates(self, x: FloatArray, y: FloatArray, query: CollisionQuery, edges: bool) -> Candidates:
         """Return the pairs that may violate a limit on the displacement from x to y."""
-        a, b = self.mesh, self.others
+        a, b = self.mesh, self.obstacles
         if edges:
-            e, f = found(a.edges, b.edges, x, y, limits).T
-            vertices = np.column_stack([a.edges.corners[e], b.edges.corners[f]])
-            parallel = MOLLIFIED * (a.length[e] * b.length[f]) ** 2
+            e, f = find_candidate_pairs(a.edges, b.edges, x, y, query).T
+            vertices = np.column_stack([a.edges.primitives[e], b.edges.primitives[f]])
+            parallel = MOLLIFIER_THRESHOLD_SCALE * (a.edge_lengths[e] * b.edge_lengths[f]) ** 2
         else:
-            one, two = (found(i.points, j.triangles, x, y, limits).T for i, j in ((a, b), (b, a)))
+            one, two = (find_candidate_pairs(i.points, j.triangles, x, y, query).T for i, j in ((a, b), (b, a)))
             vertices = np.concatenate(
                 [
-                    np.column_stack([a.points.corners[one[0]], b.triangles.corners[one[1]]]),
-                    np.column_stack([b.points.corners[two[0]], a.triangles.corners[two[1]]]),
+                    np.column_stack([a.points.primitives[one[0]], b.triangles.primitives[one[1]]]),
+                    np.column_stack([b.points.primitives[two[0]], a.triangles.primitives[two[1]]]),
                 ]
             )
             parallel = np.zeros(len(vertices))
         own, points = vertices < len(self.stiffness), 0 if edges else len(vertices)
         stiffness = np.where(own, self.stiffness[np.where(own, vertices, 0)], 0.0).sum(axis=1) / own.sum(axis=1)
-        return Pairs(vertices, points, np.ones(len(vertices)), stiffness, parallel, self.thickness, self.reach)
+        return Candidates(vertices, points, np.ones(len(vertices)), stiffness, parallel, self.min_distance, self.dhat)

@@ -24,21 +24,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
-from solvers.contact.local_global import Corrections, Model, PreparedContact
-from solvers.contact.touching import without_contact
-from solvers.core.bounds import PairBlocks, without_bounded
-from solvers.core.descent import Point, search
-from solvers.core.driver import Iterating
-from solvers.core.fixed_objective import Objective
+from solvers.contact.local_global import ContactCorrections, ContactQuadraticModel, PreparedHalfSpaceLocalGlobal
+from solvers.contact.touching import without_vertex_contact
+from solvers.core.bounds import PairBlocks, without_barriers
+from solvers.core.descent import DescentPoint, backtracking_line_search
+from solvers.core.driver import SolverState
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
 from solvers.core.prefactored import PreparedLocalGlobal
 from solvers.problem import Positions, Solver, StepProblem, System, Unsupported
 
-_ITERATIONS = 60
+_MAX_CG_ITERATIONS = 60
 """Maximum number of conjugate gradient iterations."""
 
 
-def local_global(solver: Solver, system: System) -> PreparedPairs:
+def prepare_with_barriers(solver: Solver, system: System) -> PreparedBarrierLocalGlobal:
     """Prepare a local-global method with barrier contact.
 
     Args:
@@ -48,96 +48,100 @@ def local_global(solver: Solver, system: System) -> PreparedPairs:
     Raises:
         Unsupported: if the system also has vertex contact, or if the solver does not support it without contact.
     """
-    if without_contact(system) is not system:
+    if without_vertex_contact(system) is not system:
         raise Unsupported(
             "local-global: vertex contact (Contact) and barrier contact of pairs are not supported together; use "
             "surface-contact"
         )
-    idle: Any = solver.prepare(without_bounded(system))
+    idle: Any = solver.prepare(without_barriers(system))
     base = idle if isinstance(idle, PreparedLocalGlobal) else idle.base
-    return PreparedPairs(replace(base, system=system), idle, Objective(system), Corrections(base))
+    return PreparedBarrierLocalGlobal(
+        replace(base, system=system), idle, FixedObjective(system), ContactCorrections(base)
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedPairs(PreparedContact):
+class PreparedBarrierLocalGlobal(PreparedHalfSpaceLocalGlobal):
     """Local-global iterations with barrier contact."""
 
     @property
-    def choice(self) -> str:
+    def description(self) -> str:
         """Description of the linear solver."""
-        return f"{self.idle.choice}; where pairs touch, by conjugate gradients"
+        return f"{self.contact_free.description}; where pairs touch, by conjugate gradients"
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Return the initial state of the iteration of a step."""
-        return _Iterating(self, problem, guess)
+        return _BarrierState(self, problem, initial_guess)
 
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """Return no phases: those of an iteration are not separable."""
         return {}
 
-    def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
+    def build_residual(self, problem: StepProblem) -> Callable[[Positions], float]:
         """Return the function that computes the residual of positions."""
-        step = StepObjective(self.objective, problem)
-        return lambda p: self.corrections.residual(self.corrections.plain(step.gradient(p)))
+        step = StepObjective(self.fixed_objective, problem)
+        return lambda p: self.corrections.residual_norm(self.corrections.solve_without_contact(step.gradient(p)))
 
 
-class _Iterating(Iterating):
+class _BarrierState(SolverState):
     """Iteration state; each step is collision-free and does not increase the objective.
 
     The state of the method without contact is reused as long as its iterates are accepted.
     """
 
-    def __init__(self, prepared: PreparedPairs, problem: StepProblem, guess: Positions) -> None:
+    def __init__(self, prepared: PreparedBarrierLocalGlobal, problem: StepProblem, initial_guess: Positions) -> None:
         self._prepared, self._problem = prepared, problem
-        self._step = StepObjective(prepared.objective, problem)
-        self.positions = self._step.placed(guess)
-        self._far: Iterating | None = None
+        self._step = StepObjective(prepared.fixed_objective, problem)
+        self.positions = self._step.apply_exact_pins(initial_guess)
+        self._contact_free_state: SolverState | None = None
         self._residual: Callable[[], float] = lambda: float("nan")
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         """Perform one iteration."""
-        blocks = self._blocks(self.positions)
-        return self._near(blocks) if blocks else self._alone()
+        blocks = self._active_blocks(self.positions)
+        return self._step_with_contact(blocks) if blocks else self._step_without_contact()
 
     def residual(self) -> float:
         """Return the residual of the previous positions."""
         return self._residual()
 
-    def _blocks(self, p: Positions) -> list[PairBlocks]:
+    def _active_blocks(self, p: Positions) -> list[PairBlocks]:
         """Return the Hessian blocks of the pairs active at p."""
-        found = (energy.blocks(p, 0.0) for energy in self._step.bounded)
+        found = (energy.hessian_blocks(p, 0.0) for energy in self._step.barrier_energies)
         return [blocks for blocks in found if len(blocks.vertices)]
 
-    def _alone(self) -> bool:
+    def _step_without_contact(self) -> bool:
         """Perform an iteration without contact, as far as its step is collision-free."""
-        if self._far is None:
-            self._far = self._prepared.idle.begin(self._problem, self.positions)
-        far, p = self._far, self.positions
-        self._residual, moved = far.residual, far.advance()
+        if self._contact_free_state is None:
+            self._contact_free_state = self._prepared.contact_free.init_state(self._problem, self.positions)
+        far, p = self._contact_free_state, self.positions
+        self._residual, moved = far.residual, far.step_state()
         q = far.positions.copy()
-        if self._step.reach(p, q - p) == 1.0 and not self._blocks(q):
+        if self._step.max_step_size(p, q - p) == 1.0 and not self._active_blocks(q):
             self.positions = q
             return moved
-        self._far = None
-        return self._along(Point(p, self._step.gradient(p)), q - p)
+        self._contact_free_state = None
+        return self._line_search(DescentPoint(p, self._step.gradient(p)), q - p)
 
-    def _near(self, blocks: list[PairBlocks]) -> bool:
+    def _step_with_contact(self, blocks: list[PairBlocks]) -> bool:
         """Perform an iteration with Q + W."""
-        self._far, corrections, p = None, self._prepared.corrections, self.positions
-        at = Point(p, self._step.gradient(p))
-        plain = corrections.plain(at.gradient)
-        self._residual = lambda: corrections.residual(plain)
-        model = Model(corrections.plain, _matrix(blocks, len(p)), -at.gradient)
-        model.iterate(model.product, _ITERATIONS)
-        return self._along(at, model.x) or self._along(at, -plain)
+        self._contact_free_state, corrections, p = None, self._prepared.corrections, self.positions
+        at = DescentPoint(p, self._step.gradient(p))
+        plain = corrections.solve_without_contact(at.gradient)
+        self._residual = lambda: corrections.residual_norm(plain)
+        model = ContactQuadraticModel(
+            corrections.solve_without_contact, _assemble_contact_matrix(blocks, len(p)), -at.gradient
+        )
+        model.run_iterations(model.residual_product, _MAX_CG_ITERATIONS)
+        return self._line_search(at, model.x) or self._line_search(at, -plain)
 
-    def _along(self, at: Point, direction: Positions) -> bool:
-        found = search(self._step, at, direction)
+    def _line_search(self, at: DescentPoint, direction: Positions) -> bool:
+        found = backtracking_line_search(self._step, at, direction)
         self.positions = found.positions if found else at.positions
         return found is not None
 
 
-def _matrix(blocks: list[PairBlocks], n: int) -> csr_array:
+def _assemble_contact_matrix(blocks: list[PairBlocks], n: int) -> csr_array:
     """Return W (3n, 3n), without vertices that do not move."""
     at: NDArray[np.int64] = np.concatenate([one.vertices for one in blocks])
     values = np.concatenate([one.values for one in blocks])

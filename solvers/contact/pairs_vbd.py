@@ -24,20 +24,20 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.contact.energy import Planes
+from solvers.contact.energy import ContactPlanes
 from solvers.core.bounds import PairBlocks
-from solvers.core.descent import Point, search
-from solvers.core.driver import Iterating
+from solvers.core.descent import DescentPoint, backtracking_line_search
+from solvers.core.driver import SolverState
 from solvers.core.objective import StepObjective
 from solvers.problem import Positions
 
-Array = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
-LEAST = 1e-6
+MIN_STIFFNESS_RATIO = 1e-6
 """Stiffness added in every direction, relative to the majorant of a vertex."""
 
 
-class Separable(NamedTuple):
+class SeparableModel(NamedTuple):
     """Separable contact model at a point.
 
     Attributes:
@@ -48,39 +48,41 @@ class Separable(NamedTuple):
 
     vertices: NDArray[np.int64]
     gradient: Positions
-    block: Array
+    diagonal_blocks: FloatArray
 
-    def planes(self, p: Positions, held: Array) -> Planes:
+    def to_contact_planes(self, p: Positions, majorant: FloatArray) -> ContactPlanes:
         """Express the model as two-sided planes normal to three axes per vertex.
 
         Args:
             p: positions of the model (n, 3) [m].
             majorant: stiffness of each vertex without contact (n,) [N/m].
         """
-        curve, axes = np.linalg.eigh(self.block)
-        k = np.maximum(curve, 0.0) + LEAST * held[self.vertices, None]
+        curve, axes = np.linalg.eigh(self.diagonal_blocks)
+        k = np.maximum(curve, 0.0) + MIN_STIFFNESS_RATIO * majorant[self.vertices, None]
         normal = np.swapaxes(axes, 1, 2)
         offset = np.einsum("vai,vi->va", normal, p[self.vertices]) - np.einsum("vai,vi->va", normal, self.gradient) / k
         normal, none = normal.reshape(-1, 3), np.zeros(k.size)
-        return Planes(np.repeat(self.vertices, 3), normal, offset.ravel(), np.zeros_like(normal), k.ravel(), none)
+        return ContactPlanes(
+            np.repeat(self.vertices, 3), normal, offset.ravel(), np.zeros_like(normal), k.ravel(), none
+        )
 
 
-class Sweeps(Protocol):
+class VbdSweeps(Protocol):
     """Vertex block descent sweeps of one step."""
 
-    def alone(self, p: Positions) -> Positions:
+    def sweep_without_contact(self, p: Positions) -> Positions:
         """Return the positions after a sweep from p without contact, (n, 3) each.
 
         Chebyshev extrapolation uses the preceding sweeps since the last `sweep_with_planes`.
         """
         ...
 
-    def pushed(self, p: Positions, planes: Planes) -> Positions:
+    def sweep_with_planes(self, p: Positions, planes: ContactPlanes) -> Positions:
         """Return the positions after a sweep from p with contact planes, without extrapolation."""
         ...
 
 
-class Guarded(Iterating):
+class BarrierVbdState(SolverState):
     """Iteration state of VBD with barriers.
 
     majorant (n,) [N/m]: of all energies but contact; compute_residual: returns the residual of positions.
@@ -88,45 +90,47 @@ class Guarded(Iterating):
 
     def __init__(
         self,
-        sweeps: Sweeps,
+        sweeps: VbdSweeps,
         step: StepObjective,
-        guess: Positions,
-        majorant: Array,
+        initial_guess: Positions,
+        majorant: FloatArray,
         radius: float,
-        gauge: Callable[[Positions], float],
+        compute_residual: Callable[[Positions], float],
     ) -> None:
-        self._sweeps, self._step, self._majorant, self._gauge = sweeps, step, majorant, gauge
+        self._sweeps, self._step, self._majorant, self._compute_residual = sweeps, step, majorant, compute_residual
         self._squared, self._factor = radius**2, 0.0
-        self.positions = step.placed(guess)
-        self._older = self.positions
+        self.positions = step.apply_exact_pins(initial_guess)
+        self._previous_positions = self.positions
 
     def residual(self) -> float:
         """Return the residual of the current positions."""
-        return self._gauge(self.positions)
+        return self._compute_residual(self.positions)
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         """Perform one iteration."""
-        p, blocks = self.positions, self._blocks(self.positions)
+        p, blocks = self.positions, self._active_blocks(self.positions)
         if not blocks:
-            q = self._sweeps.alone(p)
-            if self._step.reach(p, q - p) == 1.0 and not self._blocks(q):
-                self.positions, self._older, self._factor = q, p, 0.0
+            q = self._sweeps.sweep_without_contact(p)
+            if self._step.max_step_size(p, q - p) == 1.0 and not self._active_blocks(q):
+                self.positions, self._previous_positions, self._factor = q, p, 0.0
                 return True
-        at, model = Point(p, self._step.gradient(p)), self._model(p, blocks)
-        q = self._sweeps.pushed(p, model.planes(p, self._majorant))
-        found = search(self._step, at, q - p) or search(self._step, at, self._each(at.gradient, model))
+        at, model = DescentPoint(p, self._step.gradient(p)), self._build_model(p, blocks)
+        q = self._sweeps.sweep_with_planes(p, model.to_contact_planes(p, self._majorant))
+        found = backtracking_line_search(self._step, at, q - p) or backtracking_line_search(
+            self._step, at, self._vertex_newton_steps(at.gradient, model)
+        )
         if found is None:
             return False
-        self.positions, self._older = self._further(found.positions), p
+        self.positions, self._previous_positions = self._extrapolate(found.positions), p
         return True
 
-    def _blocks(self, p: Positions) -> list[PairBlocks]:
-        found = (energy.blocks(p, 0.0) for energy in self._step.bounded)
+    def _active_blocks(self, p: Positions) -> list[PairBlocks]:
+        found = (energy.hessian_blocks(p, 0.0) for energy in self._step.barrier_energies)
         return [blocks for blocks in found if len(blocks.vertices)]
 
-    def _model(self, p: Positions, blocks: list[PairBlocks]) -> Separable:
+    def _build_model(self, p: Positions, blocks: list[PairBlocks]) -> SeparableModel:
         gradient, total, known = np.zeros_like(p), np.zeros((len(p), 3, 3)), np.zeros(len(p), bool)
-        for energy in self._step.bounded:
+        for energy in self._step.barrier_energies:
             energy.add_gradient(p, gradient)
         for one in blocks:
             k = one.vertices.shape[1]
@@ -135,15 +139,15 @@ class Guarded(Iterating):
             np.add.at(total, one.vertices[moves], k * own[moves])
             known[one.vertices[moves]] = True
         vertices = np.flatnonzero(known)
-        return Separable(vertices, gradient[vertices], total[vertices])
+        return SeparableModel(vertices, gradient[vertices], total[vertices])
 
-    def _each(self, gradient: Positions, model: Separable) -> Positions:
+    def _vertex_newton_steps(self, gradient: Positions, model: SeparableModel) -> Positions:
         """Return the Newton direction of each vertex with its own block."""
         block = self._majorant[:, None, None] * np.eye(3)
-        block[model.vertices] += model.block
+        block[model.vertices] += model.diagonal_blocks
         return np.asarray(-np.linalg.solve(block, gradient[:, :, None])[:, :, 0], np.float64)
 
-    def _further(self, q: Positions) -> Positions:
+    def _extrapolate(self, q: Positions) -> Positions:
         """Extrapolate q from the previous start if that is collision-free and does not increase the objective."""
         if not self._squared:
             return q
@@ -151,8 +155,8 @@ class Guarded(Iterating):
         w = 4.0 / (4.0 - self._squared * before) if before > 1.0 else 2.0 / (2.0 - self._squared) if before else 1.0
         self._factor = w
         if w > 1.0:
-            way = self._step.placed(self._older + w * (q - self._older)) - q
-            if self._step.reach(q, way) == 1.0 and self._step.rise(q, q + way)[0] <= 0.0:
+            way = self._step.apply_exact_pins(self._previous_positions + w * (q - self._previous_positions)) - q
+            if self._step.max_step_size(q, way) == 1.0 and self._step.objective_change(q, q + way)[0] <= 0.0:
                 return q + way
             self._factor = 0.0
         return q

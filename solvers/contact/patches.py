@@ -15,37 +15,37 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import kernel
+from solvers.compiling import jit_kernel
 from solvers.contact import affine, flat, trees, ways
-from solvers.contact.affine import Lie, Rest
-from solvers.contact.barrier import distances
-from solvers.contact.boxes import Gaps, Indices, Limits
-from solvers.contact.contacts import Pairs, pad
-from solvers.contact.flat import Beside, Sight
-from solvers.contact.owned import Owned, among
-from solvers.contact.trees import Tree
-from solvers.contact.ways import unevenness
+from solvers.contact.affine import ClusterPose, RestClusters
+from solvers.contact.barrier import compute_distances
+from solvers.contact.boxes import ClearanceBounds, CollisionQuery, IndexArray
+from solvers.contact.contacts import Candidates, copy_padded
+from solvers.contact.flat import ClusterPairs, ProjectionBasis
+from solvers.contact.owned import ClusterPrimitives, cluster_candidates
+from solvers.contact.trees import BVH
+from solvers.contact.ways import max_relative_displacement
 from solvers.problem import Positions
 
-Array = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
-_PATCH = 16
+_CLUSTER_SIZE = 16
 """Vertices of a cluster, in addition to those of its neighbours that its primitives have."""
 
-_WIDER = 1.5
+_QUERY_INFLATION = 1.5
 """Query distance relative to the required one: a larger clearance stays valid for longer."""
 
-_FAR = 4.0
+_REMOTE_INFLATION = 4.0
 """Factor on that distance for clusters not close at rest, tried first."""
 
-_SAME = 1e-12
+_POSITION_TOLERANCE = 1e-12
 """Tolerance, relative to the query distance, within which two positions count as the same."""
 
-_FEW = 4096
+_MAX_PRIMITIVE_PAIRS = 4096
 """Maximum number of primitive pairs; beyond it, some pair is assumed to come close."""
 
 
-class Scratch(NamedTuple):
+class CullingScratch(NamedTuple):
     """Scratch memory of a query.
 
     Attributes:
@@ -59,20 +59,20 @@ class Scratch(NamedTuple):
         displacement_min, displacement_max: boxes of the displacements of each cluster (m, 4).
     """
 
-    tile: Array
-    stack: Indices
-    sight: Sight
-    doubtful: Indices
-    here: Array
-    there: Array
-    found: Indices
-    way: Array
-    low: Array
-    high: Array
+    tile: FloatArray
+    stack: IndexArray
+    projection: ProjectionBasis
+    unresolved_pairs: IndexArray
+    start_aabbs: FloatArray
+    end_aabbs: FloatArray
+    primitive_pairs: IndexArray
+    displacement: FloatArray
+    displacement_min: FloatArray
+    displacement_max: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class Patches:
+class ClusterCulling:
     """Clusters of a surface.
 
     Attributes:
@@ -88,21 +88,23 @@ class Patches:
         is_dense: whether too many clusters are close at rest, as in a stack of sheets, for culling to be useful.
     """
 
-    rest: Rest
-    tree: Tree
-    points: Owned
-    edges: Owned
-    triangles: Owned
-    looked: float
-    pairs: Beside
-    scratch: Scratch
-    starts: Indices
-    seen: list[_Seen] = field(default_factory=list["_Seen"])
-    apart: list[tuple[Positions, float]] = field(default_factory=list[tuple[Positions, float]])
-    crowded: bool = False
+    rest_clusters: RestClusters
+    bvh: BVH
+    points: ClusterPrimitives
+    edges: ClusterPrimitives
+    triangles: ClusterPrimitives
+    rest_query_distance: float
+    cluster_pairs: ClusterPairs
+    scratch: CullingScratch
+    pair_starts: IndexArray
+    recent_poses: list[_ClusterSnapshot] = field(default_factory=list["_ClusterSnapshot"])
+    remote_clearances: list[tuple[Positions, float]] = field(default_factory=list[tuple[Positions, float]])
+    is_dense: bool = False
 
     @classmethod
-    def of(cls, rest: Positions, points: Tree, edges: Tree, triangles: Tree, looked: float) -> Patches:
+    def from_rest_shape(
+        cls, rest: Positions, points: BVH, edges: BVH, triangles: BVH, rest_query_distance: float
+    ) -> ClusterCulling:
         """Divide a rest shape into clusters.
 
         Args:
@@ -110,34 +112,42 @@ class Patches:
             points, edges, triangles: trees over the primitives.
             rest_query_distance: distance up to which cluster pairs count as close at rest [m].
         """
-        many = max(1, -(-len(points.corners) // _PATCH))
+        many = max(1, -(-len(points.primitives) // _CLUSTER_SIZE))
         rank = np.zeros(len(rest), np.int64)
-        rank[points.corners[:, 0]] = np.arange(len(points.corners)) // _PATCH
+        rank[points.primitives[:, 0]] = np.arange(len(points.primitives)) // _CLUSTER_SIZE
         owned = (
-            Owned.of(points.corners, rank, many),
-            Owned.of(edges.corners, rank, many),
-            Owned.of(triangles.corners, rank, many),
+            ClusterPrimitives.from_primitives(points.primitives, rank, many),
+            ClusterPrimitives.from_primitives(edges.primitives, rank, many),
+            ClusterPrimitives.from_primitives(triangles.primitives, rank, many),
         )
-        at_rest = affine.rest(rest, np.concatenate([one.members() for one in owned]), many)
-        tree, most = Tree.over(many), max(int(np.diff(one.starts).max()) for one in owned)
+        at_rest = affine.build_rest_clusters(rest, np.concatenate([one.cluster_vertices() for one in owned]), many)
+        tree, most = BVH.from_count(many), max(int(np.diff(one.cluster_starts).max()) for one in owned)
         room, eights = 24 * many + 8, -(-most // 8) + -(-most // 64) + 1
         patches = len(at_rest.centre)
-        scratch = Scratch(
+        scratch = CullingScratch(
             tile=np.empty((3 * at_rest.vertices.shape[1], 8)),
-            stack=trees.stack(),
-            sight=Sight.room(patches),
-            doubtful=np.empty((room, 2), np.int64),
-            here=np.empty((eights, 6, 8)),
-            there=np.empty((eights, 6, 8)),
-            found=np.empty((_FEW, 4), np.int64),
-            way=np.empty((len(rest), 4)),
-            low=np.empty((patches, 4)),
-            high=np.empty((patches, 4)),
+            stack=trees.allocate_traversal_stack(),
+            projection=ProjectionBasis.allocate_basis(patches),
+            unresolved_pairs=np.empty((room, 2), np.int64),
+            start_aabbs=np.empty((eights, 6, 8)),
+            end_aabbs=np.empty((eights, 6, 8)),
+            primitive_pairs=np.empty((_MAX_PRIMITIVE_PAIRS, 4), np.int64),
+            displacement=np.empty((len(rest), 4)),
+            displacement_min=np.empty((patches, 4)),
+            displacement_max=np.empty((patches, 4)),
         )
-        made = cls(at_rest, tree, *owned, looked, Beside.room(room), scratch, np.zeros(many + 1, np.int64))
-        return made._knowing(rest)
+        made = cls(
+            at_rest,
+            tree,
+            *owned,
+            rest_query_distance,
+            ClusterPairs.allocate_pairs(room),
+            scratch,
+            np.zeros(many + 1, np.int64),
+        )
+        return made._with_rest_pairs(rest)
 
-    def clear(self, p: Positions, q: Positions, limits: Limits) -> Gaps | None:
+    def compute_clearance_bounds(self, p: Positions, q: Positions, query: CollisionQuery) -> ClearanceBounds | None:
         """Return clearance bounds at q of primitives without common vertices, if the motion violates no limit.
 
         Args:
@@ -148,47 +158,57 @@ class Patches:
         Returns:
             Clearance bounds; None if the test is inconclusive.
         """
-        if self.crowded:
+        if self.is_dense:
             return None
-        limits = limits._replace(moved=unevenness(p, q))
-        begin, end, memory = self._lies(p, limits), self._lies(q, limits), self.scratch
-        wide = limits._replace(reach=_WIDER * limits.reach)
-        far, others = self._far(p, q, limits), 0
+        query = query._replace(max_displacement=max_relative_displacement(p, q))
+        begin, end, memory = self._fit_clusters(p, query), self._fit_clusters(q, query), self.scratch
+        wide = query._replace(inflation_radius=_QUERY_INFLATION * query.inflation_radius)
+        far, others = self._known_remote_clearance(p, q, query), 0
         if not far:
-            for far in (_FAR * wide.reach, wide.reach):
-                others = self._met(begin, end, limits._replace(reach=far))
+            for far in (_REMOTE_INFLATION * wide.inflation_radius, wide.inflation_radius):
+                others = self._find_cluster_pairs(begin, end, query._replace(inflation_radius=far))
                 if not others:
-                    self.apart[:] = [(q.copy(), far)]
+                    self.remote_clearances[:] = [(q.copy(), far)]
                     break
             if others < 0:
                 return None
-        count = self.known + others
-        count, near = flat.doubtful(
-            begin.lie, end.lie, self.pairs, count, limits, wide.reach, memory.sight, memory.tile, memory.doubtful
+        count = self.num_rest_pairs + others
+        count, near = flat.unresolved_cluster_pairs(
+            begin.pose,
+            end.pose,
+            self.cluster_pairs,
+            count,
+            query,
+            wide.inflation_radius,
+            memory.projection,
+            memory.tile,
+            memory.unresolved_pairs,
         )
         if count:
-            pairs = self._pairs(memory.doubtful[:count], begin.x, end.x, wide)
+            pairs = self._find_primitive_pairs(memory.unresolved_pairs[:count], begin.positions, end.positions, wide)
             if pairs is None:
                 return None
-            pairs, scratch = pairs._replace(thickness=limits.reach), ways.scratch()
-            np.subtract(end.x, begin.x, out=memory.way)
-            if ways.largest(pairs, begin.x, memory.way, 1.0, *scratch) < 1.0:
+            pairs, scratch = pairs._replace(min_distance=query.inflation_radius), ways.allocate_ccd_scratch()
+            np.subtract(end.positions, begin.positions, out=memory.displacement)
+            if ways.collision_free_step_size(pairs, begin.positions, memory.displacement, 1.0, *scratch) < 1.0:
                 return None
-            near = min(near, float(distances(pairs, q).min(initial=wide.reach)))
-        return Gaps(near, near if others else far)
+            near = min(near, float(compute_distances(pairs, q).min(initial=wide.inflation_radius)))
+        return ClearanceBounds(near, near if others else far)
 
-    def _far(self, p: Positions, q: Positions, limits: Limits) -> float:
+    def _known_remote_clearance(self, p: Positions, q: Positions, query: CollisionQuery) -> float:
         """Return the known clearance [m] at q of clusters not close at rest.
 
         The result is 0 unless the known clearances prove that the motion from p to q violates no limit.
         """
-        for at, far in self.apart:
-            before, after = unevenness(at, p), unevenness(at, q)
-            if max(limits.reach, limits.closed + limits.share * (far + before)) <= far - max(before, after):
+        for at, far in self.remote_clearances:
+            before, after = max_relative_displacement(at, p), max_relative_displacement(at, q)
+            if max(
+                query.inflation_radius, query.min_distance + query.relative_min_distance * (far + before)
+            ) <= far - max(before, after):
                 return far - after
         return 0.0
 
-    def unevenness(self, p: Positions, q: Positions) -> float:
+    def max_relative_displacement(self, p: Positions, q: Positions) -> float:
         """Return the largest relative displacement of two vertices of clusters that are close at rest.
 
         Args:
@@ -199,91 +219,111 @@ class Patches:
             Upper bound [m].
         """
         memory = self.scratch
-        return affine.spread(
-            self.rest.vertices, self.pairs.patches, self.known, p, q, memory.way, memory.tile, memory.low, memory.high
+        return affine.max_cluster_displacement(
+            self.rest_clusters.vertices,
+            self.cluster_pairs.clusters,
+            self.num_rest_pairs,
+            p,
+            q,
+            memory.displacement,
+            memory.tile,
+            memory.displacement_min,
+            memory.displacement_max,
         )
 
-    def _lies(self, p: Positions, limits: Limits) -> _Seen:
-        for k, one in enumerate(self.seen):
-            if ways.alike(one.x, p, _SAME * limits.reach):
-                self.seen.append(self.seen.pop(k))  # the other one is the first to be overwritten
+    def _fit_clusters(self, p: Positions, query: CollisionQuery) -> _ClusterSnapshot:
+        for k, one in enumerate(self.recent_poses):
+            if ways.is_rigid_translation(one.positions, p, _POSITION_TOLERANCE * query.inflation_radius):
+                self.recent_poses.append(self.recent_poses.pop(k))  # the other one is the first to be overwritten
                 return one
-        one = self.seen.pop(0) if len(self.seen) > 1 else _Seen.of(self.rest, self.tree, len(p))
-        pad(p, one.x)
-        leaf = self.tree.nodes - len(self.rest.centre) // 8
-        affine.lie(self.rest, one.x, leaf, one.boxes, self.scratch.tile, one.lie)
-        self.seen.append(one)
+        one = (
+            self.recent_poses.pop(0)
+            if len(self.recent_poses) > 1
+            else _ClusterSnapshot.allocate_snapshot(self.rest_clusters, self.bvh, len(p))
+        )
+        copy_padded(p, one.positions)
+        leaf = self.bvh.num_nodes - len(self.rest_clusters.centre) // 8
+        affine.fit_affine(self.rest_clusters, one.positions, leaf, one.aabbs, self.scratch.tile, one.pose)
+        self.recent_poses.append(one)
         return one
 
-    def _met(self, begin: _Seen, end: _Seen, limits: Limits) -> int:
+    def _find_cluster_pairs(self, begin: _ClusterSnapshot, end: _ClusterSnapshot, query: CollisionQuery) -> int:
         """Find cluster pairs to test in addition to those close at rest; return their number, -1 if out of memory."""
-        known, pairs = self.known, self.pairs
-        here, there = begin.boxes, end.boxes
+        known, pairs = self.num_rest_pairs, self.cluster_pairs
+        here, there = begin.aabbs, end.aabbs
         for around in (here, there):
-            trees.lift(around, len(self.tree.corners))
-        many = trees.look(
-            self.tree, self.tree, (here, here), (there, there), limits, True, self.scratch.stack, pairs.patches[known:]
+            trees.propagate_bounds(around, len(self.bvh.primitives))
+        many = trees.traverse_trees(
+            self.bvh, self.bvh, (here, here), (there, there), query, True, self.scratch.stack, pairs.clusters[known:]
         )
-        if known + many > len(pairs.patches):
+        if known + many > len(pairs.clusters):
             return -1
-        count = strange(pairs.patches, self.starts, many)
-        pairs.apart[known : known + count] = self.looked
-        flat.relate(self.rest, known, known + count, pairs)
+        count = keep_new_pairs(pairs.clusters, self.pair_starts, many)
+        pairs.rest_distance[known : known + count] = self.rest_query_distance
+        flat.compute_rest_relations(self.rest_clusters, known, known + count, pairs)
         return count
 
-    def _pairs(self, patches: Indices, x: Array, y: Array, limits: Limits) -> Pairs | None:
+    def _find_primitive_pairs(
+        self, patches: IndexArray, x: FloatArray, y: FloatArray, query: CollisionQuery
+    ) -> Candidates | None:
         """Return the primitive pairs of cluster pairs (k, 2) whose boxes may violate the limits; None if too many."""
         memory = self.scratch
         owned = self.points, self.edges, self.triangles
-        first, many = among(owned, patches, x, y, limits, memory.here, memory.there, memory.found)
-        if many > len(memory.found):
+        first, many = cluster_candidates(
+            owned, patches, x, y, query, memory.start_aabbs, memory.end_aabbs, memory.primitive_pairs
+        )
+        if many > len(memory.primitive_pairs):
             return None
         nothing = np.empty(0)
-        return Pairs(memory.found[:many], first, np.ones(many), nothing, nothing, limits.reach, 0.0)
+        return Candidates(
+            memory.primitive_pairs[:many], first, np.ones(many), nothing, nothing, query.inflation_radius, 0.0
+        )
 
-    def _knowing(self, rest: Positions) -> Patches:
+    def _with_rest_pairs(self, rest: Positions) -> ClusterCulling:
         """Return the clusters with the pairs that are close at rest (n, 3)."""
-        limits = Limits(self.looked, self.looked, 0.0, 0.0)
-        many, at, pairs = len(self.tree.corners), self._lies(rest, limits), self.pairs
-        others = self._met(at, at, limits)
-        if not 0 <= others <= len(pairs.patches) // 2:
-            return replace(self, seen=[], crowded=True)
+        limits = CollisionQuery(self.rest_query_distance, self.rest_query_distance, 0.0, 0.0)
+        many, at, pairs = len(self.bvh.primitives), self._fit_clusters(rest, limits), self.cluster_pairs
+        others = self._find_cluster_pairs(at, at, limits)
+        if not 0 <= others <= len(pairs.clusters) // 2:
+            return replace(self, recent_poses=[], is_dense=True)
         each = np.arange(many)
-        met = np.concatenate([np.column_stack([each, each]), pairs.patches[:others]])
+        met = np.concatenate([np.column_stack([each, each]), pairs.clusters[:others]])
         known = len(met)
-        pairs.patches[:known] = met[np.lexsort((met[:, 1], met[:, 0]))]
+        pairs.clusters[:known] = met[np.lexsort((met[:, 1], met[:, 0]))]
         for k in range(known):
-            near = self._pairs(pairs.patches[k : k + 1], at.x, at.x, limits)
-            pairs.apart[k] = distances(near, rest).min(initial=self.looked) if near else 0.0
-        flat.relate(self.rest, 0, known, pairs)
-        starts = np.searchsorted(pairs.patches[:known, 0], np.arange(many + 1))
-        return replace(self, starts=starts, seen=[])
+            near = self._find_primitive_pairs(pairs.clusters[k : k + 1], at.positions, at.positions, limits)
+            pairs.rest_distance[k] = (
+                compute_distances(near, rest).min(initial=self.rest_query_distance) if near else 0.0
+            )
+        flat.compute_rest_relations(self.rest_clusters, 0, known, pairs)
+        starts = np.searchsorted(pairs.clusters[:known, 0], np.arange(many + 1))
+        return replace(self, pair_starts=starts, recent_poses=[])
 
     @property
-    def known(self) -> int:
+    def num_rest_pairs(self) -> int:
         """Number of cluster pairs that are close at rest."""
-        return int(self.starts[-1])
+        return int(self.pair_starts[-1])
 
 
-class _Seen(NamedTuple):
+class _ClusterSnapshot(NamedTuple):
     """Poses and bounding boxes of clusters at x (n, 4), padded positions."""
 
-    x: Array
-    lie: Lie
-    boxes: Array
+    positions: FloatArray
+    pose: ClusterPose
+    aabbs: FloatArray
 
     @classmethod
-    def of(cls, rest: Rest, tree: Tree, vertices: int) -> _Seen:
+    def allocate_snapshot(cls, rest: RestClusters, tree: BVH, vertices: int) -> _ClusterSnapshot:
         """Allocate a snapshot."""
         many = len(rest.centre)
-        around = np.empty((tree.nodes, 6, 8))
+        around = np.empty((tree.num_nodes, 6, 8))
         around[:, :3], around[:, 3:] = np.inf, -np.inf
-        lies = Lie(*(np.zeros((many, 4)) for _ in Lie._fields))
+        lies = ClusterPose(*(np.zeros((many, 4)) for _ in ClusterPose._fields))
         return cls(np.empty((vertices, 4)), lies, around)
 
 
-@kernel
-def strange(pairs, starts, many):
+@jit_kernel
+def keep_new_pairs(pairs, starts, num_new_pairs):
     """Remove the last pairs that are close at rest, which are stored already, and compact the others.
 
     Args:
@@ -296,7 +336,7 @@ def strange(pairs, starts, many):
     """
     known = starts[-1]
     count = known
-    for e in range(known, known + many):
+    for e in range(known, known + num_new_pairs):
         a, b = pairs[e, 0], pairs[e, 1]
         new = True
         for k in range(starts[a], starts[a + 1]):

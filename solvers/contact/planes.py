@@ -16,14 +16,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kernel
+from solvers.compiling import jit_inner, jit_kernel
 
-_ITERATIONS = 40
-_CONTACT = 1e-6
+_MAX_ITERATIONS = 40
+_CONTACT_TOLERANCE = 1e-6
 """Tolerance relative to R within which a vertex has reached the obstacle."""
 
 
-class Rounded(NamedTuple):
+class RoundedBox(NamedTuple):
     """A box from low to high (3,) [m], rounded by a radius R [m]."""
 
     low: NDArray[np.float64]
@@ -31,7 +31,7 @@ class Rounded(NamedTuple):
     radius: float
 
 
-class HalfSpaces(NamedTuple):
+class SeparatingPlanes(NamedTuple):
     """Half-spaces n.x >= d in world coordinates at the step's end.
 
     Attributes:
@@ -44,11 +44,11 @@ class HalfSpaces(NamedTuple):
     vertices: NDArray[np.int64]
     normal: NDArray[np.float64]
     offset: NDArray[np.float64]
-    carried: NDArray[np.float64]
+    comoving_position: NDArray[np.float64]
 
 
-@kernel
-def near(p, v, dt, frames, low, high, out):
+@jit_kernel
+def find_nearby_obstacles(p, v, dt, frames, low, high, out):
     """Find which obstacles any vertex could reach, by the bounding box of all vertices.
 
     Args:
@@ -72,15 +72,15 @@ def near(p, v, dt, frames, low, high, out):
     for k in range(len(out)):
         out[k] = True
         for c in range(3):
-            begin, end = _extent(frames[k, 0], c, x0, x1, x2, y0, y1, y2)
-            other, last = _extent(frames[k, 1], c, x0, x1, x2, y0, y1, y2)  # less than `way` from where they end
+            begin, end = _project_box(frames[k, 0], c, x0, x1, x2, y0, y1, y2)
+            other, last = _project_box(frames[k, 1], c, x0, x1, x2, y0, y1, y2)  # less than `way` from where they end
             out[k] &= min(begin, other - way) <= high[k, c] + way and max(end, last + way) >= low[k, c] - way
         found = way if out[k] else found
     return found
 
 
-@inner
-def _extent(frame, c, x0, x1, x2, y0, y1, y2):
+@jit_inner
+def _project_box(frame, c, x0, x1, x2, y0, y1, y2):
     """Return the smallest and largest coordinate c, in a frame, of the box from x to y."""
     e0, e1, e2, o = frame[1 + c, 0], frame[1 + c, 1], frame[1 + c, 2], frame[0]
     middle = e0 * (0.5 * (x0 + y0) - o[0]) + e1 * (0.5 * (x1 + y1) - o[1]) + e2 * (0.5 * (x2 + y2) - o[2])
@@ -88,8 +88,8 @@ def _extent(frame, c, x0, x1, x2, y0, y1, y2):
     return middle - half, middle + half
 
 
-@kernel
-def planes(p, v, dt, frames, obstacle, margin, out, work):
+@jit_kernel
+def build_separating_planes(p, v, dt, frames, obstacle, margin, out, work):
     """Write the half-spaces of the vertices that may reach one obstacle to the first k rows of `out`.
 
     Args:
@@ -107,14 +107,14 @@ def planes(p, v, dt, frames, obstacle, margin, out, work):
     """
     count = 0
     for i in range(len(p)):
-        if plane(p, v, i, dt, frames, obstacle, margin, out, count, work):
+        if write_separating_plane(p, v, i, dt, frames, obstacle, margin, out, count, work):
             out.vertices[count] = i
             count += 1
     return count
 
 
-@inner
-def plane(p, v, i, dt, frames, obstacle, margin, out, at, work):
+@jit_inner
+def write_separating_plane(p, v, i, dt, frames, obstacle, margin, out, row_index, work):
     """Return whether vertex i may reach an obstacle; if so, write its half-space to row `row_index` of `out`."""
     _, normal, offset, carried = out
     a, b, x, c, n = work[0], work[1], work[2], work[3], work[4]
@@ -125,31 +125,31 @@ def plane(p, v, i, dt, frames, obstacle, margin, out, at, work):
             a[k] += first[1 + k, j] * (p[i, j] - first[0, j])
             b[k] += second[1 + k, j] * (p[i, j] + dt * v[i, j] - second[0, j])
         way += (b[k] - a[k]) ** 2
-    far = _nearest(a, obstacle, c, n)
+    far = _closest_box_point(a, obstacle, c, n)
     if not far <= obstacle.radius + margin + 2.0 * np.sqrt(way):
         return False
-    _separate(a, b, obstacle, far, x, c, n)
-    offset[at] = obstacle.radius
+    _find_separating_plane(a, b, obstacle, far, x, c, n)
+    offset[row_index] = obstacle.radius
     for j in range(3):
-        normal[at, j], carried[at, j] = 0.0, second[0, j]
+        normal[row_index, j], carried[row_index, j] = 0.0, second[0, j]
         for k in range(3):
-            normal[at, j] += n[k] * second[1 + k, j]
-            carried[at, j] += a[k] * second[1 + k, j]
+            normal[row_index, j] += n[k] * second[1 + k, j]
+            carried[row_index, j] += a[k] * second[1 + k, j]
     for k in range(3):
-        offset[at] += n[k] * c[k] + normal[at, k] * second[0, k]
+        offset[row_index] += n[k] * c[k] + normal[row_index, k] * second[0, k]
     return True
 
 
-@inner
-def _separate(a, b, obstacle, far, x, c, n):
+@jit_inner
+def _find_separating_plane(a, b, obstacle, far, x, c, n):
     """Find the separating plane by Newton's method along the line from a to b.
 
     c and n, the closest point and the normal, are those of a on entry and those of the half-space on return; x:
     scratch.
     """
-    begin, end, slope, radius = 0.0, np.inf, _slope(a, b, n), obstacle.radius
-    for _ in range(_ITERATIONS):
-        if far <= (1.0 + _CONTACT) * radius or slope >= 0.0:
+    begin, end, slope, radius = 0.0, np.inf, _directional_derivative(a, b, n), obstacle.radius
+    for _ in range(_MAX_ITERATIONS):
+        if far <= (1.0 + _CONTACT_TOLERANCE) * radius or slope >= 0.0:
             break
         s = begin - (far - radius) / slope
         if s >= 1.0:
@@ -158,24 +158,24 @@ def _separate(a, b, obstacle, far, x, c, n):
             s = 0.5 * (begin + end)
         for k in range(3):
             x[k] = a[k] + s * (b[k] - a[k])
-        there = _nearest(x, obstacle, c, n)
-        steep = _slope(a, b, n)
+        there = _closest_box_point(x, obstacle, c, n)
+        steep = _directional_derivative(a, b, n)
         if steep < 0.0:
             begin, far, slope = s, there, steep
         else:  # past the nearest point of the way: the obstacle is not met
             end = s
     for k in range(3):
         x[k] = a[k] + begin * (b[k] - a[k])
-    _nearest(x, obstacle, c, n)
+    _closest_box_point(x, obstacle, c, n)
 
 
-@inner
-def _slope(a, b, n):
+@jit_inner
+def _directional_derivative(a, b, n):
     return n[0] * (b[0] - a[0]) + n[1] * (b[1] - a[1]) + n[2] * (b[2] - a[2])
 
 
-@inner
-def _nearest(x, obstacle, c, n):
+@jit_inner
+def _closest_box_point(x, obstacle, c, n):
     """Return the signed distance of x from the box; write the closest surface point to c, and the normal to n."""
     low, high, _ = obstacle
     square, least, axis, side = 0.0, np.inf, 0, 1.0

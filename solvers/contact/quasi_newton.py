@@ -9,75 +9,81 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.contact.local_global import Corrections
-from solvers.contact.touching import ContactEnergy, ContactRows, touching
-from solvers.core.acceleration import Accelerating, Engine, Interpreted, Scheme
-from solvers.core.fixed_objective import Objective
+from solvers.contact.local_global import ContactCorrections
+from solvers.contact.touching import PenaltyRows, VertexContactEnergy, begin_active_contacts
+from solvers.core.acceleration import AcceleratedState, AccelerationEngine, AccelerationScheme, InterpretedState
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
 from solvers.core.prefactored import PreparedLocalGlobal
 from solvers.kernels import accelerate
 from solvers.problem import Positions, StepProblem, System
 
-_ALIKE = 2.0
+_MAX_WEIGHT_RATIO = 2.0
 """Factor up to which contact stiffnesses may differ for W to be reused."""
 
 
-class Touching:
+class ContactEngine:
     """Acceleration engine with vertex contact; contact_free: the engine used while no contact is active."""
 
-    def __init__(self, scheme: Scheme, system: System, base: PreparedLocalGlobal, idle: Engine) -> None:
-        self._scheme, self._base, self._idle = scheme, base, idle
-        self._objective, self._corrections = Objective(system), Corrections(base)
+    def __init__(
+        self, scheme: AccelerationScheme, system: System, base: PreparedLocalGlobal, contact_free: AccelerationEngine
+    ) -> None:
+        self._scheme, self._base, self._contact_free = scheme, base, contact_free
+        self._objective, self._corrections = FixedObjective(system), ContactCorrections(base)
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
         """Return the initial state of a step."""
-        contacts = touching(problem)
+        contacts = begin_active_contacts(problem)
         if not contacts:
-            return self._idle.begin(problem, guess)
+            return self._contact_free.init_state(problem, initial_guess)
         step = StepObjective(self._objective, problem)
-        return _Touching(self._base, self._scheme, step, guess, contacts, self._corrections)
+        return _ContactAcceleration(self._base, self._scheme, step, initial_guess, contacts, self._corrections)
 
 
-class _Touching(Interpreted):
+class _ContactAcceleration(InterpretedState):
     def __init__(
         self,
         base: PreparedLocalGlobal,
-        scheme: Scheme,
+        scheme: AccelerationScheme,
         step: StepObjective,
-        guess: Positions,
-        contacts: list[ContactEnergy],
-        corrections: Corrections,
+        initial_guess: Positions,
+        contacts: list[VertexContactEnergy],
+        corrections: ContactCorrections,
     ) -> None:
         self._contacts, self._corrections = contacts, corrections
-        self._rows: ContactRows | None = None
-        self._begun = True
-        super().__init__(base, scheme, step, guess)
+        self._rows: PenaltyRows | None = None
+        self._starts_window = True
+        super().__init__(base, scheme, step, initial_guess)
 
-    def _solved(self) -> NDArray[np.float64]:
+    def _solve_trial(self) -> NDArray[np.float64]:
         """Return the correction at the trial point, with the previous rows if they are compatible."""
-        super()._solved()
-        self._plain = -self._image
-        gradient, at = -self._there, (self._contacts, self._trial)
-        x, rows = self._corrections.around(*at, gradient, self._plain, cautious=True)
-        self._begun = self._rows is None or not _alike(self._rows, rows)
-        if self._begun or self._rows is None:
+        super()._solve_trial()
+        self._contact_free_correction = -self._trial_correction
+        gradient, at = -self._trial_descent, (self._contacts, self._trial_positions)
+        x, rows = self._corrections.solve_with_contact(*at, gradient, self._contact_free_correction, majorise=True)
+        self._starts_window = self._rows is None or not _are_rows_compatible(self._rows, rows)
+        if self._starts_window or self._rows is None:
             self._rows = rows
         else:
-            x = self._corrections.displacement(self._rows, gradient, self._plain)
-        self._image[:] = x
-        return self._image.ravel()
+            x = self._corrections.solve_with_rows(self._rows, gradient, self._contact_free_correction)
+        self._trial_correction[:] = x
+        return self._trial_correction.ravel()
 
-    def _accept(self) -> None:
-        correction = self._solved()
-        (accelerate.begin if self._begun else accelerate.accept)(self._window, correction)
+    def _accept_trial(self) -> None:
+        correction = self._solve_trial()
+        (accelerate.init_window if self._starts_window else accelerate.accept_trial)(self._window, correction)
 
     def residual(self) -> float:
         """Return the residual of the trial point."""
-        return self._corrections.residual(self._plain)
+        return self._corrections.residual_norm(self._contact_free_correction)
 
 
-def _alike(one: ContactRows, other: ContactRows) -> bool:
+def _are_rows_compatible(one: PenaltyRows, other: PenaltyRows) -> bool:
     """Return whether the rows of one point can be reused at another; rows with a gap belong to one point alone."""
     if not np.array_equal(one.vertices, other.vertices) or one.gap.any() or other.gap.any():
         return False
-    return bool((np.maximum(one.weight, other.weight) <= _ALIKE * np.minimum(one.weight, other.weight)).all())
+    return bool(
+        (
+            np.maximum(one.stiffness, other.stiffness) <= _MAX_WEIGHT_RATIO * np.minimum(one.stiffness, other.stiffness)
+        ).all()
+    )

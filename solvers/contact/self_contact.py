@@ -18,36 +18,41 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers.contact import barrier, contacts, known
-from solvers.contact.blocks import Blocks, Room
-from solvers.contact.contacts import Contacts, Pairs, padded
-from solvers.contact.curvature import add_curvature, coupled, curvature, moving
-from solvers.contact.friction_rounds import ROUNDS
-from solvers.contact.grip import NO_GRIP, Grip
-from solvers.contact.known import Kept, Surfaces
-from solvers.problem import Positions, Start
+from solvers.contact.blocks import PackedBlocks, ReusableBuffer
+from solvers.contact.contacts import Candidates, Collisions, pad_positions
+from solvers.contact.curvature import (
+    add_barrier_hessian,
+    build_hessian_blocks,
+    collect_block_vertices,
+    mask_static_vertices,
+)
+from solvers.contact.friction_rounds import MAX_FRICTION_ITERATIONS
+from solvers.contact.grip import NO_TANGENTIAL_COLLISIONS, TangentialCollisions
+from solvers.contact.known import CachedCandidates, CandidateSource
+from solvers.problem import Positions, StepStart
 
-Array = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
-_NEAR = 1.25
+_CANDIDATE_INFLATION = 1.25
 """Query radius relative to the activation distance: pairs this close may become active during a solve."""
 
 
-Place = Callable[[float], Positions]
-Carry = Callable[[float, float, Positions], list[Positions]]
+ObstacleMotion = Callable[[float], Positions]
+ComovingMap = Callable[[float, float, Positions], list[Positions]]
 
 
-class _Met(NamedTuple):
+class _CollisionState(NamedTuple):
     """Active collisions at p (n, 3), with energy [J] and gradient (n, 3) [N]; buffer: memory of the collisions."""
 
     p: Positions
-    contacts: Contacts
-    value: float
+    collisions: Collisions
+    energy: float
     gradient: Positions
-    space: Contacts
+    buffer: Collisions
 
 
 @dataclass(frozen=True, eq=False)
-class PairContact:
+class BarrierContact:
     """Barrier energy of primitive pairs, with lagged friction.
 
     Attributes:
@@ -61,65 +66,75 @@ class PairContact:
         tangential_collisions: friction of the current step.
     """
 
-    surface: Surfaces
+    collision_mesh: CandidateSource
     friction: float = 0.0
-    slip: float = 1e-3
-    friction_rounds: int = ROUNDS
-    kept: list[Kept] = field(default_factory=list[Kept])
-    met: list[_Met] = field(default_factory=list[_Met])
-    room: Room = field(default_factory=Room)
-    grip: Grip = NO_GRIP
+    eps_v: float = 1e-3
+    friction_iterations: int = MAX_FRICTION_ITERATIONS
+    candidate_caches: list[CachedCandidates] = field(default_factory=list[CachedCandidates])
+    recent_states: list[_CollisionState] = field(default_factory=list[_CollisionState])
+    block_buffer: ReusableBuffer = field(default_factory=ReusableBuffer)
+    tangential_collisions: TangentialCollisions = NO_TANGENTIAL_COLLISIONS
 
     @property
-    def range(self) -> float:
+    def activation_distance(self) -> float:
         """Distance [m] beyond which the barrier vanishes."""
-        return self.surface.thickness + self.surface.reach
+        return self.collision_mesh.min_distance + self.collision_mesh.dhat
 
-    def begin_step(self, start: Start) -> Self:
+    def begin_step(self, start: StepStart) -> Self:
         """Return the energy of a step; pairs active at `start.pressed` have friction."""
         if not self.friction:
             return self
-        begun = self.whole(start.positions)
-        grip = self._gripping(begun if start.pressed is None else self.whole(start.pressed), begun, start)
-        return self if grip is self.grip else replace(self, grip=grip)
+        begun = self.append_obstacle_positions(start.positions)
+        grip = self._build_tangential_collisions(
+            begun
+            if start.normal_force_positions is None
+            else self.append_obstacle_positions(start.normal_force_positions),
+            begun,
+            start,
+        )
+        return self if grip is self.tangential_collisions else replace(self, tangential_collisions=grip)
 
-    def _gripping(self, p: Positions, begun: Positions, start: Start) -> Grip:
+    def _build_tangential_collisions(
+        self, p: Positions, start_positions: Positions, start: StepStart
+    ) -> TangentialCollisions:
         """Build friction. p: all vertices where normal forces are evaluated; start_positions: at the step's start."""
-        if known.idle(self.surface, self.kept, p):
-            return NO_GRIP
-        return Grip.of(self._at(p).contacts, begun, self.friction, self.slip * (start.until - start.time))
+        if known.has_no_active_collisions(self.collision_mesh, self.candidate_caches, p):
+            return NO_TANGENTIAL_COLLISIONS
+        return TangentialCollisions.from_collisions(
+            self._state_at(p).collisions, start_positions, self.friction, self.eps_v * (start.stage_time - start.time)
+        )
 
-    def whole(self, p: Positions) -> Positions:
+    def append_obstacle_positions(self, p: Positions) -> Positions:
         """Return the positions of all vertices, those of the mesh (n, 3) first."""
         return p if p.flags.carray else np.array(p, order="C")
 
-    def toward(self, direction: Positions) -> Positions:
+    def append_obstacle_displacements(self, direction: Positions) -> Positions:
         """Return the displacements of all vertices, those of the mesh (n, 3) first."""
         return direction if direction.flags.carray else np.array(direction, order="C")
 
-    def pairs(self, p: Positions) -> Pairs:
+    def find_candidates(self, p: Positions) -> Candidates:
         """Return all pairs active at p, positions (N, 3) of all vertices, and possibly more."""
-        return known.pairs(self.surface, self.kept, p)
+        return known.find_candidates(self.collision_mesh, self.candidate_caches, p)
 
     def value(self, p: Positions) -> float:
         """Return the energy [J] at p (n, 3); infinite if a pair is closer than the minimum distance."""
-        p = self.whole(p)
-        if not known.idle(self.surface, self.kept, p):
+        p = self.append_obstacle_positions(p)
+        if not known.has_no_active_collisions(self.collision_mesh, self.candidate_caches, p):
             if not np.isfinite(p).all():
                 return np.inf
-            pressed = self._at(p).value
+            pressed = self._state_at(p).energy
         else:
             pressed = 0.0
-        return pressed + self.grip.value(p) if len(self.grip.vertices) else pressed
+        return pressed + self.tangential_collisions.value(p) if len(self.tangential_collisions.vertices) else pressed
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient [N] at p (n, 3) to `out` (n, 3)."""
-        n, p = len(p), self.whole(p)
-        if not known.idle(self.surface, self.kept, p):
+        n, p = len(p), self.append_obstacle_positions(p)
+        if not known.has_no_active_collisions(self.collision_mesh, self.candidate_caches, p):
             if not np.isfinite(p).all():
                 return
-            met = self._at(p)
-            if len(met.contacts.vertices):
+            met = self._state_at(p)
+            if len(met.collisions.vertices):
                 out += met.gradient[:n]
         friction = self.friction_gradient(p[:n])
         if friction is not None:
@@ -127,35 +142,47 @@ class PairContact:
 
     def friction_gradient(self, p: Positions) -> Positions | None:
         """Return the gradient of friction alone [N], (n, 3); None without contact."""
-        if not len(self.grip.vertices):
+        if not len(self.tangential_collisions.vertices):
             return None
-        n, p = len(p), self.whole(p)
+        n, p = len(p), self.append_obstacle_positions(p)
         out = np.zeros_like(p)
-        self.grip.add_gradient(p, out)
+        self.tangential_collisions.add_gradient(p, out)
         return out[:n]
 
-    def blocks(self, p: Positions, keep: float = 1.0) -> Blocks:
+    def hessian_blocks(self, p: Positions, negative_fraction: float = 1.0) -> PackedBlocks:
         """Return the Hessian blocks [N/m] of all active collisions.
 
         Args:
             p: positions (n, 3) [m].
             negative_fraction: fraction of the negative curvature to include; 0 gives positive semidefinite blocks.
         """
-        n, p = len(p), self.whole(p)
-        return curvature(self._at(p).contacts, self.grip, p, n, keep, self.room)
+        n, p = len(p), self.append_obstacle_positions(p)
+        return build_hessian_blocks(
+            self._state_at(p).collisions, self.tangential_collisions, p, n, negative_fraction, self.block_buffer
+        )
 
-    def coupled(self, p: Positions) -> NDArray[np.int64]:
+    def block_vertices(self, p: Positions) -> NDArray[np.int64]:
         """Return the vertices (a, 4) of all Hessian blocks at p (n, 3); -1 for none."""
-        return coupled(self._at(self.whole(p)).contacts, self.grip, len(p))
+        return collect_block_vertices(
+            self._state_at(self.append_obstacle_positions(p)).collisions, self.tangential_collisions, len(p)
+        )
 
-    def neighbours(self, p: Positions) -> NDArray[np.int64]:
+    def candidate_vertices(self, p: Positions) -> NDArray[np.int64]:
         """Return the vertices (k, 4) of pairs near p (n, 3); -1 for none.
 
         The result is independent of the caches.
         """
-        return moving(self.surface.within(self.whole(p), _NEAR * self.range).vertices, self.grip, len(p))
+        return mask_static_vertices(
+            self.collision_mesh.find_proximity_candidates(
+                self.append_obstacle_positions(p), _CANDIDATE_INFLATION * self.activation_distance
+            ).vertices,
+            self.tangential_collisions,
+            len(p),
+        )
 
-    def add_curvature(self, p: Positions, keep: float, places: NDArray[np.int64], values: Array) -> None:
+    def add_hessian_blocks(
+        self, p: Positions, negative_fraction: float, block_indices: NDArray[np.int64], values: FloatArray
+    ) -> None:
         """Add the Hessian blocks [N/m] at p to existing 3x3 blocks.
 
         Args:
@@ -164,32 +191,36 @@ class PairContact:
             block_indices: target block of each vertex pair, (a, 16); -1 for none.
             values: blocks (b, 3, 3) [N/m], updated.
         """
-        p = self.whole(p)
-        add_curvature(self._at(p).contacts, self.grip, p, keep, places, values)
+        p = self.append_obstacle_positions(p)
+        add_barrier_hessian(
+            self._state_at(p).collisions, self.tangential_collisions, p, negative_fraction, block_indices, values
+        )
 
-    def _at(self, p: Positions) -> _Met:
+    def _state_at(self, p: Positions) -> _CollisionState:
         """Return the collisions at p, positions (N, 3) of all vertices."""
-        for met in self.met:
+        for met in self.recent_states:
             if np.array_equal(met.p, p):
                 return met
-        pairs = self.pairs(p)
+        pairs = self.find_candidates(p)
         many = len(pairs.vertices)
         if not many:
-            nothing = contacts.room(0, pairs.thickness, pairs.reach)
-            return _Met(p, nothing, 0.0, p, nothing)
+            nothing = contacts.allocate_collisions(0, pairs.min_distance, pairs.dhat)
+            return _CollisionState(p, nothing, 0.0, p, nothing)
         gradient = np.zeros_like(p)
-        space = self.met.pop(0).space if len(self.met) > 1 else None
+        space = self.recent_states.pop(0).buffer if len(self.recent_states) > 1 else None
         if space is None or len(space.vertices) < many:
-            space = contacts.room(many, pairs.thickness, pairs.reach)
-        near = contacts.in_range(pairs, padded(p), space)
-        self.met.append(_Met(p.copy(), near, barrier.press(near, p, gradient), gradient, space))
-        return self.met[-1]
+            space = contacts.allocate_collisions(many, pairs.min_distance, pairs.dhat)
+        near = contacts.build_collisions(pairs, pad_positions(p), space)
+        self.recent_states.append(
+            _CollisionState(p.copy(), near, barrier.energy_and_gradient(near, p, gradient), gradient, space)
+        )
+        return self.recent_states[-1]
 
     def hessian(self, p: Positions) -> csr_array:
         """Return the Hessian [N/m], (3n, 3n)."""
-        return self.blocks(p).matrix(len(p))
+        return self.hessian_blocks(p).assemble_matrix(len(p))
 
-    def largest_step(self, p: Positions, direction: Positions) -> float:
+    def collision_free_step_size(self, p: Positions, direction: Positions) -> float:
         """Return the largest step size up to 1 that keeps all gaps open.
 
         Args:
@@ -199,9 +230,14 @@ class PairContact:
         Returns:
             Step size in [0, 1]; 0 if a gap is closed at p. All smaller step sizes are collision-free too.
         """
-        return known.largest_step(self.surface, self.kept, self.whole(p), self.toward(direction))
+        return known.find_collision_free_step_size(
+            self.collision_mesh,
+            self.candidate_caches,
+            self.append_obstacle_positions(p),
+            self.append_obstacle_displacements(direction),
+        )
 
-    def carried(self, p: Positions, direction: Positions, begin: float) -> float:
+    def collision_free_step_size_moving(self, p: Positions, direction: Positions, start_fraction: float) -> float:
         """Return the largest collision-free step size while the obstacles move as well.
 
         Args:
@@ -212,37 +248,37 @@ class PairContact:
         Returns:
             Fraction of the remaining displacements, in [0, 1].
         """
-        return self.largest_step(p, direction)
+        return self.collision_free_step_size(p, direction)
 
-    def at_part(self, part: float) -> Self:
+    def at_fraction(self, fraction: float) -> Self:
         """Return the energy with obstacles at a fraction of their motion, 1 at its end."""
         return self
 
-    def with_obstacles(self, p: Positions) -> list[Positions]:
+    def comoving_positions(self, p: Positions) -> list[Positions]:
         """Return the end positions that p (n, 3) would have if it moved with each of the moving obstacles."""
         return []
 
-    def closed(self, p: Positions) -> list[tuple[NDArray[np.int64], bool, float]]:
+    def find_violated_pairs(self, p: Positions) -> list[tuple[NDArray[np.int64], bool, float]]:
         """Return the pairs that violate their minimum distance at p (n, 3), the closest first.
 
         Returns:
             For each pair its vertices (4,), whether it is one of edges, and its distance [m].
         """
-        p = self.whole(p)
-        pairs = self.pairs(p)
-        apart = barrier.distances(pairs, p)
-        bad = np.flatnonzero(~(apart > pairs.scale * pairs.thickness))
+        p = self.append_obstacle_positions(p)
+        pairs = self.find_candidates(p)
+        apart = barrier.compute_distances(pairs, p)
+        bad = np.flatnonzero(~(apart > pairs.distance_scale * pairs.min_distance))
         bad = bad[np.argsort(apart[bad], kind="stable")]
-        return [(pairs.vertices[e], bool(e >= pairs.points), float(apart[e])) for e in bad.tolist()]
+        return [(pairs.vertices[e], bool(e >= pairs.num_point_triangle), float(apart[e])) for e in bad.tolist()]
 
 
 @dataclass(frozen=True, eq=False)
-class SelfContact(PairContact):
+class SelfContact(BarrierContact):
     """Contact of a surface with itself."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ObstacleContact(PairContact):
+class ObstacleContact(BarrierContact):
     """Contact of a surface with obstacles.
 
     Attributes:
@@ -254,16 +290,22 @@ class ObstacleContact(PairContact):
         step_times: start and end of the step [s].
     """
 
-    place: Place
-    carry: Carry
-    begun: Positions
-    placed: Positions
-    end: Positions
-    times: tuple[float, float] = (0.0, 0.0)
+    obstacle_positions_at: ObstacleMotion
+    comoving_map: ComovingMap
+    start_positions: Positions
+    current_positions: Positions
+    end_positions: Positions
+    step_times: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def of(
-        cls, surface: Surfaces, place: Place, carry: Carry, friction: float, slip: float, friction_rounds: int = ROUNDS
+    def from_collision_mesh(
+        cls,
+        collision_mesh: CandidateSource,
+        obstacle_positions_at: ObstacleMotion,
+        comoving_map: ComovingMap,
+        friction: float,
+        eps_v: float,
+        friction_iterations: int = MAX_FRICTION_ITERATIONS,
     ) -> Self:
         """Build the contact at time 0, before any step.
 
@@ -275,37 +317,63 @@ class ObstacleContact(PairContact):
             eps_v: speed [m/s] below which a pair counts as sticking.
             friction_iterations: maximum number of solves of a step.
         """
-        now = place(0.0)
-        return cls(surface, friction, slip, friction_rounds, place=place, carry=carry, begun=now, placed=now, end=now)
+        now = obstacle_positions_at(0.0)
+        return cls(
+            collision_mesh,
+            friction,
+            eps_v,
+            friction_iterations,
+            obstacle_positions_at=obstacle_positions_at,
+            comoving_map=comoving_map,
+            start_positions=now,
+            current_positions=now,
+            end_positions=now,
+        )
 
-    def begin_step(self, start: Start) -> Self:
+    def begin_step(self, start: StepStart) -> Self:
         """Return the energy of a step, with obstacles at their end positions."""
-        begun, end = self.place(start.time), self.place(start.until)
-        step = replace(self, begun=begun, placed=end, end=end, times=(start.time, start.until))
+        begun, end = self.obstacle_positions_at(start.time), self.obstacle_positions_at(start.stage_time)
+        step = replace(
+            self,
+            start_positions=begun,
+            current_positions=end,
+            end_positions=end,
+            step_times=(start.time, start.stage_time),
+        )
         if self.friction:
             first = np.concatenate([start.positions, begun])
-            pressed = first if start.pressed is None else np.concatenate([start.pressed, end])
-            step = replace(step, grip=step._gripping(pressed, first, start))
+            pressed = (
+                first if start.normal_force_positions is None else np.concatenate([start.normal_force_positions, end])
+            )
+            step = replace(step, grip=step._build_tangential_collisions(pressed, first, start))
         return step
 
-    def whole(self, p: Positions) -> Positions:
+    def append_obstacle_positions(self, p: Positions) -> Positions:
         """Return the positions of all vertices, those of the mesh (n, 3) first."""
-        return np.concatenate([p, self.placed])
+        return np.concatenate([p, self.current_positions])
 
-    def toward(self, direction: Positions) -> Positions:
+    def append_obstacle_displacements(self, direction: Positions) -> Positions:
         """Return the displacements of all vertices, with zeros for the obstacles."""
-        return np.concatenate([direction, np.zeros_like(self.placed)])
+        return np.concatenate([direction, np.zeros_like(self.current_positions)])
 
-    def carried(self, p: Positions, direction: Positions, begin: float) -> float:
+    def collision_free_step_size_moving(self, p: Positions, direction: Positions, start_fraction: float) -> float:
         """Return the largest collision-free step size while the obstacles move to their end positions."""
-        there = self.at_part(begin).placed
-        way = np.concatenate([direction, self.end - there])
-        return known.largest_step(self.surface, self.kept, np.concatenate([p, there]), way)
+        there = self.at_fraction(start_fraction).current_positions
+        way = np.concatenate([direction, self.end_positions - there])
+        return known.find_collision_free_step_size(
+            self.collision_mesh, self.candidate_caches, np.concatenate([p, there]), way
+        )
 
-    def at_part(self, part: float) -> Self:
+    def at_fraction(self, fraction: float) -> Self:
         """Return this energy with obstacles at a fraction of their motion in the step."""
-        return self if self.begun is self.end else replace(self, placed=self.begun + part * (self.end - self.begun))
+        return (
+            self
+            if self.start_positions is self.end_positions
+            else replace(
+                self, current_positions=self.start_positions + fraction * (self.end_positions - self.start_positions)
+            )
+        )
 
-    def with_obstacles(self, p: Positions) -> list[Positions]:
+    def comoving_positions(self, p: Positions) -> list[Positions]:
         """Return the end positions that p (n, 3) would have if it moved with each of the moving obstacles."""
-        return self.carry(*self.times, p)
+        return self.comoving_map(*self.step_times, p)

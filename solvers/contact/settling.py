@@ -24,21 +24,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import kernel
-from solvers.contact.energy import Contact
-from solvers.core.descent import DECREASE, Metric, Point, dot, search
+from solvers.compiling import jit_kernel
+from solvers.contact.energy import HalfSpaceContact
+from solvers.core.descent import ARMIJO_FRACTION, DescentPoint, ResidualMetric, backtracking_line_search, inner_product
 from solvers.core.objective import StepObjective
 from solvers.problem import Positions
 
-_SWEEPS = 4
-_AHEAD = 4
+_NUM_SWEEPS = 4
+_WATCHDOG_STEPS = 4
 """Number of additional steps in the watchdog technique."""
 
-Newton = Callable[[Point], Positions | None]
+NewtonDirection = Callable[[DescentPoint], Positions | None]
 """Function that returns the Newton direction at a point; None if the Hessian would have to be modified."""
 
 
-class Matrix(NamedTuple):
+class FreeVertexMatrix(NamedTuple):
     """Q over the free vertices.
 
     Attributes:
@@ -47,38 +47,46 @@ class Matrix(NamedTuple):
         diagonal: diagonal of Q.
     """
 
-    number: NDArray[np.int64]
-    starts: NDArray[np.int64]
+    free_index: NDArray[np.int64]
+    row_starts: NDArray[np.int64]
     columns: NDArray[np.int64]
     entries: NDArray[np.float64]
     diagonal: NDArray[np.float64]
 
 
-class Settling:
+class FrictionGaussSeidel:
     """Friction relaxation and watchdog search of Newton's methods, for one system."""
 
-    def __init__(self, metric: Metric) -> None:
-        Q, free = metric.inner, metric.system.free
-        number = np.full(metric.system.vertices, -1)
+    def __init__(self, metric: ResidualMetric) -> None:
+        Q, free = metric.free_block, metric.system.free_vertices
+        number = np.full(metric.system.num_vertices, -1)
         number[free] = np.arange(len(free))
-        self._matrix = Matrix(number, Q.indptr.astype(np.int64), free[Q.indices], Q.data, metric.diagonal)
+        self._matrix = FreeVertexMatrix(
+            number, Q.indptr.astype(np.int64), free[Q.indices], Q.data, metric.free_diagonal
+        )
 
-    def settled(self, step: StepObjective, p: Positions) -> Positions:
+    def relax_friction(self, step: StepObjective, p: Positions) -> Positions:
         """Return p (n, 3) with friction relaxed; p itself without friction."""
         out = p
-        for one in _contacts(step):
-            planes = one.planes
-            if planes.grip.any():
+        for one in _active_contacts(step):
+            planes = one.active_planes
+            if planes.friction_limit.any():
                 out = p.copy() if out is p else out
-                settle(planes, one.slip, self._matrix, out, step.gradient(out), _SWEEPS)
+                sweep_friction(planes, one.smoothing_length, self._matrix, out, step.gradient(out), _NUM_SWEEPS)
         return out
 
-    def start(self, step: StepObjective, at: Point) -> Point:
+    def relax_initial_point(self, step: StepObjective, at: DescentPoint) -> DescentPoint:
         """Relax friction at the initial point, if that decreases the objective."""
-        p = self.settled(step, at.positions)
-        return at if p is at.positions or step.rise(at.positions, p)[0] >= 0.0 else Point(p, step.gradient(p))
+        p = self.relax_friction(step, at.positions)
+        return (
+            at
+            if p is at.positions or step.objective_change(at.positions, p)[0] >= 0.0
+            else DescentPoint(p, step.gradient(p))
+        )
 
-    def search(self, step: StepObjective, at: Point, direction: Positions, newton: Newton) -> Point | None:
+    def watchdog_search(
+        self, step: StepObjective, at: DescentPoint, direction: Positions, newton_direction: NewtonDirection
+    ) -> DescentPoint | None:
         """Return a lower point along a direction, or after the watchdog steps; None if there is none.
 
         Args:
@@ -87,40 +95,50 @@ class Settling:
             direction: Newton direction at the point (n, 3) [m].
             newton_direction: returns the direction at later points.
         """
-        return self._ahead(step, at, direction, newton) or self._along(step, at, direction)
+        return self._take_watchdog_steps(step, at, direction, newton_direction) or self._line_search(
+            step, at, direction
+        )
 
-    def _along(self, step: StepObjective, at: Point, direction: Positions) -> Point | None:
-        return search(step, at, direction, settled=lambda p: self.settled(step, p))
+    def _line_search(self, step: StepObjective, at: DescentPoint, direction: Positions) -> DescentPoint | None:
+        return backtracking_line_search(step, at, direction, relax_locally=lambda p: self.relax_friction(step, p))
 
-    def _ahead(self, step: StepObjective, origin: Point, direction: Positions, newton: Newton) -> Point | None:
+    def _take_watchdog_steps(
+        self, step: StepObjective, origin: DescentPoint, direction: Positions, newton_direction: NewtonDirection
+    ) -> DescentPoint | None:
         """Take full Newton steps while each activates further half-spaces; return a point lower than the origin."""
-        at, enough = origin, DECREASE * dot(origin.gradient, direction)
-        for _ in range(_AHEAD):
-            p = self.settled(step, step.placed(at.positions + direction))
-            if step.rise(origin.positions, p)[0] <= enough:
-                return Point(p, step.gradient(p))
-            if not (_pressed(step, p) & ~_pressed(step, at.positions)).any():
-                found = None if at is origin else self._along(step, at, direction)
-                return found if found and step.rise(origin.positions, found.positions)[0] <= enough else None
-            at = Point(p, step.gradient(p))
-            following = newton(at)
+        at, enough = origin, ARMIJO_FRACTION * inner_product(origin.gradient, direction)
+        for _ in range(_WATCHDOG_STEPS):
+            p = self.relax_friction(step, step.apply_exact_pins(at.positions + direction))
+            if step.objective_change(origin.positions, p)[0] <= enough:
+                return DescentPoint(p, step.gradient(p))
+            if not (_active_plane_mask(step, p) & ~_active_plane_mask(step, at.positions)).any():
+                found = None if at is origin else self._line_search(step, at, direction)
+                return (
+                    found if found and step.objective_change(origin.positions, found.positions)[0] <= enough else None
+                )
+            at = DescentPoint(p, step.gradient(p))
+            following = newton_direction(at)
             if following is None:
                 return None
             direction = following
         return None
 
 
-def _contacts(step: StepObjective) -> list[Contact]:
-    return [energy for energy in step.problem.energies if isinstance(energy, Contact) and not energy.idle()]
+def _active_contacts(step: StepObjective) -> list[HalfSpaceContact]:
+    return [
+        energy
+        for energy in step.problem.energies
+        if isinstance(energy, HalfSpaceContact) and not energy.has_no_active_collisions()
+    ]
 
 
-def _pressed(step: StepObjective, p: Positions) -> NDArray[np.bool_]:
+def _active_plane_mask(step: StepObjective, p: Positions) -> NDArray[np.bool_]:
     """Return a mask of the half-spaces that are active at p."""
-    return np.concatenate([one.gap(p) < 0.0 for one in _contacts(step)])
+    return np.concatenate([one.compute_gaps(p) < 0.0 for one in _active_contacts(step)])
 
 
-@kernel
-def settle(planes, slip, matrix, p, gradient, sweeps):
+@jit_kernel
+def sweep_friction(planes, smoothing_length, matrix, p, gradient, sweeps):
     """Relax friction by Gauss-Seidel sweeps over the vertices of half-spaces with friction limit F > 0.
 
     Args:
@@ -146,12 +164,16 @@ def settle(planes, slip, matrix, p, gradient, sweeps):
             g0, g1, g2 = gradient[i, 0], gradient[i, 1], gradient[i, 2]
             along = n0 * g0 + n1 * g1 + n2 * g2
             g0, g1, g2 = g0 - along * n0, g1 - along * n1, g2 - along * n2
-            weight = grip[e] / max(slip, np.sqrt(u0 * u0 + u1 * u1 + u2 * u2))
+            weight = grip[e] / max(smoothing_length, np.sqrt(u0 * u0 + u1 * u1 + u2 * u2))
             v0, v1, v2 = u0 - (g0 - weight * u0) / q, u1 - (g1 - weight * u1) / q, u2 - (g2 - weight * u2) / q
             length = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-            kept = q / (q + grip[e] / slip) if length <= slip + grip[e] / q else 1.0 - grip[e] / (q * length)
+            kept = (
+                q / (q + grip[e] / smoothing_length)
+                if length <= smoothing_length + grip[e] / q
+                else 1.0 - grip[e] / (q * length)
+            )
             d0, d1, d2 = kept * v0 - u0, kept * v1 - u1, kept * v2 - u2
-            after = grip[e] / max(slip, kept * length)
+            after = grip[e] / max(smoothing_length, kept * length)
             p[i, 0], p[i, 1], p[i, 2] = p[i, 0] + d0, p[i, 1] + d1, p[i, 2] + d2
             gradient[i, 0] += after * kept * v0 - weight * u0
             gradient[i, 1] += after * kept * v1 - weight * u1

@@ -11,30 +11,30 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kernel
-from solvers.contact.barrier import distances
-from solvers.contact.boxes import Gaps, Indices, Limits
-from solvers.contact.closest import dot, edge_edge_way, point_triangle_way
-from solvers.contact.contacts import Pairs, padded
-from solvers.contact.mollifier import MOLLIFIED
-from solvers.contact.patches import Patches
-from solvers.contact.trees import Tree, found
+from solvers.compiling import jit_inner, jit_kernel
+from solvers.contact.barrier import compute_distances
+from solvers.contact.boxes import ClearanceBounds, CollisionQuery, IndexArray
+from solvers.contact.closest import dot3, edge_edge_distance_vector, point_triangle_distance_vector
+from solvers.contact.contacts import Candidates, pad_positions
+from solvers.contact.mollifier import MOLLIFIER_THRESHOLD_SCALE
+from solvers.contact.patches import ClusterCulling
+from solvers.contact.trees import BVH, find_candidate_pairs
 from solvers.problem import Positions
-from solvers.vectors.eights import bits, lowest, rows
+from solvers.vectors.eights import gather_rows, lowest_set_bit, mask_to_bits
 
-Array = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
-_LESS = 1.0 - 1e-12
+_REST_SCALE_FACTOR = 1.0 - 1e-12
 """Factor on the scale of distances: without it, round-off would produce forces at rest."""
 
-_LOOKED = 4.0
+_REST_QUERY_FACTOR = 4.0
 """Distance, relative to the activation distance, up to which pairs are tested one by one at rest."""
 
-_NOTHING = np.empty(0)
+_EMPTY_ARRAY = np.empty(0)
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class CollisionMesh:
     """Points, edges and triangles of a mesh, in contact with each other.
 
     Pairs that share a vertex are excluded. Pairs that are closer at rest than the activation distance have both
@@ -50,20 +50,26 @@ class Surface:
         rest_close_pairs: sorted keys of the pairs with scaled distances, and their scales.
     """
 
-    rest: Positions
-    points: Tree
-    edges: Tree
-    triangles: Tree
-    length: Array
-    stiffness: Array
-    thickness: float
-    reach: float
-    near: tuple[Indices, Array]
+    rest_positions: Positions
+    points: BVH
+    edges: BVH
+    triangles: BVH
+    edge_lengths: FloatArray
+    stiffness: FloatArray
+    min_distance: float
+    dhat: float
+    rest_close_pairs: tuple[IndexArray, FloatArray]
 
     @classmethod
-    def of(
-        cls, rest: Positions, edges: Indices, triangles: Indices, stiffness: Array, thickness: float, reach: float
-    ) -> Surface:
+    def from_rest_shape(
+        cls,
+        rest: Positions,
+        edges: IndexArray,
+        triangles: IndexArray,
+        stiffness: FloatArray,
+        min_distance: float,
+        dhat: float,
+    ) -> CollisionMesh:
         """Build the collision mesh of a rest shape.
 
         Args:
@@ -77,95 +83,107 @@ class Surface:
         points = np.unique(np.append(edges.ravel(), triangles.ravel())).astype(np.int64)
         rest = np.array(rest, order="C")
         none = np.empty(0, np.int64), np.empty(0)
-        trees = Tree.of(rest, points[:, None]), Tree.of(rest, edges), Tree.of(rest, triangles)
-        lengths = _lengths(rest, trees[1].corners)
-        bare = cls(rest, *trees, lengths, np.array(stiffness), thickness, reach, none)
-        near, first = bare._near(padded(rest), thickness + reach)
-        apart = distances(bare._bare(near, first), rest)
-        close = apart < thickness + reach
-        keys, share = bare._keys(near, first)[close], _LESS * apart[close] / (thickness + reach)
+        trees = (
+            BVH.from_primitives(rest, points[:, None]),
+            BVH.from_primitives(rest, edges),
+            BVH.from_primitives(rest, triangles),
+        )
+        lengths = _compute_edge_lengths(rest, trees[1].primitives)
+        bare = cls(rest, *trees, lengths, np.array(stiffness), min_distance, dhat, none)
+        near, first = bare._find_close_pairs(pad_positions(rest), min_distance + dhat)
+        apart = compute_distances(bare._geometric_candidates(near, first), rest)
+        close = apart < min_distance + dhat
+        keys, share = bare._pair_keys(near, first)[close], _REST_SCALE_FACTOR * apart[close] / (min_distance + dhat)
         order = np.argsort(keys)
         near = keys[order], share[order]
-        return cls(rest, *trees, lengths, np.array(stiffness), thickness, reach, near)
+        return cls(rest, *trees, lengths, np.array(stiffness), min_distance, dhat, near)
 
-    def _near(self, x: Array, reach: float) -> tuple[Indices, int]:
+    def _find_close_pairs(self, x: FloatArray, inflation_radius: float) -> tuple[IndexArray, int]:
         """Return index pairs (k, 2) that may be closer than a radius at x (n, 4), and how many are point-triangle."""
-        limits = Limits(reach, reach, 0.0, 0.0)
-        one = found(self.points, self.triangles, x, x, limits)
-        return np.concatenate([one, found(self.edges, self.edges, x, x, limits)]), len(one)
+        limits = CollisionQuery(inflation_radius, inflation_radius, 0.0, 0.0)
+        one = find_candidate_pairs(self.points, self.triangles, x, x, limits)
+        return np.concatenate([one, find_candidate_pairs(self.edges, self.edges, x, x, limits)]), len(one)
 
     @cached_property
-    def _patches(self) -> Patches:
-        return Patches.of(self.rest, self.points, self.edges, self.triangles, _LOOKED * (self.thickness + self.reach))
+    def _cluster_culling(self) -> ClusterCulling:
+        return ClusterCulling.from_rest_shape(
+            self.rest_positions,
+            self.points,
+            self.edges,
+            self.triangles,
+            _REST_QUERY_FACTOR * (self.min_distance + self.dhat),
+        )
 
-    def clear(self, p: Positions, q: Positions, limits: Limits) -> Gaps | None:
+    def compute_clearance_bounds(self, p: Positions, q: Positions, query: CollisionQuery) -> ClearanceBounds | None:
         """Return lower bounds of the distances at q, if the displacement from p to q violates no limit."""
-        return self._patches.clear(p, q, limits)
+        return self._cluster_culling.compute_clearance_bounds(p, q, query)
 
-    def unevenness(self, p: Positions, q: Positions) -> float:
+    def max_relative_displacement(self, p: Positions, q: Positions) -> float:
         """Return the largest relative displacement [m] of two vertices that are close to each other at rest."""
-        return self._patches.unevenness(p, q)
+        return self._cluster_culling.max_relative_displacement(p, q)
 
-    def within(self, p: Positions, reach: float) -> Pairs:
+    def find_proximity_candidates(self, p: Positions, inflation_radius: float) -> Candidates:
         """Return the pairs closer than `inflation_radius` [m] at p (n, 3) [m]."""
-        x = padded(p)
-        met, first = self._near(x, reach)
+        x = pad_positions(p)
+        met, first = self._find_close_pairs(x, inflation_radius)
         many = len(met)
         vertices, numbers = np.empty((many, 4), np.int64), (np.empty(many), np.empty(many))
-        pairs = Pairs(vertices, first, _NOTHING, *numbers, self.thickness, self.reach)
-        points, count = nearer(pairs, met, self._parts, self.length, self.stiffness, x, reach)
-        scale = self._scale(met[:count], points)
+        pairs = Candidates(vertices, first, _EMPTY_ARRAY, *numbers, self.min_distance, self.dhat)
+        points, count = filter_candidates(
+            pairs, met, self._primitives, self.edge_lengths, self.stiffness, x, inflation_radius
+        )
+        scale = self._distance_scales(met[:count], points)
         return pairs._replace(
             vertices=pairs.vertices[:count],
-            points=points,
-            scale=scale,
+            num_point_triangle=points,
+            distance_scale=scale,
             stiffness=pairs.stiffness[:count],
-            parallel=pairs.parallel[:count],
+            mollifier_threshold=pairs.mollifier_threshold[:count],
         )
 
     @property
-    def _parts(self) -> tuple[Indices, Indices, Indices]:
-        return self.points.corners, self.triangles.corners, self.edges.corners
+    def _primitives(self) -> tuple[IndexArray, IndexArray, IndexArray]:
+        return self.points.primitives, self.triangles.primitives, self.edges.primitives
 
-    def on_way(self, x: Array, y: Array, limits: Limits, edges: bool) -> Pairs:
+    def find_ccd_candidates(self, x: FloatArray, y: FloatArray, query: CollisionQuery, edges: bool) -> Candidates:
         """Return the pairs that may violate a limit between x and y, without barrier parameters."""
         one, other = (self.edges, self.edges) if edges else (self.points, self.triangles)
-        met = found(one, other, x, y, limits)
+        met = find_candidate_pairs(one, other, x, y, query)
         first = 0 if edges else len(met)
-        return self._bare(met, first)._replace(scale=self._scale(met, first))
+        return self._geometric_candidates(met, first)._replace(distance_scale=self._distance_scales(met, first))
 
-    def _bare(self, met: Indices, first: int) -> Pairs:
+    def _geometric_candidates(self, met: IndexArray, first: int) -> Candidates:
         """Return candidates of index pairs (k, 2), the first ones point-triangle, without scales and stiffnesses."""
         vertices = np.empty((len(met), 4), np.int64)
-        name(met, first, self._parts, vertices)
-        return Pairs(vertices, first, _NOTHING, _NOTHING, _NOTHING, self.thickness, self.reach)
+        write_candidate_vertices(met, first, self._primitives, vertices)
+        return Candidates(vertices, first, _EMPTY_ARRAY, _EMPTY_ARRAY, _EMPTY_ARRAY, self.min_distance, self.dhat)
 
-    def _scale(self, met: Indices, first: int) -> Array:
+    def _distance_scales(self, met: IndexArray, first: int) -> FloatArray:
         """Return the factors (k,) on the distances of pairs."""
-        keys, share = self.near
+        keys, share = self.rest_close_pairs
         if not (len(keys) and len(met)):
             return np.ones(len(met))
-        wanted = self._keys(met, first)
+        wanted = self._pair_keys(met, first)
         at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
         return np.where(keys[at] == wanted, share[at], 1.0)
 
-    def _keys(self, met: Indices, first: int) -> Indices:
+    def _pair_keys(self, met: IndexArray, first: int) -> IndexArray:
         """Return a unique key of each pair."""
-        many = max(len(self.triangles.corners), len(self.edges.corners), 1)
+        many = max(len(self.triangles.primitives), len(self.edges.primitives), 1)
         key = met[:, 0] * many + met[:, 1]
-        key[first:] += len(self.points.corners) * many
+        key[first:] += len(self.points.primitives) * many
         return key
 
 
-def _lengths(x: Positions, edges: Indices) -> Array:
+def _compute_edge_lengths(x: Positions, edges: IndexArray) -> FloatArray:
     return np.asarray(np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1), np.float64)
 
 
-@inner
-def _name(found, e, edges, parts, vertices, k):
+@jit_inner
+def _write_pair_vertices(pair_indices, e, edges, parts, vertices, k):
     """Write the vertices of pair e to row k."""
     points, triangles, sides = parts
-    i, j = found[e, 0], found[e, 1]
+    i, j = pair_indices[e, 0], pair_indices[e, 1]
     if edges:
         vertices[k, 0], vertices[k, 1], vertices[k, 2], vertices[k, 3] = (
             sides[i, 0],
@@ -178,8 +196,8 @@ def _name(found, e, edges, parts, vertices, k):
         vertices[k, 1], vertices[k, 2], vertices[k, 3] = triangles[j, 0], triangles[j, 1], triangles[j, 2]
 
 
-@kernel
-def name(found, first, parts, vertices):
+@jit_kernel
+def write_candidate_vertices(pair_indices, first, parts, vertices):
     """Write the vertices (k, 4) of index pairs.
 
     Args:
@@ -188,12 +206,12 @@ def name(found, first, parts, vertices):
         parts: points, triangles and edges.
         vertices: output (k, 4).
     """
-    for e in range(len(found)):
-        _name(found, e, e >= first, parts, vertices, e)
+    for e in range(len(pair_indices)):
+        _write_pair_vertices(pair_indices, e, e >= first, parts, vertices, e)
 
 
-@kernel
-def nearer(pairs, found, parts, lengths, stiffness, x, reach):
+@jit_kernel
+def filter_candidates(candidates, pair_indices, parts, lengths, stiffness, x, inflation_radius):
     """Remove the pairs that are not closer than a radius, and write the others to `candidates`.
 
     Args:
@@ -208,37 +226,39 @@ def nearer(pairs, found, parts, lengths, stiffness, x, reach):
     Returns:
         Number of point-triangle pairs, and of all pairs.
     """
-    count, points, begin, limit = 0, 0, 0, reach * reach
+    count, points, begin, limit = 0, 0, 0, inflation_radius * inflation_radius
     for edges in (False, True):
-        end = len(found) if edges else pairs.points
+        end = len(pair_indices) if edges else candidates.num_point_triangle
         for first in range(begin, end, 8):
             many = min(8, end - first)
             for k in range(many):
-                _name(found, first + k, edges, parts, pairs.vertices, count + k)
-            left, last = _near(pairs.vertices, x, count, count + many - 1, edges, limit), count
+                _write_pair_vertices(pair_indices, first + k, edges, parts, candidates.vertices, count + k)
+            left, last = _close_pair_mask(candidates.vertices, x, count, count + many - 1, edges, limit), count
             while left != 0:
-                lane = lowest(left)
+                lane = lowest_set_bit(left)
                 left &= left - 1
                 if lane < many:
                     e = first + lane
-                    i, j = found[e, 0], found[e, 1]
-                    found[count, 0], found[count, 1] = i, j
-                    v = pairs.vertices[count]
+                    i, j = pair_indices[e, 0], pair_indices[e, 1]
+                    pair_indices[count, 0], pair_indices[count, 1] = i, j
+                    v = candidates.vertices[count]
                     for a in range(4):
-                        v[a] = pairs.vertices[last + lane, a]
-                    pairs.stiffness[count] = 0.25 * (
+                        v[a] = candidates.vertices[last + lane, a]
+                    candidates.stiffness[count] = 0.25 * (
                         stiffness[v[0]] + stiffness[v[1]] + stiffness[v[2]] + stiffness[v[3]]
                     )
-                    pairs.parallel[count] = MOLLIFIED * (lengths[i] * lengths[j]) ** 2 if edges else 0.0
+                    candidates.mollifier_threshold[count] = (
+                        MOLLIFIER_THRESHOLD_SCALE * (lengths[i] * lengths[j]) ** 2 if edges else 0.0
+                    )
                     count += 1
         begin, points = end, points if edges else count
     return points, count
 
 
-@inner
-def _near(vertices, x, first, last, edges, limit):
+@jit_inner
+def _close_pair_mask(vertices, x, first, last, edges, limit):
     """Return as bits which of eight pairs have a squared distance below a limit."""
-    a, b = rows(x, vertices, first, last, 0), rows(x, vertices, first, last, 1)
-    c, d = rows(x, vertices, first, last, 2), rows(x, vertices, first, last, 3)
-    z = edge_edge_way(a, b, c, d)[4] if edges else point_triangle_way(a, b, c, d)[4]
-    return bits(dot(z, z) < limit)
+    a, b = gather_rows(x, vertices, first, last, 0), gather_rows(x, vertices, first, last, 1)
+    c, d = gather_rows(x, vertices, first, last, 2), gather_rows(x, vertices, first, last, 3)
+    z = edge_edge_distance_vector(a, b, c, d)[4] if edges else point_triangle_distance_vector(a, b, c, d)[4]
+    return mask_to_bits(dot3(z, z) < limit)

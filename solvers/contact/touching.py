@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from solvers.problem import Energy, LaggedEnergy, Positions, StepProblem, System
 
 
-class ContactRows(NamedTuple):
+class PenaltyRows(NamedTuple):
     """Penalty terms w/2 (direction.x_v + gap)^2 of the displacements x of vertices v (r,).
 
     Attributes:
@@ -29,19 +29,19 @@ class ContactRows(NamedTuple):
 
     vertices: NDArray[np.int64]
     direction: Positions
-    weight: NDArray[np.float64]
+    stiffness: NDArray[np.float64]
     gap: NDArray[np.float64]
 
 
 @runtime_checkable
-class ContactEnergy(LaggedEnergy, Protocol):
+class VertexContactEnergy(LaggedEnergy, Protocol):
     """An energy of single vertices, convex and once differentiable."""
 
-    def idle(self) -> bool:
+    def has_no_active_collisions(self) -> bool:
         """Return whether no vertex can collide in the current step."""
         ...
 
-    def rows(self, p: Positions, trial: Positions, *, cautious: bool) -> ContactRows:
+    def build_penalty_rows(self, p: Positions, trial: Positions, *, majorise: bool) -> PenaltyRows:
         """Return the rows of contacts active at p or between p and `trial`.
 
         Args:
@@ -52,23 +52,23 @@ class ContactEnergy(LaggedEnergy, Protocol):
         ...
 
 
-def is_contact(energy: Energy) -> TypeGuard[ContactEnergy]:
+def is_vertex_contact(energy: Energy) -> TypeGuard[VertexContactEnergy]:
     """Return whether an energy is one of vertex contact."""
-    return _is_contact(type(energy))
+    return _is_vertex_contact_type(type(energy))
 
 
 @cache
-def _is_contact(kind: type) -> bool:
-    return issubclass(kind, ContactEnergy)  # takes 30 us each time, and is asked each step
+def _is_vertex_contact_type(kind: type) -> bool:
+    return issubclass(kind, VertexContactEnergy)  # takes 30 us each time, and is asked each step
 
 
-def touching(problem: StepProblem) -> list[ContactEnergy]:
+def begin_active_contacts(problem: StepProblem) -> list[VertexContactEnergy]:
     """Return the active contacts of a step, begun separately from energies that may not be needed."""
-    begun = [energy.begin_step(problem.start) for energy in problem.system.energies if is_contact(energy)]
-    return [energy for energy in begun if is_contact(energy) and not energy.idle()]
+    begun = [energy.begin_step(problem.step_start) for energy in problem.system.energies if is_vertex_contact(energy)]
+    return [energy for energy in begun if is_vertex_contact(energy) and not energy.has_no_active_collisions()]
 
 
-def without_contact(system: System) -> System:
+def without_vertex_contact(system: System) -> System:
     """Return the system without vertex contact; the same object if it has none."""
-    kept = tuple(energy for energy in system.energies if not is_contact(energy))
+    kept = tuple(energy for energy in system.energies if not is_vertex_contact(energy))
     return system if len(kept) == len(system.energies) else replace(system, energies=kept)

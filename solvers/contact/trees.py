@@ -13,31 +13,31 @@ from typing import NamedTuple
 
 import numpy as np
 
-from solvers.compiling import kernel
+from solvers.compiling import jit_kernel
 from solvers.contact.boxes import (
-    Array,
-    Indices,
-    Limits,
-    hull,
-    hulls,
-    larger,
-    met,
-    one_of,
-    put_boxes,
-    share_vertex,
-    smaller,
+    CollisionQuery,
+    FloatArray,
+    IndexArray,
+    componentwise_max,
+    componentwise_min,
+    extract_aabb,
+    has_common_vertex,
+    merge_aabbs,
+    overlap_mask,
+    primitive_aabbs,
+    store_aabbs,
 )
 from solvers.problem import Positions
-from solvers.vectors.eights import lowest
+from solvers.vectors.eights import lowest_set_bit
 
-_BITS = 10
-_DEPTH = 8 * 22
+_MORTON_BITS = 10
+_STACK_SIZE = 8 * 22
 """Stack entries: eight times the number of levels of any tree that fits in memory."""
-_ROOM = 24
+_CANDIDATES_PER_PRIMITIVE = 24
 """Initial capacity for pairs of each primitive; beyond it the query is repeated. Four touching layers have some 14."""
 
 
-class Tree(NamedTuple):
+class BVH(NamedTuple):
     """Implicit tree of eight-box nodes.
 
     Attributes:
@@ -46,51 +46,53 @@ class Tree(NamedTuple):
         mean_primitive_size: mean diagonal of the primitives at rest [m].
     """
 
-    corners: Indices
-    levels: int
-    size: float = 0.0
+    primitives: IndexArray
+    num_levels: int
+    mean_primitive_size: float = 0.0
 
     @classmethod
-    def of(cls, rest: Positions, corners: Indices) -> Tree:
+    def from_primitives(cls, rest: Positions, corners: IndexArray) -> BVH:
         """Build a tree over primitives (m, k) of a rest shape (n, 3) [m]."""
-        order, size = along_curve(rest[corners].mean(axis=1)), 0.0
+        order, size = morton_order(rest[corners].mean(axis=1)), 0.0
         if len(corners):
             size = float(np.linalg.norm(np.ptp(rest[corners], axis=1), axis=1).mean())
-        return cls.over(len(corners))._replace(corners=np.ascontiguousarray(corners[order]), size=size)
+        return cls.from_count(len(corners))._replace(
+            primitives=np.ascontiguousarray(corners[order]), mean_primitive_size=size
+        )
 
     @classmethod
-    def over(cls, many: int) -> Tree:
+    def from_count(cls, num_primitives: int) -> BVH:
         """Build a tree over items that are in Morton order already."""
         levels = 1
-        while 8**levels < many:
+        while 8**levels < num_primitives:
             levels += 1
-        return cls(np.arange(many)[:, None], levels)
+        return cls(np.arange(num_primitives)[:, None], levels)
 
     @property
-    def nodes(self) -> int:
+    def num_nodes(self) -> int:
         """Number of nodes; the last level ends with the last primitive."""
-        return _first(self.levels - 1) + max(1, -(-len(self.corners) // 8))
+        return _first_node_of_level(self.num_levels - 1) + max(1, -(-len(self.primitives) // 8))
 
 
-def _first(level: int) -> int:
+def _first_node_of_level(level: int) -> int:
     """Return the index of a level's first node."""
     return (8**level - 1) // 7
 
 
-def along_curve(x: Positions) -> Indices:
+def morton_order(x: Positions) -> IndexArray:
     """Return the order of points (m, 3) [m] along a Morton curve."""
     if not len(x):
         return np.empty(0, np.int64)
     size = float(np.ptp(x, axis=0).max()) or 1.0
-    cell = np.minimum((x - x.min(axis=0)) / size * 2**_BITS, 2**_BITS - 1).astype(np.int64)
+    cell = np.minimum((x - x.min(axis=0)) / size * 2**_MORTON_BITS, 2**_MORTON_BITS - 1).astype(np.int64)
     code = np.zeros(len(x), np.int64)
-    for bit in range(_BITS):
+    for bit in range(_MORTON_BITS):
         for axis in range(3):
             code |= ((cell[:, axis] >> bit) & 1) << (3 * bit + axis)
     return np.argsort(code, kind="stable")
 
 
-def found(one: Tree, other: Tree, x: Array, y: Array, limits: Limits) -> Indices:
+def find_candidate_pairs(one: BVH, other: BVH, x: FloatArray, y: FloatArray, query: CollisionQuery) -> IndexArray:
     """Return the pairs of two trees that may violate the limits on a linear motion.
 
     Pairs that share a vertex are excluded. If vertices move relative to each other by less than the primitive size,
@@ -105,36 +107,36 @@ def found(one: Tree, other: Tree, x: Array, y: Array, limits: Limits) -> Indices
     Returns:
         Primitive indices (k, 2).
     """
-    if not (len(one.corners) and len(other.corners)):
+    if not (len(one.primitives) and len(other.primitives)):
         return np.empty((0, 2), np.int64)
-    if limits.moved <= max(one.size, other.size):
-        begin = end = _boxes(one, other, x, y)
+    if query.max_displacement <= max(one.mean_primitive_size, other.mean_primitive_size):
+        begin = end = _build_node_aabbs(one, other, x, y)
     else:
-        begin, end = _boxes(one, other, x, x), _boxes(one, other, y, y)
-    room, ways = _ROOM * len(one.corners) + 64, stack()
+        begin, end = _build_node_aabbs(one, other, x, x), _build_node_aabbs(one, other, y, y)
+    room, ways = _CANDIDATES_PER_PRIMITIVE * len(one.primitives) + 64, allocate_traversal_stack()
     while True:
         out = np.empty((room, 2), np.int64)
-        count = look(one, other, begin, end, limits, one is other, ways, out)
+        count = traverse_trees(one, other, begin, end, query, one is other, ways, out)
         if count <= room:
             return out[:count]
         room = count
 
 
-def stack() -> Indices:
+def allocate_traversal_stack() -> IndexArray:
     """Allocate the scratch of a traversal."""
-    return np.empty((_DEPTH, 3), np.int64)
+    return np.empty((_STACK_SIZE, 3), np.int64)
 
 
-def _boxes(one: Tree, other: Tree, x: Array, y: Array) -> tuple[Array, Array]:
+def _build_node_aabbs(one: BVH, other: BVH, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Build the boxes of both trees around the linear motion from x to y, (n, 4) each."""
-    boxes = [np.empty((tree.nodes, 6, 8)) for tree in ((one,) if one is other else (one, other))]
+    boxes = [np.empty((tree.num_nodes, 6, 8)) for tree in ((one,) if one is other else (one, other))]
     for tree, around in zip((one, other), boxes, strict=False):
-        refit(tree, x, y, around)
+        refit_aabbs(tree, x, y, around)
     return boxes[0], boxes[-1]
 
 
-@kernel
-def refit(tree, x, y, boxes):
+@jit_kernel
+def refit_aabbs(tree, x, y, boxes):
     """Refit the boxes of a tree to a linear motion.
 
     Args:
@@ -143,23 +145,23 @@ def refit(tree, x, y, boxes):
         y: end positions (n, 4) [m].
         boxes: boxes (nodes, 6, 8) [m], overwritten; unused lanes get empty boxes at infinity.
     """
-    many = len(tree.corners)
+    many = len(tree.primitives)
     leaf = len(boxes) - (many + 7) // 8
     for first in range(0, many, 8):
-        low, high = hulls(tree.corners, first, many - 1, x)
+        low, high = primitive_aabbs(tree.primitives, first, many - 1, x)
         if x is not y:
-            lower, upper = hulls(tree.corners, first, many - 1, y)
-            low, high = smaller(low, lower), larger(high, upper)
-        put_boxes(low, high, boxes, leaf + first // 8)
-    lift(boxes, many)
+            lower, upper = primitive_aabbs(tree.primitives, first, many - 1, y)
+            low, high = componentwise_min(low, lower), componentwise_max(high, upper)
+        store_aabbs(low, high, boxes, leaf + first // 8)
+    propagate_bounds(boxes, many)
 
 
-@kernel
-def lift(boxes, many):
+@jit_kernel
+def propagate_bounds(boxes, num_primitives):
     """Compute the boxes (nodes, 6, 8) of all inner nodes from those of the last level."""
-    last = len(boxes) - (many + 7) // 8
+    last = len(boxes) - (num_primitives + 7) // 8
     boxes[:last, :3], boxes[:last, 3:] = np.inf, -np.inf
-    for k in range(many, 8 * ((many + 7) // 8)):
+    for k in range(num_primitives, 8 * ((num_primitives + 7) // 8)):
         boxes[last + k // 8, :3, k % 8], boxes[last + k // 8, 3:, k % 8] = np.inf, -np.inf
     for node in range(len(boxes) - 1, 0, -1):
         above, slot = boxes[(node - 1) // 8], (node - 1) % 8
@@ -170,8 +172,8 @@ def lift(boxes, many):
             above[axis, slot], above[3 + axis, slot] = low, high
 
 
-@kernel
-def look(one, other, begin, end, limits, same, stack, out):
+@jit_kernel
+def traverse_trees(one, other, begin, end, query, is_same_tree, stack, out):
     """Write the pairs of two trees that may violate the limits, and return their number.
 
     Args:
@@ -183,19 +185,19 @@ def look(one, other, begin, end, limits, same, stack, out):
         out: primitive indices (k, 2); pairs beyond its capacity are counted only.
     """
     (mine, boxes), (yours, there) = begin, end
-    count, leaf = 0, len(mine) - (len(one.corners) + 7) // 8
-    for first_of_eight in range(0, len(one.corners), 8):
+    count, leaf = 0, len(mine) - (len(one.primitives) + 7) // 8
+    for first_of_eight in range(0, len(one.primitives), 8):
         around, after = mine[leaf + first_of_eight // 8], yours[leaf + first_of_eight // 8]
-        low, high = hull(around, 8)
-        lower, upper = hull(after, 8)
+        low, high = merge_aabbs(around, 8)
+        lower, upper = merge_aabbs(after, 8)
         # Stack entries: a node, its first primitive, and the number of primitives in each of its boxes.
-        stack[0, 0], stack[0, 1], stack[0, 2], top = 0, 0, 8 ** (other.levels - 1), 1
+        stack[0, 0], stack[0, 1], stack[0, 2], top = 0, 0, 8 ** (other.num_levels - 1), 1
         while top > 0:
             top -= 1
             node, first, each = stack[top, 0], stack[top, 1], stack[top, 2]
             if each > 1:
-                left = met(boxes, there, node, low, high, lower, upper, limits)
-                if same:
+                left = overlap_mask(boxes, there, node, low, high, lower, upper, query)
+                if is_same_tree:
                     left &= -1 << max(0, (first_of_eight - first) // each)  # nothing that comes before these eight
                 for slot in range(7, -1, -1):  # the first one comes out first
                     if left >> slot & 1:
@@ -208,20 +210,20 @@ def look(one, other, begin, end, limits, same, stack, out):
                 continue
             above, slot, own = max(0, node - 1) // 8, (node - 1) % 8, 255
             if node > 0:  # which of the eight come near the box around this node
-                own = met(
-                    mine, yours, leaf + first_of_eight // 8, *one_of(boxes[above], slot), *one_of(there[above], slot),
-                    limits,
+                own = overlap_mask(
+                    mine, yours, leaf + first_of_eight // 8, *extract_aabb(boxes[above], slot), *extract_aabb(there[above], slot),
+                    query,
                 )  # fmt: skip
             while own != 0:
-                k = lowest(own)
+                k = lowest_set_bit(own)
                 own &= own - 1
-                left = met(boxes, there, node, *one_of(around, k), *one_of(after, k), limits)
-                if same:
+                left = overlap_mask(boxes, there, node, *extract_aabb(around, k), *extract_aabb(after, k), query)
+                if is_same_tree:
                     left &= -1 << max(0, first_of_eight + k - first + 1)
                 while left != 0:
-                    f = first + lowest(left)
+                    f = first + lowest_set_bit(left)
                     left &= left - 1
                     if count < len(out):  # what shares a vertex is written over: nobody could foretell a branch here
                         out[count, 0], out[count, 1] = first_of_eight + k, f
-                    count += not share_vertex(one.corners, first_of_eight + k, other.corners, f)
+                    count += not has_common_vertex(one.primitives, first_of_eight + k, other.primitives, f)
     return count

@@ -12,29 +12,43 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kernel
-from solvers.contact.boxes import larger, smaller
-from solvers.contact.closest import distance, dot, edge_edge_way, minus, point_triangle_way
+from solvers.compiling import jit_inner, jit_kernel
+from solvers.contact.boxes import componentwise_max, componentwise_min
+from solvers.contact.closest import (
+    compute_pair_distance,
+    dot3,
+    edge_edge_distance_vector,
+    point_triangle_distance_vector,
+    subtract3,
+)
 from solvers.problem import Positions
-from solvers.vectors.eights import bits, loaded, lowest, root, rows, stored, where
+from solvers.vectors.eights import (
+    gather_rows,
+    load_packet,
+    lowest_set_bit,
+    mask_to_bits,
+    sqrt_packet,
+    store_packet,
+    where,
+)
 
-LEFT = 0.1
+MIN_GAP_FRACTION = 0.1
 """Fraction of the initial gap at which the CCD of a pair stops; each step leaves at least half of it."""
 
-_WIDER = 1.0 + 1e-12
+_ROUNDOFF_FACTOR = 1.0 + 1e-12
 """Factor on displacements, so that round-off discards no pair."""
 
-_LOOKS = 500
+_MAX_CCD_ITERATIONS = 500
 """Maximum number of CCD iterations of one pair; if they do not suffice, the last iterate is used, which is safe."""
 
 
-def scratch() -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+def allocate_ccd_scratch() -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Allocate the scratch arrays `local_indices`, `corners` and `relative_displacement` of the CCD."""
     return np.empty(4, np.int64), np.empty((4, 3)), np.empty((4, 3))
 
 
-@kernel
-def largest(pairs, p, direction, most, four, corners, way):
+@jit_kernel
+def collision_free_step_size(candidates, p, displacement, max_step, local_indices, corners, relative_displacement):
     """Return the largest step size that keeps all candidate pairs separated, on linear trajectories.
 
     Args:
@@ -48,56 +62,77 @@ def largest(pairs, p, direction, most, four, corners, way):
         Step size in [0, max_step]; 0 if a pair starts closer than its minimum distance.
     """
     for k in range(4):
-        four[k] = k
-    end, edges = pairs.points, False
+        local_indices[k] = k
+    end, edges = candidates.num_point_triangle, False
     for _ in range(2):
-        begin, end = (end, len(pairs.vertices)) if edges else (0, end)
+        begin, end = (end, len(candidates.vertices)) if edges else (0, end)
         for first in range(begin, end, 8):
-            left = _reached(pairs, p, direction, most, first, end - 1, edges)
+            left = _needs_ccd(candidates, p, displacement, max_step, first, end - 1, edges)
             while left != 0:
-                e = first + lowest(left)
+                e = first + lowest_set_bit(left)
                 left &= left - 1
                 if e < end:
-                    most = min(most, free(pairs, e, p, direction, most, edges, four, corners, way))
-            if most == 0.0:
+                    max_step = min(
+                        max_step,
+                        pair_time_of_impact(
+                            candidates,
+                            e,
+                            p,
+                            displacement,
+                            max_step,
+                            edges,
+                            local_indices,
+                            corners,
+                            relative_displacement,
+                        ),
+                    )
+            if max_step == 0.0:
                 return 0.0
         edges = True
-    return most
+    return max_step
 
 
-@inner
-def _reached(pairs, p, direction, most, first, last, edges):
+@jit_inner
+def _needs_ccd(candidates, p, displacement, max_step, first, last, edges):
     """Return as bits which of eight pairs can reach each other, by distances and displacement lengths alone."""
-    x = pairs.vertices
-    a, b, c, d = (rows(p, x, first, last, 0), rows(p, x, first, last, 1), rows(p, x, first, last, 2),
-                  rows(p, x, first, last, 3))  # fmt: skip
-    z = edge_edge_way(a, b, c, d)[4] if edges else point_triangle_way(a, b, c, d)[4]
-    a, b, c, d = (rows(direction, x, first, last, 0), rows(direction, x, first, last, 1),
-                  rows(direction, x, first, last, 2), rows(direction, x, first, last, 3))  # fmt: skip
-    mean = _mean(a, b, c, d, 0), _mean(a, b, c, d, 1), _mean(a, b, c, d, 2)
-    l0, l1, l2, l3 = _size(a, mean), _size(b, mean), _size(c, mean), _size(d, mean)
-    speed = _more(l0, l1) + _more(l2, l3) if edges else l0 + _more(l1, _more(l2, l3))
-    return 255 & ~bits((root(dot(z, z)) - pairs.thickness) * (1.0 - LEFT) >= _WIDER * most * speed)
+    x = candidates.vertices
+    a, b, c, d = (gather_rows(p, x, first, last, 0), gather_rows(p, x, first, last, 1), gather_rows(p, x, first, last, 2),
+                  gather_rows(p, x, first, last, 3))  # fmt: skip
+    z = edge_edge_distance_vector(a, b, c, d)[4] if edges else point_triangle_distance_vector(a, b, c, d)[4]
+    a, b, c, d = (gather_rows(displacement, x, first, last, 0), gather_rows(displacement, x, first, last, 1),
+                  gather_rows(displacement, x, first, last, 2), gather_rows(displacement, x, first, last, 3))  # fmt: skip
+    mean = _mean_coordinate(a, b, c, d, 0), _mean_coordinate(a, b, c, d, 1), _mean_coordinate(a, b, c, d, 2)
+    l0, l1, l2, l3 = (
+        _relative_length(a, mean),
+        _relative_length(b, mean),
+        _relative_length(c, mean),
+        _relative_length(d, mean),
+    )
+    speed = _packet_max(l0, l1) + _packet_max(l2, l3) if edges else l0 + _packet_max(l1, _packet_max(l2, l3))
+    return 255 & ~mask_to_bits(
+        (sqrt_packet(dot3(z, z)) - candidates.min_distance) * (1.0 - MIN_GAP_FRACTION)
+        >= _ROUNDOFF_FACTOR * max_step * speed
+    )
 
 
-@inner
-def _mean(a, b, c, d, axis):
+@jit_inner
+def _mean_coordinate(a, b, c, d, axis):
     return 0.25 * (a[axis] + b[axis] + c[axis] + d[axis])
 
 
-@inner
-def _size(a, mean):
-    a = minus(a, mean)
-    return root(dot(a, a))
+@jit_inner
+def _relative_length(a, mean):
+    a = subtract3(a, mean)
+    return sqrt_packet(dot3(a, a))
 
 
-@inner
-def _more(a, b):
+@jit_inner
+def _packet_max(a, b):
     return where(a > b, a, b)
 
 
-@inner
-def free(pairs, e, p, direction, most, edges, four, corners, way):
+@jit_inner
+def pair_time_of_impact(candidates, e, p, displacement, max_step, edges, local_indices, corners, relative_displacement):
     """Return the largest step size in [0, max_step] that keeps one pair separated.
 
     Args:
@@ -109,51 +144,62 @@ def free(pairs, e, p, direction, most, edges, four, corners, way):
         edges: whether the pair is one of edges.
         local_indices, corners, relative_displacement: scratch, (4,), (4, 3) and (4, 3).
     """
-    x = pairs.vertices[e]
-    speed = _relative(p, direction, x, edges, corners, way)
-    closed = pairs.scale[e] * pairs.thickness
-    gap = distance(p, x, edges) - closed
+    x = candidates.vertices[e]
+    speed = _centre_motion(p, displacement, x, edges, corners, relative_displacement)
+    closed = candidates.distance_scale[e] * candidates.min_distance
+    gap = compute_pair_distance(p, x, edges) - closed
     if not gap > 0.0:
         return 0.0
-    return most if gap * (1.0 - LEFT) >= most * speed else _one(corners, way, four, edges, gap, closed, speed, most)
+    return (
+        max_step
+        if gap * (1.0 - MIN_GAP_FRACTION) >= max_step * speed
+        else _additive_ccd(corners, relative_displacement, local_indices, edges, gap, closed, speed, max_step)
+    )
 
 
-@inner
-def _one(corners, way, four, edges, gap, closed, speed, most):
-    least, t = LEFT * gap, 0.9 * (1.0 - LEFT) * gap / speed
+@jit_inner
+def _additive_ccd(corners, relative_displacement, local_indices, edges, gap, min_distance, speed, max_step):
+    least, t = MIN_GAP_FRACTION * gap, 0.9 * (1.0 - MIN_GAP_FRACTION) * gap / speed
     done = 0.0
-    for _ in range(_LOOKS):
-        if t >= most:
-            return most
+    for _ in range(_MAX_CCD_ITERATIONS):
+        if t >= max_step:
+            return max_step
         for k in range(4):
             for a in range(3):
-                corners[k, a] += (t - done) * way[k, a]
+                corners[k, a] += (t - done) * relative_displacement[k, a]
         done = t
-        gap = distance(corners, four, edges) - closed
+        gap = compute_pair_distance(corners, local_indices, edges) - min_distance
         if gap <= least:
             return t
         t += 0.9 * (gap - 0.5 * least) / speed
     return done
 
 
-@inner
-def _relative(p, direction, x, edges, corners, way):
+@jit_inner
+def _centre_motion(p, displacement, x, edges, corners, relative_displacement):
     """Write corners (4, 3) relative to the first one and displacements without their mean; return the closing speed."""
     for a in range(3):
-        mean = 0.25 * (direction[x[0], a] + direction[x[1], a] + direction[x[2], a] + direction[x[3], a])
+        mean = 0.25 * (displacement[x[0], a] + displacement[x[1], a] + displacement[x[2], a] + displacement[x[3], a])
         for k in range(4):
             corners[k, a] = p[x[k], a] - p[x[0], a]
-            way[k, a] = direction[x[k], a] - mean
-    l0, l1, l2, l3 = _length(way, 0), _length(way, 1), _length(way, 2), _length(way, 3)
+            relative_displacement[k, a] = displacement[x[k], a] - mean
+    l0, l1, l2, l3 = (
+        _row_length(relative_displacement, 0),
+        _row_length(relative_displacement, 1),
+        _row_length(relative_displacement, 2),
+        _row_length(relative_displacement, 3),
+    )
     return max(l0, l1) + max(l2, l3) if edges else l0 + max(l1, l2, l3)
 
 
-@inner
-def _length(way, k):
-    return np.sqrt(way[k, 0] ** 2 + way[k, 1] ** 2 + way[k, 2] ** 2)
+@jit_inner
+def _row_length(relative_displacement, k):
+    return np.sqrt(
+        relative_displacement[k, 0] ** 2 + relative_displacement[k, 1] ** 2 + relative_displacement[k, 2] ** 2
+    )
 
 
-def unevenness(p: Positions, q: Positions) -> float:
+def max_relative_displacement(p: Positions, q: Positions) -> float:
     """Return the largest displacement of any two vertices relative to each other.
 
     Args:
@@ -163,30 +209,34 @@ def unevenness(p: Positions, q: Positions) -> float:
     Returns:
         Upper bound [m]; infinite if a coordinate is not finite.
     """
-    return _unevenness(p, q, np.empty((9, 8)))
+    return _displacement_diagonal(p, q, np.empty((9, 8)))
 
 
-@kernel
-def _unevenness(p, q, tile):
+@jit_kernel
+def _displacement_diagonal(p, q, tile):
     """Return the diagonal [m] of the bounding box of all q - p; tile (9, 8): scratch."""
     whole = len(p) // 8
     tile[:3], tile[3:6], tile[6:] = np.inf, -np.inf, 0.0
     if whole > 0:
         # Three consecutive registers contain x y z x y z ... of eight vertices.
-        x, y, z = loaded(q, 0) - loaded(p, 0), loaded(q, 8) - loaded(p, 8), loaded(q, 16) - loaded(p, 16)
+        x, y, z = (
+            load_packet(q, 0) - load_packet(p, 0),
+            load_packet(q, 8) - load_packet(p, 8),
+            load_packet(q, 16) - load_packet(p, 16),
+        )
         low, high, nothing = (x, y, z), (x, y, z), (0.0 * x, 0.0 * y, 0.0 * z)
         for k in range(24, 24 * whole, 24):
             x, y, z = (
-                loaded(q, k) - loaded(p, k),
-                loaded(q, k + 8) - loaded(p, k + 8),
-                loaded(q, k + 16) - loaded(p, k + 16),
+                load_packet(q, k) - load_packet(p, k),
+                load_packet(q, k + 8) - load_packet(p, k + 8),
+                load_packet(q, k + 16) - load_packet(p, k + 16),
             )
-            low, high = smaller((x, y, z), low), larger((x, y, z), high)
+            low, high = componentwise_min((x, y, z), low), componentwise_max((x, y, z), high)
             nothing = nothing[0] + 0.0 * x, nothing[1] + 0.0 * y, nothing[2] + 0.0 * z
         for k in range(3):
-            stored(low[k], tile, 8 * k)
-            stored(high[k], tile, 24 + 8 * k)
-            stored(nothing[k], tile, 48 + 8 * k)
+            store_packet(low[k], tile, 8 * k)
+            store_packet(high[k], tile, 24 + 8 * k)
+            store_packet(nothing[k], tile, 48 + 8 * k)
     square, known = 0.0, 0.0
     for axis in range(3):
         least, most = np.inf, -np.inf
@@ -200,8 +250,8 @@ def _unevenness(p, q, tile):
     return np.sqrt(square) if known == 0.0 else np.inf
 
 
-@kernel
-def alike(x, p, most):
+@jit_kernel
+def is_rigid_translation(x, p, max_step):
     """Return whether all vertices are translated equally, up to a tolerance.
 
     Args:
@@ -212,6 +262,6 @@ def alike(x, p, most):
     a, b, c = p[0, 0] - x[0, 0], p[0, 1] - x[0, 1], p[0, 2] - x[0, 2]
     for i in range(len(p)):
         d, e, f = p[i, 0] - x[i, 0] - a, p[i, 1] - x[i, 1] - b, p[i, 2] - x[i, 2] - c
-        if not (abs(d) <= most and abs(e) <= most and abs(f) <= most):
+        if not (abs(d) <= max_step and abs(e) <= max_step and abs(f) <= max_step):
             return False
     return True

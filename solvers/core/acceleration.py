@@ -13,17 +13,17 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.core.driver import Iterating
+from solvers.core.driver import SolverState
 from solvers.core.objective import StepObjective
 from solvers.core.prefactored import PreparedLocalGlobal
 from solvers.kernels import accelerate
-from solvers.kernels.accelerate import Window
-from solvers.memory import aligned
+from solvers.kernels.accelerate import AccelerationWindow
+from solvers.memory import allocate_aligned
 from solvers.problem import Positions, StepProblem
 
 
 @dataclass(frozen=True)
-class Scheme:
+class AccelerationScheme:
     """An acceleration scheme.
 
     Attributes:
@@ -35,18 +35,18 @@ class Scheme:
     """
 
     name: str
-    coefficients: int
-    pairs: int
-    retries: int
-    projective: bool
+    coefficient_rule: int
+    history_size: int
+    max_retries: int
+    needs_projective: bool
 
 
-class Accelerating(Iterating):
+class AcceleratedState(SolverState):
     """The state of a solve that also provides the gradient and the total decrease of the objective."""
 
     @property
     @abstractmethod
-    def fallen(self) -> float:
+    def objective_decrease(self) -> float:
         """Decrease of the objective so far [J], as far as it exceeds round-off."""
 
     @abstractmethod
@@ -54,87 +54,91 @@ class Accelerating(Iterating):
         """Return the gradient of the objective [N], (n, 3), at the iterate."""
 
 
-class Engine(Protocol):
+class AccelerationEngine(Protocol):
     """A factory of solves."""
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
         """Start a solve from an initial guess (n, 3)."""
         ...
 
 
-def window_for(scheme: Scheme, entries: int, whole: int, precision: Any = np.float64) -> Window:
+def allocate_window(
+    scheme: AccelerationScheme, num_entries: int, vector_size: int, precision: Any = np.float64
+) -> AccelerationWindow:
     """Allocate vectors of `vector_size`, of which `num_entries` are unknown; `precision` is that of the factor."""
-    m = scheme.pairs
-    now = np.zeros(1, accelerate.NOW)
-    now["method"], now["retries"] = scheme.coefficients, scheme.retries
-    steps, images, correction, direction = (aligned(k * entries, precision) for k in (m, m, 1, 1))
-    position, trial, descent, there = (aligned(whole) for _ in range(4))
+    m = scheme.history_size
+    now = np.zeros(1, accelerate.WINDOW_STATE_DTYPE)
+    now["method"], now["retries"] = scheme.coefficient_rule, scheme.max_retries
+    steps, images, correction, direction = (allocate_aligned(k * num_entries, precision) for k in (m, m, 1, 1))
+    position, trial, descent, there = (allocate_aligned(vector_size) for _ in range(4))
     sy, wy = np.zeros((2, m, m))
     sg, wg, a, b = np.zeros((4, m))
-    block = aligned(accelerate.BLOCK)
-    return Window(
+    block = allocate_aligned(accelerate.CACHE_BLOCK)
+    return AccelerationWindow(
         steps, images, position, trial, descent, there, correction, direction, block, sy, wy, sg, wg, a, b, now
     )
 
 
-class Interpreted(Accelerating):
+class InterpretedState(AcceleratedState):
     """A solve with any energies and any factor."""
 
-    def __init__(self, base: PreparedLocalGlobal, scheme: Scheme, objective: StepObjective, guess: Positions) -> None:
-        window = window_for(scheme, guess.size, guess.size)
+    def __init__(
+        self, base: PreparedLocalGlobal, scheme: AccelerationScheme, objective: StepObjective, guess: Positions
+    ) -> None:
+        window = allocate_window(scheme, guess.size, guess.size)
         self._base, self._window, self._objective = base, window, objective
-        self.positions, self._trial, self._there = (
-            x.reshape(-1, 3) for x in (window.position, window.trial, window.descent_there)
+        self.positions, self._trial_positions, self._trial_descent = (
+            x.reshape(-1, 3) for x in (window.position, window.trial_position, window.trial_descent)
         )
-        self._image = np.zeros_like(self._trial)
-        self._trial[:] = objective.placed(guess)
-        self._look()
-        accelerate.begin(window, self._solved())
+        self._trial_correction = np.zeros_like(self._trial_positions)
+        self._trial_positions[:] = objective.apply_exact_pins(guess)
+        self._evaluate_trial()
+        accelerate.init_window(window, self._solve_trial())
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents descent."""
-        window, now = self._window, self._window.now
-        accelerate.propose(window)
-        verdict = accelerate.AGAIN
-        while verdict == accelerate.AGAIN:
-            if not self._free():
+        window, now = self._window, self._window.window_state
+        accelerate.propose_trial(window)
+        verdict = accelerate.TRIAL_AGAIN
+        while verdict == accelerate.TRIAL_AGAIN:
+            if not self._shorten_trial():
                 return False
-            self._look()
-            now["rise"], now["noise"] = self._objective.rise(self.positions, self._trial)
-            verdict = accelerate.judge(window)
-        if verdict == accelerate.STALLED:
+            self._evaluate_trial()
+            now["rise"], now["noise"] = self._objective.objective_change(self.positions, self._trial_positions)
+            verdict = accelerate.judge_trial(window)
+        if verdict == accelerate.TRIAL_STALLED:
             return False
-        self._accept()
+        self._accept_trial()
         return True
 
     def residual(self) -> float:
         """Return the residual [J^(1/2)] at the iterate."""
-        return self._base.residual(self._window.correction.reshape(-1, 3).copy())
+        return self._base.correction_residual(self._window.correction.reshape(-1, 3).copy())
 
     @property
-    def fallen(self) -> float:
+    def objective_decrease(self) -> float:
         """Decrease of the objective so far [J]."""
-        return float(self._window.now["fallen"][0])
+        return float(self._window.window_state["fallen"][0])
 
     def gradient(self) -> Positions:
         """Return the gradient of the objective [N], (n, 3)."""
         return -self._window.descent.reshape(-1, 3)
 
-    def _free(self) -> bool:
+    def _shorten_trial(self) -> bool:
         """Shorten the trial to the collision-free step size; return whether that is positive."""
-        if self._objective.bounded:
-            most = self._objective.reach(self.positions, self._trial - self.positions)
+        if self._objective.barrier_energies:
+            most = self._objective.max_step_size(self.positions, self._trial_positions - self.positions)
             if most < 1.0:
-                accelerate.shorten(self._window, most)
+                accelerate.shorten_trial(self._window, most)
             return most > 0.0
         return True
 
-    def _look(self) -> None:
-        np.negative(self._objective.gradient(self._trial), out=self._there)
+    def _evaluate_trial(self) -> None:
+        np.negative(self._objective.gradient(self._trial_positions), out=self._trial_descent)
 
-    def _solved(self) -> NDArray[np.float64]:
-        self._base.correction(self._there, self._image)
-        return self._image.ravel()
+    def _solve_trial(self) -> NDArray[np.float64]:
+        self._base.solve_correction(self._trial_descent, self._trial_correction)
+        return self._trial_correction.ravel()
 
-    def _accept(self) -> None:
-        accelerate.accept(self._window, self._solved())
+    def _accept_trial(self) -> None:
+        accelerate.accept_trial(self._window, self._solve_trial())

@@ -32,7 +32,7 @@ class PairBlocks(Protocol):
         """Block of each pair, (a, 3k, 3k)."""
         ...
 
-    def of(self, values: NDArray[np.float64]) -> PairBlocks:
+    def with_values(self, values: NDArray[np.float64]) -> PairBlocks:
         """Return blocks of the same pairs with other values."""
         ...
 
@@ -40,20 +40,20 @@ class PairBlocks(Protocol):
         """Add the product with x (n, 3) to `out`."""
         ...
 
-    def add(self, places: NDArray[np.int64], values: NDArray[np.float64]) -> None:
+    def add_blocks(self, block_indices: NDArray[np.int64], values: NDArray[np.float64]) -> None:
         """Add the blocks to a matrix with blocks (b, 3, 3), at indices (a, k^2); -1 for none."""
         ...
 
 
 @runtime_checkable
-class Bounded(Energy, Protocol):
+class BarrierEnergy(Energy, Protocol):
     """An energy that is infinite beyond a surface and whose active vertex pairs depend on the positions."""
 
-    def largest_step(self, p: Positions, direction: Positions) -> float:
+    def collision_free_step_size(self, p: Positions, direction: Positions) -> float:
         """Return the largest collision-free step size up to 1 from p along a direction, both (n, 3) [m]."""
         ...
 
-    def carried(self, p: Positions, direction: Positions, begin: float) -> float:
+    def collision_free_step_size_moving(self, p: Positions, direction: Positions, start_fraction: float) -> float:
         """Return the largest collision-free step size up to 1 while obstacles move through the remaining step.
 
         Args:
@@ -63,26 +63,28 @@ class Bounded(Energy, Protocol):
         """
         ...
 
-    def at_part(self, part: float) -> Bounded:
+    def at_fraction(self, fraction: float) -> BarrierEnergy:
         """Return this energy with obstacles at a fraction of their displacement in the step, 1 at its end."""
         ...
 
-    def with_obstacles(self, p: Positions) -> list[Positions]:
+    def comoving_positions(self, p: Positions) -> list[Positions]:
         """Return the end positions of p (n, 3) [m] under the rigid motion of each moving obstacle."""
         ...
 
-    def neighbours(self, p: Positions) -> NDArray[np.int64]:
+    def candidate_vertices(self, p: Positions) -> NDArray[np.int64]:
         """Return the vertices (a, k) of all candidate pairs at and near p (n, 3).
 
         The index -1 means none.
         """
         ...
 
-    def coupled(self, p: Positions) -> NDArray[np.int64]:
+    def block_vertices(self, p: Positions) -> NDArray[np.int64]:
         """Return the vertices (a, k) of each Hessian block at p (n, 3); -1 for none."""
         ...
 
-    def add_curvature(self, p: Positions, keep: float, places: NDArray[np.int64], values: NDArray[np.float64]) -> None:
+    def add_hessian_blocks(
+        self, p: Positions, negative_fraction: float, block_indices: NDArray[np.int64], values: NDArray[np.float64]
+    ) -> None:
         """Add the Hessian blocks at p (n, 3) to a matrix.
 
         Args:
@@ -93,7 +95,7 @@ class Bounded(Energy, Protocol):
         """
         ...
 
-    def blocks(self, p: Positions, keep: float = 1.0) -> PairBlocks:
+    def hessian_blocks(self, p: Positions, negative_fraction: float = 1.0) -> PairBlocks:
         """Return the Hessian blocks at p (n, 3).
 
         `negative_fraction` is the factor of their negative part; 0 makes them positive semidefinite.
@@ -101,17 +103,19 @@ class Bounded(Energy, Protocol):
         ...
 
 
-def is_bounded(energy: Energy) -> TypeGuard[Bounded]:
+def is_barrier_energy(energy: Energy) -> TypeGuard[BarrierEnergy]:
     """Return whether an energy is a barrier that limits the step size."""
     return hasattr(energy, "largest_step")
 
 
-def reach(energies: Iterable[Energy], p: Positions, direction: Positions) -> float:
+def max_step_size(energies: Iterable[Energy], p: Positions, direction: Positions) -> float:
     """Return the largest collision-free step size up to 1 from p along a direction, both (n, 3) [m]."""
-    return min((energy.largest_step(p, direction) for energy in energies if is_bounded(energy)), default=1.0)
+    return min(
+        (energy.collision_free_step_size(p, direction) for energy in energies if is_barrier_energy(energy)), default=1.0
+    )
 
 
-def without_bounded(system: System) -> System:
+def without_barriers(system: System) -> System:
     """Return the system without barrier energies; the system itself if it has none."""
-    kept = tuple(energy for energy in system.energies if not is_bounded(energy))
+    kept = tuple(energy for energy in system.energies if not is_barrier_energy(energy))
     return system if len(kept) == len(system.energies) else replace(system, energies=kept)

@@ -19,21 +19,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from solvers.core.bounds import Bounded, is_bounded, reach
+from solvers.core.bounds import BarrierEnergy, is_barrier_energy, max_step_size
 from solvers.problem import Positions, StepProblem
 
-_ROUNDS, _PUSHES = 400, 6
+_MAX_ROUNDS, _PUSHES_PER_ROUND = 400, 6
 """Maximum number of rounds in which obstacles advance, and pushes per round."""
 
-_OPEN = 0.9
+_SAFE_FRACTION = 0.9
 """Fraction of a collision-free displacement that is used, which leaves a gap for the pushes."""
 
 
-class Blocked(Exception):
+class NoClearance(Exception):
     """An error for obstacles that leave no intersection-free start; the message states the fraction reached."""
 
 
-def begun_free(problem: StepProblem) -> StepProblem:
+def intersection_free_guess(problem: StepProblem) -> StepProblem:
     """Return the problem with intersection-free current positions and initial guess.
 
     Each is replaced by the start of the step unless the straight path from there to it is free of collisions. If
@@ -43,65 +43,65 @@ def begun_free(problem: StepProblem) -> StepProblem:
     Raises:
         NoClearance: no intersection-free start was found.
     """
-    energies = [energy for energy in problem.energies if is_bounded(energy)]
+    energies = [energy for energy in problem.energies if is_barrier_energy(energy)]
     if not energies:
         return problem
-    p = problem.start.positions
+    p = problem.step_start.positions
 
     def free(q: Positions) -> bool:
-        return all(energy.carried(p, q - p, 0.0) == 1.0 for energy in energies)
+        return all(energy.collision_free_step_size_moving(p, q - p, 0.0) == 1.0 for energy in energies)
 
     start, rest = p, np.zeros_like(p)
-    if not free(p) and all(energy.at_part(0.0).largest_step(p, rest) == 1.0 for energy in energies):
-        start = _cleared(problem, energies)
-    current = problem.current if free(problem.current) else start
+    if not free(p) and all(energy.at_fraction(0.0).collision_free_step_size(p, rest) == 1.0 for energy in energies):
+        start = _find_clear_positions(problem, energies)
+    current = problem.current_positions if free(problem.current_positions) else start
     guess = current
-    if problem.first_guess is not problem.current:
-        guess = problem.first_guess if free(problem.first_guess) else start
-    return replace(problem, current=current, first_guess=guess)
+    if problem.initial_guess is not problem.current_positions:
+        guess = problem.initial_guess if free(problem.initial_guess) else start
+    return replace(problem, current_positions=current, initial_guess=guess)
 
 
-def _cleared(problem: StepProblem, energies: Sequence[Bounded]) -> Positions:
+def _find_clear_positions(problem: StepProblem, energies: Sequence[BarrierEnergy]) -> Positions:
     """Return positions (n, 3) [m] without intersections at the end of the step, by a path without collisions.
 
     Raises NoClearance if none is found.
     """
-    p, part = problem.start.positions, 0.0
-    exact = problem.system.pins.vertices[problem.system.pins.exact]
-    ends = [p, p + problem.system.time_step * problem.start.velocity]
-    ends += [q for energy in energies for q in energy.with_obstacles(p)]
-    for _ in range(_ROUNDS):
+    p, part = problem.step_start.positions, 0.0
+    exact = problem.system.pins.vertices[problem.system.pins.exact_mask]
+    ends = [p, p + problem.system.time_step * problem.step_start.velocity]
+    ends += [q for energy in energies for q in energy.comoving_positions(p)]
+    for _ in range(_MAX_ROUNDS):
         most, along = 0.0, np.zeros_like(p)
-        for way in [np.zeros_like(p)] + [(1.0 - part) * (q - problem.start.positions) for q in ends[1:]]:
+        for way in [np.zeros_like(p)] + [(1.0 - part) * (q - problem.step_start.positions) for q in ends[1:]]:
             way[exact] = 0.0
-            t = min(energy.carried(p, way, part) for energy in energies)
+            t = min(energy.collision_free_step_size_moving(p, way, part) for energy in energies)
             if t > most:
                 most, along = t, way
             if t == 1.0:
                 return p + way
-        p, part = p + _OPEN * most * along, part + _OPEN * most * (1.0 - part)
-        waiting = [energy.at_part(part) for energy in energies]
-        for _ in range(_PUSHES):
-            p = _pushed(problem, waiting, p)
-    raise Blocked(
+        p, part = p + _SAFE_FRACTION * most * along, part + _SAFE_FRACTION * most * (1.0 - part)
+        waiting = [energy.at_fraction(part) for energy in energies]
+        for _ in range(_PUSHES_PER_ROUND):
+            p = _push_out(problem, waiting, p)
+    raise NoClearance(
         f"obstacles leave no room: what is in their way could be moved out of it for {part:.3g} of the step's length; "
         "reduce their motion per step, or use a smaller step size"
     )
 
 
-def _pushed(problem: StepProblem, energies: Sequence[Bounded], p: Positions) -> Positions:
+def _push_out(problem: StepProblem, energies: Sequence[BarrierEnergy], p: Positions) -> Positions:
     """Return p (n, 3) after one push."""
     system = problem.system
     gradient, curvature = np.zeros_like(p), np.zeros((len(p), 3, 3))
     for energy in energies:
         energy.add_gradient(p, gradient)
-        blocks = energy.blocks(p, 0.0)
+        blocks = energy.hessian_blocks(p, 0.0)
         k = blocks.vertices.shape[1]
         places = np.full((len(blocks.vertices), k * k), -1)
         places[:, :: k + 1] = blocks.vertices
-        blocks.add(places, curvature)
-    held = np.maximum(system.inertia, 1e-9 * float(curvature.max(initial=0.0)) or 1.0)
+        blocks.add_blocks(places, curvature)
+    held = np.maximum(system.inertia_diagonal, 1e-9 * float(curvature.max(initial=0.0)) or 1.0)
     curvature += held[:, None, None] * np.eye(3)
     way = np.asarray(-0.5 * np.linalg.solve(curvature, gradient[:, :, None])[:, :, 0], np.float64)
-    way[system.pins.vertices[system.pins.exact]] = 0.0
-    return p + reach(energies, p, way) * way
+    way[system.pins.vertices[system.pins.exact_mask]] = 0.0
+    return p + max_step_size(energies, p, way) * way

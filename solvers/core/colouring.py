@@ -21,28 +21,28 @@ from solvers.matrices import signed_incidence_matrix_sparse
 class Colouring:
     """The items by colour and index (order), and the start of each colour in that order (colours + 1,)."""
 
-    order: NDArray[np.int64]
-    start: NDArray[np.int64]
+    item_order: NDArray[np.int64]
+    colour_starts: NDArray[np.int64]
 
     @property
-    def colours(self) -> int:
+    def num_colours(self) -> int:
         """Number of colours."""
-        return len(self.start) - 1
+        return len(self.colour_starts) - 1
 
 
-def of_springs(edges: NDArray[np.int64], n: int) -> Colouring:
+def colour_springs(edges: NDArray[np.int64], n: int) -> Colouring:
     """Colour springs (m, 2) over n vertices; no two of a colour share a vertex."""
     A = signed_incidence_matrix_sparse(edges, n)
-    return _coloured(A, csr_array(A.T))
+    return _colour_rows(A, csr_array(A.T))
 
 
-def of_vertices(edges: NDArray[np.int64], n: int) -> Colouring:
+def colour_vertices(edges: NDArray[np.int64], n: int) -> Colouring:
     """Colour n vertices; no two of a colour share one of the springs (m, 2)."""
     A = signed_incidence_matrix_sparse(edges, n)
-    return _coloured(csr_array(A.T), A)
+    return _colour_rows(csr_array(A.T), A)
 
 
-def _coloured(groups: csr_array, items: csr_array) -> Colouring:
+def _colour_rows(groups: csr_array, items: csr_array) -> Colouring:
     """Colour the rows of `groups`, adjacent if they have an entry in one column; `items` is the transpose."""
     for matrix in (groups, items):
         matrix.sort_indices()

@@ -19,93 +19,122 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from solvers.core.driver import Iterating, Iterative, largest
-from solvers.core.parts import Parts, split
+from solvers.core.driver import IterativeSolver, SolverState, compute_max_coordinate
+from solvers.core.parts import SpringForm, decompose_energies
 from solvers.core.prefactored import PreparedLocalGlobal
 from solvers.energies.springs import Springs
 from solvers.kernels import springs as kernels
 from solvers.kernels import step, step_ends
-from solvers.kernels.edges import Edges
-from solvers.kernels.loop import ONE, Limits, at_most
-from solvers.kernels.plan import Order, of_inverse, of_supernodal, vectors
-from solvers.linear.inverse import Inverse
-from solvers.linear.supernodal import Supernodal
-from solvers.linear.team import Team
-from solvers.memory import aligned
-from solvers.problem import Positions, ResidualOf, StepProblem
+from solvers.kernels.edges import EdgeElements
+from solvers.kernels.loop import ONE_ITERATION, LoopLimits, iteration_limit
+from solvers.kernels.plan import EliminationSchedule, allocate_vectors, schedule_inverse, schedule_supernodal
+from solvers.linear.inverse import DenseInverse
+from solvers.linear.supernodal import SupernodalCholesky
+from solvers.linear.team import ThreadTeam
+from solvers.memory import allocate_aligned
+from solvers.problem import Positions, ResidualIterate, StepProblem
 from solvers.round_off import EPS
 
-Ints = NDArray[np.int64]
-Reals = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
 
-_LOST = 1e-3
+_MAX_POSITION_LOSS = 1e-3
 """Largest position error by the bound, relative to the median rest length; the bound is about 20 times the error.
 Sheets of 256 vertices a side and 1e5 N/m stay below it by a factor of 100; scenes with stiffness ratios of 1e12 exceed
 it."""
 
-_NEAR = 100.0
+_USUAL_EXTENT = 100.0
 """Distance [m] from the origin within which most scenes stay."""
 
-FAR = 1e100
+PADDING_COORDINATE = 1e100
 """Coordinate of the ends of padding springs, far from any vertex in any unit of length."""
 
-ORDERS: dict[type, Callable[[Any], Order]] = {Supernodal: of_supernodal, Inverse: of_inverse}
+SCHEDULE_BUILDERS: dict[type, Callable[[Any], EliminationSchedule]] = {
+    SupernodalCholesky: schedule_supernodal,
+    DenseInverse: schedule_inverse,
+}
 """Linear solvers whose panels the kernels traverse; others are called between compiled parts."""
 
 
-def compiled(base: PreparedLocalGlobal, *, corrects: bool = False) -> PreparedCompiled | str:
+def compile_iterations(
+    base: PreparedLocalGlobal, *, use_corrections: bool = False
+) -> PreparedCompiledLocalGlobal | str:
     """Return the compiled iterations over the factor's rows, or the reason in words why they run through Python.
 
     `use_corrections` selects corrections for any precision of the factor.
     """
-    order = _order(base)
+    order = _build_schedule(base)
     if order is None:
         return "iterations through Python: this linear solver is called from there"
-    parts = split(base.system)
-    if parts.unknown:
-        return f"iterations through Python: the kernels do not know {', '.join(parts.unknown)}"
-    if parts.cancel:
+    parts = decompose_energies(base.system)
+    if parts.unsupported_energies:
+        return f"iterations through Python: the kernels do not know {', '.join(parts.unsupported_energies)}"
+    if parts.has_cancellation:
         return "iterations through Python: the stiffnesses between some vertices cancel"
-    return PreparedCompiled.of(replace(base, choice=f"{base.choice}; iterations compiled"), parts, order, corrects)
+    return PreparedCompiledLocalGlobal.from_schedule(
+        replace(base, description=f"{base.description}; iterations compiled"), parts, order, use_corrections
+    )
 
 
-def _order(base: PreparedLocalGlobal) -> Order | None:
+def _build_schedule(base: PreparedLocalGlobal) -> EliminationSchedule | None:
     """Return a factor's elimination schedule; None for a factor that the kernels do not support."""
-    return next((order(base.factor) for kind, order in ORDERS.items() if isinstance(base.factor, kind)), None)
+    return next(
+        (order(base.factor) for kind, order in SCHEDULE_BUILDERS.items() if isinstance(base.factor, kind)), None
+    )
 
 
-def _reach(base: PreparedLocalGlobal, springs: Springs) -> float:
+def _max_direct_coordinate(base: PreparedLocalGlobal, springs: Springs) -> float:
     """Return the largest coordinate [m] for which a direct solve has an acceptable position error."""
     lengths = springs.rest_length[springs.rest_length > 0.0]
-    return _LOST * float(np.median(lengths)) / (2.0 * EPS * base.spread) if len(lengths) else np.inf
+    return (
+        _MAX_POSITION_LOSS * float(np.median(lengths)) / (2.0 * EPS * base.diagonal_dominance_ratio)
+        if len(lengths)
+        else np.inf
+    )
 
 
-def _plan(order: Order, first: Ints, held: Reals, measure: Reals, loose: Reals) -> step.Plan:
+def _build_plan(
+    order: EliminationSchedule, first: IndexArray, held: FloatArray, measure: FloatArray, loose: FloatArray
+) -> step.IterationPlan:
     """Build the plan over a factor's spans, with the first packet of each (groups + 1,)."""
-    spans = np.ascontiguousarray(np.column_stack([order.spans[:, :2], first[:-1], first[1:], order.spans[:, 2:]]))
-    factor = order.squares, order.panels, order.places, order.chunks, order.top
-    return step.Plan(*factor, spans, order.of_group, order.visits, order.visits_of, held, measure, loose, order.shift)
+    spans = np.ascontiguousarray(
+        np.column_stack([order.block_spans[:, :2], first[:-1], first[1:], order.block_spans[:, 2:]])
+    )
+    factor = order.inverse_blocks, order.panels, order.row_slots, order.chunks, order.top_range
+    return step.IterationPlan(
+        *factor,
+        spans,
+        order.group_blocks,
+        order.visit_schedule,
+        order.visit_starts,
+        held,
+        measure,
+        loose,
+        order.row_shift,
+    )
 
 
-def _rows(base: PreparedLocalGlobal, row: Ints, right: Ints, corrects: bool) -> step_ends.VertexRows:
+def _build_vertex_rows(
+    base: PreparedLocalGlobal, row: IndexArray, right: IndexArray, corrects: bool
+) -> step_ends.VertexRows:
     """Build the constant data of the right-hand side; corrections omit Q's coupling to exact pins."""
     s, pins = base.system, base.system.pins
-    coupling = csr_array((0, 0)).tocoo() if corrects else base.coupling.tocoo()
-    ends = s.free[coupling.coords[0]], np.flatnonzero(pins.exact)[coupling.coords[1]]
+    coupling = csr_array((0, 0)).tocoo() if corrects else base.pin_coupling.tocoo()
+    ends = s.free_vertices[coupling.coords[0]], np.flatnonzero(pins.exact_mask)[coupling.coords[1]]
     held = np.array(pins.weight), np.array(pins.vertices), np.array(coupling.data, np.float64)
-    return step_ends.VertexRows(row, right, s.inertia, *held, *ends)
+    return step_ends.VertexRows(row, right, s.inertia_diagonal, *held, *ends)
 
 
 class StepScratch(NamedTuple):
     """The arrays that kernels overwrite: vectors, right-hand side, and positions for corrections or None."""
 
     vectors: tuple[NDArray[Any], ...]
-    right: NDArray[np.float64]
-    p: NDArray[np.float64] | None
+    right_hand_side: NDArray[np.float64]
+    positions: NDArray[np.float64] | None
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedCompiled(Iterative):
+class PreparedCompiledLocalGlobal(IterativeSolver):
     """The iterations over a factor's own rows (see `solvers.kernels.local_global_iteration`).
 
     Attributes:
@@ -121,188 +150,209 @@ class PreparedCompiled(Iterative):
         max_coordinate: largest coordinate [m] up to which it may solve for positions.
     """
 
-    residual_of: ClassVar[ResidualOf] = "previous"
+    residual_iterate: ClassVar[ResidualIterate] = "previous"
 
     base: PreparedLocalGlobal
-    parts: Parts
-    plan: step.Plan
-    bundles: kernels.Bundles
-    edges: Edges | None
-    form: kernels.Bundles
-    rows: step_ends.VertexRows
-    far: int
-    corrects: bool
-    reach: float
+    spring_form: SpringForm
+    iteration_plan: step.IterationPlan
+    spring_packets: kernels.SpringPackets
+    edges: EdgeElements | None
+    norm_packets: kernels.SpringPackets
+    vertex_rows: step_ends.VertexRows
+    padding_row: int
+    use_corrections: bool
+    max_coordinate: float
 
     @classmethod
-    def of(cls, base: PreparedLocalGlobal, parts: Parts, order: Order, corrects: bool) -> PreparedCompiled:
+    def from_schedule(
+        cls, base: PreparedLocalGlobal, parts: SpringForm, order: EliminationSchedule, corrects: bool
+    ) -> PreparedCompiledLocalGlobal:
         """Build the iterations over a factor in blocks; use_corrections selects corrections in any case."""
         s, pins = base.system, base.system.pins
-        exact = pins.vertices[pins.exact]
-        nobody = order.rows + len(exact)
-        row = np.empty(s.vertices, np.int64)
-        slot = order.slot[: len(s.free)]  # those behind are padding
-        row[s.free] = slot
-        row[exact] = order.rows + np.arange(len(exact))
-        part = np.full(s.vertices, -1)
-        part[s.free] = np.searchsorted(order.spans[:, 0], slot, side="right") - 1
-        corrects |= order.squares.dtype != np.float64
-        where = row, part, len(order.spans), nobody, nobody + 1
-        form, first = kernels.Bundles.of(parts.pairs, *where)
+        exact = pins.vertices[pins.exact_mask]
+        nobody = order.num_rows + len(exact)
+        row = np.empty(s.num_vertices, np.int64)
+        slot = order.row_of_unknown[: len(s.free_vertices)]  # those behind are padding
+        row[s.free_vertices] = slot
+        row[exact] = order.num_rows + np.arange(len(exact))
+        part = np.full(s.num_vertices, -1)
+        part[s.free_vertices] = np.searchsorted(order.block_spans[:, 0], slot, side="right") - 1
+        corrects |= order.inverse_blocks.dtype != np.float64
+        where = row, part, len(order.block_spans), nobody, nobody + 1
+        form, first = kernels.SpringPackets.from_springs(parts.system_pairs, *where)
         # A solve for positions has the forms in Q; one for corrections also needs their gradient.
-        local = parts.whole if corrects else parts.springs
-        bundles = form if local is parts.pairs else kernels.Bundles.of(local, *where)[0]
-        inertia = s.inertia
-        held, measure, loose = np.zeros((3, nobody + 2 + order.shift))
-        held[row] = measure[row] = inertia + parts.held
-        _, soft, weight = s.penalty
+        local = parts.springs_and_forms if corrects else parts.springs
+        bundles = form if local is parts.system_pairs else kernels.SpringPackets.from_springs(local, *where)[0]
+        inertia = s.inertia_diagonal
+        held, measure, loose = np.zeros((3, nobody + 2 + order.row_shift))
+        held[row] = measure[row] = inertia + parts.vertex_weight
+        _, soft, weight = s.penalty_pins
         held[row[soft]] += weight
-        measure[row[s.free]] -= 0.5 * base.coupling.sum(axis=1)
-        loose[row[s.unpinned]] = 1.0
+        measure[row[s.free_vertices]] -= 0.5 * base.pin_coupling.sum(axis=1)
+        loose[row[s.unpinned_mask]] = 1.0
         return cls(
             base,
             parts,
-            _plan(order, first, held, form.in_lanes(measure), loose),
+            _build_plan(order, first, held, form.gather_lanes(measure), loose),
             bundles,
-            parts.edges(row, len(held)),
+            parts.build_edges(row, len(held)),
             form,
-            _rows(base, row, bundles.in_right(len(held))[row], corrects),
+            _build_vertex_rows(base, row, bundles.right_hand_side_offset(len(held))[row], corrects),
             nobody + 1,
             corrects,
-            np.inf if corrects else _reach(base, parts.springs),
+            np.inf if corrects else _max_direct_coordinate(base, parts.springs),
         )
 
     @cached_property
-    def corrected(self) -> PreparedCompiled:
+    def with_corrections(self) -> PreparedCompiledLocalGlobal:
         """The iterations that solve for corrections."""
-        order = _order(self.base)
+        order = _build_schedule(self.base)
         assert order is not None  # `of` was given one
-        return self.of(self.base, self.parts, order, True)
+        return self.from_schedule(self.base, self.spring_form, order, True)
 
     @property
-    def facts(self) -> dict[str, float]:
+    def stats(self) -> dict[str, float]:
         """Exact counts of the setup."""
-        return self.base.facts
+        return self.base.stats
 
     @property
-    def choice(self) -> str:
+    def description(self) -> str:
         """The linear solver, the distance for corrections if scenes may reach it, and the threads used if not all."""
-        beyond = f"; corrections beyond {self.reach:.1g} m of the origin" if self.reach < _NEAR else ""
-        allowed, used = numba.get_num_threads(), self.threads() or 1
+        beyond = (
+            f"; corrections beyond {self.max_coordinate:.1g} m of the origin"
+            if self.max_coordinate < _USUAL_EXTENT
+            else ""
+        )
+        allowed, used = numba.get_num_threads(), self.num_threads() or 1
         if used == allowed:
-            return f"{self.base.choice}{beyond}"
+            return f"{self.base.description}{beyond}"
         why = "the system is too small for a second thread to pay" if used == 1 else f"its factor comes in {used} parts"
-        return f"{self.base.choice}{beyond}; {used} of {allowed} threads: {why}"
+        return f"{self.base.description}{beyond}; {used} of {allowed} threads: {why}"
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        return _Iterating(self if largest(problem) <= self.reach else self.corrected, problem, guess)
+        return _CompiledState(
+            self if compute_max_coordinate(problem) <= self.max_coordinate else self.with_corrections,
+            problem,
+            initial_guess,
+        )
 
-    def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
+    def build_residual(self, problem: StepProblem) -> Callable[[Positions], float]:
         """Build a residual function that evaluates the energies of the step once."""
-        made = self if largest(problem) <= self.reach else self.corrected
-        return _Iterating(made, problem, problem.current).residual_from
+        made = self if compute_max_coordinate(problem) <= self.max_coordinate else self.with_corrections
+        return _CompiledState(made, problem, problem.current_positions).residual_from
 
-    def scale(self, problem: StepProblem) -> float:
+    def residual_scale(self, problem: StepProblem) -> float:
         """Return the residual scale [J^(1/2)] for the round-off check."""
-        return largest(problem) * self.base.trace**0.5
+        return compute_max_coordinate(problem) * self.base.unpinned_trace**0.5
 
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """Return the local step over all springs at the initial guess, and one solve with the unrefined factor.
 
         Within a step neither runs alone, because blocks alternate between both.
         """
-        (a, b, _, _), right, p = work = self.memory()
-        target, force, pins, guess = self.arrays(problem, problem.first_guess)
-        step_ends.state(self.rows, target, force, pins, right)
-        step_ends.start(self.rows, work.vectors, p, guess, pins)
+        (a, b, _, _), right, p = work = self.allocate_scratch()
+        target, force, pins, guess = self.step_arrays(problem, problem.initial_guess)
+        step_ends.write_right_hand_side(self.vertex_rows, target, force, pins, right)
+        step_ends.init_vectors(self.vertex_rows, work.vectors, p, guess, pins)
 
-        edges = self.parts.begun(self.edges, problem)
+        edges = self.spring_form.update_edges(self.edges, problem)
 
         def local() -> NDArray[Any]:
-            step.local(self.plan, self.bundles, edges, a, right, p, b)
+            step.run_local_step(self.iteration_plan, self.spring_packets, edges, a, right, p, b)
             return b
 
-        y, out = self.base.system.inertia[:, None] * target + force, np.zeros_like(target)
-        return {"local": local, "global": lambda: self.base.correction(y, out)}
+        y, out = self.base.system.inertia_diagonal[:, None] * target + force, np.zeros_like(target)
+        return {"local": local, "global": lambda: self.base.solve_correction(y, out)}
 
-    def arrays(self, problem: StepProblem, guess: Positions) -> list[Positions]:
+    def step_arrays(self, problem: StepProblem, guess: Positions) -> list[Positions]:
         """Return target, force, pin targets and guess; read-only arrays are copied.
 
         The kernels are compiled for writable arrays.
         """
-        given = (problem.target, self.parts.force(problem), problem.pin_targets, guess)
+        given = (problem.inertial_target, self.spring_form.compute_force(problem), problem.pin_targets, guess)
         return [x if x.flags.carray else np.array(x, np.float64, order="C") for x in given]
 
     @cached_property
-    def team(self) -> Team:
+    def thread_team(self) -> ThreadTeam:
         """The thread team of whole solves."""
-        return Team.of(int(self.plan.top[2]))
+        return ThreadTeam.from_task_count(int(self.iteration_plan.top_range[2]))
 
     @cached_property
-    def work(self) -> StepScratch:
+    def shared_scratch(self) -> StepScratch:
         """The scratch memory that whole solves share."""
-        return self.memory()
+        return self.allocate_scratch()
 
-    def memory(self) -> StepScratch:
+    def allocate_scratch(self) -> StepScratch:
         """Allocate the scratch memory of one solve."""
-        rows, dtype = len(self.plan.held), self.plan.squares.dtype
-        arrays = vectors(dtype, rows)
-        p = aligned(4 * rows) if self.corrects else None
+        rows, dtype = len(self.iteration_plan.anchor_stiffness), self.iteration_plan.inverse_blocks.dtype
+        arrays = allocate_vectors(dtype, rows)
+        p = allocate_aligned(4 * rows) if self.use_corrections else None
         for x in arrays[:3] if p is None else [p]:
-            x[4 * self.far] = FAR
-        return StepScratch(arrays, self.bundles.right(self.plan.held), p)
+            x[4 * self.padding_row] = PADDING_COORDINATE
+        return StepScratch(arrays, self.spring_packets.build_right_hand_side(self.iteration_plan.anchor_stiffness), p)
 
-    def threads(self) -> int | None:
+    def num_threads(self) -> int | None:
         """Return the smaller of the allowed threads and the groups of subtrees; None for one thread."""
-        groups = int(self.plan.top[2])
+        groups = int(self.iteration_plan.top_range[2])
         threads = min(numba.get_num_threads(), groups) if groups > 1 else 1
         return threads if threads > 1 else None
 
 
-class _Iterating(Iterating):
+class _CompiledState(SolverState):
     """A solve whose iterations are one call, in memory that all solves share; single iterations use their own."""
 
-    def __init__(self, prepared: PreparedCompiled, problem: StepProblem, guess: Positions) -> None:
+    def __init__(self, prepared: PreparedCompiledLocalGlobal, problem: StepProblem, guess: Positions) -> None:
         self._prepared, self._problem, self._guess = prepared, problem, guess
-        self._arrays, self._edges = prepared.arrays(problem, guess), prepared.parts.begun(prepared.edges, problem)
-        self.positions = np.empty_like(problem.target)
+        self._arrays, self._edges = (
+            prepared.step_arrays(problem, guess),
+            prepared.spring_form.update_edges(prepared.edges, problem),
+        )
+        self.positions = np.empty_like(problem.inertial_target)
 
-    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Iterate up to the limits; return count, residual and reason."""
         made = self._prepared
-        fixed = made.plan, made.bundles, self._edges, made.form, made.rows, *made.work, tuple(self._arrays)
-        answer = step_ends.solve(*fixed, limits, made.threads(), made.team, self.positions)
+        fixed = (
+            made.iteration_plan,
+            made.spring_packets,
+            self._edges,
+            made.norm_packets,
+            made.vertex_rows,
+            *made.shared_scratch,
+            tuple(self._arrays),
+        )
+        answer = step_ends.solve_step(*fixed, limits, made.num_threads(), made.thread_team, self.positions)
         self._arrays[-1] = self.positions  # where the next ones go on
         return answer
 
     def residual_from(self, p: Positions) -> float:
         """Return |p - LG(p)|_Q of positions p (n, 3), by one iteration from there."""
         self._arrays[-1] = p if p.flags.carray else np.array(p, np.float64, order="C")
-        return self.iterate(at_most(1))[1]
+        return self.run_iterations(iteration_limit(1))[1]
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents descent."""
         made = self._prepared
-        (a, b, c, e), right, p = self._own
-        fixed = made.plan, made.bundles, self._edges, made.form, (a, b, c, e), right, p
-        step.iterate(*fixed, ONE, made.threads(), self._team)
-        self._own = StepScratch((b, a, c, e), right, p)
-        step_ends.fetch(made.rows, b if p is None else p, self.positions)
+        (a, b, c, e), right, p = self._own_scratch
+        fixed = made.iteration_plan, made.spring_packets, self._edges, made.norm_packets, (a, b, c, e), right, p
+        step.run_iterations(*fixed, ONE_ITERATION, made.num_threads(), self._thread_team)
+        self._own_scratch = StepScratch((b, a, c, e), right, p)
+        step_ends.read_positions(made.vertex_rows, b if p is None else p, self.positions)
         return True
 
     def residual(self) -> float:
         """Return |p - LG(p)|_Q of the previous positions p."""
-        (a, b, _, e), _, p = self._own
-        return step.length(self._prepared.plan, self._prepared.form, a, b, p, e)
+        (a, b, _, e), _, p = self._own_scratch
+        return step.compute_residual(self._prepared.iteration_plan, self._prepared.norm_packets, a, b, p, e)
 
     @cached_property
-    def _own(self) -> StepScratch:
-        work, (target, force, pins, guess) = self._prepared.memory(), self._arrays
-        step_ends.state(self._prepared.rows, target, force, pins, work.right)
-        step_ends.start(self._prepared.rows, work.vectors, work.p, guess, pins)
+    def _own_scratch(self) -> StepScratch:
+        work, (target, force, pins, guess) = self._prepared.allocate_scratch(), self._arrays
+        step_ends.write_right_hand_side(self._prepared.vertex_rows, target, force, pins, work.right_hand_side)
+        step_ends.init_vectors(self._prepared.vertex_rows, work.vectors, work.positions, guess, pins)
         return work
 
     @cached_property
-    def _team(self) -> Team:
-        return Team.of(int(self._prepared.plan.top[2]))
+    def _thread_team(self) -> ThreadTeam:
+        return ThreadTeam.from_task_count(int(self._prepared.iteration_plan.top_range[2]))

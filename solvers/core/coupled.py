@@ -16,13 +16,13 @@ from solvers.problem import Energy, Positions
 
 
 @runtime_checkable
-class Coupled(Energy, Protocol):
+class RankUpdateEnergy(Energy, Protocol):
     """An energy whose Hessian is sparse plus a product of a few columns."""
 
     def sparse_hessian(self, p: Positions) -> csr_array:
         """Return the Hessian minus V V' [N/m], shape (3n, 3n)."""
         ...
 
-    def columns(self, p: Positions) -> Positions:
+    def low_rank_columns(self, p: Positions) -> Positions:
         """Return V [(N/m)^(1/2)], one column for each scalar, shape (n, 3, r)."""
         ...

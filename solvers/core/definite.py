@@ -24,34 +24,34 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.core.descent import Point, dot
-from solvers.core.eigenvalues import Filtering
+from solvers.core.descent import DescentPoint, inner_product
+from solvers.core.eigenvalues import PsdProjection
 from solvers.core.objective import Hessian, StepObjective
 
-SHIFTS = tuple(10.0**k for k in range(-4, 9, 2))
-LEVELS = ((1.0, 0.0), (0.9, 0.0), (0.5, 0.0), (0.0, 0.0), *((0.0, by) for by in SHIFTS))
+DIAGONAL_SHIFTS = tuple(10.0**k for k in range(-4, 9, 2))
+SHIFT_SCHEDULE = ((1.0, 0.0), (0.9, 0.0), (0.5, 0.0), (0.0, 0.0), *((0.0, by) for by in DIAGONAL_SHIFTS))
 """Pairs of the negative fraction (of the springs' transverse part) and the multiple of a diagonal; the first that has a
 factor is used."""
 
-_CLOSE = (*((keep, 0.0) for keep in (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.25)), *LEVELS[3:])
+_CONTACT_SCHEDULE = (*((keep, 0.0) for keep in (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.25)), *SHIFT_SCHEDULE[3:])
 """The schedule with active collisions."""
 
-Indefinite = Literal["graded", "clamp", "absolute", "trust-region", "progressive"]
+IndefiniteStrategy = Literal["graded", "clamp", "absolute", "trust-region", "progressive"]
 
-_TRUSTED = 0.01
+_TRUST_TOLERANCE = 0.01
 """Largest deviation from 1 of the ratio of actual to predicted decrease for which eigenvalues are clamped, as in the
 paper."""
 
-_HALVINGS = 60
+_MAX_HALVINGS = 60
 """Maximum number of halvings of the threshold; then all elements are projected."""
 
 
-def factorised(
+def factorise_shifted(
     hessian: Hessian,
     diagonal: NDArray[np.float64],
     shift: NDArray[np.float64] | float = 0.0,
-    levels: Sequence[tuple[float, float]] = LEVELS,
-    first: int = 0,
+    schedule: Sequence[tuple[float, float]] = SHIFT_SCHEDULE,
+    first_level: int = 0,
 ) -> int | None:
     """Factorise the first positive definite Hessian of a schedule and return its level, or None.
 
@@ -65,40 +65,40 @@ def factorised(
     Returns:
         The level; 0 is the exact Hessian; None if no level has a factor.
     """
-    tried = enumerate(levels[first:], first)
+    tried = enumerate(schedule[first_level:], first_level)
     return next((k for k, (keep, by) in tried if hessian.factorise(keep, shift + by * diagonal)), None)
 
 
-class Rule(Protocol):
+class RegularisationRule(Protocol):
     """The regularisation in one solve."""
 
-    def factorised(self, hessian: Hessian, at: Point, diagonal: NDArray[np.float64]) -> int | None:
+    def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
         """Factorise a Hessian and return its level: 0 for the exact one, more for others, None for no factor.
 
         The diagonal is that of `factorise_shifted`.
         """
         ...
 
-    def took(self, step: StepObjective, hessian: Hessian, at: Point, to: Point) -> None:
+    def record_step(self, step: StepObjective, hessian: Hessian, at: DescentPoint, to: DescentPoint) -> None:
         """Record a step from a point with the given Hessian to another point."""
         ...
 
 
-class Graded:
+class ShiftScheduleRule:
     """The smallest change of a schedule.
 
     It is the only rule that supports energies without an element-wise form.
     """
 
-    def factorised(self, hessian: Hessian, at: Point, diagonal: NDArray[np.float64]) -> int | None:
+    def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
         """Factorise at the first level of the schedule that has a factor."""
-        return factorised(hessian, diagonal)
+        return factorise_shifted(hessian, diagonal)
 
-    def took(self, step: StepObjective, hessian: Hessian, at: Point, to: Point) -> None:
+    def record_step(self, step: StepObjective, hessian: Hessian, at: DescentPoint, to: DescentPoint) -> None:
         """Record nothing."""
 
 
-class Close(Graded):
+class ContactScheduleRule(ShiftScheduleRule):
     """A finer schedule for active collisions, with a warm start from the level of the previous iterate.
 
     A compressed stack is indefinite for many iterations and becomes convex gradually; each of them would otherwise
@@ -106,16 +106,18 @@ class Close(Graded):
     """
 
     def __init__(self) -> None:
-        self._level = 0
+        self._current_level = 0
 
-    def factorised(self, hessian: Hessian, at: Point, diagonal: NDArray[np.float64]) -> int | None:
+    def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
         """Factorise, starting one level below the previous one."""
-        level = factorised(hessian, diagonal, levels=_CLOSE, first=max(0, self._level - 1))
-        self._level = self._level if level is None else level
+        level = factorise_shifted(
+            hessian, diagonal, schedule=_CONTACT_SCHEDULE, first_level=max(0, self._current_level - 1)
+        )
+        self._current_level = self._current_level if level is None else level
         return level
 
 
-class Clamped(Graded):
+class ClampRule(ShiftScheduleRule):
     """Eigenvalues of all elements clamped, or replaced by their absolute values.
 
     Attributes:
@@ -123,70 +125,73 @@ class Clamped(Graded):
         num_examined, num_projected: numbers of elements examined and of elements projected in the solve so far.
     """
 
-    def __init__(self, *, absolute: bool = False) -> None:
-        self.absolute = absolute
-        self.looked = self.changed = 0
+    def __init__(self, *, use_absolute: bool = False) -> None:
+        self.use_absolute = use_absolute
+        self.num_examined = self.num_projected = 0
 
-    def factorised(self, hessian: Hessian, at: Point, diagonal: NDArray[np.float64]) -> int | None:
+    def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
         """Factorise the projected Hessian, with a shift if necessary."""
-        return self._filtered(hessian, None, (0.0, *SHIFTS), diagonal)
+        return self._factorise_projected(hessian, None, (0.0, *DIAGONAL_SHIFTS), diagonal)
 
-    def _filtered(
+    def _factorise_projected(
         self,
         hessian: Hessian,
-        among: NDArray[np.bool_] | None,
+        vertex_mask: NDArray[np.bool_] | None,
         shifts: tuple[float, ...],
         diagonal: NDArray[np.float64],
     ) -> int | None:
         """Return the level; it is 0 if no element changed and nothing was added."""
-        found = hessian.filtered(Filtering(absolute=self.absolute, among=among))
-        self.looked, self.changed = self.looked + found.looked, self.changed + found.changed
-        first = int(found.changed > 0)
-        added = (k for k, by in enumerate(shifts) if hessian.factorise_filtered(found, by * diagonal))
+        found = hessian.project_to_psd(PsdProjection(use_absolute=self.use_absolute, vertex_mask=vertex_mask))
+        self.num_examined, self.num_projected = (
+            self.num_examined + found.num_examined,
+            self.num_projected + found.num_projected,
+        )
+        first = int(found.num_projected > 0)
+        added = (k for k, by in enumerate(shifts) if hessian.factorise_projected(found, by * diagonal))
         return next((first + k for k in added), None)
 
 
-class Trusted(Clamped):
+class TrustRegionRule(ClampRule):
     """Absolute eigenvalues if the quadratic model of the previous step was inaccurate, else clamped ones."""
 
     def __init__(self) -> None:
-        super().__init__(absolute=True)
+        super().__init__(use_absolute=True)
 
-    def took(self, step: StepObjective, hessian: Hessian, at: Point, to: Point) -> None:
+    def record_step(self, step: StepObjective, hessian: Hessian, at: DescentPoint, to: DescentPoint) -> None:
         """Compare the decrease in the step with the quadratic model."""
         s = to.positions - at.positions
-        model = dot(at.gradient, s) + 0.5 * dot(s, hessian.multiply(s))
-        rise, _ = step.rise(at.positions, to.positions)
-        self.absolute = not abs(rise - model) < _TRUSTED * abs(model)
+        model = inner_product(at.gradient, s) + 0.5 * inner_product(s, hessian.matvec(s))
+        rise, _ = step.objective_change(at.positions, to.positions)
+        self.use_absolute = not abs(rise - model) < _TRUST_TOLERANCE * abs(model)
 
 
-class Progressive(Clamped):
+class ProgressiveRule(ClampRule):
     """Eigenvalues clamped for as few elements as a factor needs, those with the largest gradient."""
 
     def __init__(self) -> None:
         super().__init__()
         self._threshold = np.inf
 
-    def factorised(self, hessian: Hessian, at: Point, diagonal: NDArray[np.float64]) -> int | None:
+    def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
         """Factorise with the current threshold, halving it until there is a factor."""
         force = np.abs(at.gradient).max(axis=1, initial=0.0)
-        for _ in range(_HALVINGS):
-            level = self._filtered(hessian, force >= self._threshold, (0.0,), diagonal)
+        for _ in range(_MAX_HALVINGS):
+            level = self._factorise_projected(hessian, force >= self._threshold, (0.0,), diagonal)
             if level is not None:
                 return level
             self._threshold = 0.5 * min(self._threshold, float(force.max(initial=0.0)))
-        return self._filtered(hessian, None, SHIFTS, diagonal)
+        return self._factorise_projected(hessian, None, DIAGONAL_SHIFTS, diagonal)
 
-    def took(self, step: StepObjective, hessian: Hessian, at: Point, to: Point) -> None:
+    def record_step(self, step: StepObjective, hessian: Hessian, at: DescentPoint, to: DescentPoint) -> None:
         """Double the threshold."""
         self._threshold *= 2.0
 
 
-RULES: dict[Indefinite, Callable[[], Rule]] = {
-    "graded": Graded,
-    "clamp": Clamped,
-    "absolute": lambda: Clamped(absolute=True),
-    "trust-region": Trusted,
-    "progressive": Progressive,
+REGULARISATION_RULES: dict[IndefiniteStrategy, Callable[[], RegularisationRule]] = {
+    "graded": ShiftScheduleRule,
+    "clamp": ClampRule,
+    "absolute": lambda: ClampRule(use_absolute=True),
+    "trust-region": TrustRegionRule,
+    "progressive": ProgressiveRule,
 }
 """A factory of the rule for a solve, by the name of the strategy."""

@@ -18,39 +18,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.kernels import loop
-from solvers.kernels.loop import Limits, at_most
-from solvers.problem import Positions, ResidualOf, Solution, StepProblem, StopRule, Unsupported
-from solvers.round_off import at_rest
+from solvers.kernels.loop import LoopLimits, iteration_limit
+from solvers.problem import Positions, ResidualIterate, Solution, StepProblem, StopRule, Unsupported
+from solvers.round_off import is_gradient_roundoff
 
-_STOPPED = {
-    loop.ITERATIONS: "iterations",
-    loop.TOLERANCE: "tolerance",
-    loop.FLOOR: "floor",
-    loop.STALLED: "stalled",
+_TERMINATION_REASONS = {
+    loop.REASON_ITERATIONS: "iterations",
+    loop.REASON_TOLERANCE: "tolerance",
+    loop.REASON_FLOOR: "floor",
+    loop.REASON_STALLED: "stalled",
 }
 
-_NEAR = 1e-12
+_ROUNDOFF_CHECK_FRACTION = 1e-12
 """Fraction of `IterativeSolver.residual_scale` that no rounding error reaches. It is thousands of units in the last
 place of any sum involved."""
 
-_DISTANT = 1e5
+_FAR_ORIGIN_RATIO = 1e5
 """Ratio of coordinates to extent beyond which round-off at rest is detected by the decrease of the residual."""
 
-_CLOSE = 1e-5
+_MINIMUM_CHECK_RTOL = 1e-5
 """Largest rtol for which the last iterate is checked for a minimum; looser tolerances do not justify the check."""
 
 
-EXACT = (
+EXACT_LENGTHS_UNSUPPORTED = (
     "supports finite stiffness only, and the scene has length constraints (a stiffness of `exact`): use "
     "avbd, which supports them, or give springs and strain limits a finite stiffness"
 )
 """Reason, after the method's name, why a method without length constraints does not support the scene."""
 
 
-_loop = loop.over(methodcaller("advance"), methodcaller("residual"))
+_interpreted_loop = loop.build_loop(methodcaller("advance"), methodcaller("residual"))
 
 
-class Iterating(ABC):
+class SolverState(ABC):
     """The state of a solve.
 
     Attributes:
@@ -62,12 +62,12 @@ class Iterating(ABC):
     velocity: Positions | None = None
 
     @property
-    def kept(self) -> NDArray[np.float64] | None:
+    def warm_start(self) -> NDArray[np.float64] | None:
         """Data for the next solve, see `solvers.model.step_problem.Solution`."""
         return None
 
     @abstractmethod
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents descent and the positions do not change."""
 
     def residual(self) -> float:
@@ -78,16 +78,16 @@ class Iterating(ABC):
         """
         return float("nan")
 
-    def certifies(self) -> bool:
+    def can_terminate(self) -> bool:
         """Return whether the iterate may be a minimum if it is stationary; a saddle point returns False."""
         return True
 
-    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Iterate up to the limits; return count, residual and reason, see `solvers.kernels.iteration_loop`."""
-        return _loop(self, limits)
+        return _interpreted_loop(self, limits)
 
 
-class Iterative(ABC):
+class IterativeSolver(ABC):
     """A method after the setup for a system; with `description` and `stats` it is a `PreparedSolver`.
 
     Attributes:
@@ -97,18 +97,18 @@ class Iterative(ABC):
             Unsupported for a system that has any.
     """
 
-    residual_of: ClassVar[ResidualOf] = "returned"
-    keeps_lengths: ClassVar[bool] = False
+    residual_iterate: ClassVar[ResidualIterate] = "returned"
+    supports_length_constraints: ClassVar[bool] = False
 
     @abstractmethod
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m], which is not modified."""
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         """Yield the iterates from the initial guess; the next one may overwrite a yielded array."""
-        run = self._begun(problem)
+        run = self._initial_state(problem)
         while True:
-            run.advance()
+            run.step_state()
             yield run.positions
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
@@ -116,31 +116,38 @@ class Iterative(ABC):
 
         Without a tolerance only the last residual is computed.
         """
-        run = self._begun(problem)
-        limits, yardstick, close = at_most(stop.iterations), float("nan"), False
-        if (stop.tolerance is not None or stop.within > 0.0) and self.residual_of != "none":
-            near, limit = _NEAR * self.scale(problem) if stop.floor > 0.0 else 0.0, stop.within
-            if stop.tolerance is not None:
-                yardstick = self.residual_at(problem, problem.current)
-                limit, close = max(limit, stop.tolerance * yardstick), stop.tolerance <= _CLOSE
-            limits = Limits(stop.iterations, limit, near, loop.EACH)
-        count, residual, ended = self._iterated(run, problem, limits, stop.floor)
-        while close and ended in (loop.TOLERANCE, loop.FLOOR) and not run.certifies():
-            left = limits._replace(iterations=stop.iterations - count)
-            more, residual, ended = self._iterated(run, problem, left, stop.floor)
+        run = self._initial_state(problem)
+        limits, yardstick, close = iteration_limit(stop.max_iterations), float("nan"), False
+        if (stop.rtol is not None or stop.atol > 0.0) and self.residual_iterate != "none":
+            near, limit = (
+                _ROUNDOFF_CHECK_FRACTION * self.residual_scale(problem) if stop.roundoff_floor > 0.0 else 0.0,
+                stop.atol,
+            )
+            if stop.rtol is not None:
+                yardstick = self.residual_at(problem, problem.current_positions)
+                limit, close = max(limit, stop.rtol * yardstick), stop.rtol <= _MINIMUM_CHECK_RTOL
+            limits = LoopLimits(stop.max_iterations, limit, near, loop.RESIDUAL_EACH)
+        count, residual, ended = self._iterate_to_roundoff(run, problem, limits, stop.roundoff_floor)
+        while close and ended in (loop.REASON_TOLERANCE, loop.REASON_FLOOR) and not run.can_terminate():
+            left = limits._replace(max_iterations=stop.max_iterations - count)
+            more, residual, ended = self._iterate_to_roundoff(run, problem, left, stop.roundoff_floor)
             count += more
-            if not more and ended != loop.ITERATIONS:
-                ended = loop.STALLED
-        ended = _STOPPED[ended]
-        return Solution(run.positions, count, residual, yardstick, ended, run.velocity, self.residual_of, run.kept)
+            if not more and ended != loop.REASON_ITERATIONS:
+                ended = loop.REASON_STALLED
+        ended = _TERMINATION_REASONS[ended]
+        return Solution(
+            run.positions, count, residual, yardstick, ended, run.velocity, self.residual_iterate, run.warm_start
+        )
 
-    def _begun(self, problem: StepProblem) -> Iterating:
-        if problem.system.lengths and not self.keeps_lengths:
-            raise Unsupported(EXACT)
-        return self.begin(problem, problem.first_guess)
+    def _initial_state(self, problem: StepProblem) -> SolverState:
+        if problem.system.length_constraints and not self.supports_length_constraints:
+            raise Unsupported(EXACT_LENGTHS_UNSUPPORTED)
+        return self.init_state(problem, problem.initial_guess)
 
     @staticmethod
-    def _iterated(run: Iterating, problem: StepProblem, limits: Limits, floor: float) -> tuple[int, float, int]:
+    def _iterate_to_roundoff(
+        run: SolverState, problem: StepProblem, limits: LoopLimits, roundoff_floor: float
+    ) -> tuple[int, float, int]:
         """Call `run.run_iterations`, and return FLOOR only if the gradient is round-off at each vertex.
 
         The gradient is checked once the residual is near round-off, then after one more iteration, and then whenever
@@ -148,20 +155,20 @@ class Iterative(ABC):
         rounding of coordinates whose differences are exact; there the iterations continue while each halves the
         residual.
         """
-        count, residual, ended = run.iterate(limits)
+        count, residual, ended = run.run_iterations(limits)
         since, gains = 0, True
-        while ended == loop.FLOOR:
-            rests = at_rest(problem, run.positions, floor)
-            if rests and not (gains and is_distant(run.positions)):
+        while ended == loop.REASON_FLOOR:
+            rests = is_gradient_roundoff(problem, run.positions, roundoff_floor)
+            if rests and not (gains and is_far_from_origin(run.positions)):
                 break
-            some = min(1 if rests else 1 + since // 2, limits.iterations - count)
+            some = min(1 if rests else 1 + since // 2, limits.max_iterations - count)
             if some == 0:
-                return count, residual, loop.FLOOR if rests else loop.ITERATIONS
-            more, now, ended = run.iterate(limits._replace(iterations=some, floor=0.0))
+                return count, residual, loop.REASON_FLOOR if rests else loop.REASON_ITERATIONS
+            more, now, ended = run.run_iterations(limits._replace(max_iterations=some, residual_floor=0.0))
             gains = gains and (not rests or now < 0.5 * residual)
             count, since, residual = count + more, since + more, now
-            if ended == loop.ITERATIONS or (rests and ended == loop.STALLED):
-                ended = loop.FLOOR
+            if ended == loop.REASON_ITERATIONS or (rests and ended == loop.REASON_STALLED):
+                ended = loop.REASON_FLOOR
         return count, residual, ended
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
@@ -169,58 +176,62 @@ class Iterative(ABC):
 
         It costs one iteration if it belongs to the previous iterate.
         """
-        if self.residual_of == "none":
+        if self.residual_iterate == "none":
             return float("nan")
-        return self.begin(problem, p).iterate(at_most(int(self.residual_of == "previous")))[1]
+        return self.init_state(problem, p).run_iterations(iteration_limit(int(self.residual_iterate == "previous")))[1]
 
-    def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
+    def build_residual(self, problem: StepProblem) -> Callable[[Positions], float]:
         """Build a function that returns `residual_at` for many positions of one step."""
         return lambda p: self.residual_at(problem, p)
 
-    def scale(self, problem: StepProblem) -> float:
+    def residual_scale(self, problem: StepProblem) -> float:
         """Return the residual [J^(1/2)] of a mean displacement as large as the initial guess's largest coordinate.
 
         The check for round-off begins at a small fraction of it; 0 disables the check.
         """
         return 0.0
 
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """Return the phases of an iteration; none by default."""
         return {}
 
 
-class Substeps(Iterating):
+class SubsteppingState(SolverState):
     """The whole step in 1, 2, ... substeps, each time from its start.
 
     Iterates that are not needed are skipped.
     """
 
-    def __init__(self, step: Callable[[StepProblem, int], tuple[Positions, Positions]], problem: StepProblem) -> None:
+    def __init__(
+        self, step_in_substeps: Callable[[StepProblem, int], tuple[Positions, Positions]], problem: StepProblem
+    ) -> None:
         """Create the state; `step_in_substeps(problem, n)` returns positions [m] and velocity [m/s]."""
-        self._step, self._problem, self._substeps = step, problem, 0
-        self.positions = problem.start.positions
+        self._step_in_substeps, self._problem, self._num_substeps = step_in_substeps, problem, 0
+        self.positions = problem.step_start.positions
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         """Integrate the step with one more substep."""
-        self.iterate(loop.ONE)
+        self.run_iterations(loop.ONE_ITERATION)
         return True
 
-    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Integrate the step once, with as many more substeps as the limit has iterations."""
-        self._substeps += limits.iterations
-        self.positions, self.velocity = self._step(self._problem, self._substeps)
-        return limits.iterations, float("nan"), loop.ITERATIONS
+        self._num_substeps += limits.max_iterations
+        self.positions, self.velocity = self._step_in_substeps(self._problem, self._num_substeps)
+        return limits.max_iterations, float("nan"), loop.REASON_ITERATIONS
 
 
-def is_distant(p: Positions) -> bool:
+def is_far_from_origin(p: Positions) -> bool:
     """Return whether coordinates (n, 3) [m] are so large that their rounding dominates that of their differences."""
-    return bool(np.abs(p).max(initial=0.0) > _DISTANT * np.ptp(p, axis=0).max(initial=0.0)) if len(p) else False
+    return (
+        bool(np.abs(p).max(initial=0.0) > _FAR_ORIGIN_RATIO * np.ptp(p, axis=0).max(initial=0.0)) if len(p) else False
+    )
 
 
-def largest(problem: StepProblem) -> float:
+def compute_max_coordinate(problem: StepProblem) -> float:
     """Return the largest coordinate [m] of the initial guess, with exactly pinned vertices on their targets."""
-    s, p = problem.system, problem.first_guess
-    if len(s.free) < s.vertices:
+    s, p = problem.system, problem.initial_guess
+    if len(s.free_vertices) < s.num_vertices:
         p = p.copy()
-        p[s.pins.vertices[s.pins.exact]] = problem.pin_targets[s.pins.exact]
+        p[s.pins.vertices[s.pins.exact_mask]] = problem.pin_targets[s.pins.exact_mask]
     return float(np.abs(p).max(initial=0.0))

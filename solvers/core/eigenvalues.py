@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 
 from solvers.core.bounds import PairBlocks
 
-Array = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
-_ROUND_OFF = 16.0 * np.finfo(np.float64).eps
+_EIGENVALUE_ROUNDOFF = 16.0 * np.finfo(np.float64).eps
 """Ratio to a block's largest eigenvalue up to which a negative one counts as round-off."""
 
-_PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+_PACKED_INDEX = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """Position of xx, xy, xz, yy, yz, zz within a block."""
 
 
-class Filtered(NamedTuple):
+class ProjectedHessian(NamedTuple):
     """The parts of a Hessian with projected elements.
 
     Attributes:
@@ -37,15 +37,15 @@ class Filtered(NamedTuple):
         num_projected: number of elements with a negative eigenvalue.
     """
 
-    keep: float
-    tension: Array
-    curvature: list[Array]
-    pairs: list[PairBlocks]
-    looked: int
-    changed: int
+    negative_fraction: float
+    spring_tensions: FloatArray
+    element_hessians: list[FloatArray]
+    pair_blocks: list[PairBlocks]
+    num_examined: int
+    num_projected: int
 
 
-class Filtering:
+class PsdProjection:
     """A projection and the counts of its elements.
 
     Attributes:
@@ -53,47 +53,47 @@ class Filtering:
         vertex_mask: mask of the vertices (n,) whose elements are projected; None for all.
     """
 
-    def __init__(self, *, absolute: bool = False, among: NDArray[np.bool_] | None = None) -> None:
-        self.absolute, self._among = absolute, among
-        self.looked = self.changed = 0
+    def __init__(self, *, use_absolute: bool = False, vertex_mask: NDArray[np.bool_] | None = None) -> None:
+        self.use_absolute, self._vertex_mask = use_absolute, vertex_mask
+        self.num_examined = self.num_projected = 0
 
-    def meets(self, vertices: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def select_elements(self, vertices: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return the mask of the elements (m, k) with a selected vertex; -1 is no vertex."""
-        if self._among is None:
+        if self._vertex_mask is None:
             met = np.ones(len(vertices), np.bool_)
         else:
-            met = np.logical_or.reduce(self._among[vertices] & (vertices >= 0), axis=1)
-        self.looked += int(met.sum())
+            met = np.logical_or.reduce(self._vertex_mask[vertices] & (vertices >= 0), axis=1)
+        self.num_examined += int(met.sum())
         return met
 
-    def springs(self, edges: NDArray[np.int64], tension: Array) -> tuple[float, Array]:
+    def project_springs(self, edges: NDArray[np.int64], tension: FloatArray) -> tuple[float, FloatArray]:
         """Return the negative fraction and the tensions (m,) [N] of projected springs (m, 2).
 
         The transverse eigenvalue of a spring is t/l.
         """
-        bent = self.meets(edges) & (tension < 0.0)
-        self.changed += int(bent.sum())
-        return (-1.0, tension) if self.absolute else (1.0, np.where(bent, 0.0, tension))
+        bent = self.select_elements(edges) & (tension < 0.0)
+        self.num_projected += int(bent.sum())
+        return (-1.0, tension) if self.use_absolute else (1.0, np.where(bent, 0.0, tension))
 
-    def packed(self, vertices: NDArray[np.int64], curvature: Array) -> Array:
+    def project_packed(self, vertices: NDArray[np.int64], packed_hessians: FloatArray) -> FloatArray:
         """Project packed Hessians (m, 6) [N/m] of elements with vertices (m, k)."""
-        blocks = self.blocks(vertices, curvature[:, _PLACE])
-        return curvature if blocks is None else np.ascontiguousarray(blocks.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
+        blocks = self.project_blocks(vertices, packed_hessians[:, _PACKED_INDEX])
+        return packed_hessians if blocks is None else np.ascontiguousarray(blocks.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
 
-    def pairs(self, pairs: PairBlocks) -> PairBlocks:
+    def project_pairs(self, pairs: PairBlocks) -> PairBlocks:
         """Project the blocks of pairs."""
-        blocks = self.blocks(pairs.vertices, pairs.values) if len(pairs.vertices) else None
-        return pairs if blocks is None else pairs.of(blocks)
+        blocks = self.project_blocks(pairs.vertices, pairs.values) if len(pairs.vertices) else None
+        return pairs if blocks is None else pairs.with_values(blocks)
 
-    def blocks(self, vertices: NDArray[np.int64], blocks: Array) -> Array | None:
+    def project_blocks(self, vertices: NDArray[np.int64], blocks: FloatArray) -> FloatArray | None:
         """Project symmetric blocks (m, k, k) of elements; return None if no eigenvalue is negative."""
-        met = np.flatnonzero(self.meets(vertices))
+        met = np.flatnonzero(self.select_elements(vertices))
         size, axes = np.linalg.eigh(blocks[met])
-        bent = size[:, 0] < -_ROUND_OFF * np.abs(size).max(axis=1, initial=0.0)
-        self.changed += int(bent.sum())
+        bent = size[:, 0] < -_EIGENVALUE_ROUNDOFF * np.abs(size).max(axis=1, initial=0.0)
+        self.num_projected += int(bent.sum())
         if not bent.any():
             return None
-        size = np.abs(size[bent]) if self.absolute else np.maximum(size[bent], 0.0)
+        size = np.abs(size[bent]) if self.use_absolute else np.maximum(size[bent], 0.0)
         out = blocks.copy()
         out[met[bent]] = np.einsum("mij,mj,mkj->mik", axes[bent], size, axes[bent])
         return out

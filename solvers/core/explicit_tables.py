@@ -15,30 +15,30 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Composition:
+class SplittingMethod:
     """A splitting method: its order, drifts (k + 1,) and kicks (k,), as fractions of a step."""
 
     order: int
-    drifts: Array
-    kicks: Array
+    drifts: FloatArray
+    kicks: FloatArray
 
     @classmethod
-    def symmetric(cls, order: int, drifts: list[float], kicks: list[float]) -> Composition:
+    def from_first_half(cls, order: int, drifts: list[float], kicks: list[float]) -> SplittingMethod:
         """Build a symmetric method from its first half; the middle coefficients complete the sums."""
         middle = 1.0 - 2.0 * sum(drifts)
         kicks = [*kicks, 0.5 - sum(kicks)]
         return cls(order, np.array([*drifts, middle, *drifts[::-1]]), np.array([*kicks, *kicks[::-1]]))
 
     @property
-    def evaluations(self) -> int:
+    def num_evaluations(self) -> int:
         """Evaluations of the forces per step; a first drift of zero reuses the last evaluation."""
         return len(self.kicks) - (self.drifts[0] == 0.0)
 
-    def power(self, y: float) -> complex:
+    def amplification_factor(self, y: float) -> complex:
         """Return the largest eigenvalue of a step's matrix for an oscillator with omega h = y."""
         step = np.eye(2)
         for k, drift in enumerate(self.drifts):
@@ -48,13 +48,13 @@ class Composition:
         return max(np.linalg.eigvals(step), key=abs)
 
     @cached_property
-    def limit(self) -> float:
+    def stability_limit(self) -> float:
         """Stability limit of omega h."""
-        return _limit(self)
+        return _find_stability_limit(self)
 
 
 @dataclass(frozen=True, eq=False)
-class Tableau:
+class ExplicitTableau:
     """An explicit Runge-Kutta method.
 
     Attributes:
@@ -65,16 +65,16 @@ class Tableau:
     """
 
     order: int
-    a: Array
-    errors: Array
-    power: float = 0.0
+    a: FloatArray
+    error_weights: FloatArray
+    error_exponent: float = 0.0
 
     @property
-    def evaluations(self) -> int:
+    def num_evaluations(self) -> int:
         """Evaluations of the forces per step."""
         return len(self.a) - 1
 
-    def unfinished(self, tried: float, h: float, reached: float, frame: float, tolerance: float) -> str:
+    def format_step_failure(self, tried: float, h: float, reached: float, frame: float, tolerance: float) -> str:
         """Format the error message of a frame that was not finished.
 
         Args:
@@ -90,33 +90,33 @@ class Tableau:
             "larger error"
         )
 
-    def power_of(self, y: float) -> complex:
+    def amplification_factor(self, y: float) -> complex:
         """Return the stability function R(i y)."""
         s = len(self.a)
         stages = np.linalg.solve(np.eye(s) - 1j * y * self.a, np.ones(s))
         return stages[-1]
 
     @cached_property
-    def times(self) -> Array:
+    def stage_times(self) -> FloatArray:
         """Times c of the stages (s,)."""
         return self.a.sum(axis=1)
 
     @cached_property
-    def limit(self) -> float:
+    def stability_limit(self) -> float:
         """Stability limit of omega h."""
-        return _limit(self)
+        return _find_stability_limit(self)
 
 
-_TRIED = 20
+_MAX_TRIED_RATIO = 20
 """Maximum ratio of tried steps to the stable number with an error tolerance."""
 
 
-def most_steps(count: int, tolerance: float) -> int:
+def compute_max_steps(count: int, tolerance: float) -> int:
     """Return the maximum number of steps to try if `count` are stable; exactly `count` without a tolerance."""
-    return _TRIED * count + 10_000 if tolerance else count
+    return _MAX_TRIED_RATIO * count + 10_000 if tolerance else count
 
 
-def in_time(kicks: Array, h: float, drag: Array) -> tuple[Array, Array]:
+def integrate_drag(kicks: FloatArray, h: float, drag: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the decay of a velocity by each kick, and its gain per acceleration [s], both (k, r).
 
     They are exact for linear drag.
@@ -131,13 +131,13 @@ def in_time(kicks: Array, h: float, drag: Array) -> tuple[Array, Array]:
     return np.exp(-gone), gained
 
 
-def _limit(method: Composition | Tableau) -> float:
-    grows = method.power if isinstance(method, Composition) else method.power_of
+def _find_stability_limit(method: SplittingMethod | ExplicitTableau) -> float:
+    grows = method.amplification_factor if isinstance(method, SplittingMethod) else method.amplification_factor
     found = next(y for y in np.arange(0.01, 40.0, 0.01) if abs(grows(float(y))) > 1.0 + 1e-6)
     return float(found) - 0.01
 
 
-def _lower(*rows: list[float]) -> Array:
+def _lower_triangular(*rows: list[float]) -> FloatArray:
     """Build a square array from rows padded with zeros."""
     out = np.zeros((len(rows), len(rows)))
     for k, row in enumerate(rows):
@@ -145,21 +145,21 @@ def _lower(*rows: list[float]) -> Array:
     return out
 
 
-VERLET = Composition(2, np.array([0.0, 1.0, 0.0]), np.array([0.5, 0.5]))
-BLANES_MOAN_4 = Composition.symmetric(
+VELOCITY_VERLET = SplittingMethod(2, np.array([0.0, 1.0, 0.0]), np.array([0.5, 0.5]))
+BLANES_MOAN_4 = SplittingMethod.from_first_half(
     4, [0.0792036964311957, 0.353172906049774, -0.0420650803577195], [0.209515106613362, -0.143851773179818]
 )
-BLANES_MOAN_6 = Composition.symmetric(
+BLANES_MOAN_6 = SplittingMethod.from_first_half(
     6,
     [0.0502627644003922, 0.413514300428344, 0.0450798897943977, -0.188054853819569, 0.541960678450780],
     [0.148816447901042, -0.132385865767784, 0.067307604692185, 0.432666402578175],
 )
-RUNGE_KUTTA_4 = Tableau(
-    4, _lower([], [0.5], [0.0, 0.5], [0.0, 0.0, 1.0], [1 / 6, 1 / 3, 1 / 3, 1 / 6]), np.zeros((0, 5))
+RUNGE_KUTTA_4 = ExplicitTableau(
+    4, _lower_triangular([], [0.5], [0.0, 0.5], [0.0, 0.0, 1.0], [1 / 6, 1 / 3, 1 / 3, 1 / 6]), np.zeros((0, 5))
 )
-TSITOURAS_5 = Tableau(
+TSITOURAS_5 = ExplicitTableau(
     5,
-    _lower(
+    _lower_triangular(
         [],
         [0.161],
         [-0.008480655492356989, 0.335480655492357],
@@ -184,10 +184,10 @@ TSITOURAS_5 = Tableau(
 
 
 @cache
-def dormand_prince_8() -> Tableau:
+def build_dormand_prince_8() -> ExplicitTableau:
     """Return the method of order 8."""
     from scipy.integrate import DOP853  # for those who ask for it
 
     a = np.zeros((13, 13))
     a[:12, :12], a[12, :12] = DOP853.A, DOP853.B
-    return Tableau(8, a, np.array([DOP853.E5, DOP853.E3]), 8.0)
+    return ExplicitTableau(8, a, np.array([DOP853.E5, DOP853.E3]), 8.0)

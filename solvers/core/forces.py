@@ -11,62 +11,62 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import ArpackError, eigsh
 
-from solvers.core.driver import Iterating
+from solvers.core.driver import SolverState
 from solvers.energies.quadratic import Quadratic, drag_of_vertices
 from solvers.energies.springs import Springs
-from solvers.kernels.forms import Form
-from solvers.kernels.loop import ITERATIONS, Limits
-from solvers.kernels.springs import Bundles
-from solvers.memory import aligned
+from solvers.kernels.forms import QuadraticForm
+from solvers.kernels.loop import REASON_ITERATIONS, LoopLimits
+from solvers.kernels.springs import SpringPackets
+from solvers.memory import allocate_aligned
 from solvers.problem import Positions, System, Unsupported, is_lagged
 
-_ABOVE = 1.02
+_EIGENVALUE_MARGIN = 1.02
 """Margin for the largest eigenvalue, which is approximated from below to one percent."""
 
 
-def frequency(system: System) -> float:
+def estimate_max_frequency(system: System) -> float:
     """Return a bound of the largest angular frequency [rad/s] of springs and constant forms, with all pins fixed."""
-    free = np.flatnonzero(system.unpinned)
+    free = np.flatnonzero(system.unpinned_mask)
     constant = [e for e in system.energies if isinstance(e, (Springs, Quadratic)) and not is_lagged(e)]
     if not len(free) or not constant:
         return 0.0
-    K = reduce(add, (e.stiffness_matrix(system.vertices) for e in constant))
-    inner = csr_array(K, copy=True) if len(free) == system.vertices else csr_array(csr_array(K[free])[:, free])
+    K = reduce(add, (e.stiffness_matrix(system.num_vertices) for e in constant))
+    inner = csr_array(K, copy=True) if len(free) == system.num_vertices else csr_array(csr_array(K[free])[:, free])
     slow = 1.0 / np.sqrt(system.mass[free])
     inner.data *= np.repeat(slow, np.diff(inner.indptr))
     inner.data *= slow[inner.indices]
     rows = float(abs(inner).sum(axis=1).max(initial=0.0))  # Gershgorin
     if len(free) < 20 or not rows:
         most = float(np.linalg.eigvalsh(inner.toarray()).max(initial=0.0))
-        return _ABOVE * max(most, 0.0) ** 0.5
+        return _EIGENVALUE_MARGIN * max(most, 0.0) ** 0.5
     try:
         given = np.random.default_rng(0).normal(size=len(free))
         most = float(eigsh(inner, 1, which="LA", tol=1e-2, v0=given, return_eigenvectors=False)[0])
     except ArpackError:
         return rows**0.5
-    return min(_ABOVE * most**0.5, rows**0.5)
+    return min(_EIGENVALUE_MARGIN * most**0.5, rows**0.5)
 
 
 @dataclass(frozen=True, eq=False)
-class ForceParts:
+class ExplicitForces:
     """The forces of a system: springs and their packets, a form as in `FrameForces`, drag (n,) [1/s], load (n, 3) [N].
 
     The load is the force of the form at the origin.
     """
 
     springs: Springs
-    bundles: Bundles
-    pairs: NDArray[np.int64]
-    weight: NDArray[np.float64]
-    held: NDArray[np.float64]
-    drag: NDArray[np.float64]
-    load: Positions
+    spring_packets: SpringPackets
+    form_pairs: NDArray[np.int64]
+    form_weight: NDArray[np.float64]
+    form_vertex_weight: NDArray[np.float64]
+    drag_rate: NDArray[np.float64]
+    constant_force: Positions
 
     @classmethod
-    def of(cls, system: System, solver: str) -> ForceParts:
+    def from_system(cls, system: System, solver: str) -> ExplicitForces:
         """Build the forces; raise Unsupported for energies that are not supported."""
-        n = system.vertices
-        springs = Springs.joined([energy for energy in system.energies if isinstance(energy, Springs)])
+        n = system.num_vertices
+        springs = Springs.from_parts([energy for energy in system.energies if isinstance(energy, Springs)])
         drag, load, forms = np.zeros(n), np.zeros((n, 3)), list[csr_array]()
         for energy in system.energies:
             if (c := drag_of_vertices(energy)) is not None:
@@ -79,42 +79,48 @@ class ForceParts:
                     f"{solver}: knows springs, bending and drag on vertices; the scene has {type(energy).__name__} "
                     "as well"
                 )
-        form = Form.of(csr_array(reduce(add, forms))) if forms else Form.none()
-        part = np.where(system.unpinned, 0, -1)
-        bundles, _ = Bundles.of(springs, np.arange(n), part, 1, n, n + 1)
-        drag = np.divide(drag, system.mass, out=np.zeros(n), where=system.unpinned)
+        form = QuadraticForm.from_matrix(csr_array(reduce(add, forms))) if forms else QuadraticForm.empty_form()
+        part = np.where(system.unpinned_mask, 0, -1)
+        bundles, _ = SpringPackets.from_springs(springs, np.arange(n), part, 1, n, n + 1)
+        drag = np.divide(drag, system.mass, out=np.zeros(n), where=system.unpinned_mask)
         return cls(
-            springs, bundles, form.pairs, form.weight, form.held if form.held.any() else form.held[:0], drag, load
+            springs,
+            bundles,
+            form.pairs,
+            form.pair_weight,
+            form.vertex_weight if form.vertex_weight.any() else form.vertex_weight[:0],
+            drag,
+            load,
         )
 
 
-_FAR = 1e100
+_PADDING_COORDINATE = 1e100
 """Coordinate of the ends of padding springs, far from any vertex in any unit of length."""
 
 
-def rows_of_four(x: Positions, *, far: bool = False) -> NDArray[np.float64]:
+def pad_rows(x: Positions, *, pad_far: bool = False) -> NDArray[np.float64]:
     """Return x (n, 3) in rows of four, with two padding rows.
 
     `pad_far` moves the last one away from all vertices.
     """
-    out = aligned(4 * (len(x) + 2))
+    out = allocate_aligned(4 * (len(x) + 2))
     out.reshape(-1, 4)[: len(x), :3] = x
-    if far:
-        out[4 * (len(x) + 1)] = _FAR
+    if pad_far:
+        out[4 * (len(x) + 1)] = _PADDING_COORDINATE
     return out
 
 
-class Whole(Iterating):
+class SingleIterateState(SolverState):
     """A whole step as the only iterate, repeated."""
 
     def __init__(self, p: Positions, v: Positions | None) -> None:
         """Create the state with the velocity at the end of the step, or None if it follows from the positions."""
         self.positions, self.velocity = p, v
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents descent."""
         return True
 
-    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Iterate up to the limits; return count, residual and reason."""
-        return 1, float("nan"), ITERATIONS
+        return 1, float("nan"), REASON_ITERATIONS

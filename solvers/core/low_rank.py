@@ -18,60 +18,60 @@ from scipy.linalg import eigh
 from scipy.sparse import bsr_array, csc_array, csr_array
 from scipy.sparse.linalg import splu
 
-from solvers.core.coupled import Coupled
-from solvers.core.pattern import Matrix
+from solvers.core.coupled import RankUpdateEnergy
+from solvers.core.pattern import BlockMatrix
 from solvers.problem import Energy, Positions
 
-Solve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+LinearSolve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """The product with S^-1, (f, 3)."""
 
 
 def sparse_part(energy: Energy, p: Positions) -> csr_array:
     """Return the Hessian of an energy without its low-rank part V V'."""
-    return csr_array(energy.sparse_hessian(p) if isinstance(energy, Coupled) else energy.hessian(p))
+    return csr_array(energy.sparse_hessian(p) if isinstance(energy, RankUpdateEnergy) else energy.hessian(p))
 
 
-def columns(energies: Sequence[Energy], p: Positions) -> NDArray[np.float64] | None:
+def low_rank_columns(energies: Sequence[Energy], p: Positions) -> NDArray[np.float64] | None:
     """Return V of all energies (n, 3, r), or None if there is none."""
-    found = [energy.columns(p) for energy in energies if isinstance(energy, Coupled)]
+    found = [energy.low_rank_columns(p) for energy in energies if isinstance(energy, RankUpdateEnergy)]
     return np.concatenate(found, axis=2) if found else None
 
 
 class Woodbury:
     """The factorisation of H = S + V V' with S in a block matrix; same interface as `BlockCholesky`."""
 
-    def __init__(self, matrix: Matrix, V: NDArray[np.float64]) -> None:
+    def __init__(self, matrix: BlockMatrix, V: NDArray[np.float64]) -> None:
         """Create the factorisation for columns V (f, 3, r), over the free vertices."""
         self._matrix, self._V = matrix, V
 
     def factorise(self, values: NDArray[np.float64]) -> bool:
         """Factorise H from the blocks of S; return False if H is not positive definite."""
         cholesky, negative = self._matrix.factor, 0
-        self._inner: Solve = cholesky.solve
+        self._sparse_solve: LinearSolve = cholesky.solve
         if not cholesky.factorise(values):
-            found = _indefinite(self._matrix.graph, values)
+            found = _factorise_indefinite(self._matrix.graph, values)
             if found is None:
                 return False
-            self._inner, negative = found
+            self._sparse_solve, negative = found
         V = self._V
-        self._W = np.stack([self._inner(np.ascontiguousarray(V[:, :, k])) for k in range(V.shape[2])], axis=2)
+        self._W = np.stack([self._sparse_solve(np.ascontiguousarray(V[:, :, k])) for k in range(V.shape[2])], axis=2)
         C = np.eye(V.shape[2]) + np.einsum("fik,fil->kl", V, self._W)
-        size, self._axes = eigh(0.5 * (C + C.T)) if np.isfinite(C).all() else (np.zeros(len(C)), C)
-        self._size = size
+        size, self._eigenvectors = eigh(0.5 * (C + C.T)) if np.isfinite(C).all() else (np.zeros(len(C)), C)
+        self._eigenvalues = size
         return bool(size.all()) and negative == np.count_nonzero(size < 0.0)
 
     def solve(self, b: Positions) -> Positions:
         """Return H^-1 b, both (f, 3)."""
-        x = self._inner(b)
-        along = self._axes @ ((self._axes.T @ np.einsum("fik,fi->k", self._V, x)) / self._size)
+        x = self._sparse_solve(b)
+        along = self._eigenvectors @ ((self._eigenvectors.T @ np.einsum("fik,fi->k", self._V, x)) / self._eigenvalues)
         return x - self._W @ along
 
-    def solve_anew(self, values: NDArray[np.float64], b: Positions) -> Positions | None:
+    def factorise_and_solve(self, values: NDArray[np.float64], b: Positions) -> Positions | None:
         """Factorise H from the blocks of S and return H^-1 b; None if H is not positive definite."""
         return self.solve(b) if self.factorise(values) else None
 
 
-def _indefinite(graph: csr_array, values: NDArray[np.float64]) -> tuple[Solve, int] | None:
+def _factorise_indefinite(graph: csr_array, values: NDArray[np.float64]) -> tuple[LinearSolve, int] | None:
     """Return the product with S^-1 and the number of negative eigenvalues, from pivots on the diagonal.
 
     It is None if a pivot is zero or would have to be chosen off the diagonal.

@@ -20,22 +20,22 @@ from numpy.typing import NDArray
 from scipy.sparse import block_array, coo_array, csc_array, csr_array, diags_array, kron
 from scipy.sparse.linalg import splu
 
-from solvers.energies.edges import directions
-from solvers.held import Lengths
-from solvers.matrices import assemble
+from solvers.energies.edges import unit_directions
+from solvers.held import LengthConstraints
+from solvers.matrices import assemble_system_matrix
 from solvers.problem import Positions, ProjectiveEnergy, StepProblem, System
 
 _COMPLIANCE = 1e-10
 """The value eps relative to 1/k. It regularises redundant constraints; refinement removes its effect."""
-_REFINEMENTS = 4
-_CHANGES = 50
+_REFINEMENT_STEPS = 4
+_MAX_ACTIVE_SET_CHANGES = 50
 """Maximum number of changes of the active set."""
 
 
-class Multipliers:
+class LagrangeMultipliers:
     """The multipliers of a system's length constraints."""
 
-    def __init__(self, augmented: System, lengths: Lengths, stiffness: NDArray[np.float64]) -> None:
+    def __init__(self, augmented: System, constraints: LengthConstraints, stiffness: NDArray[np.float64]) -> None:
         """Assemble the matrices; raise NotPositiveDefinite.
 
         Args:
@@ -43,46 +43,48 @@ class Multipliers:
             constraints: the constraints.
             stiffness: stiffnesses of the penalties (m,) [N/m].
         """
-        Q = assemble(augmented, [e for e in augmented.energies if isinstance(e, ProjectiveEnergy)])
-        free = augmented.free
-        self._lengths, self._stiffness = lengths, stiffness
+        Q = assemble_system_matrix(augmented, [e for e in augmented.energies if isinstance(e, ProjectiveEnergy)])
+        free = augmented.free_vertices
+        self._constraints, self._stiffness = constraints, stiffness
         self._Q = csr_array(kron(Q[free][:, free], np.eye(3)))
-        self._column = np.full((augmented.vertices, 3), -1)
-        self._column[free] = np.arange(3 * len(free)).reshape(-1, 3)
-        self._free = free
+        self._dof_column = np.full((augmented.num_vertices, 3), -1)
+        self._dof_column[free] = np.arange(3 * len(free)).reshape(-1, 3)
+        self._free_vertices = free
 
-    def at(self, problem: StepProblem, p: Positions) -> NDArray[np.float64]:
+    def multipliers_at(self, problem: StepProblem, p: Positions) -> NDArray[np.float64]:
         """Return the multipliers (m,) [N] of a step at p (n, 3) [m], zero for lengths within their limits."""
-        x, k = self._lengths, self._stiffness
-        length, n = directions(p[x.edges[:, 0]] - p[x.edges[:, 1]], x.rest_direction)
-        J, downhill = self._jacobian(n), -problem.gradient(p)[self._free].ravel()
-        tension = k * (length - np.clip(length, x.low, x.high))
-        active = self._active(length, tension)
-        for _ in range(_CHANGES):
+        x, k = self._constraints, self._stiffness
+        length, n = unit_directions(p[x.edges[:, 0]] - p[x.edges[:, 1]], x.rest_direction)
+        J, downhill = self._jacobian(n), -problem.gradient(p)[self._free_vertices].ravel()
+        tension = k * (length - np.clip(length, x.min_length, x.max_length))
+        active = self._active_set(length, tension)
+        for _ in range(_MAX_ACTIVE_SET_CHANGES):
             (held,) = np.nonzero(active)
-            bound = np.where(active > 0, x.high, x.low)[held]
-            step, found = self._solved(J[held], k[held], downhill, bound - length[held])
+            bound = np.where(active > 0, x.max_length, x.min_length)[held]
+            step, found = self._solve_kkt(J[held], k[held], downhill, bound - length[held])
             tension = np.zeros(len(k))
             tension[held] = found
-            before, active = active, self._active(length + J @ step, tension)
+            before, active = active, self._active_set(length + J @ step, tension)
             if np.array_equal(before, active):
                 break
         return tension
 
-    def _active(self, length: NDArray[np.float64], tension: NDArray[np.float64]) -> NDArray[np.int64]:
+    def _active_set(self, length: NDArray[np.float64], tension: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the active limit of each length: 1 the maximum, -1 the minimum, 0 none."""
-        x, trial = self._lengths, length + tension / self._stiffness
-        return np.where((trial > x.high) | (x.low == x.high), 1, np.where(trial < x.low, -1, 0))
+        x, trial = self._constraints, length + tension / self._stiffness
+        return np.where(
+            (trial > x.max_length) | (x.min_length == x.max_length), 1, np.where(trial < x.min_length, -1, 0)
+        )
 
     def _jacobian(self, n: Positions) -> csr_array:
         """Return the derivatives of the lengths (m, 3 f) by the coordinates of free vertices."""
-        columns = self._column[self._lengths.edges].reshape(len(n), 6)
+        columns = self._dof_column[self._constraints.edges].reshape(len(n), 6)
         rows = np.repeat(np.arange(len(n)), 6).reshape(-1, 6)
         values, there = np.hstack([n, -n]), columns >= 0
         shape = len(n), self._Q.shape[0]
         return csr_array(coo_array((values[there], (rows[there], columns[there])), shape=shape))
 
-    def _solved(
+    def _solve_kkt(
         self, J: csr_array, k: NDArray[np.float64], downhill: NDArray[np.float64], open: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Solve the linear system for d [m] and t [N]."""
@@ -92,6 +94,6 @@ class Multipliers:
         right = np.concatenate([downhill, open])
         compliance = np.concatenate([np.zeros(len(downhill)), -_COMPLIANCE / k])
         factor, x = splu(csc_array(K + diags_array(compliance))), np.zeros_like(right)
-        for _ in range(_REFINEMENTS):
+        for _ in range(_REFINEMENT_STEPS):
             x += factor.solve(right - K @ x)
         return x[: len(downhill)], x[len(downhill) :]

@@ -26,16 +26,16 @@ from solvers.core.prefactored import PreparedLocalGlobal
 from solvers.energies.springs import Springs
 from solvers.problem import NotPositiveDefinite, Positions, System, Unsupported
 
-HEADERS = Path(__file__).parent.parent / "methods"
-FLAGS = ("-O3", "-march=native", "-DNDEBUG", "-std=c++17")
-SYSTEM = ("/usr/include/eigen3", "/usr/include/suitesparse")
+HEADER_FOLDER = Path(__file__).parent.parent / "methods"
+COMPILER_FLAGS = ("-O3", "-march=native", "-DNDEBUG", "-std=c++17")
+SYSTEM_INCLUDE_FOLDERS = ("/usr/include/eigen3", "/usr/include/suitesparse")
 """Header folders of Debian's libraries; those in the compiler's own search path (CPATH) are used as well."""
 
-LIBRARY = ("-shared", "-fPIC")
+SHARED_LIBRARY_FLAGS = ("-shared", "-fPIC")
 
 
 def compile_cpp(
-    source: Path, folder: Path, needs: str, options: Sequence[str] = (), libraries: Sequence[str] = ()
+    source: Path, folder: Path, requirements: str, options: Sequence[str] = (), libraries: Sequence[str] = ()
 ) -> Path:
     """Return the program or library compiled in `folder`; recompile it after a change of the sources or headers.
 
@@ -52,10 +52,12 @@ def compile_cpp(
     compiler = next(filter(None, map(shutil.which, (os.environ.get("CXX", ""), "c++", "g++", "clang++"))), None)
     if compiler is None:
         raise Unsupported("there is no C++ compiler (c++, g++, clang++, or CXX)")
-    included = ["-I", str(HEADERS), *(part for path in SYSTEM for part in ("-isystem", path))]
-    command = [compiler, *FLAGS, *options, *included, str(source), *libraries]
-    content = b"".join(path.read_bytes() for path in (source, *sorted(HEADERS.glob("*.hpp"))))
-    name = hashlib.sha256(" ".join([compiler, *FLAGS, *options, *libraries]).encode() + content).hexdigest()[:12]
+    included = ["-I", str(HEADER_FOLDER), *(part for path in SYSTEM_INCLUDE_FOLDERS for part in ("-isystem", path))]
+    command = [compiler, *COMPILER_FLAGS, *options, *included, str(source), *libraries]
+    content = b"".join(path.read_bytes() for path in (source, *sorted(HEADER_FOLDER.glob("*.hpp"))))
+    name = hashlib.sha256(" ".join([compiler, *COMPILER_FLAGS, *options, *libraries]).encode() + content).hexdigest()[
+        :12
+    ]
     made = folder.resolve() / f"{source.stem}-{name}"
     if not made.exists():
         folder.mkdir(parents=True, exist_ok=True)
@@ -63,66 +65,68 @@ def compile_cpp(
         told = subprocess.run([*command, "-o", str(partial)], capture_output=True, text=True)
         if told.returncode:
             first = next((line for line in told.stderr.splitlines() if "error" in line), "no message")
-            raise Unsupported(f"{source.name} does not compile: {first.strip()}; it needs {needs}")
+            raise Unsupported(f"{source.name} does not compile: {first.strip()}; it needs {requirements}")
         os.replace(partial, made)
     return made
 
 
-def library(source: Path, needs: str, libraries: Sequence[str] = ()) -> ctypes.CDLL:
+def load_library(source: Path, requirements: str, libraries: Sequence[str] = ()) -> ctypes.CDLL:
     """Compile a source and load the library; raise Unsupported if that fails."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "springbench"
-    made = ctypes.CDLL(str(compile_cpp(source, cache, needs, LIBRARY, libraries)))
+    made = ctypes.CDLL(str(compile_cpp(source, cache, requirements, SHARED_LIBRARY_FLAGS, libraries)))
     made.prepare.restype = ctypes.c_void_p
     return made
 
 
-class Native:
+class CppBackend:
     """The local step and the factor of one system."""
 
     nonzeros: int | None = None
 
     def __init__(self, library: ctypes.CDLL, system: System, springs: Springs) -> None:
         """Prepare a system; raise NotPositiveDefinite if Q has no factor."""
-        _, pinned, weight = system.penalty
-        self.library, self._n, self._free = library, system.vertices, len(system.free)
-        given = [np.ascontiguousarray(part, np.int64) for part in (springs.edges, pinned, system.free)]
+        _, pinned, weight = system.penalty_pins
+        self.library, self._num_vertices, self._num_free = library, system.num_vertices, len(system.free_vertices)
+        given = [np.ascontiguousarray(part, np.int64) for part in (springs.edges, pinned, system.free_vertices)]
         given += [
             np.ascontiguousarray(part, np.float64)
-            for part in (springs.stiffness, springs.rest_length, system.inertia, weight)
+            for part in (springs.stiffness, springs.rest_length, system.inertia_diagonal, weight)
         ]
-        sizes = self._n, len(springs.edges), len(pinned), self._free
-        made = library.prepare(*map(ctypes.c_int64, sizes), *map(address, given))
+        sizes = self._num_vertices, len(springs.edges), len(pinned), self._num_free
+        made = library.prepare(*map(ctypes.c_int64, sizes), *map(array_address, given))
         if not made:
             raise NotPositiveDefinite("there is no factor of Q = A'KA + M/dt^2 + w C'C")
-        self.made = ctypes.c_void_p(made)
-        weakref.finalize(self, library.release, self.made)
+        self.handle = ctypes.c_void_p(made)
+        weakref.finalize(self, library.release, self.handle)
 
-    def project(self, p: Positions, y: Positions, out: Positions) -> None:
+    def apply_local_step(self, p: Positions, y: Positions, out: Positions) -> None:
         """Write y + A'K d(p) to `out`."""
-        self.library.local(self.made, ctypes.c_int64(self._n), *map(address, (p, y, out)))
+        self.library.local(self.handle, ctypes.c_int64(self._num_vertices), *map(array_address, (p, y, out)))
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Write Q^-1 b to `out`, for the free rows and columns of Q."""
-        self.library.global_(self.made, ctypes.c_int64(self._free), address(b), address(out))
+        self.library.global_(self.handle, ctypes.c_int64(self._num_free), array_address(b), array_address(out))
 
 
-def address(array: np.ndarray) -> ctypes.c_void_p:
+def array_address(array: np.ndarray) -> ctypes.c_void_p:
     """Return the address of a contiguous array."""
     assert array.flags.c_contiguous
     return ctypes.c_void_p(array.ctypes.data)
 
 
-Made = TypeVar("Made", bound=PreparedLocalGlobal)
+PreparedType = TypeVar("PreparedType", bound=PreparedLocalGlobal)
 
 
-def prepared(kind: type[Made], system: System, springs: Springs, native: Native, choice: str) -> Made:
+def prepare_cpp_backend(
+    kind: type[PreparedType], system: System, springs: Springs, native: CppBackend, choice: str
+) -> PreparedType:
     """Prepare the iteration over compiled steps; the norm and the coupling use our own matrices."""
-    norm = _Norm(system, springs)
-    coupling = norm.coupling if system.pins.exact.any() else csr_array((len(system.free), 0))
-    return kind(system, native.project, native, coupling, norm, norm.trace, {}, choice)
+    norm = _SystemNorm(system, springs)
+    coupling = norm.pin_coupling if system.pins.exact_mask.any() else csr_array((len(system.free_vertices), 0))
+    return kind(system, native.apply_local_step, native, coupling, norm, norm.unpinned_trace, {}, choice)
 
 
-class _Norm:
+class _SystemNorm:
     """The norm, coupling and trace of Q, computed by our own matrices on demand."""
 
     def __init__(self, system: System, springs: Springs) -> None:
@@ -134,17 +138,17 @@ class _Norm:
 
     @cached_property
     def _Q(self) -> csr_array:
-        return matrices.assemble(self._system, [self._springs])
+        return matrices.assemble_system_matrix(self._system, [self._springs])
 
     @property
-    def coupling(self) -> csr_array:
+    def pin_coupling(self) -> csr_array:
         """Q's free rows and exactly pinned columns."""
-        exact = self._system.pins.vertices[self._system.pins.exact]
-        return csr_array(csr_array(self._Q[self._system.free])[:, exact])
+        exact = self._system.pins.vertices[self._system.pins.exact_mask]
+        return csr_array(csr_array(self._Q[self._system.free_vertices])[:, exact])
 
     @property
-    def trace(self) -> float:
+    def unpinned_trace(self) -> float:
         """Trace of the unpinned part of Q [N/m]."""
-        diagonal = self._system.inertia.copy()
+        diagonal = self._system.inertia_diagonal.copy()
         np.add.at(diagonal, self._springs.edges, self._springs.stiffness[:, None])
-        return float(diagonal[self._system.unpinned].sum())
+        return float(diagonal[self._system.unpinned_mask].sum())

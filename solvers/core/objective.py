@@ -17,22 +17,22 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers.core import low_rank
-from solvers.core.bounds import Bounded, is_bounded, reach
-from solvers.core.eigenvalues import Filtered, Filtering
-from solvers.core.fixed_objective import Objective, Stated
-from solvers.core.pairs_matrix import PairsAt, StepMatrix
-from solvers.core.pattern import Indices, Matrix
-from solvers.energies.elements import Joined, add_blocks
+from solvers.core.bounds import BarrierEnergy, is_barrier_energy, max_step_size
+from solvers.core.eigenvalues import ProjectedHessian, PsdProjection
+from solvers.core.fixed_objective import ElementEnergy, FixedObjective
+from solvers.core.pairs_matrix import BarrierHessian, StepMatrix
+from solvers.core.pattern import BlockMatrix, IndexArray
+from solvers.energies.elements import JoinedElements, add_blocks
 from solvers.kernels import forms, hessian, objective
 from solvers.linear.block import BlockCholesky
 from solvers.problem import Energy, Positions, StepProblem
 
-Values = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
-ROUND_OFF = 4.0 * np.finfo(np.float64).eps
+VALUE_ROUNDOFF = 4.0 * np.finfo(np.float64).eps
 """Relative rounding error of an energy's value."""
 
-NEAR = 1e-10
+SLOPE_FALLBACK_RATIO = 1e-10
 """Relative change of an energy below which the mean slope is more accurate than the difference of values."""
 
 
@@ -46,158 +46,185 @@ class StepObjective:
         step_matrix: the matrix of the Hessians.
     """
 
-    def __init__(self, whole: Objective, problem: StepProblem) -> None:
+    def __init__(self, fixed_objective: FixedObjective, problem: StepProblem) -> None:
         """Build the objective of a problem; raise ValueError if its system has another number of energies."""
-        if len(problem.system.energies) != len(whole.system.energies):
+        if len(problem.system.energies) != len(fixed_objective.system.energies):
             raise ValueError("the objective was made for a system of other energies than the step's")
-        self.whole, self.problem = whole, problem
-        self.given = objective.Given.of(problem)
-        self.stated: list[Stated] = []
-        self.own: list[Energy] = []
-        self.bounded: list[Bounded] = []
-        if whole.form is not None or whole.stated or whole.own:
+        self.fixed_objective, self.problem = fixed_objective, problem
+        self.step_data = objective.StepData.from_problem(problem)
+        self.element_energies: list[ElementEnergy] = []
+        self.other_energies: list[Energy] = []
+        self.barrier_energies: list[BarrierEnergy] = []
+        if (
+            fixed_objective.quadratic_form is not None
+            or fixed_objective.element_energy_indices
+            or fixed_objective.other_energy_indices
+        ):
             begun: Any = problem.energies
-            for k in whole.moving:
-                begun[k].add_projection(problem.target, self.given.force)
-            found = (Stated(k, k in whole.projective, begun[k].law, begun[k].elements) for k in whole.stated)
-            self.stated = [one for one in found if len(one.elements.vertices)]
-            self.own = [begun[k] for k in whole.own]
-            self.bounded = [energy for energy in self.own if is_bounded(energy)]
-        self._constant: tuple[Matrix, Values] | None = None
-        self.matrix = StepMatrix(whole, self.bounded)
+            for k in fixed_objective.forms_with_force:
+                begun[k].add_projection(problem.inertial_target, self.step_data.external_force)
+            found = (
+                ElementEnergy(k, k in fixed_objective.projective_indices, begun[k].law, begun[k].elements)
+                for k in fixed_objective.element_energy_indices
+            )
+            self.element_energies = [one for one in found if len(one.elements.vertices)]
+            self.other_energies = [begun[k] for k in fixed_objective.other_energy_indices]
+            self.barrier_energies = [energy for energy in self.other_energies if is_barrier_energy(energy)]
+        self._constant_cache: tuple[BlockMatrix, FloatArray] | None = None
+        self.step_matrix = StepMatrix(fixed_objective, self.barrier_energies)
         pins = problem.system.pins
-        self._exact, self._held = pins.vertices[pins.exact], problem.pin_targets[pins.exact]
+        self._exact_pins, self._exact_targets = pins.vertices[pins.exact_mask], problem.pin_targets[pins.exact_mask]
 
     @property
-    def touched(self) -> bool:
+    def has_contact_elements(self) -> bool:
         """Whether elements act that are not part of Q, i.e. those of contact that may become active in this step."""
-        return any(not one.projective for one in self.stated)
+        return any(not one.is_projective for one in self.element_energies)
 
-    def reach(self, p: Positions, direction: Positions, first: float = 1.0) -> float:
+    def max_step_size(self, p: Positions, search_direction: Positions, initial_step: float = 1.0) -> float:
         """Return the largest collision-free step size up to `initial_step`.
 
         It is that from p along the search direction, both (n, 3); see `barrier_energy`.
         """
         return (
-            first * reach(self.bounded, p, direction if first == 1.0 else first * direction) if self.bounded else first
+            initial_step
+            * max_step_size(
+                self.barrier_energies, p, search_direction if initial_step == 1.0 else initial_step * search_direction
+            )
+            if self.barrier_energies
+            else initial_step
         )
 
-    def placed(self, p: Positions) -> Positions:
+    def apply_exact_pins(self, p: Positions) -> Positions:
         """Return a copy of p with the exactly pinned vertices on their targets."""
         out = np.array(p, np.float64, order="C")
-        out[self._exact] = self._held
+        out[self._exact_pins] = self._exact_targets
         return out
 
-    def fall(self) -> Positions:
+    def inertial_prediction(self) -> Positions:
         """Return the positions (n, 3) under inertia and external force alone, pinned vertices on their targets."""
-        problem, h = self.problem, self.problem.system.inertia[:, None]
-        p = problem.target + np.divide(problem.force, h, out=np.zeros_like(problem.force), where=h > 0.0)
+        problem, h = self.problem, self.problem.system.inertia_diagonal[:, None]
+        p = problem.inertial_target + np.divide(
+            problem.external_force, h, out=np.zeros_like(problem.external_force), where=h > 0.0
+        )
         p[problem.system.pins.vertices] = problem.pin_targets
         return p
 
     def gradient(self, p: Positions) -> Positions:
         """Return the gradient [N], (n, 3), zero at exactly pinned vertices."""
         out = np.empty_like(p)
-        objective.gradient(self.whole.terms, self.given, p, out)
-        if self.whole.form is not None:
-            forms.add_gradient(self.whole.form, p, out)
-        for one in self.stated:
-            one.law.add_gradient(one.elements, p, out)
-        for energy in self.own:
+        objective.gradient(self.fixed_objective.objective_terms, self.step_data, p, out)
+        if self.fixed_objective.quadratic_form is not None:
+            forms.add_gradient(self.fixed_objective.quadratic_form, p, out)
+        for one in self.element_energies:
+            one.element_law.add_gradient(one.elements, p, out)
+        for energy in self.other_energies:
             energy.add_gradient(p, out)
-        out[self._exact] = 0.0
+        out[self._exact_pins] = 0.0
         return out
 
-    def rise(self, p: Positions, q: Positions) -> tuple[float, float]:
+    def objective_change(self, p: Positions, q: Positions) -> tuple[float, float]:
         """Return g(q) - g(p) [J], and the part that may be round-off of energies without an element-wise form.
 
         Such an energy contributes the difference of its values, or the mean slope if that difference is cancelled.
         """
-        change, noise = objective.rise(self.whole.terms, self.given, p, q), 0.0
-        if self.whole.form is not None:
-            change += forms.rise(self.whole.form, p, q)
-        for one in self.stated:
-            change += one.law.rise(one.elements, p, q)
-        for energy in self.own:
+        change, noise = objective.objective_change(self.fixed_objective.objective_terms, self.step_data, p, q), 0.0
+        if self.fixed_objective.quadratic_form is not None:
+            change += forms.energy_change(self.fixed_objective.quadratic_form, p, q)
+        for one in self.element_energies:
+            change += one.element_law.energy_change(one.elements, p, q)
+        for energy in self.other_energies:
             before, after = energy.value(p), energy.value(q)
-            if before == after == 0.0 and is_bounded(energy):
+            if before == after == 0.0 and is_barrier_energy(energy):
                 continue  # nothing is in range, at either
             slope = np.zeros_like(q)
             energy.add_gradient(q, slope)
             scale = abs(before) + abs(after) + float(np.abs(slope * q).sum())
-            if abs(after - before) <= NEAR * scale < np.inf:
+            if abs(after - before) <= SLOPE_FALLBACK_RATIO * scale < np.inf:
                 energy.add_gradient(p, slope)
                 change += 0.5 * float((slope * (q - p)).sum())
             else:
                 change += after - before
-                noise += ROUND_OFF * scale
+                noise += VALUE_ROUNDOFF * scale
         return change, noise
 
-    def tensions(self, p: Positions, d: Positions) -> Values:
+    def linearise_tensions(self, p: Positions, d: Positions) -> FloatArray:
         """Return the springs' tensions [N], (m,), at p, linearised for a displacement d."""
-        out = np.empty(len(self.whole.terms.stiffness))
-        hessian.tensions(self.whole.terms, p, d, out)
+        out = np.empty(len(self.fixed_objective.objective_terms.stiffness))
+        hessian.linearise_tensions(self.fixed_objective.objective_terms, p, d, out)
         return out
 
     def hessian(self, p: Positions) -> Hessian:
         """Build the Hessian at p for a factorisation."""
         return Hessian(self, p)
 
-    def curvature(self, p: Positions) -> list[Values]:
+    def element_hessians(self, p: Positions) -> list[FloatArray]:
         """Return the second derivatives of the elements at p, (m, 6) [N/m] for each energy."""
-        return [self._curve(one, p) for one in self.stated]
+        return [self._evaluate_hessian(one, p) for one in self.element_energies]
 
     @staticmethod
-    def _curve(one: Stated, p: Positions) -> Values:
+    def _evaluate_hessian(one: ElementEnergy, p: Positions) -> FloatArray:
         out = np.empty((len(one.elements.vertices), 6))
-        one.law.curve(one.elements, p, out)
+        one.element_law.evaluate_hessians(one.elements, p, out)
         return out
 
-    def constant(self, matrix: Matrix, p: Positions) -> Values | None:
+    def constant_blocks(self, matrix: BlockMatrix, p: Positions) -> FloatArray | None:
         """Return the matrix blocks that do not depend on the point p of this step; None for springs alone."""
-        steady = [one for one in self.stated if one.law.constant]
+        steady = [one for one in self.element_energies if one.element_law.has_constant_hessian]
         if not steady:
-            return matrix.constant if self.whole.form is not None else None
-        if self._constant is None or self._constant[0] is not matrix:
-            blocks = matrix.constant.copy()
+            return matrix.constant_blocks if self.fixed_objective.quadratic_form is not None else None
+        if self._constant_cache is None or self._constant_cache[0] is not matrix:
+            blocks = matrix.constant_blocks.copy()
             for one in steady:
-                places = matrix.of_elements(one.number, one.elements.vertices)
-                add_blocks(one.elements, places, self._curve(one, p), blocks)
-            self._constant = matrix, blocks
-        return self._constant[1]
+                places = matrix.element_block_indices(one.energy_index, one.elements.vertices)
+                add_blocks(one.elements, places, self._evaluate_hessian(one, p), blocks)
+            self._constant_cache = matrix, blocks
+        return self._constant_cache[1]
 
     @cached_property
-    def joined(self) -> Joined | None:
+    def joined_elements(self) -> JoinedElements | None:
         """The elements of all energies in one set; None if there are none."""
-        return Joined.of([one.elements for one in self.stated]) if self.stated else None
+        return (
+            JoinedElements.from_elements([one.elements for one in self.element_energies])
+            if self.element_energies
+            else None
+        )
 
 
 class Hessian:
     """The Hessian [N/m] at a point, over the free vertices (f,), with the blocks of elements and of collisions."""
 
     def __init__(self, step: StepObjective, p: Positions) -> None:
-        self._step, self._p = step, p
-        self._terms, self.free = step.whole.terms, step.whole.system.free
-        parts = [low_rank.sparse_part(energy, p) for energy in step.own if energy not in step.bounded]
-        self._columns = low_rank.columns(step.own, p) if step.own else None
-        self._others = reduce(lambda a, b: csr_array(a + b), parts) if parts else None
-        self.curvature = step.curvature(p)
-        self.met = PairsAt(step.bounded, p)
+        self._step_objective, self._positions = step, p
+        self._objective_terms, self.free_vertices = (
+            step.fixed_objective.objective_terms,
+            step.fixed_objective.system.free_vertices,
+        )
+        parts = [
+            low_rank.sparse_part(energy, p) for energy in step.other_energies if energy not in step.barrier_energies
+        ]
+        self._low_rank_columns = low_rank.low_rank_columns(step.other_energies, p) if step.other_energies else None
+        self._sparse_part = reduce(lambda a, b: csr_array(a + b), parts) if parts else None
+        self.element_hessians = step.element_hessians(p)
+        self.barrier_hessian = BarrierHessian(step.barrier_energies, p)
 
     @cached_property
-    def _placed(self) -> tuple[Matrix, Indices, Values]:
+    def _matrix_and_entries(self) -> tuple[BlockMatrix, IndexArray, FloatArray]:
         """The matrix, and the places and values in it of energies without an element-wise form."""
-        step, whole = self._step, self._step.whole
+        step, whole = self._step_objective, self._step_objective.fixed_objective
         rows, columns, entries = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
-        if self._others is not None:
-            total = self._others.tocoo()
-            rows, columns = (3 * whole.number[x // 3] + x % 3 for x in total.coords)
+        if self._sparse_part is not None:
+            total = self._sparse_part.tocoo()
+            rows, columns = (3 * whole.free_index[x // 3] + x % 3 for x in total.coords)
             inside = (rows >= 0) & (columns >= 0)
             rows, columns, entries = rows[inside], columns[inside], np.asarray(total.data[inside], np.float64)
-        matrix = step.matrix.at(self._p, rows // 3, columns // 3, self.met.coupled)
-        return matrix, matrix.entries(rows, columns), entries
+        matrix = step.step_matrix.matrix_at(
+            self._positions, rows // 3, columns // 3, self.barrier_hessian.block_vertices
+        )
+        return matrix, matrix.entry_indices(rows, columns), entries
 
-    def factorise(self, keep: float = 1.0, shift: Values | float = 0.0, tension: Values | None = None) -> bool:
+    def factorise(
+        self, negative_fraction: float = 1.0, shift: FloatArray | float = 0.0, tension: FloatArray | None = None
+    ) -> bool:
         """Factorise the Hessian and return whether it is positive definite; the defaults give the exact Hessian.
 
         Args:
@@ -208,61 +235,86 @@ class Hessian:
         Returns:
             True if it is positive definite, so that `solve` can be called.
         """
-        return self._factor.factorise(self._assembled(keep, shift, tension).values)
+        return self._factor.factorise(self._assemble(negative_fraction, shift, tension).values)
 
-    def filtered(self, by: Filtering) -> Filtered:
+    def project_to_psd(self, psd_projection: PsdProjection) -> ProjectedHessian:
         """Return the Hessian with projected elements; constant forms have no negative eigenvalue."""
-        keep, tension = by.springs(self._terms.edges, self._tension)
-        stated = zip(self._step.stated, self.curvature, strict=True)
-        curvature = [c if one.law.constant else by.packed(one.elements.vertices, c) for one, c in stated]
-        pairs = [by.pairs(blocks) for blocks in self.met.blocks]
-        return Filtered(keep, tension, curvature, pairs, by.looked, by.changed)
+        keep, tension = psd_projection.project_springs(self._objective_terms.edges, self._current_tensions)
+        stated = zip(self._step_objective.element_energies, self.element_hessians, strict=True)
+        curvature = [
+            c if one.element_law.has_constant_hessian else psd_projection.project_packed(one.elements.vertices, c)
+            for one, c in stated
+        ]
+        pairs = [psd_projection.project_pairs(blocks) for blocks in self.barrier_hessian.pair_blocks]
+        return ProjectedHessian(
+            keep, tension, curvature, pairs, psd_projection.num_examined, psd_projection.num_projected
+        )
 
-    def convex(self) -> Matrix:
+    def assemble_clamped(self) -> BlockMatrix:
         """Assemble the Hessian with negative eigenvalues of elements clamped; valid until the next assembly."""
-        clamped = self.filtered(Filtering())
-        return self._assembled(clamped.keep, 0.0, clamped.tension, clamped)
+        clamped = self.project_to_psd(PsdProjection())
+        return self._assemble(clamped.negative_fraction, 0.0, clamped.spring_tensions, clamped)
 
-    def factorise_filtered(self, filtered: Filtered, shift: Values | float = 0.0) -> bool:
+    def factorise_projected(self, projected: ProjectedHessian, shift: FloatArray | float = 0.0) -> bool:
         """Factorise a projected Hessian plus `shift` [N/m] on its diagonal.
 
         Returns whether it is positive definite.
         """
-        return self._factor.factorise(self._assembled(filtered.keep, shift, filtered.tension, filtered).values)
+        return self._factor.factorise(
+            self._assemble(projected.negative_fraction, shift, projected.spring_tensions, projected).values
+        )
 
-    def solve_anew(
-        self, b: Positions, keep: float = 1.0, shift: Values | float = 0.0, tension: Values | None = None
+    def factorise_and_solve(
+        self,
+        b: Positions,
+        negative_fraction: float = 1.0,
+        shift: FloatArray | float = 0.0,
+        tension: FloatArray | None = None,
     ) -> Positions | None:
         """Factorise and solve in one pass, faster than both calls.
 
         Returns None if it is not positive definite.
         """
         out = np.zeros_like(b)
-        x = self._factor.solve_anew(self._assembled(keep, shift, tension).values, b[self.free])
+        x = self._factor.factorise_and_solve(
+            self._assemble(negative_fraction, shift, tension).values, b[self.free_vertices]
+        )
         if x is None:
             return None
-        out[self.free] = x
+        out[self.free_vertices] = x
         return out
 
-    def _assembled(
-        self, keep: float, shift: Values | float, tension: Values | None, filtered: Filtered | None = None
-    ) -> Matrix:
-        matrix, places, entries = self._placed
-        step, tension = self._step, self._tension if tension is None else tension
-        constant = step.constant(matrix, self._p)
-        hessian.assemble(self._terms, matrix.places, constant, self._p, tension, keep, matrix.values)
-        elements = filtered.curvature if filtered else self.curvature
-        for one, curvature in zip(step.stated, elements, strict=True):
-            if not one.law.constant:
-                at = matrix.of_elements(one.number, one.elements.vertices)
+    def _assemble(
+        self,
+        negative_fraction: float,
+        shift: FloatArray | float,
+        tension: FloatArray | None,
+        projected: ProjectedHessian | None = None,
+    ) -> BlockMatrix:
+        matrix, places, entries = self._matrix_and_entries
+        step, tension = self._step_objective, self._current_tensions if tension is None else tension
+        constant = step.constant_blocks(matrix, self._positions)
+        hessian.assemble_hessian(
+            self._objective_terms,
+            matrix.block_indices,
+            constant,
+            self._positions,
+            tension,
+            negative_fraction,
+            matrix.values,
+        )
+        elements = projected.element_hessians if projected else self.element_hessians
+        for one, curvature in zip(step.element_energies, elements, strict=True):
+            if not one.element_law.has_constant_hessian:
+                at = matrix.element_block_indices(one.energy_index, one.elements.vertices)
                 add_blocks(one.elements, at, curvature, matrix.values)
-        for k, blocks in enumerate(filtered.pairs if filtered else []):
-            blocks.add(matrix.of_elements(-1 - k, blocks.vertices), matrix.values)
-        if not filtered:
-            self.met.add(keep, matrix)
+        for k, blocks in enumerate(projected.pair_blocks if projected else []):
+            blocks.add_blocks(matrix.element_block_indices(-1 - k, blocks.vertices), matrix.values)
+        if not projected:
+            self.barrier_hessian.add_to_matrix(negative_fraction, matrix)
         values = matrix.values.reshape(-1)
         values[places] += entries
-        values[matrix.diagonal] += shift
+        values[matrix.diagonal_entries] += shift
         return matrix
 
     def solve(self, b: Positions) -> Positions:
@@ -271,40 +323,50 @@ class Hessian:
         The result is zero at vertices that are not free.
         """
         out = np.zeros_like(b)
-        out[self.free] = self._factor.solve(b[self.free])
+        out[self.free_vertices] = self._factor.solve(b[self.free_vertices])
         return out
 
     @cached_property
     def _factor(self) -> BlockCholesky | low_rank.Woodbury:
-        matrix = self._placed[0]
-        return matrix.factor if self._columns is None else low_rank.Woodbury(matrix, self._columns[self.free])
+        matrix = self._matrix_and_entries[0]
+        return (
+            matrix.factor
+            if self._low_rank_columns is None
+            else low_rank.Woodbury(matrix, self._low_rank_columns[self.free_vertices])
+        )
 
     @cached_property
-    def _tension(self) -> Values:
-        return self._step.tensions(self._p, np.zeros_like(self._p))
+    def _current_tensions(self) -> FloatArray:
+        return self._step_objective.linearise_tensions(self._positions, np.zeros_like(self._positions))
 
     @cached_property
-    def _linear(self) -> Values:
-        linear = np.empty((len(self._terms.stiffness), 4))
-        hessian.linearise(self._terms, self._p, linear)
+    def _linear_terms(self) -> FloatArray:
+        linear = np.empty((len(self._objective_terms.stiffness), 4))
+        hessian.linearise_springs(self._objective_terms, self._positions, linear)
         return linear
 
     @cached_property
-    def compiled(self) -> tuple[Any, ...]:
+    def kernel_arguments(self) -> tuple[Any, ...]:
         """Arguments of `solvers.kernels.spring_hessian.multiply`: all terms with an element-wise form."""
-        step = self._step
-        curvature = np.concatenate(self.curvature) if self.curvature else None
-        return self._terms, self._linear, step.whole.form, step.joined, curvature
+        step = self._step_objective
+        curvature = np.concatenate(self.element_hessians) if self.element_hessians else None
+        return (
+            self._objective_terms,
+            self._linear_terms,
+            step.fixed_objective.quadratic_form,
+            step.joined_elements,
+            curvature,
+        )
 
-    def multiply(self, x: Positions) -> Positions:
+    def matvec(self, x: Positions) -> Positions:
         """Return the exact Hessian times x (n, 3); x and the product are zero at vertices that are not free."""
         product, out = np.empty_like(x), np.zeros_like(x)
-        hessian.multiply(*self.compiled, x, product)
-        if self._others is not None:
-            product += (self._others @ x.ravel()).reshape(-1, 3)
-        if self._columns is not None:
-            product += self._columns @ np.einsum("nik,ni->k", self._columns, x)
-        for pairs in self.met.blocks:
+        hessian.multiply_hessian(*self.kernel_arguments, x, product)
+        if self._sparse_part is not None:
+            product += (self._sparse_part @ x.ravel()).reshape(-1, 3)
+        if self._low_rank_columns is not None:
+            product += self._low_rank_columns @ np.einsum("nik,ni->k", self._low_rank_columns, x)
+        for pairs in self.barrier_hessian.pair_blocks:
             pairs.add_product(x, product)
-        out[self.free] = product[self.free]
+        out[self.free_vertices] = product[self.free_vertices]
         return out

@@ -7,9 +7,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.core.bounds import Bounded, PairBlocks
-from solvers.core.fixed_objective import Objective
-from solvers.core.pattern import Indices, Matrix
+from solvers.core.bounds import BarrierEnergy, PairBlocks
+from solvers.core.fixed_objective import FixedObjective
+from solvers.core.pattern import BlockMatrix, IndexArray
 from solvers.problem import Positions
 
 
@@ -20,53 +20,61 @@ class StepMatrix:
     analysed once. The result is valid as long as it suffices, usually to the end of the step.
     """
 
-    def __init__(self, whole: Objective, bounded: list[Bounded]) -> None:
-        self._whole, self._bounded = whole, bounded
-        self._known: Matrix | None = None
+    def __init__(self, fixed_objective: FixedObjective, barrier_energies: list[BarrierEnergy]) -> None:
+        self._fixed_objective, self._barrier_energies = fixed_objective, barrier_energies
+        self._cached_matrix: BlockMatrix | None = None
 
-    def at(self, p: Positions, i: Indices, j: Indices, met: list[Indices]) -> Matrix:
+    def matrix_at(self, p: Positions, i: IndexArray, j: IndexArray, block_vertices: list[IndexArray]) -> BlockMatrix:
         """Return the matrix at p with blocks (i, j) of free vertices and the blocks of each barrier energy.
 
         The latter are between the vertices `block_vertices` (a, k).
         """
-        known = self._known or self._whole.matrix
-        if not (known.has(i, j) and all(known.holds(-1 - k, vertices) for k, vertices in enumerate(met))):
-            near = (self._whole.between(energy.neighbours(p)) for energy in self._bounded)
-            i, j = (np.concatenate(side) for side in zip(known.blocks, (i, j), *near, strict=True))
-            known = self._known = self._whole.matrix_for(i, j)
+        known = self._cached_matrix or self._fixed_objective.hessian_matrix
+        if not (
+            known.has_blocks(i, j)
+            and all(known.has_element_blocks(-1 - k, vertices) for k, vertices in enumerate(block_vertices))
+        ):
+            near = (
+                self._fixed_objective.free_vertex_pairs(energy.candidate_vertices(p))
+                for energy in self._barrier_energies
+            )
+            i, j = (np.concatenate(side) for side in zip(known.block_coordinates, (i, j), *near, strict=True))
+            known = self._cached_matrix = self._fixed_objective.matrix_with_blocks(i, j)
         return known
 
 
-class PairsAt:
+class BarrierHessian:
     """The Hessian blocks of barrier energies at a point."""
 
-    def __init__(self, energies: list[Bounded], p: Positions) -> None:
-        self._energies, self._p = energies, p
-        self._ends: dict[float, NDArray[np.float64]] = {}
+    def __init__(self, energies: list[BarrierEnergy], p: Positions) -> None:
+        self._barrier_energies, self._positions = energies, p
+        self._endpoint_values: dict[float, NDArray[np.float64]] = {}
 
     @cached_property
-    def blocks(self) -> list[PairBlocks]:
+    def pair_blocks(self) -> list[PairBlocks]:
         """Exact blocks of each energy."""
-        return [energy.blocks(self._p) for energy in self._energies]
+        return [energy.hessian_blocks(self._positions) for energy in self._barrier_energies]
 
     @cached_property
-    def coupled(self) -> list[Indices]:
+    def block_vertices(self) -> list[IndexArray]:
         """Vertices (a, k) of the blocks of each energy."""
-        return [energy.coupled(self._p) for energy in self._energies]
+        return [energy.block_vertices(self._positions) for energy in self._barrier_energies]
 
-    def add(self, keep: float, matrix: Matrix) -> None:
+    def add_to_matrix(self, negative_fraction: float, matrix: BlockMatrix) -> None:
         """Add the blocks to the matrix.
 
         They are linear in the fraction of their negative part.
         """
-        if any(map(len, self.coupled)):
-            for end, share in ((1.0, keep), (0.0, 1.0 - keep)):
+        if any(map(len, self.block_vertices)):
+            for end, share in ((1.0, negative_fraction), (0.0, 1.0 - negative_fraction)):
                 if share:
-                    matrix.values += share * self._at(end, matrix)
+                    matrix.values += share * self._values_at_endpoint(end, matrix)
 
-    def _at(self, end: float, matrix: Matrix) -> NDArray[np.float64]:
-        if end not in self._ends:
-            out = self._ends[end] = np.zeros_like(matrix.values)
-            for k, (energy, vertices) in enumerate(zip(self._energies, self.coupled, strict=True)):
-                energy.add_curvature(self._p, end, matrix.of_elements(-1 - k, vertices), out)
-        return self._ends[end]
+    def _values_at_endpoint(self, endpoint: float, matrix: BlockMatrix) -> NDArray[np.float64]:
+        if endpoint not in self._endpoint_values:
+            out = self._endpoint_values[endpoint] = np.zeros_like(matrix.values)
+            for k, (energy, vertices) in enumerate(zip(self._barrier_energies, self.block_vertices, strict=True)):
+                energy.add_hessian_blocks(
+                    self._positions, endpoint, matrix.element_block_indices(-1 - k, vertices), out
+                )
+        return self._endpoint_values[endpoint]

@@ -20,16 +20,16 @@ from scipy.sparse import csr_array
 
 from solvers import matrices
 from solvers.energies.springs import Springs
-from solvers.problem import Energy, Positions, Start, StepProblem, System, is_lagged
+from solvers.problem import Energy, Positions, StepProblem, StepStart, System, is_lagged
 
 if TYPE_CHECKING:
     from solvers.energies.dashpots import Dashpots
     from solvers.energies.strain_limits import StrainLimits
-    from solvers.kernels.edges import Edges
+    from solvers.kernels.edges import EdgeElements
 
 
 @dataclass(frozen=True, eq=False)
-class Parts:
+class SpringForm:
     """The decomposition of a system's energies.
 
     Attributes:
@@ -45,118 +45,126 @@ class Parts:
     """
 
     springs: Springs
-    whole: Springs
-    pairs: Springs
-    held: NDArray[np.float64]
-    forms: tuple[Callable[[Start], Any], ...] = field(default=())
-    limits: tuple[StrainLimits, ...] = field(default=())
+    springs_and_forms: Springs
+    system_pairs: Springs
+    vertex_weight: NDArray[np.float64]
+    form_builders: tuple[Callable[[StepStart], Any], ...] = field(default=())
+    strain_limits: tuple[StrainLimits, ...] = field(default=())
     dashpots: tuple[Dashpots, ...] = field(default=())
-    unknown: tuple[str, ...] = field(default=())
-    cancel: bool = False
+    unsupported_energies: tuple[str, ...] = field(default=())
+    has_cancellation: bool = False
 
-    def force(self, problem: StepProblem) -> Positions:
+    def compute_force(self, problem: StepProblem) -> Positions:
         """Return the external force plus the constant one of the forms, (n, 3) [N]; not a copy without forms."""
-        if not self.forms:
-            return problem.force
-        out = problem.force.copy()
-        for form in self.forms:
-            form(problem.start).add_projection(problem.target, out)
+        if not self.form_builders:
+            return problem.external_force
+        out = problem.external_force.copy()
+        for form in self.form_builders:
+            form(problem.step_start).add_projection(problem.inertial_target, out)
         return out
 
-    def negative(self, p: Positions) -> float:
+    def negative_energy(self, p: Positions) -> float:
         """Return the absolute energy [J] of the pairs with negative stiffness at p (n, 3) [m]."""
-        return 0.5 * abs(float(np.einsum("ij,ij->", p, self._negative @ p))) if self.forms else 0.0
+        return 0.5 * abs(float(np.einsum("ij,ij->", p, self._negative_stiffness @ p))) if self.form_builders else 0.0
 
     @cached_property
-    def _negative(self) -> csr_array:
-        below = self.whole.stiffness < 0.0
-        return _pairs(self.whole.edges[below], -self.whole.stiffness[below]).stiffness_matrix(len(self.held))
+    def _negative_stiffness(self) -> csr_array:
+        below = self.springs_and_forms.stiffness < 0.0
+        return _zero_length_springs(
+            self.springs_and_forms.edges[below], -self.springs_and_forms.stiffness[below]
+        ).stiffness_matrix(len(self.vertex_weight))
 
-    def edges(self, row: NDArray[np.int64], rows: int) -> Edges | None:
+    def build_edges(self, row: NDArray[np.int64], rows: int) -> EdgeElements | None:
         """Build the strain limits and dashpots as they are before a step; None if there are none.
 
         Args:
             row: row of each vertex (n,).
             rows: number of rows.
         """
-        if not (self.limits or self.dashpots):
+        if not (self.strain_limits or self.dashpots):
             return None
-        from solvers.kernels.edges import Edges
+        from solvers.kernels.edges import EdgeElements
 
-        both = (*self.limits, *self.dashpots)
+        both = (*self.strain_limits, *self.dashpots)
         ends, k = np.concatenate([e.edges for e in both]), np.concatenate([e.stiffness for e in both])
         none = np.empty(0)
-        low, high = (np.concatenate([none, *(getattr(e, at) for e in self.limits)]) for at in ("low", "high"))
-        edges = Edges.of(ends, k, low, high, row, rows)
-        edges.axis[: len(low)] = np.concatenate([none.reshape(0, 3), *(e.rest_direction for e in self.limits)])
+        low, high = (np.concatenate([none, *(getattr(e, at) for e in self.strain_limits)]) for at in ("low", "high"))
+        edges = EdgeElements.from_edges(ends, k, low, high, row, rows)
+        edges.edge_axis[: len(low)] = np.concatenate(
+            [none.reshape(0, 3), *(e.rest_direction for e in self.strain_limits)]
+        )
         return edges
 
-    def begun(self, edges: Edges | None, problem: StepProblem) -> Edges | None:
+    def update_edges(self, edges: EdgeElements | None, problem: StepProblem) -> EdgeElements | None:
         """Return the edges updated to a step."""
-        if edges is not None and any(map(is_lagged, self.limits)):
+        if edges is not None and any(map(is_lagged, self.strain_limits)):
             from solvers.energies.strain_limits import StrainLimits
 
             limits = [e for e in problem.energies if isinstance(e, StrainLimits)]
             low, high = (np.concatenate([getattr(e, at) for e in limits]) for at in ("low", "high"))
-            edges = edges._replace(low=low, high=high)
+            edges = edges._replace(min_length=low, max_length=high)
         if edges is None or not self.dashpots:
             return edges
         from solvers.energies.dashpots import Dashpots
 
-        steps, first = [e for e in problem.energies if isinstance(e, Dashpots)], len(edges.low)
-        axis, offset = edges.axis.copy(), edges.offset.copy()
+        steps, first = [e for e in problem.energies if isinstance(e, Dashpots)], len(edges.min_length)
+        axis, offset = edges.edge_axis.copy(), edges.offset.copy()
         axis[first:] = np.concatenate([e.direction for e in steps])
         offset[first:] = np.concatenate([e.offset for e in steps])
         return edges._replace(axis=axis, offset=offset)
 
-    def size(self, p: Positions) -> float:
+    def edge_energy_scale(self, p: Positions) -> float:
         """Return the sum of k |v|^2 [J] over strain limits and dashpots at p (n, 3), the scale of cancellation."""
-        return sum(float(e.stiffness @ e.lengths(p) ** 2) for e in (*self.limits, *self.dashpots))
+        return sum(float(e.stiffness @ e.edge_lengths(p) ** 2) for e in (*self.strain_limits, *self.dashpots))
 
 
-def split(system: System) -> Parts:
+def decompose_energies(system: System) -> SpringForm:
     """Decompose the energies of a system."""
-    n = system.vertices
-    springs = Springs.joined([energy for energy in system.energies if isinstance(energy, Springs)])
+    n = system.num_vertices
+    springs = Springs.from_parts([energy for energy in system.energies if isinstance(energy, Springs)])
     others = [energy for energy in system.energies if not isinstance(energy, Springs)]
     if not others:
-        return Parts(springs, springs, springs, np.zeros(n))
+        return SpringForm(springs, springs, springs, np.zeros(n))
     from solvers.energies.dashpots import Dashpots  # for those who need one of them
     from solvers.energies.quadratic import Quadratic
     from solvers.energies.strain_limits import StrainLimits
-    from solvers.kernels.forms import Form
+    from solvers.kernels.forms import QuadraticForm
 
     forms = [energy for energy in others if isinstance(energy, Quadratic)]
     limits = tuple(energy for energy in others if isinstance(energy, StrainLimits))
     dashpots = tuple(
-        replace(energy, stiffness=system.rate * energy.stiffness) for energy in others if isinstance(energy, Dashpots)
+        replace(energy, entry_stiffness=system.velocity_rate * energy.stiffness)
+        for energy in others
+        if isinstance(energy, Dashpots)
     )
     known = Quadratic, StrainLimits, Dashpots
     unknown = tuple(sorted({type(energy).__name__ for energy in others if not isinstance(energy, known)}))
-    L: csr_array = reduce(lambda total, share: total + share, matrices.shares(system, forms), csr_array((n, n)))
-    form = Form.of(L)
-    whole = Springs.joined([springs, _pairs(form.pairs, form.weight)])
-    edges = [_pairs(energy.edges, energy.stiffness) for energy in (*limits, *dashpots)]
-    pairs = Springs.joined([whole, *edges])
-    K = Springs.joined([springs, *edges]).stiffness_matrix(n)
-    return Parts(
+    L: csr_array = reduce(
+        lambda total, share: total + share, matrices.stiffness_shares(system, forms), csr_array((n, n))
+    )
+    form = QuadraticForm.from_matrix(L)
+    whole = Springs.from_parts([springs, _zero_length_springs(form.pairs, form.pair_weight)])
+    edges = [_zero_length_springs(energy.edges, energy.stiffness) for energy in (*limits, *dashpots)]
+    pairs = Springs.from_parts([whole, *edges])
+    K = Springs.from_parts([springs, *edges]).stiffness_matrix(n)
+    return SpringForm(
         springs,
         whole,
         pairs,
-        form.held,
-        tuple(form.begin_step if is_lagged(form) else _steady(form) for form in forms),
+        form.vertex_weight,
+        tuple(form.begin_step if is_lagged(form) else _constant_form(form) for form in forms),
         limits,
         dashpots,
         unknown,
-        matrices.without_zeros(K + L).nnz < matrices.without_zeros(abs(K) + abs(L)).nnz,
+        matrices.drop_zeros(K + L).nnz < matrices.drop_zeros(abs(K) + abs(L)).nnz,
     )
 
 
-def _pairs(edges: NDArray[np.int64], stiffness: NDArray[np.float64]) -> Springs:
+def _zero_length_springs(edges: NDArray[np.int64], stiffness: NDArray[np.float64]) -> Springs:
     """Return springs of zero rest length."""
     flat = np.zeros(len(stiffness))
     return Springs(edges, stiffness, flat, flat[:, None] + [1.0, 0.0, 0.0])
 
 
-def _steady(form: Energy) -> Callable[[Start], Energy]:
+def _constant_form(form: Energy) -> Callable[[StepStart], Energy]:
     return lambda start: form

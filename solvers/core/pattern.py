@@ -15,18 +15,25 @@ from scipy.sparse import coo_array, csr_array
 
 from solvers import matrices
 from solvers.kernels import forms, hessian
-from solvers.kernels.forms import Form
-from solvers.kernels.objective import Terms
+from solvers.kernels.forms import QuadraticForm
+from solvers.kernels.objective import ObjectiveTerms
 from solvers.linear.block import BlockCholesky
 from solvers.problem import System
 
-Indices = NDArray[np.int64]
+IndexArray = NDArray[np.int64]
 
 
-class Matrix:
+class BlockMatrix:
     """A matrix of 3 x 3 blocks between free vertices."""
 
-    def __init__(self, system: System, terms: Terms, form: Form | None, number: Indices, graph: csr_array) -> None:
+    def __init__(
+        self,
+        system: System,
+        terms: ObjectiveTerms,
+        quadratic_form: QuadraticForm | None,
+        free_index: IndexArray,
+        graph: csr_array,
+    ) -> None:
         """Analyse a block pattern.
 
         Args:
@@ -36,27 +43,27 @@ class Matrix:
             free_index: index of each vertex among the free ones (n,), or -1.
             graph: pattern of the blocks (f, f), sorted, with a diagonal.
         """
-        self.graph, self._number, self._size = graph, number, len(system.free)
-        self._terms, self._form = terms, form
+        self.graph, self._free_index, self._num_free = graph, free_index, len(system.free_vertices)
+        self._objective_terms, self._quadratic_form = terms, quadratic_form
         self.values = np.empty((graph.nnz, 3, 3))
         self.factor = BlockCholesky(graph)
-        self.places = hessian.Places.of(system, terms.edges, graph)
+        self.block_indices = hessian.BlockIndices.from_graph(system, terms.edges, graph)
         rows = np.repeat(np.arange(len(graph.indptr) - 1), np.diff(graph.indptr))
-        self._keys = rows * self._size + graph.indices
-        self.diagonal = self.entries(*np.tile(np.arange(3 * len(system.free)), (2, 1)))
-        self._elements: dict[int, tuple[Indices, Indices]] = {}
+        self._block_keys = rows * self._num_free + graph.indices
+        self.diagonal_entries = self.entry_indices(*np.tile(np.arange(3 * len(system.free_vertices)), (2, 1)))
+        self._element_indices: dict[int, tuple[IndexArray, IndexArray]] = {}
 
     @classmethod
-    def of(
+    def from_graph(
         cls,
         system: System,
-        terms: Terms,
-        form: Form | None,
-        number: Indices,
+        terms: ObjectiveTerms,
+        quadratic_form: QuadraticForm | None,
+        free_index: IndexArray,
         graph: csr_array,
-        i: Indices,
-        j: Indices,
-    ) -> Matrix:
+        i: IndexArray,
+        j: IndexArray,
+    ) -> BlockMatrix:
         """Return a matrix with the blocks of a graph and additional ones.
 
         The latter are between vertices i and j, in both directions, where both are free.
@@ -64,65 +71,67 @@ class Matrix:
         i, j = i[(i >= 0) & (j >= 0)], j[(i >= 0) & (j >= 0)]
         ones = np.ones(2 * len(i))
         more = csr_array(coo_array((ones, (np.append(i, j), np.append(j, i))), shape=graph.shape))
-        return cls(system, terms, form, number, matrices.without_zeros(abs(graph) + more))
+        return cls(system, terms, quadratic_form, free_index, matrices.drop_zeros(abs(graph) + more))
 
     @property
-    def blocks(self) -> tuple[Indices, Indices]:
+    def block_coordinates(self) -> tuple[IndexArray, IndexArray]:
         """Rows and columns of all blocks."""
-        return self._keys // self._size, self._keys % self._size
+        return self._block_keys // self._num_free, self._block_keys % self._num_free
 
-    def has(self, i: Indices, j: Indices) -> bool:
+    def has_blocks(self, i: IndexArray, j: IndexArray) -> bool:
         """Return whether the matrix has the blocks (i, j)."""
-        keys = i * self._size + j
-        at = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
-        return bool((self._keys[at] == keys).all())
+        keys = i * self._num_free + j
+        at = np.minimum(np.searchsorted(self._block_keys, keys), len(self._block_keys) - 1)
+        return bool((self._block_keys[at] == keys).all())
 
-    def needs(self, i: Indices, j: Indices, base: Matrix) -> bool:
+    def is_exact_extension(self, i: IndexArray, j: IndexArray, base: BlockMatrix) -> bool:
         """Return whether the matrix has exactly the blocks of another one, (i, j) and (j, i)."""
-        size = self._size
-        return len(np.unique(np.concatenate([base._keys, i * size + j, j * size + i]))) == len(self._keys)
+        size = self._num_free
+        return len(np.unique(np.concatenate([base._block_keys, i * size + j, j * size + i]))) == len(self._block_keys)
 
-    def entries(self, rows: Indices, columns: Indices) -> Indices:
+    def entry_indices(self, rows: IndexArray, columns: IndexArray) -> IndexArray:
         """Return the indices of the entries (rows, columns) within the flat values."""
-        block = np.searchsorted(self._keys, rows // 3 * self._size + columns // 3)
+        block = np.searchsorted(self._block_keys, rows // 3 * self._num_free + columns // 3)
         return 9 * block + 3 * (rows % 3) + columns % 3
 
-    def of_elements(self, energy: int, vertices: Indices) -> Indices:
+    def element_block_indices(self, energy: int, vertices: IndexArray) -> IndexArray:
         """Return the block index of each vertex pair of an energy's elements (m, k), as (m, k^2); -1 if not free.
 
         They are cached for the same array of vertices. Raises LookupError if a block is missing.
         """
-        if not self.holds(energy, vertices):
+        if not self.has_element_blocks(energy, vertices):
             raise LookupError("the matrix has no place for some blocks of these elements")
-        return self._elements[energy][1]
+        return self._element_indices[energy][1]
 
-    def holds(self, energy: int, vertices: Indices) -> bool:
+    def has_element_blocks(self, energy: int, vertices: IndexArray) -> bool:
         """Return whether the matrix has all blocks of an energy's elements."""
-        known = self._elements.get(energy)
+        known = self._element_indices.get(energy)
         if known is not None and known[0] is vertices:
             return True
         (m, k), graph = vertices.shape, self.graph
         if k == 1:
-            self._elements[energy] = vertices, self.places.diagonal[vertices]
+            self._element_indices[energy] = vertices, self.block_indices.diagonal_block[vertices]
             return True
         out = np.empty((m, k * k), np.int64)
-        if not hessian.locate(self._number, graph.indptr, graph.indices, np.ascontiguousarray(vertices), out):
+        if not hessian.locate_blocks(
+            self._free_index, graph.indptr, graph.indices, np.ascontiguousarray(vertices), out
+        ):
             return False
-        self._elements[energy] = vertices, out
+        self._element_indices[energy] = vertices, out
         return True
 
-    def _between(self, i: Indices, j: Indices) -> Indices:
+    def _pair_block_indices(self, i: IndexArray, j: IndexArray) -> IndexArray:
         """Return the blocks between vertices i and j, of one shape; -1 if one is not free."""
-        i, j = self._number[i], self._number[j]
-        return np.where((i >= 0) & (j >= 0), np.searchsorted(self._keys, i * self._size + j), -1)
+        i, j = self._free_index[i], self._free_index[j]
+        return np.where((i >= 0) & (j >= 0), np.searchsorted(self._block_keys, i * self._num_free + j), -1)
 
     @cached_property
-    def constant(self) -> NDArray[np.float64]:
+    def constant_blocks(self) -> NDArray[np.float64]:
         """Blocks of inertia, penalty pins and the form, (b, 3, 3) [N/m]."""
         out = np.empty_like(self.values)
-        hessian.hold(self._terms, self.places, out)
-        if self._form is not None:
-            i, j = self._form.pairs.T
-            across = np.column_stack([self._between(i, j), self._between(j, i)])
-            forms.add_blocks(self._form, self.places.diagonal, across, out)
+        hessian.write_constant_blocks(self._objective_terms, self.block_indices, out)
+        if self._quadratic_form is not None:
+            i, j = self._quadratic_form.pairs.T
+            across = np.column_stack([self._pair_block_indices(i, j), self._pair_block_indices(j, i)])
+            forms.add_blocks(self._quadratic_form, self.block_indices.diagonal_block, across, out)
         return out

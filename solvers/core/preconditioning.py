@@ -19,96 +19,104 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.core.bounds import is_bounded
-from solvers.core.descent import Metric
-from solvers.core.eigenvalues import Filtering
-from solvers.core.fixed_objective import Objective
+from solvers.core.bounds import is_barrier_energy
+from solvers.core.descent import ResidualMetric
+from solvers.core.eigenvalues import PsdProjection
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import Hessian, StepObjective
-from solvers.core.pattern import Matrix
+from solvers.core.pattern import BlockMatrix
 from solvers.energies.elements import add_blocks
 from solvers.kernels import forms
 from solvers.kernels import hessian as springs
-from solvers.linear.schwarz import Patches, ordered
+from solvers.linear.schwarz import SubdomainHierarchy, order_into_subdomains
 from solvers.problem import Positions, Unsupported
 
-Preconditioning = Literal["factor", "schwarz", "block-jacobi"]
+PreconditionerName = Literal["factor", "schwarz", "block-jacobi"]
 """The names of the preconditioners."""
 
 Preconditioner = Callable[[Positions], Positions]
 """A map from gradients [N] to displacements [m], both (n, 3)."""
 
-At = Callable[[StepObjective, Positions], tuple[Hessian, Preconditioner]]
+PreconditionerBuilder = Callable[[StepObjective, Positions], tuple[Hessian, Preconditioner]]
 """A function that returns the Hessian at p (n, 3) and its preconditioner."""
 
-LEAST = 1e-6
+MIN_DIAGONAL_FRACTION = 1e-6
 """Fraction of Q's diagonal added to blocks, because the springs at a massless vertex may act in one direction only."""
 
 
-def preconditioning(name: Preconditioning, metric: Metric, objective: Objective, solver: str) -> At:
+def build_preconditioner(
+    name: PreconditionerName, metric: ResidualMetric, objective: FixedObjective, solver: str
+) -> PreconditionerBuilder:
     """Return the builder of a preconditioner.
 
     Raises Unsupported if an energy without elements must be clamped.
     """
     if name == "factor":
-        return _Factor(metric)
+        return _FactorPreconditioner(metric)
     energies = objective.system.energies
-    unknown = {type(energies[k]).__name__ for k in objective.own if not is_bounded(energies[k])}
+    unknown = {type(energies[k]).__name__ for k in objective.other_energy_indices if not is_barrier_energy(energies[k])}
     if unknown:
         raise Unsupported(
             f"{solver}, preconditioner: {name}: clamps second derivatives element by element, and there are none of "
             f"{', '.join(sorted(unknown))}; take preconditioner: factor"
         )
-    return _Schwarz(metric) if name == "schwarz" else _Blocks(metric)
+    return _SchwarzPreconditioner(metric) if name == "schwarz" else _BlockJacobiPreconditioner(metric)
 
 
-class _Factor:
+class _FactorPreconditioner:
     """Q^-1, or (S Q S)^-1 with active contact."""
 
-    def __init__(self, metric: Metric) -> None:
+    def __init__(self, metric: ResidualMetric) -> None:
         self._metric = metric
 
     def __call__(self, step: StepObjective, p: Positions) -> tuple[Hessian, Preconditioner]:
         hessian = step.hessian(p)
-        beyond = step.touched or any(len(blocks.vertices) for blocks in hessian.met.blocks)
-        return hessian, Scaled(self._metric, *_beyond(step, hessian, len(p))) if beyond else self._metric.solve
+        beyond = step.has_contact_elements or any(
+            len(blocks.vertices) for blocks in hessian.barrier_hessian.pair_blocks
+        )
+        return hessian, ScaledPreconditioner(
+            self._metric, *_contact_blocks(step, hessian, len(p))
+        ) if beyond else self._metric.solve
 
 
-class _Blocks:
+class _BlockJacobiPreconditioner:
     """Block Jacobi with the diagonal blocks of the clamped Hessian."""
 
-    def __init__(self, metric: Metric) -> None:
-        self._free, self._least = metric.system.free, _least(metric)
+    def __init__(self, metric: ResidualMetric) -> None:
+        self._free_vertices, self._diagonal_blocks = metric.system.free_vertices, _minimum_diagonal_blocks(metric)
 
     def __call__(self, step: StepObjective, p: Positions) -> tuple[Hessian, Preconditioner]:
         hessian = step.hessian(p)
-        inverses = np.linalg.inv(diagonal_blocks(step, hessian, p) + self._least)
-        return hessian, _among(self._free, lambda r: np.einsum("fij,fj->fi", inverses, r))
+        inverses = np.linalg.inv(assemble_diagonal_blocks(step, hessian, p) + self._diagonal_blocks)
+        return hessian, _extend_to_all_vertices(self._free_vertices, lambda r: np.einsum("fij,fj->fi", inverses, r))
 
 
-class _Schwarz:
+class _SchwarzPreconditioner:
     """Additive Schwarz with patches of the clamped Hessian."""
 
-    def __init__(self, metric: Metric) -> None:
-        self._free, self._least = metric.system.free, _least(metric)
-        self._order = ordered(metric.inner)
-        self._known: tuple[Matrix, Patches] | None = None
+    def __init__(self, metric: ResidualMetric) -> None:
+        self._free_vertices, self._diagonal_blocks = metric.system.free_vertices, _minimum_diagonal_blocks(metric)
+        self._order = order_into_subdomains(metric.free_block)
+        self._cached_patches: tuple[BlockMatrix, SubdomainHierarchy] | None = None
 
     def __call__(self, step: StepObjective, p: Positions) -> tuple[Hessian, Preconditioner]:
         hessian = step.hessian(p)
-        matrix = hessian.convex()
-        if self._known is None or self._known[0] is not matrix:
-            self._known = matrix, Patches(matrix.graph, self._order)
+        matrix = hessian.assemble_clamped()
+        if self._cached_patches is None or self._cached_patches[0] is not matrix:
+            self._cached_patches = matrix, SubdomainHierarchy(matrix.graph, self._order)
         blocks = matrix.values.copy()
-        blocks[matrix.places.diagonal[self._free]] += self._least
-        return hessian, _among(self._free, self._known[1].inverted(blocks).solve)
+        blocks[matrix.block_indices.diagonal_block[self._free_vertices]] += self._diagonal_blocks
+        return hessian, _extend_to_all_vertices(
+            self._free_vertices, self._cached_patches[1].build_preconditioner(blocks).apply_preconditioner
+        )
 
 
-def _least(metric: Metric) -> NDArray[np.float64]:
+def _minimum_diagonal_blocks(metric: ResidualMetric) -> NDArray[np.float64]:
     """Return blocks (f, 3, 3) [N/m] to add to the diagonal."""
-    return LEAST * metric.diagonal[:, None, None] * np.eye(3)
+    return MIN_DIAGONAL_FRACTION * metric.free_diagonal[:, None, None] * np.eye(3)
 
 
-def _among(free: NDArray[np.int64], solve: Preconditioner) -> Preconditioner:
+def _extend_to_all_vertices(free: NDArray[np.int64], solve: Preconditioner) -> Preconditioner:
     """Extend a solve for free vertices (f,) to all vertices (n, 3)."""
 
     def whole(b: Positions) -> Positions:
@@ -119,27 +127,27 @@ def _among(free: NDArray[np.int64], solve: Preconditioner) -> Preconditioner:
     return whole
 
 
-def diagonal_blocks(step: StepObjective, hessian: Hessian, p: Positions) -> NDArray[np.float64]:
+def assemble_diagonal_blocks(step: StepObjective, hessian: Hessian, p: Positions) -> NDArray[np.float64]:
     """Return the diagonal blocks (f, 3, 3) [N/m] of the clamped Hessian without assembling that matrix.
 
     They include springs, forms, elements and pairs.
     """
-    whole, clamped = step.whole, hessian.filtered(Filtering())
-    terms, number, form = whole.terms, whole.number, whole.form
-    places = springs.Places(whole.system.free, number, np.full((len(terms.stiffness), 2), -1))
-    out = np.empty((len(whole.system.free), 3, 3))
-    springs.assemble(terms, places, None, p, clamped.tension, clamped.keep, out)
+    whole, clamped = step.fixed_objective, hessian.project_to_psd(PsdProjection())
+    terms, number, form = whole.objective_terms, whole.free_index, whole.quadratic_form
+    places = springs.BlockIndices(whole.system.free_vertices, number, np.full((len(terms.stiffness), 2), -1))
+    out = np.empty((len(whole.system.free_vertices), 3, 3))
+    springs.assemble_hessian(terms, places, None, p, clamped.spring_tensions, clamped.negative_fraction, out)
     if form is not None:
-        forms.add_blocks(form, number, np.full((len(form.weight), 2), -1), out)
-    for one, curvature in zip(step.stated, clamped.curvature, strict=True):
-        add_blocks(one.elements, _on_diagonal(number, one.elements.vertices), curvature, out)
-    for pairs in clamped.pairs:
+        forms.add_blocks(form, number, np.full((len(form.pair_weight), 2), -1), out)
+    for one, curvature in zip(step.element_energies, clamped.element_hessians, strict=True):
+        add_blocks(one.elements, _diagonal_block_indices(number, one.elements.vertices), curvature, out)
+    for pairs in clamped.pair_blocks:
         if len(pairs.vertices):
-            pairs.add(_on_diagonal(number, pairs.vertices), out)
+            pairs.add_blocks(_diagonal_block_indices(number, pairs.vertices), out)
     return out
 
 
-def _on_diagonal(number: NDArray[np.int64], vertices: NDArray[np.int64]) -> NDArray[np.int64]:
+def _diagonal_block_indices(number: NDArray[np.int64], vertices: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the diagonal blocks of elements with vertices (m, k), as (m, k^2), -1 off the diagonal.
 
     The block is the vertex's index (n + 1,), whose last entry is for the vertex -1.
@@ -150,44 +158,44 @@ def _on_diagonal(number: NDArray[np.int64], vertices: NDArray[np.int64]) -> NDAr
     return places
 
 
-class Scaled:
+class ScaledPreconditioner:
     """The preconditioner (S Q S)^-1 with S_i = (I + W_i/Q_ii)^(1/2) at some vertices, I at all others.
 
     Attributes:
         inverse_scaling: these vertices (c,), and S_i^-1 (c, 3, 3).
     """
 
-    def __init__(self, metric: Metric, vertices: NDArray[np.int64], blocks: NDArray[np.float64]) -> None:
+    def __init__(self, metric: ResidualMetric, vertices: NDArray[np.int64], blocks: NDArray[np.float64]) -> None:
         """Create the preconditioner for positive semidefinite blocks W (c, 3, 3) [N/m] of vertices (c,)."""
         self._metric, system = metric, metric.system
-        resists = np.full(system.vertices, np.inf)
-        resists[system.free] = metric.diagonal
+        resists = np.full(system.num_vertices, np.inf)
+        resists[system.free_vertices] = metric.free_diagonal
         size, axes = np.linalg.eigh(blocks)
         shrunk = (1.0 + np.maximum(0.0, size) / resists[vertices, None]) ** -0.5
-        self.shrunk = vertices, (axes * shrunk[:, None, :]) @ axes.transpose(0, 2, 1)
+        self.inverse_scaling = vertices, (axes * shrunk[:, None, :]) @ axes.transpose(0, 2, 1)
 
     def __call__(self, b: Positions) -> Positions:
         """Return (S Q S)^-1 b, (n, 3)."""
         scaled = b.copy()
-        self._shrink(scaled)
+        self._apply_scaling(scaled)
         x = self._metric.solve(scaled)
-        self._shrink(x)
+        self._apply_scaling(x)
         return x
 
-    def _shrink(self, x: Positions) -> None:
-        vertices, root = self.shrunk
+    def _apply_scaling(self, x: Positions) -> None:
+        vertices, root = self.inverse_scaling
         x[vertices] = np.einsum("vij,vj->vi", root, x[vertices])
 
 
-def _beyond(step: StepObjective, hessian: Hessian, n: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _contact_blocks(step: StepObjective, hessian: Hessian, n: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the vertices (c,) with contact and the blocks (c, 3, 3) [N/m] of elements and pairs outside Q."""
     blocks, acted, number = np.zeros((n, 3, 3)), np.zeros(n, np.bool_), np.append(np.arange(n), -1)
-    for one, curvature in zip(step.stated, hessian.curvature, strict=True):
-        if not one.projective:
-            add_blocks(one.elements, _on_diagonal(number, one.elements.vertices), curvature, blocks)
+    for one, curvature in zip(step.element_energies, hessian.element_hessians, strict=True):
+        if not one.is_projective:
+            add_blocks(one.elements, _diagonal_block_indices(number, one.elements.vertices), curvature, blocks)
             acted[one.elements.vertices] = True
-    for pairs in hessian.met.blocks:
-        pairs.add(_on_diagonal(number, pairs.vertices), blocks)
+    for pairs in hessian.barrier_hessian.pair_blocks:
+        pairs.add_blocks(_diagonal_block_indices(number, pairs.vertices), blocks)
         acted[pairs.vertices] = True
     acted &= blocks.any(axis=(1, 2))
     return np.flatnonzero(acted), blocks[acted]

@@ -13,30 +13,30 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from solvers import matrices
-from solvers.core.driver import Iterating, Iterative, largest
+from solvers.core.driver import IterativeSolver, SolverState, compute_max_coordinate
 from solvers.energies.springs import Springs
-from solvers.linear.factors import DenseCholesky, Factor
+from solvers.linear.factors import DenseCholesky, LinearSolver
 from solvers.problem import (
     Energy,
     Positions,
     ProjectiveEnergy,
-    ResidualOf,
+    ResidualIterate,
     StepProblem,
     System,
     Unsupported,
     is_lagged,
 )
 
-Project = Callable[[Positions, Positions, Positions], None]
+LocalStep = Callable[[Positions, Positions, Positions], None]
 """A function (p, y, out) that writes y + A'K d(p) to `out`."""
 
 
-_COUNTS = {"nnz_factor": "nonzeros", "panel_bytes": "panel_bytes", "flops_per_solve": "flops"}
+_FACTOR_STATS = {"nnz_factor": "nonzeros", "panel_bytes": "panel_bytes", "flops_per_solve": "flops"}
 """Statistics of a factor, by the attribute that provides them, if any."""
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedLocalGlobal(Iterative):
+class PreparedLocalGlobal(IterativeSolver):
     """The iteration with any backend's local step, factor and norm.
 
     Attributes:
@@ -55,65 +55,65 @@ class PreparedLocalGlobal(Iterative):
             number.
     """
 
-    residual_of: ClassVar[ResidualOf] = "previous"
+    residual_iterate: ClassVar[ResidualIterate] = "previous"
 
     system: System
-    project: Project
-    factor: Factor
-    coupling: csr_array
-    norm: Callable[[Positions], float]
-    trace: float
-    facts: dict[str, float]
-    choice: str
-    lagged: Callable[[StepProblem], Project] | None = None
-    rounded: csr_array | None = None
-    spread: float = 1.0
+    local_step: LocalStep
+    factor: LinearSolver
+    pin_coupling: csr_array
+    energy_norm: Callable[[Positions], float]
+    unpinned_trace: float
+    stats: dict[str, float]
+    description: str
+    build_lagged_step: Callable[[StepProblem], LocalStep] | None = None
+    correction_matrix: csr_array | None = None
+    diagonal_dominance_ratio: float = 1.0
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        return Iterations(self, problem, guess)
+        return LocalGlobalState(self, problem, initial_guess)
 
-    def scale(self, problem: StepProblem) -> float:
+    def residual_scale(self, problem: StepProblem) -> float:
         """Return the residual scale [J^(1/2)] for the round-off check."""
-        return largest(problem) * self.trace**0.5
+        return compute_max_coordinate(problem) * self.unpinned_trace**0.5
 
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """Return the local and the global step at the initial guess, as callables for separate timing."""
-        constant, b = self.constant(problem), np.empty_like(problem.target)
-        p = self.placed(problem.first_guess, problem)
-        out, project = p.copy(), self.local(problem)
+        constant, b = self.constant_right_hand_side(problem), np.empty_like(problem.inertial_target)
+        p = self.apply_exact_pins(problem.initial_guess, problem)
+        out, project = p.copy(), self.local_step_of(problem)
 
         def local() -> Positions:
             project(p, constant, b)
             return b
 
         def whole() -> Positions:
-            self.toward(b, p, out)
+            self.solve_positions(b, p, out)
             return out
 
         local()
         return {"local": local, "global": whole}
 
-    def local(self, problem: StepProblem) -> Project:
+    def local_step_of(self, problem: StepProblem) -> LocalStep:
         """Return the local step of a problem."""
-        return self.lagged(problem) if self.lagged else self.project
+        return self.build_lagged_step(problem) if self.build_lagged_step else self.local_step
 
-    def constant(self, problem: StepProblem) -> Positions:
+    def constant_right_hand_side(self, problem: StepProblem) -> Positions:
         """Return y, with the exact pins' columns of Q moved to the right-hand side."""
         s = self.system
-        y = s.inertia[:, None] * problem.target + problem.force
-        soft, vertices, weight = s.penalty
+        y = s.inertia_diagonal[:, None] * problem.inertial_target + problem.external_force
+        soft, vertices, weight = s.penalty_pins
         y[vertices] += weight[:, None] * problem.pin_targets[soft]
-        if s.pins.exact.any():
-            y[s.free] -= self.coupling @ problem.pin_targets[s.pins.exact]
+        if s.pins.exact_mask.any():
+            y[s.free_vertices] -= self.pin_coupling @ problem.pin_targets[s.pins.exact_mask]
         return y
 
-    def correction(self, b: Positions, out: Positions) -> Positions:
+    def solve_correction(self, b: Positions, out: Positions) -> Positions:
         """Write Q^-1 b, without refinement of the factor's precision, to `out` and return `out`, both (n, 3).
 
         Exactly pinned vertices of `out` are not changed.
         """
-        free = self.system.free
+        free = self.system.free_vertices
         if len(free) == len(b):
             self.factor.solve(b, out)
         elif len(free):
@@ -122,58 +122,65 @@ class PreparedLocalGlobal(Iterative):
             out[free] = solved
         return out
 
-    def toward(self, b: Positions, p: Positions, out: Positions) -> None:
+    def solve_positions(self, b: Positions, p: Positions, out: Positions) -> None:
         """Write the solution of Q p = b to `out`, all (n, 3).
 
         A low-precision factor solves for the correction of p.
         """
-        if self.rounded is None:
-            self.correction(b, out)
+        if self.correction_matrix is None:
+            self.solve_correction(b, out)
             return
-        free, left = self.system.free, b.copy()
-        left[free] -= self.rounded @ p[free]
-        self.correction(left, out)
+        free, left = self.system.free_vertices, b.copy()
+        left[free] -= self.correction_matrix @ p[free]
+        self.solve_correction(left, out)
         out[free] += p[free]
 
-    def placed(self, p: Positions, problem: StepProblem) -> Positions:
+    def apply_exact_pins(self, p: Positions, problem: StepProblem) -> Positions:
         """Return a copy of p with the exactly pinned vertices on their targets."""
         placed = np.array(p, order="C")
-        exact = self.system.pins.exact
+        exact = self.system.pins.exact_mask
         placed[self.system.pins.vertices[exact]] = problem.pin_targets[exact]
         return placed
 
-    def residual(self, e: Positions) -> float:
+    def correction_residual(self, e: Positions) -> float:
         """Return |e|_Q [J^(1/2)] of a displacement (n, 3) [m] over the unpinned vertices.
 
         The pinned rows are set to zero.
         """
         e[self.system.pins.vertices] = 0.0
-        return self.norm(e)
+        return self.energy_norm(e)
 
 
-class Iterations(Iterating):
+class LocalGlobalState(SolverState):
     """The state of a local-global solve with two alternating position arrays; right_hand_side: y (n, 3) [N]."""
 
     def __init__(self, base: PreparedLocalGlobal, problem: StepProblem, guess: Positions) -> None:
-        self.base, self._project = base, base.local(problem)
-        self.constant, self._b = base.constant(problem), np.empty_like(problem.target)
-        self.positions, self._other = base.placed(guess, problem), base.placed(problem.current, problem)
-        self._moved = False
+        self.base, self._local_step = base, base.local_step_of(problem)
+        self.right_hand_side, self._b = base.constant_right_hand_side(problem), np.empty_like(problem.inertial_target)
+        self.positions, self._previous_positions = (
+            base.apply_exact_pins(guess, problem),
+            base.apply_exact_pins(problem.current_positions, problem),
+        )
+        self._has_stepped = False
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents descent."""
         p = self.positions
-        self._project(p, self.constant, self._b)
-        self.base.toward(self._b, p, self._other)
-        self.positions, self._other, self._moved = self._other, p, True
+        self._local_step(p, self.right_hand_side, self._b)
+        self.base.solve_positions(self._b, p, self._previous_positions)
+        self.positions, self._previous_positions, self._has_stepped = self._previous_positions, p, True
         return True
 
     def residual(self) -> float:
         """Return |p - LG(p)|_Q of the previous positions p."""
-        return self.base.residual(self._other - self.positions) if self._moved else float("nan")
+        return (
+            self.base.correction_residual(self._previous_positions - self.positions)
+            if self._has_stepped
+            else float("nan")
+        )
 
 
-def projective(system: System, solver: str) -> list[ProjectiveEnergy]:
+def require_projective(system: System, solver: str) -> list[ProjectiveEnergy]:
     """Return the system's energies, all projective; raise Unsupported with the names of others."""
     energies = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
     if len(energies) < len(system.energies):
@@ -182,20 +189,20 @@ def projective(system: System, solver: str) -> list[ProjectiveEnergy]:
     return energies
 
 
-def only_springs(system: System, solver: str) -> Springs:
+def require_only_springs(system: System, solver: str) -> Springs:
     """Return the system's springs as one energy; raise Unsupported if it has another energy."""
     others = {type(energy).__name__ for energy in system.energies if not isinstance(energy, Springs)}
     if others:
         raise Unsupported(f"{solver}: knows springs only; the scene has {', '.join(sorted(others))} as well")
-    return Springs.joined([energy for energy in system.energies if isinstance(energy, Springs)])
+    return Springs.from_parts([energy for energy in system.energies if isinstance(energy, Springs)])
 
 
-def prepared(
+def prepare_local_global(
     system: System,
     energies: Sequence[ProjectiveEnergy],
-    factorise: Callable[[csr_array], tuple[Factor, str]],
+    factorise: Callable[[csr_array], tuple[LinearSolver, str]],
     *,
-    rounded: bool = False,
+    is_low_precision: bool = False,
 ) -> PreparedLocalGlobal:
     """Prepare the iteration with the local steps of the energies and a factor of the assembled Q.
 
@@ -205,29 +212,29 @@ def prepared(
         factorise: function of Q's free part that returns a factor and a description.
         is_low_precision: whether the factor is less precise than float64.
     """
-    Q = matrices.assemble(system, energies)
-    free = system.free
-    rows = Q if len(free) == system.vertices else csr_array(Q[free])
-    exact = system.pins.vertices[system.pins.exact]
-    inner = rows if len(free) == system.vertices else csr_array(rows[:, free])
+    Q = matrices.assemble_system_matrix(system, energies)
+    free = system.free_vertices
+    rows = Q if len(free) == system.num_vertices else csr_array(Q[free])
+    exact = system.pins.vertices[system.pins.exact_mask]
+    inner = rows if len(free) == system.num_vertices else csr_array(rows[:, free])
     factor, choice = factorise(inner) if len(free) else (DenseCholesky(np.eye(0)), "nothing to solve for")
     lagged = any(is_lagged(energy) for energy in energies)
     return PreparedLocalGlobal(
         system,
-        _projection(energies),
+        _build_local_step(energies),
         factor,
         csr_array(rows[:, exact]),
         lambda e: matrices.energy_norm(Q, e),
-        float(Q.diagonal()[system.unpinned].sum()),
-        facts(Q.nnz, factor),
+        float(Q.diagonal()[system.unpinned_mask].sum()),
+        factor_stats(Q.nnz, factor),
         choice,
-        (lambda problem: _projection(problem.energies)) if lagged else None,
-        inner if rounded else None,
-        _spread(inner),
+        (lambda problem: _build_local_step(problem.energies)) if lagged else None,
+        inner if is_low_precision else None,
+        _diagonal_dominance_ratio(inner),
     )
 
 
-def _spread(Q: csr_array) -> float:
+def _diagonal_dominance_ratio(Q: csr_array) -> float:
     """Return max_i Q_ii / (Q 1)_i; infinite if a row sum is zero or round-off."""
     sums, diagonal = Q.sum(axis=1), Q.diagonal()
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
@@ -235,7 +242,7 @@ def _spread(Q: csr_array) -> float:
     return float(found.max(initial=1.0))
 
 
-def _projection(energies: Iterable[Energy]) -> Project:
+def _build_local_step(energies: Iterable[Energy]) -> LocalStep:
     projective = [energy for energy in energies if isinstance(energy, ProjectiveEnergy)]
 
     def project(p: Positions, y: Positions, out: Positions) -> None:
@@ -246,7 +253,7 @@ def _projection(energies: Iterable[Energy]) -> Project:
     return project
 
 
-def facts(entries: int, factor: Factor) -> dict[str, float]:
+def factor_stats(entries: int, factor: LinearSolver) -> dict[str, float]:
     """Return the number of entries of Q, and the statistics that the factor provides."""
-    counts = {name: getattr(factor, attribute, None) for name, attribute in _COUNTS.items()}
+    counts = {name: getattr(factor, attribute, None) for name, attribute in _FACTOR_STATS.items()}
     return {"nnz_system": float(entries)} | {name: float(n) for name, n in counts.items() if n is not None}

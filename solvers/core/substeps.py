@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 from math import ceil
 from typing import ClassVar, Self
 
-from solvers.core.explicit_tables import Composition, Tableau
-from solvers.problem import ResidualOf, Unsupported
+from solvers.core.explicit_tables import ExplicitTableau, SplittingMethod
+from solvers.problem import ResidualIterate, Unsupported
 
 
 @dataclass(frozen=True)
-class Substeps:
+class SubstepChoice:
     """The choice of substeps.
 
     Attributes:
@@ -21,21 +21,21 @@ class Substeps:
         description: description in words.
     """
 
-    count: int
+    num_substeps: int
     tolerance: float
-    rate: float
-    choice: str
+    fastest_rate: float
+    description: str
 
 
 @dataclass(frozen=True, eq=False)
-class Substepping:
+class PreparedSubstepping:
     """The part of an explicit method that is set up for a system."""
 
-    residual_of: ClassVar[ResidualOf] = "none"
-    factorisations: ClassVar[int] = 0
+    residual_iterate: ClassVar[ResidualIterate] = "none"
+    num_factorisations: ClassVar[int] = 0
 
-    method: Composition | Tableau
-    substeps: Substeps
+    method: SplittingMethod | ExplicitTableau
+    substep_choice: SubstepChoice
 
     @property
     def order(self) -> int:
@@ -43,20 +43,20 @@ class Substepping:
         return self.method.order
 
     @property
-    def evaluations(self) -> int:
+    def num_evaluations(self) -> int:
         """Evaluations of the forces per substep."""
-        return self.method.evaluations
+        return self.method.num_evaluations
 
-    def within(self, tolerance: float) -> Self:
+    def with_tolerance(self, tolerance: float) -> Self:
         """Return the solver with another error tolerance [m] of substeps.
 
         Raises Unsupported for a fixed size.
         """
-        if not self.substeps.tolerance:
+        if not self.substep_choice.tolerance:
             raise Unsupported("the method chooses no steps by an error")
-        return replace(self, substeps=replace(self.substeps, tolerance=tolerance))
+        return replace(self, substep_choice=replace(self.substep_choice, tolerance=tolerance))
 
-    def refined(self, times: float) -> Self:
+    def with_refinement(self, refinement_factor: float) -> Self:
         """Return the solver with a multiple of the substeps, rounded up."""
-        count = ceil(times * self.substeps.count)
-        return replace(self, substeps=replace(self.substeps, count=count))
+        count = ceil(refinement_factor * self.substep_choice.num_substeps)
+        return replace(self, substep_choice=replace(self.substep_choice, num_substeps=count))

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.core import colouring, vertex_terms
-from solvers.core.parts import Parts
-from solvers.core.vertex_elements import Beside
-from solvers.kernels.springs import Bundles
+from solvers.core.parts import SpringForm
+from solvers.core.vertex_elements import VertexElements
+from solvers.kernels.springs import SpringPackets
 from solvers.problem import System
 from solvers.vectors.springs import LANES
 
@@ -31,34 +31,38 @@ class VertexBlocks(NamedTuple):
         majorant: that plus the stiffness of springs and elements (n + 2,) [N/m]; 1 for padding.
     """
 
-    row: NDArray[np.int64]
-    free: int
-    bundles: Bundles
-    first: NDArray[np.int64]
-    held: NDArray[np.float64]
+    row_of_vertex: NDArray[np.int64]
+    num_free: int
+    spring_packets: SpringPackets
+    first_packet: NDArray[np.int64]
+    anchor_stiffness: NDArray[np.float64]
     majorant: NDArray[np.float64]
 
     @property
-    def colours(self) -> int:
+    def num_colours(self) -> int:
         """Number of colours."""
-        return len(self.first) - 1
+        return len(self.first_packet) - 1
 
     @classmethod
-    def of(cls, system: System, parts: Parts, beside: Beside) -> VertexBlocks:
+    def from_system(cls, system: System, parts: SpringForm, beside: VertexElements) -> VertexBlocks:
         """Build the rows of a system from the decomposition of its energies."""
-        n = system.vertices
-        coloured = colouring.of_vertices(np.concatenate([parts.whole.edges, beside.pairs()]), n)
+        n = system.num_vertices
+        coloured = colouring.colour_vertices(np.concatenate([parts.springs_and_forms.edges, beside.vertex_pairs()]), n)
         colour = np.empty(n, np.int64)
-        colour[coloured.order] = np.repeat(np.arange(coloured.colours), np.diff(coloured.start))
-        pinned = system.pins.vertices[system.pins.exact]
-        order = coloured.order[~np.isin(coloured.order, pinned)]
+        colour[coloured.item_order] = np.repeat(np.arange(coloured.num_colours), np.diff(coloured.colour_starts))
+        pinned = system.pins.vertices[system.pins.exact_mask]
+        order = coloured.item_order[~np.isin(coloured.item_order, pinned)]
         row = np.empty(n, np.int64)
         row[order], row[pinned] = np.arange(len(order)), np.arange(len(order), n)
         colour[pinned] = -1
-        bundles, first = Bundles.of(parts.whole, row, colour, coloured.colours, n, n + 1)
+        bundles, first = SpringPackets.from_springs(
+            parts.springs_and_forms, row, colour, coloured.num_colours, n, n + 1
+        )
         held, majorant = np.zeros(n + 2), np.ones(n + 2)
-        held[: len(order)] = majorant[: len(order)] = (vertex_terms.held(system) + parts.held)[order]
-        majorant[: len(order)] += beside.diagonal()[order]
-        ends = np.repeat(bundles.own.reshape(-1, LANES), np.diff(bundles.start), axis=0)
-        np.add.at(majorant, ends.ravel() // 4, bundles.each()[1])
+        held[: len(order)] = majorant[: len(order)] = (
+            vertex_terms.compute_anchor_stiffness(system) + parts.vertex_weight
+        )[order]
+        majorant[: len(order)] += beside.stiffness_diagonal()[order]
+        ends = np.repeat(bundles.row_offset.reshape(-1, LANES), np.diff(bundles.packet_start), axis=0)
+        np.add.at(majorant, ends.ravel() // 4, bundles.entry_weights()[1])
         return cls(row, len(order), bundles, first, held, majorant)

@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers import matrices
-from solvers.energies.elements import Elements, Law
+from solvers.energies.elements import ElementLaw, Elements
 from solvers.kernels import vbd as plain
 from solvers.problem import ProjectiveEnergy, StepProblem, System, is_lagged
 
 if TYPE_CHECKING:
-    from solvers.kernels.stencils import Around
+    from solvers.kernels.stencils import IncidentElements
 
 
 @dataclass(frozen=True, eq=False)
-class Beside:
+class VertexElements:
     """The projective energies of a system with an element-wise form.
 
     Attributes:
@@ -32,11 +32,11 @@ class Beside:
     """
 
     system: System
-    numbers: tuple[int, ...] = ()
-    around: tuple[Around, ...] = field(default=())
+    energy_indices: tuple[int, ...] = ()
+    incident_elements: tuple[IncidentElements, ...] = field(default=())
 
     @classmethod
-    def of(cls, system: System) -> Beside:
+    def from_system(cls, system: System) -> VertexElements:
         """Select those of a system."""
         known = (k for k, e in enumerate(system.energies) if hasattr(e, "law") and isinstance(e, ProjectiveEnergy))
         return cls(system, tuple(known))
@@ -44,9 +44,9 @@ class Beside:
     @property
     def energies(self) -> list[Any]:
         """The selected energies."""
-        return [self.system.energies[k] for k in self.numbers]
+        return [self.system.energies[k] for k in self.energy_indices]
 
-    def pairs(self) -> NDArray[np.int64]:
+    def vertex_pairs(self) -> NDArray[np.int64]:
         """Return all pairs of vertices of an element, (., 2)."""
         found = [np.empty((0, 2), np.int64)]
         for energy in self.energies:
@@ -54,48 +54,51 @@ class Beside:
             found += [vertices[:, [i, j]] for i, j in zip(*np.triu_indices(vertices.shape[1], 1), strict=True)]
         return np.concatenate(found)
 
-    def diagonal(self) -> NDArray[np.float64]:
+    def stiffness_diagonal(self) -> NDArray[np.float64]:
         """Return the diagonal of A'WA (n,) [N/m], which does not depend on the step."""
-        total = np.zeros(self.system.vertices)
-        for share in matrices.shares(self.system, self.energies):
+        total = np.zeros(self.system.num_vertices)
+        for share in matrices.stiffness_shares(self.system, self.energies):
             total += share.diagonal()
         return total
 
-    def among(self, row: NDArray[np.int64], rows: int) -> Beside:
+    def with_rows(self, row: NDArray[np.int64], rows: int) -> VertexElements:
         """Return these energies with vertices in rows `row` (n,) of `rows`."""
-        if not self.numbers:
+        if not self.energy_indices:
             return self
-        from solvers.kernels.stencils import Around  # for those who need it
+        from solvers.kernels.stencils import IncidentElements  # for those who need it
 
-        joined = zip(self._laws, self._joined(self.energies), strict=True)
-        return replace(self, around=tuple(Around.of(law, one, row, rows) for law, one in joined))
+        joined = zip(self._unique_laws, self._elements_by_law(self.energies), strict=True)
+        return replace(
+            self, incident_elements=tuple(IncidentElements.from_elements(law, one, row, rows) for law, one in joined)
+        )
 
-    def begun(self, problem: StepProblem) -> tuple[Around, ...] | None:
+    def update_elements(self, problem: StepProblem) -> tuple[IncidentElements, ...] | None:
         """Return the elements by rows, updated to a step; None if there are none."""
         if not any(is_lagged(energy) for energy in self.energies):
-            return self.around or None
-        joined = self._joined([problem.energies[k] for k in self.numbers])
+            return self.incident_elements or None
+        joined = self._elements_by_law([problem.energies[k] for k in self.energy_indices])
         return tuple(
-            around.with_numbers(law, one) for around, law, one in zip(self.around, self._laws, joined, strict=True)
+            around.with_parameters(law, one)
+            for around, law, one in zip(self.incident_elements, self._unique_laws, joined, strict=True)
         )
 
     @cached_property
-    def kernel(self) -> Any:
+    def iteration_kernel(self) -> Any:
         """The kernel `solvers.methods.vertex_block.vbd_sweeps.run_iterations` extended by these energies."""
-        if not self.numbers:
-            return plain.iterate
-        from solvers.kernels.stencils import Kind  # for those who need it
-        from solvers.kernels.vbd_elements import iterating
+        if not self.energy_indices:
+            return plain.run_iterations
+        from solvers.kernels.stencils import ElementKind  # for those who need it
+        from solvers.kernels.vbd_elements import build_element_iteration
 
-        widths = [one.vertices.shape[1] for one in self._joined(self.energies)]
-        return iterating(*(Kind(*kind) for kind in zip(self._laws, widths, strict=True)))
+        widths = [one.vertices.shape[1] for one in self._elements_by_law(self.energies)]
+        return build_element_iteration(*(ElementKind(*kind) for kind in zip(self._unique_laws, widths, strict=True)))
 
     @cached_property
-    def _laws(self) -> list[Law]:
+    def _unique_laws(self) -> list[ElementLaw]:
         """The distinct laws."""
         return list({id(energy.law): energy.law for energy in self.energies}.values())
 
-    def _joined(self, energies: list[Any]) -> list[Elements]:
+    def _elements_by_law(self, energies: list[Any]) -> list[Elements]:
         """Concatenate the elements of the energies by law."""
-        of_law = [[e.elements for e in energies if e.law is law] for law in self._laws]
+        of_law = [[e.elements for e in energies if e.element_law is law] for law in self._unique_laws]
         return [Elements(*(np.concatenate(arrays) for arrays in zip(*some, strict=True))) for some in of_law]

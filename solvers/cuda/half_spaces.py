@@ -17,24 +17,24 @@ from numba import float64
 from numpy.typing import NDArray
 
 from solvers.contact import planes
-from solvers.contact.energy import Contact
+from solvers.contact.energy import HalfSpaceContact
 from solvers.cuda import sums, vbd_kernels
-from solvers.cuda.shared import shared
-from solvers.cuda.steps import Step
-from solvers.cuda.target import Stream, cuda
-from solvers.cuda.vbd_kernels import ASKED, WEIGHT
+from solvers.cuda.shared import share_with_device
+from solvers.cuda.steps import DeviceStep
+from solvers.cuda.target import DeviceStream, cuda
+from solvers.cuda.vbd_kernels import EXTRAPOLATION, IS_REQUESTED
 from solvers.kernels import half_spaces
-from solvers.kernels.half_spaces import EXACT, MAJORANT, HalfSpaces
+from solvers.kernels.half_spaces import EXACT_BLOCK, SPRING_MAJORANT, HalfSpaces
 from solvers.problem import System
 
-NUMBERS = 12
+FLOATS_PER_ROW = 12
 """Number of float64 values per row and obstacle."""
 
-_plane, _deeper = shared(planes.plane), shared(half_spaces.deeper)
-_Rounded = planes.Rounded
+_plane, _deeper = share_with_device(planes.write_separating_plane), share_with_device(half_spaces.add_half_space_change)
+_Rounded = planes.RoundedBox
 
 
-class Bodies(NamedTuple):
+class ObstacleBodies(NamedTuple):
     """Obstacles on the device.
 
     Attributes:
@@ -48,62 +48,64 @@ class Bodies(NamedTuple):
 
     low: Any
     high: Any
-    radius: Any
-    margin: Any
-    friction: Any
-    creep: Any
+    spectral_radius: Any
+    force_margin: Any
+    friction_coefficient: Any
+    eps_v: Any
     stiffness: Any
 
 
-class Spaces:
+class DeviceHalfSpaces:
     """Half-spaces of a solve on the device, one per free row and obstacle."""
 
-    def __init__(self, stream: Stream, system: System, order: NDArray[np.int64], vertex: Any, free: int) -> None:
+    def __init__(
+        self, stream: DeviceStream, system: System, order: NDArray[np.int64], vertex: Any, num_free: int
+    ) -> None:
         """Allocate the half-spaces; `order` and `vertex` (n,) are the vertices of the rows on host and device."""
         self._stream, self._vertex, self._dt = stream, vertex, system.time_step
-        self._contacts = [energy for energy in system.energies if isinstance(energy, Contact)]
+        self._contacts = [energy for energy in system.energies if isinstance(energy, HalfSpaceContact)]
         all_of = [(contact, one) for contact in self._contacts for one in contact.obstacles]
-        many, up = len(all_of), stream.upload
-        self._bodies = Bodies(
+        many, up = len(all_of), stream.upload_array
+        self._obstacle_bodies = ObstacleBodies(
             up(np.array([one.low for _, one in all_of], np.float64)),
             up(np.array([one.high for _, one in all_of], np.float64)),
-            up(np.array([one.radius + contact.thickness for contact, one in all_of])),
-            up(np.array([contact.margin for contact, _ in all_of], np.float64)),
+            up(np.array([one.radius + contact.min_distance for contact, one in all_of])),
+            up(np.array([contact.safety_margin for contact, _ in all_of], np.float64)),
             up(np.array([contact.friction for contact, _ in all_of], np.float64)),
-            up(np.array([contact.creep for contact, _ in all_of], np.float64)),
+            up(np.array([contact.eps_v for contact, _ in all_of], np.float64)),
             up(np.array([contact.stiffness[order] for contact, _ in all_of])),
         )
-        slots = max(1, many * free)
-        near: Any = stream.zeros(max(1, free), np.bool_)
-        normal, anchor = (stream.zeros((slots, 3), np.float64) for _ in range(2))
-        offset, stiffness, grip, slip = (stream.zeros(slots, np.float64) for _ in range(4))
-        first = up(many * np.arange(free + 1))
-        self.given = HalfSpaces(first, near, normal, anchor, offset, stiffness, grip, slip, both=False)
-        given, one = self.given, stream.zeros(1, np.int64)
-        self._found = planes.HalfSpaces(one, given.normal, given.offset, given.anchor)
-        self._square, self._frames = stream.zeros(1, np.float64), up(self._frames_at(0.0))
-        self._move = any(one.frame(0.0) is not one.frame(1.0) for _, one in all_of)
-        self.over = sums.blocks(free), sums.THREADS, stream.queue
+        slots = max(1, many * num_free)
+        near: Any = stream.allocate_zeros(max(1, num_free), np.bool_)
+        normal, anchor = (stream.allocate_zeros((slots, 3), np.float64) for _ in range(2))
+        offset, stiffness, grip, slip = (stream.allocate_zeros(slots, np.float64) for _ in range(4))
+        first = up(many * np.arange(num_free + 1))
+        self.half_spaces = HalfSpaces(first, near, normal, anchor, offset, stiffness, grip, slip, is_two_sided=False)
+        given, one = self.half_spaces, stream.allocate_zeros(1, np.int64)
+        self._found = planes.SeparatingPlanes(one, given.normal, given.offset, given.friction_anchor)
+        self._max_squared_speed, self._frames = stream.allocate_zeros(1, np.float64), up(self._obstacle_frames(0.0))
+        self._has_moving_obstacles = any(one.frame(0.0) is not one.frame(1.0) for _, one in all_of)
+        self.launch_shape = sums.count_blocks(num_free), sums.THREADS_PER_BLOCK, stream.cuda_stream
 
-    def take(self, step: Step) -> None:
+    def load_step(self, step: DeviceStep) -> None:
         """Build the half-spaces of a step."""
-        begin, end = step.times
-        if self._move:
-            self._stream.put(self._frames_at(begin), self._frames)
-        self._stream.put(np.zeros(1), self._square)
-        fastest[self.over](step.velocity, self._square)
-        find[self.over](
-            self._vertex, step.positions, step.velocity, self._dt, (end - begin) / self._dt, self._square, self._frames,
-            self._bodies, self._found, step.pressed is not None,
-            step.positions if step.pressed is None else step.pressed, self.given,
+        begin, end = step.start_and_stage_time
+        if self._has_moving_obstacles:
+            self._stream.overwrite_array(self._obstacle_frames(begin), self._frames)
+        self._stream.overwrite_array(np.zeros(1), self._max_squared_speed)
+        measure_max_speed[self.launch_shape](step.velocity, self._max_squared_speed)
+        build_half_spaces[self.launch_shape](
+            self._vertex, step.copy_positions, step.velocity, self._dt, (end - begin) / self._dt, self._max_squared_speed, self._frames,
+            self._obstacle_bodies, self._found, step.normal_force_positions is not None,
+            step.copy_positions if step.normal_force_positions is None else step.normal_force_positions, self.half_spaces,
         )  # fmt: skip
 
-    def _frames_at(self, time: float) -> NDArray[np.float64]:
-        return np.concatenate([contact.frames(time) for contact in self._contacts])
+    def _obstacle_frames(self, time: float) -> NDArray[np.float64]:
+        return np.concatenate([contact.compute_frames(time) for contact in self._contacts])
 
 
 @cuda.jit
-def fastest(v, out):
+def measure_max_speed(v, out):
     """Update out[0] to the largest |v|^2, a maximum that is independent of the order of threads."""
     most, i = 0.0, cuda.grid(1)
     while i < v.shape[0]:
@@ -113,7 +115,7 @@ def fastest(v, out):
 
 
 @cuda.jit
-def find(vertex, p, v, dt, when, square, frames, bodies, found, rounds, pressed, spaces):
+def build_half_spaces(vertex, p, v, dt, when, square, frames, bodies, found, rounds, pressed, spaces):
     """Write the half-spaces of the free rows, one per obstacle.
 
     A half-space is empty if the vertex is not near the obstacle.
@@ -130,46 +132,54 @@ def find(vertex, p, v, dt, when, square, frames, bodies, found, rounds, pressed,
         rounds: whether friction uses the normal forces at `pressed` (n, 3) [m], by vertices.
     """
     work = cuda.local.array((5, 3), np.float64)
-    i, many = cuda.grid(1), bodies.radius.shape[0]
+    i, many = cuda.grid(1), bodies.spectral_radius.shape[0]
     way = dt * math.sqrt(square[0])
-    while i < spaces.near.shape[0]:
-        spaces.near[i] = False
+    while i < spaces.has_half_space.shape[0]:
+        spaces.has_half_space[i] = False
         x = vertex[i]
         for o in range(many):
-            k, body = many * i + o, _Rounded(bodies.low[o], bodies.high[o], bodies.radius[o])
-            if _plane(p, v, x, dt, frames[o], body, bodies.margin[o] + way, found, k, work):
+            k, body = many * i + o, _Rounded(bodies.low[o], bodies.high[o], bodies.spectral_radius[o])
+            if _plane(p, v, x, dt, frames[o], body, bodies.force_margin[o] + way, found, k, work):
                 before, lagged, taken, stiffness = 0.0, 0.0, 0.0, bodies.stiffness[o, i]
                 for c in range(3):
-                    n, here, carried = spaces.normal[k, c], p[x, c], spaces.anchor[k, c]
+                    n, here, carried = spaces.normal[k, c], p[x, c], spaces.friction_anchor[k, c]
                     before += n * here
                     lagged += n * carried
                     taken += n * pressed[x, c]
-                    spaces.anchor[k, c] = here + when * (carried - here)
+                    spaces.friction_anchor[k, c] = here + when * (carried - here)
                 depth = when * (spaces.offset[k] - lagged)
                 spaces.offset[k] = before + when * (spaces.offset[k] - before)
                 depth = spaces.offset[k] - taken if rounds else depth
-                spaces.stiffness[k], spaces.slip[k] = stiffness, bodies.creep[o] * (when * dt)
-                spaces.grip[k] = bodies.friction[o] * stiffness * max(0.0, depth)
-                spaces.near[i] = True
+                spaces.stiffness[k], spaces.smoothing_length[k] = stiffness, bodies.eps_v[o] * (when * dt)
+                spaces.friction_limit[k] = bodies.friction_coefficient[o] * stiffness * max(0.0, depth)
+                spaces.has_half_space[i] = True
             else:
                 for c in range(3):
-                    spaces.normal[k, c], spaces.anchor[k, c] = 0.0, 0.0
-                spaces.offset[k], spaces.stiffness[k], spaces.grip[k], spaces.slip[k] = -1.0, 0.0, 0.0, 1.0
+                    spaces.normal[k, c], spaces.friction_anchor[k, c] = 0.0, 0.0
+                spaces.offset[k], spaces.stiffness[k], spaces.friction_limit[k], spaces.smoothing_length[k] = (
+                    -1.0,
+                    0.0,
+                    0.0,
+                    1.0,
+                )
         i += cuda.gridsize(1)
 
 
 class Kernels(NamedTuple):
     """Kernels in one floating-point type."""
 
-    push: Any
-    press: Any
+    push_with_model: Any
+    evaluate_penalty: Any
 
 
 @cache
 def kernels(real: Any) -> Kernels:
     """Build the kernels for the floating-point type of the displacements."""
-    of_springs = vbd_kernels.kernels(real)
-    gathered, lowering = of_springs.gathered, shared(half_spaces.trying(of_springs.risen_there))
+    of_springs = vbd_kernels.build_vbd_kernels(real)
+    gathered, lowering = (
+        of_springs.gather_force_and_block,
+        share_with_device(half_spaces.build_block_step(of_springs.vertex_energy_change)),
+    )
 
     @cuda.jit
     def push(
@@ -194,7 +204,7 @@ def kernels(real: Any) -> Kernels:
         block = float64(b00), float64(b01), float64(b02), float64(b11), float64(b12), float64(b22)
         lane = t, first, last, (u0, u1, u2), (f0, f1, f2), neighbour, kind, weights, arrows, far, held, u
         # A spring of zero length has no Hessian: the step of the majorant separates its ends.
-        level = MAJORANT if lengthless else EXACT
+        level = SPRING_MAJORANT if lengthless else EXACT_BLOCK
         most = float64(majorant[t])
         d = lowering(spaces, i, at, (most, 0.0, 0.0, most, 0.0, most), level, gradient, block, lane)
         u[i, 0], u[i, 1], u[i, 2] = real(u0 + d[0]), real(u1 + d[1]), real(u2 + d[2])
@@ -205,9 +215,9 @@ def kernels(real: Any) -> Kernels:
 
         The numbers are stored in `out` from `first` on; see `sum_objective` in `solvers.cuda.vbd_kernels`.
         """
-        if asked == ASKED and not control[ASKED] > 0.0:
+        if asked == IS_REQUESTED and not control[IS_REQUESTED] > 0.0:
             return
-        if asked == WEIGHT and not control[WEIGHT] > 1.0:
+        if asked == EXTRAPOLATION and not control[EXTRAPOLATION] > 1.0:
             return
         total, i = 0.0, cuda.grid(1)
         while i < spaces.near.shape[0]:
@@ -215,7 +225,7 @@ def kernels(real: Any) -> Kernels:
                 d = float64(u[i, 0]), float64(u[i, 1]), float64(u[i, 2])
                 total = _deeper(spaces, i, (x[i, 0], x[i, 1], x[i, 2]), d, total)
             i += cuda.gridsize(1)
-        total = sums.of_block(total)
+        total = sums.sum_block(total)
         if cuda.threadIdx.x == 0:
             out[first + cuda.blockIdx.x] = total
 

@@ -19,19 +19,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.contact.touching import without_contact
-from solvers.core.bounds import without_bounded
-from solvers.core.parts import Parts, split
-from solvers.cuda.target import Stream
+from solvers.contact.touching import without_vertex_contact
+from solvers.core.bounds import without_barriers
+from solvers.core.parts import SpringForm, decompose_energies
+from solvers.cuda.target import DeviceStream
 from solvers.problem import System, Unsupported
 
-WARP = 32
+WARP_SIZE = 32
 """Number of rows with interleaved entries: a warp."""
 
-Ints = NDArray[np.int64]
+IndexArray = NDArray[np.int64]
 
 
-class Entries(NamedTuple):
+class EdgeEntries(NamedTuple):
     """Edges listed at both of their ends.
 
     Attributes:
@@ -40,12 +40,12 @@ class Entries(NamedTuple):
         edge_indices: edge of each entry, ~edge at its second end.
     """
 
-    first: Any
-    other: Any
-    edge: Any
+    warp_starts: Any
+    neighbour_rows: Any
+    edge_indices: Any
 
     @classmethod
-    def of(cls, ends: Ints, rows: int) -> Entries:
+    def from_ends(cls, ends: IndexArray, rows: int) -> EdgeEntries:
         """Build the entries of edges between rows (m, 2), for the first `rows` rows, without self-loops."""
         kept = np.flatnonzero(ends[:, 0] != ends[:, 1])
         here, there = ends[kept].T.ravel(), ends[kept, ::-1].T.ravel()
@@ -54,18 +54,18 @@ class Entries(NamedTuple):
         order = order[: np.searchsorted(here[order], rows)]
         here, there, edge = here[order], there[order], edge[order]
         nth = np.arange(len(here)) - np.searchsorted(here, here)
-        warps = -(-rows // WARP)
-        count = np.bincount(here, minlength=warps * WARP).reshape(warps, WARP).max(axis=1, initial=0)
-        first = np.concatenate([[0], np.cumsum(WARP * count)])
-        at = first[here // WARP] + WARP * nth + here % WARP
+        warps = -(-rows // WARP_SIZE)
+        count = np.bincount(here, minlength=warps * WARP_SIZE).reshape(warps, WARP_SIZE).max(axis=1, initial=0)
+        first = np.concatenate([[0], np.cumsum(WARP_SIZE * count)])
+        at = first[here // WARP_SIZE] + WARP_SIZE * nth + here % WARP_SIZE
         lane = np.arange(first[-1]) - np.repeat(first[:-1], np.diff(first))
-        other = (np.repeat(WARP * np.arange(warps), np.diff(first)) + lane % WARP).astype(np.int32)
+        other = (np.repeat(WARP_SIZE * np.arange(warps), np.diff(first)) + lane % WARP_SIZE).astype(np.int32)
         edges = np.zeros(first[-1], np.int32)
         other[at], edges[at] = there, edge
         return cls(first.astype(np.int32), other, edges)
 
 
-class Edges(NamedTuple):
+class DeviceEdges(NamedTuple):
     """Edges on the device.
 
     Attributes:
@@ -77,46 +77,46 @@ class Edges(NamedTuple):
         dashpot_offset: (m,) [m].
     """
 
-    first: Any
-    other: Any
-    edge: Any
-    stiffness: Any
-    rest: Any
+    warp_starts: Any
+    neighbour_rows: Any
+    edge_indices: Any
+    entry_stiffness: Any
+    entry_rest_length: Any
     ends: Any
-    strength: Any
-    length: Any
-    axis: Any
-    offset: Any
+    edge_stiffness: Any
+    edge_rest_length: Any
+    edge_direction: Any
+    dashpot_offset: Any
 
 
-class Given(NamedTuple):
+class DeviceStepData(NamedTuple):
     """Data of a step on the device.
 
     Anchor stiffness h (f,) [N/m], centres c (f, 3) [m] and force (f, 3) [N] of the free rows.
     """
 
-    hold: Any
-    centre: Any
-    force: Any
+    anchor_stiffness: Any
+    anchor_positions: Any
+    external_force: Any
 
 
 @dataclass(frozen=True, eq=False)
-class Network:
+class DeviceNetwork:
     """Edges of a system; `row_vertices` (n,) are the vertices of the rows, the first `num_free` rows move."""
 
     system: System
-    parts: Parts
-    order: Ints
-    free: int
-    ends: Ints
-    entries: Entries
+    spring_form: SpringForm
+    row_vertices: IndexArray
+    num_free: int
+    ends: IndexArray
+    edge_entries: EdgeEntries
     stiffness: NDArray[np.float64]
-    rest: NDArray[np.float64]
-    axis: NDArray[np.float64]
-    hold: NDArray[np.float64]
+    rest_length: NDArray[np.float64]
+    edge_direction: NDArray[np.float64]
+    anchor_stiffness: NDArray[np.float64]
 
     @classmethod
-    def of(cls, solver: str, system: System, order: Ints) -> Network:
+    def from_system(cls, solver: str, system: System, free_order: IndexArray) -> DeviceNetwork:
         """Build the network of a system.
 
         Args:
@@ -127,54 +127,67 @@ class Network:
         Raises:
             Unsupported: with the names of energies other than springs, constant forms and dashpots.
         """
-        parts = split(system)
-        require_known(solver, system)
-        exact = system.pins.vertices[system.pins.exact]
-        order = np.concatenate([system.free[order], exact]).astype(np.int64)
-        row = np.empty(system.vertices, np.int64)
-        row[order] = np.arange(len(order))
+        parts = decompose_energies(system)
+        require_known_energies(solver, system)
+        exact = system.pins.vertices[system.pins.exact_mask]
+        free_order = np.concatenate([system.free_vertices[free_order], exact]).astype(np.int64)
+        row = np.empty(system.num_vertices, np.int64)
+        row[free_order] = np.arange(len(free_order))
         none = np.empty(0)
         dashpots = parts.dashpots
-        ends = row[np.concatenate([parts.whole.edges, *(e.edges for e in dashpots)])]
-        stiffness = np.concatenate([parts.whole.stiffness, *(e.stiffness for e in dashpots)])
-        damped = np.full(len(ends) - len(parts.whole.edges), np.nan)
-        rest = np.concatenate([parts.whole.rest_length, damped])
-        axis = np.concatenate([parts.whole.rest_direction, *(e.direction for e in dashpots), none.reshape(0, 3)])
-        hold = system.inertia + parts.held
-        _, pinned, weight = system.penalty
+        ends = row[np.concatenate([parts.springs_and_forms.edges, *(e.edges for e in dashpots)])]
+        stiffness = np.concatenate([parts.springs_and_forms.stiffness, *(e.stiffness for e in dashpots)])
+        damped = np.full(len(ends) - len(parts.springs_and_forms.edges), np.nan)
+        rest = np.concatenate([parts.springs_and_forms.rest_length, damped])
+        axis = np.concatenate(
+            [parts.springs_and_forms.rest_direction, *(e.direction for e in dashpots), none.reshape(0, 3)]
+        )
+        hold = system.inertia_diagonal + parts.vertex_weight
+        _, pinned, weight = system.penalty_pins
         hold[pinned] += weight
-        free = len(system.free)
-        return cls(system, parts, order, free, ends, Entries.of(ends, free), stiffness, rest, axis, hold[order])
+        free = len(system.free_vertices)
+        return cls(
+            system,
+            parts,
+            free_order,
+            free,
+            ends,
+            EdgeEntries.from_ends(ends, free),
+            stiffness,
+            rest,
+            axis,
+            hold[free_order],
+        )
 
     @property
-    def bytes(self) -> float:
+    def device_bytes(self) -> float:
         """Return the bytes of the network on the device, without vectors."""
-        return 24.0 * len(self.entries.other) + 64.0 * len(self.ends)
+        return 24.0 * len(self.edge_entries.neighbour_rows) + 64.0 * len(self.ends)
 
-    def upload(self, stream: Stream) -> Edges:
+    def upload_edges(self, stream: DeviceStream) -> DeviceEdges:
         """Copy the edges to the device."""
-        first, other, edge = self.entries
+        first, other, edge = self.edge_entries
         named = np.maximum(edge, ~edge)
-        return Edges(
-            stream.upload(first),
-            stream.upload(other),
-            stream.upload(edge),
-            stream.upload(self.stiffness[named]),
-            stream.upload(self.rest[named]),
-            stream.upload(self.ends.astype(np.int32)),
-            stream.upload(self.stiffness),
-            stream.upload(self.rest),
-            stream.upload(self.axis),
-            stream.upload(np.zeros(len(self.rest))),
+        return DeviceEdges(
+            stream.upload_array(first),
+            stream.upload_array(other),
+            stream.upload_array(edge),
+            stream.upload_array(self.stiffness[named]),
+            stream.upload_array(self.rest_length[named]),
+            stream.upload_array(self.ends.astype(np.int32)),
+            stream.upload_array(self.stiffness),
+            stream.upload_array(self.rest_length),
+            stream.upload_array(self.edge_direction),
+            stream.upload_array(np.zeros(len(self.rest_length))),
         )
 
 
-def require_known(solver: str, system: System) -> None:
+def require_known_energies(solver: str, system: System) -> None:
     """Raise Unsupported with the names of energies that the device kernels do not support."""
-    bare = without_bounded(without_contact(system))
+    bare = without_barriers(without_vertex_contact(system))
     there = {type(e).__name__ for e in system.energies if e not in bare.energies}
-    parts = split(bare)
-    unknown = {*there, *parts.unknown, *(type(e).__name__ for e in parts.limits)}
+    parts = decompose_energies(bare)
+    unknown = {*there, *parts.unsupported_energies, *(type(e).__name__ for e in parts.strain_limits)}
     if unknown:
         raise Unsupported(
             f"{solver}, device: cuda: its kernels know springs, bending, attachments, linear drag and dashpots; not "

@@ -20,37 +20,41 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.core.descent import HALVINGS, Metric
-from solvers.core.driver import largest
-from solvers.core.fixed_objective import Objective
-from solvers.core.preconditioning import LEAST, Preconditioning
+from solvers.core.descent import MAX_HALVINGS, ResidualMetric
+from solvers.core.driver import compute_max_coordinate
+from solvers.core.fixed_objective import FixedObjective
+from solvers.core.preconditioning import MIN_DIAGONAL_FRACTION, PreconditionerName
 from solvers.cuda import device, objective_kernels, sums
-from solvers.cuda.network import Network, require_known
-from solvers.cuda.run import DeviceIterating, Minimising
-from solvers.cuda.schwarz import Level, Schwarz, UploadedLevel, levels, needed
-from solvers.cuda.steps import Begun, Step, Uploaded
-from solvers.cuda.target import Stream, cuda
-from solvers.kernels.line_search import falls
-from solvers.linear.schwarz import ordered
+from solvers.cuda.network import DeviceNetwork, require_known_energies
+from solvers.cuda.run import DeviceSolverState, MinimisingSolver
+from solvers.cuda.schwarz import DeviceAdditiveSchwarz, SchwarzLevel, UploadedLevel, build_levels, compute_device_bytes
+from solvers.cuda.steps import DeviceStep, LoadedStep, UploadedNetwork
+from solvers.cuda.target import DeviceStream, cuda
+from solvers.kernels.line_search import is_armijo_step
+from solvers.linear.schwarz import order_into_subdomains
 from solvers.problem import StepProblem, System, Unsupported
 
-TOGETHER = 16
+ITERATIONS_PER_CHECK = 16
 """Iterations of conjugate gradients per check of their end."""
 
-_SUMS = 2
+_NUM_SUMS = 2
 """Number of simultaneous sums."""
 
-ENDED, COUNT, PRODUCT, BEFORE, CURVATURE, LIMIT = range(6)
+STATUS, NUM_ITERATIONS, RESIDUAL_PRODUCT, PREVIOUS_PRODUCT, CURVATURE, PRODUCT_LIMIT = range(6)
 """Indices of `now`: reason of the end; iterations; r'z, its previous value, p'Hp and the tolerance of r'z [J]."""
 
-GOING, NEAR, CURVED = 0.0, 1.0, 2.0
+RUNNING, CONVERGED, NEGATIVE_CURVATURE = 0.0, 1.0, 2.0
 """Reasons of the end of conjugate gradients."""
 
 Real = type[np.float32] | type[np.float64]
 
 
-def prepare(
-    system: System, preconditioner: Preconditioning, real: Real, forcing: tuple[float, float], most: int
+def prepare_newton_cg(
+    system: System,
+    preconditioner: PreconditionerName,
+    real: Real,
+    eta_bounds: tuple[float, float],
+    max_cg_iterations: int,
 ) -> PreparedNewtonCG:
     """Prepare the method on an available device.
 
@@ -69,66 +73,66 @@ def prepare(
         raise Unsupported(
             f"newton-cg, device: cuda: knows preconditioner: schwarz, not {preconditioner}; take that, or device: cpu"
         )
-    require_known("newton-cg", system)
-    metric = Metric(system)
-    order = ordered(metric.inner)
-    network = Network.of("newton-cg", system, order)
+    require_known_energies("newton-cg", system)
+    metric = ResidualMetric(system)
+    order = order_into_subdomains(metric.free_block)
+    network = DeviceNetwork.from_system("newton-cg", system, order)
     size = np.dtype(real).itemsize
-    held = network.hold[: network.free] + LEAST * metric.diagonal[order]
-    of = levels(network, held)
-    vectors = network.free * (3.0 * (12 * 8 + 8 * size) + 8.0 * 8)
-    solve = vectors + needed(of, size) + 4.0 * size * len(network.entries.other)
-    device.require_memory("newton-cg", network.bytes + solve)
-    with device.guarded():
-        stream = Stream()
-        there = [UploadedLevel.of(stream, level) for level in of]
+    held = network.anchor_stiffness[: network.num_free] + MIN_DIAGONAL_FRACTION * metric.free_diagonal[order]
+    of = build_levels(network, held)
+    vectors = network.num_free * (3.0 * (12 * 8 + 8 * size) + 8.0 * 8)
+    solve = vectors + compute_device_bytes(of, size) + 4.0 * size * len(network.edge_entries.neighbour_rows)
+    device.require_memory("newton-cg", network.device_bytes + solve)
+    with device.guard_device_errors():
+        stream = DeviceStream()
+        there = [UploadedLevel.from_level(stream, level) for level in of]
         return PreparedNewtonCG(
-            Uploaded.of(network, stream),
+            UploadedNetwork.from_network(network, stream),
             metric,
-            Objective(system),
+            FixedObjective(system),
             of,
             there,
             real,
-            forcing,
-            most,
-            device.told(),
-            f"kernels in {np.dtype(real)}, the gradient in float64; for the residual alone {metric.choice}",
+            eta_bounds,
+            max_cg_iterations,
+            device.describe_device(),
+            f"kernels in {np.dtype(real)}, the gradient in float64; for the residual alone {metric.description}",
         )
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedNewtonCG(Minimising):
+class PreparedNewtonCG(MinimisingSolver):
     """Newton-CG, prepared on a device, with the levels of the preconditioner on host and device.
 
     `forcing` and `most` are the arguments of the preparation, `columns` the device columns of rows.
     """
 
-    uploaded: Uploaded
-    metric: Metric
-    objective: Objective
-    levels: list[Level]
+    uploaded: UploadedNetwork
+    metric: ResidualMetric
+    objective: FixedObjective
+    levels: list[SchwarzLevel]
     on_device: list[UploadedLevel]
-    real: Real
+    real_dtype: Real
     forcing: tuple[float, float]
     most: int
-    columns: dict[str, Any]
-    choice: str
+    device_columns: dict[str, Any]
+    description: str
 
     @property
-    def facts(self) -> dict[str, float]:
+    def stats(self) -> dict[str, float]:
         """Exact counts of the prepared data."""
-        return self.metric.facts
+        return self.metric.stats
 
-    def iterating(self) -> DeviceIterating:
+    def allocate_state(self) -> DeviceSolverState:
         """Allocate the memory of a solve."""
-        return _Iterating(self)
+        return _NewtonCGState(self)
 
-    def scale(self, problem: StepProblem) -> float:
+    def residual_scale(self, problem: StepProblem) -> float:
         """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
-        return largest(problem) * self.metric.trace**0.5
+        return compute_max_coordinate(problem) * self.metric.unpinned_trace**0.5
 
 
-class _Iterating(DeviceIterating):
+class _NewtonCGState(DeviceSolverState):
     """State of a Newton-CG solve, in rows on the device.
 
     Attributes:
@@ -141,113 +145,126 @@ class _Iterating(DeviceIterating):
     """
 
     def __init__(self, made: PreparedNewtonCG) -> None:
-        of, network = made.uploaded, made.uploaded.network
-        super().__init__(of.stream, network.order)
-        self._made, stream, real, rows = made, self.stream, made.real, network.free
-        self._begun = Begun(of)
-        self._edges, self._given = self._begun.edges, self._begun.given
-        self._p, self._q = (stream.zeros((len(network.order), 3), np.float64) for _ in range(2))
-        self._kernels, self._conjugate = objective_kernels.kernels(real), kernels(real)
-        self._preconditioner = Schwarz(made.levels, made.on_device, stream, rows, real)
-        self._linear = stream.zeros((4, len(network.entries.other)), real)
-        self._g = stream.zeros((rows, 3), np.float64)
-        self._z, self._d, self._s, self._y, self._w = (stream.zeros((rows, 3), real) for _ in range(5))
-        self._partials, self._sums = sums.partials(_SUMS), stream.zeros(_SUMS, np.float64)
-        self._now, self._idle, self._largest = (stream.zeros(k, np.float64) for k in (6, 1, 1))
-        self._over = sums.blocks(rows), sums.THREADS, stream.queue
-        self._over_all = sums.blocks(max(rows, len(network.ends))), sums.THREADS, stream.queue
-        self._loose, self._tight = made.forcing
-        self._floor = self._eta = self._product = 0.0
+        of, network = made.uploaded, made.uploaded.host_network
+        super().__init__(of.stream, network.row_vertices)
+        self._made, stream, real, rows = made, self.stream, made.real_dtype, network.num_free
+        self._begun = LoadedStep(of)
+        self._edges, self._given = self._begun.device_edges, self._begun.step_data
+        self._p, self._q = (stream.allocate_zeros((len(network.row_vertices), 3), np.float64) for _ in range(2))
+        self._kernels, self._cg_kernels = objective_kernels.build_hessian_kernels(real), kernels(real)
+        self._preconditioner = DeviceAdditiveSchwarz(made.levels, made.on_device, stream, rows, real)
+        self._linear = stream.allocate_zeros((4, len(network.edge_entries.neighbour_rows)), real)
+        self._g = stream.allocate_zeros((rows, 3), np.float64)
+        self._z, self._d, self._s, self._y, self._w = (stream.allocate_zeros((rows, 3), real) for _ in range(5))
+        self._partials, self._sums = sums.allocate_partials(_NUM_SUMS), stream.allocate_zeros(_NUM_SUMS, np.float64)
+        self._cg_status, self._idle, self._largest = (stream.allocate_zeros(k, np.float64) for k in (6, 1, 1))
+        self._over = sums.count_blocks(rows), sums.THREADS_PER_BLOCK, stream.cuda_stream
+        self._over_all = sums.count_blocks(max(rows, len(network.ends))), sums.THREADS_PER_BLOCK, stream.cuda_stream
+        self._max_eta, self._min_eta = made.forcing
+        self._floor = self._eta = self._residual_product = 0.0
 
-    def take(self, step: Step) -> None:
+    def load_step(self, step: DeviceStep) -> None:
         """Load a step; waits for the largest coordinate, which determines round-off."""
-        self._begun.take(step, self._p, self._q)
-        self.stream.put(np.zeros(1), self._largest)
-        farthest[self._over_all](self._p, self._largest)
-        self._floor = self._made.metric.round_off(self.stream.download(self._largest)[:, None])
-        self._eta, self._product = self._loose, self._arrived()
+        self._begun.load_step(step, self._p, self._q)
+        self.stream.overwrite_array(np.zeros(1), self._largest)
+        measure_max_coordinate[self._over_all](self._p, self._largest)
+        self._floor = self._made.metric.energy_roundoff(self.stream.download_array(self._largest)[:, None])
+        self._eta, self._residual_product = self._max_eta, self._linearise_at_point()
 
-    def settled(self) -> Any:
+    def position_rows(self) -> Any:
         """Return the current positions in rows (n, 3) [m], on the device."""
         return self._p
 
-    def sweep(self, count: int) -> int:
+    def launch_iterations(self, num_iterations: int) -> int:
         """Run iterations; each waits for the numbers of its trial."""
-        for number in range(count):
+        for number in range(num_iterations):
             if self.stalled or not self._advanced():
                 return number
-        return count
+        return num_iterations
 
     def _advanced(self) -> bool:
         """Do one iteration; return False if no direction descends."""
-        if not self._product > self._floor or not (self._search(self._direction()) or self._search(self._z)):
+        if not self._residual_product > self._floor or not (
+            self._search(self._compute_direction()) or self._search(self._z)
+        ):
             return False
-        before, self._product = self._product, self._arrived()
-        following, held = 0.9 * self._product / before, 0.9 * self._eta**2
-        self._eta = min(self._loose, max(self._tight, following, held if held > 0.1 else 0.0))
+        before, self._residual_product = self._residual_product, self._linearise_at_point()
+        following, held = 0.9 * self._residual_product / before, 0.9 * self._eta**2
+        self._eta = min(self._max_eta, max(self._min_eta, following, held if held > 0.1 else 0.0))
         return True
 
-    def _arrived(self) -> float:
+    def _linearise_at_point(self) -> float:
         """Compute the gradient, the Hessian and z at p; return g'z [J]."""
-        objective_kernels.gradient[self._over](self._edges, self._given, self._p, self._g)
-        self._kernels.linearise[self._over](self._edges, len(self._g), self._p, self._linear)
-        self._preconditioner.linearised(self._edges, self._p)
-        negated[self._over](self._g, self._preconditioner.r)
-        self._preconditioner.apply(self._z, 0, self._partials, self._idle)
+        objective_kernels.gradient_bytes[self._over](self._edges, self._given, self._p, self._g)
+        self._kernels.linearise_hessian[self._over](self._edges, len(self._g), self._p, self._linear)
+        self._preconditioner.set_linearisation(self._edges, self._p)
+        write_negated[self._over](self._g, self._preconditioner.r)
+        self._preconditioner.apply_preconditioner(self._z, 0, self._partials, self._idle)
         return float(self._collected(1, len(self._d))[0])
 
     def _collected(self, count: int, terms: int) -> NDArray[np.float64]:
         """Wait for the first `count` sums of `terms` terms, and return them."""
-        sums.collect[1, sums.THREADS, self.stream.queue](count, self._partials, sums.blocks(terms), self._sums)
-        return self.stream.download(self._sums)[:count]
+        sums.collect_sums[1, sums.THREADS_PER_BLOCK, self.stream.cuda_stream](
+            count, self._partials, sums.count_blocks(terms), self._sums
+        )
+        return self.stream.download_array(self._sums)[:count]
 
     def _search(self, direction: Any) -> bool:
         """Line search by step halving along a direction (f, 3); return success."""
-        t, network = 1.0, self._made.uploaded.network
-        for _ in range(HALVINGS):
-            trial[self._over_all](self._p, direction, t, self._q, self._g, 0, self._partials)
-            objective_kernels.rise[self._over_all](self._edges, self._given, self._p, self._q, 1, self._partials)
-            slope, rise = map(float, self._collected(2, max(network.free, len(network.ends))))
+        t, network = 1.0, self._made.uploaded.host_network
+        for _ in range(MAX_HALVINGS):
+            write_trial[self._over_all](self._p, direction, t, self._q, self._g, 0, self._partials)
+            objective_kernels.sum_objective_change[self._over_all](
+                self._edges, self._given, self._p, self._q, 1, self._partials
+            )
+            slope, rise = map(float, self._collected(2, max(network.num_free, len(network.ends))))
             if not slope < 0.0:
                 return False
-            if falls(rise, t, slope, 0.0):
+            if is_armijo_step(rise, t, slope, 0.0):
                 self._p, self._q = self._q, self._p
                 return True
             t *= 0.5
         return False
 
-    def _direction(self) -> Any:
+    def _compute_direction(self) -> Any:
         """Solve for -H^-1 g approximately by conjugate gradients."""
-        limit, most = self._eta**2 * self._product, self._made.most
-        if self._product <= limit:
+        limit, most = self._eta**2 * self._residual_product, self._made.most
+        if self._residual_product <= limit:
             return self._d
         now = np.zeros(6)
-        now[PRODUCT], now[BEFORE], now[LIMIT] = self._product, np.inf, limit
-        self.stream.put(now, self._now)
+        now[RESIDUAL_PRODUCT], now[PREVIOUS_PRODUCT], now[PRODUCT_LIMIT] = self._residual_product, np.inf, limit
+        self.stream.overwrite_array(now, self._cg_status)
         z, done = self._z, 0
-        while done < most and now[ENDED] == GOING:
-            some = min(TOGETHER, most - done)
+        while done < most and now[STATUS] == RUNNING:
+            some = min(ITERATIONS_PER_CHECK, most - done)
             for _ in range(some):
-                self._turn(z)
+                self._launch_cg_iteration(z)
                 z = self._w
             done += some
-            now = self.stream.download(self._now)
-        return self._s if now[ENDED] == CURVED and now[COUNT] == 0.0 else self._d
+            now = self.stream.download_array(self._cg_status)
+        return self._s if now[STATUS] == NEGATIVE_CURVATURE and now[NUM_ITERATIONS] == 0.0 else self._d
 
-    def _turn(self, z: Any) -> None:
-        launch, one, count = self._over, (1, sums.THREADS, self.stream.queue), self._over[0]
-        self._conjugate.turn[launch](z, self._s, self._now)
-        self._kernels.multiply[launch](
-            self._edges, self._given.hold, self._linear, self._s, self._y, 0, self._partials, self._now
+    def _launch_cg_iteration(self, z: Any) -> None:
+        launch, one, count = self._over, (1, sums.THREADS_PER_BLOCK, self.stream.cuda_stream), self._over[0]
+        self._cg_kernels.update_direction[launch](z, self._s, self._cg_status)
+        self._kernels.multiply_hessian[launch](
+            self._edges,
+            self._given.anchor_stiffness,
+            self._linear,
+            self._s,
+            self._y,
+            0,
+            self._partials,
+            self._cg_status,
         )
-        curve[one](self._partials, 0, count, self._now)
-        self._conjugate.go[launch](self._s, self._y, self._d, self._preconditioner.r, self._now)
-        self._preconditioner.apply(self._w, 1, self._partials, self._now)
-        judge[one](self._partials, 1, count, self._now)
+        evaluate_barrier_blocks[one](self._partials, 0, count, self._cg_status)
+        self._cg_kernels.update_iterate[launch](self._s, self._y, self._d, self._preconditioner.r, self._cg_status)
+        self._preconditioner.apply_preconditioner(self._w, 1, self._partials, self._cg_status)
+        check_convergence[one](self._partials, 1, count, self._cg_status)
 
 
 @cuda.jit
-def farthest(p, out):
+def measure_max_coordinate(p, out):
     """Update out[0] to the largest coordinate of p (n, 3).
 
     The maximum is independent of the order of threads.
@@ -261,7 +278,7 @@ def farthest(p, out):
 
 
 @cuda.jit
-def negated(x, out):
+def write_negated(x, out):
     """Write -x (f, 3) to `out`, rounded to its type."""
     i = cuda.grid(1)
     while i < out.shape[0]:
@@ -270,7 +287,7 @@ def negated(x, out):
 
 
 @cuda.jit
-def trial(p, d, t, q, g, which, partials):
+def write_trial(p, d, t, q, g, sum_slot, partials):
     """Write p + t d to the first rows of q, and store the first stage of the sum g'd."""
     total, i = 0.0, cuda.grid(1)
     while i < d.shape[0]:
@@ -279,14 +296,14 @@ def trial(p, d, t, q, g, which, partials):
             q[i, c] = p[i, c] + t * step
             total += g[i, c] * step
         i += cuda.gridsize(1)
-    sums.keep(total, which, partials)
+    sums.store_partial_sum(total, sum_slot, partials)
 
 
 class Kernels(NamedTuple):
     """Conjugate gradient kernels for one precision."""
 
-    turn: Any
-    go: Any
+    update_direction: Any
+    update_iterate: Any
 
 
 @cache
@@ -296,9 +313,9 @@ def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
     @cuda.jit
     def turn(z, p, now):
         """Update the direction: p = z + r'z / (r'z before) p."""
-        if now[ENDED] != GOING:
+        if now[STATUS] != RUNNING:
             return
-        first, scale = now[COUNT] == 0.0, real(now[PRODUCT] / now[BEFORE])
+        first, scale = now[NUM_ITERATIONS] == 0.0, real(now[RESIDUAL_PRODUCT] / now[PREVIOUS_PRODUCT])
         i = cuda.grid(1)
         while i < p.shape[0]:
             for c in range(3):
@@ -308,9 +325,9 @@ def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
     @cuda.jit
     def go(p, y, d, r, now):
         """Update the iterate: d += t p, r -= t y."""
-        if now[ENDED] != GOING:
+        if now[STATUS] != RUNNING:
             return
-        first, length = now[COUNT] == 0.0, real(now[PRODUCT] / now[CURVATURE])
+        first, length = now[NUM_ITERATIONS] == 0.0, real(now[RESIDUAL_PRODUCT] / now[CURVATURE])
         i = cuda.grid(1)
         while i < d.shape[0]:
             for c in range(3):
@@ -323,25 +340,25 @@ def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
 
 
 @cuda.jit
-def curve(partials, which, count, now):
+def evaluate_barrier_blocks(partials, which, count, now):
     """Second stage of p'Hp, and its sign; one block."""
-    if now[ENDED] != GOING:
+    if now[STATUS] != RUNNING:
         return
-    total = sums.of_all(which, partials, count)
+    total = sums.sum_partials(which, partials, count)
     if cuda.threadIdx.x == 0:
         now[CURVATURE] = total
         if not total > 0.0:
-            now[ENDED] = CURVED
+            now[STATUS] = NEGATIVE_CURVATURE
 
 
 @cuda.jit
-def judge(partials, which, count, now):
+def check_convergence(partials, which, count, now):
     """Second stage of r'z, and the convergence test; one block."""
-    if now[ENDED] != GOING:
+    if now[STATUS] != RUNNING:
         return
-    total = sums.of_all(which, partials, count)
+    total = sums.sum_partials(which, partials, count)
     if cuda.threadIdx.x == 0:
-        now[BEFORE], now[PRODUCT] = now[PRODUCT], total
-        now[COUNT] += 1.0
-        if total <= now[LIMIT]:
-            now[ENDED] = NEAR
+        now[PREVIOUS_PRODUCT], now[RESIDUAL_PRODUCT] = now[RESIDUAL_PRODUCT], total
+        now[NUM_ITERATIONS] += 1.0
+        if total <= now[PRODUCT_LIMIT]:
+            now[STATUS] = CONVERGED

@@ -17,43 +17,47 @@ import numpy as np
 
 from solvers.cuda import sums
 from solvers.cuda.target import cuda
-from solvers.energies.edges import TINY
+from solvers.energies.edges import ZERO_LENGTH
 
 
 @cuda.jit(device=True)
-def along(edges, e, v0, v1, v2):
+def edge_direction_and_tension(edges, e, v0, v1, v2):
     """Return the direction, tension [N] and length [m] of an entry's edge.
 
     The direction points away from the entry's own end; v is the vector from the other end.
     """
     length = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-    k, rest = edges.stiffness[e], edges.rest[e]
-    if rest == rest and length > TINY:
+    k, rest = edges.stiffness[e], edges.entry_rest_length[e]
+    if rest == rest and length > ZERO_LENGTH:
         return v0 / length, v1 / length, v2 / length, k * (length - rest), length
-    named, sign = edges.edge[e], 1.0
+    named, sign = edges.edge_indices[e], 1.0
     if named < 0:
         named, sign = ~named, -1.0
-    n0, n1, n2 = sign * edges.axis[named, 0], sign * edges.axis[named, 1], sign * edges.axis[named, 2]
+    n0, n1, n2 = (
+        sign * edges.edge_direction[named, 0],
+        sign * edges.edge_direction[named, 1],
+        sign * edges.edge_direction[named, 2],
+    )
     if rest == rest:
         return n0, n1, n2, -k * rest, 0.0
     return n0, n1, n2, k * (n0 * v0 + n1 * v1 + n2 * v2 - edges.offset[named]), length
 
 
 @cuda.jit
-def gradient(edges, given, p, out):
+def gradient_bytes(edges, step_data, p, out):
     """Write the gradient [N] at rows p [m] to `out` (f, 3)."""
     i = cuda.grid(1)
     while i < out.shape[0]:
-        x, y, z, h = p[i, 0], p[i, 1], p[i, 2], given.hold[i]
-        g0 = h * (x - given.centre[i, 0]) - given.force[i, 0]
-        g1 = h * (y - given.centre[i, 1]) - given.force[i, 1]
-        g2 = h * (z - given.centre[i, 2]) - given.force[i, 2]
+        x, y, z, h = p[i, 0], p[i, 1], p[i, 2], step_data.anchor_stiffness[i]
+        g0 = h * (x - step_data.anchor_positions[i, 0]) - step_data.external_force[i, 0]
+        g1 = h * (y - step_data.anchor_positions[i, 1]) - step_data.external_force[i, 1]
+        g2 = h * (z - step_data.anchor_positions[i, 2]) - step_data.external_force[i, 2]
         e, end = edges.first[i >> 5] + (i & 31), edges.first[(i >> 5) + 1]
         while e < end:
             j = edges.other[e]
             if j == i:
                 break
-            n0, n1, n2, tension, _ = along(edges, e, x - p[j, 0], y - p[j, 1], z - p[j, 2])
+            n0, n1, n2, tension, _ = edge_direction_and_tension(edges, e, x - p[j, 0], y - p[j, 1], z - p[j, 2])
             g0 += tension * n0
             g1 += tension * n1
             g2 += tension * n2
@@ -63,19 +67,22 @@ def gradient(edges, given, p, out):
 
 
 @cuda.jit
-def rise(edges, given, p, q, which, partials):
+def sum_objective_change(edges, step_data, p, q, sum_slot, partials):
     """First stage of the sum g(q) - g(p) [J], with p and q in rows."""
     total = 0.0
     i = cuda.grid(1)
-    while i < given.hold.shape[0]:
+    while i < step_data.anchor_stiffness.shape[0]:
         for c in range(3):
             middle = 0.5 * (p[i, c] + q[i, c])
-            pull = given.hold[i] * (middle - given.centre[i, c]) - given.force[i, c]
+            pull = (
+                step_data.anchor_stiffness[i] * (middle - step_data.anchor_positions[i, c])
+                - step_data.external_force[i, c]
+            )
             total += (q[i, c] - p[i, c]) * pull
         i += cuda.gridsize(1)
     e = cuda.grid(1)
     while e < edges.ends.shape[0]:
-        i, j, k, rest = edges.ends[e, 0], edges.ends[e, 1], edges.strength[e], edges.length[e]
+        i, j, k, rest = edges.ends[e, 0], edges.ends[e, 1], edges.edge_stiffness[e], edges.edge_rest_length[e]
         if rest == rest:
             before, after, change = 0.0, 0.0, 0.0
             for c in range(3):
@@ -85,27 +92,27 @@ def rise(edges, given, p, q, which, partials):
                 after += (v + s) * (v + s)
                 change += s * (2.0 * v + s)
             both = math.sqrt(before) + math.sqrt(after)
-            if both > TINY:
+            if both > ZERO_LENGTH:
                 total += k * (change / both) * (0.5 * both - rest)
         else:
             closing, closer = -edges.offset[e], 0.0
             for c in range(3):
-                closing += edges.axis[e, c] * (p[i, c] - p[j, c])
-                closer += edges.axis[e, c] * ((q[i, c] - p[i, c]) - (q[j, c] - p[j, c]))
+                closing += edges.edge_direction[e, c] * (p[i, c] - p[j, c])
+                closer += edges.edge_direction[e, c] * ((q[i, c] - p[i, c]) - (q[j, c] - p[j, c]))
             total += k * closer * (closing + 0.5 * closer)
         e += cuda.gridsize(1)
-    sums.keep(total, which, partials)
+    sums.store_partial_sum(total, sum_slot, partials)
 
 
-class Kernels(NamedTuple):
+class HessianKernels(NamedTuple):
     """Hessian kernels for one precision."""
 
-    linearise: Any
-    multiply: Any
+    linearise_hessian: Any
+    multiply_hessian: Any
 
 
 @cache
-def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
+def build_hessian_kernels(real: type[np.float32] | type[np.float64]) -> HessianKernels:
     """Build the kernels that compute in `real`."""
 
     @cuda.jit
@@ -114,13 +121,15 @@ def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
         i = cuda.grid(1)
         while i < free:
             x, y, z = p[i, 0], p[i, 1], p[i, 2]
-            e, end = edges.first[i >> 5] + (i & 31), edges.first[(i >> 5) + 1]
+            e, end = edges.warp_starts[i >> 5] + (i & 31), edges.warp_starts[(i >> 5) + 1]
             while e < end:
-                j = edges.other[e]
+                j = edges.neighbour_rows[e]
                 if j == i:
                     break
-                n0, n1, n2, tension, length = along(edges, e, x - p[j, 0], y - p[j, 1], z - p[j, 2])
-                k, rest = edges.stiffness[e], edges.rest[e]
+                n0, n1, n2, tension, length = edge_direction_and_tension(
+                    edges, e, x - p[j, 0], y - p[j, 1], z - p[j, 2]
+                )
+                k, rest = edges.stiffness[e], edges.entry_rest_length[e]
                 lateral = 0.0
                 if rest == 0.0:
                     lateral = k
@@ -145,9 +154,9 @@ def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
         while i < rows:
             x0, x1, x2, h = x[i, 0], x[i, 1], x[i, 2], real(hold[i])
             y0, y1, y2 = h * x0, h * x1, h * x2
-            e, end = edges.first[i >> 5] + (i & 31), edges.first[(i >> 5) + 1]
+            e, end = edges.warp_starts[i >> 5] + (i & 31), edges.warp_starts[(i >> 5) + 1]
             while e < end:
-                j = edges.other[e]
+                j = edges.neighbour_rows[e]
                 if j == i:
                     break
                 s0, s1, s2 = x0, x1, x2
@@ -162,6 +171,6 @@ def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
             out[i, 0], out[i, 1], out[i, 2] = y0, y1, y2
             total += np.float64(x0) * np.float64(y0) + np.float64(x1) * np.float64(y1) + np.float64(x2) * np.float64(y2)
             i += cuda.gridsize(1)
-        sums.keep(total, which, partials)
+        sums.store_partial_sum(total, which, partials)
 
-    return Kernels(linearise, multiply)
+    return HessianKernels(linearise, multiply)

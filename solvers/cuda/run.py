@@ -15,22 +15,29 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.core.descent import Metric
-from solvers.core.driver import Iterating, Iterative
-from solvers.core.fixed_objective import Objective
+from solvers.core.descent import ResidualMetric
+from solvers.core.driver import IterativeSolver, SolverState
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
 from solvers.cuda import device
-from solvers.cuda.steps import Step, Uploaded
-from solvers.cuda.target import Stream
-from solvers.device import Marks
-from solvers.kernels.loop import EACH, ITERATIONS, LAST, STALLED, Limits, verdict
+from solvers.cuda.steps import DeviceStep, UploadedNetwork
+from solvers.cuda.target import DeviceStream
+from solvers.device import SolveEvents
+from solvers.kernels.loop import (
+    REASON_ITERATIONS,
+    REASON_STALLED,
+    RESIDUAL_EACH,
+    RESIDUAL_LAST,
+    LoopLimits,
+    check_residual,
+)
 from solvers.problem import Positions, Solution, StepProblem, StopRule
 
-EVERY = 8
+ITERATIONS_PER_RESIDUAL = 8
 """Iterations between evaluations of the residual."""
 
 
-class DeviceIterating(Iterating):
+class DeviceSolverState(SolverState):
     """State of a solve on a device, with its own memory.
 
     Attributes:
@@ -39,153 +46,165 @@ class DeviceIterating(Iterating):
         residual_of_positions: returns the residual [J^(1/2)] at positions; nan for a method that does not minimise.
     """
 
-    def __init__(self, stream: Stream, order: NDArray[np.int64]) -> None:
+    def __init__(self, stream: DeviceStream, order: NDArray[np.int64]) -> None:
         self.stream, self.order, self.stalled = stream, order, False
-        self.gauge: Callable[[Positions], float] = lambda p: float("nan")
-        self._began = self._up = self._asked = self._down = stream.mark()
-        self._copy: Positions | None = None
-        self._done = 0
+        self.residual_of_positions: Callable[[Positions], float] = lambda p: float("nan")
+        self._start_event = self._upload_event = self._kernel_event = self._download_event = stream.record_event()
+        self._positions_copy: Positions | None = None
+        self._num_iterations = 0
 
-    def begun(self) -> None:
+    def mark_start(self) -> None:
         """Mark the start of a solve: the following copies belong to it."""
-        self._began = self.stream.mark()
+        self._start_event = self.stream.record_event()
 
-    def uploaded(self) -> None:
+    def mark_uploaded(self) -> None:
         """Mark the end of the uploads of a solve."""
-        self._up = self._asked = self._down = self.stream.mark()
+        self._upload_event = self._kernel_event = self._download_event = self.stream.record_event()
 
     @abstractmethod
-    def take(self, step: Step) -> None:
+    def load_step(self, step: DeviceStep) -> None:
         """Start to solve a step that is on the device.
 
         Its arrays must not change until the solve has ended.
         """
 
     @abstractmethod
-    def sweep(self, count: int) -> int:
+    def launch_iterations(self, num_iterations: int) -> int:
         """Launch iterations; return how many of them moved something."""
 
     @abstractmethod
-    def settled(self) -> Any:
+    def position_rows(self) -> Any:
         """Return the current positions in rows (n, 3) [m], on the device."""
 
-    def speeds(self) -> Any:
+    def velocity_rows(self) -> Any:
         """Return the final velocity in rows (n, 3) [m/s], on the device.
 
         None for a method without its own velocity.
         """
         return None
 
-    def _by_vertices(self, rows: Any) -> Positions:
+    def _download_by_vertices(self, rows: Any) -> Positions:
         out = np.empty((len(self.order), 3))
-        out[self.order] = self.stream.download(rows)
+        out[self.order] = self.stream.download_array(rows)
         return out
 
     @property
-    def positions(self) -> Positions:  # pyright: ignore[reportIncompatibleVariableOverride] a copy, when asked for
+    def copy_positions(self) -> Positions:  # pyright: ignore[reportIncompatibleVariableOverride] a copy, when asked for
         """A copy of the current positions (n, 3) [m], with the velocity; reused until the next iteration."""
-        if self._copy is None:
-            with device.guarded():
-                self._asked = self.stream.mark()
-                speeds = self.speeds()
+        if self._positions_copy is None:
+            with device.guard_device_errors():
+                self._kernel_event = self.stream.record_event()
+                speeds = self.velocity_rows()
                 if speeds is not None:
-                    self.velocity = self._by_vertices(speeds)
-                self._copy = self._by_vertices(self.settled())
-                self._down = self.stream.mark()
-        return self._copy
+                    self.velocity = self._download_by_vertices(speeds)
+                self._positions_copy = self._download_by_vertices(self.position_rows())
+                self._download_event = self.stream.record_event()
+        return self._positions_copy
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents any further change."""
-        self.launch(1)
+        self.run_unchecked(1)
         return not self.stalled
 
-    def launch(self, count: int) -> int:
+    def run_unchecked(self, num_iterations: int) -> int:
         """Run iterations and invalidate the copy; return how many of them moved something."""
-        with device.guarded():
-            moved = self.sweep(count)
-        self._copy, self._done, self.stalled = None, self._done + moved, moved < count
+        with device.guard_device_errors():
+            moved = self.launch_iterations(num_iterations)
+        self._positions_copy, self._num_iterations, self.stalled = (
+            None,
+            self._num_iterations + moved,
+            moved < num_iterations,
+        )
         return moved
 
     def residual(self) -> float:
         """Return the residual; computed on the host from a copy of the positions."""
-        return self.gauge(self.positions)
+        return self.residual_of_positions(self.copy_positions)
 
-    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Run iterations within the limits; evaluate the residual at intervals if it can end the solve."""
-        count, found, ended = 0, float("nan"), ITERATIONS
-        while count < limits.iterations and ended == ITERATIONS:
-            some = limits.iterations - count
-            some = min(EVERY - self._done % EVERY, some) if limits.wanted == EACH else some
-            count += self.launch(some)
-            if limits.wanted == EACH:
+        count, found, ended = 0, float("nan"), REASON_ITERATIONS
+        while count < limits.max_iterations and ended == REASON_ITERATIONS:
+            some = limits.max_iterations - count
+            some = (
+                min(ITERATIONS_PER_RESIDUAL - self._num_iterations % ITERATIONS_PER_RESIDUAL, some)
+                if limits.residual_mode == RESIDUAL_EACH
+                else some
+            )
+            count += self.run_unchecked(some)
+            if limits.residual_mode == RESIDUAL_EACH:
                 found = self.residual()
-                ended = verdict(found, limits)
-            if ended == ITERATIONS and self.stalled:
-                ended = STALLED
-        if limits.wanted == LAST or (limits.wanted == EACH and count == 0):
+                ended = check_residual(found, limits)
+            if ended == REASON_ITERATIONS and self.stalled:
+                ended = REASON_STALLED
+        if limits.residual_mode == RESIDUAL_LAST or (limits.residual_mode == RESIDUAL_EACH and count == 0):
             found = self.residual()
         return count, found, ended
 
-    def marks(self) -> Marks | None:
+    def solve_events(self) -> SolveEvents | None:
         """Events up to the last copy of positions, already synchronised.
 
         None in the simulator, which has no times.
         """
-        return None if device.simulated() else Marks(self._began, self._up, self._asked, self._down)
+        return (
+            None
+            if device.is_simulated()
+            else SolveEvents(self._start_event, self._upload_event, self._kernel_event, self._download_event)
+        )
 
 
-class DeviceIterative(Iterative):
+class DeviceSolver(IterativeSolver):
     """A method that is prepared on a device, with the device `columns` of its rows."""
 
-    columns: dict[str, Any]
+    device_columns: dict[str, Any]
 
-    def state(self) -> dict[str, float | None]:
+    def device_state(self) -> dict[str, float | None]:
         """Return the device's clocks, power and temperature now; None for unavailable values."""
-        return device.state()
+        return device.read_device_state()
 
     @abstractmethod
-    def iterating(self) -> DeviceIterating:
+    def allocate_state(self) -> DeviceSolverState:
         """Allocate the memory of a solve."""
 
     @abstractmethod
-    def stated(self, problem: StepProblem, guess: Positions) -> Step:
+    def upload_problem(self, problem: StepProblem, guess: Positions) -> DeviceStep:
         """Upload a step to the device, with an initial guess (n, 3) [m]."""
 
-    def begin(self, problem: StepProblem, guess: Positions) -> DeviceIterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> DeviceSolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        with device.guarded():
-            run = self.iterating()
-            run.begun()
-            step = self.stated(problem, guess)
-            run.uploaded()
-            run.take(step)
+        with device.guard_device_errors():
+            run = self.allocate_state()
+            run.mark_start()
+            step = self.upload_problem(problem, initial_guess)
+            run.mark_uploaded()
+            run.load_step(step)
             return run
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """Iterate until the stop rule is met, or until no iteration descends."""
-        with device.guarded():
+        with device.guard_device_errors():
             return super().solve(problem, stop)
 
-    def uncopied(self, problem: StepProblem) -> Iterator[Callable[[], Positions]]:
+    def iterates_without_copy(self, problem: StepProblem) -> Iterator[Callable[[], Positions]]:
         """Yield a function per iterate that copies it; each iterate is complete when it is yielded."""
-        with device.guarded():
-            run = self.begin(problem, problem.first_guess)
+        with device.guard_device_errors():
+            run = self.init_state(problem, problem.initial_guess)
             while True:
-                run.launch(1)
-                run.stream.wait()
-                yield lambda: run.positions
+                run.run_unchecked(1)
+                run.stream.synchronise_stream()
+                yield lambda: run.copy_positions
 
-    def replay(self, problem: StepProblem, iterations: int) -> tuple[Solution, Marks | None]:
+    def replay_iterations(self, problem: StepProblem, iterations: int) -> tuple[Solution, SolveEvents | None]:
         """Repeat iterations without residuals; return the solution, and the events or None without a clock."""
-        with device.guarded():
-            run = self.begin(problem, problem.first_guess)
-            run.launch(iterations)
-            p, nan = run.positions, float("nan")
-            found = Solution(p, iterations, nan, nan, "iterations", run.velocity, self.residual_of)
-            return found, run.marks()
+        with device.guard_device_errors():
+            run = self.init_state(problem, problem.initial_guess)
+            run.run_unchecked(iterations)
+            p, nan = run.copy_positions, float("nan")
+            found = Solution(p, iterations, nan, nan, "iterations", run.velocity, self.residual_iterate)
+            return found, run.solve_events()
 
 
-class Minimising(DeviceIterative):
+class MinimisingSolver(DeviceSolver):
     """A device method that minimises the objective of a network.
 
     Attributes:
@@ -194,26 +213,26 @@ class Minimising(DeviceIterative):
         touches: whether the method supports contact and requires the start of a step.
     """
 
-    uploaded: Uploaded
-    metric: Metric
-    objective: Objective
-    touches: ClassVar[bool] = False
+    uploaded_network: UploadedNetwork
+    metric: ResidualMetric
+    objective: FixedObjective
+    supports_contact: ClassVar[bool] = False
 
-    def stated(self, problem: StepProblem, guess: Positions) -> Step:
+    def upload_problem(self, problem: StepProblem, initial_guess: Positions) -> DeviceStep:
         """Upload a step to the device, with an initial guess (n, 3) [m]."""
-        return self.uploaded.step(problem, guess, touches=self.touches)
+        return self.uploaded_network.upload_step(problem, initial_guess, supports_contact=self.supports_contact)
 
-    def begin(self, problem: StepProblem, guess: Positions) -> DeviceIterating:
+    def begin(self, problem: StepProblem, guess: Positions) -> DeviceSolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        run = super().begin(problem, guess)
-        run.gauge = self.gauge(problem)
+        run = super().init_state(problem, guess)
+        run.residual_of_positions = self.residual_of_positions(problem)
         return run
 
-    def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
+    def residual_of_positions(self, problem: StepProblem) -> Callable[[Positions], float]:
         """Return the residual as a function of positions, for many evaluations in one step."""
         step = StepObjective(self.objective, problem)
-        return lambda p: self.metric.residual(step.gradient(step.placed(p)))
+        return lambda p: self.metric.residual(step.gradient(step.apply_exact_pins(p)))
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """Return the residual [J^(1/2)] at positions p (n, 3) [m]."""
-        return self.gauge(problem)(p)
+        return self.residual_of_positions(problem)(p)

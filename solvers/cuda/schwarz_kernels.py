@@ -17,32 +17,32 @@ import numpy as np
 
 from solvers.cuda import sums
 from solvers.cuda.target import cuda
-from solvers.energies.edges import TINY
+from solvers.energies.edges import ZERO_LENGTH
 
-Real = type[np.float32] | type[np.float64]
+RealType = type[np.float32] | type[np.float64]
 
 
-def packed(nodes: int) -> int:
+def packed_length(num_nodes: int) -> int:
     """Return the length of the packed half of a subdomain's matrix."""
-    return 3 * nodes * (3 * nodes + 1) // 2
+    return 3 * num_nodes * (3 * num_nodes + 1) // 2
 
 
 @cuda.jit
-def stiffen(edges, p, stiff):
+def write_edge_blocks(edges, p, stiff):
     """Write b of all edges at rows p to `stiff` (6, m) [N/m].
 
     The six numbers are those of a symmetric block.
     """
     e = cuda.grid(1)
     while e < edges.ends.shape[0]:
-        i, j, k, rest = edges.ends[e, 0], edges.ends[e, 1], edges.strength[e], edges.length[e]
+        i, j, k, rest = edges.ends[e, 0], edges.ends[e, 1], edges.edge_stiffness[e], edges.edge_rest_length[e]
         v0, v1, v2 = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2]
         length, lateral = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2), 0.0
-        if rest == rest and length > TINY:  # a dashpot's length at rest is nan, and its direction is its axis
+        if rest == rest and length > ZERO_LENGTH:  # a dashpot's length at rest is nan, and its direction is its axis
             n0, n1, n2 = v0 / length, v1 / length, v2 / length
             lateral = max(0.0, min(k * (length - rest) / length, k))
         else:
-            n0, n1, n2 = edges.axis[e, 0], edges.axis[e, 1], edges.axis[e, 2]
+            n0, n1, n2 = edges.edge_direction[e, 0], edges.edge_direction[e, 1], edges.edge_direction[e, 2]
         if rest == 0.0:
             lateral = k
         a = k - lateral
@@ -52,31 +52,31 @@ def stiffen(edges, p, stiff):
 
 
 @cuda.jit
-def fold(level, count, finer, stiff):
+def sum_fine_edge_blocks(level, count, finer, stiff):
     """Sum b of the finer edges (6, m) for each of `count` edges of a level."""
     e = cuda.grid(1)
     while e < count:
         for c in range(6):
             total = 0.0
-            for k in range(level.lists[e], level.lists[e + 1]):
-                total += finer[c, level.finer[k]]
+            for k in range(level.fine_edge_starts[e], level.fine_edge_starts[e + 1]):
+                total += finer[c, level.fine_edges[k]]
             stiff[c, e] = total
         e += cuda.gridsize(1)
 
 
-class Kernels(NamedTuple):
+class SchwarzKernels(NamedTuple):
     """Kernels for one precision and one size of subdomains."""
 
-    invert: Any
-    gather: Any
-    multiply: Any
-    dot: Any
+    invert_subdomains: Any
+    restrict_residual: Any
+    apply_inverses: Any
+    sum_inner_product: Any
 
 
 @cache
-def kernels(real: Real, patch: int) -> Kernels:
+def build_schwarz_kernels(real: RealType, patch: int) -> SchwarzKernels:
     """Build the kernels with inverses and residuals of type `real`."""
-    rows, half = 3 * patch, packed(patch)
+    rows, half = 3 * patch, packed_length(patch)
 
     @cuda.jit
     def invert(level, stiff, nodes, inverses):
@@ -95,16 +95,16 @@ def kernels(real: Real, patch: int) -> Kernels:
             t = cuda.threadIdx.x
             while t < count:
                 i = begin + t
-                xx = yy = zz = level.held[i]
+                xx = yy = zz = level.anchor_stiffness[i]
                 xy = xz = yz = 0.0
                 one, two, three = (
                     3 * t * (3 * t + 1) // 2,
                     (3 * t + 1) * (3 * t + 2) // 2,
                     (3 * t + 2) * (3 * t + 3) // 2,
                 )
-                e, end = level.first[i >> 5] + (i & 31), level.first[(i >> 5) + 1]
+                e, end = level.warp_starts[i >> 5] + (i & 31), level.warp_starts[(i >> 5) + 1]
                 while e < end:
-                    j, k = level.other[e], level.edge[e]
+                    j, k = level.neighbour_rows[e], level.edge_indices[e]
                     if j == i:
                         break
                     k = ~k if k < 0 else k
@@ -229,6 +229,6 @@ def kernels(real: Real, patch: int) -> Kernels:
             for c in range(3):
                 total += np.float64(r[i, c]) * np.float64(z[i, c])
             i += cuda.gridsize(1)
-        sums.keep(total, which, partials)
+        sums.store_partial_sum(total, which, partials)
 
-    return Kernels(invert, gather, multiply, dot)
+    return SchwarzKernels(invert, gather, multiply, dot)

@@ -12,37 +12,37 @@ from typing import Any
 
 import numpy as np
 
-from solvers.cuda.device import simulated
+from solvers.cuda.device import is_simulated
 from solvers.cuda.target import cuda
 
-_COPIES: dict[Any, Any] = {}
+_DEVICE_COPIES: dict[Any, Any] = {}
 
 
-def _on_device(function: Any) -> Any:
-    return function if simulated() else cuda.jit(device=True)(function)
+def _filter_kernel(function: Any) -> Any:
+    return function if is_simulated() else cuda.jit(device=True)(function)
 
 
-def shared(function: Any) -> Any:
+def share_with_device(function: Any) -> Any:
     """Return a CPU function (inner function, kernel, or not compiled) for use in device kernels."""
     plain = getattr(function, "py_func", function)
-    if plain not in _COPIES:
-        names = {name for code in _codes(plain.__code__) for name in code.co_names}
-        own = {name: _replaced(value) for name, value in plain.__globals__.items() if name in names}
-        cells = tuple(CellType(_replaced(cell.cell_contents)) for cell in plain.__closure__ or ())
+    if plain not in _DEVICE_COPIES:
+        names = {name for code in _nested_codes(plain.__code__) for name in code.co_names}
+        own = {name: _replace_global(value) for name, value in plain.__globals__.items() if name in names}
+        cells = tuple(CellType(_replace_global(cell.cell_contents)) for cell in plain.__closure__ or ())
         copy = FunctionType(plain.__code__, own, plain.__name__, plain.__defaults__, cells)
         copy.__module__ = plain.__module__
-        _COPIES[plain] = _on_device(copy)
-    return _COPIES[plain]
+        _DEVICE_COPIES[plain] = _filter_kernel(copy)
+    return _DEVICE_COPIES[plain]
 
 
-def _codes(code: Any) -> list[Any]:
+def _nested_codes(code: Any) -> list[Any]:
     """Return a code object and all code objects nested in it."""
-    return [code] + [one for inside in code.co_consts if hasattr(inside, "co_names") for one in _codes(inside)]
+    return [code] + [one for inside in code.co_consts if hasattr(inside, "co_names") for one in _nested_codes(inside)]
 
 
-def _replaced(value: Any) -> Any:
+def _replace_global(value: Any) -> Any:
     """Return the device replacement of a global."""
-    if value is np and not simulated():
+    if value is np and not is_simulated():
         return math
     of_processor = hasattr(value, "py_func") and "cuda" not in type(value).__module__
-    return shared(value) if of_processor else value
+    return share_with_device(value) if of_processor else value

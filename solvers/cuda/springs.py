@@ -22,15 +22,15 @@ import numpy as np
 from numba import float64
 from numpy.typing import NDArray
 
-from solvers.cuda.target import Stream, cuda
-from solvers.kernels.springs import TINY_SQUARED, Bundles
+from solvers.cuda.target import DeviceStream, cuda
+from solvers.kernels.springs import ZERO_LENGTH_SQUARED, SpringPackets
 from solvers.vectors.springs import LANES
 
-SHORT = {np.float32: 1e-36, np.float64: TINY_SQUARED}
+MIN_SQUARED_LENGTH = {np.float32: 1e-36, np.float64: ZERO_LENGTH_SQUARED}
 """Squared length [m^2] at or below which a spring counts as having zero length, as smaller values have no digits."""
 
 
-class Lanes(NamedTuple):
+class DeviceLanes(NamedTuple):
     """Spring packets on the device.
 
     Attributes:
@@ -45,80 +45,100 @@ class Lanes(NamedTuple):
         padding_row, padding_end_row: rows of padding lanes, and of the ends of padding springs.
     """
 
-    own: Any
-    start: Any
-    neighbour: Any
-    kind: Any
-    weights: Any
-    exact: Any
-    spring: Any
-    direction: Any
-    arrows: Any
-    nobody: int
-    far: int
+    lane_row: Any
+    packet_start: Any
+    neighbour_row: Any
+    weight_offset: Any
+    spring_weights: Any
+    float64_weights: Any
+    spring_index: Any
+    rest_direction: Any
+    spring_vectors: Any
+    padding_row: int
+    padding_end_row: int
 
     @classmethod
-    def of(cls, stream: Stream, bundles: Bundles, nobody: int, real: Any) -> Lanes:
+    def from_packets(cls, stream: DeviceStream, bundles: SpringPackets, padding_row: int, real: Any) -> DeviceLanes:
         """Copy the packets to the device.
 
         `padding_row` + 1 is the row of the ends of padding springs.
         """
-        entries = len(bundles.neighbour)
-        direction = bundles.direction if len(bundles.direction) else np.zeros((1, 3))
+        entries = len(bundles.neighbour_offset)
+        direction = bundles.rest_direction if len(bundles.rest_direction) else np.zeros((1, 3))
         return cls(
-            stream.upload(bundles.own // 4, np.int32),
-            stream.upload(bundles.start, np.int32),
-            stream.upload(_some(bundles.neighbour // 4), np.int32),
-            stream.upload(_some(bundles.kind), np.int32),
-            stream.upload(_some(bundles.weights), real),
-            stream.upload(_some(bundles.weights), np.float64),
-            stream.upload(_some(bundles.spring), np.int32),
-            stream.upload(direction, np.float64),
-            stream.zeros((3, max(1, entries)), real),
-            nobody,
-            nobody + 1,
+            stream.upload_array(bundles.row_offset // 4, np.int32),
+            stream.upload_array(bundles.packet_start, np.int32),
+            stream.upload_array(_nonempty_array(bundles.neighbour_offset // 4), np.int32),
+            stream.upload_array(_nonempty_array(bundles.weight_offset), np.int32),
+            stream.upload_array(_nonempty_array(bundles.weights), real),
+            stream.upload_array(_nonempty_array(bundles.weights), np.float64),
+            stream.upload_array(_nonempty_array(bundles.spring_index), np.int32),
+            stream.upload_array(direction, np.float64),
+            stream.allocate_zeros((3, max(1, entries)), real),
+            padding_row,
+            padding_row + 1,
         )
 
     @property
-    def read(self) -> tuple[Any, ...]:
+    def single_type_arguments(self) -> tuple[Any, ...]:
         """Return the arguments of the kernels in the kernels' type."""
-        return self.own, self.start, self.neighbour, self.kind, self.weights, self.spring, self.direction, self.arrows
+        return (
+            self.lane_row,
+            self.packet_start,
+            self.neighbour_row,
+            self.weight_offset,
+            self.spring_weights,
+            self.spring_index,
+            self.rest_direction,
+            self.spring_vectors,
+        )
 
     @property
-    def written(self) -> tuple[Any, ...]:
+    def float64_arguments(self) -> tuple[Any, ...]:
         """Return the arguments of the float64 kernel that writes the spring vectors."""
-        return self.own, self.start, self.neighbour, self.kind, self.exact, self.spring, self.direction, self.arrows
+        return (
+            self.lane_row,
+            self.packet_start,
+            self.neighbour_row,
+            self.weight_offset,
+            self.float64_weights,
+            self.spring_index,
+            self.rest_direction,
+            self.spring_vectors,
+        )
 
 
-def _some(array: NDArray[Any]) -> NDArray[Any]:
+def _nonempty_array(array: NDArray[Any]) -> NDArray[Any]:
     """Return the array, or one element, as a device does not support empty arrays."""
     return array if len(array) else np.zeros(1, array.dtype)
 
 
-def needed(bundles: Bundles, real: Any) -> int:
+def compute_device_bytes(bundles: SpringPackets, real: Any) -> int:
     """Return the bytes of the lanes on the device."""
     size = np.dtype(real).itemsize
-    return len(bundles.neighbour) * (8 + 3 * size) + 8 * len(bundles.own) + (8 + size) * bundles.weights.size
+    return (
+        len(bundles.neighbour_offset) * (8 + 3 * size) + 8 * len(bundles.row_offset) + (8 + size) * bundles.weights.size
+    )
 
 
-class Kernels(NamedTuple):
+class SpringKernels(NamedTuple):
     """Device functions and kernels in one floating-point type."""
 
-    unit: Any
-    change: Any
-    clear: Any
-    settle: Any
-    linearise: Any
+    spring_direction: Any
+    force_change: Any
+    clear_rows: Any
+    write_positions: Any
+    linearise_springs: Any
 
 
 @cache
-def kernels(real: Any) -> Kernels:
+def build_spring_kernels(real: Any) -> SpringKernels:
     """Build the kernels of one floating-point type.
 
     All literals have this type, as a float64 literal would promote the arithmetic.
     """
-    zero, one, short = real(0.0), real(1.0), real(SHORT[real])
-    tiny = TINY_SQUARED
+    zero, one, short = real(0.0), real(1.0), real(MIN_SQUARED_LENGTH[real])
+    tiny = ZERO_LENGTH_SQUARED
 
     @cuda.jit(device=True)
     def unit(v0, v1, v2, squared, name, direction):
@@ -176,10 +196,10 @@ def kernels(real: Any) -> Kernels:
         if t >= len(own) or own[t] == nobody:
             return
         i, b, lane = own[t], t // LANES, t % LANES
-        held, x0, x1, x2 = given.hold[i], x[i, 0], x[i, 1], x[i, 2]
-        f0 = held * (given.centre[i, 0] - x0) + given.force[i, 0]
-        f1 = held * (given.centre[i, 1] - x1) + given.force[i, 1]
-        f2 = held * (given.centre[i, 2] - x2) + given.force[i, 2]
+        held, x0, x1, x2 = given.anchor_stiffness[i], x[i, 0], x[i, 1], x[i, 2]
+        f0 = held * (given.anchor_positions[i, 0] - x0) + given.external_force[i, 0]
+        f1 = held * (given.anchor_positions[i, 1] - x1) + given.external_force[i, 1]
+        f2 = held * (given.anchor_positions[i, 2] - x2) + given.external_force[i, 2]
         for entry in range(start[b], start[b + 1]):
             e = LANES * entry + lane
             j = neighbour[e]
@@ -200,4 +220,4 @@ def kernels(real: Any) -> Kernels:
             f0, f1, f2 = f0 + pull * v0, f1 + pull * v1, f2 + pull * v2
         force[0, t], force[1, t], force[2, t] = real(f0), real(f1), real(f2)
 
-    return Kernels(unit, change, clear, settle, linearise)
+    return SpringKernels(unit, change, clear, settle, linearise)

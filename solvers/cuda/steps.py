@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.cuda import sums
-from solvers.cuda.network import Edges, Given, Network
-from solvers.cuda.target import Stream, cuda
-from solvers.energies.edges import TINY
+from solvers.cuda.network import DeviceEdges, DeviceNetwork, DeviceStepData
+from solvers.cuda.target import DeviceStream, cuda
+from solvers.energies.edges import ZERO_LENGTH
 from solvers.problem import Positions, StepProblem, System
 
 
-class Step(NamedTuple):
+class DeviceStep(NamedTuple):
     """A step on the device, by vertices.
 
     Attributes:
@@ -37,19 +37,19 @@ class Step(NamedTuple):
         normal_force_positions: (n, 3) [m], where friction evaluates normal forces; None for the start of the step.
     """
 
-    target: Any
-    force: Any
-    guess: Any
-    pins: Any
-    origin: Any
-    lagged: Any
-    positions: Any
+    inertial_target: Any
+    external_force: Any
+    initial_guess: Any
+    pin_targets: Any
+    velocity_origin: Any
+    lagged_positions: Any
+    copy_positions: Any
     velocity: Any
-    times: tuple[float, float]
-    pressed: Any = None
+    start_and_stage_time: tuple[float, float]
+    normal_force_positions: Any = None
 
 
-class Places(NamedTuple):
+class RowData(NamedTuple):
     """Data of each row (n,) on the device.
 
     Attributes:
@@ -60,15 +60,15 @@ class Places(NamedTuple):
         form_weight: h of all forms [N/m].
     """
 
-    vertex: Any
-    pin: Any
-    inertia: Any
-    weight: Any
-    form: Any
+    vertex_indices: Any
+    pin_indices: Any
+    inertia_diagonal: Any
+    pin_weight: Any
+    form_weight: Any
 
 
 @dataclass(frozen=True, eq=False)
-class Uploaded:
+class UploadedNetwork:
     """A network on a device.
 
     Attributes:
@@ -77,55 +77,65 @@ class Uploaded:
         axis: (m, 3), of the edges as prepared.
     """
 
-    network: Network
-    stream: Stream
-    edges: Edges
-    places: Places
-    hold: Any
+    host_network: DeviceNetwork
+    stream: DeviceStream
+    device_edges: DeviceEdges
+    row_data: RowData
+    anchor_stiffness: Any
 
     @classmethod
-    def of(cls, network: Network, stream: Stream) -> Uploaded:
+    def from_network(cls, network: DeviceNetwork, stream: DeviceStream) -> UploadedNetwork:
         """Copy a network to the device."""
-        system, order = network.system, network.order
-        pin, weight = pin_numbers(system), np.zeros(system.vertices)
-        _, pinned, weights = system.penalty
+        system, order = network.system, network.row_vertices
+        pin, weight = number_pins(system), np.zeros(system.num_vertices)
+        _, pinned, weights = system.penalty_pins
         weight[pinned] = weights
-        places = Places(
-            stream.upload(order, np.int32),
-            stream.upload(pin[order]),
-            stream.upload(system.inertia[order]),
-            stream.upload(weight[order]),
-            stream.upload(network.parts.held[order]),
+        places = RowData(
+            stream.upload_array(order, np.int32),
+            stream.upload_array(pin[order]),
+            stream.upload_array(system.inertia_diagonal[order]),
+            stream.upload_array(weight[order]),
+            stream.upload_array(network.spring_form.vertex_weight[order]),
         )
-        hold = stream.upload(network.hold[: network.free])
-        return cls(network, stream, network.upload(stream), places, hold)
+        hold = stream.upload_array(network.anchor_stiffness[: network.num_free])
+        return cls(network, stream, network.upload_edges(stream), places, hold)
 
-    def step(self, problem: StepProblem, guess: Positions, *, touches: bool = False) -> Step:
+    def upload_step(
+        self, problem: StepProblem, initial_guess: Positions, *, supports_contact: bool = False
+    ) -> DeviceStep:
         """Upload a step problem with an initial guess (n, 3) [m].
 
         For methods with contact, also upload the start of the step.
         """
-        force, up = self.network.parts.force(problem), self.stream.upload
-        target, pins, start = up(problem.target), pins_of(problem, self.stream), problem.start
-        lagged = (up(start.origin), up(start.expected)) if self.network.parts.dashpots else (target, target)
-        begun = (up(start.positions), up(start.velocity)) if touches else (target, target)
-        pressed = up(start.pressed) if touches and start.pressed is not None else None
-        return Step(target, up(force), up(guess), pins, *lagged, *begun, (start.time, start.until), pressed)
+        force, up = self.host_network.spring_form.compute_force(problem), self.stream.upload_array
+        target, pins, start = up(problem.inertial_target), upload_pin_targets(problem, self.stream), problem.step_start
+        lagged = (
+            (up(start.velocity_origin), up(start.lagged_positions))
+            if self.host_network.spring_form.dashpots
+            else (target, target)
+        )
+        begun = (up(start.positions), up(start.velocity)) if supports_contact else (target, target)
+        pressed = (
+            up(start.normal_force_positions) if supports_contact and start.normal_force_positions is not None else None
+        )
+        return DeviceStep(
+            target, up(force), up(initial_guess), pins, *lagged, *begun, (start.time, start.stage_time), pressed
+        )
 
 
-def pin_numbers(system: System) -> NDArray[np.int32]:
+def number_pins(system: System) -> NDArray[np.int32]:
     """Return the index of each vertex's pin (n,), -1 for none."""
-    numbers = np.full(system.vertices, -1, np.int32)
+    numbers = np.full(system.num_vertices, -1, np.int32)
     numbers[system.pins.vertices] = np.arange(len(system.pins.vertices))
     return numbers
 
 
-def pins_of(problem: StepProblem, stream: Stream) -> Any:
+def upload_pin_targets(problem: StepProblem, stream: DeviceStream) -> Any:
     """Upload the pin targets to the device, which does not support empty arrays."""
-    return stream.upload(problem.pin_targets if len(problem.pin_targets) else np.zeros((1, 3)))
+    return stream.upload_array(problem.pin_targets if len(problem.pin_targets) else np.zeros((1, 3)))
 
 
-class Begun:
+class LoadedStep:
     """Data of a solve for its step, in rows.
 
     Attributes:
@@ -133,75 +143,97 @@ class Begun:
         step_data: anchors of the free rows (f,) and (f, 3).
     """
 
-    def __init__(self, uploaded: Uploaded) -> None:
-        stream, network, edges = uploaded.stream, uploaded.network, uploaded.edges
-        self._uploaded, rows = uploaded, (network.free, 3)
-        if network.parts.dashpots:
-            own = stream.upload(network.axis), stream.zeros(len(network.rest), np.float64)
+    def __init__(self, uploaded: UploadedNetwork) -> None:
+        stream, network, edges = uploaded.stream, uploaded.host_network, uploaded.device_edges
+        self._uploaded_network, rows = uploaded, (network.num_free, 3)
+        if network.spring_form.dashpots:
+            own = (
+                stream.upload_array(network.edge_direction),
+                stream.allocate_zeros(len(network.rest_length), np.float64),
+            )
             edges = edges._replace(axis=own[0], offset=own[1])
-        self.edges = edges
-        self.given = Given(uploaded.hold, stream.zeros(rows, np.float64), stream.zeros(rows, np.float64))
+        self.device_edges = edges
+        self.step_data = DeviceStepData(
+            uploaded.anchor_stiffness, stream.allocate_zeros(rows, np.float64), stream.allocate_zeros(rows, np.float64)
+        )
 
-    def take(self, step: Step, *rows: Any) -> None:
+    def load_step(self, step: DeviceStep, *rows: Any) -> None:
         """Load the step, and write its initial guess to the given rows of at least three numbers.
 
         Exactly pinned vertices are set to their targets.
         """
-        uploaded, queue = self._uploaded, self._uploaded.stream.queue
-        network, places = uploaded.network, uploaded.places
-        launch = sums.blocks(len(network.order)), sums.THREADS, queue
-        give[launch](places, step.target, step.force, step.pins, self.given)
+        uploaded, queue = self._uploaded_network, self._uploaded_network.stream.cuda_stream
+        network, places = uploaded.host_network, uploaded.row_data
+        launch = sums.count_blocks(len(network.row_vertices)), sums.THREADS_PER_BLOCK, queue
+        write_step_data[launch](places, step.inertial_target, step.external_force, step.pin_targets, self.step_data)
         for each in rows:
-            place[launch](places, network.free, step.guess, step.pins, each)
-        first, edges = len(network.parts.whole.edges), len(network.ends)
+            write_initial_rows[launch](places, network.num_free, step.initial_guess, step.pin_targets, each)
+        first, edges = len(network.spring_form.springs_and_forms.edges), len(network.ends)
         if first < edges:
-            over = sums.blocks(edges - first), sums.THREADS, queue
-            lag[over](first, places.vertex, step.origin, step.lagged, uploaded.edges.axis, self.edges)
+            over = sums.count_blocks(edges - first), sums.THREADS_PER_BLOCK, queue
+            write_lagged_positions[over](
+                first,
+                places.vertex_indices,
+                step.velocity_origin,
+                step.lagged_positions,
+                uploaded.device_edges.edge_direction,
+                self.device_edges,
+            )
 
 
 @cuda.jit
-def give(places, target, force, pins, given):
+def write_step_data(row_data, target, force, pin_targets, step_data):
     """Write the anchors of the free rows, and the other forces on them."""
     i = cuda.grid(1)
-    while i < given.centre.shape[0]:
-        v, m, w = places.vertex[i], places.inertia[i], places.weight[i]
+    while i < step_data.anchor_positions.shape[0]:
+        v, m, w = row_data.vertex_indices[i], row_data.inertia_diagonal[i], row_data.pin_weight[i]
         for c in range(3):
             centre, whole = target[v, c], m + w
             if w > 0.0:
-                centre = (m * centre + w * pins[places.pin[i], c]) / whole
-            given.centre[i, c] = centre
-            given.force[i, c] = force[v, c] - places.form[i] * centre
+                centre = (m * centre + w * pin_targets[row_data.pin_indices[i], c]) / whole
+            step_data.anchor_positions[i, c] = centre
+            step_data.external_force[i, c] = force[v, c] - row_data.form_weight[i] * centre
         i += cuda.gridsize(1)
 
 
 @cuda.jit
-def place(places, free, guess, pins, rows):
+def write_initial_rows(row_data, num_free, initial_guess, pin_targets, rows):
     """Write an initial guess (n, 3) to rows.
 
     Rows from `num_free` on are set to their pins' targets.
     """
     i = cuda.grid(1)
-    while i < places.vertex.shape[0]:
+    while i < row_data.vertex_indices.shape[0]:
         for c in range(3):
-            rows[i, c] = guess[places.vertex[i], c] if i < free else pins[places.pin[i], c]
+            rows[i, c] = (
+                initial_guess[row_data.vertex_indices[i], c]
+                if i < num_free
+                else pin_targets[row_data.pin_indices[i], c]
+            )
         i += cuda.gridsize(1)
 
 
 @cuda.jit
-def lag(first, vertex, origin, lagged, made, edges):
+def write_lagged_positions(first_dashpot, row_vertices, velocity_origin, lagged_positions, default_directions, edges):
     """Write directions and offsets of the dashpots, the edges from `first_dashpot` on.
 
     `default_directions` are used at zero length.
     """
-    e = first + cuda.grid(1)
+    e = first_dashpot + cuda.grid(1)
     while e < edges.ends.shape[0]:
-        i, j = vertex[edges.ends[e, 0]], vertex[edges.ends[e, 1]]
-        v0, v1, v2 = lagged[i, 0] - lagged[j, 0], lagged[i, 1] - lagged[j, 1], lagged[i, 2] - lagged[j, 2]
+        i, j = row_vertices[edges.ends[e, 0]], row_vertices[edges.ends[e, 1]]
+        v0, v1, v2 = (
+            lagged_positions[i, 0] - lagged_positions[j, 0],
+            lagged_positions[i, 1] - lagged_positions[j, 1],
+            lagged_positions[i, 2] - lagged_positions[j, 2],
+        )
         length = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-        n0, n1, n2 = made[e, 0], made[e, 1], made[e, 2]
-        if length > TINY:
+        n0, n1, n2 = default_directions[e, 0], default_directions[e, 1], default_directions[e, 2]
+        if length > ZERO_LENGTH:
             n0, n1, n2 = v0 / length, v1 / length, v2 / length
         edges.axis[e, 0], edges.axis[e, 1], edges.axis[e, 2] = n0, n1, n2
-        moved = n0 * (origin[i, 0] - origin[j, 0]) + n1 * (origin[i, 1] - origin[j, 1])
-        edges.offset[e] = moved + n2 * (origin[i, 2] - origin[j, 2])
+        moved = n0 * (velocity_origin[i, 0] - velocity_origin[j, 0]) + n1 * (
+            velocity_origin[i, 1] - velocity_origin[j, 1]
+        )
+        edges.offset[e] = moved + n2 * (velocity_origin[i, 2] - velocity_origin[j, 2])
         e += cuda.gridsize(1)

@@ -13,28 +13,28 @@ from typing import Any
 
 import numpy as np
 
-from solvers.cuda.device import simulated
+from solvers.cuda.device import is_simulated
 from solvers.cuda.target import cuda
 
-THREADS, MOST_BLOCKS = (1, 2) if simulated() else (256, 1024)
+THREADS_PER_BLOCK, MAX_BLOCKS = (1, 2) if is_simulated() else (256, 1024)
 """Threads per block. The simulator starts a Python thread for each, which is slower than its work. Its device functions
 from other files than the kernel's also require a block of one thread."""
 
 
-def blocks(n: int) -> int:
+def count_blocks(n: int) -> int:
     """Return the number of blocks of a launch for n terms, over which threads loop with a stride."""
-    return max(1, min(MOST_BLOCKS, -(-n // THREADS)))
+    return max(1, min(MAX_BLOCKS, -(-n // THREADS_PER_BLOCK)))
 
 
 @cuda.jit(device=True)
-def of_block(value):
+def sum_block(value):
     """Return the sum of a float64 over the threads of the block, to all of them."""
-    shared = cuda.shared.array(THREADS, np.float64)
+    shared = cuda.shared.array(THREADS_PER_BLOCK, np.float64)
     thread = cuda.threadIdx.x
     cuda.syncthreads()
     shared[thread] = value
     cuda.syncthreads()
-    half = THREADS // 2
+    half = THREADS_PER_BLOCK // 2
     while half > 0:
         if thread < half:
             shared[thread] += shared[thread + half]
@@ -44,35 +44,35 @@ def of_block(value):
 
 
 @cuda.jit(device=True, inline="always")
-def keep(value, which, partials):
+def store_partial_sum(value, sum_slot, partials):
     """First stage: store the sum of the block in a row of partials (k, MAX_BLOCKS)."""
-    total = of_block(value)
+    total = sum_block(value)
     if cuda.threadIdx.x == 0:
-        partials[which, cuda.blockIdx.x] = total
+        partials[sum_slot, cuda.blockIdx.x] = total
 
 
 @cuda.jit(device=True, inline="always")
-def of_all(which, partials, count):
+def sum_partials(sum_slot, partials, count):
     """Second stage: return the sum of a row's first `count` partials to all threads.
 
     It runs in a kernel of one block.
     """
     mine, k = 0.0, cuda.threadIdx.x
     while k < count:
-        mine += partials[which, k]
-        k += THREADS
-    return of_block(mine)
+        mine += partials[sum_slot, k]
+        k += THREADS_PER_BLOCK
+    return sum_block(mine)
 
 
 @cuda.jit
-def collect(rows, partials, count, out):
+def collect_sums(rows, partials, count, out):
     """Second stage of the first `rows` sums; one block."""
     for k in range(rows):
-        total = of_all(k, partials, count)
+        total = sum_partials(k, partials, count)
         if cuda.threadIdx.x == 0:
             out[k] = total
 
 
-def partials(rows: int) -> Any:
+def allocate_partials(rows: int) -> Any:
     """Allocate memory for `rows` simultaneous sums."""
-    return cuda.device_array((rows, MOST_BLOCKS), np.float64)
+    return cuda.device_array((rows, MAX_BLOCKS), np.float64)

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.cuda.device import simulated
+from solvers.cuda.device import is_simulated
 
 cuda: Any = import_module("numba.cuda")
 
-THREADS = 8 if simulated() else 128
+THREADS = 8 if is_simulated() else 128
 """Threads per block; the simulator starts a CPU thread for each."""
 
 
@@ -21,44 +21,44 @@ def blocks(threads: int) -> int:
     return max(1, -(-threads // THREADS))
 
 
-class Stream:
+class DeviceStream:
     """A stream with its uploaded arrays and its events; device arrays live as long as the stream."""
 
     def __init__(self) -> None:
-        self.queue: Any = cuda.stream()
+        self.cuda_stream: Any = cuda.stream()
 
-    def upload(self, array: NDArray[Any], dtype: Any = None) -> Any:
+    def upload_array(self, array: NDArray[Any], dtype: Any = None) -> Any:
         """Copy a host array to the device."""
-        return cuda.to_device(np.ascontiguousarray(array, dtype), stream=self.queue)
+        return cuda.to_device(np.ascontiguousarray(array, dtype), stream=self.cuda_stream)
 
-    def put(self, array: NDArray[Any], there: Any) -> None:
+    def overwrite_array(self, array: NDArray[Any], device_array: Any) -> None:
         """Copy a host array to an existing device array of the same shape and type."""
-        there.copy_to_device(np.ascontiguousarray(array, there.dtype), stream=self.queue)
+        device_array.copy_to_device(np.ascontiguousarray(array, device_array.dtype), stream=self.cuda_stream)
 
-    def copy(self, array: Any, there: Any) -> None:
+    def copy_array(self, array: Any, device_array: Any) -> None:
         """Copy a device array to another one of the same shape and type."""
-        there.copy_to_device(array, stream=self.queue)
+        device_array.copy_to_device(array, stream=self.cuda_stream)
 
-    def empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
+    def allocate_array(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
         """Allocate an uninitialised device array."""
-        return cuda.device_array(shape, dtype, stream=self.queue)
+        return cuda.device_array(shape, dtype, stream=self.cuda_stream)
 
-    def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
+    def allocate_zeros(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
         """Allocate a device array of zeros."""
-        return self.upload(np.zeros(shape, dtype))
+        return self.upload_array(np.zeros(shape, dtype))
 
-    def download(self, there: Any) -> NDArray[Any]:
+    def download_array(self, device_array: Any) -> NDArray[Any]:
         """Copy a device array to the host; waits for all launched kernels."""
-        out = there.copy_to_host(stream=self.queue)
-        self.wait()
+        out = device_array.copy_to_host(stream=self.cuda_stream)
+        self.synchronise_stream()
         return out
 
-    def wait(self) -> None:
+    def synchronise_stream(self) -> None:
         """Wait for all launched work."""
-        self.queue.synchronize()
+        self.cuda_stream.synchronize()
 
-    def mark(self) -> Any:
+    def record_event(self) -> Any:
         """Record an event on the stream."""
         event = cuda.event()
-        event.record(self.queue)
+        event.record(self.cuda_stream)
         return event

@@ -13,30 +13,32 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from solvers.contact.energy import Contact
-from solvers.contact.touching import is_contact, without_contact
-from solvers.core.descent import Metric
-from solvers.core.driver import largest
-from solvers.core.fixed_objective import Objective
-from solvers.core.parts import Parts
+from solvers.contact.energy import HalfSpaceContact
+from solvers.contact.touching import is_vertex_contact, without_vertex_contact
+from solvers.core.descent import ResidualMetric
+from solvers.core.driver import compute_max_coordinate
+from solvers.core.fixed_objective import FixedObjective
+from solvers.core.parts import SpringForm
 from solvers.core.vertex_blocks import VertexBlocks
 from solvers.cuda import device, half_spaces, springs
-from solvers.cuda.network import Network
-from solvers.cuda.run import DeviceIterating, Minimising
-from solvers.cuda.springs import Lanes
-from solvers.cuda.steps import Begun, Step, Uploaded
-from solvers.cuda.target import THREADS, Stream, blocks
-from solvers.cuda.vbd_kernels import ASKED, CONTROLS, KNOWN, WEIGHT, kernels
+from solvers.cuda.network import DeviceNetwork
+from solvers.cuda.run import DeviceSolverState, MinimisingSolver
+from solvers.cuda.springs import DeviceLanes
+from solvers.cuda.steps import DeviceStep, LoadedStep, UploadedNetwork
+from solvers.cuda.target import THREADS, DeviceStream, blocks
+from solvers.cuda.vbd_kernels import EXTRAPOLATION, IS_REQUESTED, NUM_CONTROLS, OBJECTIVE, build_vbd_kernels
 from solvers.energies.quadratic import Quadratic
 from solvers.energies.springs import Springs
 from solvers.problem import StepProblem, System, Unsupported
 from solvers.vectors.springs import LANES
 
-REBASE = 16
+REBASE_INTERVAL = 16
 """Iterations between evaluations of the gradient in float64."""
 
 
-def prepare(system: System, parts: Parts, made: VertexBlocks, radius: float, real: Any) -> PreparedVertexBlockDescent:
+def prepare_vbd(
+    system: System, spring_form: SpringForm, vertex_blocks: VertexBlocks, spectral_radius: float, real: Any
+) -> PreparedDeviceVertexBlockDescent:
     """Prepare the method on an available device.
 
     Args:
@@ -49,80 +51,82 @@ def prepare(system: System, parts: Parts, made: VertexBlocks, radius: float, rea
     Raises:
         Unsupported: for other energies, and if the device memory is too small.
     """
-    taken = Springs, Quadratic, Contact
+    taken = Springs, Quadratic, HalfSpaceContact
     others = sorted({type(energy).__name__ for energy in system.energies if not isinstance(energy, taken)})
     if others:
         raise Unsupported(
             "vbd: on a device it takes springs, quadratic forms and contact of vertices with obstacles alone, not "
             f"{', '.join(others)}; without `device: cuda` it takes these too"
         )
-    order = np.searchsorted(system.free, np.argsort(made.row)[: made.free])
-    network = Network.of("vbd", without_contact(system), order)  # in the rows of the colours
-    rows, size = system.vertices + 2, np.dtype(real).itemsize
-    solve = len(made.bundles.own) * 6 * size + rows * (4 * 8 + 12 * size + 8 * 18)
-    obstacles = sum(len(energy.obstacles) for energy in system.energies if isinstance(energy, Contact))
-    solve += 8 * half_spaces.NUMBERS * obstacles * made.free
-    device.require_memory("vbd", springs.needed(made.bundles, real) + network.bytes + solve)
-    with device.guarded():
-        stream = Stream()
-        return PreparedVertexBlockDescent(
+    order = np.searchsorted(system.free_vertices, np.argsort(vertex_blocks.row_of_vertex)[: vertex_blocks.num_free])
+    network = DeviceNetwork.from_system("vbd", without_vertex_contact(system), order)  # in the rows of the colours
+    rows, size = system.num_vertices + 2, np.dtype(real).itemsize
+    solve = len(vertex_blocks.spring_packets.row_offset) * 6 * size + rows * (4 * 8 + 12 * size + 8 * 18)
+    obstacles = sum(len(energy.obstacles) for energy in system.energies if isinstance(energy, HalfSpaceContact))
+    solve += 8 * half_spaces.FLOATS_PER_ROW * obstacles * vertex_blocks.num_free
+    device.require_memory(
+        "vbd", springs.compute_device_bytes(vertex_blocks.spring_packets, real) + network.device_bytes + solve
+    )
+    with device.guard_device_errors():
+        stream = DeviceStream()
+        return PreparedDeviceVertexBlockDescent(
             system,
-            parts,
-            made,
-            radius,
+            spring_form,
+            vertex_blocks,
+            spectral_radius,
             real,
-            device.told(),
-            Uploaded.of(network, stream),
-            Lanes.of(stream, made.bundles, system.vertices, real),
-            stream.upload(made.bundles.in_lanes(made.held), real),
-            stream.upload(made.bundles.in_lanes(made.majorant), real),
-            Metric(system),
-            Objective(system),
+            device.describe_device(),
+            UploadedNetwork.from_network(network, stream),
+            DeviceLanes.from_packets(stream, vertex_blocks.spring_packets, system.num_vertices, real),
+            stream.upload_array(vertex_blocks.spring_packets.gather_lanes(vertex_blocks.anchor_stiffness), real),
+            stream.upload_array(vertex_blocks.spring_packets.gather_lanes(vertex_blocks.majorant), real),
+            ResidualMetric(system),
+            FixedObjective(system),
         )
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedVertexBlockDescent(Minimising):
+class PreparedDeviceVertexBlockDescent(MinimisingSolver):
     """VBD, prepared on a device, with lanes, anchor stiffness and majorant of each lane [N/m] there."""
 
     system: System
-    parts: Parts
-    made: VertexBlocks
-    radius: float
-    real: Any
-    columns: dict[str, Any]
-    uploaded: Uploaded
-    lanes: Lanes
-    held: Any
-    majorant: Any
-    metric: Metric
-    objective: Objective
-    touches: ClassVar[bool] = True
+    spring_form: SpringForm
+    vertex_blocks: VertexBlocks
+    spectral_radius: float
+    real_dtype: Any
+    device_columns: dict[str, Any]
+    uploaded_network: UploadedNetwork
+    device_lanes: DeviceLanes
+    anchor_stiffness: Any
+    hessian_majorant: Any
+    metric: ResidualMetric
+    objective: FixedObjective
+    supports_contact: ClassVar[bool] = True
 
     @property
-    def facts(self) -> dict[str, float]:
+    def stats(self) -> dict[str, float]:
         """Exact counts of the prepared data."""
-        return self.metric.facts
+        return self.metric.stats
 
     @property
-    def choice(self) -> str:
+    def description(self) -> str:
         """Description of the prepared solver."""
         return (
-            f"vertices in {self.made.colours} colours; kernels in {np.dtype(self.real)}, the gradient in float64; for "
-            f"the residual alone {self.metric.choice}"
+            f"vertices in {self.vertex_blocks.num_colours} colours; kernels in {np.dtype(self.real_dtype)}, the gradient in float64; for "
+            f"the residual alone {self.metric.description}"
         )
 
-    def iterating(self) -> DeviceIterating:
+    def allocate_state(self) -> DeviceSolverState:
         """Allocate the memory of a solve."""
-        return Sweeps(self)
+        return DeviceSweepState(self)
 
-    def scale(self, problem: StepProblem) -> float:
+    def residual_scale(self, problem: StepProblem) -> float:
         """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
-        stiffness = self.made.majorant[self.made.row][self.system.unpinned]
-        return largest(problem) * float(stiffness.sum()) ** 0.5
+        stiffness = self.vertex_blocks.majorant[self.vertex_blocks.row_of_vertex][self.system.unpinned_mask]
+        return compute_max_coordinate(problem) * float(stiffness.sum()) ** 0.5
 
 
-class Sweeps(DeviceIterating):
+class DeviceSweepState(DeviceSolverState):
     """State of a VBD solve on the device.
 
     Attributes:
@@ -133,93 +137,154 @@ class Sweeps(DeviceIterating):
         rows: (n, 3), the current positions, written on demand.
     """
 
-    def __init__(self, made: PreparedVertexBlockDescent) -> None:
-        super().__init__(made.uploaded.stream, made.uploaded.network.order)
-        self._made, self._kernels, self._springs = made, kernels(made.real), springs.kernels(made.real)
-        stream, lanes, n = self.stream, len(made.made.bundles.own), made.system.vertices
-        self._x = stream.empty((n + 2, 4), np.float64)
-        self._u, self._older, self._before = (stream.empty((n + 2, 4), made.real) for _ in range(3))
-        self._force = stream.empty((3, max(1, lanes)), made.real)
-        self._rows = stream.empty((n, 3), np.float64)
-        self._spaces = None
-        if any(map(is_contact, made.system.energies)):
-            of, self._pushing = made.uploaded, half_spaces.kernels(made.real)
-            self._spaces = half_spaces.Spaces(stream, made.system, of.network.order, of.places.vertex, made.made.free)
-        more = self._spaces.over[0] if self._spaces else 0
-        self._sums = [stream.zeros(blocks(lanes) + more, np.float64) for _ in range(2)]
-        self.loaded, self._control = Begun(made.uploaded), stream.zeros(CONTROLS, np.float64)
-        fresh = np.zeros(CONTROLS)
-        fresh[[KNOWN, WEIGHT]] = np.nan, 1.0
-        self._fresh = stream.upload(fresh)
-        self._launch(self._springs.clear, len(self._x), self._x, self._u, self._older, self._before)
+    def __init__(self, made: PreparedDeviceVertexBlockDescent) -> None:
+        super().__init__(made.uploaded_network.stream, made.uploaded_network.host_network.row_vertices)
+        self._prepared, self._kernels, self._springs = (
+            made,
+            build_vbd_kernels(made.real_dtype),
+            springs.build_spring_kernels(made.real_dtype),
+        )
+        stream, lanes, n = self.stream, len(made.vertex_blocks.spring_packets.row_offset), made.system.num_vertices
+        self._reference = stream.allocate_array((n + 2, 4), np.float64)
+        self._displacement, self._previous_iterate, self._sweep_start = (
+            stream.allocate_array((n + 2, 4), made.real_dtype) for _ in range(3)
+        )
+        self._force = stream.allocate_array((3, max(1, lanes)), made.real_dtype)
+        self._rows = stream.allocate_array((n, 3), np.float64)
+        self._half_spaces = None
+        if any(map(is_vertex_contact, made.system.energies)):
+            of, self._half_space_kernels = made.uploaded_network, half_spaces.kernels(made.real_dtype)
+            self._half_spaces = half_spaces.DeviceHalfSpaces(
+                stream,
+                made.system,
+                of.host_network.row_vertices,
+                of.row_data.vertex_indices,
+                made.vertex_blocks.num_free,
+            )
+        more = self._half_spaces.launch_shape[0] if self._half_spaces else 0
+        self._sums = [stream.allocate_zeros(blocks(lanes) + more, np.float64) for _ in range(2)]
+        self.loaded_step, self._control = (
+            LoadedStep(made.uploaded_network),
+            stream.allocate_zeros(NUM_CONTROLS, np.float64),
+        )
+        fresh = np.zeros(NUM_CONTROLS)
+        fresh[[OBJECTIVE, EXTRAPOLATION]] = np.nan, 1.0
+        self._initial_control = stream.upload_array(fresh)
+        self._launch_kernel(
+            self._springs.clear_rows,
+            len(self._reference),
+            self._reference,
+            self._displacement,
+            self._previous_iterate,
+            self._sweep_start,
+        )
 
-    def take(self, step: Step) -> None:
+    def load_step(self, step: DeviceStep) -> None:
         """Load a step that is on the device, and start to solve it."""
-        self._launch(self._springs.clear, len(self._x), self._x, self._u, self._older, self._before)
-        self.stream.copy(self._fresh, self._control)
-        self.loaded.take(step, self._x)
-        if self._spaces:
-            self._spaces.take(step)
+        self._launch_kernel(
+            self._springs.clear_rows,
+            len(self._reference),
+            self._reference,
+            self._displacement,
+            self._previous_iterate,
+            self._sweep_start,
+        )
+        self.stream.copy_array(self._initial_control, self._control)
+        self.loaded_step.load_step(step, self._reference)
+        if self._half_spaces:
+            self._half_spaces.load_step(step)
 
-    def settled(self) -> Any:
+    def position_rows(self) -> Any:
         """Return the current positions in rows (n, 3) [m], on the device."""
-        self._launch(self._springs.settle, len(self._rows), self._x, self._u, self._rows)
+        self._launch_kernel(
+            self._springs.write_positions, len(self._rows), self._reference, self._displacement, self._rows
+        )
         return self._rows
 
-    def sweep(self, count: int) -> int:
+    def launch_iterations(self, num_iterations: int) -> int:
         """Launch iterations; return how many of them moved something."""
-        for number in range(self._done, self._done + count):
-            if number % REBASE == 0:
-                self._rebase(moved=number > 0)
-            self._once()
-        return count
+        for number in range(self._num_iterations, self._num_iterations + num_iterations):
+            if number % REBASE_INTERVAL == 0:
+                self._rebase_reference(moved=number > 0)
+            self._launch_iteration()
+        return num_iterations
 
-    def _rebase(self, *, moved: bool) -> None:
-        made = self._made
-        lanes = made.lanes
+    def _rebase_reference(self, *, moved: bool) -> None:
+        made = self._prepared
+        lanes = made.device_lanes
         if moved:
-            self._launch(self._kernels.rebase, len(self._x), self._x, self._u, self._older, self._control)
-        self._launch(
-            self._springs.linearise, len(lanes.own), *lanes.written, lanes.nobody, lanes.far, self.loaded.given,
-            self._x, self._force,
+            self._launch_kernel(
+                self._kernels.rebase_reference,
+                len(self._reference),
+                self._reference,
+                self._displacement,
+                self._previous_iterate,
+                self._control,
+            )
+        self._launch_kernel(
+            self._springs.linearise_springs, len(lanes.lane_row), *lanes.float64_arguments, lanes.padding_row, lanes.padding_end_row, self.loaded_step.step_data,
+            self._reference, self._force,
         )  # fmt: skip
 
-    def _once(self) -> None:
-        made, run = self._made, self._kernels
-        rows = len(self._x)
-        accelerated = made.radius > 0.0
+    def _launch_iteration(self) -> None:
+        made, run = self._prepared, self._kernels
+        rows = len(self._reference)
+        accelerated = made.spectral_radius > 0.0
         if accelerated:
-            self._level(self._u, ASKED, self._sums[0])
-        self._colours()
+            self._sum_objective(self._displacement, IS_REQUESTED, self._sums[0])
+        self._launch_sweep()
         if accelerated:
-            self._launch(run.extrapolate, rows, self._u, self._older, self._control)
-            self._level(self._older, WEIGHT, self._sums[1])
-            self._launch(run.decide, THREADS, made.radius, *self._sums, self._control)
-            self._launch(run.finish, rows, self._u, self._before, self._older, self._control)
+            self._launch_kernel(
+                run.extrapolate_iterate, rows, self._displacement, self._previous_iterate, self._control
+            )
+            self._sum_objective(self._previous_iterate, EXTRAPOLATION, self._sums[1])
+            self._launch_kernel(run.decide_extrapolation, THREADS, made.spectral_radius, *self._sums, self._control)
+            self._launch_kernel(
+                run.finish_extrapolation,
+                rows,
+                self._displacement,
+                self._sweep_start,
+                self._previous_iterate,
+                self._control,
+            )
 
-    def _colours(self) -> None:
+    def _launch_sweep(self) -> None:
         """Sweep all colours; vertices with half-spaces are then recomputed from their previous positions."""
-        made = self._made
-        lanes, first = made.lanes, made.made.first
+        made = self._prepared
+        lanes, first = made.device_lanes, made.vertex_blocks.first_packet
         for begin, end in zip(LANES * first[:-1], LANES * first[1:], strict=True):
             colour = (
-                begin, end, *lanes.read, lanes.nobody, lanes.far, made.held, made.majorant, self._force, self._u,
-                self._before,
+                begin, end, *lanes.single_type_arguments, lanes.padding_row, lanes.padding_end_row, made.anchor_stiffness, made.hessian_majorant, self._force, self._displacement,
+                self._sweep_start,
             )  # fmt: skip
-            self._launch(self._kernels.sweep, end - begin, *colour)
-            if self._spaces:
-                self._launch(self._pushing.push, end - begin, *colour, self._x, self._spaces.given)
+            self._launch_kernel(self._kernels.sweep_colour, end - begin, *colour)
+            if self._half_spaces:
+                self._launch_kernel(
+                    self._half_space_kernels.push_with_model,
+                    end - begin,
+                    *colour,
+                    self._reference,
+                    self._half_spaces.half_spaces,
+                )
 
-    def _level(self, u: Any, asked: int, sums: Any) -> None:
-        made = self._made
-        lanes = made.lanes
-        self._launch(
-            self._kernels.level, len(lanes.own), *lanes.read, lanes.nobody, lanes.far, made.made.free, made.held,
+    def _sum_objective(self, u: Any, asked: int, sums: Any) -> None:
+        made = self._prepared
+        lanes = made.device_lanes
+        self._launch_kernel(
+            self._kernels.sum_objective, len(lanes.lane_row), *lanes.single_type_arguments, lanes.padding_row, lanes.padding_end_row, made.vertex_blocks.num_free, made.anchor_stiffness,
             self._force, u, asked, self._control, sums,
         )  # fmt: skip
-        if self._spaces:
-            press, over = self._pushing.press, self._spaces.over
-            press[over](self._spaces.given, self._x, u, asked, self._control, blocks(len(lanes.own)), sums)
+        if self._half_spaces:
+            press, over = self._half_space_kernels.evaluate_penalty, self._half_spaces.launch_shape
+            press[over](
+                self._half_spaces.half_spaces,
+                self._reference,
+                u,
+                asked,
+                self._control,
+                blocks(len(lanes.lane_row)),
+                sums,
+            )
 
-    def _launch(self, kernel: Any, threads: int, *arguments: Any) -> None:
-        kernel[blocks(threads), THREADS, self.stream.queue](*arguments)
+    def _launch_kernel(self, kernel: Any, threads: int, *arguments: Any) -> None:
+        kernel[blocks(threads), THREADS, self.stream.cuda_stream](*arguments)

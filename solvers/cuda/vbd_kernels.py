@@ -19,35 +19,38 @@ from numba import float64
 
 from solvers.cuda import springs
 from solvers.cuda.target import THREADS, cuda
-from solvers.kernels.springs import TINY_SQUARED
+from solvers.kernels.springs import ZERO_LENGTH_SQUARED
 from solvers.vectors.springs import LANES
 
-OMEGA, KNOWN, WEIGHT, TAKEN, ASKED = range(5)
-CONTROLS = 5
-_ROUND_OFF = {np.float32: 1e-6, np.float64: 1e-14}
+OMEGA, OBJECTIVE, EXTRAPOLATION, IS_ACCEPTED, IS_REQUESTED = range(5)
+NUM_CONTROLS = 5
+_PIVOT_ROUNDOFF = {np.float32: 1e-6, np.float64: 1e-14}
 """Pivots up to this fraction of the diagonal's sum are round-off, with about ten springs per vertex."""
 
 
-class Kernels(NamedTuple):
+class VbdKernels(NamedTuple):
     """Device functions and kernels in one floating-point type."""
 
-    gathered: Any
-    risen_there: Any
-    sweep: Any
-    extrapolate: Any
-    level: Any
-    decide: Any
-    finish: Any
-    rebase: Any
+    gather_force_and_block: Any
+    vertex_energy_change: Any
+    sweep_colour: Any
+    extrapolate_iterate: Any
+    sum_objective: Any
+    decide_extrapolation: Any
+    finish_extrapolation: Any
+    rebase_reference: Any
 
 
 @cache
-def kernels(real: Any) -> Kernels:
+def build_vbd_kernels(real: Any) -> VbdKernels:
     """Build the kernels of one type."""
     zero, half, one = real(0.0), real(0.5), real(1.0)
-    least = real(_ROUND_OFF[real])
-    change, unit_exact = springs.kernels(real).change, springs.kernels(np.float64).unit
-    tiny = TINY_SQUARED
+    least = real(_PIVOT_ROUNDOFF[real])
+    change, unit_exact = (
+        springs.build_spring_kernels(real).force_change,
+        springs.build_spring_kernels(np.float64).spring_direction,
+    )
+    tiny = ZERO_LENGTH_SQUARED
 
     @cuda.jit(device=True)
     def gathered(
@@ -175,7 +178,7 @@ def kernels(real: Any) -> Kernels:
     def extrapolate(u, older, control):
         """Extrapolate `older`, the iterate before the last one, to w (u - older) + older."""
         i = cuda.grid(1)
-        w = real(control[WEIGHT])
+        w = real(control[EXTRAPOLATION])
         if i < len(u) and w > one:
             for c in range(3):
                 older[i, c] += w * (u[i, c] - older[i, c])
@@ -195,9 +198,9 @@ def kernels(real: Any) -> Kernels:
         """
         kept = cuda.shared.array(THREADS, float64)
         t, inside = cuda.grid(1), cuda.threadIdx.x
-        if asked == ASKED and not control[ASKED] > 0.0:
+        if asked == IS_REQUESTED and not control[IS_REQUESTED] > 0.0:
             return
-        if asked == WEIGHT and not control[WEIGHT] > 1.0:
+        if asked == EXTRAPOLATION and not control[EXTRAPOLATION] > 1.0:
             return
         total = float64(0.0)
         if t < len(own) and own[t] != nobody:
@@ -248,11 +251,11 @@ def kernels(real: Any) -> Kernels:
         kept = cuda.shared.array((2, THREADS), float64)
         inside = cuda.threadIdx.x
         before, new = float64(0.0), float64(0.0)
-        w = control[WEIGHT]
+        w = control[EXTRAPOLATION]
         if w > 1.0:
             for k in range(inside, len(at_new), THREADS):
                 new += at_new[k]
-            if control[ASKED] > 0.0:
+            if control[IS_REQUESTED] > 0.0:
                 for k in range(inside, len(at_before), THREADS):
                     before += at_before[k]
         kept[0, inside], kept[1, inside] = before, new
@@ -265,9 +268,9 @@ def kernels(real: Any) -> Kernels:
             cuda.syncthreads()
             span //= 2
         if inside == 0:
-            omega, known, taken = w, control[KNOWN], 0.0
+            omega, known, taken = w, control[OBJECTIVE], 0.0
             if w > 1.0:
-                if control[ASKED] > 0.0:
+                if control[IS_REQUESTED] > 0.0:
                     known = kept[0, 0]
                 if kept[1, 0] <= known:
                     known, taken = kept[1, 0], 1.0
@@ -278,14 +281,19 @@ def kernels(real: Any) -> Kernels:
                 following = 4.0 / (4.0 - radius * radius * omega)
             elif omega == 1.0:
                 following = 2.0 / (2.0 - radius * radius)
-            control[OMEGA], control[KNOWN], control[WEIGHT], control[TAKEN] = omega, known, following, taken
-            control[ASKED] = 1.0 if following > 1.0 and math.isnan(known) else 0.0
+            control[OMEGA], control[OBJECTIVE], control[EXTRAPOLATION], control[IS_ACCEPTED] = (
+                omega,
+                known,
+                following,
+                taken,
+            )
+            control[IS_REQUESTED] = 1.0 if following > 1.0 and math.isnan(known) else 0.0
 
     @cuda.jit
     def finish(u, before, older, control):
         """Apply the extrapolation if accepted; store where the iteration started."""
         i = cuda.grid(1)
-        taken = control[TAKEN] > 0.0
+        taken = control[IS_ACCEPTED] > 0.0
         if i < len(u):
             for c in range(3):
                 if taken:
@@ -296,12 +304,12 @@ def kernels(real: Any) -> Kernels:
     def rebase(x, u, older, control):
         """Add the displacement to the reference; the objective there is 0 by definition if it was known."""
         i = cuda.grid(1)
-        if i == 0 and not math.isnan(control[KNOWN]):
-            control[KNOWN] = 0.0
+        if i == 0 and not math.isnan(control[OBJECTIVE]):
+            control[OBJECTIVE] = 0.0
         if i < len(x):
             for c in range(3):
                 x[i, c] += float64(u[i, c])
                 older[i, c] -= u[i, c]
                 u[i, c] = zero
 
-    return Kernels(gathered, risen_there, sweep, extrapolate, level, decide, finish, rebase)
+    return VbdKernels(gathered, risen_there, sweep, extrapolate, level, decide, finish, rebase)

@@ -14,19 +14,25 @@ from numpy.typing import NDArray
 
 from solvers.core import vertex_terms
 from solvers.cuda import device, sums
-from solvers.cuda.run import DeviceIterating, DeviceIterative
-from solvers.cuda.steps import Step, pin_numbers, pins_of
-from solvers.cuda.target import Stream, cuda
-from solvers.cuda.xpbd_kernels import kernels, moved, predict, settle
-from solvers.kernels.xpbd import Constraints
-from solvers.problem import Positions, ResidualOf, StepProblem, System
+from solvers.cuda.run import DeviceSolver, DeviceSolverState
+from solvers.cuda.steps import DeviceStep, number_pins, upload_pin_targets
+from solvers.cuda.target import DeviceStream, cuda
+from solvers.cuda.xpbd_kernels import build_xpbd_kernels, finish_substep, predict_step, write_positions
+from solvers.kernels.xpbd import SpringConstraints
+from solvers.problem import Positions, ResidualIterate, StepProblem, System
 
-Real = type[np.float32] | type[np.float64]
+RealType = type[np.float32] | type[np.float64]
 
 
-def prepare(
-    system: System, constraints: Constraints, first: NDArray[np.int64], real: Real, choice: str, *, small: bool
-) -> PreparedXpbd:
+def prepare_xpbd(
+    system: System,
+    coloured_constraints: SpringConstraints,
+    colour_starts: NDArray[np.int64],
+    real_dtype: RealType,
+    description: str,
+    *,
+    small_steps: bool,
+) -> PreparedDeviceXpbd:
     """Prepare the method on an available device.
 
     Args:
@@ -40,18 +46,21 @@ def prepare(
     Raises:
         Unsupported: if the device memory is too small.
     """
-    m, n, size = len(constraints.stiffness), system.vertices, np.dtype(real).itemsize
+    m, n, size = len(coloured_constraints.stiffness), system.num_vertices, np.dtype(real_dtype).itemsize
     solve = m * 5.0 * size + n * (5 * 24 + 8 + 5.0 * size)
     device.require_memory("xpbd", m * (8 + 8 + 24.0 + size) + n * (6 * 24 + 32) + solve)
-    with device.guarded():
-        stream = Stream()
-        there = Springs.of(stream, constraints, real), Places.of(stream, system)
-        told = f"{choice}; kernels in {np.dtype(real)}, from a reference in float64"
-        made = PreparedSmallSteps if small else PreparedXpbd
-        return made(system, stream, *there, first, real, device.told(), told)
+    with device.guard_device_errors():
+        stream = DeviceStream()
+        there = (
+            DeviceConstraints.from_constraints(stream, coloured_constraints, real_dtype),
+            VertexData.from_system(stream, system),
+        )
+        told = f"{description}; kernels in {np.dtype(real_dtype)}, from a reference in float64"
+        made = PreparedDeviceXpbdSmallSteps if small_steps else PreparedDeviceXpbd
+        return made(system, stream, *there, colour_starts, real_dtype, device.describe_device(), told)
 
 
-class Springs(NamedTuple):
+class DeviceConstraints(NamedTuple):
     """Springs on the device.
 
     Attributes:
@@ -65,13 +74,15 @@ class Springs(NamedTuple):
 
     ends: Any
     stiffness: Any
-    rest: Any
-    direction: Any
-    arrows: Any = None
-    tension: Any = None
+    rest_length: Any
+    rest_direction: Any
+    reference_vectors: Any = None
+    spring_tensions: Any = None
 
     @classmethod
-    def of(cls, stream: Stream, constraints: Constraints, real: Real) -> Springs:
+    def from_constraints(
+        cls, stream: DeviceStream, constraints: SpringConstraints, real: RealType
+    ) -> DeviceConstraints:
         """Copy the constraints to the device, which does not support empty arrays."""
         m = max(1, len(constraints.stiffness))
         ends, direction = np.zeros((m, 2), np.int32), np.zeros((m, 3))
@@ -79,19 +90,21 @@ class Springs(NamedTuple):
         for there, given in zip((ends, stiffness, rest, direction), constraints, strict=True):
             there[: len(given)] = given
         return cls(
-            stream.upload(ends),
-            stream.upload(stiffness, real),
-            stream.upload(rest),
-            stream.upload(direction),
+            stream.upload_array(ends),
+            stream.upload_array(stiffness, real),
+            stream.upload_array(rest),
+            stream.upload_array(direction),
         )
 
-    def begun(self, real: Real) -> Springs:
+    def allocate_solve(self, real: RealType) -> DeviceConstraints:
         """Allocate the arrays of a solve."""
         m = len(self.stiffness)
-        return self._replace(arrows=cuda.device_array((4, m), real), tension=cuda.device_array(m, real))
+        return self._replace(
+            reference_vectors=cuda.device_array((4, m), real), spring_tensions=cuda.device_array(m, real)
+        )
 
 
-class Places(NamedTuple):
+class VertexData(NamedTuple):
     """Data of each vertex (n,) on the device.
 
     Attributes:
@@ -101,152 +114,195 @@ class Places(NamedTuple):
         mass: [kg].
     """
 
-    pin: Any
-    weight: Any
-    held: Any
+    pin_indices: Any
+    pin_weight: Any
+    anchor_stiffness: Any
     mass: Any
 
     @classmethod
-    def of(cls, stream: Stream, system: System) -> Places:
+    def from_system(cls, stream: DeviceStream, system: System) -> VertexData:
         """Build the vertex data of a system."""
-        n, pins = system.vertices, system.pins
+        n, pins = system.num_vertices, system.pins
         weight = np.zeros(n)
         weight[pins.vertices] = pins.weight
-        arrays = pin_numbers(system), weight, vertex_terms.held(system), system.mass
-        return cls(*map(stream.upload, arrays))
+        arrays = number_pins(system), weight, vertex_terms.compute_anchor_stiffness(system), system.mass
+        return cls(*map(stream.upload_array, arrays))
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedXpbd(DeviceIterative):
+class PreparedDeviceXpbd(DeviceSolver):
     """XPBD, prepared on a device; `colour_starts` (colours + 1,) are the first springs of the colours."""
 
-    residual_of: ClassVar[ResidualOf] = "none"
+    residual_iterate: ClassVar[ResidualIterate] = "none"
 
     system: System
-    stream: Stream
-    springs: Springs
-    places: Places
-    first: NDArray[np.int64]
-    real: Real
-    columns: dict[str, Any]
-    choice: str
+    stream: DeviceStream
+    device_constraints: DeviceConstraints
+    vertex_data: VertexData
+    colour_starts: NDArray[np.int64]
+    real_dtype: RealType
+    device_columns: dict[str, Any]
+    description: str
 
-    facts: dict[str, float] = field(default_factory=dict[str, float])
+    stats: dict[str, float] = field(default_factory=dict[str, float])
     own: ClassVar[bool] = False
 
-    def stated(self, problem: StepProblem, guess: Positions) -> Step:
+    def upload_problem(self, problem: StepProblem, initial_guess: Positions) -> DeviceStep:
         """Upload a step problem; the initial guess is not used."""
-        up, start = self.stream.upload, problem.start
-        target, force, pins = up(problem.target), up(problem.force), pins_of(problem, self.stream)
+        up, start = self.stream.upload_array, problem.step_start
+        target, force, pins = (
+            up(problem.inertial_target),
+            up(problem.external_force),
+            upload_pin_targets(problem, self.stream),
+        )
         here = (up(start.positions), up(start.velocity)) if self.own else (target, target)
-        return Step(target, force, target, pins, target, target, *here, (start.time, start.until))
+        return DeviceStep(target, force, target, pins, target, target, *here, (start.time, start.stage_time))
 
-    def iterating(self) -> DeviceIterating:
+    def allocate_state(self) -> DeviceSolverState:
         """Allocate the memory of a solve."""
-        return Passes(self)
+        return DeviceXpbdState(self)
 
 
-class PreparedSmallSteps(PreparedXpbd):
+class PreparedDeviceXpbdSmallSteps(PreparedDeviceXpbd):
     """XPBD with small steps, prepared on a device."""
 
-    own: ClassVar[bool] = True
+    is_substepping: ClassVar[bool] = True
 
-    def iterating(self) -> DeviceIterating:
+    def allocate_state(self) -> DeviceSolverState:
         """Allocate the memory of a solve."""
-        return SmallSteps(self)
+        return DeviceXpbdSmallStepsState(self)
 
 
-class _Iterating(DeviceIterating):
+class _DeviceXpbdState(DeviceSolverState):
     """State of an XPBD solve on the device.
 
     Reference x (n, 3) [m], displacement u (n, 4) [m], vertex compliance (n,) [m/N].
     """
 
-    def __init__(self, made: PreparedXpbd) -> None:
-        n, stream = made.system.vertices, made.stream
+    def __init__(self, made: PreparedDeviceXpbd) -> None:
+        n, stream = made.system.num_vertices, made.stream
         super().__init__(stream, np.arange(n))
-        self.made, self.kernels, self.springs = made, kernels(made.real), made.springs.begun(made.real)
-        self.x, self.out = (stream.empty((n, 3), np.float64) for _ in range(2))
-        self.u, self.compliance = stream.empty((n, 4), made.real), stream.empty(n, made.real)
+        self.prepared, self.xpbd_kernels, self.device_constraints = (
+            made,
+            build_xpbd_kernels(made.real_dtype),
+            made.device_constraints.allocate_solve(made.real_dtype),
+        )
+        self.reference, self.position_output = (stream.allocate_array((n, 3), np.float64) for _ in range(2))
+        self.displacement, self.vertex_compliance = (
+            stream.allocate_array((n, 4), made.real_dtype),
+            stream.allocate_array(n, made.real_dtype),
+        )
 
-    def settled(self) -> Any:
+    def position_rows(self) -> Any:
         """Return the current positions in rows (n, 3) [m], on the device."""
-        self.run(moved, len(self.x), self.x, self.u, self.out)
-        return self.out
+        self.launch_kernel(
+            write_positions, len(self.reference), self.reference, self.displacement, self.position_output
+        )
+        return self.position_output
 
-    def run(self, kernel: Any, threads: int, *arguments: Any) -> None:
+    def launch_kernel(self, kernel: Any, num_items: int, *arguments: Any) -> None:
         """Launch a kernel whose threads loop over `threads` items."""
-        kernel[sums.blocks(threads), sums.THREADS, self.stream.queue](*arguments)
+        kernel[sums.count_blocks(num_items), sums.THREADS_PER_BLOCK, self.stream.cuda_stream](*arguments)
 
-    def linearise(self) -> None:
+    def linearise_constraints(self) -> None:
         """Initialise the springs at the reference, with zero tensions."""
-        count = int(self.made.first[-1])
-        self.run(self.kernels.linearise, count, self.x, count, self.springs)
+        count = int(self.prepared.colour_starts[-1])
+        self.launch_kernel(
+            self.xpbd_kernels.linearise_constraints, count, self.reference, count, self.device_constraints
+        )
 
-    def project(self) -> None:
+    def project_constraints(self) -> None:
         """Project all springs once."""
-        for begin, end in zip(self.made.first[:-1].tolist(), self.made.first[1:].tolist(), strict=True):
-            self.run(self.kernels.project, end - begin, begin, end, self.springs, self.compliance, self.u)
+        for begin, end in zip(
+            self.prepared.colour_starts[:-1].tolist(), self.prepared.colour_starts[1:].tolist(), strict=True
+        ):
+            self.launch_kernel(
+                self.xpbd_kernels.project_colour,
+                end - begin,
+                begin,
+                end,
+                self.device_constraints,
+                self.vertex_compliance,
+                self.displacement,
+            )
 
 
-class Passes(_Iterating):
+class DeviceXpbdState(_DeviceXpbdState):
     """State of an XPBD solve, which starts at the positions without springs."""
 
-    def take(self, step: Step) -> None:
+    def load_step(self, step: DeviceStep) -> None:
         """Load a step that is on the device, and start to solve it."""
-        n, places = len(self.x), self.made.places
-        self.run(self.kernels.anchor, n, places, step.target, step.force, step.pins, self.x, self.u, self.compliance)
-        self.linearise()
+        n, places = len(self.reference), self.prepared.vertex_data
+        self.launch_kernel(
+            self.xpbd_kernels.write_anchors,
+            n,
+            places,
+            step.inertial_target,
+            step.external_force,
+            step.pin_targets,
+            self.reference,
+            self.displacement,
+            self.vertex_compliance,
+        )
+        self.linearise_constraints()
 
-    def sweep(self, count: int) -> int:
+    def launch_iterations(self, num_iterations: int) -> int:
         """Launch iterations; return how many of them moved something."""
-        for _ in range(count):
-            self.project()
-        return count
+        for _ in range(num_iterations):
+            self.project_constraints()
+        return num_iterations
 
 
-class SmallSteps(_Iterating):
+class DeviceXpbdSmallStepsState(_DeviceXpbdState):
     """State of a small-steps solve on the device.
 
     Each solve restarts at the start of the step, with one substep per iteration so far.
     """
 
-    def __init__(self, made: PreparedXpbd) -> None:
+    def __init__(self, made: PreparedDeviceXpbd) -> None:
         super().__init__(made)
-        shape, empty = self.x.shape, self.stream.empty
-        self._before, self._v = (empty(shape, np.float64) for _ in range(2))
-        self._gives, self._substeps = empty(shape[0], np.float64), 0
-        self._step: Step
+        shape, empty = self.reference.shape, self.stream.allocate_array
+        self._substep_start, self._v = (empty(shape, np.float64) for _ in range(2))
+        self._float64_compliance, self._num_substeps = empty(shape[0], np.float64), 0
+        self._step: DeviceStep
 
-    def take(self, step: Step) -> None:
+    def load_step(self, step: DeviceStep) -> None:
         """Load a step that is on the device, and start to solve it."""
-        self._substeps, self._step = 0, step
+        self._num_substeps, self._step = 0, step
 
-    def settled(self) -> Any:
+    def position_rows(self) -> Any:
         """Return the current positions in rows (n, 3) [m], on the device."""
-        return super().settled() if self._substeps else self._step.positions
+        return super().position_rows() if self._num_substeps else self._step.copy_positions
 
-    def speeds(self) -> Any:
+    def velocity_rows(self) -> Any:
         """Return the final velocity in rows (n, 3) [m/s], on the device."""
-        return self._v if self._substeps else self._step.velocity
+        return self._v if self._num_substeps else self._step.velocity
 
-    def sweep(self, count: int) -> int:
+    def launch_iterations(self, num_iterations: int) -> int:
         """Launch iterations; return how many of them moved something."""
-        step, n, places = self._step, len(self.x), self.made.places
-        self._substeps += count
-        if not self._substeps:
-            return count
-        h = self.made.system.time_step / self._substeps
-        self.stream.copy(step.positions, self.x)
-        self.stream.copy(step.velocity, self._v)
-        self.run(self.kernels.soften, n, places, h, self.u, self.compliance, self._gives)
-        for left in range(self._substeps - 1, -1, -1):
-            part = left / self._substeps
-            self.run(
-                predict, n, h, part, places, step.positions, step.pins, self._gives, step.force, self._v, self._before,
-                self.x, self.u,
+        step, n, places = self._step, len(self.reference), self.prepared.vertex_data
+        self._num_substeps += num_iterations
+        if not self._num_substeps:
+            return num_iterations
+        h = self.prepared.system.time_step / self._num_substeps
+        self.stream.copy_array(step.copy_positions, self.reference)
+        self.stream.copy_array(step.velocity, self._v)
+        self.launch_kernel(
+            self.xpbd_kernels.write_compliance,
+            n,
+            places,
+            h,
+            self.displacement,
+            self.vertex_compliance,
+            self._float64_compliance,
+        )
+        for left in range(self._num_substeps - 1, -1, -1):
+            part = left / self._num_substeps
+            self.launch_kernel(
+                predict_step, n, h, part, places, step.copy_positions, step.pin_targets, self._float64_compliance, step.external_force, self._v, self._substep_start,
+                self.reference, self.displacement,
             )  # fmt: skip
-            self.linearise()
-            self.project()
-            self.run(settle, n, h, self._before, self.x, self.u, self._v)
-        return count
+            self.linearise_constraints()
+            self.project_constraints()
+            self.launch_kernel(finish_substep, n, h, self._substep_start, self.reference, self.displacement, self._v)
+        return num_iterations

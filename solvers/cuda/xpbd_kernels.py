@@ -15,32 +15,32 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from solvers.cuda.springs import SHORT
+from solvers.cuda.springs import MIN_SQUARED_LENGTH
 from solvers.cuda.target import cuda
 
-Real = type[np.float32] | type[np.float64]
+RealType = type[np.float32] | type[np.float64]
 
 
-class Kernels(NamedTuple):
+class XpbdKernels(NamedTuple):
     """Kernels for one precision."""
 
-    anchor: Any
-    soften: Any
-    linearise: Any
-    project: Any
+    write_anchors: Any
+    write_compliance: Any
+    linearise_constraints: Any
+    project_colour: Any
 
 
 @cache
-def kernels(real: Real) -> Kernels:
+def build_xpbd_kernels(real: RealType) -> XpbdKernels:
     """Build the kernels that compute in `real`."""
-    zero, one, short = real(0.0), real(1.0), real(SHORT[real])
+    zero, one, short = real(0.0), real(1.0), real(MIN_SQUARED_LENGTH[real])
 
     @cuda.jit
     def anchor(places, target, force, pins, x, u, compliance):
         """Write the positions without springs, y/q, to x; set u to 0."""
         i = cuda.grid(1)
         while i < x.shape[0]:
-            held, w, q = places.held[i], places.weight[i], places.pin[i]
+            held, w, q = places.anchor_stiffness[i], places.pin_weight[i], places.pin_indices[i]
             for c in range(3):
                 away = force[i, c]
                 if q >= 0 and not math.isinf(w):
@@ -55,7 +55,7 @@ def kernels(real: Real) -> Kernels:
         """Write 1/q for a step of h [s], in `real` and in float64; set u to 0."""
         i = cuda.grid(1)
         while i < gives.shape[0]:
-            gives[i] = 1.0 / (places.mass[i] / (h * h) + places.weight[i])
+            gives[i] = 1.0 / (places.mass[i] / (h * h) + places.pin_weight[i])
             compliance[i] = real(gives[i])
             for c in range(4):
                 u[i, c] = zero
@@ -69,9 +69,13 @@ def kernels(real: Real) -> Kernels:
             i, j = springs.ends[e, 0], springs.ends[e, 1]
             v0, v1, v2 = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
             length = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-            springs.arrows[0, e], springs.arrows[1, e], springs.arrows[2, e] = real(v0), real(v1), real(v2)
-            springs.arrows[3, e] = real(length - springs.rest[e])
-            springs.tension[e] = zero
+            springs.reference_vectors[0, e], springs.reference_vectors[1, e], springs.reference_vectors[2, e] = (
+                real(v0),
+                real(v1),
+                real(v2),
+            )
+            springs.reference_vectors[3, e] = real(length - springs.rest_length[e])
+            springs.spring_tensions[e] = zero
             e += cuda.gridsize(1)
 
     @cuda.jit
@@ -80,33 +84,37 @@ def kernels(real: Real) -> Kernels:
         e = begin + cuda.grid(1)
         while e < end:
             i, j = springs.ends[e, 0], springs.ends[e, 1]
-            d0, d1, d2 = springs.arrows[0, e], springs.arrows[1, e], springs.arrows[2, e]
+            d0, d1, d2 = (
+                springs.reference_vectors[0, e],
+                springs.reference_vectors[1, e],
+                springs.reference_vectors[2, e],
+            )
             w0, w1, w2 = u[i, 0] - u[j, 0], u[i, 1] - u[j, 1], u[i, 2] - u[j, 2]
             v0, v1, v2 = d0 + w0, d1 + w1, d2 + w2
             squared = v0 * v0 + v1 * v1 + v2 * v2
             if squared <= short:
-                stretch = -real(springs.rest[e])
-                v0, v1 = real(springs.direction[e, 0]), real(springs.direction[e, 1])
-                v2 = real(springs.direction[e, 2])
+                stretch = -real(springs.rest_length[e])
+                v0, v1 = real(springs.rest_direction[e, 0]), real(springs.rest_direction[e, 1])
+                v2 = real(springs.rest_direction[e, 2])
             else:
                 length = real(math.sqrt(squared))
                 both = length + real(math.sqrt(d0 * d0 + d1 * d1 + d2 * d2))
-                stretch = springs.arrows[3, e] + ((d0 + v0) * w0 + (d1 + v1) * w1 + (d2 + v2) * w2) / both
+                stretch = springs.reference_vectors[3, e] + ((d0 + v0) * w0 + (d1 + v1) * w1 + (d2 + v2) * w2) / both
                 scale = one / length
                 v0, v1, v2 = scale * v0, scale * v1, scale * v2
             k, gives, takes = springs.stiffness[e], compliance[i], compliance[j]
-            change = (k * stretch - springs.tension[e]) / (one + k * (gives + takes))
-            springs.tension[e] += change
+            change = (k * stretch - springs.spring_tensions[e]) / (one + k * (gives + takes))
+            springs.spring_tensions[e] += change
             a, b = gives * change, takes * change
             u[i, 0], u[i, 1], u[i, 2] = u[i, 0] - a * v0, u[i, 1] - a * v1, u[i, 2] - a * v2
             u[j, 0], u[j, 1], u[j, 2] = u[j, 0] + b * v0, u[j, 1] + b * v1, u[j, 2] + b * v2
             e += cuda.gridsize(1)
 
-    return Kernels(anchor, soften, linearise, project)
+    return XpbdKernels(anchor, soften, linearise, project)
 
 
 @cuda.jit
-def moved(x, u, out):
+def write_positions(x, u, out):
     """Write x + u to `out`, (n, 3) [m]."""
     i = cuda.grid(1)
     while i < x.shape[0]:
@@ -116,7 +124,9 @@ def moved(x, u, out):
 
 
 @cuda.jit
-def predict(h, left, places, start, pins, compliance, force, v, before, x, u):
+def predict_step(
+    h, remaining_fraction, vertex_data, start_positions, pin_targets, vertex_compliance, force, v, before, x, u
+):
     """Write the positions without springs in a substep of h [s] to x; set u to 0.
 
     Args:
@@ -127,24 +137,24 @@ def predict(h, left, places, start, pins, compliance, force, v, before, x, u):
     """
     i = cuda.grid(1)
     while i < x.shape[0]:
-        q, w = places.pin[i], places.weight[i]
+        q, w = vertex_data.pin[i], vertex_data.pin_weight[i]
         for c in range(3):
             here = x[i, c]
             before[i, c], u[i, c] = here, 0.0
-            there = here + h * v[i, c] + compliance[i] * force[i, c]
+            there = here + h * v[i, c] + vertex_compliance[i] * force[i, c]
             if q >= 0:
-                target = pins[q, c] + left * (start[i, c] - pins[q, c])
+                target = pin_targets[q, c] + remaining_fraction * (start_positions[i, c] - pin_targets[q, c])
                 if math.isinf(w):
                     there = target
                 else:
                     # Prediction by inertia alone, without the force that was added above.
-                    there += compliance[i] * w * (target - here - h * v[i, c])
+                    there += vertex_compliance[i] * w * (target - here - h * v[i, c])
             x[i, c] = there
         i += cuda.gridsize(1)
 
 
 @cuda.jit
-def settle(h, before, x, u, v):
+def finish_substep(h, before, x, u, v):
     """Finish a substep: it ends at x + u, which determines the velocity."""
     i = cuda.grid(1)
     while i < x.shape[0]:

@@ -13,18 +13,22 @@ from numpy.typing import NDArray
 
 from solvers.energies.quadratic import Quadratic
 from solvers.matrices import selection_matrix_sparse
-from solvers.problem import Positions, Start
+from solvers.problem import Positions, StepStart
 
 
 @dataclass(frozen=True, eq=False)
 class Attachments(Quadratic):
     """Attachments of vertices; anchor_positions_at: anchor points (m, 3) [m] as a function of time [s]."""
 
-    points: Callable[[float], Positions]
+    anchor_positions_at: Callable[[float], Positions]
 
     @classmethod
-    def of(
-        cls, vertices: NDArray[np.int64], stiffness: NDArray[np.float64], points: Callable[[float], Positions], n: int
+    def from_vertices(
+        cls,
+        vertices: NDArray[np.int64],
+        stiffness: NDArray[np.float64],
+        anchor_positions_at: Callable[[float], Positions],
+        n: int,
     ) -> Attachments:
         """Return attachments of vertices, at time zero.
 
@@ -34,8 +38,8 @@ class Attachments(Quadratic):
             anchor_positions_at: anchor points (m, 3) [m] as a function of time [s].
             n: number of vertices.
         """
-        return cls(selection_matrix_sparse(vertices, n), stiffness, points(0.0), points)
+        return cls(selection_matrix_sparse(vertices, n), stiffness, anchor_positions_at(0.0), anchor_positions_at)
 
-    def begin_step(self, start: Start) -> Attachments:
+    def begin_step(self, start: StepStart) -> Attachments:
         """Return the energy of a step, with the anchor points at the time of the stage."""
-        return replace(self, d=self.points(start.until))
+        return replace(self, d=self.anchor_positions_at(start.stage_time))

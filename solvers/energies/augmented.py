@@ -20,74 +20,88 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner
+from solvers.compiling import jit_inner
 from solvers.energies import strain_limits
-from solvers.energies.edges import TINY
-from solvers.energies.elements import Law, line
+from solvers.energies.edges import ZERO_LENGTH
+from solvers.energies.elements import ElementLaw, axial_hessian
 from solvers.energies.strain_limits import StrainLimits
-from solvers.held import Lengths
-from solvers.matrices import shares
-from solvers.problem import Positions, ProjectiveEnergy, Start, System
+from solvers.held import LengthConstraints
+from solvers.matrices import stiffness_shares
+from solvers.problem import Positions, ProjectiveEnergy, StepStart, System
 
-_LIMITS = StrainLimits.law.one
+_LIMIT_FUNCTIONS = StrainLimits.element_law.element_functions
 
 
-@inner
-def _curvature(numbers, e, z0, z1, z2):
+@jit_inner
+def _hessian(numbers, e, z0, z1, z2):
     """Return the Hessian of a strain limit without the negative transverse part of a compressed edge."""
     length = np.sqrt(z0 * z0 + z1 * z1 + z2 * z2)
-    force = numbers[e, 0] * strain_limits.excess(numbers, e, length)
+    force = numbers[e, 0] * strain_limits.length_excess(numbers, e, length)
     if force == 0.0 and numbers[e, 1] < numbers[e, 2]:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    n0, n1, n2 = strain_limits.direction(numbers, e, length, z0, z1, z2)
-    return line(numbers[e, 0], max(0.0, force / length) if length > TINY else 0.0, n0, n1, n2)
+    n0, n1, n2 = strain_limits.edge_direction(numbers, e, length, z0, z1, z2)
+    return axial_hessian(numbers[e, 0], max(0.0, force / length) if length > ZERO_LENGTH else 0.0, n0, n1, n2)
 
 
 @dataclass(frozen=True, eq=False)
-class Augmented(StrainLimits):
+class AugmentedLagrangian(StrainLimits):
     """Edges of an augmented Lagrangian, whose limits are shifted by tensions that may change from step to step."""
 
-    law: ClassVar[Law] = Law.of(_LIMITS.value, _LIMITS.gradient, _curvature, _LIMITS.rise)
+    element_law: ClassVar[ElementLaw] = ElementLaw.from_functions(
+        _LIMIT_FUNCTIONS.value, _LIMIT_FUNCTIONS.gradient, _hessian, _LIMIT_FUNCTIONS.energy_change
+    )
 
     @classmethod
-    def of(cls, lengths: Lengths, stiffness: NDArray[np.float64], tension: NDArray[np.float64]) -> Augmented:
+    def from_constraints(
+        cls, constraints: LengthConstraints, stiffness: NDArray[np.float64], tensions: NDArray[np.float64]
+    ) -> AugmentedLagrangian:
         """Return edges with positive stiffnesses k [N/m] and tensions t [N], both (m,)."""
-        moved = tension / stiffness
-        return cls(lengths.edges, stiffness, lengths.low - moved, lengths.high - moved, lengths.rest_direction)
+        moved = tensions / stiffness
+        return cls(
+            constraints.edges,
+            stiffness,
+            constraints.min_length - moved,
+            constraints.max_length - moved,
+            constraints.rest_direction,
+        )
 
-    def begin_step(self, start: Start) -> Augmented:
+    def begin_step(self, start: StepStart) -> AugmentedLagrangian:
         """Return the energy itself, because the tensions are fixed."""
         return self
 
 
-def joined(parts: Sequence[Lengths]) -> Lengths:
+def concatenate_constraints(parts: Sequence[LengthConstraints]) -> LengthConstraints:
     """Concatenate length constraints in their order; an empty set for no parts."""
-    none = Lengths(np.empty((0, 2), np.int64), np.empty(0), np.empty(0), np.empty((0, 3)))
-    fields = zip(*((x.edges, x.low, x.high, x.rest_direction) for x in (none, *parts)), strict=True)
-    return Lengths(*(np.concatenate(arrays) for arrays in fields))
+    none = LengthConstraints(np.empty((0, 2), np.int64), np.empty(0), np.empty(0), np.empty((0, 3)))
+    fields = zip(*((x.edges, x.min_length, x.max_length, x.rest_direction) for x in (none, *parts)), strict=True)
+    return LengthConstraints(*(np.concatenate(arrays) for arrays in fields))
 
 
-def off(lengths: Lengths, p: Positions) -> NDArray[np.float64]:
+def length_errors(constraints: LengthConstraints, p: Positions) -> NDArray[np.float64]:
     """Return the constraint violations at p (n, 3) [m], negative below the minimum length: (m,) [m]."""
-    found = np.linalg.norm(p[lengths.edges[:, 0]] - p[lengths.edges[:, 1]], axis=1)
-    return found - np.clip(found, lengths.low, lengths.high)
+    found = np.linalg.norm(p[constraints.edges[:, 0]] - p[constraints.edges[:, 1]], axis=1)
+    return found - np.clip(found, constraints.min_length, constraints.max_length)
 
 
-def penalties(system: System, lengths: Lengths) -> NDArray[np.float64]:
+def compute_penalty_stiffness(system: System, constraints: LengthConstraints) -> NDArray[np.float64]:
     """Return stiffnesses k (m,) [N/m] by which an edge resists as much as its two ends do, 1/(1/q_i + 1/q_j).
 
     Here q is the diagonal of Q. An edge between exact pins, which cannot move, gets the value 1.
     """
-    q = system.inertia.copy()
-    for share in shares(system, [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]):
+    q = system.inertia_diagonal.copy()
+    for share in stiffness_shares(
+        system, [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
+    ):
         q += share.diagonal()
     q[system.pins.vertices] += system.pins.weight
     with np.errstate(divide="ignore"):
-        gives = (1.0 / q)[lengths.edges].sum(axis=1)
+        gives = (1.0 / q)[constraints.edges].sum(axis=1)
     return np.divide(1.0, gives, out=np.ones(len(gives)), where=(gives > 0.0) & np.isfinite(gives))
 
 
-def augmented(system: System, lengths: Lengths, stiffness: NDArray[np.float64], tension: NDArray[np.float64]) -> System:
+def build_augmented_system(
+    system: System, constraints: LengthConstraints, stiffness: NDArray[np.float64], tensions: NDArray[np.float64]
+) -> System:
     """Return the system without length constraints whose objective is L.
 
     Without constraints the result has the objective of the system itself.
@@ -98,6 +112,10 @@ def augmented(system: System, lengths: Lengths, stiffness: NDArray[np.float64], 
         stiffness: stiffnesses k (m,) [N/m].
         tensions: tensions t (m,) [N].
     """
-    if not len(lengths.edges):
-        return replace(system, lengths=()) if system.lengths else system
-    return replace(system, energies=(*system.energies, Augmented.of(lengths, stiffness, tension)), lengths=())
+    if not len(constraints.edges):
+        return replace(system, length_constraints=()) if system.length_constraints else system
+    return replace(
+        system,
+        energies=(*system.energies, AugmentedLagrangian.from_constraints(constraints, stiffness, tensions)),
+        length_constraints=(),
+    )

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from solvers.energies.quadratic import Quadratic
 from solvers.problem import Positions
 
-Indices = NDArray[np.int64]
+IndexArray = NDArray[np.int64]
 
-_SQUARE = 1e-6
+_RECTANGLE_TOLERANCE = 1e-6
 """Diagonals whose lengths differ by no more than this fraction count as equal."""
 
 
@@ -35,7 +35,7 @@ class Bending(Quadratic):
     """The bending energy of a surface."""
 
     @classmethod
-    def of(cls, rest: Positions, triangles: Indices, stiffness: float) -> Bending:
+    def from_rest_shape(cls, rest: Positions, triangles: IndexArray, stiffness: float) -> Bending:
         """Return the bending energy of triangles with areas, of which at most two share an edge.
 
         Args:
@@ -43,13 +43,13 @@ class Bending(Quadratic):
             triangles: (f, 3).
             stiffness: flexural rigidity B [N m].
         """
-        parts = [_stencils(rest, flaps(cut)) for cut in _cuts(rest, triangles)]
+        parts = [_flap_stencils(rest, find_flaps(cut)) for cut in _triangulations(rest, triangles)]
         A = scipy.sparse.csr_array(scipy.sparse.vstack([K for K, _ in parts]))
         weight = np.concatenate([stiffness / len(parts) / area for _, area in parts])
         return cls(A, weight, np.zeros((len(weight), 3)))
 
 
-def flaps(triangles: Indices) -> Indices:
+def find_flaps(triangles: IndexArray) -> IndexArray:
     """Return the edges that two triangles share, with the opposite corners, (h, 4)."""
     edges = np.concatenate([triangles[:, [k, (k + 1) % 3, (k + 2) % 3]] for k in range(3)])
     edges[:, :2].sort(axis=1)
@@ -58,13 +58,13 @@ def flaps(triangles: Indices) -> Indices:
     return np.column_stack([edges[first], edges[first + 1, 2]])
 
 
-def _cuts(rest: Positions, triangles: Indices) -> Iterator[Indices]:
+def _triangulations(rest: Positions, triangles: IndexArray) -> Iterator[IndexArray]:
     """Yield the triangles, and the triangulation with the other diagonal of all rectangles if there are any."""
     yield triangles
-    a, b, c, d = flaps(triangles).T
+    a, b, c, d = find_flaps(triangles).T
     diagonal, other = (np.linalg.norm(rest[i] - rest[j], axis=1) for i, j in ((a, b), (c, d)))
     middle = np.linalg.norm(rest[a] + rest[b] - rest[c] - rest[d], axis=1)
-    rectangle = np.maximum(np.abs(diagonal - other), middle) <= _SQUARE * diagonal
+    rectangle = np.maximum(np.abs(diagonal - other), middle) <= _RECTANGLE_TOLERANCE * diagonal
     if rectangle.any():
         a, b, c, d = (x[rectangle] for x in (a, b, c, d))
         cut = np.sort(np.concatenate([np.stack(corners, axis=1) for corners in ((a, b, c), (a, b, d))]), axis=1)
@@ -74,20 +74,20 @@ def _cuts(rest: Positions, triangles: Indices) -> Iterator[Indices]:
         yield np.concatenate([kept, np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1)])
 
 
-def _stencils(rest: Positions, flap: Indices) -> tuple[scipy.sparse.csr_array, NDArray[np.float64]]:
+def _flap_stencils(rest: Positions, flap: IndexArray) -> tuple[scipy.sparse.csr_array, NDArray[np.float64]]:
     """Return K of each flap (h, 4) as rows (h, n), and the areas A0 + A1 (h,) [m^2]."""
     x0, x1, x2, x3 = (rest[corner] for corner in flap.T)
-    c01, c02 = _cotangent(x1 - x0, x2 - x0), _cotangent(x1 - x0, x3 - x0)
-    c03, c04 = _cotangent(x0 - x1, x2 - x1), _cotangent(x0 - x1, x3 - x1)
+    c01, c02 = _corner_cotangents(x1 - x0, x2 - x0), _corner_cotangents(x1 - x0, x3 - x0)
+    c03, c04 = _corner_cotangents(x0 - x1, x2 - x1), _corner_cotangents(x0 - x1, x3 - x1)
     K = np.stack([c03 + c04, c01 + c02, -c01 - c03, -c02 - c04], axis=1)
     entries = np.repeat(np.arange(len(flap)), 4), flap.ravel()
     rows = scipy.sparse.csr_array(scipy.sparse.coo_array((K.ravel(), entries), shape=(len(flap), len(rest))))
-    return rows, _area(x1 - x0, x2 - x0) + _area(x1 - x0, x3 - x0)
+    return rows, _triangle_areas(x1 - x0, x2 - x0) + _triangle_areas(x1 - x0, x3 - x0)
 
 
-def _area(u: Positions, v: Positions) -> NDArray[np.float64]:
+def _triangle_areas(u: Positions, v: Positions) -> NDArray[np.float64]:
     return 0.5 * np.linalg.norm(np.cross(u, v), axis=1)
 
 
-def _cotangent(u: Positions, v: Positions) -> NDArray[np.float64]:
-    return np.einsum("ij,ij->i", u, v) / (2.0 * _area(u, v))
+def _corner_cotangents(u: Positions, v: Positions) -> NDArray[np.float64]:
+    return np.einsum("ij,ij->i", u, v) / (2.0 * _triangle_areas(u, v))

@@ -20,41 +20,41 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from solvers.compiling import inner
-from solvers.energies.edges import Edges, directions, rest_directions
-from solvers.energies.elements import Elements, Law, line
-from solvers.problem import Positions, Start
+from solvers.compiling import jit_inner
+from solvers.energies.edges import EdgeEnergy, rest_directions, unit_directions
+from solvers.energies.elements import ElementLaw, Elements, axial_hessian
+from solvers.problem import Positions, StepStart
 
 
-@inner
-def _closing(numbers, e, z0, z1, z2):
+@jit_inner
+def _closing_length(numbers, e, z0, z1, z2):
     return numbers[e, 1] * z0 + numbers[e, 2] * z1 + numbers[e, 3] * z2 - numbers[e, 4]
 
 
-@inner
+@jit_inner
 def _value(numbers, e, z0, z1, z2):
-    return 0.5 * numbers[e, 0] * _closing(numbers, e, z0, z1, z2) ** 2
+    return 0.5 * numbers[e, 0] * _closing_length(numbers, e, z0, z1, z2) ** 2
 
 
-@inner
+@jit_inner
 def _gradient(numbers, e, z0, z1, z2):
-    force = numbers[e, 0] * _closing(numbers, e, z0, z1, z2)
+    force = numbers[e, 0] * _closing_length(numbers, e, z0, z1, z2)
     return force * numbers[e, 1], force * numbers[e, 2], force * numbers[e, 3]
 
 
-@inner
-def _curvature(numbers, e, z0, z1, z2):
-    return line(numbers[e, 0], 0.0, numbers[e, 1], numbers[e, 2], numbers[e, 3])
+@jit_inner
+def _hessian(numbers, e, z0, z1, z2):
+    return axial_hessian(numbers[e, 0], 0.0, numbers[e, 1], numbers[e, 2], numbers[e, 3])
 
 
-@inner
-def _rise(numbers, e, z0, z1, z2, s0, s1, s2):
+@jit_inner
+def _energy_change(numbers, e, z0, z1, z2, s0, s1, s2):
     closer = numbers[e, 1] * s0 + numbers[e, 2] * s1 + numbers[e, 3] * s2
-    return numbers[e, 0] * closer * (_closing(numbers, e, z0, z1, z2) + 0.5 * closer)
+    return numbers[e, 0] * closer * (_closing_length(numbers, e, z0, z1, z2) + 0.5 * closer)
 
 
 @dataclass(frozen=True, eq=False)
-class Dashpots(Edges):
+class Dashpots(EdgeEnergy):
     """Dashpots along edges.
 
     Attributes:
@@ -66,16 +66,18 @@ class Dashpots(Edges):
     direction: Positions
     offset: NDArray[np.float64]
 
-    lagged: ClassVar[bool] = True
-    law: ClassVar[Law] = Law.of(_value, _gradient, _curvature, _rise, constant=True)
+    is_lag_extrapolated: ClassVar[bool] = True
+    element_law: ClassVar[ElementLaw] = ElementLaw.from_functions(
+        _value, _gradient, _hessian, _energy_change, has_constant_hessian=True
+    )
 
     @cached_property
     def elements(self) -> Elements:
         """The edges with their damping, directions and offsets."""
-        return Elements.along(self.edges, self.stiffness, self.direction, self.offset)
+        return Elements.from_edges(self.edges, self.stiffness, self.direction, self.offset)
 
     @classmethod
-    def along(cls, rest: Positions, edges: NDArray[np.int64], damping: NDArray[np.float64]) -> Dashpots:
+    def from_rest_shape(cls, rest: Positions, edges: NDArray[np.int64], damping: NDArray[np.float64]) -> Dashpots:
         """Return dashpots along edges of a rest shape.
 
         Args:
@@ -86,40 +88,40 @@ class Dashpots(Edges):
         _, direction = rest_directions(rest, edges)
         return cls(edges, damping, direction, np.zeros(len(edges)))
 
-    def begin_step(self, start: Start) -> Dashpots:
+    def begin_step(self, start: StepStart) -> Dashpots:
         """Return the energy of a step."""
-        _, n = directions(self._along(start.expected), self.direction)
-        offset = _dot(n, self._along(start.origin))
-        return replace(self, stiffness=start.rate * self.stiffness, direction=n, offset=offset)
+        _, n = unit_directions(self._edge_vectors(start.lagged_positions), self.direction)
+        offset = _row_dots(n, self._edge_vectors(start.velocity_origin))
+        return replace(self, entry_stiffness=start.velocity_rate * self.stiffness, direction=n, offset=offset)
 
-    def _closing(self, p: Positions) -> NDArray[np.float64]:
+    def _closing_length(self, p: Positions) -> NDArray[np.float64]:
         """Return n'(A p - A velocity_origin), (m,) [m]."""
-        return _dot(self.direction, self._along(p)) - self.offset
+        return _row_dots(self.direction, self._edge_vectors(p)) - self.offset
 
     def value(self, p: Positions) -> float:
         """Return the energy [J] at p, shape (n, 3): half the energy dissipated in the time 1/velocity_rate."""
-        return 0.5 * float(self.stiffness @ self._closing(p) ** 2)
+        return 0.5 * float(self.stiffness @ self._closing_length(p) ** 2)
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient [N], shape (n, 3), to `out`."""
-        self._add(self._closing(p)[:, None] * self.direction, out)
+        self._scatter_forces(self._closing_length(p)[:, None] * self.direction, out)
 
     def add_projection(self, p: Positions, out: Positions) -> None:
         """Add A'K d(p) [N], shape (n, 3), to `out` (the local step)."""
-        self._add(self._along(p) - self._closing(p)[:, None] * self.direction, out)
+        self._scatter_forces(self._edge_vectors(p) - self._closing_length(p)[:, None] * self.direction, out)
 
     def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
         """Add k (|p_i| + |p_j| + |offset|) [N] to `out` (n,) at both ends (`rounding_bound`)."""
-        self._add_absolute(self._reach(p) + np.abs(self.offset), out)
+        self._scatter_absolute_terms(self._endpoint_norms(p) + np.abs(self.offset), out)
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
         """Return the Hessian [N/m], shape (3n, 3n), with k nn' per edge."""
-        return self._blocks(np.zeros(len(self.edges)), self.direction, len(p))
+        return self._block_hessian(np.zeros(len(self.edges)), self.direction, len(p))
 
 
 class RayleighDashpots(Dashpots):
     """The stiffness-proportional part of Rayleigh damping of springs."""
 
 
-def _dot(a: Positions, b: Positions) -> NDArray[np.float64]:
+def _row_dots(a: Positions, b: Positions) -> NDArray[np.float64]:
     return np.einsum("ij,ij->i", a, b)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kernel
+from solvers.compiling import jit_inner, jit_kernel
 
 
 class Elements(NamedTuple):
@@ -24,15 +24,15 @@ class Elements(NamedTuple):
 
     vertices: NDArray[np.int64]
     coefficients: NDArray[np.float64]
-    numbers: NDArray[np.float64]
+    parameters: NDArray[np.float64]
 
     @classmethod
-    def along(cls, edges: NDArray[np.int64], *numbers: NDArray[np.float64]) -> Elements:
+    def from_edges(cls, edges: NDArray[np.int64], *parameters: NDArray[np.float64]) -> Elements:
         """Return elements of edges (m, 2), z from second to first end, with columns of parameters, (m,) or (m, c)."""
-        return cls(edges, np.tile([1.0, -1.0], (len(edges), 1)), np.column_stack(numbers))
+        return cls(edges, np.tile([1.0, -1.0], (len(edges), 1)), np.column_stack(parameters))
 
 
-class One(NamedTuple):
+class ElementFunctions(NamedTuple):
     """The functions of one element, compiled as inner functions.
 
     Their arguments are the parameters (m, q), the element e and z0, z1, z2; that of the change also has s0, s1, s2.
@@ -41,11 +41,11 @@ class One(NamedTuple):
 
     value: Any
     gradient: Any
-    curvature: Any
-    rise: Any
+    hessian: Any
+    energy_change: Any
 
 
-class Law(NamedTuple):
+class ElementLaw(NamedTuple):
     """The law of one element as passes over all elements.
 
     Attributes:
@@ -60,35 +60,37 @@ class Law(NamedTuple):
 
     value: Callable[..., float]
     add_gradient: Callable[..., None]
-    rise: Callable[..., float]
-    curve: Callable[..., None]
-    constant: bool
-    one: One
+    energy_change: Callable[..., float]
+    evaluate_hessians: Callable[..., None]
+    has_constant_hessian: bool
+    element_functions: ElementFunctions
 
     @classmethod
-    def of(cls, value: Any, gradient: Any, curvature: Any, rise: Any, *, constant: bool = False) -> Law:
+    def from_functions(
+        cls, value: Any, gradient: Any, hessian: Any, energy_change: Any, *, has_constant_hessian: bool = False
+    ) -> ElementLaw:
         """Build the passes from the functions of a single element (see `ElementFunctions`)."""
 
-        @kernel
+        @jit_kernel
         def values(elements, p):
             total = 0.0
             for e in range(len(elements.vertices)):
-                z0, z1, z2 = seen(elements, e, p)
-                total += value(elements.numbers, e, z0, z1, z2)
+                z0, z1, z2 = gather_coordinates(elements, e, p)
+                total += value(elements.parameters, e, z0, z1, z2)
             return total
 
-        @kernel
+        @jit_kernel
         def add_gradient(elements, p, out):
             for e in range(len(elements.vertices)):
-                z0, z1, z2 = seen(elements, e, p)
-                g0, g1, g2 = gradient(elements.numbers, e, z0, z1, z2)
+                z0, z1, z2 = gather_coordinates(elements, e, p)
+                g0, g1, g2 = gradient(elements.parameters, e, z0, z1, z2)
                 for a in range(elements.vertices.shape[1]):
                     i, c = elements.vertices[e, a], elements.coefficients[e, a]
                     out[i, 0] += c * g0
                     out[i, 1] += c * g1
                     out[i, 2] += c * g2
 
-        @kernel
+        @jit_kernel
         def rises(elements, p, q):
             total = 0.0
             for e in range(len(elements.vertices)):
@@ -99,21 +101,28 @@ class Law(NamedTuple):
                     s0 += c * (q[i, 0] - p[i, 0])
                     s1 += c * (q[i, 1] - p[i, 1])
                     s2 += c * (q[i, 2] - p[i, 2])
-                total += rise(elements.numbers, e, z0, z1, z2, s0, s1, s2)
+                total += energy_change(elements.parameters, e, z0, z1, z2, s0, s1, s2)
             return total
 
-        @kernel
+        @jit_kernel
         def curve(elements, p, out):
             for e in range(len(elements.vertices)):
-                z0, z1, z2 = seen(elements, e, p)
-                xx, xy, xz, yy, yz, zz = curvature(elements.numbers, e, z0, z1, z2)
+                z0, z1, z2 = gather_coordinates(elements, e, p)
+                xx, xy, xz, yy, yz, zz = hessian(elements.parameters, e, z0, z1, z2)
                 out[e, 0], out[e, 1], out[e, 2], out[e, 3], out[e, 4], out[e, 5] = xx, xy, xz, yy, yz, zz
 
-        return cls(values, add_gradient, rises, curve, constant, One(value, gradient, curvature, rise))
+        return cls(
+            values,
+            add_gradient,
+            rises,
+            curve,
+            has_constant_hessian,
+            ElementFunctions(value, gradient, hessian, energy_change),
+        )
 
 
-@inner
-def seen(elements, e, p):
+@jit_inner
+def gather_coordinates(elements, e, p):
     """Return z of element e at p (n, 3)."""
     z0 = z1 = z2 = 0.0
     for a in range(elements.vertices.shape[1]):
@@ -122,8 +131,8 @@ def seen(elements, e, p):
     return z0, z1, z2
 
 
-@inner
-def line(along, across, n0, n1, n2):
+@jit_inner
+def axial_hessian(along, across, n0, n1, n2):
     """Return the Hessian with stiffness `along` the unit vector n and stiffness `across` perpendicular to it."""
     more = along - across
     return (
@@ -132,7 +141,7 @@ def line(along, across, n0, n1, n2):
     )  # fmt: skip
 
 
-class Joined(NamedTuple):
+class JoinedElements(NamedTuple):
     """The rows of A of many energies.
 
     Attributes:
@@ -140,12 +149,12 @@ class Joined(NamedTuple):
         vertices, coefficients: of the entries.
     """
 
-    first: NDArray[np.int64]
+    row_starts: NDArray[np.int64]
     vertices: NDArray[np.int64]
     coefficients: NDArray[np.float64]
 
     @classmethod
-    def of(cls, parts: list[Elements]) -> Joined:
+    def from_elements(cls, parts: list[Elements]) -> JoinedElements:
         """Concatenate the rows of several energies."""
         widths = [np.full(len(x.vertices), x.vertices.shape[1]) for x in parts]
         return cls(
@@ -155,8 +164,8 @@ class Joined(NamedTuple):
         )
 
 
-@kernel
-def add_blocks(elements, places, curvature, values):
+@jit_kernel
+def add_blocks(elements, block_indices, hessians, values):
     """Add the second derivatives (m, 6) of elements to matrix blocks (b, 3, 3).
 
     Args:
@@ -166,14 +175,14 @@ def add_blocks(elements, places, curvature, values):
         values: blocks (b, 3, 3) [N/m].
     """
     width = elements.vertices.shape[1]
-    for e in range(len(curvature)):
-        xx, xy, xz = curvature[e, 0], curvature[e, 1], curvature[e, 2]
-        yy, yz, zz = curvature[e, 3], curvature[e, 4], curvature[e, 5]
+    for e in range(len(hessians)):
+        xx, xy, xz = hessians[e, 0], hessians[e, 1], hessians[e, 2]
+        yy, yz, zz = hessians[e, 3], hessians[e, 4], hessians[e, 5]
         if xx == 0.0 and yy == 0.0 and zz == 0.0:
             continue  # a limit that is not reached, an obstacle that is not touched
         for a in range(width):
             for b in range(width):
-                block, c = places[e, a * width + b], elements.coefficients[e, a] * elements.coefficients[e, b]
+                block, c = block_indices[e, a * width + b], elements.coefficients[e, a] * elements.coefficients[e, b]
                 if block < 0:
                     continue
                 values[block, 0, 0] += c * xx
@@ -187,27 +196,27 @@ def add_blocks(elements, places, curvature, values):
                 values[block, 2, 2] += c * zz
 
 
-@inner
-def add_products(joined, curvature, x, out):
+@jit_inner
+def add_products(joined, hessians, x, out):
     """Add the product [N] of all second derivatives with x [m], (n, 3), to `out`.
 
     Does nothing without elements.
     """
     if joined is None:
         return
-    for e in range(len(curvature)):
-        xx, xy, xz = curvature[e, 0], curvature[e, 1], curvature[e, 2]
-        yy, yz, zz = curvature[e, 3], curvature[e, 4], curvature[e, 5]
+    for e in range(len(hessians)):
+        xx, xy, xz = hessians[e, 0], hessians[e, 1], hessians[e, 2]
+        yy, yz, zz = hessians[e, 3], hessians[e, 4], hessians[e, 5]
         if xx == 0.0 and yy == 0.0 and zz == 0.0:
             continue
         z0 = z1 = z2 = 0.0
-        for a in range(joined.first[e], joined.first[e + 1]):
+        for a in range(joined.row_starts[e], joined.row_starts[e + 1]):
             i, c = joined.vertices[a], joined.coefficients[a]
             z0, z1, z2 = z0 + c * x[i, 0], z1 + c * x[i, 1], z2 + c * x[i, 2]
         f0 = xx * z0 + xy * z1 + xz * z2
         f1 = xy * z0 + yy * z1 + yz * z2
         f2 = xz * z0 + yz * z1 + zz * z2
-        for a in range(joined.first[e], joined.first[e + 1]):
+        for a in range(joined.row_starts[e], joined.row_starts[e + 1]):
             i, c = joined.vertices[a], joined.coefficients[a]
             out[i, 0] += c * f0
             out[i, 1] += c * f1

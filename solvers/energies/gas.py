@@ -15,10 +15,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from solvers.matrices import without_zeros
+from solvers.matrices import drop_zeros
 from solvers.problem import Positions
 
-_INSIDE_OUT = 1e-3
+_INVERTED_VOLUME_FRACTION = 1e-3
 """Fraction of the rest volume that replaces a non-positive volume in the gradient."""
 
 _LEVI_CIVITA = np.array([np.cross(np.eye(3), e) for e in np.eye(3)])
@@ -36,15 +36,15 @@ class Gas:
     """
 
     triangles: NDArray[np.int64]
-    pressure: float
-    volume: float
+    rest_pressure: float
+    rest_volume: float
 
     def volume_at(self, p: Positions) -> float:
         """Return V [m^3] at p, shape (n, 3); negative if the surface is inverted."""
-        a, b, c = self._corners(p)
+        a, b, c = self._corner_positions(p)
         return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6.0
 
-    def _corners(self, p: Positions) -> list[Positions]:
+    def _corner_positions(self, p: Positions) -> list[Positions]:
         x = p - p.mean(axis=0)  # a closed surface may be moved; far from zero its volume would cancel
         return [x[corner] for corner in self.triangles.T]
 
@@ -54,17 +54,21 @@ class Gas:
         It is infinite if the volume is not positive.
         """
         volume = self.volume_at(p)
-        return -self.pressure * self.volume * float(np.log(volume / self.volume)) if volume > 0.0 else np.inf
+        return (
+            -self.rest_pressure * self.rest_volume * float(np.log(volume / self.rest_volume))
+            if volume > 0.0
+            else np.inf
+        )
 
     def _pressure_at(self, p: Positions) -> tuple[float, float]:
         """Return the pressure [Pa] and the volume [m^3] at which it is evaluated."""
         volume = self.volume_at(p)
-        volume = volume if volume > 0.0 else _INSIDE_OUT * self.volume
-        return self.pressure * self.volume / volume, volume
+        volume = volume if volume > 0.0 else _INVERTED_VOLUME_FRACTION * self.rest_volume
+        return self.rest_pressure * self.rest_volume / volume, volume
 
     def _volume_gradient(self, p: Positions) -> Positions:
         """Return grad V, (n, 3) [m^2]."""
-        a, b, c = self._corners(p)
+        a, b, c = self._corner_positions(p)
         out = np.zeros_like(p)
         for corner, area in zip(self.triangles.T, (np.cross(b, c), np.cross(c, a), np.cross(a, b)), strict=True):
             np.add.at(out, corner, area / 6.0)
@@ -95,21 +99,21 @@ class Gas:
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
         """Return the Hessian [N/m], shape (3n, 3n), which has no zero entries; see `sparse_hessian`."""
-        column = self.columns(p).ravel()
-        return without_zeros(scipy.sparse.csr_array(self.sparse_hessian(p) + np.outer(column, column)))
+        column = self.low_rank_columns(p).ravel()
+        return drop_zeros(scipy.sparse.csr_array(self.sparse_hessian(p) + np.outer(column, column)))
 
     def sparse_hessian(self, p: Positions) -> scipy.sparse.csr_array:
         """Return -p Hess V [N/m], shape (3n, 3n), sparse and indefinite."""
-        return without_zeros(scipy.sparse.csr_array(-self._pressure_at(p)[0] * self._volume_hessian(p)))
+        return drop_zeros(scipy.sparse.csr_array(-self._pressure_at(p)[0] * self._volume_hessian(p)))
 
-    def columns(self, p: Positions) -> NDArray[np.float64]:
+    def low_rank_columns(self, p: Positions) -> NDArray[np.float64]:
         """Return V = (p/V)^(1/2) grad V [(N/m)^(1/2)], shape (n, 3, 1); V V' is the rest of the Hessian."""
         pressure, volume = self._pressure_at(p)
         return (np.sqrt(pressure / volume) * self._volume_gradient(p))[:, :, None]
 
     def _volume_hessian(self, p: Positions) -> scipy.sparse.csr_array:
         n = len(p)
-        cross = [np.einsum("fk,kij->fij", x, _LEVI_CIVITA) / 6.0 for x in self._corners(p)]
+        cross = [np.einsum("fk,kij->fij", x, _LEVI_CIVITA) / 6.0 for x in self._corner_positions(p)]
         rows, columns, blocks = [], [], []
         for k in range(3):  # d/d(next) and d/d(previous) of next x previous, the gradient at corner k
             i, j, l = (self.triangles[:, (k + step) % 3] for step in range(3))

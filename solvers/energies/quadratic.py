@@ -14,8 +14,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from solvers.matrices import diagonal, without_zeros
-from solvers.problem import Energy, Positions, Start
+from solvers.matrices import diagonal_matrix, drop_zeros
+from solvers.problem import Energy, Positions, StepStart
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Quadratic:
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient [N], shape (n, 3), to `out`."""
-        out += self._pulled(self.A @ p - self.d)
+        out += self._weighted_transpose(self.A @ p - self.d)
 
     def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
         """Add |A|'W (|A| |p| + |d|) [N] to `out` (n,) (`rounding_bound`)."""
@@ -48,32 +48,32 @@ class Quadratic:
 
     def add_projection(self, p: Positions, out: Positions) -> None:
         """Add A'W d [N], shape (n, 3), which does not depend on p, to `out`."""
-        out += self._pulled(self.d)
+        out += self._weighted_transpose(self.d)
 
-    def _pulled(self, x: Positions) -> Positions:
+    def _weighted_transpose(self, x: Positions) -> Positions:
         """Return A'W x, (n, 3), of x (m, 3)."""
         return self.A.T @ (self.weight[:, None] * x)
 
     def stiffness_matrix(self, n: int) -> scipy.sparse.csr_array:
         """Return A'WA [N/m], shape (n, n)."""
-        return without_zeros(self.A.T @ diagonal(self.weight) @ self.A)
+        return drop_zeros(self.A.T @ diagonal_matrix(self.weight) @ self.A)
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
         """Return the Hessian [N/m], shape (3n, 3n), which does not depend on p."""
-        return without_zeros(
+        return drop_zeros(
             scipy.sparse.csr_array(scipy.sparse.kron(self.stiffness_matrix(len(p)), np.eye(3), format="csr"))
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Viscous(Quadratic):
+class ViscousDamping(Quadratic):
     """Linear damping of A v.
 
     The weight is c (m,) [N s/m] initially, i.e. c velocity_rate [N/m] at a rate of 1/s, and c velocity_rate in a step.
     """
 
     @classmethod
-    def of(cls, A: scipy.sparse.csr_array, damping: NDArray[np.float64]) -> Viscous:
+    def from_operator(cls, A: scipy.sparse.csr_array, damping: NDArray[np.float64]) -> ViscousDamping:
         """Return damping of A v, A: (m, n), with coefficients c (m,) [N s/m].
 
         Undamped rows are omitted.
@@ -82,29 +82,29 @@ class Viscous(Quadratic):
         return cls(scipy.sparse.csr_array(A[damped]), damping[damped], np.zeros((len(damped), 3)))
 
     @classmethod
-    def of_vertices(cls, damping: NDArray[np.float64]) -> Viscous:
+    def from_vertices(cls, damping: NDArray[np.float64]) -> ViscousDamping:
         """Return damping of each vertex's velocity, c (n,) [N s/m]."""
-        return cls.of(diagonal(np.ones(len(damping))), damping)
+        return cls.from_operator(diagonal_matrix(np.ones(len(damping))), damping)
 
-    def begin_step(self, start: Start) -> Viscous:
+    def begin_step(self, start: StepStart) -> ViscousDamping:
         """Return the energy of a step."""
-        return replace(self, weight=start.rate * self.weight, d=self.A @ start.origin)
+        return replace(self, weight=start.velocity_rate * self.weight, d=self.A @ start.velocity_origin)
 
 
 def drag_of_vertices(energy: Energy) -> NDArray[np.float64] | None:
     """Return the coefficients c (n,) [N s/m] of an energy that damps single vertices; None for other energies."""
-    if isinstance(energy, Viscous) and (np.diff(energy.A.indptr) == 1).all():
+    if isinstance(energy, ViscousDamping) and (np.diff(energy.A.indptr) == 1).all():
         return energy.A.power(2).T @ energy.weight
     return None
 
 
-class AirDrag(Viscous):
+class AirDrag(ViscousDamping):
     """Drag of each vertex, proportional to its velocity."""
 
 
-class EtherDrag(Viscous):
+class EtherDrag(ViscousDamping):
     """Drag of each vertex, proportional to its mass and its velocity."""
 
 
-class RayleighDamping(Viscous):
+class RayleighDamping(ViscousDamping):
     """The part of Rayleigh damping proportional to the masses, or to the matrix of a quadratic energy."""

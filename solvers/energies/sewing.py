@@ -16,22 +16,22 @@ from numpy.typing import NDArray
 
 from solvers.energies.edges import rest_directions
 from solvers.energies.strain_limits import StrainLimits
-from solvers.problem import Positions, Start
+from solvers.problem import Positions, StepStart
 
 
 @dataclass(frozen=True, eq=False)
 class Sewing(StrainLimits):
     """Threads; max_length_at: their maximum lengths (m,) [m] as a function of time [s]."""
 
-    longest: Callable[[float], NDArray[np.float64]]
+    max_length_at: Callable[[float], NDArray[np.float64]]
 
     @classmethod
-    def of(
+    def from_rest_shape(
         cls,
         rest: Positions,
         pairs: NDArray[np.int64],
         stiffness: NDArray[np.float64],
-        longest: Callable[[float], NDArray[np.float64]],
+        max_length_at: Callable[[float], NDArray[np.float64]],
     ) -> Sewing:
         """Return threads between pairs of vertices, at time zero.
 
@@ -41,8 +41,10 @@ class Sewing(StrainLimits):
             stiffness: k (m,) [N/m].
             max_length_at: maximum lengths (m,) [m] as a function of time [s].
         """
-        return cls(pairs, stiffness, np.zeros(len(pairs)), longest(0.0), rest_directions(rest, pairs)[1], longest)
+        return cls(
+            pairs, stiffness, np.zeros(len(pairs)), max_length_at(0.0), rest_directions(rest, pairs)[1], max_length_at
+        )
 
-    def begin_step(self, start: Start) -> Sewing:
+    def begin_step(self, start: StepStart) -> Sewing:
         """Return the energy of a step, with the maximum lengths at the time of the stage."""
-        return replace(self, high=self.longest(start.until))
+        return replace(self, max_length=self.max_length_at(start.stage_time))

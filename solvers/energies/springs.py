@@ -15,13 +15,13 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from solvers.energies.edges import TINY, Edges, directions, rest_directions
+from solvers.energies.edges import ZERO_LENGTH, EdgeEnergy, rest_directions, unit_directions
 from solvers.problem import Positions
 from solvers.round_off import EPS
 
 
 @dataclass(frozen=True, eq=False)
-class Springs(Edges):
+class Springs(EdgeEnergy):
     """Springs between pairs of vertices.
 
     Attributes:
@@ -35,7 +35,7 @@ class Springs(Edges):
     rest_direction: NDArray[np.float64]
 
     @classmethod
-    def at_rest(cls, rest: Positions, edges: NDArray[np.int64], stiffness: NDArray[np.float64]) -> Springs:
+    def from_rest_shape(cls, rest: Positions, edges: NDArray[np.int64], stiffness: NDArray[np.float64]) -> Springs:
         """Return springs whose rest shape is `rest`.
 
         Rest lengths that differ only by the round-off of positions are made equal.
@@ -47,10 +47,10 @@ class Springs(Edges):
         """
         length, direction = rest_directions(rest, edges)
         round_off = 4.0 * np.finfo(float).eps * float(np.abs(rest).max(initial=0.0))
-        return cls(edges, stiffness, _levelled(length, round_off), direction)
+        return cls(edges, stiffness, _merge_lengths(length, round_off), direction)
 
     @classmethod
-    def joined(cls, parts: Sequence[Springs]) -> Springs:
+    def from_parts(cls, parts: Sequence[Springs]) -> Springs:
         """Concatenate the springs of all parts in their order; an empty set for no parts."""
         if len(parts) == 1:
             return parts[0]
@@ -60,34 +60,34 @@ class Springs(Edges):
 
     def value(self, p: Positions) -> float:
         """Return the elastic energy [J] at p, shape (n, 3)."""
-        return 0.5 * float(self.stiffness @ (self.lengths(p) - self.rest_length) ** 2)
+        return 0.5 * float(self.stiffness @ (self.edge_lengths(p) - self.rest_length) ** 2)
 
-    def hessian_at_rest(self, lateral: float, n: int) -> scipy.sparse.csr_array:
+    def rest_hessian(self, lateral_ratio: float, n: int) -> scipy.sparse.csr_array:
         """Return the Hessian [N/m], (3n, 3n), of the rest shape with a transverse stiffness of `lateral_ratio` k."""
-        across = np.where(self.rest_length == 0.0, 1.0, lateral)
-        return self._blocks(across, self.rest_direction, n)
+        across = np.where(self.rest_length == 0.0, 1.0, lateral_ratio)
+        return self._block_hessian(across, self.rest_direction, n)
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient A'K (A p - d) [N], shape (n, 3), to `out`."""
-        v = self._along(p)
-        _, unit = directions(v, self.rest_direction)
-        self._add(v - self.rest_length[:, None] * unit, out)
+        v = self._edge_vectors(p)
+        _, unit = unit_directions(v, self.rest_direction)
+        self._scatter_forces(v - self.rest_length[:, None] * unit, out)
 
     def add_projection(self, p: Positions, out: Positions) -> None:
         """Add A'K d(p) [N], shape (n, 3), to `out` (the local step)."""
-        _, unit = directions(self._along(p), self.rest_direction)
-        self._add(self.rest_length[:, None] * unit, out)
+        _, unit = unit_directions(self._edge_vectors(p), self.rest_direction)
+        self._scatter_forces(self.rest_length[:, None] * unit, out)
 
     def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
         """Add k (max(1, r/l - 1) (|p_i| + |p_j|) + l + r) [N] to `out` (n,) at both ends (`rounding_bound`).
 
         The error of a unit direction is at most of order 1, so that a spring of nearly zero length adds 2 k r / eps.
         """
-        length, r = self.lengths(p), self.rest_length
-        lateral = np.divide(r, length, out=np.full_like(length, np.inf), where=length > TINY) - 1.0
-        reach = self._reach(p)
+        length, r = self.edge_lengths(p), self.rest_length
+        lateral = np.divide(r, length, out=np.full_like(length, np.inf), where=length > ZERO_LENGTH) - 1.0
+        reach = self._endpoint_norms(p)
         turned = np.minimum(np.maximum(1.0, np.where(r > 0.0, lateral, 1.0)) * reach, reach + 2.0 * r / EPS)
-        self._add_absolute(turned + length + r, out)
+        self._scatter_absolute_terms(turned + length + r, out)
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
         """Return the Hessian [N/m], shape (3n, 3n).
@@ -95,12 +95,12 @@ class Springs(Edges):
         It is k (nn' + (1 - r/l)(I - nn')) per spring, n its direction, l its length. A spring of zero length and
         positive rest length has no defined transverse stiffness; it is set to zero.
         """
-        length, unit = directions(self._along(p), self.rest_direction)
-        ratio = np.divide(self.rest_length, length, out=np.ones_like(length), where=length > TINY)
-        return self._blocks(np.where(self.rest_length == 0.0, 1.0, 1.0 - ratio), unit, len(p))
+        length, unit = unit_directions(self._edge_vectors(p), self.rest_direction)
+        ratio = np.divide(self.rest_length, length, out=np.ones_like(length), where=length > ZERO_LENGTH)
+        return self._block_hessian(np.where(self.rest_length == 0.0, 1.0, 1.0 - ratio), unit, len(p))
 
 
-def _levelled(lengths: NDArray[np.float64], round_off: float) -> NDArray[np.float64]:
+def _merge_lengths(lengths: NDArray[np.float64], round_off: float) -> NDArray[np.float64]:
     """Return the lengths (m,) [m], each replaced by the smallest of its group with gaps up to `round_off` [m]."""
     order = np.argsort(lengths, kind="stable")
     ascending = lengths[order]

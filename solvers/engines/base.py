@@ -20,43 +20,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.core import vertex_terms
-from solvers.core.driver import Iterating, Iterative, Substeps
+from solvers.core.driver import IterativeSolver, SolverState, SubsteppingState
 from solvers.energies.dashpots import Dashpots
 from solvers.energies.quadratic import drag_of_vertices
 from solvers.energies.springs import Springs
-from solvers.problem import Positions, ResidualOf, StepProblem, System, Unsupported
+from solvers.problem import Positions, ResidualIterate, StepProblem, System, Unsupported
 
-_SAME = 1e-12
+_ACCELERATION_RTOL = 1e-12
 """Tolerance relative to the largest acceleration: the round-off of weights divided by masses."""
 
 
-class Package(NamedTuple):
+class EnginePackage(NamedTuple):
     """The package of an engine: imported module, distribution, and our extra that installs it."""
 
-    module: str
-    distribution: str
-    extra: str
+    module_name: str
+    distribution_name: str
+    extra_name: str
 
-    def load(self, engine: str) -> Any:
+    def import_library(self, engine: str) -> Any:
         """Import the module; raise Unsupported with the installation command on failure."""
         try:
-            return import_module(self.module)
+            return import_module(self.module_name)
         except ImportError as error:
             raise Unsupported(
-                f"{engine}: {self.distribution} cannot be imported ({error}); `.venv/bin/pip install -e "
-                f"'.[{self.extra}]'` in the checkout installs it"
+                f"{engine}: {self.distribution_name} cannot be imported ({error}); `.venv/bin/pip install -e "
+                f"'.[{self.extra_name}]'` in the checkout installs it"
             ) from error
 
     @property
-    def told(self) -> str:
+    def name_and_version(self) -> str:
         """Return the name and version."""
         try:
-            return f"{self.distribution} {version(self.distribution)}"
+            return f"{self.distribution_name} {version(self.distribution_name)}"
         except PackageNotFoundError:
-            return self.distribution
+            return self.distribution_name
 
 
-class Lines(NamedTuple):
+class SpringDashpots(NamedTuple):
     """Forces along edges.
 
     Attributes:
@@ -73,7 +73,7 @@ class Lines(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Network:
+class EngineNetwork:
     """A system in the form that engines support.
 
     Attributes:
@@ -86,14 +86,14 @@ class Network:
     """
 
     mass: NDArray[np.float64]
-    free: NDArray[np.int64]
-    pinned: NDArray[np.int64]
-    lines: Lines
-    drag: NDArray[np.float64]
+    free_vertices: NDArray[np.int64]
+    pinned_vertices: NDArray[np.int64]
+    spring_dashpots: SpringDashpots
+    vertex_drag: NDArray[np.float64]
     time_step: float
 
     @classmethod
-    def of(cls, system: System, engine: str, *, damps: bool) -> Network:
+    def from_system(cls, system: System, engine: str, *, supports_damping: bool) -> EngineNetwork:
         """Build the network of a system.
 
         Args:
@@ -106,50 +106,68 @@ class Network:
                 without mass.
         """
         vertex_terms.require_implicit_euler(system, engine)
-        vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), engine)
-        lines, drag, others = list[Lines](), np.zeros(system.vertices), set[str]()
+        vertex_terms.require_mass(system, np.where(system.unpinned_mask, system.mass, np.inf), engine)
+        lines, drag, others = list[SpringDashpots](), np.zeros(system.num_vertices), set[str]()
         for energy in system.energies:
             if isinstance(energy, Springs):
                 k = energy.stiffness
-                lines.append(Lines(energy.edges, k, energy.rest_length, 0.0 * k))
-            elif damps and isinstance(energy, Dashpots):
+                lines.append(SpringDashpots(energy.edges, k, energy.rest_length, 0.0 * k))
+            elif supports_damping and isinstance(energy, Dashpots):
                 c = energy.stiffness
-                lines.append(Lines(energy.edges, 0.0 * c, 0.0 * c, c))
-            elif damps and (of_vertices := drag_of_vertices(energy)) is not None:
+                lines.append(SpringDashpots(energy.edges, 0.0 * c, 0.0 * c, c))
+            elif supports_damping and (of_vertices := drag_of_vertices(energy)) is not None:
                 drag += of_vertices
             else:
                 others.add(type(energy).__name__)
         if others:
-            known = "springs, dashpots and drag on vertices" if damps else "springs"
+            known = "springs, dashpots and drag on vertices" if supports_damping else "springs"
             raise Unsupported(f"{engine}: expresses {known}; the scene has {', '.join(sorted(others))} as well")
-        free = np.flatnonzero(system.unpinned)
-        return cls(system.mass, free, system.pins.vertices, _joined(lines, system.unpinned), drag, system.time_step)
+        free = np.flatnonzero(system.unpinned_mask)
+        return cls(
+            system.mass,
+            free,
+            system.pins.vertices,
+            _concatenate_edges(lines, system.unpinned_mask),
+            drag,
+            system.time_step,
+        )
 
-    def acceleration(self, force: Positions) -> NDArray[np.float64] | None:
+    def uniform_acceleration(self, force: Positions) -> NDArray[np.float64] | None:
         """Return the common acceleration (3,) [m/s^2] of all free vertices under a force (n, 3) [N].
 
         Gravity is such a force. Return None if the accelerations differ.
         """
-        found = force[self.free] / self.mass[self.free, None]
+        found = force[self.free_vertices] / self.mass[self.free_vertices, None]
         one = np.median(found, axis=0) if len(found) else np.zeros(3)
-        return one if np.allclose(found, one, rtol=0.0, atol=_SAME * max(1.0, float(np.abs(one).max()))) else None
+        return (
+            one
+            if np.allclose(found, one, rtol=0.0, atol=_ACCELERATION_RTOL * max(1.0, float(np.abs(one).max())))
+            else None
+        )
 
-    def arrays(self, problem: StepProblem) -> dict[str, NDArray[Any]]:
+    def export_arrays(self, problem: StepProblem) -> dict[str, NDArray[Any]]:
         """Return all arrays with a step's start and load, by the names that scripts read."""
-        start, lines = problem.start, self.lines._asdict()
-        begun = {"positions": start.positions, "velocities": start.velocity, "force": problem.force}
-        return {"mass": self.mass, "free": self.free, "pinned": self.pinned, "drag": self.drag, **lines, **begun}
+        start, lines = problem.step_start, self.spring_dashpots._asdict()
+        begun = {"positions": start.positions, "velocities": start.velocity, "force": problem.external_force}
+        return {
+            "mass": self.mass,
+            "free": self.free_vertices,
+            "pinned": self.pinned_vertices,
+            "drag": self.vertex_drag,
+            **lines,
+            **begun,
+        }
 
 
-def _joined(parts: list[Lines], unpinned: NDArray[np.bool_]) -> Lines:
+def _concatenate_edges(parts: list[SpringDashpots], unpinned: NDArray[np.bool_]) -> SpringDashpots:
     """Concatenate edges with two distinct ends, at least one of them free."""
-    none = Lines(np.empty((0, 2), np.int64), np.empty(0), np.empty(0), np.empty(0))
+    none = SpringDashpots(np.empty((0, 2), np.int64), np.empty(0), np.empty(0), np.empty(0))
     ends, *rest = (np.concatenate(arrays) for arrays in zip(none, *parts, strict=True))
     acts = (ends[:, 0] != ends[:, 1]) & unpinned[ends].any(axis=1) & ((rest[0] > 0.0) | (rest[2] > 0.0))
-    return Lines(ends[acts], *(array[acts] for array in rest))
+    return SpringDashpots(ends[acts], *(array[acts] for array in rest))
 
 
-class Stepping(Protocol):
+class EngineStepper(Protocol):
     """Interface of an engine with a loaded network."""
 
     def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
@@ -158,14 +176,14 @@ class Stepping(Protocol):
 
 
 @dataclass(frozen=True)
-class Engine(ABC):
+class ExternalEngine(ABC):
     """Base class of the engines; each is a frozen dataclass of parameters."""
 
-    minimises: ClassVar[bool] = False
-    descends: ClassVar[bool] = False
-    name: ClassVar[str]
-    package: ClassVar[Package]
-    damps: ClassVar[bool] = False
+    is_minimiser: ClassVar[bool] = False
+    is_monotone: ClassVar[bool] = False
+    solver_name: ClassVar[str]
+    engine_package: ClassVar[EnginePackage]
+    supports_damping: ClassVar[bool] = False
 
     def prepare(self, system: System) -> PreparedEngine:
         """Prepare the engine for a system.
@@ -173,18 +191,20 @@ class Engine(ABC):
         Raises:
             Unsupported: for features that the engine does not support, and if it is not installed.
         """
-        network = Network.of(system, self.name, damps=self.damps)
-        stepping, told = self.built(network, self.package.load(self.name))
-        soft = int((~system.pins.exact).sum())
+        network = EngineNetwork.from_system(system, self.solver_name, supports_damping=self.supports_damping)
+        stepping, told = self.build_stepper(network, self.engine_package.import_library(self.solver_name))
+        soft = int((~system.pins.exact_mask).sum())
         taken = f"; {soft} pins by penalty taken as exact" if soft else ""
-        return PreparedEngine(system, stepping, f"{self.package.told}, {told}{taken}")
+        return PreparedEngine(system, stepping, f"{self.engine_package.name_and_version}, {told}{taken}")
 
     @abstractmethod
-    def built(self, network: Network, library: Any) -> tuple[Stepping, str]:
+    def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[EngineStepper, str]:
         """Build the network in the engine; return its stepper and a description, or raise Unsupported."""
 
     @abstractmethod
-    def script(self, name: str, network: Network, problem: StepProblem, substeps: int, frames: int) -> dict[str, str]:
+    def write_script(
+        self, file_stem: str, network: EngineNetwork, problem: StepProblem, num_substeps: int, num_frames: int
+    ) -> dict[str, str]:
         """Return scripts that repeat a motion from a step's start with the engine only.
 
         Args:
@@ -204,22 +224,22 @@ class Engine(ABC):
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedEngine(Iterative):
+class PreparedEngine(IterativeSolver):
     """An engine, prepared for a system; `engine_stepper` has the network."""
 
-    residual_of: ClassVar[ResidualOf] = "none"
+    residual_iterate: ClassVar[ResidualIterate] = "none"
 
     system: System
-    stepping: Stepping
-    choice: str
-    facts: dict[str, float] = field(default_factory=dict[str, float])
+    engine_stepper: EngineStepper
+    description: str
+    stats: dict[str, float] = field(default_factory=dict[str, float])
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve at the start of the step."""
-        return Substeps(self.stepping.step, problem)
+        return SubsteppingState(self.engine_stepper.step, problem)
 
 
-def evenly(begin: Positions, end: Positions, substeps: int) -> list[Positions] | None:
+def interpolate_pins(start_targets: Positions, end_targets: Positions, substeps: int) -> list[Positions] | None:
     """Interpolate the pins (q, 3) [m] linearly.
 
     Args:
@@ -230,6 +250,6 @@ def evenly(begin: Positions, end: Positions, substeps: int) -> list[Positions] |
     Returns:
         The pins at the start of each substep, None if they are at rest.
     """
-    if np.array_equal(begin, end):
+    if np.array_equal(start_targets, end_targets):
         return None
-    return [begin + k / substeps * (end - begin) for k in range(substeps)]
+    return [start_targets + k / substeps * (end_targets - start_targets) for k in range(substeps)]

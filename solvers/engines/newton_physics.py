@@ -25,16 +25,16 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.about import ENGINE, About, Reference
-from solvers.core.colouring import of_vertices
-from solvers.device import OnDevice
-from solvers.engines.base import Engine, Network, Package, PreparedEngine, evenly
+from solvers.about import ENGINE_FAMILY, Citation, SolverInfo
+from solvers.core.colouring import colour_vertices
+from solvers.device import DeviceOptions
+from solvers.engines.base import EngineNetwork, EnginePackage, ExternalEngine, PreparedEngine, interpolate_pins
 from solvers.problem import Positions, StepProblem, System, Unsupported
 
-Method = Literal["vbd", "xpbd", "semi-implicit"]
-Colours = Literal["springs", "newton"]
+NewtonSolverName = Literal["vbd", "xpbd", "semi-implicit"]
+ColouringSource = Literal["springs", "newton"]
 
-_SCRIPT = """\
+_SCRIPT_TEMPLATE = """\
 import time
 import newton
 import numpy as np
@@ -59,7 +59,7 @@ print(f"{{seconds:.3g}} s; {{abs(p - net['end']).max():.3g}} m from the end of t
 
 
 @dataclass(frozen=True)
-class NewtonPhysics(Engine, OnDevice):
+class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
     """Newton physics engine.
 
     Args:
@@ -69,18 +69,18 @@ class NewtonPhysics(Engine, OnDevice):
         device: as for the other solvers.
     """
 
-    name: ClassVar[str] = "newton-physics"
-    package: ClassVar[Package] = Package("newton", "newton", "newton")
-    about: ClassVar[About] = About(
-        ENGINE,
-        Reference("{Newton Contributors}", 2025, "Newton: an open-source, GPU-accelerated physics simulation engine"),
-        own_steps=True,
-        package="newton",
+    solver_name: ClassVar[str] = "newton-physics"
+    engine_package: ClassVar[EnginePackage] = EnginePackage("newton", "newton", "newton")
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
+        ENGINE_FAMILY,
+        Citation("{Newton Contributors}", 2025, "Newton: an open-source, GPU-accelerated physics simulation engine"),
+        is_substepping=True,
+        package_name="newton",
     )
 
-    method: Method = "vbd"
+    method: NewtonSolverName = "vbd"
     iterations: int = 10
-    colours: Colours = "springs"
+    colours: ColouringSource = "springs"
 
     def prepare(self, system: System) -> PreparedEngine:
         """Prepare the engine for a system; raise Unsupported for unsupported features."""
@@ -89,7 +89,7 @@ class NewtonPhysics(Engine, OnDevice):
             warp.config.log_level = warp.LOG_ERROR  # it tells of devices and of each module that it compiles
         return super().prepare(system)
 
-    def built(self, network: Network, library: Any) -> tuple[_Model, str]:
+    def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[_NewtonPhysicsStepper, str]:
         """Build the network in the engine; return its stepper and a description."""
         if not self.iterations >= 1:
             raise Unsupported(f"newton-physics: iterations came as {self.iterations}; wanted 1 or more")
@@ -97,38 +97,42 @@ class NewtonPhysics(Engine, OnDevice):
         if self.device == "cuda" and not warp.is_cuda_available():
             raise Unsupported("newton-physics: device: cuda: Warp finds no CUDA device, or no driver for it")
         builder = library.ModelBuilder(gravity=(0.0, 0.0, 0.0))
-        fixed = np.isin(np.arange(len(network.mass)), network.pinned)
+        fixed = np.isin(np.arange(len(network.mass)), network.pinned_vertices)
         for m in np.where(fixed, 0.0, network.mass).tolist():
             builder.add_particle((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), m, radius=0.0)  # without radius, no contact
-        for (i, j), k in zip(network.lines.ends.tolist(), network.lines.stiffness.tolist(), strict=True):
+        for (i, j), k in zip(
+            network.spring_dashpots.ends.tolist(), network.spring_dashpots.stiffness.tolist(), strict=True
+        ):
             builder.add_spring(i, j, k, 0.0, control=0.0)
-        builder.spring_rest_length = network.lines.rest_length.tolist()
+        builder.spring_rest_length = network.spring_dashpots.rest_length.tolist()
         told = "explicit"
         if self.method != "semi-implicit":
             told = f"{self.iterations} iterations a substep"
         if self.method == "vbd":
-            told += f", {self._colour(builder, network)} colours"
+            told += f", {self._set_colouring(builder, network)} colours"
         model = builder.finalize(device=self.device)
-        solver, explicit = self._solver(library.solvers, model), self.method == "semi-implicit"
-        made = _Model(warp, model, solver, network, explicit=explicit)
+        solver, explicit = self._build_solver(library.solvers, model), self.method == "semi-implicit"
+        made = _NewtonPhysicsStepper(warp, model, solver, network, explicit=explicit)
         where = f"the device {model.device.name}" if self.device == "cuda" else "the CPU, on one thread"
         return made, f"{self.method}, {told}, in float32 on {where}"
 
-    def _colour(self, builder: Any, network: Network) -> int:
+    def _set_colouring(self, builder: Any, network: EngineNetwork) -> int:
         """Set the colours; return their number."""
         if self.colours == "newton":
             builder.color()
         else:
-            found = of_vertices(network.lines.ends, len(network.mass))
-            builder.set_coloring(np.split(found.order, found.start[1:-1]))
+            found = colour_vertices(network.spring_dashpots.ends, len(network.mass))
+            builder.set_coloring(np.split(found.item_order, found.colour_starts[1:-1]))
         return len(builder.particle_color_groups)
 
-    def _solver(self, solvers: Any, model: Any) -> Any:
+    def _build_solver(self, solvers: Any, model: Any) -> Any:
         if self.method == "semi-implicit":
             return solvers.SolverSemiImplicit(model)
         return {"vbd": solvers.SolverVBD, "xpbd": solvers.SolverXPBD}[self.method](model, iterations=self.iterations)
 
-    def script(self, name: str, network: Network, problem: StepProblem, substeps: int, frames: int) -> dict[str, str]:
+    def write_script(
+        self, file_stem: str, network: EngineNetwork, problem: StepProblem, num_substeps: int, num_frames: int
+    ) -> dict[str, str]:
         """Return scripts that repeat a motion from a step's start with the engine only, by file name."""
         made = {
             "vbd": f"SolverVBD(model, iterations={self.iterations})",
@@ -139,52 +143,61 @@ class NewtonPhysics(Engine, OnDevice):
         if self.method == "vbd" and self.colours == "newton":
             colouring = "builder.color()\n"
         elif self.method == "vbd":
-            found = of_vertices(network.lines.ends, len(network.mass))
-            groups = [group.tolist() for group in np.split(found.order, found.start[1:-1])]
+            found = colour_vertices(network.spring_dashpots.ends, len(network.mass))
+            groups = [group.tolist() for group in np.split(found.item_order, found.colour_starts[1:-1])]
             colouring = f"builder.set_coloring({groups})  # no two of a colour share a spring\n"
-        text = _SCRIPT.format(
-            name=name,
+        text = _SCRIPT_TEMPLATE.format(
+            name=file_stem,
             colouring=colouring,
             device=self.device,
             solver=made[self.method],
-            steps=substeps * frames,
-            h=network.time_step / substeps,
+            steps=num_substeps * num_frames,
+            h=network.time_step / num_substeps,
         )
-        return {f"{name}.py": text}
+        return {f"{file_stem}.py": text}
 
 
-class _Model:
+class _NewtonPhysicsStepper:
     """A model, its solver and two alternating states. On the CPU its arrays are accessed in place."""
 
-    def __init__(self, warp: Any, model: Any, solver: Any, network: Network, *, explicit: bool) -> None:
+    def __init__(self, warp: Any, model: Any, solver: Any, network: EngineNetwork, *, explicit: bool) -> None:
         self._warp, self._solver, self._network, self._explicit = warp, solver, network, explicit
-        self._now, self._then = model.state(), model.state()
-        self._load = warp.zeros_like(self._now.particle_f)
-        solver.step(self._now, self._then, None, None, network.time_step)  # compiles; each step sets its own state
+        self._current_state, self._next_state = model.state(), model.state()
+        self._external_force = warp.zeros_like(self._current_state.particle_f)
+        solver.step(
+            self._current_state, self._next_state, None, None, network.time_step
+        )  # compiles; each step sets its own state
 
     def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
         """Integrate a step in `substeps` substeps; return positions [m] and velocities [m/s] at its end."""
-        net, start, h = self._network, problem.start, self._network.time_step / substeps
-        _set(self._now.particle_q, start.positions)
-        _set(self._now.particle_qd, start.velocity)
-        for state in (self._now, self._then):
-            _set(state.particle_qd, 0.0, net.pinned)  # a particle without mass would go on with what it has
-        _set(self._load, problem.force)
-        begin, end = start.positions[net.pinned], problem.pin_targets
-        places = evenly(begin, end, substeps)
+        net, start, h = self._network, problem.step_start, self._network.time_step / substeps
+        _write_array(self._current_state.particle_q, start.positions)
+        _write_array(self._current_state.particle_qd, start.velocity)
+        for state in (self._current_state, self._next_state):
+            _write_array(
+                state.particle_qd, 0.0, net.pinned_vertices
+            )  # a particle without mass would go on with what it has
+        _write_array(self._external_force, problem.external_force)
+        begin, end = start.positions[net.pinned_vertices], problem.pin_targets
+        places = interpolate_pins(begin, end, substeps)
         ahead = 0.0 if self._explicit else (end - begin) / substeps  # implicit steps have pins where they will be
         for k in range(substeps):
             if places is not None:
-                _set(self._now.particle_q, places[k] + ahead, net.pinned)
-            self._warp.copy(self._now.particle_f, self._load)  # an explicit step adds the springs' forces to it
-            self._solver.step(self._now, self._then, None, None, h)
-            self._now, self._then = self._then, self._now
-        p, v = (np.array(array.numpy(), np.float64) for array in (self._now.particle_q, self._now.particle_qd))
-        p[net.pinned], v[net.pinned] = end, (end - begin) / net.time_step
+                _write_array(self._current_state.particle_q, places[k] + ahead, net.pinned_vertices)
+            self._warp.copy(
+                self._current_state.particle_f, self._external_force
+            )  # an explicit step adds the springs' forces to it
+            self._solver.step(self._current_state, self._next_state, None, None, h)
+            self._current_state, self._next_state = self._next_state, self._current_state
+        p, v = (
+            np.array(array.numpy(), np.float64)
+            for array in (self._current_state.particle_q, self._current_state.particle_qd)
+        )
+        p[net.pinned_vertices], v[net.pinned_vertices] = end, (end - begin) / net.time_step
         return p, v
 
 
-def _set(array: Any, values: NDArray[np.float64] | float, rows: NDArray[np.int64] | None = None) -> None:
+def _write_array(array: Any, values: NDArray[np.float64] | float, rows: NDArray[np.int64] | None = None) -> None:
     """Write values to a Warp array (n, 3), or to some of its rows."""
     if rows is None and array.device.is_cuda:
         array.assign(np.asarray(values, np.float32))

@@ -16,11 +16,11 @@ import numba
 import numpy as np
 from threadpoolctl import ThreadpoolController  # pyright: ignore[reportMissingTypeStubs]
 
-from solvers.about import ENGINE, About, Reference
-from solvers.engines.base import Engine, Network, Package, evenly
+from solvers.about import ENGINE_FAMILY, Citation, SolverInfo
+from solvers.engines.base import EngineNetwork, EnginePackage, ExternalEngine, interpolate_pins
 from solvers.problem import Positions, StepProblem, Unsupported
 
-_SCRIPT = """\
+_SCRIPT_TEMPLATE = """\
 import time
 import numpy as np
 import pypbd as pbd
@@ -46,129 +46,138 @@ print(f"{{seconds:.3g}} s; {{abs(p - net['end']).max():.3g}} m from the end of t
 
 
 @dataclass(frozen=True)
-class PyPbd(Engine):
+class PyPbdEngine(ExternalEngine):
     """PositionBasedDynamics.
 
     Args:
         iterations_per_substep: iterations over all constraints in each substep.
     """
 
-    name: ClassVar[str] = "pypbd"
-    package: ClassVar[Package] = Package("pypbd", "pyPBD", "pypbd")
-    about: ClassVar[About] = About(
-        ENGINE,
-        Reference(
+    solver_name: ClassVar[str] = "pypbd"
+    engine_package: ClassVar[EnginePackage] = EnginePackage("pypbd", "pyPBD", "pypbd")
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
+        ENGINE_FAMILY,
+        Citation(
             "Bender, Jan and Müller, Matthias and Macklin, Miles",
             2017,
             "A survey on position based dynamics",
             "10.2312/egt.20171034",
         ),
-        own_steps=True,
-        package="pyPBD",
+        is_substepping=True,
+        package_name="pyPBD",
     )
 
     iterations: int = 1
 
-    def built(self, network: Network, library: Any) -> tuple[_Model, str]:
+    def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[_PyPbdStepper, str]:
         """Build the network in the engine; return its stepper and a description."""
         if not self.iterations >= 1:
             raise Unsupported(f"pypbd: iterations came as {self.iterations}; wanted 1 or more")
-        made = _Model(library, network, self.iterations)
+        made = _PyPbdStepper(library, network, self.iterations)
         return made, f"{self.iterations} iterations a substep, in {made.precision}"
 
-    def script(self, name: str, network: Network, problem: StepProblem, substeps: int, frames: int) -> dict[str, str]:
+    def write_script(
+        self, file_stem: str, network: EngineNetwork, problem: StepProblem, num_substeps: int, num_frames: int
+    ) -> dict[str, str]:
         """Return scripts that repeat a motion from a step's start with the engine only, by file name."""
         _require_gravity(network, problem)
-        given = {"time_step": network.time_step, "substeps": substeps, "iterations": self.iterations, "frames": frames}
-        return {f"{name}.py": _SCRIPT.format(name=name, **given)}
+        given = {
+            "time_step": network.time_step,
+            "substeps": num_substeps,
+            "iterations": self.iterations,
+            "frames": num_frames,
+        }
+        return {f"{file_stem}.py": _SCRIPT_TEMPLATE.format(name=file_stem, **given)}
 
 
-GRAVITY = (0.0, -9.81, 0.0)
+PYPBD_GRAVITY = (0.0, -9.81, 0.0)
 """Gravity of pyPBD, the only value that its interface supports [m/s^2]."""
 
 
-def _require_gravity(network: Network, problem: StepProblem) -> None:
-    found = network.acceleration(problem.force)
-    if found is None or not np.allclose(found, GRAVITY, rtol=0.0, atol=1e-9):
+def _require_gravity(network: EngineNetwork, problem: StepProblem) -> None:
+    found = network.uniform_acceleration(problem.external_force)
+    if found is None or not np.allclose(found, PYPBD_GRAVITY, rtol=0.0, atol=1e-9):
         came = "loads of another kind" if found is None else f"({', '.join(f'{x:g}' for x in found)}) m/s²"
         raise Unsupported(f"pypbd: has gravity of 9.81 m/s² along -y and no other force; the scene has {came}")
 
 
-def _pin_threads() -> None:
+def _limit_openmp_threads() -> None:
     """Limit the engine's OpenMP threads to the number of threads of our kernels."""
     for pool in ThreadpoolController().select(internal_api="openmp").lib_controllers:
         if "pypbd" in pool.filepath:
             pool.set_num_threads(numba.get_num_threads())
 
 
-class _Model:
+class _PyPbdStepper:
     """A pyPBD model and its state.
 
     Only vertices that differ from the previous final state are set, one by one.
     """
 
-    def __init__(self, library: Any, network: Network, iterations: int) -> None:
+    def __init__(self, library: Any, network: EngineNetwork, iterations: int) -> None:
         self._library, self._network = library, network
-        _pin_threads()
+        _limit_openmp_threads()
         library.Simulation.getCurrent()  # has gravity
         self._model, self._control = library.SimulationModel(), library.TimeStepController()
         self._model.init()
         self._control.init()
         self._particles = self._model.getParticles()
-        fixed = np.isin(np.arange(len(network.mass)), network.pinned)
+        fixed = np.isin(np.arange(len(network.mass)), network.pinned_vertices)
         for i, m in enumerate(np.where(fixed, 0.0, network.mass).tolist()):
             self._particles.addVertex(np.zeros(3))
             self._particles.setMass(i, m)
-        for (i, j), k in zip(network.lines.ends.tolist(), network.lines.stiffness.tolist(), strict=True):
+        for (i, j), k in zip(
+            network.spring_dashpots.ends.tolist(), network.spring_dashpots.stiffness.tolist(), strict=True
+        ):
             self._model.addDistanceConstraint_XPBD(i, j, k)
         constraints = self._model.getConstraints()
-        for e, r in enumerate(network.lines.rest_length.tolist()):
+        for e, r in enumerate(network.spring_dashpots.rest_length.tolist()):
             constraints[e].restLength = r
-        self._set(iterations, "MAX_ITERATIONS")
-        self._set(0, "MAX_ITERATIONS_V")  # there is nothing to project velocities to
+        self._set_if_changed(iterations, "MAX_ITERATIONS")
+        self._set_if_changed(0, "MAX_ITERATIONS_V")  # there is nothing to project velocities to
         control = library.TimeStepController
         self._control.setValueInt(control.VELOCITY_UPDATE_METHOD, control.ENUM_VUPDATE_FIRST_ORDER)
         self._velocity = np.zeros((len(network.mass), 3))
         self.precision = f"float{8 * np.asarray(self._particles.getVertices()).itemsize}"
 
-    def _set(self, value: int, name: str) -> None:
+    def _set_if_changed(self, value: int, name: str) -> None:
         self._control.setValueUInt(getattr(self._library.TimeStepController, name), value)
 
-    def _positions(self) -> Positions:
+    def _read_positions(self) -> Positions:
         return np.array(self._particles.getVertices(), np.float64)
 
     def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
         """Integrate a step; raise Unsupported for loads other than its gravity."""
-        net, start, particles = self._network, problem.start, self._particles
+        net, start, particles = self._network, problem.step_start, self._particles
         _require_gravity(net, problem)
-        for i in np.flatnonzero((self._positions() != start.positions).any(axis=1)).tolist():
+        for i in np.flatnonzero((self._read_positions() != start.positions).any(axis=1)).tolist():
             particles.setPosition(i, start.positions[i])
         for i in np.flatnonzero((self._velocity != start.velocity).any(axis=1)).tolist():
             particles.setVelocity(i, start.velocity[i])
-        begin, end = start.positions[net.pinned], problem.pin_targets
-        places = evenly(begin, end, substeps)
+        begin, end = start.positions[net.pinned_vertices], problem.pin_targets
+        places = interpolate_pins(begin, end, substeps)
         h = net.time_step / substeps
         if places is None:
-            self._steps(h, substeps - 1)
-            before = self._positions()
-            self._steps(h, 1)
+            self._run_substeps(h, substeps - 1)
+            before = self._read_positions()
+            self._run_substeps(h, 1)
         else:
             before = start.positions
             for place in places:
-                before = self._positions()
-                for i, x in zip(net.pinned.tolist(), place + (end - begin) / substeps, strict=True):
+                before = self._read_positions()
+                for i, x in zip(net.pinned_vertices.tolist(), place + (end - begin) / substeps, strict=True):
                     particles.setPosition(i, x)
-                self._steps(h, 1)
-        p = self._positions()
+                self._run_substeps(h, 1)
+        p = self._read_positions()
         v = (1.0 / h) * (p - before)  # as it has them itself, to the last bit; to ask for them takes a call a vertex
-        v[net.pinned] = 0.0
+        v[net.pinned_vertices] = 0.0
         self._velocity = v.copy()
-        p[net.pinned], v[net.pinned] = end, (end - begin) / net.time_step
+        p[net.pinned_vertices], v[net.pinned_vertices] = end, (end - begin) / net.time_step
         return p, v
 
-    def _steps(self, h: float, number: int) -> None:
+    def _run_substeps(self, h: float, number: int) -> None:
         """Run substeps of h [s]."""
         if number:
             self._library.TimeManager.getCurrent().setTimeStepSize(h * number)
-            self._set(number, "NUM_SUB_STEPS")
+            self._set_if_changed(number, "NUM_SUB_STEPS")
             self._control.step(self._model)

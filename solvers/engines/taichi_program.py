@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 
 
-def program(ti: Any, mass: Any, pinned: Any, ends: Any, stiffness: Any, rest_length: Any, tolerance: float) -> Any:
+def build_taichi_program(
+    ti: Any, mass: Any, pinned: Any, ends: Any, stiffness: Any, rest_length: Any, cg_rtol: float
+) -> Any:
     """Build fields and kernels of a network of n vertices.
 
     Args:
@@ -96,7 +98,7 @@ def program(ti: Any, mass: Any, pinned: Any, ends: Any, stiffness: Any, rest_len
             z[i] = -g[i]  # the residual
             p[i] = inverse[i] @ z[i]
             rho += z[i].dot(p[i])
-        least, count = tolerance**2 * rho, 0
+        least, count = cg_rtol**2 * rho, 0
         while rho > least and count < 10 * n:
             product()
             curvature = ti.cast(0.0, ti.f64)

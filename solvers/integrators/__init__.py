@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from solvers.integrators.alpha import GENERALISED_ALPHA, HHT, NEWMARK, GeneralisedAlpha
-from solvers.integrators.base import End, Motion, Solved, Unknown
+from solvers.integrators.base import Motion, Stage, StageSolution, StepEnd
 from solvers.integrators.runge_kutta import ESDIRK3, ESDIRK4, SDIRK2, SDIRK3, SDIRK4, TR_BDF2, RungeKutta
-from solvers.integrators.single import BDF2, IMPLICIT_EULER, MIDPOINT, OWN, Integrator
-from solvers.plugins import Table, load
+from solvers.integrators.single import BDF2, IMPLICIT_EULER, MIDPOINT, SUBSTEPPING, SingleStageIntegrator
+from solvers.plugins import PluginTable, load_target
 
 __all__ = [
     "EVERY",
@@ -26,7 +26,7 @@ __all__ = [
     "splits",
 ]
 
-Staged = RungeKutta | GeneralisedAlpha
+StagedIntegrator = RungeKutta | GeneralisedAlpha
 """The one-step integrators with one or more stages that evaluate all forces at the stage.
 
 Common attributes are order (of the error), num_stages (per step), inertia_factor (c), velocity_factor (velocity_rate
@@ -34,7 +34,7 @@ times dt), needs_start_acceleration (whether the acceleration at the start of th
 of the embedded method for the error estimate, 0 for none) and iterate_stages (a generator of the stages).
 """
 
-AnyIntegrator = Integrator | Staged
+AnyIntegrator = SingleStageIntegrator | StagedIntegrator
 
 INTEGRATORS: dict[str, AnyIntegrator] = {
     "implicit-euler": IMPLICIT_EULER,
@@ -49,22 +49,22 @@ INTEGRATORS: dict[str, AnyIntegrator] = {
     "esdirk-3": ESDIRK3,
     "sdirk-4": SDIRK4,
     "esdirk-4": ESDIRK4,
-    "own": OWN,
+    "own": SUBSTEPPING,
 }
 """The built-in integrators by name."""
 
-EVERY = Table("springbench.integrators", INTEGRATORS)
+INTEGRATOR_TABLE = PluginTable("springbench.integrators", INTEGRATORS)
 """All integrators that a config can name."""
 
 
-def splits(method: AnyIntegrator) -> bool:
+def has_split_filters(method: AnyIntegrator) -> bool:
     """Return whether velocity filters act before a step.
 
     An integrator that evaluates forces at the stage has none.
     """
-    return isinstance(method, Integrator) and method.splits
+    return isinstance(method, SingleStageIntegrator) and method.has_split_filters
 
 
-def find(name: str) -> AnyIntegrator:
+def find_integrator(name: str) -> AnyIntegrator:
     """Return the integrator of a name, which may be a third-party one."""
-    return INTEGRATORS[name] if name in INTEGRATORS else load(EVERY[name])
+    return INTEGRATORS[name] if name in INTEGRATORS else load_target(INTEGRATOR_TABLE[name])

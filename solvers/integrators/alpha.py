@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from solvers.integrators.base import End, Motion, Unknown, Unknowns
+from solvers.integrators.base import Motion, Stage, StageGenerator, StepEnd
 from solvers.problem import Positions
 
 
@@ -27,53 +27,53 @@ from solvers.problem import Positions
 class GeneralisedAlpha:
     """The method with parameters am, of the masses, and af, of the forces."""
 
-    mass: float
-    force: float
+    alpha_m: float
+    alpha_f: float
 
     order: ClassVar[int] = 2
-    unknowns: ClassVar[int] = 1
-    starts: ClassVar[bool] = True
-    embedded: ClassVar[int] = 0
+    num_stages: ClassVar[int] = 1
+    needs_start_acceleration: ClassVar[bool] = True
+    embedded_order: ClassVar[int] = 0
 
     @classmethod
-    def damping(cls, radius: float) -> GeneralisedAlpha:
+    def from_spectral_radius(cls, spectral_radius: float) -> GeneralisedAlpha:
         """Return the method that multiplies the highest frequencies by `spectral_radius`, in [0, 1], per step."""
-        return cls((2.0 * radius - 1.0) / (radius + 1.0), radius / (radius + 1.0))
+        return cls((2.0 * spectral_radius - 1.0) / (spectral_radius + 1.0), spectral_radius / (spectral_radius + 1.0))
 
     @property
     def gamma(self) -> float:
         """The gamma of order 2."""
-        return 0.5 - self.mass + self.force
+        return 0.5 - self.alpha_m + self.alpha_f
 
     @property
     def beta(self) -> float:
         """The beta of maximum damping."""
-        return 0.25 * (1.0 - self.mass + self.force) ** 2
+        return 0.25 * (1.0 - self.alpha_m + self.alpha_f) ** 2
 
     @property
-    def factor(self) -> float:
+    def inertia_factor(self) -> float:
         """The factor c."""
-        return (1.0 - self.mass) / ((1.0 - self.force) * self.beta)
+        return (1.0 - self.alpha_m) / ((1.0 - self.alpha_f) * self.beta)
 
     @property
-    def speed(self) -> float:
+    def velocity_factor(self) -> float:
         """Ratio gamma/beta of the change of v' to that of the stage, in units of 1/dt."""
         return self.gamma / self.beta
 
-    def step(self, now: Motion, acceleration: Positions | None, dt: float) -> Unknowns:
+    def iterate_stages(self, motion: Motion, acceleration: Positions | None, dt: float) -> StageGenerator:
         """Yield the stage of a step of dt [s]; raise ValueError without a start acceleration."""
         if acceleration is None:
             raise ValueError("the method needs the acceleration at the step's start")
-        (p, v), a = now, acceleration
-        when, less = 1.0 - self.force, 1.0 - self.mass
+        (p, v), a = motion, acceleration
+        when, less = 1.0 - self.alpha_f, 1.0 - self.alpha_m
         target = p + when * (dt * v + dt**2 * (0.5 - self.beta / less) * a)
         slow = v + when * dt * (1.0 - self.gamma / less) * a  # the velocity at the target
-        found = yield Unknown(when, target, target - dt / self.speed * slow, a)
-        b = (found.acceleration - self.mass * a) / less
+        found = yield Stage(when, target, target - dt / self.velocity_factor * slow, a)
+        b = (found.acceleration - self.alpha_m * a) / less
         end = p + dt * v + dt**2 * ((0.5 - self.beta) * a + self.beta * b)
-        return End(Motion(end, v + dt * ((1.0 - self.gamma) * a + self.gamma * b)), b)
+        return StepEnd(Motion(end, v + dt * ((1.0 - self.gamma) * a + self.gamma * b)), b)
 
 
-GENERALISED_ALPHA = GeneralisedAlpha.damping(0.5)
+GENERALISED_ALPHA = GeneralisedAlpha.from_spectral_radius(0.5)
 HHT = GeneralisedAlpha(0.0, 0.1)
 NEWMARK = GeneralisedAlpha(0.0, 0.0)

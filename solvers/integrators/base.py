@@ -24,7 +24,7 @@ class Motion(NamedTuple):
     velocity: Positions
 
 
-class Unknown(NamedTuple):
+class Stage(NamedTuple):
     """A stage of a step.
 
     Attributes:
@@ -33,13 +33,13 @@ class Unknown(NamedTuple):
         predicted_acceleration: acceleration (n, 3) [m/s^2] at x predicted from the previous motion; None for none.
     """
 
-    when: float
-    target: Positions
-    origin: Positions
-    acceleration: Positions | None
+    stage_fraction: float
+    inertial_target: Positions
+    velocity_origin: Positions
+    predicted_acceleration: Positions | None
 
 
-class Solved(NamedTuple):
+class StageSolution(NamedTuple):
     """The solution of a stage: positions [m], velocity [m/s] and acceleration [m/s^2], each (n, 3)."""
 
     positions: Positions
@@ -47,7 +47,7 @@ class Solved(NamedTuple):
     acceleration: Positions
 
 
-class End(NamedTuple):
+class StepEnd(NamedTuple):
     """The result of a step.
 
     Attributes:
@@ -61,5 +61,5 @@ class End(NamedTuple):
     error: Motion | None = None
 
 
-Unknowns = Generator[Unknown, Solved, End]
+StageGenerator = Generator[Stage, StageSolution, StepEnd]
 """A generator of the stages of a step; it is sent the solution of each stage before it yields the next."""

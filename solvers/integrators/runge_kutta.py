@@ -24,10 +24,10 @@ from functools import cached_property
 
 import numpy as np
 
-from solvers.integrators.base import End, Motion, Solved, Unknown, Unknowns
+from solvers.integrators.base import Motion, Stage, StageGenerator, StageSolution, StepEnd
 from solvers.problem import Positions
 
-Row = tuple[float, ...]
+TableauRow = tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -42,42 +42,42 @@ class RungeKutta:
     """
 
     order: int
-    a: tuple[Row, ...]
-    lower: Row = ()
-    embedded: int = 0
+    a: tuple[TableauRow, ...]
+    embedded_weights: TableauRow = ()
+    embedded_order: int = 0
 
     def __post_init__(self) -> None:
         """Raise ValueError if the stages do not share one system matrix."""
-        diagonal = {row[-1] for row in self.a[self.starts :]}
+        diagonal = {row[-1] for row in self.a[self.needs_start_acceleration :]}
         if len(diagonal) != 1 or [len(row) for row in self.a] != list(range(1, len(self.a) + 1)):
             raise ValueError("wanted a lower triangular tableau with one diagonal element, explicit first stages apart")
 
     @cached_property
-    def starts(self) -> bool:
+    def needs_start_acceleration(self) -> bool:
         """Whether the first stage is explicit, so that the start acceleration is needed."""
         return self.a[0] == (0.0,)
 
     @property
-    def unknowns(self) -> int:
+    def num_stages(self) -> int:
         """Number of implicit stages."""
-        return len(self.a) - self.starts
+        return len(self.a) - self.needs_start_acceleration
 
     @cached_property
-    def times(self) -> Row:
+    def stage_times(self) -> TableauRow:
         """Times c_i of the stages."""
         return tuple(float(sum(row)) for row in self.a)
 
     @property
-    def speed(self) -> float:
+    def velocity_factor(self) -> float:
         """Ratio 1/gamma of the velocity to the displacement of a stage, in units of 1/dt."""
         return 1.0 / self.a[-1][-1]
 
     @property
-    def factor(self) -> float:
+    def inertia_factor(self) -> float:
         """The factor c = 1/gamma^2."""
-        return self.speed**2
+        return self.velocity_factor**2
 
-    def step(self, now: Motion, acceleration: Positions | None, dt: float) -> Unknowns:
+    def iterate_stages(self, motion: Motion, acceleration: Positions | None, dt: float) -> StageGenerator:
         """Yield the stages of a step.
 
         The predicted acceleration of a stage is the known one that is nearest in time.
@@ -87,28 +87,30 @@ class RungeKutta:
             acceleration: acceleration (n, 3) [m/s^2] at the start of the step, or None.
             dt: step size [s].
         """
-        v: list[Positions] = [now.velocity] if self.starts else []
-        a: list[Positions] = [acceleration] if self.starts and acceleration is not None else []
+        v: list[Positions] = [motion.velocity] if self.needs_start_acceleration else []
+        a: list[Positions] = [acceleration] if self.needs_start_acceleration and acceleration is not None else []
         h = dt * self.a[-1][-1]
-        found = Solved(now.positions, now.velocity, now.velocity)
-        for row, time in zip(self.a[self.starts :], self.times[self.starts :], strict=True):
-            origin = _combined(now.positions, dt, row, v)
-            target = origin + h * _combined(now.velocity, dt, row, a)
-            known = [(0.0, acceleration), *zip(self.times, a, strict=False)]
+        found = StageSolution(motion.positions, motion.velocity, motion.velocity)
+        for row, time in zip(
+            self.a[self.needs_start_acceleration :], self.stage_times[self.needs_start_acceleration :], strict=True
+        ):
+            origin = _weighted_sum(motion.positions, dt, row, v)
+            target = origin + h * _weighted_sum(motion.velocity, dt, row, a)
+            known = [(0.0, acceleration), *zip(self.stage_times, a, strict=False)]
             expected = min(known, key=lambda one: abs(time - one[0]))[1]
-            found = yield Unknown(time, target, origin, expected)
+            found = yield Stage(time, target, origin, expected)
             v.append(found.velocity)
             a.append(found.acceleration)
-        return End(Motion(found.positions, found.velocity), found.acceleration, self._error(dt, v, a))
+        return StepEnd(Motion(found.positions, found.velocity), found.acceleration, self._embedded_error(dt, v, a))
 
-    def _error(self, dt: float, v: Sequence[Positions], a: Sequence[Positions]) -> Motion | None:
-        if not self.lower:
+    def _embedded_error(self, dt: float, v: Sequence[Positions], a: Sequence[Positions]) -> Motion | None:
+        if not self.embedded_weights:
             return None
-        weights = [b - lower for b, lower in zip(self.a[-1], self.lower, strict=True)]
-        return Motion(*(_combined(np.zeros_like(v[0]), dt, weights, part) for part in (v, a)))
+        weights = [b - lower for b, lower in zip(self.a[-1], self.embedded_weights, strict=True)]
+        return Motion(*(_weighted_sum(np.zeros_like(v[0]), dt, weights, part) for part in (v, a)))
 
 
-def _combined(x: Positions, dt: float, weights: Sequence[float], parts: Sequence[Positions]) -> Positions:
+def _weighted_sum(x: Positions, dt: float, weights: Sequence[float], parts: Sequence[Positions]) -> Positions:
     """Return x + dt sum_j weights_j parts_j as a new array."""
     out = x.copy()
     for weight, part in zip(weights, parts, strict=False):
@@ -117,61 +119,65 @@ def _combined(x: Positions, dt: float, weights: Sequence[float], parts: Sequence
     return out
 
 
-def _rows(*rows: str) -> tuple[Row, ...]:
+def _parse_rows(*rows: str) -> tuple[TableauRow, ...]:
     """Parse tableau rows of fractions."""
     return tuple(tuple(float(Fraction(number)) for number in row.split()) for row in rows)
 
 
-_TWO = 1.0 - 0.5**0.5
-_THREE = 0.43586652150845899942
+_SDIRK2_GAMMA = 1.0 - 0.5**0.5
+_SDIRK3_GAMMA = 0.43586652150845899942
 """Root of x^3 - 3 x^2 + 3/2 x - 1/6 in (1/6, 1/2)."""
 
-_ALEXANDER = (
-    (_THREE,),
-    (0.5 * (1.0 - _THREE), _THREE),
-    (-1.5 * _THREE**2 + 4.0 * _THREE - 0.25, 1.5 * _THREE**2 - 5.0 * _THREE + 1.25, _THREE),
+_SDIRK3_TABLEAU = (
+    (_SDIRK3_GAMMA,),
+    (0.5 * (1.0 - _SDIRK3_GAMMA), _SDIRK3_GAMMA),
+    (
+        -1.5 * _SDIRK3_GAMMA**2 + 4.0 * _SDIRK3_GAMMA - 0.25,
+        1.5 * _SDIRK3_GAMMA**2 - 5.0 * _SDIRK3_GAMMA + 1.25,
+        _SDIRK3_GAMMA,
+    ),
 )
-_W = 0.5**0.5 / 2.0
+_TR_BDF2_WEIGHT = 0.5**0.5 / 2.0
 
-_KC3 = "1767732205903/4055673282236"
+_ESDIRK3_GAMMA = "1767732205903/4055673282236"
 
-SDIRK2 = RungeKutta(2, ((_TWO,), (1.0 - _TWO, _TWO)))
-SDIRK3 = RungeKutta(3, _ALEXANDER)
+SDIRK2 = RungeKutta(2, ((_SDIRK2_GAMMA,), (1.0 - _SDIRK2_GAMMA, _SDIRK2_GAMMA)))
+SDIRK3 = RungeKutta(3, _SDIRK3_TABLEAU)
 SDIRK4 = RungeKutta(
     4,
-    _rows(
+    _parse_rows(
         "1/4",
         "1/2 1/4",
         "17/50 -1/25 1/4",
         "371/1360 -137/2720 15/544 1/4",
         "25/24 -49/48 125/16 -85/12 1/4",
     ),
-    *_rows("59/48 -17/96 225/32 -85/12 0"),
-    embedded=3,
+    *_parse_rows("59/48 -17/96 225/32 -85/12 0"),
+    embedded_order=3,
 )
 TR_BDF2 = RungeKutta(
     2,
-    ((0.0,), (_TWO, _TWO), (_W, _W, _TWO)),
-    ((1.0 - _W) / 3.0, (3.0 * _W + 1.0) / 3.0, _TWO / 3.0),
-    embedded=3,
+    ((0.0,), (_SDIRK2_GAMMA, _SDIRK2_GAMMA), (_TR_BDF2_WEIGHT, _TR_BDF2_WEIGHT, _SDIRK2_GAMMA)),
+    ((1.0 - _TR_BDF2_WEIGHT) / 3.0, (3.0 * _TR_BDF2_WEIGHT + 1.0) / 3.0, _SDIRK2_GAMMA / 3.0),
+    embedded_order=3,
 )
 ESDIRK3 = RungeKutta(
     3,
-    _rows(
+    _parse_rows(
         "0",
-        f"{_KC3} {_KC3}",
-        f"2746238789719/10658868560708 -640167445237/6845629431997 {_KC3}",
-        f"1471266399579/7840856788654 -4482444167858/7529755066697 11266239266428/11593286722821 {_KC3}",
+        f"{_ESDIRK3_GAMMA} {_ESDIRK3_GAMMA}",
+        f"2746238789719/10658868560708 -640167445237/6845629431997 {_ESDIRK3_GAMMA}",
+        f"1471266399579/7840856788654 -4482444167858/7529755066697 11266239266428/11593286722821 {_ESDIRK3_GAMMA}",
     ),
-    *_rows(
+    *_parse_rows(
         "2756255671327/12835298489170 -10771552573575/22201958757719 9247589265047/10645013368117 "
         "2193209047091/5459859503100"
     ),
-    embedded=2,
+    embedded_order=2,
 )
 ESDIRK4 = RungeKutta(
     4,
-    _rows(
+    _parse_rows(
         "0",
         "1/4 1/4",
         "8611/62500 -1743/31250 1/4",
@@ -179,6 +185,6 @@ ESDIRK4 = RungeKutta(
         "15267082809/155376265600 -71443401/120774400 730878875/902184768 2285395/8070912 1/4",
         "82889/524892 0 15625/83664 69875/102672 -2260/8211 1/4",
     ),
-    *_rows("4586570599/29645900160 0 178811875/945068544 814220225/1159782912 -3700637/11593932 61727/225920"),
-    embedded=3,
+    *_parse_rows("4586570599/29645900160 0 178811875/945068544 814220225/1159782912 -3700637/11593932 61727/225920"),
+    embedded_order=3,
 )

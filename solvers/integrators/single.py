@@ -23,11 +23,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from solvers.integrators.base import Motion
-from solvers.problem import Positions, Solution, Start, Unsupported
+from solvers.problem import Positions, Solution, StepStart, Unsupported
 
 
 @dataclass(frozen=True, slots=True)
-class Integrator:
+class SingleStageIntegrator:
     """An integrator with one stage per step.
 
     Attributes:
@@ -40,53 +40,53 @@ class Integrator:
         order: order of the error.
     """
 
-    speed: ClassVar[None] = None
+    velocity_factor: ClassVar[None] = None
     """None: the velocity of the stage follows from c."""
-    unknowns: ClassVar[int] = 1
-    splits: ClassVar[bool] = True
+    num_stages: ClassVar[int] = 1
+    has_split_filters: ClassVar[bool] = True
     """Whether velocity filters act before a step."""
 
-    factor: float
-    when: float
-    ahead: float
-    history: bool
-    predict: Callable[[Motion, Motion, float], tuple[Positions, Positions]]
+    inertia_factor: float
+    stage_fraction: float
+    extrapolation_fraction: float
+    needs_history: bool
+    predict_target: Callable[[Motion, Motion, float], tuple[Positions, Positions]]
     order: int = 1
 
-    def advance(self, start: Start, solution: Solution) -> Motion:
+    def complete_step(self, step_start: StepStart, solution: Solution) -> Motion:
         """Return the motion at the end of the step, with the solver's own velocity if the solution has one."""
         x = solution.positions
         if solution.velocity is not None:
             return Motion(x, solution.velocity)
-        v = start.velocity_at(x)
-        if self.when == 1.0:
+        v = step_start.velocity_at(x)
+        if self.stage_fraction == 1.0:
             return Motion(x, v)
-        return Motion(2.0 * x - start.positions, 2.0 * v - start.velocity)  # x and v are means over the step
+        return Motion(2.0 * x - step_start.positions, 2.0 * v - step_start.velocity)  # x and v are means over the step
 
 
-def _euler(now: Motion, before: Motion, dt: float) -> tuple[Positions, Positions]:
-    return now.positions + dt * now.velocity, now.positions
+def _predict_euler(motion: Motion, previous_motion: Motion, dt: float) -> tuple[Positions, Positions]:
+    return motion.positions + dt * motion.velocity, motion.positions
 
 
-def _bdf2(now: Motion, before: Motion, dt: float) -> tuple[Positions, Positions]:
-    origin = (4.0 * now.positions - before.positions) / 3.0
-    return origin + 2.0 * dt / 9.0 * (4.0 * now.velocity - before.velocity), origin
+def _predict_bdf2(motion: Motion, previous_motion: Motion, dt: float) -> tuple[Positions, Positions]:
+    origin = (4.0 * motion.positions - previous_motion.positions) / 3.0
+    return origin + 2.0 * dt / 9.0 * (4.0 * motion.velocity - previous_motion.velocity), origin
 
 
-def _midpoint(now: Motion, before: Motion, dt: float) -> tuple[Positions, Positions]:
-    return now.positions + 0.5 * dt * now.velocity, now.positions
+def _predict_midpoint(motion: Motion, previous_motion: Motion, dt: float) -> tuple[Positions, Positions]:
+    return motion.positions + 0.5 * dt * motion.velocity, motion.positions
 
 
 @dataclass(frozen=True, slots=True)
-class Own(Integrator):
+class SubsteppingIntegrator(SingleStageIntegrator):
     """The integrator for solvers that integrate a step themselves and return the velocity.
 
     Drag is then a force.
     """
 
-    splits: ClassVar[bool] = False
+    has_split_filters: ClassVar[bool] = False
 
-    def advance(self, start: Start, solution: Solution) -> Motion:
+    def complete_step(self, step_start: StepStart, solution: Solution) -> Motion:
         """Return the solver's motion; raise Unsupported for a solver without a velocity."""
         if solution.velocity is None:
             raise Unsupported(
@@ -96,7 +96,7 @@ class Own(Integrator):
         return Motion(solution.positions, solution.velocity)
 
 
-IMPLICIT_EULER = Integrator(1.0, 1.0, 0.0, False, _euler)
-BDF2 = Integrator(2.25, 1.0, 1.0, True, _bdf2, order=2)
-MIDPOINT = Integrator(4.0, 0.5, 0.5, False, _midpoint, order=2)
-OWN = Own(1.0, 1.0, 0.0, False, _euler)
+IMPLICIT_EULER = SingleStageIntegrator(1.0, 1.0, 0.0, False, _predict_euler)
+BDF2 = SingleStageIntegrator(2.25, 1.0, 1.0, True, _predict_bdf2, order=2)
+MIDPOINT = SingleStageIntegrator(4.0, 0.5, 0.5, False, _predict_midpoint, order=2)
+SUBSTEPPING = SubsteppingIntegrator(1.0, 1.0, 0.0, False, _predict_euler)

@@ -18,21 +18,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kernel
-from solvers.kernels.accelerate_coefficients import coefficients
-from solvers.kernels.line_search import falls, flattens
-from solvers.vectors.dots import dot, dots
+from solvers.compiling import jit_inner, jit_kernel
+from solvers.kernels.accelerate_coefficients import compute_coefficients
+from solvers.kernels.line_search import is_approximate_wolfe_step, is_armijo_step
+from solvers.vectors.dots import ordered_dot, ordered_dot_pair
 
-_FLATTER = 0.1
-AGAIN, ACCEPTED, STALLED = 0, 1, 2
+_WOLFE_FRACTION = 0.1
+TRIAL_AGAIN, TRIAL_ACCEPTED, TRIAL_STALLED = 0, 1, 2
 """The result of `judge_trial`: evaluate the next trial, accept it, or stop because round-off prevents descent."""
 
-BLOCK = 512
+CACHE_BLOCK = 512
 """Entries per block, so that the data of all pairs stay in the first-level cache."""
 
-_HALVINGS = 40
+_MAX_HALVINGS = 40
 
-NOW = np.dtype(
+WINDOW_STATE_DTYPE = np.dtype(
     [
         ("method", np.int64),  # see `accelerate_coefficients`
         ("retries", np.int64),  # shorter steps along d before the plain correction
@@ -56,7 +56,7 @@ NOW = np.dtype(
 """The state of an iteration."""
 
 
-class Window(NamedTuple):
+class AccelerationWindow(NamedTuple):
     """The state of a solve with m pairs in the history and N entries per vector.
 
     Attributes:
@@ -73,112 +73,117 @@ class Window(NamedTuple):
     The arrays s, w, c and d have the precision of the factor.
     """
 
-    steps: NDArray[Any]
-    images: NDArray[Any]
+    step_history: NDArray[Any]
+    image_history: NDArray[Any]
     position: NDArray[np.float64]
-    trial: NDArray[np.float64]
+    trial_position: NDArray[np.float64]
     descent: NDArray[np.float64]
-    descent_there: NDArray[np.float64]
+    trial_descent: NDArray[np.float64]
     correction: NDArray[Any]
     direction: NDArray[Any]
-    block: NDArray[np.float64]
+    block_scratch: NDArray[np.float64]
     sy: NDArray[np.float64]
     wy: NDArray[np.float64]
     sg: NDArray[np.float64]
     wg: NDArray[np.float64]
     a: NDArray[np.float64]
     b: NDArray[np.float64]
-    now: NDArray[Any]
+    window_state: NDArray[Any]
 
 
-@kernel
-def begin(window, correction):
+@jit_kernel
+def init_window(window, correction):
     """Initialise the window at the trial point, whose descent direction and correction are known."""
-    now = window.now[0]
-    now.count, now.newest, now.radius, now.degree = 0, -1, 0.0, 0
+    now = window.window_state[0]
+    now.num_pairs, now.newest_pair, now.spectral_radius, now.polynomial_degree = 0, -1, 0.0, 0
     size = len(window.correction)
     for k in range(len(window.position)):
-        window.position[k] = window.trial[k]
+        window.position[k] = window.trial_position[k]
     for k in range(size):
-        window.descent[k], window.correction[k] = window.descent_there[k], correction[k]
-    now.squared = dot(window.descent, window.correction, size)
+        window.descent[k], window.correction[k] = window.trial_descent[k], correction[k]
+    now.correction_squarednorm = ordered_dot(window.descent, window.correction, size)
 
 
-@kernel
-def propose(window):
+@jit_kernel
+def propose_trial(window):
     """Propose the first trial of an iteration."""
-    now = window.now[0]
-    now.plain, now.tries = coefficients(window), 0
-    _combine(window)
+    now = window.window_state[0]
+    now.is_plain, now.num_rejected_trials = compute_coefficients(window), 0
+    _combine_history(window)
 
 
-@kernel
-def shorten(window, part):
+@jit_kernel
+def shorten_trial(window, fraction):
     """Shorten the trial to a fraction of its length."""
-    _try(window, part * window.now[0].length)
+    _set_trial(window, fraction * window.window_state[0].step_size)
 
 
-@kernel
-def judge(window):
+@jit_kernel
+def judge_trial(window):
     """Decide about a trial whose change, noise and gradient are known."""
-    now = window.now[0]
-    even = abs(now.rise) <= now.noise < np.inf
+    now = window.window_state[0]
+    even = abs(now.objective_change) <= now.roundoff < np.inf
     if even:
-        there = -dot(window.direction, window.descent_there, len(window.direction))
-        enough = now.slope <= 0.0 and flattens(there, now.slope, _FLATTER)
-        excess = 0.5 * now.length * (there - now.slope)
+        there = -ordered_dot(window.direction, window.trial_descent, len(window.direction))
+        enough = now.slope <= 0.0 and is_approximate_wolfe_step(there, now.slope, _WOLFE_FRACTION)
+        excess = 0.5 * now.step_size * (there - now.slope)
     else:
-        enough = falls(now.rise, now.length, min(0.0, now.slope), 0.0)
-        excess = now.rise - now.length * now.slope
+        enough = is_armijo_step(now.objective_change, now.step_size, min(0.0, now.slope), 0.0)
+        excess = now.objective_change - now.step_size * now.slope
     if enough:
-        now.fallen -= 0.0 if even else now.rise
-        return ACCEPTED
-    now.tries += 1
-    if now.plain and (even or now.tries > _HALVINGS):
-        return STALLED
-    if now.plain or (now.tries <= now.retries and now.slope < 0.0):
+        now.objective_decrease -= 0.0 if even else now.objective_change
+        return TRIAL_ACCEPTED
+    now.num_rejected_trials += 1
+    if now.is_plain and (even or now.num_rejected_trials > _MAX_HALVINGS):
+        return TRIAL_STALLED
+    if now.is_plain or (now.num_rejected_trials <= now.max_retries and now.slope < 0.0):
         # Minimum of the interpolating parabola, safeguarded against too short or too long steps.
-        least = -0.5 * now.slope * now.length / excess if excess > 0.0 else 0.5
-        _try(window, now.length * min(max(least, 0.1), 0.5))
-        return AGAIN
-    now.plain, now.count, now.degree, now.tries = 1, now.count if now.retries == 0 else 0, 0, 0
+        least = -0.5 * now.slope * now.step_size / excess if excess > 0.0 else 0.5
+        _set_trial(window, now.step_size * min(max(least, 0.1), 0.5))
+        return TRIAL_AGAIN
+    now.is_plain, now.num_pairs, now.polynomial_degree, now.num_rejected_trials = (
+        1,
+        now.num_pairs if now.max_retries == 0 else 0,
+        0,
+        0,
+    )
     for k in range(len(window.direction)):
         window.direction[k] = window.correction[k]
-    now.slope = -now.squared
-    _try(window, 1.0)
-    return AGAIN
+    now.slope = -now.correction_squarednorm
+    _set_trial(window, 1.0)
+    return TRIAL_AGAIN
 
 
-@kernel
-def accept(window, correction):
+@jit_kernel
+def accept_trial(window, correction):
     """Accept the trial point, where `correction` is the plain one, and add the pair of this step to the history."""
-    now, m = window.now[0], len(window.a)
-    new = (now.newest + 1) % m
-    now.count = min(now.count + 1, m)
+    now, m = window.window_state[0], len(window.a)
+    new = (now.newest_pair + 1) % m
+    now.num_pairs = min(now.num_pairs + 1, m)
     for j in range(m):
         # The product with a gradient difference is the difference of the products with the gradients.
         window.sy[j, new], window.wy[j, new] = -window.sg[j], -window.wg[j]
         window.sg[j] = window.wg[j] = 0.0
     window.sy[new, new] = window.wy[new, new] = 0.0
-    now.squared = 0.0
+    now.correction_squarednorm = 0.0
     size = len(window.direction)
-    for begin in range(0, size, BLOCK):
-        end = min(size, begin + BLOCK)
-        step = window.steps[new * size + begin : new * size + end]
-        image = window.images[new * size + begin : new * size + end]
-        y = window.block[: end - begin]
-        _replace(window.trial[begin:end], window.position[begin:end], step, 1.0)
-        _replace(correction[begin:end], window.correction[begin:end], image, -1.0)
-        _replace(window.descent_there[begin:end], window.descent[begin:end], y, -1.0)
-        now.squared += dot(window.descent[begin:end], window.correction[begin:end], end - begin)
-        sy, wy = dots(step, image, y, end - begin)
+    for begin in range(0, size, CACHE_BLOCK):
+        end = min(size, begin + CACHE_BLOCK)
+        step = window.step_history[new * size + begin : new * size + end]
+        image = window.image_history[new * size + begin : new * size + end]
+        y = window.block_scratch[: end - begin]
+        _replace_difference(window.trial_position[begin:end], window.position[begin:end], step, 1.0)
+        _replace_difference(correction[begin:end], window.correction[begin:end], image, -1.0)
+        _replace_difference(window.trial_descent[begin:end], window.descent[begin:end], y, -1.0)
+        now.correction_squarednorm += ordered_dot(window.descent[begin:end], window.correction[begin:end], end - begin)
+        sy, wy = ordered_dot_pair(step, image, y, end - begin)
         window.sy[new, new] += sy
         window.wy[new, new] += wy
-        for back in range(now.count):
+        for back in range(now.num_pairs):
             j = (new - back + m) % m
-            sg, wg = dots(
-                window.steps[j * size + begin : j * size + end],
-                window.images[j * size + begin : j * size + end],
+            sg, wg = ordered_dot_pair(
+                window.step_history[j * size + begin : j * size + end],
+                window.image_history[j * size + begin : j * size + end],
                 window.descent[begin:end],
                 end - begin,
             )
@@ -189,61 +194,61 @@ def accept(window, correction):
             window.sy[j, new] += window.sg[j]
             window.wy[j, new] += window.wg[j]
         window.wy[new, j] = window.wy[j, new]
-    now.newest = new
+    now.newest_pair = new
 
 
-@inner
-def _try(window, length):
-    window.now[0].length = length
+@jit_inner
+def _set_trial(window, length):
+    window.window_state[0].step_size = length
     size = len(window.direction)
-    _go(window.position[:size], length, window.direction, window.trial[:size])
+    _move_along(window.position[:size], length, window.direction, window.trial_position[:size])
 
 
-@inner
-def _go(position, length, direction, trial):
+@jit_inner
+def _move_along(position, length, direction, trial):
     for k in range(len(trial)):
         trial[k] = position[k] + length * direction[k]
 
 
-@inner
-def _combine(window):
+@jit_inner
+def _combine_history(window):
     """Compute the direction from the coefficients, its slope, and a trial at full length."""
-    now, size, m = window.now[0], len(window.direction), len(window.a)
+    now, size, m = window.window_state[0], len(window.direction), len(window.a)
     slope = 0.0
-    for begin in range(0, size, BLOCK):
-        end = min(size, begin + BLOCK)
-        direction = window.block[: end - begin]
-        _set(direction, now.scale, window.correction[begin:end])
-        for back in range(now.count):
-            j = (now.newest - back + m) % m
-            _subtract(
+    for begin in range(0, size, CACHE_BLOCK):
+        end = min(size, begin + CACHE_BLOCK)
+        direction = window.block_scratch[: end - begin]
+        _set_scaled(direction, now.correction_scale, window.correction[begin:end])
+        for back in range(now.num_pairs):
+            j = (now.newest_pair - back + m) % m
+            _subtract_pair(
                 direction,
                 window.a[j],
-                window.steps[j * size + begin : j * size + end],
+                window.step_history[j * size + begin : j * size + end],
                 window.b[j],
-                window.images[j * size + begin : j * size + end],
+                window.image_history[j * size + begin : j * size + end],
             )
-        _set(window.direction[begin:end], 1.0, direction)
-        slope -= dot(window.direction[begin:end], window.descent[begin:end], end - begin)
-        _go(window.position[begin:end], 1.0, window.direction[begin:end], window.trial[begin:end])
-    now.slope, now.length = slope, 1.0
+        _set_scaled(window.direction[begin:end], 1.0, direction)
+        slope -= ordered_dot(window.direction[begin:end], window.descent[begin:end], end - begin)
+        _move_along(window.position[begin:end], 1.0, window.direction[begin:end], window.trial_position[begin:end])
+    now.slope, now.step_size = slope, 1.0
 
 
-@inner
-def _replace(new, old, change, sign):
+@jit_inner
+def _replace_difference(new, old, change, sign):
     """Replace old entries by new ones, and write the change times `sign`."""
     for k in range(len(new)):
         change[k] = sign * (new[k] - old[k])
         old[k] = new[k]
 
 
-@inner
-def _set(out, scale, c):
+@jit_inner
+def _set_scaled(out, scale, c):
     for k in range(len(out)):
         out[k] = scale * c[k]
 
 
-@inner
-def _subtract(out, a, s, b, w):
+@jit_inner
+def _subtract_pair(out, a, s, b, w):
     for k in range(len(out)):
         out[k] -= a * s[k] + b * w[k]

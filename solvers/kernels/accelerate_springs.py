@@ -14,13 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner
-from solvers.kernels.springs import TINY_SQUARED, Bundles, add_short, kinds
+from solvers.compiling import jit_inner
+from solvers.kernels.springs import ZERO_LENGTH_SQUARED, SpringPackets, add_degenerate_packet, deduplicate_packets
 from solvers.vectors import descent
-from solvers.vectors.springs import LANES, RIGHT
+from solvers.vectors.springs import LANES, RHS_STRIDE
 
 
-class Shares(NamedTuple):
+class ObjectiveWeights(NamedTuple):
     """The data of the objective in addition to those of the gradient.
 
     Attributes:
@@ -32,60 +32,68 @@ class Shares(NamedTuple):
         energy_scale: sum of k r^2 [J].
     """
 
-    kind: NDArray[np.int32]
-    shares: NDArray[np.float64]
-    inverse: NDArray[np.float64]
-    massless: NDArray[np.int64]
-    size: float
+    weight_offset: NDArray[np.int32]
+    energy_weights: NDArray[np.float64]
+    inverse_anchor: NDArray[np.float64]
+    massless_rows: NDArray[np.int64]
+    energy_scale: float
 
     @classmethod
-    def of(cls, bundles: Bundles, held: NDArray[np.float64], pinned: NDArray[np.int64]) -> Shares:
+    def from_packets(
+        cls, bundles: SpringPackets, anchor_stiffness: NDArray[np.float64], pinned: NDArray[np.int64]
+    ) -> ObjectiveWeights:
         """Build the weights of springs in packets, of which the rows `pinned` do not move."""
-        pull, k = bundles.each()
-        parts = np.where(np.isin(bundles.neighbour, 4 * pinned), 0.5, 0.25)
+        pull, k = bundles.entry_weights()
+        parts = np.where(np.isin(bundles.neighbour_offset, 4 * pinned), 0.5, 0.25)
         share = np.divide(parts, k, out=np.zeros_like(k), where=k != 0.0)
-        inverse = np.divide(0.5, held, out=np.zeros_like(held), where=held > 0.0)
-        massless = np.unique(bundles.own[bundles.in_lanes(held) == 0.0])
-        places = np.column_stack([massless, bundles.in_right(len(held))[massless // 4]])
-        return cls(*kinds(share), bundles.in_lanes(inverse), places.astype(np.int64), 2.0 * float(share @ pull**2))
+        inverse = np.divide(0.5, anchor_stiffness, out=np.zeros_like(anchor_stiffness), where=anchor_stiffness > 0.0)
+        massless = np.unique(bundles.row_offset[bundles.gather_lanes(anchor_stiffness) == 0.0])
+        places = np.column_stack([massless, bundles.right_hand_side_offset(len(anchor_stiffness))[massless // 4]])
+        return cls(
+            *deduplicate_packets(share),
+            bundles.gather_lanes(inverse),
+            places.astype(np.int64),
+            2.0 * float(share @ pull**2),
+        )
 
 
-@inner
-def descend(bundles, shares, p, right, out):
+@jit_inner
+def value_and_descent(bundles, shares, p, right, out):
     """Write minus the gradient at p to the rows of `out`, and return the objective."""
     total = 0.0
-    for b in range(len(bundles.start) - 1):
-        energy = descent.descend(bundles, shares, b, p, right, out)
+    for b in range(len(bundles.packet_start) - 1):
+        energy = descent.spring_energy_and_descent(bundles, shares, b, p, right, out)
         if energy < 0.0:
             for lane in range(LANES):
                 for c in range(4):
-                    out[bundles.own[LANES * b + lane] + c] = 0.0
-            add_short(bundles, b, p, right, out, True)
-            energy = _short(bundles, shares, b, p, right)
+                    out[bundles.row_offset[LANES * b + lane] + c] = 0.0
+            add_degenerate_packet(bundles, b, p, right, out, True)
+            energy = _degenerate_packet_energy(bundles, shares, b, p, right)
         total += energy
-    for k in range(len(shares.massless)):
+    for k in range(len(shares.massless_rows)):
         for c in range(3):
-            total -= right[shares.massless[k, 1] + LANES * c] * p[shares.massless[k, 0] + c]
+            total -= right[shares.massless_rows[k, 1] + LANES * c] * p[shares.massless_rows[k, 0] + c]
     return total
 
 
-@inner
-def _short(bundles, shares, b, p, right):
+@jit_inner
+def _degenerate_packet_energy(bundles, shares, b, p, right):
     """Return the energy of a packet with a spring of zero length."""
     total = 0.0
     for lane in range(LANES):
-        i, at = bundles.own[LANES * b + lane], RIGHT * b + lane
+        i, at = bundles.row_offset[LANES * b + lane], RHS_STRIDE * b + lane
         for c in range(3):
             away = right[at + LANES * c] - right[at + 3 * LANES] * p[i + c]
-            total += shares.inverse[LANES * b + lane] * away**2
-    for e in range(LANES * bundles.start[b], LANES * bundles.start[b + 1]):
+            total += shares.inverse_anchor[LANES * b + lane] * away**2
+    for e in range(LANES * bundles.packet_start[b], LANES * bundles.packet_start[b + 1]):
         entry, lane = divmod(e, LANES)
-        i, j, w = bundles.own[LANES * b + lane], bundles.neighbour[e], bundles.kind[entry] + lane
+        i, j, w = bundles.row_offset[LANES * b + lane], bundles.neighbour_offset[e], bundles.weight_offset[entry] + lane
         squared = 0.0
         for c in range(3):
             squared += (p[i + c] - p[j + c]) ** 2
-        length = 0.0 if squared <= TINY_SQUARED else np.sqrt(squared)
+        length = 0.0 if squared <= ZERO_LENGTH_SQUARED else np.sqrt(squared)
         total += (
-            shares.shares[shares.kind[entry] + lane] * (bundles.weights[w] - bundles.weights[w + LANES] * length) ** 2
+            shares.energy_weights[shares.weight_offset[entry] + lane]
+            * (bundles.weights[w] - bundles.weights[w + LANES] * length) ** 2
         )
     return total

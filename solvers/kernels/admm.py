@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from solvers.compiling import kernel
-from solvers.energies.edges import TINY
+from solvers.compiling import jit_kernel
+from solvers.energies.edges import ZERO_LENGTH
 
 
-@kernel
-def project(edges, stiffness, low, high, rest_direction, weight, p, constant, u, out):
+@jit_kernel
+def run_local_step(edges, stiffness, low, high, rest_direction, weight, p, constant, u, out):
     """Write constant + W A'K (z - u) [N] to `out` and update u.
 
     Args:
@@ -32,7 +32,7 @@ def project(edges, stiffness, low, high, rest_direction, weight, p, constant, u,
         v0, v1, v2 = p[i, 0] - p[j, 0] + u[e, 0], p[i, 1] - p[j, 1] + u[e, 1], p[i, 2] - p[j, 2] + u[e, 2]
         length = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
         d0, d1, d2 = rest_direction[e, 0], rest_direction[e, 1], rest_direction[e, 2]
-        if length > TINY:
+        if length > ZERO_LENGTH:
             d0, d1, d2 = v0 / length, v1 / length, v2 / length
         t = min(max(length, low[e]), high[e])
         d0, d1, d2 = t * d0, t * d1, t * d2

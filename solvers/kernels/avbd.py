@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kernel
+from solvers.compiling import jit_inner, jit_kernel
 
 
-class Duals(NamedTuple):
+class DualState(NamedTuple):
     """The dual variables and parameters of each edge (m,), updated after sweeps.
 
     Attributes:
@@ -31,72 +31,76 @@ class Duals(NamedTuple):
         majorant_scratch: scratch for the majorant with the edges (rows,).
     """
 
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    exact: NDArray[np.bool_]
-    ramp: NDArray[np.float64]
-    most: NDArray[np.float64]
-    firmest: NDArray[np.float64]
+    min_length: NDArray[np.float64]
+    max_length: NDArray[np.float64]
+    exact_mask: NDArray[np.bool_]
+    stiffness_ramp: NDArray[np.float64]
+    max_stiffness: NDArray[np.float64]
+    max_tension: NDArray[np.float64]
     stiffness: NDArray[np.float64]
     tension: NDArray[np.float64]
-    base: NDArray[np.float64]
-    bound: NDArray[np.float64]
+    base_majorant: NDArray[np.float64]
+    majorant_scratch: NDArray[np.float64]
 
 
-@inner
-def _clipped(x, low, high):
+@jit_inner
+def _clip(x, low, high):
     return min(max(x, low), high)
 
 
-@kernel
-def place(blocks, hard, duals, p):
+@jit_kernel
+def write_edge_parameters(blocks, hard, duals, p):
     """Write the edges' stiffnesses and shifted limits to their parameters, and the vertex majorants to the lanes.
 
     If an edge pulls with t, the stiffness of a transverse step is at most t/l.
     """
-    for row in range(len(duals.base)):
-        duals.bound[row] = duals.base[row]
-    for e in range(len(duals.low)):
+    for row in range(len(duals.base_majorant)):
+        duals.majorant_scratch[row] = duals.base_majorant[row]
+    for e in range(len(duals.min_length)):
         k, t = duals.stiffness[e], duals.tension[e]
-        hard.numbers[e, 0], hard.numbers[e, 1], hard.numbers[e, 2] = k, duals.low[e] - t / k, duals.high[e] - t / k
-        i, j = hard.rows[e, 0], hard.rows[e, 1]
+        hard.parameters[e, 0], hard.parameters[e, 1], hard.parameters[e, 2] = (
+            k,
+            duals.min_length[e] - t / k,
+            duals.max_length[e] - t / k,
+        )
+        i, j = hard.element_rows[e, 0], hard.element_rows[e, 1]
         if i != j:
-            share = k + max(t, 0.0) / max(_length(hard, e, p), 0.01 * duals.high[e])
-            duals.bound[i] += share
-            duals.bound[j] += share
+            share = k + max(t, 0.0) / max(_edge_length(hard, e, p), 0.01 * duals.max_length[e])
+            duals.majorant_scratch[i] += share
+            duals.majorant_scratch[j] += share
     for lane in range(len(blocks.majorant)):
-        blocks.majorant[lane] = duals.bound[blocks.bundles.own[lane] // 4]
+        blocks.majorant[lane] = duals.majorant_scratch[blocks.spring_packets.row_offset[lane] // 4]
 
 
-@inner
-def _length(hard, e, p):
-    i, j = 4 * hard.rows[e, 0], 4 * hard.rows[e, 1]
+@jit_inner
+def _edge_length(hard, e, p):
+    i, j = 4 * hard.element_rows[e, 0], 4 * hard.element_rows[e, 1]
     return np.sqrt((p[i] - p[j]) ** 2 + (p[i + 1] - p[j + 1]) ** 2 + (p[i + 2] - p[j + 2]) ** 2)
 
 
-@inner
-def _renew(hard, duals, p):
+@jit_inner
+def _update_duals(hard, duals, p):
     """Do the dual step at p."""
-    for e in range(len(duals.low)):
-        k, length = duals.stiffness[e], _length(hard, e, p)
-        force = k * (length - _clipped(length, hard.numbers[e, 1], hard.numbers[e, 2]))
-        if duals.exact[e]:
-            duals.tension[e] = _clipped(force, -duals.firmest[e], duals.firmest[e])
+    for e in range(len(duals.min_length)):
+        k, length = duals.stiffness[e], _edge_length(hard, e, p)
+        force = k * (length - _clip(length, hard.parameters[e, 1], hard.parameters[e, 2]))
+        if duals.exact_mask[e]:
+            duals.tension[e] = _clip(force, -duals.max_tension[e], duals.max_tension[e])
         if force != 0.0:
-            off = abs(length - _clipped(length, duals.low[e], duals.high[e]))
-            duals.stiffness[e] = min(k + duals.ramp[e] * off, duals.most[e])
+            off = abs(length - _clip(length, duals.min_length[e], duals.max_length[e]))
+            duals.stiffness[e] = min(k + duals.stiffness_ramp[e] * off, duals.max_stiffness[e])
 
 
 @cache
-def augmenting(sweeps: Any) -> Any:
+def build_augmented_iteration(sweeps: Any) -> Any:
     """Build the iteration over a kernel of sweeps, `vbd_sweeps.run_iterations` or one for elements."""
 
-    @kernel
+    @jit_kernel
     def iterate(blocks, spaces, beside, right, work, p, iterations, hard, duals):
         """Run n sweeps from p, which is overwritten, each with a dual step; edge parameters must be current."""
         for _ in range(iterations):
             sweeps(blocks, spaces, beside, right, 0.0, work, p, 1)
-            _renew(hard, duals, p)
-            place(blocks, hard, duals, p)
+            _update_duals(hard, duals, p)
+            write_edge_parameters(blocks, hard, duals, p)
 
     return iterate

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from solvers.compiling import kernel
+from solvers.compiling import jit_kernel
 
 
-@kernel
+@jit_kernel
 def first_fit(pointers, groups, back, items, colour, taken):
     """Write to `colour`, for each item in order, the first colour that no earlier item of its groups has.
 

@@ -10,25 +10,32 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kernel
-from solvers.kernels.hessian import multiply
-from solvers.linear.krylov import CURVED, compiled_over
-from solvers.linear.supernodal import Supernodal
-from solvers.linear.supernodal_solve import Factor, solve
-from solvers.linear.team import Team
+from solvers.compiling import jit_inner, jit_kernel
+from solvers.kernels.hessian import multiply_hessian
+from solvers.linear.krylov import NEGATIVE_CURVATURE, compile_cg_loop
+from solvers.linear.supernodal import SupernodalCholesky
+from solvers.linear.supernodal_solve import SupernodalFactor, solve_supernodal
+from solvers.linear.team import ThreadTeam
 
 
-def among(factor: Supernodal, free: NDArray[np.int64]) -> Factor:
+def embed_factor(factor: SupernodalCholesky, free: NDArray[np.int64]) -> SupernodalFactor:
     """Embed a float64 factor over the free vertices (f,) so that it solves with vectors of all vertices."""
     at = factor.layout
     by_slot, by_vertex = (
-        np.stack([free[order[:, 0]], order[:, 1]], axis=1).astype(np.uint32) for order in (at.by_slot, at.by_vertex)
+        np.stack([free[order[:, 0]], order[:, 1]], axis=1).astype(np.uint32)
+        for order in (at.order_by_slot, at.order_by_vertex)
     )
-    lists = at.places, at.chunks, at.spans, by_slot, by_vertex
-    return Factor(factor.squares, factor.panels, *lists, np.zeros(4 * at.rows), Team.of(len(at.spans) - 1))
+    lists = at.row_slots, at.chunks, at.group_spans, by_slot, by_vertex
+    return SupernodalFactor(
+        factor.inverse_blocks,
+        factor.panels,
+        *lists,
+        np.zeros(4 * at.num_work_rows),
+        ThreadTeam.from_task_count(len(at.group_spans) - 1),
+    )
 
 
-class Newton(NamedTuple):
+class NewtonEquation(NamedTuple):
     """The state of the solve of a Newton equation H d = -g.
 
     Attributes:
@@ -41,60 +48,60 @@ class Newton(NamedTuple):
             (n, 3).
     """
 
-    hessian: tuple[Any, ...]
-    factor: Factor
-    threads: int | None
-    held: NDArray[np.int64]
-    shrunk: tuple[NDArray[np.int64], NDArray[np.float64]] | None
+    hessian_arguments: tuple[Any, ...]
+    factor: SupernodalFactor
+    num_threads: int | None
+    fixed_vertices: NDArray[np.int64]
+    inverse_scaling: tuple[NDArray[np.int64], NDArray[np.float64]] | None
     d: NDArray[np.float64]
     r: NDArray[np.float64]
     p: NDArray[np.float64]
     z: NDArray[np.float64]
-    product: NDArray[np.float64]
+    hessian_product: NDArray[np.float64]
 
 
-@inner
-def _turn(state, product, before):
+@jit_inner
+def _update_direction(state, product, before):
     newton, _ = state
     scale = product / before
     for i in range(len(newton.p)):
         for c in range(3):
             newton.p[i, c] = newton.z[i, c] + scale * newton.p[i, c]
-    multiply(*newton.hessian, newton.p, newton.product)
-    for v in newton.held:
+    multiply_hessian(*newton.hessian_arguments, newton.p, newton.hessian_product)
+    for v in newton.fixed_vertices:
         for c in range(3):
-            newton.product[v, c] = 0.0
-    return _dot(newton.p, newton.product)
+            newton.hessian_product[v, c] = 0.0
+    return _inner_product(newton.p, newton.hessian_product)
 
 
-@inner
-def _go(state, product, curvature):
+@jit_inner
+def _update_iterate(state, product, curvature):
     newton, _ = state
     length = product / curvature
     for i in range(len(newton.d)):
         for c in range(3):
             newton.d[i, c] += length * newton.p[i, c]
-            newton.r[i, c] -= length * newton.product[i, c]
-    b = _scaled(newton.shrunk, newton.r, newton.product)
-    solve(newton.factor, b, newton.z, newton.threads)
-    _shrink(newton.shrunk, newton.z)
-    return _dot(newton.r, newton.z)
+            newton.r[i, c] -= length * newton.hessian_product[i, c]
+    b = _scaled_copy(newton.inverse_scaling, newton.r, newton.hessian_product)
+    solve_supernodal(newton.factor, b, newton.z, newton.num_threads)
+    _apply_scaling(newton.inverse_scaling, newton.z)
+    return _inner_product(newton.r, newton.z)
 
 
-@inner
-def _scaled(shrunk, r, out):
+@jit_inner
+def _scaled_copy(shrunk, r, out):
     """Write S^-1 r (n, 3) to `out` and return it; return r itself without scaling."""
     if shrunk is None:
         return r
     for v in range(len(r)):
         for c in range(3):
             out[v, c] = r[v, c]
-    _shrink(shrunk, out)
+    _apply_scaling(shrunk, out)
     return out
 
 
-@inner
-def _shrink(shrunk, x):
+@jit_inner
+def _apply_scaling(shrunk, x):
     """Multiply x (n, 3) by S^-1."""
     if shrunk is None:
         return
@@ -106,22 +113,22 @@ def _shrink(shrunk, x):
             x[v, c] = root[k, c, 0] * x0 + root[k, c, 1] * x1 + root[k, c, 2] * x2
 
 
-@inner
-def _convex(state, curvature):
+@jit_inner
+def _is_convex(state, curvature):
     return not curvature <= 0.0
 
 
-@inner
-def _near(state, product):
+@jit_inner
+def _is_converged(state, product):
     _, limit = state
     return product <= limit
 
 
-_iterate = compiled_over(_turn, _go, _convex, _near)
+_iterate_loop = compile_cg_loop(_update_direction, _update_iterate, _is_convex, _is_converged)
 
 
-@kernel
-def direction(newton, gradient, descent, eta, most):
+@jit_kernel
+def solve_direction(newton, gradient, descent, eta, most):
     """Write newton.d (n, 3) [m]; it is -Q^-1 g if the Hessian is not convex along that.
 
     Vectors of `newton` are zero at the vertices that do not move.
@@ -137,16 +144,16 @@ def direction(newton, gradient, descent, eta, most):
         for c in range(3):
             newton.d[i, c] = newton.p[i, c] = 0.0
             newton.r[i, c], newton.z[i, c] = -gradient[i, c], -descent[i, c]
-    product = _dot(gradient, descent)
-    count, ended = _iterate((newton, eta * eta * product), product, most)
-    if ended == CURVED and count == 0:
+    product = _inner_product(gradient, descent)
+    count, ended = _iterate_loop((newton, eta * eta * product), product, most)
+    if ended == NEGATIVE_CURVATURE and count == 0:
         for i in range(len(newton.d)):
             for c in range(3):
                 newton.d[i, c] = newton.p[i, c]
 
 
-@inner
-def _dot(a, b):
+@jit_inner
+def _inner_product(a, b):
     total = 0.0
     for i in range(len(a)):
         total += a[i, 0] * b[i, 0] + a[i, 1] * b[i, 1] + a[i, 2] * b[i, 2]

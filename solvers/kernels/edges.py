@@ -14,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner
-from solvers.energies.edges import TINY
+from solvers.compiling import jit_inner
+from solvers.energies.edges import ZERO_LENGTH
 from solvers.problem import Positions
 
 
-class Edges(NamedTuple):
+class EdgeElements(NamedTuple):
     """Edges by the rows of their ends, strain limits first.
 
     Attributes:
@@ -33,18 +33,18 @@ class Edges(NamedTuple):
         offset: o (m,) [m].
     """
 
-    ends: NDArray[np.int64]
-    first: NDArray[np.int64]
-    other: NDArray[np.int64]
-    edge: NDArray[np.int64]
+    end_rows: NDArray[np.int64]
+    row_starts: NDArray[np.int64]
+    other_row: NDArray[np.int64]
+    edge_index: NDArray[np.int64]
     stiffness: NDArray[np.float64]
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    axis: Positions
+    min_length: NDArray[np.float64]
+    max_length: NDArray[np.float64]
+    edge_axis: Positions
     offset: NDArray[np.float64]
 
     @classmethod
-    def of(
+    def from_edges(
         cls,
         ends: NDArray[np.int64],
         stiffness: NDArray[np.float64],
@@ -52,7 +52,7 @@ class Edges(NamedTuple):
         high: NDArray[np.float64],
         row: NDArray[np.int64],
         rows: int,
-    ) -> Edges:
+    ) -> EdgeElements:
         """Build edges between vertices (m, 2) in rows `row` (n,)."""
         kept = np.flatnonzero(ends[:, 0] != ends[:, 1])
         here, there = row[ends[kept]].T.ravel(), row[ends[kept, ::-1]].T.ravel()
@@ -70,26 +70,26 @@ class Edges(NamedTuple):
         )
 
 
-@inner
-def _at(edges, row, entry, x):
+@jit_inner
+def _evaluate_entry(edges, row, entry, x):
     """Return v and b of an entry, seen from its own end, and its stiffness."""
-    j, e, sign = edges.other[entry], edges.edge[entry], 1.0
+    j, e, sign = edges.other_row[entry], edges.edge_index[entry], 1.0
     if e < 0:
         e, sign = ~e, -1.0
     v = x[4 * row] - x[4 * j], x[4 * row + 1] - x[4 * j + 1], x[4 * row + 2] - x[4 * j + 2]
-    n = sign * edges.axis[e, 0], sign * edges.axis[e, 1], sign * edges.axis[e, 2]
-    if e >= len(edges.low):
+    n = sign * edges.edge_axis[e, 0], sign * edges.edge_axis[e, 1], sign * edges.edge_axis[e, 2]
+    if e >= len(edges.min_length):
         scale = n[0] * v[0] + n[1] * v[1] + n[2] * v[2] - edges.offset[e]
         return v, (scale * n[0], scale * n[1], scale * n[2]), edges.stiffness[e]
     length = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    scale = length - min(max(length, edges.low[e]), edges.high[e])
-    if length <= TINY:
+    scale = length - min(max(length, edges.min_length[e]), edges.max_length[e])
+    if length <= ZERO_LENGTH:
         return v, (scale * n[0], scale * n[1], scale * n[2]), edges.stiffness[e]
     scale /= length
     return v, (scale * v[0], scale * v[1], scale * v[2]), edges.stiffness[e]
 
 
-@inner
+@jit_inner
 def add_edges(edges, begin, end, x, out, shift, correct):
     """Add A'K d, or minus the gradient if `correct`, to rows shifted by `shift`.
 
@@ -99,8 +99,8 @@ def add_edges(edges, begin, end, x, out, shift, correct):
         return
     for row in range(begin, end):
         s0 = s1 = s2 = 0.0
-        for entry in range(edges.first[row], edges.first[row + 1]):
-            v, b, k = _at(edges, row, entry, x)
+        for entry in range(edges.row_starts[row], edges.row_starts[row + 1]):
+            v, b, k = _evaluate_entry(edges, row, entry, x)
             if correct:
                 s0, s1, s2 = s0 - k * b[0], s1 - k * b[1], s2 - k * b[2]
             else:
@@ -109,30 +109,30 @@ def add_edges(edges, begin, end, x, out, shift, correct):
         out[at], out[at + 1], out[at + 2] = out[at] + s0, out[at + 1] + s1, out[at + 2] + s2
 
 
-@inner
-def descend_edges(edges, rows, x, out):
+@jit_inner
+def add_edge_descent(edges, rows, x, out):
     """Add minus the gradient of all edges to the first `rows` rows of `out`, which move; return the energy [J].
 
     Each edge is computed once and added at both of its ends.
     """
     if edges is None:
         return 0.0
-    total, limits = 0.0, len(edges.low)
+    total, limits = 0.0, len(edges.min_length)
     for e in range(len(edges.stiffness)):
-        i, j, k = edges.ends[e, 0], edges.ends[e, 1], edges.stiffness[e]
+        i, j, k = edges.end_rows[e, 0], edges.end_rows[e, 1], edges.stiffness[e]
         if i == j or (i >= rows and j >= rows):
             continue
         v0, v1, v2 = x[4 * i] - x[4 * j], x[4 * i + 1] - x[4 * j + 1], x[4 * i + 2] - x[4 * j + 2]
-        n0, n1, n2 = edges.axis[e, 0], edges.axis[e, 1], edges.axis[e, 2]
+        n0, n1, n2 = edges.edge_axis[e, 0], edges.edge_axis[e, 1], edges.edge_axis[e, 2]
         if e >= limits:
             scale = n0 * v0 + n1 * v1 + n2 * v2 - edges.offset[e]
         else:
             squared = v0 * v0 + v1 * v1 + v2 * v2
-            if edges.low[e] * edges.low[e] <= squared <= edges.high[e] * edges.high[e]:
+            if edges.min_length[e] * edges.min_length[e] <= squared <= edges.max_length[e] * edges.max_length[e]:
                 continue
             length = np.sqrt(squared)
-            scale = length - min(max(length, edges.low[e]), edges.high[e])
-            if length > TINY:
+            scale = length - min(max(length, edges.min_length[e]), edges.max_length[e])
+            if length > ZERO_LENGTH:
                 n0, n1, n2 = v0 / length, v1 / length, v2 / length
         total += 0.5 * k * scale * scale
         f0, f1, f2 = k * scale * n0, k * scale * n1, k * scale * n2

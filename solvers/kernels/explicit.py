@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from solvers.compiling import kernel
+from solvers.compiling import jit_kernel
 from solvers.kernels.springs import add_descent
 
 
-@kernel
-def advance(bundles, pins, begin, end, force, rate, h, count, p, v, acceleration):
+@jit_kernel
+def run_symplectic_euler(bundles, pins, begin, end, force, rate, h, count, p, v, acceleration):
     """Run `count` substeps of size h; p and v, in rows of four, are overwritten with the result.
 
     Args:
@@ -25,7 +25,7 @@ def advance(bundles, pins, begin, end, force, rate, h, count, p, v, acceleration
     for step in range(1, count + 1):
         for k in range(len(acceleration)):
             acceleration[k] = 0.0
-        add_descent(bundles, 0, len(bundles.start) - 1, p, force, acceleration, 0)
+        add_descent(bundles, 0, len(bundles.packet_start) - 1, p, force, acceleration, 0)
         for i in range(len(rate)):
             for k in range(4 * i, 4 * i + 3):
                 v[k] += rate[i] * acceleration[k]

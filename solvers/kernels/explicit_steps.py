@@ -12,21 +12,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kernel
-from solvers.kernels.springs import Bundles, add_descent
-from solvers.memory import aligned
+from solvers.compiling import jit_inner, jit_kernel
+from solvers.kernels.springs import SpringPackets, add_descent
+from solvers.memory import allocate_aligned
 from solvers.problem import Positions
 
-FEWEST, LARGEST, CAUTION = 0.2, 5.0, 0.9
+FACTORMIN, FACTORMAX, SAFETY = 0.2, 5.0, 0.9
 """Limits of the change of the step size, and the safety factor."""
 
-FLOOR = 1e-10
+MIN_STEP_FRACTION = 1e-10
 """Smallest step size relative to the frame; below it the integration is abandoned."""
 
-Array = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 
-class Forces(NamedTuple):
+class FrameForces(NamedTuple):
     """The forces of a frame.
 
     Attributes:
@@ -40,53 +40,57 @@ class Forces(NamedTuple):
         pin_start, pin_end: positions of the pins (q, 3) [m].
     """
 
-    bundles: Bundles
-    right: Array
-    pairs: NDArray[np.int64]
-    weight: Array
-    held: Array
-    inverse: Array
-    drag: Array
-    pins: NDArray[np.int64]
-    begin: Positions
-    end: Positions
+    spring_packets: SpringPackets
+    right_hand_side: FloatArray
+    form_pairs: NDArray[np.int64]
+    form_weight: FloatArray
+    form_vertex_weight: FloatArray
+    inverse_mass: FloatArray
+    drag_rate: FloatArray
+    pinned_vertices: NDArray[np.int64]
+    pin_start: Positions
+    pin_end: Positions
 
 
-@inner
+@jit_inner
 def add_forces(forces, p, out):
     """Add all forces except drag [N] at p to `out`, in rows of four."""
-    add_descent(forces.bundles, 0, len(forces.bundles.start) - 1, p, forces.right, out, 0)
-    for i in range(len(forces.held)):
+    add_descent(
+        forces.spring_packets, 0, len(forces.spring_packets.packet_start) - 1, p, forces.right_hand_side, out, 0
+    )
+    for i in range(len(forces.form_vertex_weight)):
         for k in range(4 * i, 4 * i + 3):
-            out[k] -= forces.held[i] * p[k]
-    for e in range(len(forces.weight)):
-        i, j, w = 4 * forces.pairs[e, 0], 4 * forces.pairs[e, 1], forces.weight[e]
+            out[k] -= forces.form_vertex_weight[i] * p[k]
+    for e in range(len(forces.form_weight)):
+        i, j, w = 4 * forces.form_pairs[e, 0], 4 * forces.form_pairs[e, 1], forces.form_weight[e]
         for c in range(3):
             f = w * (p[i + c] - p[j + c])
             out[i + c] -= f
             out[j + c] += f
 
 
-@inner
-def pull(forces, p, out):
+@jit_inner
+def compute_acceleration(forces, p, out):
     """Write the acceleration [m/s^2] by these forces to `out`."""
     for k in range(len(out)):
         out[k] = 0.0
     add_forces(forces, p, out)
     for k in range(len(out)):
-        out[k] *= forces.inverse[k]
+        out[k] *= forces.inverse_mass[k]
 
 
-@inner
-def carry(forces, part, p):
+@jit_inner
+def apply_pins(forces, fraction, p):
     """Move the pins to their positions at a fraction of the frame."""
-    for q in range(len(forces.pins)):
+    for q in range(len(forces.pinned_vertices)):
         for c in range(3):
-            p[4 * forces.pins[q] + c] = forces.end[q, c] + (1.0 - part) * (forces.begin[q, c] - forces.end[q, c])
+            p[4 * forces.pinned_vertices[q] + c] = forces.pin_end[q, c] + (1.0 - fraction) * (
+                forces.pin_start[q, c] - forces.pin_end[q, c]
+            )
 
 
-@inner
-def kick(inverse, kept, gained, first, second, h, p, v, force):
+@jit_inner
+def kick_and_drift(inverse, kept, gained, first, second, h, p, v, force):
     """Apply one kick to v, a second one unless it is negative, and a drift of p for h [s].
 
     The force [N] is cleared.
@@ -101,8 +105,8 @@ def kick(inverse, kept, gained, first, second, h, p, v, force):
         p[i] += h * w
 
 
-@kernel
-def compose(forces, drifts, kept, gained, count, h, p, v, force):
+@jit_kernel
+def run_splitting(forces, drifts, kept, gained, count, h, p, v, force):
     """Run `count` steps of size h: drift 0, kick 0, drift 1, ..., the last drift.
 
     If a step neither starts nor ends with a drift, its last kick and the first kick of the next step share one force.
@@ -125,18 +129,18 @@ def compose(forces, drifts, kept, gained, count, h, p, v, force):
         if drifts[0] != 0.0:
             for i in range(len(p)):
                 p[i] += drifts[0] * h * v[i]
-            carry(forces, (step + gone) / count, p)
+            apply_pins(forces, (step + gone) / count, p)
         for k in range(1 if joined and step > 0 else 0, last + 1):
             both = joined and k == last and step < count - 1
             after = drifts[1] if both else drifts[k + 1]
             add_forces(forces, p, force)
-            kick(forces.inverse, kept, gained, k, 0 if both else -1, after * h, p, v, force)
+            kick_and_drift(forces.inverse_mass, kept, gained, k, 0 if both else -1, after * h, p, v, force)
             gone = 1 + after if both else gone + after
             if after != 0.0:
-                carry(forces, (step + gone) / count, p)
+                apply_pins(forces, (step + gone) / count, p)
 
 
-class Coefficients(NamedTuple):
+class TableauCoefficients(NamedTuple):
     """The coefficients of a Runge-Kutta method.
 
     Attributes:
@@ -146,37 +150,37 @@ class Coefficients(NamedTuple):
         error_exponent: exponent of h in the error; 0 fixes h.
     """
 
-    a: Array
-    times: Array
-    errors: Array
-    power: float
+    a: FloatArray
+    stage_times: FloatArray
+    error_weights: FloatArray
+    error_exponent: float
 
 
-class Subdivision(NamedTuple):
+class AdaptiveSteps(NamedTuple):
     """The steps of a frame [s]: rms error tolerance of a step [m], maximum number of tried steps, first step [s]."""
 
-    frame: float
+    frame_length: float
     tolerance: float
-    most: float
-    first: float
+    max_steps: float
+    initial_step: float
 
 
-class Scratch(NamedTuple):
+class StageScratch(NamedTuple):
     """The motion at a stage, q [m] and w [m/s], and the derivatives q' and w' at all stages, (s, rows)."""
 
-    q: Array
-    w: Array
-    speeds: Array
-    pulls: Array
+    q: FloatArray
+    w: FloatArray
+    stage_velocities: FloatArray
+    stage_accelerations: FloatArray
 
     @classmethod
-    def of(cls, stages: int, rows: int) -> Scratch:
+    def from_sizes(cls, stages: int, rows: int) -> StageScratch:
         """Allocate the scratch for a number of stages and of coordinates."""
-        return cls(aligned(rows), aligned(rows), *np.zeros((2, stages, rows)))
+        return cls(allocate_aligned(rows), allocate_aligned(rows), *np.zeros((2, stages, rows)))
 
 
-@inner
-def _stage(stages, s, h, p, v, at):
+@jit_inner
+def _write_stage(stages, s, h, p, v, at):
     """Write the motion of stage s to `at`."""
     for i in range(len(p)):
         at.q[i], at.w[i] = p[i], v[i]
@@ -184,46 +188,46 @@ def _stage(stages, s, h, p, v, at):
         a = stages.a[s, j]
         if a != 0.0:
             for i in range(len(p)):
-                at.q[i] += h * a * at.speeds[j, i]
-                at.w[i] += h * a * at.pulls[j, i]
+                at.q[i] += h * a * at.stage_velocities[j, i]
+                at.w[i] += h * a * at.stage_accelerations[j, i]
 
 
-@inner
-def _evaluate(forces, s, q, w, at):
+@jit_inner
+def _evaluate_stage(forces, s, q, w, at):
     """Write q' and w' of stage s to `at`."""
-    pull(forces, q, at.pulls[s])
+    compute_acceleration(forces, q, at.stage_accelerations[s])
     for i in range(len(q)):
-        at.pulls[s, i] -= forces.drag[i] * w[i]
-        at.speeds[s, i] = w[i]
+        at.stage_accelerations[s, i] -= forces.drag_rate[i] * w[i]
+        at.stage_velocities[s, i] = w[i]
 
 
-@inner
-def _squares(forces, weights, span, at):
+@jit_inner
+def _error_squares(forces, weights, span, at):
     """Return the sum of squares of an error: of positions, and of velocities times `span`."""
     total = 0.0
-    for i in range(0, len(forces.inverse), 4):
-        if forces.inverse[i] != 0.0:
+    for i in range(0, len(forces.inverse_mass), 4):
+        if forces.inverse_mass[i] != 0.0:
             for c in range(i, i + 3):
                 x = y = 0.0
                 for j in range(len(weights)):
-                    x += weights[j] * at.speeds[j, c]
-                    y += weights[j] * at.pulls[j, c]
+                    x += weights[j] * at.stage_velocities[j, c]
+                    y += weights[j] * at.stage_accelerations[j, c]
                 total += x * x + span * span * y * y
     return total
 
 
-@inner
-def _error(forces, errors, span, at):
+@jit_inner
+def _step_error(forces, errors, span, at):
     """Return the sum of squares of a step's error; a second estimate moderates the first one."""
-    size = _squares(forces, errors[0], span, at)
+    size = _error_squares(forces, errors[0], span, at)
     if len(errors) == 1:
         return size
-    other = _squares(forces, errors[1], span, at)
+    other = _error_squares(forces, errors[1], span, at)
     return size * size / (size + 0.01 * other) if size > 0.0 else 0.0
 
 
-@kernel
-def integrate(forces, stages, steps, p, v, at, told):
+@jit_kernel
+def integrate_adaptive(forces, stages, steps, p, v, at, step_stats):
     """Integrate a frame by a Runge-Kutta method with adaptive step size.
 
     An error of the velocity is multiplied by the length of the frame.
@@ -238,34 +242,37 @@ def integrate(forces, stages, steps, p, v, at, told):
         step_stats: output: accepted steps, rejected steps, last step size [s], time reached [s].
     """
     free = 0
-    for i in range(0, len(forces.inverse), 4):
-        free += 3 * (forces.inverse[i] != 0.0)
-    frame, power, end = steps.frame, stages.power, len(stages.a) - 1
-    t, before, h = 0.0, 1.0, steps.first
-    told[0] = told[1] = 0.0
-    _evaluate(forces, 0, p, v, at)
+    for i in range(0, len(forces.inverse_mass), 4):
+        free += 3 * (forces.inverse_mass[i] != 0.0)
+    frame, power, end = steps.frame_length, stages.error_exponent, len(stages.a) - 1
+    t, before, h = 0.0, 1.0, steps.initial_step
+    step_stats[0] = step_stats[1] = 0.0
+    _evaluate_stage(forces, 0, p, v, at)
     while t < frame:
         last = t + 1.0000001 * h >= frame
         step = frame - t if last else h
         for s in range(1, end + 1):
-            _stage(stages, s, step, p, v, at)
-            carry(forces, (t + stages.times[s] * step) / frame, at.q)
-            _evaluate(forces, s, at.q, at.w, at)
-        error = step * np.sqrt(_error(forces, stages.errors, frame, at) / max(1, free)) / steps.tolerance
+            _write_stage(stages, s, step, p, v, at)
+            apply_pins(forces, (t + stages.stage_times[s] * step) / frame, at.q)
+            _evaluate_stage(forces, s, at.q, at.w, at)
+        error = step * np.sqrt(_step_error(forces, stages.error_weights, frame, at) / max(1, free)) / steps.tolerance
         if error <= 1.0:
             t = frame if last else t + step
             for i in range(len(p)):
                 p[i], v[i] = at.q[i], at.w[i]
-                at.speeds[0, i], at.pulls[0, i] = at.speeds[end, i], at.pulls[end, i]
-            told[0] += 1.0
+                at.stage_velocities[0, i], at.stage_accelerations[0, i] = (
+                    at.stage_velocities[end, i],
+                    at.stage_accelerations[end, i],
+                )
+            step_stats[0] += 1.0
             if power > 0.0:  # by proportion and integral (Hairer and Wanner, section IV.2)
-                change = CAUTION * max(error, 1e-10) ** (-0.7 / power) * before ** (0.4 / power)
+                change = SAFETY * max(error, 1e-10) ** (-0.7 / power) * before ** (0.4 / power)
                 before = max(error, 1e-4)
-                h = max(h, step * change) if last else step * min(LARGEST, max(FEWEST, change))
+                h = max(h, step * change) if last else step * min(FACTORMAX, max(FACTORMIN, change))
         else:  # and where it is no number
-            told[1] += 1.0
+            step_stats[1] += 1.0
             known = power > 0.0 and error < np.inf
-            h = step * (max(FEWEST, CAUTION * error ** (-1.0 / power)) if known else FEWEST)
-        if h < FLOOR * frame or told[0] + told[1] >= steps.most:
+            h = step * (max(FACTORMIN, SAFETY * error ** (-1.0 / power)) if known else FACTORMIN)
+        if h < MIN_STEP_FRACTION * frame or step_stats[0] + step_stats[1] >= steps.max_steps:
             break
-    told[2], told[3] = h, t
+    step_stats[2], step_stats[3] = h, t

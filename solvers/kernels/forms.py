@@ -14,59 +14,59 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, triu
 
-from solvers.compiling import inner, kernel
+from solvers.compiling import jit_inner, jit_kernel
 
-_ROUND_OFF = 1e-13
+_ROW_SUM_ROUNDOFF = 1e-13
 """Ratio of a row's sum to its absolute sum below which it counts as zero: the round-off of a dozen terms."""
 
 
-class Form(NamedTuple):
+class QuadraticForm(NamedTuple):
     """A quadratic form: pairs (k, 2) of vertices; pair_weight: w (k,) [N/m]; vertex_weight: h (n,) [N/m]."""
 
     pairs: NDArray[np.int64]
-    weight: NDArray[np.float64]
-    held: NDArray[np.float64]
+    pair_weight: NDArray[np.float64]
+    vertex_weight: NDArray[np.float64]
 
     @classmethod
-    def of(cls, L: csr_array) -> Form:
+    def from_matrix(cls, L: csr_array) -> QuadraticForm:
         """Build the form of a symmetric matrix [N/m], (n, n)."""
         above = coo_array(triu(L, 1))
         held, size = L.sum(axis=1), abs(L).sum(axis=1)
         return cls(
             np.column_stack(above.coords).astype(np.int64),
             -np.asarray(above.data, np.float64),
-            np.where(abs(held) <= _ROUND_OFF * size, 0.0, held),
+            np.where(abs(held) <= _ROW_SUM_ROUNDOFF * size, 0.0, held),
         )
 
     @classmethod
-    def none(cls) -> Form:
+    def empty_form(cls) -> QuadraticForm:
         """Build an empty form."""
         return cls(np.empty((0, 2), np.int64), np.empty(0), np.empty(0))
 
 
-@kernel
+@jit_kernel
 def add_gradient(form, p, out):
     """Add L p [N] to `out`, both (n, 3)."""
-    _add(form, p, out)
+    _add_product(form, p, out)
 
 
-@inner
+@jit_inner
 def add_product(form, x, out):
     """Add L x [N] to `out`, both (n, 3); do nothing without a form."""
     if form is None:
         return
-    _add(form, x, out)
+    _add_product(form, x, out)
 
 
-@inner
-def _add(form, x, out):
-    for i in range(len(form.held)):
-        h = form.held[i]
+@jit_inner
+def _add_product(form, x, out):
+    for i in range(len(form.vertex_weight)):
+        h = form.vertex_weight[i]
         out[i, 0] += h * x[i, 0]
         out[i, 1] += h * x[i, 1]
         out[i, 2] += h * x[i, 2]
-    for k in range(len(form.weight)):
-        i, j, w = form.pairs[k, 0], form.pairs[k, 1], form.weight[k]
+    for k in range(len(form.pair_weight)):
+        i, j, w = form.pairs[k, 0], form.pairs[k, 1], form.pair_weight[k]
         f0, f1, f2 = w * (x[i, 0] - x[j, 0]), w * (x[i, 1] - x[j, 1]), w * (x[i, 2] - x[j, 2])
         out[i, 0] += f0
         out[i, 1] += f1
@@ -76,41 +76,41 @@ def _add(form, x, out):
         out[j, 2] -= f2
 
 
-@kernel
-def rise(form, p, q):
+@jit_kernel
+def energy_change(form, p, q):
     """Return q'Lq/2 - p'Lp/2 [J], p and q (n, 3)."""
     total = 0.0
-    for i in range(len(form.held)):
-        h = 0.5 * form.held[i]
+    for i in range(len(form.vertex_weight)):
+        h = 0.5 * form.vertex_weight[i]
         for c in range(3):
             total += h * (q[i, c] - p[i, c]) * (q[i, c] + p[i, c])
-    for k in range(len(form.weight)):
+    for k in range(len(form.pair_weight)):
         i, j, change = form.pairs[k, 0], form.pairs[k, 1], 0.0
         for c in range(3):
             s = (q[i, c] - p[i, c]) - (q[j, c] - p[j, c])
             change += s * (2.0 * (p[i, c] - p[j, c]) + s)
-        total += 0.5 * form.weight[k] * change
+        total += 0.5 * form.pair_weight[k] * change
     return total
 
 
-@kernel
-def add_blocks(form, diagonal, across, values):
+@jit_kernel
+def add_blocks(form, diagonal, off_diagonal, values):
     """Add L [N/m] to the blocks `values` (b, 3, 3).
 
     The indices are those of the diagonal (n,) and of the pairs in both directions (k, 2); -1 for none.
     """
-    for i in range(len(form.held)):
-        hold(values, diagonal[i], form.held[i])
-    for k in range(len(form.weight)):
-        w = form.weight[k]
-        hold(values, diagonal[form.pairs[k, 0]], w)
-        hold(values, diagonal[form.pairs[k, 1]], w)
-        hold(values, across[k, 0], -w)
-        hold(values, across[k, 1], -w)
+    for i in range(len(form.vertex_weight)):
+        add_to_diagonal(values, diagonal[i], form.vertex_weight[i])
+    for k in range(len(form.pair_weight)):
+        w = form.pair_weight[k]
+        add_to_diagonal(values, diagonal[form.pairs[k, 0]], w)
+        add_to_diagonal(values, diagonal[form.pairs[k, 1]], w)
+        add_to_diagonal(values, off_diagonal[k, 0], -w)
+        add_to_diagonal(values, off_diagonal[k, 1], -w)
 
 
-@inner
-def hold(values, block, w):
+@jit_inner
+def add_to_diagonal(values, block, w):
     """Add w [N/m] to the diagonal of a block, -1 for none."""
     if block >= 0:
         values[block, 0, 0] += w

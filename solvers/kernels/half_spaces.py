@@ -15,15 +15,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, inner_closure
-from solvers.kernels.springs import TINY_SQUARED
-from solvers.vectors.springs import LANES, RIGHT
+from solvers.compiling import jit_closure, jit_inner
+from solvers.kernels.springs import ZERO_LENGTH_SQUARED
+from solvers.vectors.springs import LANES, RHS_STRIDE
 
-_PASSES = 4
-EXACT, _GRIPPED, MAJORANT, _EVERYTHING = range(4)
+_MAX_ACTIVE_SET_PASSES = 4
+EXACT_BLOCK, _FRICTION_MAJORANT, SPRING_MAJORANT, _FULL_MAJORANT = range(4)
 """The blocks: exact except for compressed springs; majorant of friction; also of springs; also of inactive contact."""
 
-_ROUND_OFF = 1e-14
+_PIVOT_ROUNDOFF = 1e-14
 """Pivots up to this fraction of the trace are round-off."""
 
 
@@ -41,70 +41,72 @@ class HalfSpaces(NamedTuple):
         is_two_sided: whether they act on both sides, as planes do.
     """
 
-    first: NDArray[np.int64]
-    near: NDArray[np.bool_]
+    row_starts: NDArray[np.int64]
+    has_half_space: NDArray[np.bool_]
     normal: NDArray[np.float64]
-    anchor: NDArray[np.float64]
+    friction_anchor: NDArray[np.float64]
     offset: NDArray[np.float64]
     stiffness: NDArray[np.float64]
-    grip: NDArray[np.float64]
-    slip: NDArray[np.float64]
-    both: bool
+    friction_limit: NDArray[np.float64]
+    smoothing_length: NDArray[np.float64]
+    is_two_sided: bool
 
 
-@inner
-def _depth(s, gap):
-    return gap if s.both else min(0.0, gap)
+@jit_inner
+def _penetration_depth(s, gap):
+    return gap if s.is_two_sided else min(0.0, gap)
 
 
-@inner
-def _rounded(u, slip):
+@jit_inner
+def _huber_norm(u, slip):
     return 0.5 * u * u / slip if u <= slip else u - 0.5 * slip
 
 
-@inner
-def _across(s, k, x):
+@jit_inner
+def _tangential_displacement(s, k, x):
     """Return u and |u| of a half-space at x."""
     n0, n1, n2 = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2]
-    u0, u1, u2 = x[0] - s.anchor[k, 0], x[1] - s.anchor[k, 1], x[2] - s.anchor[k, 2]
+    u0, u1, u2 = x[0] - s.friction_anchor[k, 0], x[1] - s.friction_anchor[k, 1], x[2] - s.friction_anchor[k, 2]
     along = n0 * u0 + n1 * u1 + n2 * u2
     u0, u1, u2 = u0 - along * n0, u1 - along * n1, u2 - along * n2
     return u0, u1, u2, np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
 
 
-@inner
-def pressed(s, p):
+@jit_inner
+def half_space_energy(s, p):
     """Return the half-spaces' energy [J] at positions in rows of four; 0 without half-spaces."""
     if s is None:
         return 0.0
     total = 0.0
-    for i in range(len(s.first) - 1):
+    for i in range(len(s.row_starts) - 1):
         x = p[4 * i], p[4 * i + 1], p[4 * i + 2]
-        for k in range(s.first[i], s.first[i + 1]):
-            depth = _depth(s, s.normal[k, 0] * x[0] + s.normal[k, 1] * x[1] + s.normal[k, 2] * x[2] - s.offset[k])
+        for k in range(s.row_starts[i], s.row_starts[i + 1]):
+            depth = _penetration_depth(
+                s, s.normal[k, 0] * x[0] + s.normal[k, 1] * x[1] + s.normal[k, 2] * x[2] - s.offset[k]
+            )
             total += 0.5 * s.stiffness[k] * depth * depth
-            if s.grip[k] > 0.0:
-                total += s.grip[k] * _rounded(_across(s, k, x)[3], s.slip[k])
+            if s.friction_limit[k] > 0.0:
+                total += s.friction_limit[k] * _huber_norm(_tangential_displacement(s, k, x)[3], s.smoothing_length[k])
     return total
 
 
-@inner
-def _springs(bundles, b, lane, p, x, held, load):
+@jit_inner
+def _spring_gradient_and_block(bundles, b, lane, p, x, held, load):
     """Return the gradient and the block's upper triangle of a vertex's springs, inertia and pins."""
     g0, g1, g2 = -load[0], -load[1], -load[2]
     a00, a01, a02, a11, a12, a22 = held, 0.0, 0.0, held, 0.0, held
-    for entry in range(bundles.start[b], bundles.start[b + 1]):
-        e, w = LANES * entry + lane, bundles.kind[entry] + lane
-        j, k, pull = bundles.neighbour[e], bundles.weights[w + LANES], bundles.weights[w]
+    for entry in range(bundles.packet_start[b], bundles.packet_start[b + 1]):
+        e, w = LANES * entry + lane, bundles.weight_offset[entry] + lane
+        j, k, pull = bundles.neighbour_offset[e], bundles.weights[w + LANES], bundles.weights[w]
         if k == 0.0:
             continue
         v0, v1, v2 = x[0] - p[j], x[1] - p[j + 1], x[2] - p[j + 2]
         squared = v0 * v0 + v1 * v1 + v2 * v2
-        if squared <= TINY_SQUARED:
-            length, name = 0.0, bundles.spring[e]
+        if squared <= ZERO_LENGTH_SQUARED:
+            length, name = 0.0, bundles.spring_index[e]
             sign = -1.0 if name < 0 else 1.0
             name = ~name if name < 0 else name
-            n0, n1, n2 = bundles.direction[name]
+            n0, n1, n2 = bundles.rest_direction[name]
             n0, n1, n2 = sign * n0, sign * n1, sign * n2
             lateral = 0.0 if pull > 0.0 else k
         else:
@@ -118,8 +120,8 @@ def _springs(bundles, b, lane, p, x, held, load):
     return (g0, g1, g2), (a00, a01, a02, a11, a12, a22)
 
 
-@inner
-def _add(block, weight, n0, n1, n2):
+@jit_inner
+def _add_outer_product(block, weight, n0, n1, n2):
     a00, a01, a02, a11, a12, a22 = block
     return (
         a00 + weight * n0 * n0, a01 + weight * n0 * n1, a02 + weight * n0 * n2,
@@ -127,37 +129,37 @@ def _add(block, weight, n0, n1, n2):
     )  # fmt: skip
 
 
-@inner
-def pushed(s, i, x, d, level, gradient, block):
+@jit_inner
+def add_half_spaces(s, i, x, d, level, gradient, block):
     """Add active half-spaces and friction at x, or after a step d, to gradient and block.
 
     Returns the active set as bits.
     """
     who = 0
-    for k in range(s.first[i], s.first[i + 1]):
+    for k in range(s.row_starts[i], s.row_starts[i + 1]):
         n0, n1, n2, weight = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2], s.stiffness[k]
         gap = n0 * x[0] + n1 * x[1] + n2 * x[2] - s.offset[k]
-        if s.both or gap < 0.0 or level == _EVERYTHING or gap + n0 * d[0] + n1 * d[1] + n2 * d[2] < 0.0:
-            who |= 1 << (k - s.first[i])
-            block = _add(block, weight, n0, n1, n2)
-            force = weight * (_depth(s, gap) if level == _EVERYTHING else gap)
+        if s.is_two_sided or gap < 0.0 or level == _FULL_MAJORANT or gap + n0 * d[0] + n1 * d[1] + n2 * d[2] < 0.0:
+            who |= 1 << (k - s.row_starts[i])
+            block = _add_outer_product(block, weight, n0, n1, n2)
+            force = weight * (_penetration_depth(s, gap) if level == _FULL_MAJORANT else gap)
             gradient = gradient[0] + force * n0, gradient[1] + force * n1, gradient[2] + force * n2
-        if s.grip[k] > 0.0:
-            u0, u1, u2, length = _across(s, k, x)
-            weight = s.grip[k] / max(s.slip[k], length)
+        if s.friction_limit[k] > 0.0:
+            u0, u1, u2, length = _tangential_displacement(s, k, x)
+            weight = s.friction_limit[k] / max(s.smoothing_length[k], length)
             gradient = gradient[0] + weight * u0, gradient[1] + weight * u1, gradient[2] + weight * u2
-            a00, a01, a02, a11, a12, a22 = _add(block, -weight, n0, n1, n2)
+            a00, a01, a02, a11, a12, a22 = _add_outer_product(block, -weight, n0, n1, n2)
             block = a00 + weight, a01, a02, a11 + weight, a12, a22 + weight
-            if level == EXACT and length > s.slip[k]:
-                block = _add(block, -weight, u0 / length, u1 / length, u2 / length)
+            if level == EXACT_BLOCK and length > s.smoothing_length[k]:
+                block = _add_outer_product(block, -weight, u0 / length, u1 / length, u2 / length)
     return gradient, block, who
 
 
-@inner
-def solved(block, g):
+@jit_inner
+def solve_block(block, g):
     """Return -B^-1 g, and whether B is positive definite."""
     a, b, c, d, e, f = block
-    least = _ROUND_OFF * (a + d + f)
+    least = _PIVOT_ROUNDOFF * (a + d + f)
     if not a > least:
         return (0.0, 0.0, 0.0), False
     l1, l2 = b / a, c / a
@@ -174,14 +176,14 @@ def solved(block, g):
     return (-g[0] / a - l1 * x1 - l2 * x2, x1, x2), True
 
 
-@inner
-def _rise(bundles, b, lane, p, x, d, held, load):
+@jit_inner
+def _energy_change(bundles, b, lane, p, x, d, held, load):
     """Return the change of a vertex's energy [J] of springs, inertia and pins by a step d, without cancellation."""
     total = 0.0
     for c in range(3):
         total += d[c] * (0.5 * held * d[c] - load[c])
-    for entry in range(bundles.start[b], bundles.start[b + 1]):
-        j, w = bundles.neighbour[LANES * entry + lane], bundles.kind[entry] + lane
+    for entry in range(bundles.packet_start[b], bundles.packet_start[b + 1]):
+        j, w = bundles.neighbour_offset[LANES * entry + lane], bundles.weight_offset[entry] + lane
         stiffness, before, after, change = bundles.weights[w + LANES], 0.0, 0.0, 0.0
         if stiffness == 0.0:
             continue
@@ -196,29 +198,31 @@ def _rise(bundles, b, lane, p, x, d, held, load):
     return total
 
 
-@inner
-def deeper(s, i, x, d, total):
+@jit_inner
+def add_half_space_change(s, i, x, d, total):
     """Add to a change that of the half-spaces' energy [J] by a step d of row i from x."""
     end = x[0] + d[0], x[1] + d[1], x[2] + d[2]
-    for k in range(s.first[i], s.first[i + 1]):
+    for k in range(s.row_starts[i], s.row_starts[i + 1]):
         n0, n1, n2 = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2]
         gap = n0 * x[0] + n1 * x[1] + n2 * x[2] - s.offset[k]
-        depth, deep = _depth(s, gap), _depth(s, gap + n0 * d[0] + n1 * d[1] + n2 * d[2])
+        depth, deep = _penetration_depth(s, gap), _penetration_depth(s, gap + n0 * d[0] + n1 * d[1] + n2 * d[2])
         total += 0.5 * s.stiffness[k] * (deep - depth) * (deep + depth)
-        if s.grip[k] > 0.0:
-            u0, u1, u2, length = _across(s, k, x)
-            w0, w1, w2, longer = _across(s, k, end)
+        if s.friction_limit[k] > 0.0:
+            u0, u1, u2, length = _tangential_displacement(s, k, x)
+            w0, w1, w2, longer = _tangential_displacement(s, k, end)
             both = (w0 - u0) * (w0 + u0) + (w1 - u1) * (w1 + u1) + (w2 - u2) * (w2 + u2)
-            if length <= s.slip[k] and longer <= s.slip[k]:
-                total += 0.5 * s.grip[k] * both / s.slip[k]
-            elif length > s.slip[k] and longer > s.slip[k]:
-                total += s.grip[k] * both / (longer + length)
+            if length <= s.smoothing_length[k] and longer <= s.smoothing_length[k]:
+                total += 0.5 * s.friction_limit[k] * both / s.smoothing_length[k]
+            elif length > s.smoothing_length[k] and longer > s.smoothing_length[k]:
+                total += s.friction_limit[k] * both / (longer + length)
             else:
-                total += s.grip[k] * (_rounded(longer, s.slip[k]) - _rounded(length, s.slip[k]))
+                total += s.friction_limit[k] * (
+                    _huber_norm(longer, s.smoothing_length[k]) - _huber_norm(length, s.smoothing_length[k])
+                )
     return total
 
 
-def trying(risen: Any) -> Any:
+def build_block_step(energy_change: Any) -> Any:
     """Build a function that finds a step of row i from x that does not increase its energy.
 
     It tries increasingly large blocks; if none succeeds, the step is zero. A device compiles it separately.
@@ -228,27 +232,27 @@ def trying(risen: Any) -> Any:
             is passed to it unchanged.
     """
 
-    @inner_closure
+    @jit_closure
     def lowering(s, i, x, majorant, first, gradient, block, where):
         """Return the step; begin with the block `first`; majorant, gradient and block exclude the half-spaces."""
-        for level in range(first, _EVERYTHING + 1):
-            if level == MAJORANT:
+        for level in range(first, _FULL_MAJORANT + 1):
+            if level == SPRING_MAJORANT:
                 block = majorant
             d, definite, before = (0.0, 0.0, 0.0), True, -1
-            for _ in range(_PASSES):
-                slope, whole, who = pushed(s, i, x, d, level, gradient, block)
+            for _ in range(_MAX_ACTIVE_SET_PASSES):
+                slope, whole, who = add_half_spaces(s, i, x, d, level, gradient, block)
                 if who == before:
                     break
                 before = who
-                d, definite = solved(whole, slope)
-            if definite and deeper(s, i, x, d, risen(d, where)) <= 0.0:
+                d, definite = solve_block(whole, slope)
+            if definite and add_half_space_change(s, i, x, d, energy_change(d, where)) <= 0.0:
                 return d
         return 0.0, 0.0, 0.0
 
     return lowering
 
 
-def moving(felt: Any, risen: Any) -> Any:
+def build_vertex_move(add_gradient_block: Any, energy_change: Any) -> Any:
     """Build a function that moves the vertices of a packet to lower energies one after another.
 
     No two of them are coupled.
@@ -258,27 +262,27 @@ def moving(felt: Any, risen: Any) -> Any:
         energy_change: function (beside, i, p, d) that returns their change by a step d.
     """
 
-    @inner_closure
+    @jit_closure
     def rise(d, where):
         bundles, beside, b, lane, i, p, x, held, load = where
-        return _rise(bundles, b, lane, p, x, d, held, load) + risen(beside, i, p, d)
+        return _energy_change(bundles, b, lane, p, x, d, held, load) + energy_change(beside, i, p, d)
 
-    lowering = trying(rise)
+    lowering = build_block_step(rise)
 
-    @inner_closure
+    @jit_closure
     def move(bundles, s, beside, b, unknowns, p, right, majorant):
         for lane in range(LANES):
-            i = bundles.own[LANES * b + lane] // 4
+            i = bundles.row_offset[LANES * b + lane] // 4
             if i >= unknowns:
                 continue
-            at, most = RIGHT * b + lane, majorant[LANES * b + lane]
+            at, most = RHS_STRIDE * b + lane, majorant[LANES * b + lane]
             h = right[at + 3 * LANES]
             x = p[4 * i], p[4 * i + 1], p[4 * i + 2]
             load = right[at] - h * x[0], right[at + LANES] - h * x[1], right[at + 2 * LANES] - h * x[2]
-            gradient, block = _springs(bundles, b, lane, p, x, h, load)
-            gradient, block = felt(beside, i, p, gradient, block)
+            gradient, block = _spring_gradient_and_block(bundles, b, lane, p, x, h, load)
+            gradient, block = add_gradient_block(beside, i, p, gradient, block)
             majorant_block, where = (most, 0.0, 0.0, most, 0.0, most), (bundles, beside, b, lane, i, p, x, h, load)
-            d = lowering(s, i, x, majorant_block, EXACT, gradient, block, where)
+            d = lowering(s, i, x, majorant_block, EXACT_BLOCK, gradient, block, where)
             p[4 * i], p[4 * i + 1], p[4 * i + 2] = x[0] + d[0], x[1] + d[1], x[2] + d[2]
 
     return move

@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from solvers.compiling import inner, kernel
+from solvers.compiling import jit_inner, jit_kernel
 from solvers.energies.elements import add_products
 from solvers.kernels.forms import add_product
-from solvers.kernels.forms import hold as hold_block
-from solvers.kernels.objective import along
+from solvers.kernels.forms import add_to_diagonal as hold_block
+from solvers.kernels.objective import spring_direction
 from solvers.problem import System
 
 
-class Places(NamedTuple):
+class BlockIndices(NamedTuple):
     """Block indices of vertices and springs in a matrix over the free vertices.
 
     Attributes:
@@ -32,29 +32,29 @@ class Places(NamedTuple):
         off_diagonal: blocks of each spring from its first end to its second and back (m, 2), -1 if an end is not free.
     """
 
-    free: NDArray[np.int64]
-    diagonal: NDArray[np.int64]
-    across: NDArray[np.int64]
+    free_vertices: NDArray[np.int64]
+    diagonal_block: NDArray[np.int64]
+    off_diagonal: NDArray[np.int64]
 
     @classmethod
-    def of(cls, system: System, edges: NDArray[np.int64], graph: csr_array) -> Places:
+    def from_graph(cls, system: System, edges: NDArray[np.int64], graph: csr_array) -> BlockIndices:
         """Return the indices for a matrix with the block pattern `graph`, (f, f), sorted, over the free vertices."""
-        n, f = system.vertices, len(system.free)
+        n, f = system.num_vertices, len(system.free_vertices)
         key = np.repeat(np.arange(f), np.diff(graph.indptr)) * f + graph.indices
         number = np.full(n, -1)
-        number[system.free] = np.arange(f)
+        number[system.free_vertices] = np.arange(f)
         diagonal = np.full(n, -1)
-        diagonal[system.free] = np.searchsorted(key, np.arange(f) * (f + 1))
+        diagonal[system.free_vertices] = np.searchsorted(key, np.arange(f) * (f + 1))
         i, j = number[edges].T
         inside = (i >= 0) & (j >= 0) & (i != j)
         across = np.full((len(edges), 2), -1)
         for side, (a, b) in enumerate([(i, j), (j, i)]):
             across[inside, side] = np.searchsorted(key, a[inside] * f + b[inside])
-        return cls(system.free, diagonal, across)
+        return cls(system.free_vertices, diagonal, across)
 
 
-@kernel
-def locate(number, starts, columns, vertices, out):
+@jit_kernel
+def locate_blocks(number, starts, columns, vertices, out):
     """Write the block of each vertex pair within rows of vertices (m, k) to `out` (m, k^2).
 
     It is -1 if one vertex is not free. Returns False if a block is missing. The matrix has sorted columns; `number` is
@@ -82,8 +82,8 @@ def locate(number, starts, columns, vertices, out):
     return True
 
 
-@kernel
-def meetings(number, size, vertices, out):
+@jit_kernel
+def list_vertex_pairs(number, size, vertices, out):
     """Write each pair of different free vertices of each row (m, k) to `out`, as lower index times `size` plus higher.
 
     Returns the number of pairs; `number` is that of `locate_blocks`.
@@ -100,29 +100,29 @@ def meetings(number, size, vertices, out):
     return count
 
 
-@kernel
-def tensions(terms, p, d, out):
+@jit_kernel
+def linearise_tensions(terms, p, d, out):
     """Write the springs' tensions [N] at p, linearised for a displacement d (both (n, 3)), to out (m,)."""
     for e in range(len(terms.stiffness)):
         i, j = terms.edges[e, 0], terms.edges[e, 1]
-        n0, n1, n2, length = along(terms, e, p)
+        n0, n1, n2, length = spring_direction(terms, e, p)
         stretch = n0 * (d[i, 0] - d[j, 0]) + n1 * (d[i, 1] - d[j, 1]) + n2 * (d[i, 2] - d[j, 2])
         out[e] = terms.stiffness[e] * (length - terms.rest_length[e] + stretch)
 
 
-@inner
-def _lateral(terms, e, length, tension, keep):
+@jit_inner
+def _lateral_stiffness(terms, e, length, tension, negative_fraction):
     """Return the transverse stiffness [N/m] of spring e, at most k; 0 for zero length and positive rest length."""
     if terms.rest_length[e] == 0.0:
         return terms.stiffness[e]
     if length <= 0.0:
         return 0.0
     lateral = min(tension / length, terms.stiffness[e])
-    return lateral * keep if lateral < 0.0 else lateral
+    return lateral * negative_fraction if lateral < 0.0 else lateral
 
 
-@inner
-def _add(values, block, sign, xx, xy, xz, yy, yz, zz):
+@jit_inner
+def _add_block(values, block, sign, xx, xy, xz, yy, yz, zz):
     """Add sign times a symmetric block."""
     values[block, 0, 0] += sign * xx
     values[block, 0, 1] += sign * xy
@@ -135,23 +135,23 @@ def _add(values, block, sign, xx, xy, xz, yy, yz, zz):
     values[block, 2, 2] += sign * zz
 
 
-@kernel
-def hold(terms, places, values):
+@jit_kernel
+def write_constant_blocks(terms, places, values):
     """Write the stiffness [N/m] of inertia and penalty pins to the blocks `values`, (b, 3, 3)."""
-    _hold(terms, places, values)
+    _write_constant_blocks(terms, places, values)
 
 
-@inner
-def _hold(terms, places, values):
+@jit_inner
+def _write_constant_blocks(terms, places, values):
     values[:] = 0.0
-    for v in places.free:
-        hold_block(values, places.diagonal[v], terms.inertia[v])
-    for q in range(len(terms.pinned)):
-        hold_block(values, places.diagonal[terms.pinned[q]], terms.weight[q])
+    for v in places.free_vertices:
+        hold_block(values, places.diagonal_block[v], terms.inertia_diagonal[v])
+    for q in range(len(terms.pinned_vertices)):
+        hold_block(values, places.diagonal_block[terms.pinned_vertices[q]], terms.pin_weight[q])
 
 
-@kernel
-def assemble(terms, places, constant, p, tension, keep, values):
+@jit_kernel
+def assemble_hessian(terms, places, constant, p, tension, negative_fraction, values):
     """Write the Hessian [N/m] of springs, inertia and penalty pins at p (n, 3) to the blocks `values`, (b, 3, 3).
 
     Args:
@@ -164,7 +164,7 @@ def assemble(terms, places, constant, p, tension, keep, values):
         values: output (b, 3, 3) [N/m].
     """
     if constant is None:
-        _hold(terms, places, values)
+        _write_constant_blocks(terms, places, values)
     else:
         for block in range(len(values)):
             for row in range(3):
@@ -174,36 +174,36 @@ def assemble(terms, places, constant, p, tension, keep, values):
         i, j = terms.edges[e, 0], terms.edges[e, 1]
         if i == j:
             continue
-        n0, n1, n2, length = along(terms, e, p)
-        lateral = _lateral(terms, e, length, tension[e], keep)
+        n0, n1, n2, length = spring_direction(terms, e, p)
+        lateral = _lateral_stiffness(terms, e, length, tension[e], negative_fraction)
         a = terms.stiffness[e] - lateral
         xx, xy, xz = a * n0 * n0 + lateral, a * n0 * n1, a * n0 * n2
         yy, yz, zz = a * n1 * n1 + lateral, a * n1 * n2, a * n2 * n2 + lateral
-        if places.diagonal[i] >= 0:
-            _add(values, places.diagonal[i], 1.0, xx, xy, xz, yy, yz, zz)
-        if places.diagonal[j] >= 0:
-            _add(values, places.diagonal[j], 1.0, xx, xy, xz, yy, yz, zz)
-        if places.across[e, 0] >= 0:
-            _add(values, places.across[e, 0], -1.0, xx, xy, xz, yy, yz, zz)
-            _add(values, places.across[e, 1], -1.0, xx, xy, xz, yy, yz, zz)
+        if places.diagonal_block[i] >= 0:
+            _add_block(values, places.diagonal_block[i], 1.0, xx, xy, xz, yy, yz, zz)
+        if places.diagonal_block[j] >= 0:
+            _add_block(values, places.diagonal_block[j], 1.0, xx, xy, xz, yy, yz, zz)
+        if places.off_diagonal[e, 0] >= 0:
+            _add_block(values, places.off_diagonal[e, 0], -1.0, xx, xy, xz, yy, yz, zz)
+            _add_block(values, places.off_diagonal[e, 1], -1.0, xx, xy, xz, yy, yz, zz)
 
 
-@kernel
-def linearise(terms, p, out):
+@jit_kernel
+def linearise_springs(terms, p, out):
     """Write the linearised springs at p (n, 3) to out (m, 4).
 
     These are sqrt(k - lateral) n and lateral, the transverse stiffness.
     """
     for e in range(len(terms.stiffness)):
-        n0, n1, n2, length = along(terms, e, p)
+        n0, n1, n2, length = spring_direction(terms, e, p)
         k = terms.stiffness[e]
-        lateral = _lateral(terms, e, length, k * (length - terms.rest_length[e]), 1.0)
+        lateral = _lateral_stiffness(terms, e, length, k * (length - terms.rest_length[e]), 1.0)
         root = np.sqrt(k - lateral)
         out[e, 0], out[e, 1], out[e, 2], out[e, 3] = root * n0, root * n1, root * n2, lateral
 
 
-@kernel
-def multiply(terms, linear, form, joined, curvature, x, out):
+@jit_kernel
+def multiply_hessian(terms, linear, form, joined, curvature, x, out):
     """Write the product [N] of the exact Hessian with x [m], (n, 3), to `out`.
 
     Args:
@@ -213,20 +213,20 @@ def multiply(terms, linear, form, joined, curvature, x, out):
         x: (n, 3) [m].
         out: output (n, 3) [N].
     """
-    _multiply(terms, linear, x, out)
+    _multiply_springs(terms, linear, x, out)
     add_product(form, x, out)
     add_products(joined, curvature, x, out)
 
 
-@inner
-def _multiply(terms, linear, x, out):
+@jit_inner
+def _multiply_springs(terms, linear, x, out):
     for v in range(len(x)):
         for c in range(3):
-            out[v, c] = terms.inertia[v] * x[v, c]
-    for q in range(len(terms.pinned)):
-        v = terms.pinned[q]
+            out[v, c] = terms.inertia_diagonal[v] * x[v, c]
+    for q in range(len(terms.pinned_vertices)):
+        v = terms.pinned_vertices[q]
         for c in range(3):
-            out[v, c] += terms.weight[q] * x[v, c]
+            out[v, c] += terms.pin_weight[q] * x[v, c]
     for e in range(len(terms.stiffness)):
         i, j = terms.edges[e, 0], terms.edges[e, 1]
         s0, s1, s2 = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kernel
+from solvers.compiling import jit_inner, jit_kernel
 
 
-class Patches(NamedTuple):
+class VertexPatches(NamedTuple):
     """The patch of each free vertex and its response.
 
     Attributes:
@@ -22,26 +22,26 @@ class Patches(NamedTuple):
         response: displacements per displacement of the vertex (e, 3, 3), dimensionless.
     """
 
-    start: NDArray[np.int64]
-    near: NDArray[np.int64]
+    patch_starts: NDArray[np.int64]
+    patch_vertices: NDArray[np.int64]
     response: NDArray[np.float64]
 
 
 class PatchScratch(NamedTuple):
     """Scratch: local index (f,), initially -1; W of the largest patch; product, block (3, 3) and gradient (3,)."""
 
-    place: NDArray[np.int64]
-    turned: NDArray[np.float64]
+    local_index: NDArray[np.int64]
+    rotated_response: NDArray[np.float64]
     product: NDArray[np.float64]
     block: NDArray[np.float64]
-    pull: NDArray[np.float64]
+    patch_gradient: NDArray[np.float64]
 
     @classmethod
-    def of(cls, patches: Patches) -> PatchScratch:
+    def from_patches(cls, patches: VertexPatches) -> PatchScratch:
         """Allocate the scratch of patches."""
-        most = int(np.diff(patches.start).max(initial=1))
+        most = int(np.diff(patches.patch_starts).max(initial=1))
         return cls(
-            np.full(len(patches.start) - 1, -1),
+            np.full(len(patches.patch_starts) - 1, -1),
             np.zeros((most, 3, 3)),
             np.zeros((3, 3)),
             np.zeros((3, 3)),
@@ -49,8 +49,8 @@ class PatchScratch(NamedTuple):
         )
 
 
-@kernel
-def directions(patches, turn, pointers, columns, blocks, gradient, scratch, out):
+@jit_kernel
+def compute_directions(patches, rotations, pointers, columns, blocks, gradient, scratch, out):
     """Write the step d of each free vertex (f, 3) [m] to `out`.
 
     Args:
@@ -71,9 +71,9 @@ def directions(patches, turn, pointers, columns, blocks, gradient, scratch, out)
             for r in range(3):
                 for c in range(3):
                     turned[k, r, c] = (
-                        turn[a, r, 0] * response[first + k, 0, c]
-                        + turn[a, r, 1] * response[first + k, 1, c]
-                        + turn[a, r, 2] * response[first + k, 2, c]
+                        rotations[a, r, 0] * response[first + k, 0, c]
+                        + rotations[a, r, 1] * response[first + k, 1, c]
+                        + rotations[a, r, 2] * response[first + k, 2, c]
                     )
         for r in range(3):
             pull[r] = 0.0
@@ -81,7 +81,7 @@ def directions(patches, turn, pointers, columns, blocks, gradient, scratch, out)
                 block[r, c] = 0.0
         for k in range(count):
             a = near[first + k]
-            _times(turned, place, a, pointers, columns, blocks, product)
+            _multiply_patch(turned, place, a, pointers, columns, blocks, product)
             for r in range(3):
                 for c in range(3):
                     pull[c] += turned[k, r, c] * gradient[a, r]
@@ -89,13 +89,13 @@ def directions(patches, turn, pointers, columns, blocks, gradient, scratch, out)
                         block[s, c] += turned[k, r, s] * product[r, c]
         for k in range(count):
             place[near[first + k]] = -1
-        _solve(block, pull)
+        _solve_block(block, pull)
         for r in range(3):
-            out[i, r] = -(turn[i, r, 0] * pull[0] + turn[i, r, 1] * pull[1] + turn[i, r, 2] * pull[2])
+            out[i, r] = -(rotations[i, r, 0] * pull[0] + rotations[i, r, 1] * pull[1] + rotations[i, r, 2] * pull[2])
 
 
-@inner
-def _times(turned, place, a, pointers, columns, blocks, product):
+@jit_inner
+def _multiply_patch(turned, place, a, pointers, columns, blocks, product):
     """Write H_aa W_a / 2 plus the sum of H_ab W_b over b > a to `product`, half of a symmetric sum."""
     for r in range(3):
         for c in range(3):
@@ -112,8 +112,8 @@ def _times(turned, place, a, pointers, columns, blocks, product):
                 product[r, c] += h0 * turned[k, 0, c] + h1 * turned[k, 1, c] + h2 * turned[k, 2, c]
 
 
-@inner
-def _solve(half, x):
+@jit_inner
+def _solve_block(half, x):
     """Overwrite x with (half + half')^-1 x, or with x over the trace if that is not positive definite."""
     a, b, c = 2.0 * half[0, 0], half[0, 1] + half[1, 0], half[0, 2] + half[2, 0]
     d, e, f = 2.0 * half[1, 1], half[1, 2] + half[2, 1], 2.0 * half[2, 2]

@@ -11,19 +11,19 @@ from __future__ import annotations
 
 from numba.extending import register_jitable
 
-from solvers.compiling import inner_options
+from solvers.compiling import jit_inner_options
 
-DECREASE = 1e-4
+ARMIJO_FRACTION = 1e-4
 """Smallest decrease of a step, as a fraction of the linear prediction."""
 
 
-@register_jitable(**inner_options)
-def falls(rise: float, length: float, slope: float, curvature: float) -> bool:
+@register_jitable(**jit_inner_options)
+def is_armijo_step(objective_change: float, step_size: float, slope: float, curvature: float) -> bool:
     """Return whether the objective decreases enough for a step size, given its change [J]."""
-    return rise <= DECREASE * length * (slope + 0.5 * length * curvature)
+    return objective_change <= ARMIJO_FRACTION * step_size * (slope + 0.5 * step_size * curvature)
 
 
-@register_jitable(**inner_options)
-def flattens(there: float, slope: float, flatter: float) -> bool:
+@register_jitable(**jit_inner_options)
+def is_approximate_wolfe_step(new_slope: float, slope: float, wolfe_fraction: float) -> bool:
     """Return whether the slope [J] at the new point has decreased enough from the initial one."""
-    return there <= (2.0 * flatter - 1.0) * slope
+    return new_slope <= (2.0 * wolfe_fraction - 1.0) * slope

@@ -13,16 +13,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba.extending import register_jitable
 
-from solvers.compiling import inner_closure, inner_options
+from solvers.compiling import jit_closure, jit_inner_options
 
-ITERATIONS, TOLERANCE, FLOOR, STALLED = range(4)
+REASON_ITERATIONS, REASON_TOLERANCE, REASON_FLOOR, REASON_STALLED = range(4)
 """The termination reason of a loop: maximum iterations, residual limit, round-off floor, or no descent."""
 
-NEVER, LAST, EACH = range(3)
+RESIDUAL_NEVER, RESIDUAL_LAST, RESIDUAL_EACH = range(3)
 """When residuals are computed."""
 
 
-class Limits(NamedTuple):
+class LoopLimits(NamedTuple):
     """The limits of a loop.
 
     Attributes:
@@ -32,32 +32,32 @@ class Limits(NamedTuple):
         residual_mode: when residuals are computed.
     """
 
-    iterations: int
-    limit: float
-    floor: float
-    wanted: int
+    max_iterations: int
+    residual_limit: float
+    residual_floor: float
+    residual_mode: int
 
 
-ONE = Limits(1, 0.0, 0.0, NEVER)
+ONE_ITERATION = LoopLimits(1, 0.0, 0.0, RESIDUAL_NEVER)
 """One iteration without a residual."""
 
 
-def at_most(iterations: int) -> Limits:
+def iteration_limit(iterations: int) -> LoopLimits:
     """Return limits of n iterations with the last residual."""
-    return Limits(iterations, 0.0, 0.0, LAST)
+    return LoopLimits(iterations, 0.0, 0.0, RESIDUAL_LAST)
 
 
-@register_jitable(**inner_options)
-def verdict(residual, limits):
+@register_jitable(**jit_inner_options)
+def check_residual(residual, limits):
     """Return the termination reason of a residual; ITERATIONS if it does not end the loop."""
-    if limits.wanted != EACH:
-        return ITERATIONS
-    if residual <= limits.limit:
-        return TOLERANCE
-    return FLOOR if residual <= limits.floor else ITERATIONS
+    if limits.residual_mode != RESIDUAL_EACH:
+        return REASON_ITERATIONS
+    if residual <= limits.residual_limit:
+        return REASON_TOLERANCE
+    return REASON_FLOOR if residual <= limits.residual_floor else REASON_ITERATIONS
 
 
-def over(advance: Callable[..., Any], residual: Callable[..., Any]) -> Callable[..., Any]:
+def build_loop(step_state: Callable[..., Any], residual: Callable[..., Any]) -> Callable[..., Any]:
     """Build the iteration loop of a state.
 
     Args:
@@ -71,23 +71,23 @@ def over(advance: Callable[..., Any], residual: Callable[..., Any]) -> Callable[
     """
 
     def iterate(state: Any, limits: Any) -> Any:
-        count, found, ended = 0, np.nan, ITERATIONS
-        while ended == ITERATIONS and count < limits.iterations:
-            moved = advance(state)
+        count, found, ended = 0, np.nan, REASON_ITERATIONS
+        while ended == REASON_ITERATIONS and count < limits.max_iterations:
+            moved = step_state(state)
             if moved:
                 count += 1
-            if limits.wanted == EACH:
+            if limits.residual_mode == RESIDUAL_EACH:
                 found = residual(state)
-                ended = verdict(found, limits)
-            if ended == ITERATIONS and not moved:
-                ended = STALLED
-        if limits.wanted == LAST or (limits.wanted == EACH and count == 0):
+                ended = check_residual(found, limits)
+            if ended == REASON_ITERATIONS and not moved:
+                ended = REASON_STALLED
+        if limits.residual_mode == RESIDUAL_LAST or (limits.residual_mode == RESIDUAL_EACH and count == 0):
             found = residual(state)
         return count, found, ended
 
     return iterate
 
 
-def compiled_over(advance: Callable[..., Any], residual: Callable[..., Any]) -> Any:
+def build_compiled_loop(step_state: Callable[..., Any], residual: Callable[..., Any]) -> Any:
     """Build the loop for kernels from inner functions."""
-    return inner_closure(over(advance, residual))
+    return jit_closure(build_loop(step_state, residual))

@@ -14,72 +14,87 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kernel
-from solvers.energies.springs import TINY, Springs
+from solvers.compiling import jit_inner, jit_kernel
+from solvers.energies.springs import ZERO_LENGTH, Springs
 from solvers.problem import Positions, StepProblem, System
 from solvers.round_off import EPS
 
 
-class Terms(NamedTuple):
+class ObjectiveTerms(NamedTuple):
     """The constant data of a run: springs, inertia h (n,) [N/m], penalty pins and their weights [N/m]."""
 
     edges: NDArray[np.int64]
     stiffness: NDArray[np.float64]
     rest_length: NDArray[np.float64]
-    direction: NDArray[np.float64]
-    inertia: NDArray[np.float64]
-    pinned: NDArray[np.int64]
-    weight: NDArray[np.float64]
+    rest_direction: NDArray[np.float64]
+    inertia_diagonal: NDArray[np.float64]
+    pinned_vertices: NDArray[np.int64]
+    pin_weight: NDArray[np.float64]
 
     @classmethod
-    def of(cls, system: System, springs: Springs) -> Terms:
+    def from_system(cls, system: System, springs: Springs) -> ObjectiveTerms:
         """Copy the terms of a system into arrays."""
-        _, pinned, weight = system.penalty
+        _, pinned, weight = system.penalty_pins
         s = springs
-        arrays: list[Any] = [s.edges, s.stiffness, s.rest_length, s.rest_direction, system.inertia, pinned, weight]
+        arrays: list[Any] = [
+            s.edges,
+            s.stiffness,
+            s.rest_length,
+            s.rest_direction,
+            system.inertia_diagonal,
+            pinned,
+            weight,
+        ]
         return cls(*(np.array(a, order="C") for a in arrays))
 
 
-class Given(NamedTuple):
+class StepData(NamedTuple):
     """The data of a step: target (n, 3) [m], force (n, 3) [N], the penalty pins' targets (q, 3) [m]."""
 
-    target: Positions
-    force: Positions
-    pins: Positions
+    inertial_target: Positions
+    external_force: Positions
+    pin_targets: Positions
 
     @classmethod
-    def of(cls, problem: StepProblem) -> Given:
+    def from_problem(cls, problem: StepProblem) -> StepData:
         """Copy a step's arrays; the kernels are compiled for writable arrays."""
-        soft, _, _ = problem.system.penalty
-        return cls(*(np.array(a, order="C") for a in (problem.target, problem.force, problem.pin_targets[soft])))
+        soft, _, _ = problem.system.penalty_pins
+        return cls(
+            *(
+                np.array(a, order="C")
+                for a in (problem.inertial_target, problem.external_force, problem.pin_targets[soft])
+            )
+        )
 
 
-@inner
-def along(terms, e, p):
+@jit_inner
+def spring_direction(terms, e, p):
     """Return the unit direction of spring e and its length [m]; at zero length that of the rest shape."""
     i, j = terms.edges[e, 0], terms.edges[e, 1]
     v0, v1, v2 = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2]
     length = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-    if length <= TINY:
-        return terms.direction[e, 0], terms.direction[e, 1], terms.direction[e, 2], 0.0
+    if length <= ZERO_LENGTH:
+        return terms.rest_direction[e, 0], terms.rest_direction[e, 1], terms.rest_direction[e, 2], 0.0
     return v0 / length, v1 / length, v2 / length, length
 
 
-@kernel
-def gradient(terms, given, p, out):
+@jit_kernel
+def gradient(terms, step_data, p, out):
     """Write the gradient [N] at p, both (n, 3), of springs, inertia, force and penalty pins to `out`."""
     for v in range(len(p)):
         for c in range(3):
-            out[v, c] = terms.inertia[v] * (p[v, c] - given.target[v, c]) - given.force[v, c]
-    for q in range(len(terms.pinned)):
-        v = terms.pinned[q]
+            out[v, c] = (
+                terms.inertia_diagonal[v] * (p[v, c] - step_data.inertial_target[v, c]) - step_data.external_force[v, c]
+            )
+    for q in range(len(terms.pinned_vertices)):
+        v = terms.pinned_vertices[q]
         for c in range(3):
-            out[v, c] += terms.weight[q] * (p[v, c] - given.pins[q, c])
+            out[v, c] += terms.pin_weight[q] * (p[v, c] - step_data.pin_targets[q, c])
     for e in range(len(terms.stiffness)):
         i, j = terms.edges[e, 0], terms.edges[e, 1]
         if i == j:
             continue
-        n0, n1, n2, length = along(terms, e, p)
+        n0, n1, n2, length = spring_direction(terms, e, p)
         tension = terms.stiffness[e] * (length - terms.rest_length[e])
         out[i, 0] += tension * n0
         out[i, 1] += tension * n1
@@ -89,22 +104,26 @@ def gradient(terms, given, p, out):
         out[j, 2] -= tension * n2
 
 
-@kernel
-def round_off(terms, given, p, out):
+@jit_kernel
+def gradient_roundoff(terms, step_data, p, out):
     """Write the bound (n,) [N] of the rounding error of `gradient` at p (n, 3) [m] to `out`.
 
     It is that of `solvers.model.rounding_bound` for springs, inertia, force and penalty pins.
     """
     for v in range(len(p)):
-        out[v] = terms.inertia[v] * (size(p, v) + size(given.target, v)) + size(given.force, v)
-    for q in range(len(terms.pinned)):
-        out[terms.pinned[q]] += terms.weight[q] * (size(p, terms.pinned[q]) + size(given.pins, q))
+        out[v] = terms.inertia_diagonal[v] * (row_norm(p, v) + row_norm(step_data.inertial_target, v)) + row_norm(
+            step_data.external_force, v
+        )
+    for q in range(len(terms.pinned_vertices)):
+        out[terms.pinned_vertices[q]] += terms.pin_weight[q] * (
+            row_norm(p, terms.pinned_vertices[q]) + row_norm(step_data.pin_targets, q)
+        )
     for e in range(len(terms.stiffness)):
         i, j, rest = terms.edges[e, 0], terms.edges[e, 1], terms.rest_length[e]
         if i == j:
             continue
-        _, _, _, length = along(terms, e, p)
-        reach = size(p, i) + size(p, j)
+        _, _, _, length = spring_direction(terms, e, p)
+        reach = row_norm(p, i) + row_norm(p, j)
         turned = reach + 2.0 * rest / EPS
         if length > 0.0:
             turned = min(max(1.0, rest / length - 1.0) * reach, turned)
@@ -115,25 +134,27 @@ def round_off(terms, given, p, out):
         out[v] *= EPS
 
 
-@inner
-def size(x, v):
+@jit_inner
+def row_norm(x, v):
     """Return the norm of row v of x (n, 3)."""
     return np.sqrt(x[v, 0] * x[v, 0] + x[v, 1] * x[v, 1] + x[v, 2] * x[v, 2])
 
 
-@kernel
-def rise(terms, given, p, q):
+@jit_kernel
+def objective_change(terms, step_data, p, q):
     """Return g(q) - g(p) [J] of springs, inertia, force and penalty pins, p and q (n, 3)."""
     total = 0.0
     for v in range(len(p)):
         for c in range(3):
             middle = 0.5 * (p[v, c] + q[v, c])
-            total += (q[v, c] - p[v, c]) * (terms.inertia[v] * (middle - given.target[v, c]) - given.force[v, c])
-    for k in range(len(terms.pinned)):
-        v = terms.pinned[k]
+            total += (q[v, c] - p[v, c]) * (
+                terms.inertia_diagonal[v] * (middle - step_data.inertial_target[v, c]) - step_data.external_force[v, c]
+            )
+    for k in range(len(terms.pinned_vertices)):
+        v = terms.pinned_vertices[k]
         for c in range(3):
             middle = 0.5 * (p[v, c] + q[v, c])
-            total += terms.weight[k] * (q[v, c] - p[v, c]) * (middle - given.pins[k, c])
+            total += terms.pin_weight[k] * (q[v, c] - p[v, c]) * (middle - step_data.pin_targets[k, c])
     for e in range(len(terms.stiffness)):
         i, j = terms.edges[e, 0], terms.edges[e, 1]
         before = after = change = 0.0
@@ -144,7 +165,7 @@ def rise(terms, given, p, q):
             after += (v + s) * (v + s)
             change += s * (2.0 * v + s)
         before, after = np.sqrt(before), np.sqrt(after)
-        if before + after > TINY:
+        if before + after > ZERO_LENGTH:
             both = before + after
             total += terms.stiffness[e] * (change / both) * (0.5 * both - terms.rest_length[e])
     return total

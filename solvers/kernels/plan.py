@@ -8,19 +8,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.linear.inverse import Inverse
-from solvers.linear.supernodal import Supernodal
-from solvers.linear.supernodes import LANES, WIDTH
-from solvers.memory import aligned
+from solvers.linear.inverse import DenseInverse
+from solvers.linear.supernodal import SupernodalCholesky
+from solvers.linear.supernodes import COLUMN_LANES, MAX_PANEL_WIDTH
+from solvers.memory import allocate_aligned
 
-BLOCK_BYTES = 2 << 20
+MAX_BLOCK_BYTES = 2 << 20
 """Maximum size of the panels of a block. Up to 8 MiB all are equal; half of this costs up to 3 %, a quarter 8 %."""
 
-DOWN, UP = 0, 1
+VISIT_DOWN, VISIT_UP = 0, 1
 """Offset of a visit from twice the block's index."""
 
 
-class Order(NamedTuple):
+class EliminationSchedule(NamedTuple):
     """A factor in blocks, and their schedule.
 
     Attributes:
@@ -31,32 +31,32 @@ class Order(NamedTuple):
         num_rows: number of rows of a vector.
     """
 
-    squares: NDArray[Any]
+    inverse_blocks: NDArray[Any]
     panels: NDArray[Any]
-    places: NDArray[np.int32]
+    row_slots: NDArray[np.int32]
     chunks: NDArray[np.int64]
-    top: NDArray[np.int64]
-    spans: NDArray[np.int64]
-    of_group: NDArray[np.int64]
-    visits: NDArray[np.int64]
-    visits_of: NDArray[np.int64]
-    slot: NDArray[np.int64]
-    rows: int
-    shift: int
+    top_range: NDArray[np.int64]
+    block_spans: NDArray[np.int64]
+    group_blocks: NDArray[np.int64]
+    visit_schedule: NDArray[np.int64]
+    visit_starts: NDArray[np.int64]
+    row_of_unknown: NDArray[np.int64]
+    num_rows: int
+    row_shift: int
 
 
-def of_supernodal(factor: Supernodal) -> Order:
+def schedule_supernodal(factor: SupernodalCholesky) -> EliminationSchedule:
     """Build the schedule of a supernodal factor: each group is cut into blocks, the top is one block."""
-    squares, panels, at = factor.squares, factor.panels, factor.layout
-    places, chunks, spans = at.places, at.chunks, at.spans
+    squares, panels, at = factor.inverse_blocks, factor.panels, factor.layout
+    places, chunks, spans = at.row_slots, at.chunks, at.group_spans
     top, top_end = spans[-1, -2:].tolist()
-    subtree, begin, children = _subtrees(chunks, places, top, squares.itemsize, panels.itemsize)
+    subtree, begin, children = _measure_subtrees(chunks, places, top, squares.itemsize, panels.itemsize)
     blocks: list[tuple[int, int]] = []
     visits: list[int] = []
     of_group, visits_of = [0], [0]
     for first, last in spans[:-1, :2].tolist():
-        cut = _cut(first, last, subtree, begin, children)
-        visits += _visits(cut, begin, len(blocks))
+        cut = _cut_blocks(first, last, subtree, begin, children)
+        visits += _order_visits(cut, begin, len(blocks))
         blocks += cut
         of_group.append(len(blocks))
         visits_of.append(len(visits))
@@ -66,9 +66,9 @@ def of_supernodal(factor: Supernodal) -> Order:
     of_group.append(len(blocks))
     slots = np.append(chunks[:, 6], top_end)
     table = [(slots[first], slots[last], first, last, last) for first, last in blocks]
-    slot = np.empty(len(at.by_slot), np.int64)
-    slot[at.by_slot[:, 0]] = at.by_slot[:, 1]
-    return Order(
+    slot = np.empty(len(at.order_by_slot), np.int64)
+    slot[at.order_by_slot[:, 0]] = at.order_by_slot[:, 1]
+    return EliminationSchedule(
         squares,
         panels,
         places,
@@ -79,21 +79,21 @@ def of_supernodal(factor: Supernodal) -> Order:
         np.array(visits, np.int64),
         np.array(visits_of),
         slot,
-        at.rows,
+        at.num_work_rows,
         0,
     )
 
 
-def of_inverse(factor: Inverse) -> Order:
+def schedule_inverse(factor: DenseInverse) -> EliminationSchedule:
     """Build the schedule of a small inverse: column panels for one pass, with right-hand sides stored behind."""
-    inverse = factor.inverse
+    inverse = factor.inverse_matrix
     n = len(inverse)
-    first = np.arange(0, n, WIDTH)
-    quads = np.minimum(WIDTH, n - first) // LANES
-    tiles = inverse.reshape(-1, LANES, n).swapaxes(1, 2)
-    panels = [tiles[:, i : i + WIDTH].ravel() for i in first]
+    first = np.arange(0, n, MAX_PANEL_WIDTH)
+    quads = np.minimum(MAX_PANEL_WIDTH, n - first) // COLUMN_LANES
+    tiles = inverse.reshape(-1, COLUMN_LANES, n).swapaxes(1, 2)
+    panels = [tiles[:, i : i + MAX_PANEL_WIDTH].ravel() for i in first]
     zero = np.zeros(len(first), np.int64)
-    return Order(
+    return EliminationSchedule(
         np.zeros(1, inverse.dtype),
         np.concatenate(panels),
         np.arange(n, 2 * n, dtype=np.int32),
@@ -101,7 +101,7 @@ def of_inverse(factor: Inverse) -> Order:
         np.array([2 * n, 2 * n, 1]),
         np.array([[0, n, 0, 0, len(first)]]),
         np.array([0, 1, 1]),
-        np.array([DOWN, UP]),
+        np.array([VISIT_DOWN, VISIT_UP]),
         np.array([0, 2]),
         np.arange(n),
         2 * n,
@@ -109,12 +109,12 @@ def of_inverse(factor: Inverse) -> Order:
     )
 
 
-def vectors(dtype: Any, rows: int) -> tuple[NDArray[Any], ...]:
+def allocate_vectors(dtype: Any, rows: int) -> tuple[NDArray[Any], ...]:
     """Allocate three vectors for the iterations, and one of float64 for scratch, in rows of four."""
-    return *(aligned(4 * rows, dtype) for _ in range(3)), aligned(4 * rows)
+    return *(allocate_aligned(4 * rows, dtype) for _ in range(3)), allocate_aligned(4 * rows)
 
 
-def _subtrees(
+def _measure_subtrees(
     chunks: NDArray[np.int64], places: NDArray[np.int32], top: int, square: int, panel: int
 ) -> tuple[list[int], list[int], list[int]]:
     """Return each chunk's subtree size [bytes], its first chunk, and its number of children; the top is excluded."""
@@ -122,7 +122,7 @@ def _subtrees(
     above = places[np.minimum(at, len(places) - 1)] if len(places) else np.zeros(len(chunks), np.int64)
     inside = (below > 0) & (above < top)
     parent = np.where(inside, np.searchsorted(slot, above, side="right") - 1, -1).tolist()
-    size = ((square * LANES * quads + panel * below) * quads * LANES).tolist()
+    size = ((square * COLUMN_LANES * quads + panel * below) * quads * COLUMN_LANES).tolist()
     first = list(range(len(chunks)))
     children = [0] * len(chunks)
     for chunk, above in enumerate(parent):
@@ -133,7 +133,7 @@ def _subtrees(
     return size, first, children
 
 
-def _cut(begin: int, end: int, size: list[int], first: list[int], children: list[int]) -> list[tuple[int, int]]:
+def _cut_blocks(begin: int, end: int, size: list[int], first: list[int], children: list[int]) -> list[tuple[int, int]]:
     """Cut the chunks from `begin` to `end` into blocks: whole subtrees, or paths above them.
 
     Chunks are in a postorder, so that a subtree is a range of them. Neighbours are merged if they still fit.
@@ -143,9 +143,9 @@ def _cut(begin: int, end: int, size: list[int], first: list[int], children: list
     last = end
     while last > begin:
         chunk = last - 1
-        leaf = size[chunk] <= BLOCK_BYTES
+        leaf = size[chunk] <= MAX_BLOCK_BYTES
         start = first[chunk] if leaf else chunk
-        joins = filled + size[chunk] <= BLOCK_BYTES if leaf else last < end and children[last] == 1
+        joins = filled + size[chunk] <= MAX_BLOCK_BYTES if leaf else last < end and children[last] == 1
         if blocks and whole == leaf and joins:
             blocks[-1] = (start, blocks[-1][1])
             filled += size[chunk]
@@ -156,7 +156,7 @@ def _cut(begin: int, end: int, size: list[int], first: list[int], children: list
     return blocks[::-1]
 
 
-def _visits(blocks: list[tuple[int, int]], first: list[int], number: int) -> list[int]:
+def _order_visits(blocks: list[tuple[int, int]], first: list[int], number: int) -> list[int]:
     """Order the blocks of a group for both passes; `number` is the index of the first block.
 
     The pass down visits each block after those above it. The pass up visits them in storage order, after all below.
@@ -167,5 +167,5 @@ def _visits(blocks: list[tuple[int, int]], first: list[int], number: int) -> lis
         below[bisect_right(begins, min(begin, first[end - 1])) - 1].append(k)
     out: list[int] = []
     for k, downs in enumerate(below):
-        out += [2 * (number + d) + DOWN for d in reversed(downs)] + [2 * (number + k) + UP]
+        out += [2 * (number + d) + VISIT_DOWN for d in reversed(downs)] + [2 * (number + k) + VISIT_UP]
     return out

@@ -25,15 +25,15 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, inner_in_parallel, kernel
+from solvers.compiling import jit_inner, jit_inner_parallel, jit_kernel
 from solvers.kernels.edges import add_edges
-from solvers.kernels.loop import EACH, ITERATIONS, LAST, verdict
+from solvers.kernels.loop import REASON_ITERATIONS, RESIDUAL_EACH, RESIDUAL_LAST, check_residual
 from solvers.kernels.springs import add_descent, add_projection, squared_norm
-from solvers.linear.supernodal_solve import backwards, forwards
-from solvers.linear.team import claim, finish, following, go_on, last, start
+from solvers.linear.supernodal_solve import backward_substitution, forward_substitution
+from solvers.linear.team import complete_task, finish_phases, release_phase, reset_team, try_claim, wait_for_phase
 
 
-class Plan(NamedTuple):
+class IterationPlan(NamedTuple):
     """The order of the operations of an iteration and their data.
 
     Attributes:
@@ -53,162 +53,162 @@ class Plan(NamedTuple):
         row_shift: number of rows from a vertex's position to its right-hand side.
     """
 
-    squares: NDArray[np.float64]
+    inverse_blocks: NDArray[np.float64]
     panels: NDArray[np.float64]
-    places: NDArray[np.int32]
+    row_slots: NDArray[np.int32]
     chunks: NDArray[np.int64]
-    top: NDArray[np.int64]
-    blocks: NDArray[np.int64]
-    of_group: NDArray[np.int64]
-    visits: NDArray[np.int64]
-    visits_of: NDArray[np.int64]
-    held: NDArray[np.float64]
-    measure: NDArray[np.float64]
-    loose: NDArray[np.float64]
-    shift: int
+    top_range: NDArray[np.int64]
+    block_table: NDArray[np.int64]
+    group_blocks: NDArray[np.int64]
+    visit_schedule: NDArray[np.int64]
+    visit_starts: NDArray[np.int64]
+    anchor_stiffness: NDArray[np.float64]
+    norm_diagonal: NDArray[np.float64]
+    unpinned_mask: NDArray[np.float64]
+    row_shift: int
 
 
 # These take slices: then the compiler knows that a loop starts at no negative index, and vectorises it.
-@inner
-def _zero(a):
+@jit_inner
+def _fill_zero(a):
     for i in range(len(a)):
         a[i] = 0.0
 
 
-@inner
-def _copy(a, b):
+@jit_inner
+def _copy_slice(a, b):
     for i in range(len(a)):
         b[i] = a[i]
 
 
-@inner
-def _add(a, b):
+@jit_inner
+def _add_slice(a, b):
     for i in range(len(a)):
         b[i] += a[i]
 
 
-@inner
-def _up(plan, bundles, edges, block, x, right, p, out):
+@jit_inner
+def _forward_block(plan, bundles, edges, block, x, right, p, out):
     """Do the local step of a block at x (at p, if that is given) and its forward substitution."""
-    slot, slot_end, bundle, bundle_end, chunk, chunk_end, _ = plan.blocks[block]
+    slot, slot_end, bundle, bundle_end, chunk, chunk_end, _ = plan.block_table[block]
     if p is None:
-        add_projection(bundles, bundle, bundle_end, x, right, out, plan.shift)
-        add_edges(edges, slot, slot_end, x, out, plan.shift, False)
+        add_projection(bundles, bundle, bundle_end, x, right, out, plan.row_shift)
+        add_edges(edges, slot, slot_end, x, out, plan.row_shift, False)
     else:
-        add_descent(bundles, bundle, bundle_end, p, right, out, plan.shift)
-        add_edges(edges, slot, slot_end, p, out, plan.shift, True)
-    forwards(plan.panels, plan.places, plan.chunks, chunk, chunk_end, out)
+        add_descent(bundles, bundle, bundle_end, p, right, out, plan.row_shift)
+        add_edges(edges, slot, slot_end, p, out, plan.row_shift, True)
+    forward_substitution(plan.panels, plan.row_slots, plan.chunks, chunk, chunk_end, out)
 
 
-@inner
-def _down(plan, block, x, p):
+@jit_inner
+def _backward_block(plan, block, x, p):
     """Do the back substitution of a block and correct its positions."""
-    slot, slot_end, _, _, chunk, _, chunk_end = plan.blocks[block]
-    backwards(plan.squares, plan.panels, plan.places, plan.chunks, chunk, chunk_end, x)
+    slot, slot_end, _, _, chunk, _, chunk_end = plan.block_table[block]
+    backward_substitution(plan.inverse_blocks, plan.panels, plan.row_slots, plan.chunks, chunk, chunk_end, x)
     if p is not None:
-        _add(x[4 * slot : 4 * slot_end], p[4 * slot : 4 * slot_end])
+        _add_slice(x[4 * slot : 4 * slot_end], p[4 * slot : 4 * slot_end])
 
 
-@inner
-def _clear(plan, block, out):
-    begin, end = plan.blocks[block, 0] + plan.shift, plan.blocks[block, 1] + plan.shift
-    _zero(out[4 * begin : 4 * end])
+@jit_inner
+def _clear_block(plan, block, out):
+    begin, end = plan.block_table[block, 0] + plan.row_shift, plan.block_table[block, 1] + plan.row_shift
+    _fill_zero(out[4 * begin : 4 * end])
 
 
-@inner
-def _group(plan, bundles, edges, group, x, right, p, out, down, up):
+@jit_inner
+def _process_group(plan, bundles, edges, group, x, right, p, out, down, up):
     """Process a group in the order of its visits: down with the vector x, and up with `out`."""
-    top = 4 * plan.top[0]
-    size = 4 * plan.top[1] - top
+    top = 4 * plan.top_range[0]
+    size = 4 * plan.top_range[1] - top
     copy = top + (group + 1) * size
     if down:
-        _copy(x[top : top + size], x[copy : copy + size])
+        _copy_slice(x[top : top + size], x[copy : copy + size])
     if up:
-        _zero(out[copy : copy + size])
-    for visit in plan.visits[plan.visits_of[group] : plan.visits_of[group + 1]]:
+        _fill_zero(out[copy : copy + size])
+    for visit in plan.visit_schedule[plan.visit_starts[group] : plan.visit_starts[group + 1]]:
         block = visit >> 1
         if visit & 1 == 0:
             if down:
-                _down(plan, block, x, p)
+                _backward_block(plan, block, x, p)
             if up:
-                _clear(plan, block, out)
+                _clear_block(plan, block, out)
         elif up:
-            _up(plan, bundles, edges, block, x, right, p, out)
+            _forward_block(plan, bundles, edges, block, x, right, p, out)
 
 
-@inner
-def _turn(plan, bundles, edges, x, right, p, out):
+@jit_inner
+def _process_top(plan, bundles, edges, x, right, p, out):
     """Process the top: up at the positions x, and down again."""
-    top, top_end, groups = plan.top
+    top, top_end, groups = plan.top_range
     size = 4 * (top_end - top)
     for group in range(groups):
         begin = 4 * top_end + group * size
         if group == 0:
-            _copy(out[begin : begin + size], out[4 * top : 4 * top_end])
+            _copy_slice(out[begin : begin + size], out[4 * top : 4 * top_end])
         else:
-            _add(out[begin : begin + size], out[4 * top : 4 * top_end])
-    for block in range(plan.of_group[-2], plan.of_group[-1]):
-        _up(plan, bundles, edges, block, x, right, p, out)
-        _down(plan, block, out, p)
+            _add_slice(out[begin : begin + size], out[4 * top : 4 * top_end])
+    for block in range(plan.group_blocks[-2], plan.group_blocks[-1]):
+        _forward_block(plan, bundles, edges, block, x, right, p, out)
+        _backward_block(plan, block, out, p)
 
 
-@inner
-def _displace(plan, part, x, before, p, e):
+@jit_inner
+def _compute_displacement(plan, part, x, before, p, e):
     """Write e = p^k - p^(k-1) of the unpinned vertices of a group or the top."""
-    begin, end = plan.of_group[part], plan.of_group[part + 1]
+    begin, end = plan.group_blocks[part], plan.group_blocks[part + 1]
     if begin < end:
-        for i in range(plan.blocks[begin, 0], plan.blocks[end - 1, 1]):
+        for i in range(plan.block_table[begin, 0], plan.block_table[end - 1, 1]):
             for k in range(4 * i, 4 * i + 3):
-                e[k] = plan.loose[i] * (x[k] - before[k] if p is None else x[k])
+                e[k] = plan.unpinned_mask[i] * (x[k] - before[k] if p is None else x[k])
 
 
-@inner
-def _squared(plan, form, part, e):
+@jit_inner
+def _squared_norm(plan, form, part, e):
     """Return |e|_Q^2 [J] of a group or the top, with half of each spring at either end."""
-    begin, end = plan.of_group[part], plan.of_group[part + 1]
+    begin, end = plan.group_blocks[part], plan.group_blocks[part + 1]
     if begin == end:
         return 0.0
-    return squared_norm(form, plan.blocks[begin, 2], plan.blocks[end - 1, 3], e, plan.measure)
+    return squared_norm(form, plan.block_table[begin, 2], plan.block_table[end - 1, 3], e, plan.norm_diagonal)
 
 
-@kernel
-def length(plan, form, x, before, p, e):
+@jit_kernel
+def compute_residual(plan, form, x, before, p, e):
     """Return the residual [J^(1/2)] of an iteration from its vectors, as `run_iterations` defines it; e: scratch."""
-    groups = plan.top[2]
+    groups = plan.top_range[2]
     for part in range(groups + 1):
-        _displace(plan, part, x, before, p, e)
-    total = _squared(plan, form, groups, e)
+        _compute_displacement(plan, part, x, before, p, e)
+    total = _squared_norm(plan, form, groups, e)
     for group in range(groups):
-        total += _squared(plan, form, group, e)
+        total += _squared_norm(plan, form, group, e)
     return np.sqrt(total)
 
 
-@kernel
-def local(plan, bundles, edges, x, right, p, out):
+@jit_kernel
+def run_local_step(plan, bundles, edges, x, right, p, out):
     """Do the local step of all blocks without a solve."""
     for k in range(len(out)):
         out[k] = 0.0
     if p is None:
-        add_projection(bundles, 0, len(bundles.start) - 1, x, right, out, plan.shift)
+        add_projection(bundles, 0, len(bundles.packet_start) - 1, x, right, out, plan.row_shift)
     else:
-        add_descent(bundles, 0, len(bundles.start) - 1, p, right, out, plan.shift)
-    for block in range(len(plan.blocks)):
-        begin, end = plan.blocks[block, 0], plan.blocks[block, 1]
+        add_descent(bundles, 0, len(bundles.packet_start) - 1, p, right, out, plan.row_shift)
+    for block in range(len(plan.block_table)):
+        begin, end = plan.block_table[block, 0], plan.block_table[block, 1]
         if p is None:
-            add_edges(edges, begin, end, x, out, plan.shift, False)
+            add_edges(edges, begin, end, x, out, plan.row_shift, False)
         else:  # of another precision than x
-            add_edges(edges, begin, end, p, out, plan.shift, True)
+            add_edges(edges, begin, end, p, out, plan.row_shift, True)
 
 
-@inner
-def _share(plan, bundles, edges, form, vectors, right, p, limits, team, first):
+@jit_inner
+def _run_thread(plan, bundles, edges, form, vectors, right, p, limits, team, first):
     """Do a thread's part of the iterations: the groups from `first` on that no other thread has claimed.
 
     Phase 2 k is iteration k, phase 2 k + 1 computes its residual if it is requested.
     """
     x0, x1, x2, e = vectors
     turns = x0, x1, x2
-    groups = plan.top[2]
+    groups = plan.top_range[2]
     phase = 0
     while phase >= 0:
         k, measures = phase // 2, phase % 2 == 1
@@ -217,41 +217,43 @@ def _share(plan, bundles, edges, form, vectors, right, p, limits, team, first):
         for i in range(groups):
             # Alternating order: the last data read are still in the cache.
             group = (first + (groups - 1 - i if k % 2 == 1 else i)) % groups
-            if claim(team, group, phase):
+            if try_claim(team, group, phase):
                 if measures:
-                    _displace(plan, group, a, c, p, e)
-                    team.sums[group] = _squared(plan, form, group, e)
+                    _compute_displacement(plan, group, a, c, p, e)
+                    team.task_sums[group] = _squared_norm(plan, form, group, e)
                 else:
-                    _group(plan, bundles, edges, group, a, right, p, b, k > 0, k < limits.iterations)
-                if last(team):
-                    enough = k == limits.iterations
+                    _process_group(plan, bundles, edges, group, a, right, p, b, k > 0, k < limits.max_iterations)
+                if complete_task(team):
+                    enough = k == limits.max_iterations
                     if measures:
-                        total = _squared(plan, form, groups, e)
-                        for value in team.sums:
+                        total = _squared_norm(plan, form, groups, e)
+                        for value in team.task_sums:
                             total += value
-                        team.found[1] = np.sqrt(total)
-                        enough = enough or verdict(team.found[1], limits) != ITERATIONS
-                    elif k > 0 and (limits.wanted == EACH or (enough and limits.wanted == LAST)):
-                        _displace(plan, groups, a, c, p, e)
-                        go_on(team, phase + 1)
+                        team.results[1] = np.sqrt(total)
+                        enough = enough or check_residual(team.results[1], limits) != REASON_ITERATIONS
+                    elif k > 0 and (
+                        limits.residual_mode == RESIDUAL_EACH or (enough and limits.residual_mode == RESIDUAL_LAST)
+                    ):
+                        _compute_displacement(plan, groups, a, c, p, e)
+                        release_phase(team, phase + 1)
                         continue
                     if enough:
-                        team.found[0] = k
-                        finish(team)
+                        team.results[0] = k
+                        finish_phases(team)
                     else:
-                        _turn(plan, bundles, edges, a, right, p, b)
-                        go_on(team, 2 * k + 2)
-        phase = following(team, phase)
+                        _process_top(plan, bundles, edges, a, right, p, b)
+                        release_phase(team, 2 * k + 2)
+        phase = wait_for_phase(team, phase)
 
 
-@inner_in_parallel
-def _side_by_side(plan, bundles, edges, form, vectors, right, p, limits, team, threads):
+@jit_inner_parallel
+def _run_threads(plan, bundles, edges, form, vectors, right, p, limits, team, threads):
     for thread in prange(threads):
-        _share(plan, bundles, edges, form, vectors, right, p, limits, team, thread * plan.top[2] // threads)
+        _run_thread(plan, bundles, edges, form, vectors, right, p, limits, team, thread * plan.top_range[2] // threads)
 
 
-@kernel
-def iterate(plan, bundles, edges, form, vectors, right, p, limits, threads, team):
+@jit_kernel
+def run_iterations(plan, bundles, edges, form, vectors, right, p, limits, threads, team):
     """Iterate from the positions in the first vector, or from p if that is given, which is then overwritten.
 
     Args:
@@ -270,12 +272,12 @@ def iterate(plan, bundles, edges, form, vectors, right, p, limits, threads, team
         The number of iterations, the last residual |p^k - p^(k-1)|_Q [J^(1/2)] over the unpinned vertices (nan if none
         was requested), and the last vector.
     """
-    start(team)
-    team.found[1] = np.nan
+    reset_team(team)
+    team.results[1] = np.nan
     if threads is None:
-        _share(plan, bundles, edges, form, vectors, right, p, limits, team, 0)
+        _run_thread(plan, bundles, edges, form, vectors, right, p, limits, team, 0)
     else:
-        _side_by_side(plan, bundles, edges, form, vectors, right, p, limits, team, threads)
+        _run_threads(plan, bundles, edges, form, vectors, right, p, limits, team, threads)
     x0, x1, x2, _ = vectors
-    done = int(team.found[0])
-    return done, team.found[1], (x0, x1, x2)[done % 3]
+    done = int(team.results[0])
+    return done, team.results[1], (x0, x1, x2)[done % 3]

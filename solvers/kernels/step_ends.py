@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kernel
-from solvers.kernels.loop import verdict
-from solvers.kernels.step import iterate
-from solvers.vectors.intrinsics import ask_for
+from solvers.compiling import jit_inner, jit_kernel
+from solvers.kernels.loop import check_residual
+from solvers.kernels.step import run_iterations
+from solvers.vectors.intrinsics import prefetch_entry
 from solvers.vectors.springs import LANES
 
 
@@ -28,85 +28,91 @@ class VertexRows(NamedTuple):
         coupled_pins: the pin of each entry.
     """
 
-    row: NDArray[np.int64]
-    right: NDArray[np.int64]
-    inertia: NDArray[np.float64]
-    weight: NDArray[np.float64]
-    pinned: NDArray[np.int64]
-    coupling: NDArray[np.float64]
-    coupled: NDArray[np.int64]
-    pin: NDArray[np.int64]
+    row_of_vertex: NDArray[np.int64]
+    right_hand_side_offset: NDArray[np.int64]
+    inertia_diagonal: NDArray[np.float64]
+    pin_weight: NDArray[np.float64]
+    pinned_vertices: NDArray[np.int64]
+    pin_coupling: NDArray[np.float64]
+    coupled_vertices: NDArray[np.int64]
+    coupled_pins: NDArray[np.int64]
 
 
-_AHEAD = 64
+_PREFETCH_DISTANCE = 64
 """Number of vertices by which rows are prefetched, because they lie in another order in memory."""
 
 
-@inner
-def _ask_ahead(rows, v, x):
-    ask_for(x, 4 * rows.row[min(v + _AHEAD, len(rows.row) - 1)])
+@jit_inner
+def _prefetch_row(rows, v, x):
+    prefetch_entry(x, 4 * rows.row_of_vertex[min(v + _PREFETCH_DISTANCE, len(rows.row_of_vertex) - 1)])
 
 
-@kernel
-def state(rows, target, force, pin_targets, right):
+@jit_kernel
+def write_right_hand_side(rows, target, force, pin_targets, right):
     """Write the right-hand side y = M target/dt^2 + f + w C'C p_pin.
 
     The exact pins' columns of Q are moved to it.
     """
     for v in range(len(target)):
-        ask_for(right, rows.right[min(v + _AHEAD, len(rows.right) - 1)])
+        prefetch_entry(
+            right, rows.right_hand_side_offset[min(v + _PREFETCH_DISTANCE, len(rows.right_hand_side_offset) - 1)]
+        )
         for c in range(3):
-            right[rows.right[v] + LANES * c] = rows.inertia[v] * target[v, c] + force[v, c]
-    for q in range(len(rows.pinned)):
-        if rows.weight[q] < np.inf:
+            right[rows.right_hand_side_offset[v] + LANES * c] = rows.inertia_diagonal[v] * target[v, c] + force[v, c]
+    for q in range(len(rows.pinned_vertices)):
+        if rows.pin_weight[q] < np.inf:
             for c in range(3):
-                right[rows.right[rows.pinned[q]] + LANES * c] += rows.weight[q] * pin_targets[q, c]
-    for k in range(len(rows.coupling)):
+                right[rows.right_hand_side_offset[rows.pinned_vertices[q]] + LANES * c] += (
+                    rows.pin_weight[q] * pin_targets[q, c]
+                )
+    for k in range(len(rows.pin_coupling)):
         for c in range(3):
-            right[rows.right[rows.coupled[k]] + LANES * c] -= rows.coupling[k] * pin_targets[rows.pin[k], c]
+            right[rows.right_hand_side_offset[rows.coupled_vertices[k]] + LANES * c] -= (
+                rows.pin_coupling[k] * pin_targets[rows.coupled_pins[k], c]
+            )
 
 
-@inner
-def pin(rows, pin_targets, x):
+@jit_inner
+def write_exact_pins(rows, pin_targets, x):
     """Write the targets of the exactly pinned vertices."""
-    for q in range(len(rows.pinned)):
-        if rows.weight[q] == np.inf:
+    for q in range(len(rows.pinned_vertices)):
+        if rows.pin_weight[q] == np.inf:
             for c in range(3):
-                x[4 * rows.row[rows.pinned[q]] + c] = pin_targets[q, c]
+                x[4 * rows.row_of_vertex[rows.pinned_vertices[q]] + c] = pin_targets[q, c]
 
 
-@inner
-def place(rows, positions, pin_targets, x):
+@jit_inner
+def write_positions(rows, positions, pin_targets, x):
     """Write positions to the rows of x, with exactly pinned vertices on their targets."""
     for v in range(len(positions)):
-        _ask_ahead(rows, v, x)
+        _prefetch_row(rows, v, x)
         for c in range(3):
-            x[4 * rows.row[v] + c] = positions[v, c]
-    pin(rows, pin_targets, x)
+            x[4 * rows.row_of_vertex[v] + c] = positions[v, c]
+    write_exact_pins(rows, pin_targets, x)
 
 
-@kernel
-def fetch(rows, x, out):
+@jit_kernel
+def read_positions(rows, x, out):
     """Write the rows of x to positions (n, 3)."""
     for v in range(len(out)):
-        _ask_ahead(rows, v, x)
+        _prefetch_row(rows, v, x)
         for c in range(3):
-            out[v, c] = x[4 * rows.row[v] + c]
+            out[v, c] = x[4 * rows.row_of_vertex[v] + c]
 
 
-@kernel
-def start(rows, vectors, p, positions, pin_targets):
+@jit_kernel
+def init_vectors(rows, vectors, p, positions, pin_targets):
     """Write the initial positions to the vectors from which the iterations start."""
     if p is not None:
-        place(rows, positions, pin_targets, p)
+        write_positions(rows, positions, pin_targets, p)
         return
-    pin(rows, pin_targets, vectors[1])
-    pin(rows, pin_targets, vectors[2])
-    place(rows, positions, pin_targets, vectors[0])
+    write_exact_pins(rows, pin_targets, vectors[1])
+    write_exact_pins(rows, pin_targets, vectors[2])
+    write_positions(rows, positions, pin_targets, vectors[0])
 
 
-@kernel
-def solve(plan, bundles, edges, form, rows, vectors, right, p, given, limits, threads, team, out):
+@jit_kernel
+def solve_step(plan, bundles, edges, form, rows, vectors, right, p, step_arrays, limits, threads, team, out):
     """Solve a whole step and write the positions to `out`.
 
     An iteration gets single arguments, because nested tuples cost 3 % of a small step.
@@ -129,12 +135,12 @@ def solve(plan, bundles, edges, form, rows, vectors, right, p, given, limits, th
     Returns:
         The number of iterations, the residual [J^(1/2)] and the termination reason.
     """
-    target, force, pin_targets, guess = given
-    state(rows, target, force, pin_targets, right)
-    start(rows, vectors, p, guess, pin_targets)
-    count, residual, x = iterate(plan, bundles, edges, form, vectors, right, p, limits, threads, team)
+    target, force, pin_targets, guess = step_arrays
+    write_right_hand_side(rows, target, force, pin_targets, right)
+    init_vectors(rows, vectors, p, guess, pin_targets)
+    count, residual, x = run_iterations(plan, bundles, edges, form, vectors, right, p, limits, threads, team)
     if p is None:
-        fetch(rows, x, out)
+        read_positions(rows, x, out)
     else:
-        fetch(rows, p, out)
-    return count, residual, verdict(residual, limits)
+        read_positions(rows, p, out)
+    return count, residual, check_residual(residual, limits)

@@ -7,16 +7,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kernel
-from solvers.kernels.accelerate_springs import Shares
-from solvers.kernels.accelerate_springs import descend as objective
-from solvers.kernels.half_spaces import moving, pressed
-from solvers.kernels.springs import Bundles, add_short
+from solvers.compiling import jit_inner, jit_kernel
+from solvers.kernels.accelerate_springs import ObjectiveWeights
+from solvers.kernels.accelerate_springs import value_and_descent as objective
+from solvers.kernels.half_spaces import build_vertex_move, half_space_energy
+from solvers.kernels.springs import SpringPackets, add_degenerate_packet
 from solvers.vectors.springs import LANES
-from solvers.vectors.vbd import descend
+from solvers.vectors.vbd import vbd_newton_step
 
 
-class Blocks(NamedTuple):
+class ColourPackets(NamedTuple):
     """The packets of the free vertices and their majorants.
 
     Vectors have rows of four numbers, the unknowns first.
@@ -28,9 +28,9 @@ class Blocks(NamedTuple):
         majorant: of each lane, stiffness of inertia, pins and springs [N/m]; 1 for padding.
     """
 
-    bundles: Bundles
-    shares: Shares
-    unknowns: int
+    spring_packets: SpringPackets
+    objective_weights: ObjectiveWeights
+    num_free: int
     majorant: NDArray[np.float64]
 
 
@@ -46,71 +46,71 @@ class SweepScratch(NamedTuple):
         objective_value: the objective (1,), nan if it is unknown.
     """
 
-    before: NDArray[np.float64]
-    older: NDArray[np.float64]
-    out: NDArray[np.float64]
-    near: NDArray[np.float64]
-    sums: NDArray[np.float64]
+    previous_positions: NDArray[np.float64]
+    older_positions: NDArray[np.float64]
+    descent_scratch: NDArray[np.float64]
+    spring_scratch: NDArray[np.float64]
+    packet_sums: NDArray[np.float64]
     omega: NDArray[np.float64]
-    level: NDArray[np.float64]
+    objective_value: NDArray[np.float64]
 
 
-@inner
-def _felt(beside, i, p, gradient, block):
+@jit_inner
+def _no_contribution(beside, i, p, gradient, block):
     return gradient, block
 
 
-@inner
-def _risen(beside, i, p, d):
+@jit_inner
+def _no_energy_change(beside, i, p, d):
     return 0.0
 
 
-_move = moving(_felt, _risen)
+_move_vertices = build_vertex_move(_no_contribution, _no_energy_change)
 
 
-@inner
-def _sweep(blocks, spaces, beside, right, p, work):
+@jit_inner
+def _sweep_vertices(blocks, spaces, beside, right, p, work):
     """Move every vertex once to a lower energy."""
-    own = blocks.bundles.own
-    for b in range(len(blocks.bundles.start) - 1):
+    own = blocks.spring_packets.row_offset
+    for b in range(len(blocks.spring_packets.packet_start) - 1):
         if spaces is not None:  # noqa: SIM102 Numba leaves a branch out for None alone
-            if spaces.near[b]:
-                _move(blocks.bundles, spaces, beside, b, blocks.unknowns, p, right, blocks.majorant)
+            if spaces.has_half_space[b]:
+                _move_vertices(blocks.spring_packets, spaces, beside, b, blocks.num_free, p, right, blocks.majorant)
                 continue
-        short = descend(blocks.bundles, b, p, right, blocks.majorant, work.near)
+        short = vbd_newton_step(blocks.spring_packets, b, p, right, blocks.majorant, work.spring_scratch)
         if short:
             # Step with the majorant's block, because a spring of zero length has no Hessian.
-            forces(blocks.bundles, b, p, right, work.out)
+            write_degenerate_descent(blocks.spring_packets, b, p, right, work.descent_scratch)
             for lane in range(LANES):
                 i = own[LANES * b + lane]
                 for k in range(i, i + 3):
-                    p[k] += work.out[k] / blocks.majorant[LANES * b + lane]
+                    p[k] += work.descent_scratch[k] / blocks.majorant[LANES * b + lane]
 
 
-@inner
-def forces(bundles, b, p, right, out):
+@jit_inner
+def write_degenerate_descent(bundles, b, p, right, out):
     """Write minus the gradient of a packet with a spring of zero length to the rows of `out`."""
     for lane in range(LANES):
         for k in range(4):
-            out[bundles.own[LANES * b + lane] + k] = 0.0
-    add_short(bundles, b, p, right, out, True)
+            out[bundles.row_offset[LANES * b + lane] + k] = 0.0
+    add_degenerate_packet(bundles, b, p, right, out, True)
 
 
-@inner
-def _copy(p, out):
+@jit_inner
+def _copy_positions(p, out):
     for k in range(len(p)):
         out[k] = p[k]
 
 
-@inner
-def _level(blocks, spaces, beside, p, right, out):
-    return objective(blocks.bundles, blocks.shares, p, right, out) + pressed(spaces, p)
+@jit_inner
+def _evaluate_objective(blocks, spaces, beside, p, right, out):
+    return objective(blocks.spring_packets, blocks.objective_weights, p, right, out) + half_space_energy(spaces, p)
 
 
-def over(sweep: Any, level: Any) -> Any:
+def build_iteration(sweep: Any, level: Any) -> Any:
     """Build the iteration from a sweep and the objective."""
 
-    @kernel
+    @jit_kernel
     def iterate(blocks, spaces, beside, right, radius, work, p, iterations):
         """Run n sweeps over all vertices from p, which is overwritten with the result.
 
@@ -126,7 +126,7 @@ def over(sweep: Any, level: Any) -> Any:
             p: positions in rows of four [m].
             iterations: number of sweeps.
         """
-        omega, known, older = work.omega, work.level, work.older
+        omega, known, older = work.omega, work.objective_value, work.older_positions
         for _ in range(iterations):
             w = (
                 4.0 / (4.0 - radius**2 * omega[0])
@@ -136,24 +136,24 @@ def over(sweep: Any, level: Any) -> Any:
                 else 1.0
             )
             if w > 1.0 and np.isnan(known[0]):
-                known[0] = level(blocks, spaces, beside, p, right, work.out)
-            _copy(p, work.before)
+                known[0] = level(blocks, spaces, beside, p, right, work.descent_scratch)
+            _copy_positions(p, work.previous_positions)
             sweep(blocks, spaces, beside, right, p, work)
             if radius == 0.0:
                 continue
             omega[0] = w
             if w > 1.0:
-                for k in range(4 * blocks.unknowns):
+                for k in range(4 * blocks.num_free):
                     older[k] += w * (p[k] - older[k])
-                new = level(blocks, spaces, beside, older, right, work.out)
+                new = level(blocks, spaces, beside, older, right, work.descent_scratch)
                 if new <= known[0]:
-                    _copy(older, p)
+                    _copy_positions(older, p)
                     known[0] = new
                 else:
                     omega[0], known[0] = 0.0, np.nan
-            _copy(work.before, older)
+            _copy_positions(work.previous_positions, older)
 
     return iterate
 
 
-iterate = over(_sweep, _level)
+run_iterations = build_iteration(_sweep_vertices, _evaluate_objective)

@@ -9,53 +9,53 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from solvers.compiling import inner_closure
-from solvers.kernels.accelerate_springs import descend as objective
-from solvers.kernels.half_spaces import moving, pressed
-from solvers.kernels.stencils import Kind, Vertices
-from solvers.kernels.vbd import forces, over
+from solvers.compiling import jit_closure
+from solvers.kernels.accelerate_springs import value_and_descent as objective
+from solvers.kernels.half_spaces import build_vertex_move, half_space_energy
+from solvers.kernels.stencils import ElementKind, VertexFunctions
+from solvers.kernels.vbd import build_iteration, write_degenerate_descent
 from solvers.vectors.springs import LANES
-from solvers.vectors.vbd import model, step
+from solvers.vectors.vbd import vbd_model_step, vbd_vertex_model
 
 _INFINITE = float("inf")
-_D, _RISE = 3, 6
+_STEP_SLOT, _CHANGE_SLOT = 3, 6
 """Positions of steps and energy changes among a packet's sums."""
 
 
 @cache
-def iterating(*kinds: Kind) -> Any:
+def build_element_iteration(*kinds: ElementKind) -> Any:
     """Build the kernel `vbd_sweeps.run_iterations` for elements of these kinds."""
-    total, felt, risen = Vertices.of(list(kinds))
-    move = moving(felt, risen)
+    total, felt, risen = VertexFunctions.from_kinds(list(kinds))
+    move = build_vertex_move(felt, risen)
 
-    @inner_closure
+    @jit_closure
     def without_length(blocks, beside, right, b, p, work):
         """Step with the majorant's block, because a spring of zero length has no Hessian."""
-        forces(blocks.bundles, b, p, right, work.out)
+        write_degenerate_descent(blocks.spring_packets, b, p, right, work.descent_scratch)
         for lane in range(LANES):
-            i = blocks.bundles.own[LANES * b + lane]
-            if i // 4 >= blocks.unknowns:
+            i = blocks.spring_packets.row_offset[LANES * b + lane]
+            if i // 4 >= blocks.num_free:
                 continue
             none = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
             gradient, _ = felt(beside, i // 4, p, *none)
             for c in range(3):
-                p[i + c] += (work.out[i + c] - gradient[c]) / blocks.majorant[LANES * b + lane]
+                p[i + c] += (work.descent_scratch[i + c] - gradient[c]) / blocks.majorant[LANES * b + lane]
 
-    @inner_closure
+    @jit_closure
     def sweep(blocks, spaces, beside, right, p, work):
         """Move every vertex once to a lower energy."""
-        bundles, sums = blocks.bundles, work.sums
-        for b in range(len(bundles.start) - 1):
+        bundles, sums = blocks.spring_packets, work.packet_sums
+        for b in range(len(bundles.packet_start) - 1):
             if spaces is not None:  # noqa: SIM102 Numba leaves a branch out for None alone
-                if spaces.near[b]:
-                    move(bundles, spaces, beside, b, blocks.unknowns, p, right, blocks.majorant)
+                if spaces.has_half_space[b]:
+                    move(bundles, spaces, beside, b, blocks.num_free, p, right, blocks.majorant)
                     continue
-            if model(bundles, b, p, right, work.near, sums):
+            if vbd_vertex_model(bundles, b, p, right, work.spring_scratch, sums):
                 without_length(blocks, beside, right, b, p, work)
                 continue
             for lane in range(LANES):
-                i = bundles.own[LANES * b + lane] // 4
-                if i < blocks.unknowns:
+                i = bundles.row_offset[LANES * b + lane] // 4
+                if i < blocks.num_free:
                     force = -sums[lane], -sums[LANES + lane], -sums[2 * LANES + lane]
                     block = (
                         sums[3 * LANES + lane], sums[4 * LANES + lane], sums[5 * LANES + lane],
@@ -66,19 +66,27 @@ def iterating(*kinds: Kind) -> Any:
                         sums[LANES * c + lane] = -gradient[c]
                     for k in range(6):
                         sums[LANES * (3 + k) + lane] = block[k]
-            step(bundles, b, p, right, work.near, sums)
+            vbd_model_step(bundles, b, p, right, work.spring_scratch, sums)
             for lane in range(LANES):
-                i = bundles.own[LANES * b + lane] // 4
-                if i >= blocks.unknowns:
+                i = bundles.row_offset[LANES * b + lane] // 4
+                if i >= blocks.num_free:
                     continue
-                d = sums[LANES * _D + lane], sums[LANES * (_D + 1) + lane], sums[LANES * (_D + 2) + lane]
-                rise, most = sums[LANES * _RISE + lane], blocks.majorant[LANES * b + lane]
+                d = (
+                    sums[LANES * _STEP_SLOT + lane],
+                    sums[LANES * (_STEP_SLOT + 1) + lane],
+                    sums[LANES * (_STEP_SLOT + 2) + lane],
+                )
+                rise, most = sums[LANES * _CHANGE_SLOT + lane], blocks.majorant[LANES * b + lane]
                 if not (rise < _INFINITE and rise + risen(beside, i, p, d) <= 0.0):
                     d = sums[lane] / most, sums[LANES + lane] / most, sums[2 * LANES + lane] / most
                 p[4 * i], p[4 * i + 1], p[4 * i + 2] = p[4 * i] + d[0], p[4 * i + 1] + d[1], p[4 * i + 2] + d[2]
 
-    @inner_closure
+    @jit_closure
     def level(blocks, spaces, beside, p, right, out):
-        return objective(blocks.bundles, blocks.shares, p, right, out) + pressed(spaces, p) + total(beside, p)
+        return (
+            objective(blocks.spring_packets, blocks.objective_weights, p, right, out)
+            + half_space_energy(spaces, p)
+            + total(beside, p)
+        )
 
-    return over(sweep, level)
+    return build_iteration(sweep, level)

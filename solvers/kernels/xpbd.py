@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kernel
-from solvers.energies.springs import TINY, Springs
+from solvers.compiling import jit_inner, jit_kernel
+from solvers.energies.springs import ZERO_LENGTH, Springs
 
-_TINY_SQUARED = TINY * TINY
+_ZERO_LENGTH_SQUARED = ZERO_LENGTH * ZERO_LENGTH
 
 
-class Constraints(NamedTuple):
+class SpringConstraints(NamedTuple):
     """Springs in the order of their projection.
 
     Attributes:
@@ -23,13 +23,13 @@ class Constraints(NamedTuple):
         rest_direction: direction at zero length (m, 3).
     """
 
-    ends: NDArray[np.int32]
+    end_vertices: NDArray[np.int32]
     stiffness: NDArray[np.float64]
     rest_length: NDArray[np.float64]
     rest_direction: NDArray[np.float64]
 
     @classmethod
-    def of(cls, springs: Springs, order: NDArray[np.int64]) -> Constraints:
+    def from_springs(cls, springs: Springs, order: NDArray[np.int64]) -> SpringConstraints:
         """Select the springs in the order `order`."""
         fields = (springs.stiffness, springs.rest_length, springs.rest_direction)
         return cls(
@@ -37,7 +37,7 @@ class Constraints(NamedTuple):
         )
 
 
-class Pinned(NamedTuple):
+class PinMotion(NamedTuple):
     """The motion of the pins in a step.
 
     Attributes:
@@ -46,21 +46,21 @@ class Pinned(NamedTuple):
         pin_start, pin_end: positions at the start and the end of the step (q, 3) [m].
     """
 
-    vertices: NDArray[np.int64]
-    weight: NDArray[np.float64]
-    begin: NDArray[np.float64]
-    end: NDArray[np.float64]
+    pinned_vertices: NDArray[np.int64]
+    pin_weight: NDArray[np.float64]
+    pin_start: NDArray[np.float64]
+    pin_end: NDArray[np.float64]
 
 
-@inner
-def _project(constraints, ease, compliance, tension, p):
+@jit_inner
+def _project_constraints(constraints, ease, compliance, tension, p):
     """Project all springs once, so that each has the force k (|p_i - p_j| - r); `tension` accumulates it if given."""
     ends, stiffness, rest_length, rest_direction = constraints
     for e in range(len(stiffness)):
         i, j = ends[e]
         v0, v1, v2 = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2]
         squared = v0 * v0 + v1 * v1 + v2 * v2
-        if squared <= _TINY_SQUARED:
+        if squared <= _ZERO_LENGTH_SQUARED:
             length = 0.0
             v0, v1, v2 = rest_direction[e]
         else:
@@ -78,8 +78,8 @@ def _project(constraints, ease, compliance, tension, p):
         p[j, 0], p[j, 1], p[j, 2] = p[j, 0] + b * v0, p[j, 1] + b * v1, p[j, 2] + b * v2
 
 
-@kernel
-def iterate(constraints, ease, compliance, tension, p, iterations):
+@jit_kernel
+def run_iterations(constraints, ease, compliance, tension, p, iterations):
     """Run n passes from p (n, 3) [m], which is overwritten with the result.
 
     Args:
@@ -91,11 +91,11 @@ def iterate(constraints, ease, compliance, tension, p, iterations):
         iterations: number of passes.
     """
     for _ in range(iterations):
-        _project(constraints, ease, compliance, tension, p)
+        _project_constraints(constraints, ease, compliance, tension, p)
 
 
-@kernel
-def substeps(constraints, ease, compliance, pinned, force, before, p, v, h, count):
+@jit_kernel
+def run_substeps(constraints, ease, compliance, pinned, force, before, p, v, h, count):
     """Run `count` steps of size h, each with one pass; p and v are overwritten with the result.
 
     Args:
@@ -125,7 +125,7 @@ def substeps(constraints, ease, compliance, pinned, force, before, p, v, h, coun
                     # Displacement from the inertial motion, without the force that was added above.
                     away = target - before[i, c] - h * v[i, c]
                     p[i, c] += compliance[i] * weight[q] * away
-        _project(constraints, ease, compliance, None, p)
+        _project_constraints(constraints, ease, compliance, None, p)
         for i in range(len(p)):
             for c in range(3):
                 v[i, c] = (p[i, c] - before[i, c]) / h

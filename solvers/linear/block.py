@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers import memory
-from solvers.linear.block_factor import Fronts, Scratch, factorise, solve
-from solvers.linear.block_front import DEPTH, whole
-from solvers.linear.symbolic import Symbolic, structure
+from solvers.linear.block_factor import FactorisationScratch, FrontalStructure, factorise_blocks, solve_blocks
+from solvers.linear.block_front import PANEL_DEPTH, round_up_rows
+from solvers.linear.symbolic import SymbolicFactor, analyse_graph
 from solvers.problem import Unsupported
-from solvers.vectors.block import ROWS, TILE
+from solvers.vectors.block import TILE_COLUMNS, TILE_ROWS
 
-_NOTHING = np.empty((0, 3))
+_NO_RIGHT_HAND_SIDE = np.empty((0, 3))
 
 
 class BlockCholesky:
@@ -42,26 +42,26 @@ class BlockCholesky:
             Unsupported: if the factor does not fit in memory.
         """
         pointers, neighbours = np.asarray(graph.indptr, np.int64), np.asarray(graph.indices, np.int32)
-        symbolic = structure(pointers, neighbours)
+        symbolic = analyse_graph(pointers, neighbours)
         self.nonzeros = 9 * symbolic.nonzeros - 3 * (len(pointers) - 1)
-        self._fronts = _fronts(pointers, neighbours, symbolic)
-        f = self._fronts
-        below = np.diff(f.start) - f.own
-        w, h = 3.0 * f.own, 3.0 * below
+        self._frontal_structure = _build_frontal_structure(pointers, neighbours, symbolic)
+        f = self._frontal_structure
+        below = np.diff(f.member_start) - f.num_columns
+        w, h = 3.0 * f.num_columns, 3.0 * below
         self.flops = float((w * (w * w / 3.0 + w * h + h * h)).sum())
-        room = _room(f, 3 * below * whole(3 * below))
-        n, supernodes = len(pointers) - 1, len(f.own)
-        needs, free = 8.0 * (f.panel[-1] + 2 * room), memory.of_machine()
+        room = _required_stack_size(f, 3 * below * round_up_rows(3 * below))
+        n, supernodes = len(pointers) - 1, len(f.num_columns)
+        needs, free = 8.0 * (f.panel_start[-1] + 2 * room), memory.compute_memory_limit()
         if needs > free:
             raise Unsupported(
-                f"a factor of the Hessian has {self.nonzeros:,} entries and takes {memory.in_words(needs)} of memory, "
-                f"where {memory.in_words(free)} may be taken; take numba or newton-cg, or a coarser mesh"
+                f"a factor of the Hessian has {self.nonzeros:,} entries and takes {memory.format_bytes(needs)} of memory, "
+                f"where {memory.format_bytes(free)} may be taken; take numba or newton-cg, or a coarser mesh"
             )
-        self._panels = np.zeros(f.panel[-1] + ROWS)
+        self._panels = np.zeros(f.panel_start[-1] + TILE_ROWS)
         waiting, filled, runs = (np.zeros(k, np.int64) for k in ((2, supernodes + 1), 2, (2, n + 1)))
-        front = np.zeros(int((whole(3 * f.own) + whole(3 * below)).max(initial=0)) + ROWS)
-        stacks, triangles = np.zeros((2, room)), np.zeros((DEPTH // TILE, TILE, TILE))
-        self._scratch = Scratch(front, stacks, waiting, filled, np.zeros(TILE), triangles, runs)
+        front = np.zeros(int((round_up_rows(3 * f.num_columns) + round_up_rows(3 * below)).max(initial=0)) + TILE_ROWS)
+        stacks, triangles = np.zeros((2, room)), np.zeros((PANEL_DEPTH // TILE_COLUMNS, TILE_COLUMNS, TILE_COLUMNS))
+        self._scratch = FactorisationScratch(front, stacks, waiting, filled, np.zeros(TILE_COLUMNS), triangles, runs)
 
     def factorise(self, values: NDArray[np.float64]) -> bool:
         """Factorise H, with blocks (b, 3, 3) in the graph's order.
@@ -69,15 +69,15 @@ class BlockCholesky:
         Returns:
             Whether H is positive definite.
         """
-        return factorise(self._fronts, values, self._panels, _NOTHING, self._scratch)
+        return factorise_blocks(self._frontal_structure, values, self._panels, _NO_RIGHT_HAND_SIDE, self._scratch)
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return H^-1 b, both (n, 3), with the last factorisation."""
         x = np.array(b, order="C")
-        solve(self._fronts, self._panels, x, self._scratch.front, False)
+        solve_blocks(self._frontal_structure, self._panels, x, self._scratch.front, False)
         return x
 
-    def solve_anew(self, values: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    def factorise_and_solve(self, values: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Factorise H and return H^-1 b, faster than in two calls.
 
         Args:
@@ -88,27 +88,29 @@ class BlockCholesky:
             Solution (n, 3); None if H is not positive definite.
         """
         x = np.array(b, order="C")
-        if not factorise(self._fronts, values, self._panels, x, self._scratch):
+        if not factorise_blocks(self._frontal_structure, values, self._panels, x, self._scratch):
             return None
-        solve(self._fronts, self._panels, x, self._scratch.front, True)
+        solve_blocks(self._frontal_structure, self._panels, x, self._scratch.front, True)
         return x
 
 
-def _fronts(pointers: NDArray[np.int64], neighbours: NDArray[np.int32], symbolic: Symbolic) -> Fronts:
+def _build_frontal_structure(
+    pointers: NDArray[np.int64], neighbours: NDArray[np.int32], symbolic: SymbolicFactor
+) -> FrontalStructure:
     """Build the fronts of a symbolic factor, with supernodes renumbered in the order of their elimination."""
-    s, sequence = symbolic, symbolic.sequence
+    s, sequence = symbolic, symbolic.postorder
     number = np.empty(len(sequence) + 1, np.int64)
     number[sequence] = np.arange(len(sequence))
     number[-1] = -1
     parent = number[s.parent[sequence]]
-    own = s.width[sequence].astype(np.int64)
-    first, rows = s.first.tolist(), s.row_start.tolist()
+    own = s.num_columns[sequence].astype(np.int64)
+    first, rows = s.first_slot.tolist(), s.row_start.tolist()
     lists = [
-        s.vertex[np.append(np.arange(first[k], first[k] + s.width[k]), s.rows[rows[k] : rows[k + 1]])]
+        s.vertex_of_slot[np.append(np.arange(first[k], first[k] + s.num_columns[k]), s.rows[rows[k] : rows[k + 1]])]
         for k in sequence.tolist()
     ]
     start = np.concatenate([[0], np.cumsum([len(x) for x in lists])]).astype(np.int64)
-    members = np.concatenate([s.vertex[:0], *lists]).astype(np.int64)
+    members = np.concatenate([s.vertex_of_slot[:0], *lists]).astype(np.int64)
     within = np.full(len(members), -1)
     stack = np.zeros(len(own), np.int64)
     place = np.empty(len(pointers) - 1, np.int64)
@@ -120,13 +122,15 @@ def _fronts(pointers: NDArray[np.int64], neighbours: NDArray[np.int32], symbolic
             place[list_] = np.arange(len(list_))
             within[start[k] + own[k] : start[k + 1]] = place[members[start[k] + own[k] : start[k + 1]]]
     below = np.diff(start) - own
-    heights = whole(3 * own) + whole(3 * below)
+    heights = round_up_rows(3 * own) + round_up_rows(3 * below)
     panel = np.concatenate([[0], np.cumsum(3 * own * heights)])
-    entered = _entered(pointers, neighbours.astype(np.int64), s.slot, start, members, own, heights, panel)
-    return Fronts(start, members, own, within, parent, stack, panel, *entered)
+    entered = _locate_blocks(
+        pointers, neighbours.astype(np.int64), s.slot_of_vertex, start, members, own, heights, panel
+    )
+    return FrontalStructure(start, members, own, within, parent, stack, panel, *entered)
 
 
-def _entered(
+def _locate_blocks(
     pointers: NDArray[np.int64],
     u: NDArray[np.int64],
     rank: NDArray[np.int32],
@@ -153,16 +157,16 @@ def _entered(
     key = node * n + members
     order = np.argsort(key)
     row = place[order[np.searchsorted(key[order], at * n + u[block])]]
-    row = np.where(row < own[at], 3 * row, whole(3 * own[at]) + 3 * (row - own[at]))
+    row = np.where(row < own[at], 3 * row, round_up_rows(3 * own[at]) + 3 * (row - own[at]))
     entry = panel[at] + 3 * column[v[block]] * heights[at] + row
     return np.searchsorted(at, np.arange(len(own) + 1)), block, entry, np.flatnonzero(u == v)
 
 
-def _room(fronts: Fronts, sizes: NDArray[np.int64]) -> int:
+def _required_stack_size(fronts: FrontalStructure, sizes: NDArray[np.int64]) -> int:
     """Return the required size of each stack for updates of the given sizes."""
     top, most = [0, 0], 0
     waiting: dict[int, int] = {}  # what waits for a supernode
-    for k, (above, side, size) in enumerate(zip(fronts.parent, fronts.stack, sizes, strict=True)):
+    for k, (above, side, size) in enumerate(zip(fronts.parent, fronts.stack_index, sizes, strict=True)):
         most = max(most, top[side] + size)
         top[1 - side] -= waiting.pop(k, 0)
         if above >= 0:

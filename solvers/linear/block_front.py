@@ -14,17 +14,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner
-from solvers.vectors.block import ROWS, TILE, divide, factorise_corner, subtract_product
+from solvers.compiling import jit_inner
+from solvers.vectors.block import TILE_COLUMNS, TILE_ROWS, factorise_tile, solve_tile_triangle, subtract_tile_product
 
-DEPTH, HEIGHT = 192, 128
+PANEL_DEPTH, ROW_BLOCK_HEIGHT = 192, 128
 """Columns and rows of a panel that are multiplied together: whole tiles and whole vectors, 192 KiB."""
 
-_NO_DIGITS = 4.0 * np.finfo(np.float64).eps
+_PIVOT_ROUNDOFF = 4.0 * np.finfo(np.float64).eps
 """Pivots below this fraction of the matrix entry are round-off."""
 
 
-class Dense(NamedTuple):
+class DenseFront(NamedTuple):
     """Frontal matrix of a supernode.
 
     Attributes:
@@ -38,26 +38,26 @@ class Dense(NamedTuple):
         update_stride: entries from one update column to the next.
     """
 
-    own: int
-    head: int
+    num_columns: int
+    below_offset: int
     stride: int
     panels: NDArray[np.float64]
-    base: int
-    update: NDArray[np.float64]
-    begin: int
-    size: int
+    panel_offset: int
+    update_buffer: NDArray[np.float64]
+    update_offset: int
+    update_stride: int
 
 
-def whole(rows: Any) -> Any:
+def round_up_rows(rows: Any) -> Any:
     """Return the number of rows, rounded up to whole vectors."""
-    return (rows + ROWS - 1) // ROWS * ROWS
+    return (rows + TILE_ROWS - 1) // TILE_ROWS * TILE_ROWS
 
 
-rows_of = inner(whole)
+round_up_rows_inner = jit_inner(round_up_rows)
 
 
-@inner
-def eliminate(fronts, s, values, panels, stride, least, triangles):
+@jit_inner
+def eliminate_front(fronts, supernode, values, panels, stride, min_pivots, triangles):
     """Factorise the panel of a supernode; return False if a pivot is not positive.
 
     Args:
@@ -68,70 +68,94 @@ def eliminate(fronts, s, values, panels, stride, least, triangles):
         stride: entries from one panel column to the next.
         min_pivots, triangles: scratch.
     """
-    base, width = fronts.panel[s], 3 * fronts.own[s]
-    for first in range(0, width, DEPTH):
-        end = min(first + DEPTH, width)
+    base, width = fronts.panel_start[supernode], 3 * fronts.num_columns[supernode]
+    for first in range(0, width, PANEL_DEPTH):
+        end = min(first + PANEL_DEPTH, width)
         left = base + first * stride
-        row, stop = first, min(rows_of(end), stride)  # the triangle of these columns, and then the rows below
+        row, stop = (
+            first,
+            min(round_up_rows_inner(end), stride),
+        )  # the triangle of these columns, and then the rows below
         while row < stride:
-            for tile in range(first, end, TILE):
-                columns, triangle = min(TILE, end - tile), triangles[(tile - first) // TILE]
-                above = max(row, tile // ROWS * ROWS)
-                column, strips = base + tile * stride, (stop - above) // ROWS
-                _subtract(
+            for tile in range(first, end, TILE_COLUMNS):
+                columns, triangle = min(TILE_COLUMNS, end - tile), triangles[(tile - first) // TILE_COLUMNS]
+                above = max(row, tile // TILE_ROWS * TILE_ROWS)
+                column, strips = base + tile * stride, (stop - above) // TILE_ROWS
+                _subtract_tile(
                     panels, left, above, tile, stride, tile - first, panels, column + above, stride, strips, columns
                 )
                 if row == first:
                     corner = column + tile
                     for j in range(columns):
-                        v = fronts.members[fronts.start[s] + (tile + j) // 3]
-                        least[j] = _NO_DIGITS * values[fronts.diagonal[v], j % 3, j % 3]
+                        v = fronts.member_vertices[fronts.member_start[supernode] + (tile + j) // 3]
+                        min_pivots[j] = _PIVOT_ROUNDOFF * values[fronts.diagonal_block[v], j % 3, j % 3]
                     if columns == 6:
-                        positive = factorise_corner(panels, corner, stride, least, triangle, 6)
+                        positive = factorise_tile(panels, corner, stride, min_pivots, triangle, 6)
                     else:
-                        positive = factorise_corner(panels, corner, stride, least, triangle, 3)
+                        positive = factorise_tile(panels, corner, stride, min_pivots, triangle, 3)
                     if not positive:
                         return False
                 if columns == 6:
-                    divide(panels, column + above, stride, triangle, strips, 6)
+                    solve_tile_triangle(panels, column + above, stride, triangle, strips, 6)
                 else:
-                    divide(panels, column + above, stride, triangle, strips, 3)
+                    solve_tile_triangle(panels, column + above, stride, triangle, strips, 3)
                 if row == first:
                     for j in range(columns):
                         panels[column + j * stride + tile + j] = triangle[j, j]
-            row, stop = stop, min(stop + HEIGHT, stride)
-        _product(panels, left, stride, end - first, 0, panels, base, stride, end, width)
+            row, stop = stop, min(stop + ROW_BLOCK_HEIGHT, stride)
+        _subtract_lower_product(panels, left, stride, end - first, 0, panels, base, stride, end, width)
     return True
 
 
-@inner
-def update(to, columns):
+@jit_inner
+def subtract_front_update(to, columns):
     """Subtract the product of a panel's rows below from the update."""
-    for first in range(0, 3 * to.own, DEPTH):
-        left, depth = to.base + first * to.stride, min(DEPTH, 3 * to.own - first)
-        _product(to.panels, left, to.stride, depth, to.head, to.update, to.begin, to.size, 0, columns)
+    for first in range(0, 3 * to.num_columns, PANEL_DEPTH):
+        left, depth = to.panel_offset + first * to.stride, min(PANEL_DEPTH, 3 * to.num_columns - first)
+        _subtract_lower_product(
+            to.panels,
+            left,
+            to.stride,
+            depth,
+            to.below_offset,
+            to.update_buffer,
+            to.update_offset,
+            to.update_stride,
+            0,
+            columns,
+        )
 
 
-@inner
-def _product(panels, left, stride, depth, head, target, to, size, first, end):
+@jit_inner
+def _subtract_lower_product(panels, left, stride, depth, head, target, to, size, first, end):
     """Subtract the lower triangle of the product of panel columns with themselves from columns of a matrix.
 
     head: offset of the rows that are multiplied; first, end: range of the matrix columns.
     """
-    for row in range(first // ROWS * ROWS, size, HEIGHT):
-        stop = min(row + HEIGHT, size)
-        for tile in range(first, min(end, stop), TILE):
-            above = max(row, tile // ROWS * ROWS)
-            place, strips = to + tile * size + above, (stop - above) // ROWS
-            _subtract(
-                panels, left + head, above, tile, stride, depth, target, place, size, strips, min(TILE, end - tile)
+    for row in range(first // TILE_ROWS * TILE_ROWS, size, ROW_BLOCK_HEIGHT):
+        stop = min(row + ROW_BLOCK_HEIGHT, size)
+        for tile in range(first, min(end, stop), TILE_COLUMNS):
+            above = max(row, tile // TILE_ROWS * TILE_ROWS)
+            place, strips = to + tile * size + above, (stop - above) // TILE_ROWS
+            _subtract_tile(
+                panels,
+                left + head,
+                above,
+                tile,
+                stride,
+                depth,
+                target,
+                place,
+                size,
+                strips,
+                min(TILE_COLUMNS, end - tile),
             )
 
 
-@inner
-def _subtract(panels, left, row, top, stride, depth, target, to, size, strips, columns):
+@jit_inner
+def _subtract_tile(panels, left, row, top, stride, depth, target, to, size, strips, columns):
     """Call `subtract_tile_product` for six or three columns."""
     if columns == 6:
-        subtract_product(panels, left + row, left + top, stride, depth, target, to, size, strips, 6)
+        subtract_tile_product(panels, left + row, left + top, stride, depth, target, to, size, strips, 6)
     else:
-        subtract_product(panels, left + row, left + top, stride, depth, target, to, size, strips, 3)
+        subtract_tile_product(panels, left + row, left + top, stride, depth, target, to, size, strips, 3)

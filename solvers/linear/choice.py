@@ -17,44 +17,44 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from scipy.sparse import csr_array
 
-from solvers.compiling import kept
+from solvers.compiling import cached_njit
 from solvers.linear.conjugate_gradients import ConjugateGradients
-from solvers.linear.factors import Factor, SimplicialCholesky
-from solvers.linear.inverse import Inverse
-from solvers.linear.supernodal import Supernodal, stored
-from solvers.linear.symbolic import Symbolic, structure
+from solvers.linear.factors import LinearSolver, SimplicialCholesky
+from solvers.linear.inverse import DenseInverse
+from solvers.linear.supernodal import SupernodalCholesky, count_stored_entries
+from solvers.linear.symbolic import SymbolicFactor, analyse_graph
 from solvers.matrices import energy_norm
-from solvers.memory import in_words, of_machine
+from solvers.memory import compute_memory_limit, format_bytes
 from solvers.problem import Unsupported
 
-Linear = Literal["auto", "inverse", "cholespy", "supernodal", "cg"]
+LinearSolverName = Literal["auto", "inverse", "cholespy", "supernodal", "cg"]
 Precision = Literal["float64", "float32", "float16"]
 
-SMALL = 25
+MAX_DENSE_VERTICES = 25
 """Number of vertices up to which the inverse is no slower. A step of 50 iterations takes as long at 9 and 25 vertices
 of a sheet, 1.15 times as long as with the supernodal factor at 49, and 1.5 times at 100."""
 
-_SOLVES = 200
+_AMORTISED_SOLVES = 200
 """Solves within which a factor has to pay off: 4 steps of 50 iterations. Sheets get a factor at any size, solids up to
 about 80 vertices a side. Beyond, it would take minutes, and a solve would take as long as conjugate gradients."""
 
 _BYTES_PER_FLOP = 0.4
 """Bytes read by a solve that take as long as a flop: 35 Gflop/s and 13 GB/s, on a solid of 60 vertices a side."""
 
-_ITERATIONS = 10
+_EXPECTED_CG_ITERATIONS = 10
 """Conjugate gradient iterations to the tolerance: 9 to 11 on sheets and solids of 1e4 to 1e6 vertices."""
 
-_LEFT, _POWERS = 0.9, 4
+_MAX_ERROR_REDUCTION, _POWER_ITERATIONS = 0.9, 4
 """Fraction of an error that a correction by a rounded factor may leave (at 1 corrections no longer converge), and
 number of corrections by which it is estimated."""
 
-_ROUNDING: dict[Precision, float] = {"float64": 0.0, "float32": 0.5, "float16": 1.25}
+_ROUNDED_COPY_MEMORY: dict[Precision, float] = {"float64": 0.0, "float32": 0.5, "float16": 1.25}
 """Memory of the rounded copy of a factor, relative to its float64 panels, which exist while the copy is made."""
 
-_BYTES_PER_VERTEX = 200
+_SYMBOLIC_BYTES_PER_VERTEX = 200
 """Bytes of the symbolic factor: 180 per vertex on a sheet of 512 vertices a side."""
 
-_BYTES_READ, _BYTES_KEPT = 70, 60
+_BYTES_READ_PER_ENTRY, _BYTES_STORED_PER_ENTRY = 70, 60
 """Bytes per entry of Q: read by one multigrid iteration, coarse levels included, and allocated at most during setup. A
 vertex counts as four entries, for its vectors. The first is within a tenth of the measured value on sheets and solids
 of 1e6 vertices. The second is above the measured ones: 38 for sheets, 31 for solids, 50 for chains and for stiffnesses
@@ -62,7 +62,7 @@ over six decades."""
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class CostEstimate:
     """Estimated cost of a solver.
 
     Attributes:
@@ -71,22 +71,26 @@ class Estimate:
         description: the underlying counts.
     """
 
-    memory: float
-    traffic: float
-    words: str
+    memory_bytes: float
+    traffic_bytes: float
+    description: str
 
 
-class Choice(NamedTuple):
+class SolverChoice(NamedTuple):
     """A solver's name, the reason for its selection, and its symbolic factor if that was computed."""
 
-    name: str
-    why: str
-    symbolic: Symbolic | None = None
+    solver_name: str
+    reason: str
+    symbolic_factor: SymbolicFactor | None = None
 
 
-def factorise(
-    Q: csr_array, linear: Linear = "auto", precision: Precision = "float64", *, memory: float | None = None
-) -> tuple[Factor, str]:
+def build_linear_solver(
+    Q: csr_array,
+    linear: LinearSolverName = "auto",
+    precision: Precision = "float64",
+    *,
+    memory_limit: float | None = None,
+) -> tuple[LinearSolver, str]:
     """Build a solver of Q x = b.
 
     Below float64, a solve has only the accuracy of the precision and is meant for corrections p - Q^-1 grad; cg always
@@ -106,15 +110,15 @@ def factorise(
         Unsupported: if no solver fits in memory.
         NotPositiveDefinite: if the matrix is not positive definite.
     """
-    name, why, symbolic = choose(Q, linear, precision, memory=memory)
-    found = _MAKERS[name](Q, precision, symbolic)
-    if precision == "float64" or name == "cg" or _left(Q, found) <= _LEFT:
+    name, why, symbolic = select_solver(Q, linear, precision, memory_limit=memory_limit)
+    found = _SOLVER_BUILDERS[name](Q, precision, symbolic)
+    if precision == "float64" or name == "cg" or _error_reduction(Q, found) <= _MAX_ERROR_REDUCTION:
         return found, f"{name}: {why}"
-    found, whole = factorise(Q, linear, memory=memory)
+    found, whole = build_linear_solver(Q, linear, memory_limit=memory_limit)
     return found, f"{whole}; in float64, for stiffnesses lie too far apart for {precision}"
 
 
-def _left(Q: csr_array, factor: Factor) -> float:
+def _error_reduction(Q: csr_array, factor: LinearSolver) -> float:
     """Estimate the largest |e - R^-1 Q e|_Q / |e|_Q of corrections of an error e by a rounded factor R.
 
     Below 1 each correction is a descent step. A few power iterations from a random vector detect larger values. They
@@ -122,7 +126,7 @@ def _left(Q: csr_array, factor: Factor) -> float:
     """
     e = np.random.default_rng(0).standard_normal((len(Q.indptr) - 1, 3))
     most, corrected, before = 0.0, np.empty_like(e), energy_norm(Q, e)
-    for _ in range(_POWERS):
+    for _ in range(_POWER_ITERATIONS):
         factor.solve(Q @ e, corrected)
         e -= corrected
         after = energy_norm(Q, e)
@@ -134,9 +138,13 @@ def _left(Q: csr_array, factor: Factor) -> float:
     return most
 
 
-def choose(
-    Q: csr_array, linear: Linear = "auto", precision: Precision = "float64", *, memory: float | None = None
-) -> Choice:
+def select_solver(
+    Q: csr_array,
+    linear: LinearSolverName = "auto",
+    precision: Precision = "float64",
+    *,
+    memory_limit: float | None = None,
+) -> SolverChoice:
     """Select the solver for Q.
 
     Args:
@@ -148,73 +156,93 @@ def choose(
     Raises:
         Unsupported: if the solver is unknown, does not support the precision, or does not fit in memory.
     """
-    if linear not in get_args(Linear):
-        raise Unsupported(f"linear: {linear!r} is not known; it is one of {', '.join(get_args(Linear))}")
+    if linear not in get_args(LinearSolverName):
+        raise Unsupported(f"linear: {linear!r} is not known; it is one of {', '.join(get_args(LinearSolverName))}")
     if linear == "cholespy" and precision != "float64":
         raise Unsupported(f"{linear}: is used in float64 alone, not in {precision}; use supernodal")
     n = len(Q.indptr) - 1
-    room = of_machine() if memory is None else memory
+    room = compute_memory_limit() if memory_limit is None else memory_limit
     if linear == "cholespy":
-        return Choice(linear, "as asked; its factor is not estimated beforehand")
-    if linear == "inverse" or (linear == "auto" and n <= SMALL):
-        why = "as asked" if linear == "inverse" else f"{n} vertices, at most {SMALL}"
-        return Choice("inverse", why) if _fits(_inverse(n), room) else _refuse(room, {"inverse": _inverse(n)})
-    iterative = _iterative(Q)
+        return SolverChoice(linear, "as asked; its factor is not estimated beforehand")
+    if linear == "inverse" or (linear == "auto" and n <= MAX_DENSE_VERTICES):
+        why = "as asked" if linear == "inverse" else f"{n} vertices, at most {MAX_DENSE_VERTICES}"
+        return (
+            SolverChoice("inverse", why)
+            if _fits_in_memory(_estimate_inverse_cost(n), room)
+            else _raise_out_of_memory(room, {"inverse": _estimate_inverse_cost(n)})
+        )
+    iterative = _estimate_cg_cost(Q)
     if linear == "cg":
-        found = Choice("cg", f"as asked; {iterative.words}")
-        return found if _fits(iterative, room) else _refuse(room, {"cg": iterative})
+        found = SolverChoice("cg", f"as asked; {iterative.description}")
+        return found if _fits_in_memory(iterative, room) else _raise_out_of_memory(room, {"cg": iterative})
     pointers, neighbours = np.asarray(Q.indptr, np.int64), np.asarray(Q.indices, np.int32)
-    symbolic = structure(pointers, neighbours)
-    direct = estimate(symbolic, precision)
+    symbolic = analyse_graph(pointers, neighbours)
+    direct = estimate_supernodal_cost(symbolic, precision)
     if linear == "supernodal":
-        found = Choice("supernodal", f"as asked; {direct.words}", symbolic)
-        return found if _fits(direct, room) else _refuse(room, {"supernodal": direct, "cg": iterative})
-    if _fits(direct, room) and direct.traffic <= iterative.traffic:
-        return Choice("supernodal", direct.words, symbolic)
-    if _fits(iterative, room):
-        reason = "a factor would cost more" if _fits(direct, room) else f"a factor would not fit in {in_words(room)}"
-        return Choice("cg", f"{iterative.words}; {reason} ({direct.words})")
-    if _fits(direct, room):
-        return Choice("supernodal", direct.words, symbolic)
-    return _refuse(room, {"supernodal": direct, "cg": iterative})
+        found = SolverChoice("supernodal", f"as asked; {direct.description}", symbolic)
+        return (
+            found
+            if _fits_in_memory(direct, room)
+            else _raise_out_of_memory(room, {"supernodal": direct, "cg": iterative})
+        )
+    if _fits_in_memory(direct, room) and direct.traffic_bytes <= iterative.traffic_bytes:
+        return SolverChoice("supernodal", direct.description, symbolic)
+    if _fits_in_memory(iterative, room):
+        reason = (
+            "a factor would cost more"
+            if _fits_in_memory(direct, room)
+            else f"a factor would not fit in {format_bytes(room)}"
+        )
+        return SolverChoice("cg", f"{iterative.description}; {reason} ({direct.description})")
+    if _fits_in_memory(direct, room):
+        return SolverChoice("supernodal", direct.description, symbolic)
+    return _raise_out_of_memory(room, {"supernodal": direct, "cg": iterative})
 
 
-def estimate(s: Symbolic, precision: Precision = "float64") -> Estimate:
+def estimate_supernodal_cost(s: SymbolicFactor, precision: Precision = "float64") -> CostEstimate:
     """Estimate the cost of a supernodal factor: its panels, and fronts and updates during factorisation."""
-    squares, entered = stored(s)
+    squares, entered = count_stored_entries(s)
     half = 2 if precision == "float16" else 4
     panels = 8 * (squares + entered)
     kept = panels if precision == "float64" else 4 * squares + half * entered
-    fronts, flops = _factorisation(s.parent, s.first, s.row_start, s.sequence)
-    memory = panels + max(8 * fronts, _ROUNDING[precision] * panels) + _BYTES_PER_VERTEX * len(s.slot)
-    words = f"its factor has {s.nonzeros:,} entries, {in_words(kept)} in {precision}, after {flops:.1e} flops"
-    return Estimate(memory, 2 * kept + _BYTES_PER_FLOP * flops / _SOLVES, words)
-
-
-def _inverse(n: int) -> Estimate:
-    size = 8.0 * n**2
-    return Estimate(5 * size, size, f"{n**2:,} entries, {in_words(size)}")
-
-
-def _iterative(Q: csr_array) -> Estimate:
-    entries = Q.nnz + 4 * (len(Q.indptr) - 1)
-    words = (
-        f"{in_words(_BYTES_KEPT * entries)} for multigrid on {Q.nnz:,} entries, about {_ITERATIONS} iterations a solve"
+    fronts, flops = _count_factorisation_work(s.parent, s.first_slot, s.row_start, s.postorder)
+    memory = (
+        panels
+        + max(8 * fronts, _ROUNDED_COPY_MEMORY[precision] * panels)
+        + _SYMBOLIC_BYTES_PER_VERTEX * len(s.slot_of_vertex)
     )
-    return Estimate(_BYTES_KEPT * entries, _ITERATIONS * _BYTES_READ * entries, words)
+    words = f"its factor has {s.nonzeros:,} entries, {format_bytes(kept)} in {precision}, after {flops:.1e} flops"
+    return CostEstimate(memory, 2 * kept + _BYTES_PER_FLOP * flops / _AMORTISED_SOLVES, words)
 
 
-def _fits(need: Estimate, room: float) -> bool:
-    return need.memory <= room
+def _estimate_inverse_cost(n: int) -> CostEstimate:
+    size = 8.0 * n**2
+    return CostEstimate(5 * size, size, f"{n**2:,} entries, {format_bytes(size)}")
 
 
-def _refuse(room: float, needs: dict[str, Estimate]) -> Choice:
-    listed = "; ".join(f"{name} needs {in_words(need.memory)} ({need.words})" for name, need in needs.items())
-    raise Unsupported(f"the system does not fit in {in_words(room)} of memory: {listed}; use a coarser mesh")
+def _estimate_cg_cost(Q: csr_array) -> CostEstimate:
+    entries = Q.nnz + 4 * (len(Q.indptr) - 1)
+    words = f"{format_bytes(_BYTES_STORED_PER_ENTRY * entries)} for multigrid on {Q.nnz:,} entries, about {_EXPECTED_CG_ITERATIONS} iterations a solve"
+    return CostEstimate(
+        _BYTES_STORED_PER_ENTRY * entries, _EXPECTED_CG_ITERATIONS * _BYTES_READ_PER_ENTRY * entries, words
+    )
 
 
-@kept()
-def _factorisation(parent, first, row_start, sequence):
+def _fits_in_memory(need: CostEstimate, memory_limit: float) -> bool:
+    return need.memory_bytes <= memory_limit
+
+
+def _raise_out_of_memory(memory_limit: float, needs: dict[str, CostEstimate]) -> SolverChoice:
+    listed = "; ".join(
+        f"{name} needs {format_bytes(need.memory_bytes)} ({need.description})" for name, need in needs.items()
+    )
+    raise Unsupported(
+        f"the system does not fit in {format_bytes(memory_limit)} of memory: {listed}; use a coarser mesh"
+    )
+
+
+@cached_njit()
+def _count_factorisation_work(parent, first, row_start, sequence):
     """Return the peak number of entries in fronts and pending updates, and the flops, of the factorisation."""
     nodes = len(parent)
     waiting = np.zeros(nodes + 1, np.int64)  # of each supernode's children; the last is the roots'
@@ -229,9 +257,9 @@ def _factorisation(parent, first, row_start, sequence):
     return largest**2 + most, flops
 
 
-_MAKERS: dict[str, Callable[[csr_array, Precision, Symbolic | None], Factor]] = {
-    "inverse": lambda Q, precision, _: Inverse(Q, precision="float64" if precision == "float64" else "float32"),
+_SOLVER_BUILDERS: dict[str, Callable[[csr_array, Precision, SymbolicFactor | None], LinearSolver]] = {
+    "inverse": lambda Q, precision, _: DenseInverse(Q, precision="float64" if precision == "float64" else "float32"),
     "cholespy": lambda Q, precision, _: SimplicialCholesky(Q),
-    "supernodal": lambda Q, precision, symbolic: Supernodal(Q, precision=precision, symbolic=symbolic),
+    "supernodal": lambda Q, precision, symbolic: SupernodalCholesky(Q, precision=precision, symbolic_factor=symbolic),
     "cg": lambda Q, precision, _: ConjugateGradients(Q),
 }

@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers.linear import multigrid_kernels as kernels
-from solvers.linear.krylov import CURVED, Iteration
+from solvers.linear.krylov import NEGATIVE_CURVATURE, ConjugateGradientIteration
 from solvers.linear.multigrid import Multigrid
 from solvers.problem import NotPositiveDefinite, Positions, Unsupported
 
-TOLERANCE = 1e-12
+CG_RTOL = 1e-12
 """Positions distinct at 1e-9 of a scene's size remain so at a distance of a hundred sizes from the origin, and after
 some iterations. Each iteration gains a constant number of digits, so that two more digits cost two iterations in
 ten."""
 
-_LIMIT = 200
+_MAX_ITERATIONS = 200
 """Sheets and solids take about ten iterations at any size, springs over six decades of stiffness thirty."""
 
 
@@ -55,10 +55,10 @@ class ConjugateGradients:
         self._Q = np.asarray(Q.indptr, np.int64), np.asarray(Q.indices, np.int32), Q.data
         self._multigrid = Multigrid(Q)
         self.nonzeros: int | None = self._multigrid.nonzeros
-        self.iterations = 0
-        self.changes: list[NDArray[np.float64]] = []
+        self.num_iterations = 0
+        self.correction_ratios: list[NDArray[np.float64]] = []
         self._vectors = np.zeros((4, len(diagonal), 4))
-        self._parts = np.zeros((-(-len(diagonal) // kernels.BLOCK), 9))
+        self._partial_sums = np.zeros((-(-len(diagonal) // kernels.ROWS_PER_BLOCK), 9))
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Write Q^-1 b to `out`.
@@ -71,23 +71,23 @@ class ConjugateGradients:
             NotPositiveDefinite: with the vertex at fault.
             Unsupported: if the iteration does not converge.
         """
-        columns = _Columns(self._Q, self._multigrid, self._vectors, self._parts, b)
-        self.iterations, ended = columns.iterate(columns.precondition(), _LIMIT)
-        self.changes = columns.changes
-        if ended == CURVED:
+        columns = _ColumnIteration(self._Q, self._multigrid, self._vectors, self._partial_sums, b)
+        self.num_iterations, ended = columns.run_iterations(columns.apply_preconditioner(), _MAX_ITERATIONS)
+        self.correction_ratios = columns.correction_ratios
+        if ended == NEGATIVE_CURVATURE:
             raise NotPositiveDefinite(
-                f"Q = A'KA + M/dt^2 + w C'C is not positive definite about vertex {columns.at_fault}: stiffnesses, "
+                f"Q = A'KA + M/dt^2 + w C'C is not positive definite about vertex {columns.failing_vertex}: stiffnesses, "
                 "masses and pin weights lie too far apart or are negative"
             )
-        if not columns.settled():
+        if not columns.is_within_tolerance():
             raise Unsupported(
-                f"cg: after {self.iterations} iterations entries still change by {self.changes[-1].max():.1e} of "
+                f"cg: after {self.num_iterations} iterations entries still change by {self.correction_ratios[-1].max():.1e} of "
                 "the largest: the stiffnesses lie too far apart for multigrid; use supernodal"
             )
         out[:] = columns.x[:, :3]
 
 
-class _Columns(Iteration):
+class _ColumnIteration(ConjugateGradientIteration):
     """State of the iterations, one per column of b (n, 3).
 
     x, r, p and Q p are (n, 4) in float64, z in float32.
@@ -97,52 +97,63 @@ class _Columns(Iteration):
     """
 
     def __init__(
-        self, Q: Any, multigrid: Multigrid, vectors: NDArray[np.float64], parts: NDArray[np.float64], b: Positions
+        self,
+        Q: Any,
+        multigrid: Multigrid,
+        vectors: NDArray[np.float64],
+        partial_sums: NDArray[np.float64],
+        b: Positions,
     ) -> None:
-        self._Q, self._multigrid, self._parts = Q, multigrid, parts
+        self._Q, self._multigrid, self._partial_sums = Q, multigrid, partial_sums
         self.x, self._r, self._p, self._image = vectors
         vectors[:3] = 0.0
         self._r[:, :3] = b
         multigrid.right_hand_side[:] = self._r
-        self._size, self.changes, self.at_fault = 0.0, list[NDArray[np.float64]](), -1
+        self._largest_entry, self.correction_ratios, self.failing_vertex = 0.0, list[NDArray[np.float64]](), -1
 
-    def precondition(self) -> NDArray[np.float64]:
+    def apply_preconditioner(self) -> NDArray[np.float64]:
         """Compute z, and return r'z."""
-        self._z, parts = self._multigrid.apply(), self._parts
-        kernels.compare(self._r, self._z, parts)
-        self._change = parts[:, 3:6].max(axis=0, initial=0.0)
-        self.changes.append(self._change / self._size if self._size else np.ones(3))
+        self._z, parts = self._multigrid.apply_cycle(), self._partial_sums
+        kernels.dot_and_max(self._r, self._z, parts)
+        self._largest_correction = parts[:, 3:6].max(axis=0, initial=0.0)
+        self.correction_ratios.append(
+            self._largest_correction / self._largest_entry if self._largest_entry else np.ones(3)
+        )
         return parts[:, :3].sum(axis=0)
 
-    def turn(self, product: NDArray[np.float64], before: NDArray[np.float64]) -> NDArray[np.float64]:
+    def update_direction(
+        self, product: NDArray[np.float64], previous_product: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Update the search direction p; return p'Qp."""
-        kernels.turn(_ratio(product, before), self._z, self._p)
-        kernels.multiply_and_dot(*self._Q, self._p, self._image, self._parts)
-        return self._parts[:, :3].sum(axis=0)
+        kernels.update_direction(_safe_divide(product, previous_product), self._z, self._p)
+        kernels.multiply_sparse_and_dot(*self._Q, self._p, self._image, self._partial_sums)
+        return self._partial_sums[:, :3].sum(axis=0)
 
-    def go(self, product: NDArray[np.float64], curvature: NDArray[np.float64]) -> NDArray[np.float64]:
+    def update_iterate(self, product: NDArray[np.float64], curvature: NDArray[np.float64]) -> NDArray[np.float64]:
         """Update x and r, and apply the preconditioner; return r'z."""
-        parts, rounded = self._parts, self._multigrid.right_hand_side
-        kernels.advance(_ratio(product, curvature), self._p, self._image, self.x, self._r, rounded, parts)
-        self._size = float(parts[:, :3].max(initial=0.0))
-        return self.precondition()
+        parts, rounded = self._partial_sums, self._multigrid.right_hand_side
+        kernels.update_iterate_and_residual(
+            _safe_divide(product, curvature), self._p, self._image, self.x, self._r, rounded, parts
+        )
+        self._largest_entry = float(parts[:, :3].max(initial=0.0))
+        return self.apply_preconditioner()
 
-    def convex(self, curvature: NDArray[np.float64]) -> bool:
+    def is_convex(self, curvature: NDArray[np.float64]) -> bool:
         """Return whether no curvature is negative."""
         wrong = curvature < 0.0
         if wrong.any():
-            self.at_fault = int(np.abs(self._p[:, :3][:, wrong]).max(axis=1).argmax())
+            self.failing_vertex = int(np.abs(self._p[:, :3][:, wrong]).max(axis=1).argmax())
         return not wrong.any()
 
-    def near(self, product: NDArray[np.float64]) -> bool:
+    def is_converged(self, product: NDArray[np.float64]) -> bool:
         """Return whether the iteration ends: converged, or not finite."""
-        return self.settled() or not np.isfinite(product).all()
+        return self.is_within_tolerance() or not np.isfinite(product).all()
 
-    def settled(self) -> bool:
+    def is_within_tolerance(self) -> bool:
         """Return whether the corrections of all entries of x are within the tolerance."""
-        return bool((self._change <= TOLERANCE * self._size).all())
+        return bool((self._largest_correction <= CG_RTOL * self._largest_entry).all())
 
 
-def _ratio(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def _safe_divide(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a / b, and 0 where b is 0: a converged or zero right-hand side remains constant."""
     return np.divide(a, b, out=np.zeros(3), where=b > 0.0)

@@ -15,13 +15,13 @@ from scipy.sparse.linalg import splu
 
 from solvers.problem import NotPositiveDefinite, Positions, Unsupported
 
-_REASON = (
+_NOT_DEFINITE_MESSAGE = (
     "Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point: its stiffnesses, masses and "
     "pin weights lie too far apart, or one of them is negative or not finite"
 )
 
 
-class Factor(Protocol):
+class LinearSolver(Protocol):
     """Interface of a linear solver of a fixed matrix."""
 
     nonzeros: int | None
@@ -39,7 +39,7 @@ class DenseCholesky:
         try:
             self._factor = cho_factor(Q, lower=True)
         except (LinAlgError, ValueError) as error:
-            raise NotPositiveDefinite(_REASON) from error
+            raise NotPositiveDefinite(_NOT_DEFINITE_MESSAGE) from error
         self.nonzeros: int | None = len(Q) * (len(Q) + 1) // 2
 
     def solve(self, b: Positions, out: Positions) -> None:
@@ -60,10 +60,10 @@ class SparseLU:
                 options={"SymmetricMode": True},
             )
         except RuntimeError as error:
-            raise NotPositiveDefinite(_REASON) from error
+            raise NotPositiveDefinite(_NOT_DEFINITE_MESSAGE) from error
         # With diagonal pivots Q = P'LUP is L D L', so that Q is positive definite if D is positive.
         if not (self._factor.U.diagonal() > 0.0).all():
-            raise NotPositiveDefinite(_REASON)
+            raise NotPositiveDefinite(_NOT_DEFINITE_MESSAGE)
         self.nonzeros: int | None = self._factor.L.nnz
 
     def solve(self, b: Positions, out: Positions) -> None:
@@ -85,12 +85,12 @@ class SimplicialCholesky:
                 "cholespy is not installed, for it has no wheel for this machine; leave `linear` out"
             ) from error
         if not np.isfinite(Q.data).all():
-            raise NotPositiveDefinite(_REASON)
+            raise NotPositiveDefinite(_NOT_DEFINITE_MESSAGE)
         pointers, columns = Q.indptr.astype(np.int32), Q.indices.astype(np.int32)
         try:
             self._factor = CholeskySolverD(len(pointers) - 1, pointers, columns, Q.data, MatrixType.CSR)
         except ValueError as error:
-            raise NotPositiveDefinite(_REASON) from error
+            raise NotPositiveDefinite(_NOT_DEFINITE_MESSAGE) from error
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Write Q^-1 b to `out`, (n, 3) each."""

@@ -16,14 +16,14 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.sparse import csr_array
 
-from solvers.compiling import kept
+from solvers.compiling import cached_njit
 from solvers.problem import NotPositiveDefinite, Positions
 
-_ROWS = 4
+_ROWS_PER_BLOCK = 4
 """Rows of the inverse that are processed together: 12 independent sums hide the latency of an addition."""
 
 
-class Inverse:
+class DenseInverse:
     """Dense inverse of a symmetric positive definite Q, with n^2 entries and therefore for small n.
 
     Attributes:
@@ -59,22 +59,22 @@ class Inverse:
                     "determines its position, or stiffnesses, masses and pin weights lie too far apart or are negative"
                 )
             inverse, _ = dpotri(factor, lower=1)
-        padded = -(-n // _ROWS) * _ROWS
+        padded = -(-n // _ROWS_PER_BLOCK) * _ROWS_PER_BLOCK
         stored = np.zeros((padded, padded), precision)
         stored[:n, :n] = np.tril(inverse) + np.tril(inverse, -1).T
         self.nonzeros: int | None = n * (n + 1) // 2
-        self.panel_bytes = stored.nbytes
+        self.factor_bytes = stored.nbytes
         self.flops = 2 * 3 * stored.size
-        self.inverse, self._columns = stored, np.zeros((3, padded), precision)
+        self.inverse_matrix, self._columns = stored, np.zeros((3, padded), precision)
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Write Q^-1 b to `out`, (n, 3) each; b is not modified and must not be `out`."""
-        multiply(self.inverse, self._columns, b, out)
+        multiply_dense(self.inverse_matrix, self._columns, b, out)
 
 
 # Reordering of sums permits vectorisation; NaN and infinity keep their meaning.
-@kept(fastmath={"contract", "reassoc", "nsz"})
-def multiply(inverse, columns, b, out):
+@cached_njit(fastmath={"contract", "reassoc", "nsz"})
+def multiply_dense(inverse, columns, b, out):
     """Compute out = inverse b.
 
     Args:
@@ -88,7 +88,7 @@ def multiply(inverse, columns, b, out):
         columns[0, i], columns[1, i], columns[2, i] = b[i, 0], b[i, 1], b[i, 2]
     x, y, z = columns[0], columns[1], columns[2]
     zero = inverse.dtype.type(0.0)
-    for i in range(0, len(inverse), _ROWS):
+    for i in range(0, len(inverse), _ROWS_PER_BLOCK):
         r0, r1, r2, r3 = inverse[i], inverse[i + 1], inverse[i + 2], inverse[i + 3]
         x0, x1, x2, x3 = zero, zero, zero, zero
         y0, y1, y2, y3 = zero, zero, zero, zero

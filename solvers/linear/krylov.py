@@ -15,14 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from solvers.compiling import inner_closure
+from solvers.compiling import jit_closure
 
-ITERATIONS, NEAR, CURVED = range(3)
+ITERATION_LIMIT, CONVERGED, NEGATIVE_CURVATURE = range(3)
 """Reasons for the end of an iteration: the limit, convergence, or a curvature p'Ap that a definite A cannot have."""
 
 
-def over(
-    turn: Callable[..., Any], go: Callable[..., Any], convex: Callable[..., Any], near: Callable[..., Any]
+def make_cg_loop(
+    update_direction: Callable[..., Any],
+    update_iterate: Callable[..., Any],
+    is_convex: Callable[..., Any],
+    is_converged: Callable[..., Any],
 ) -> Callable[..., Any]:
     """Build the iteration from operations on a state with known r and z.
 
@@ -40,49 +43,49 @@ def over(
 
     def iterate(state: Any, product: Any, most: int) -> tuple[int, int]:
         count, before = 0, np.inf
-        while not near(state, product):
+        while not is_converged(state, product):
             if count == most:
-                return count, ITERATIONS
-            curvature = turn(state, product, before)
-            if not convex(state, curvature):
-                return count, CURVED
-            before, product = product, go(state, product, curvature)
+                return count, ITERATION_LIMIT
+            curvature = update_direction(state, product, before)
+            if not is_convex(state, curvature):
+                return count, NEGATIVE_CURVATURE
+            before, product = product, update_iterate(state, product, curvature)
             count += 1
-        return count, NEAR
+        return count, CONVERGED
 
     return iterate
 
 
-def compiled_over(*functions: Callable[..., Any]) -> Any:
+def compile_cg_loop(*functions: Callable[..., Any]) -> Any:
     """Build the iteration for kernels, from inlined kernels."""
-    return inner_closure(over(*functions))
+    return jit_closure(make_cg_loop(*functions))
 
 
-class Iteration(ABC):
+class ConjugateGradientIteration(ABC):
     """Base class of a state with known r and z (see `make_cg_loop`)."""
 
     @abstractmethod
-    def turn(self, product: Any, before: Any) -> Any:
+    def update_direction(self, product: Any, previous_product: Any) -> Any:
         """Update p, and return p'Ap."""
 
     @abstractmethod
-    def go(self, product: Any, curvature: Any) -> Any:
+    def update_iterate(self, product: Any, curvature: Any) -> Any:
         """Update x, r and z, and return r'z."""
 
-    def convex(self, curvature: Any) -> bool:
+    def is_convex(self, curvature: Any) -> bool:
         """Return whether the iteration may continue along p; always if A is known to be positive definite."""
         return True
 
     @abstractmethod
-    def near(self, product: Any) -> bool:
+    def is_converged(self, product: Any) -> bool:
         """Return whether x is accurate enough."""
 
-    def iterate(self, product: Any, most: int) -> tuple[int, int]:
+    def run_iterations(self, product: Any, max_iterations: int) -> tuple[int, int]:
         """Iterate from the product r'z; return the number of iterations and the reason for their end."""
-        return _iterate(self, product, most)
+        return _run_cg_loop(self, product, max_iterations)
 
 
-_iterate = over(
+_run_cg_loop = make_cg_loop(
     lambda state, product, before: state.turn(product, before),
     lambda state, product, curvature: state.go(product, curvature),
     lambda state, curvature: state.convex(curvature),

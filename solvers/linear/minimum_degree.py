@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from solvers.compiling import kept, part
+from solvers.compiling import cached_njit, jit_inner_allocating
 
 
-@part
-def _bits(word):
+@jit_inner_allocating
+def _popcount(word):
     """Return the number of ones in a 64-bit word (Warren, Hacker's Delight, section 5-1)."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
@@ -22,8 +22,8 @@ def _bits(word):
     return np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
-@part
-def of_piece(pointers, neighbours, piece, local):
+@jit_inner_allocating
+def order_subgraph(pointers, neighbours, piece, local):
     """Sort a piece of a graph into minimum degree order.
 
     Args:
@@ -53,7 +53,7 @@ def of_piece(pointers, neighbours, piece, local):
             rows[i, j >> 6] |= np.uint64(1) << np.uint64(j & 63)
         rows[i, i >> 6] |= np.uint64(1) << np.uint64(i & 63)
         for w in range(words):
-            degree[i] += _bits(rows[i, w])
+            degree[i] += _popcount(rows[i, w])
     for i in range(size):
         local[piece[i]] = -1
     for u in halo:
@@ -74,17 +74,17 @@ def of_piece(pointers, neighbours, piece, local):
             while word != 0:
                 lowest = word & (~word + np.uint64(1))
                 word ^= lowest
-                i = w * 64 + _bits(lowest - np.uint64(1))
+                i = w * 64 + _popcount(lowest - np.uint64(1))
                 if i >= size:
                     break
                 rows[i, best >> 6] &= ~(np.uint64(1) << np.uint64(best & 63))
                 degree[i] = 0
                 for k in range(words):
                     rows[i, k] |= rows[best, k]
-                    degree[i] += _bits(rows[i, k])
+                    degree[i] += _popcount(rows[i, k])
 
 
-@kept()
-def minimum_degree(pointers, neighbours, order):
+@cached_njit()
+def minimum_degree_order(pointers, neighbours, order):
     """Sort `order`, all vertices of a graph in CSR form, into minimum degree order."""
-    of_piece(pointers, neighbours, order, np.full(len(order), -1, np.int32))
+    order_subgraph(pointers, neighbours, order, np.full(len(order), -1, np.int32))

@@ -19,15 +19,15 @@ from scipy.sparse import csr_array, dia_array
 
 from solvers import matrices
 from solvers.linear import multigrid_kernels as kernels
-from solvers.linear.supernodal import Supernodal
+from solvers.linear.supernodal import SupernodalCholesky
 from solvers.problem import NotPositiveDefinite
 
-_COARSEST = 1500
+_MAX_COARSE_SIZE = 1500
 """Size up to which a level is factorised: its solve then costs less than 2 % of a cycle."""
 
-_STRENGTH, _DOMINANCE = 0.25, 10.0
-_DEGREE = 2
-_LOWEST = 0.25
+_STRENGTH_THRESHOLD, _DOMINANCE_RATIO = 0.25, 10.0
+_CHEBYSHEV_DEGREE = 2
+_SMOOTHED_FRACTION = 0.25
 """The smoother damps the eigenvalues of D^-1 A above this fraction of the largest one."""
 
 
@@ -39,7 +39,7 @@ class CompressedRows(NamedTuple):
     values: NDArray[np.float32]
 
     @classmethod
-    def of(cls, matrix: csr_array) -> CompressedRows:
+    def from_matrix(cls, matrix: csr_array) -> CompressedRows:
         """Convert a matrix, with its entries rounded."""
         return cls(
             np.asarray(matrix.indptr, np.int64), np.asarray(matrix.indices, np.int32), matrix.data.astype(np.float32)
@@ -47,18 +47,18 @@ class CompressedRows(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Level:
+class MultigridLevel:
     """A level above the coarsest: matrix, prolongation P, restriction R, smoother, and vectors (n, 4)."""
 
     A: CompressedRows
     P: CompressedRows
     R: CompressedRows
     inverse_diagonal: NDArray[np.float32]
-    weights: list[tuple[np.float32, np.float32]]
+    smoother_weights: list[tuple[np.float32, np.float32]]
     b: NDArray[np.float32]
     x: NDArray[np.float32]
-    other: NDArray[np.float32]
-    step: NDArray[np.float32]
+    scratch: NDArray[np.float32]
+    smoother_step: NDArray[np.float32]
 
 
 class Multigrid:
@@ -71,91 +71,97 @@ class Multigrid:
 
     def __init__(self, Q: csr_array) -> None:
         """Build all levels; raise NotPositiveDefinite if the coarsest one is not positive definite."""
-        self._levels: list[Level] = []
-        self.sizes = [len(Q.indptr) - 1]
+        self._levels: list[MultigridLevel] = []
+        self.level_sizes = [len(Q.indptr) - 1]
         self.nonzeros = 0
         A = Q
-        while self.sizes[-1] > _COARSEST:
-            level, coarse = _coarsen(A)
-            if len(coarse.indptr) - 1 > 0.7 * self.sizes[-1]:
+        while self.level_sizes[-1] > _MAX_COARSE_SIZE:
+            level, coarse = _build_level(A)
+            if len(coarse.indptr) - 1 > 0.7 * self.level_sizes[-1]:
                 break
             self._levels.append(level)
             self.nonzeros += A.nnz + 2 * len(level.P.values)
-            self.sizes.append(len(coarse.indptr) - 1)
+            self.level_sizes.append(len(coarse.indptr) - 1)
             A = coarse
         try:
-            self._factor = Supernodal(A)
+            self._factor = SupernodalCholesky(A)
         except NotPositiveDefinite as error:
             raise NotPositiveDefinite(
                 f"Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point: level {len(self._levels)} of "
-                f"multigrid, of {self.sizes[-1]} vertices, is not; stiffnesses, masses and pin weights lie too far "
+                f"multigrid, of {self.level_sizes[-1]} vertices, is not; stiffnesses, masses and pin weights lie too far "
                 "apart or are negative"
             ) from error
         self.nonzeros += self._factor.nonzeros or 0
-        self._coarsest = np.zeros((self.sizes[-1], 4), np.float32), np.zeros((self.sizes[-1], 4), np.float32)
-        self._exact = np.zeros((self.sizes[-1], 3)), np.zeros((self.sizes[-1], 3))
+        self._coarse_vectors = (
+            np.zeros((self.level_sizes[-1], 4), np.float32),
+            np.zeros((self.level_sizes[-1], 4), np.float32),
+        )
+        self._coarse_float64 = np.zeros((self.level_sizes[-1], 3)), np.zeros((self.level_sizes[-1], 3))
 
     @property
     def right_hand_side(self) -> NDArray[np.float32]:
         """Input r of `apply_cycle`, (n, 4), with a zero last column."""
-        return self._levels[0].b if self._levels else self._coarsest[0]
+        return self._levels[0].b if self._levels else self._coarse_vectors[0]
 
-    def apply(self) -> NDArray[np.float32]:
+    def apply_cycle(self) -> NDArray[np.float32]:
         """Return z near Q^-1 r, (n, 4); the next call overwrites it."""
-        return self._cycle(0)
+        return self._run_v_cycle(0)
 
-    def _cycle(self, depth: int) -> NDArray[np.float32]:
+    def _run_v_cycle(self, depth: int) -> NDArray[np.float32]:
         if depth == len(self._levels):
-            (b, x), (b64, x64) = self._coarsest, self._exact
+            (b, x), (b64, x64) = self._coarse_vectors, self._coarse_float64
             b64[:] = b[:, :3]
             self._factor.solve(b64, x64)
             x[:, :3] = x64
             return x
         level = self._levels[depth]
-        b, x, other, step = level.b, level.x, level.other, level.step
-        (_, scale), *more = level.weights
-        kernels.smooth_first(level.inverse_diagonal, scale, b, step, x)
+        b, x, other, step = level.b, level.x, level.scratch, level.smoother_step
+        (_, scale), *more = level.smoother_weights
+        kernels.chebyshev_first_step(level.inverse_diagonal, scale, b, step, x)
         for keep, scale in more:
-            kernels.smooth(*level.A, level.inverse_diagonal, keep, scale, b, step, x, other)
+            kernels.chebyshev_step(*level.A, level.inverse_diagonal, keep, scale, b, step, x, other)
             x, other = other, x
-        kernels.residual(*level.A, b, x, other)
-        below = self._levels[depth + 1].b if depth + 1 < len(self._levels) else self._coarsest[0]
-        kernels.multiply(*level.R, other, below)
-        kernels.add_product(*level.P, self._cycle(depth + 1), x)
-        for keep, scale in level.weights:
-            kernels.smooth(*level.A, level.inverse_diagonal, keep, scale, b, step, x, other)
+        kernels.compute_residual(*level.A, b, x, other)
+        below = self._levels[depth + 1].b if depth + 1 < len(self._levels) else self._coarse_vectors[0]
+        kernels.multiply_sparse(*level.R, other, below)
+        kernels.add_sparse_product(*level.P, self._run_v_cycle(depth + 1), x)
+        for keep, scale in level.smoother_weights:
+            kernels.chebyshev_step(*level.A, level.inverse_diagonal, keep, scale, b, step, x, other)
             x, other = other, x
         return x
 
 
-def _coarsen(A: csr_array) -> tuple[Level, csr_array]:
+def _build_level(A: csr_array) -> tuple[MultigridLevel, csr_array]:
     """Return a level and the matrix of the next one."""
     n = len(A.indptr) - 1
-    of, count = kernels.aggregate(A.indptr, A.indices, A.data, _STRENGTH, _DOMINANCE)
+    of, count = kernels.build_aggregates(A.indptr, A.indices, A.data, _STRENGTH_THRESHOLD, _DOMINANCE_RATIO)
     diagonal = np.asarray(A.diagonal(), np.float64)
-    largest = largest_eigenvalue(A, diagonal)
+    largest = estimate_largest_eigenvalue(A, diagonal)
     inside = np.flatnonzero(of >= 0)
     start = np.concatenate([[0], np.cumsum(of >= 0)])
     T = csr_array((np.ones(len(inside)), of[inside], start.astype(A.indptr.dtype)), shape=(n, count))
-    F = csr_array((kernels.filtered(A.indptr, A.indices, A.data, _STRENGTH), A.indices, A.indptr), shape=A.shape)
+    F = csr_array(
+        (kernels.filter_weak_entries(A.indptr, A.indices, A.data, _STRENGTH_THRESHOLD), A.indices, A.indptr),
+        shape=A.shape,
+    )
     # For springs, lumping leaves a positive diagonal; this bound ensures it for other matrices.
     D = dia_array((1.0 / np.maximum(F.diagonal(), 0.05 * diagonal)[None, :], np.array([0])), shape=(n, n))
-    P = matrices.without_zeros(csr_array(T - (4.0 / 3.0 / largest) * (D @ (F @ T))))
+    P = matrices.drop_zeros(csr_array(T - (4.0 / 3.0 / largest) * (D @ (F @ T))))
     R = csr_array(P.T)
     coarse = csr_array(R @ csr_array(A @ P))
     vectors = [np.zeros((n, 4), np.float32) for _ in range(4)]
-    level = Level(
-        CompressedRows.of(A),
-        CompressedRows.of(P),
-        CompressedRows.of(R),
+    level = MultigridLevel(
+        CompressedRows.from_matrix(A),
+        CompressedRows.from_matrix(P),
+        CompressedRows.from_matrix(R),
         (1.0 / diagonal).astype(np.float32),
-        chebyshev_weights(largest),
+        compute_chebyshev_weights(largest),
         *vectors,
     )
     return level, coarse
 
 
-def largest_eigenvalue(A: csr_array, diagonal: NDArray[np.float64]) -> float:
+def estimate_largest_eigenvalue(A: csr_array, diagonal: NDArray[np.float64]) -> float:
     """Estimate the largest eigenvalue of D^-1 A.
 
     Args:
@@ -175,12 +181,12 @@ def largest_eigenvalue(A: csr_array, diagonal: NDArray[np.float64]) -> float:
     return min(bound, 1.1 * float(v @ (A @ v) / (v @ (diagonal * v))))
 
 
-def chebyshev_weights(largest: float) -> list[tuple[np.float32, np.float32]]:
+def compute_chebyshev_weights(largest: float) -> list[tuple[np.float32, np.float32]]:
     """Return (momentum, scale) of each Chebyshev step, for eigenvalues from _SMOOTHED_FRACTION to 1 times `largest`."""
-    centre, half = 0.5 * (1.0 + _LOWEST) * largest, 0.5 * (1.0 - _LOWEST) * largest
+    centre, half = 0.5 * (1.0 + _SMOOTHED_FRACTION) * largest, 0.5 * (1.0 - _SMOOTHED_FRACTION) * largest
     rho = half / centre
     weights = [(0.0, 1.0 / centre)]
-    for _ in range(_DEGREE - 1):
+    for _ in range(_CHEBYSHEV_DEGREE - 1):
         following = 1.0 / (2.0 * centre / half - rho)
         weights.append((following * rho, 2.0 * following / half))
         rho = following

@@ -10,88 +10,88 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from solvers.compiling import kept
-from solvers.vectors.rows import gather
+from solvers.compiling import cached_njit
+from solvers.vectors.rows import sparse_row_product
 
-BLOCK = 512
+ROWS_PER_BLOCK = 512
 """Rows that a thread processes at a time."""
 
 
-@kept(parallel=True)
-def multiply(pointers, columns, values, x, out):
+@cached_njit(parallel=True)
+def multiply_sparse(pointers, columns, values, x, out):
     """Compute out = A x; A in compressed rows, x and out (n, 4)."""
     rows = len(out)
-    for block in prange((rows + BLOCK - 1) // BLOCK):
-        for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
-            s = gather(values, columns, pointers[i], pointers[i + 1], x)
+    for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
+        for i in range(block * ROWS_PER_BLOCK, min(rows, (block + 1) * ROWS_PER_BLOCK)):
+            s = sparse_row_product(values, columns, pointers[i], pointers[i + 1], x)
             out[i, 0], out[i, 1], out[i, 2] = s[0], s[1], s[2]
 
 
-@kept(parallel=True)
-def add_product(pointers, columns, values, x, out):
+@cached_njit(parallel=True)
+def add_sparse_product(pointers, columns, values, x, out):
     """Compute out += A x; A in compressed rows, x and out (n, 4)."""
     rows = len(out)
-    for block in prange((rows + BLOCK - 1) // BLOCK):
-        for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
-            s = gather(values, columns, pointers[i], pointers[i + 1], x)
+    for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
+        for i in range(block * ROWS_PER_BLOCK, min(rows, (block + 1) * ROWS_PER_BLOCK)):
+            s = sparse_row_product(values, columns, pointers[i], pointers[i + 1], x)
             for c in range(3):
                 out[i, c] += s[c]
 
 
-@kept(parallel=True)
-def residual(pointers, columns, values, b, x, out):
+@cached_njit(parallel=True)
+def compute_residual(pointers, columns, values, b, x, out):
     """Compute out = b - A x; A in compressed rows, vectors (n, 4)."""
     rows = len(out)
-    for block in prange((rows + BLOCK - 1) // BLOCK):
-        for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
-            s = gather(values, columns, pointers[i], pointers[i + 1], x)
+    for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
+        for i in range(block * ROWS_PER_BLOCK, min(rows, (block + 1) * ROWS_PER_BLOCK)):
+            s = sparse_row_product(values, columns, pointers[i], pointers[i + 1], x)
             for c in range(3):
                 out[i, c] = b[i, c] - s[c]
 
 
-@kept(parallel=True)
-def smooth_first(inverse_diagonal, scale, b, step, x):
+@cached_njit(parallel=True)
+def chebyshev_first_step(inverse_diagonal, scale, b, step, x):
     """Compute step = x = scale D^-1 b, the first Chebyshev step from x = 0."""
     rows = len(x)
-    for block in prange((rows + BLOCK - 1) // BLOCK):
-        for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
+    for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
+        for i in range(block * ROWS_PER_BLOCK, min(rows, (block + 1) * ROWS_PER_BLOCK)):
             for c in range(3):
                 value = scale * inverse_diagonal[i] * b[i, c]
                 step[i, c] = value
                 x[i, c] = value
 
 
-@kept(parallel=True)
-def smooth(pointers, columns, values, inverse_diagonal, keep, scale, b, step, x, out):
+@cached_njit(parallel=True)
+def chebyshev_step(pointers, columns, values, inverse_diagonal, momentum, scale, b, step, x, out):
     """Compute step = momentum step + scale D^-1 (b - A x) and out = x + step."""
     rows = len(out)
-    for block in prange((rows + BLOCK - 1) // BLOCK):
-        for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
-            s = gather(values, columns, pointers[i], pointers[i + 1], x)
+    for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
+        for i in range(block * ROWS_PER_BLOCK, min(rows, (block + 1) * ROWS_PER_BLOCK)):
+            s = sparse_row_product(values, columns, pointers[i], pointers[i + 1], x)
             weight = scale * inverse_diagonal[i]
             for c in range(3):
-                value = keep * step[i, c] + weight * (b[i, c] - s[c])
+                value = momentum * step[i, c] + weight * (b[i, c] - s[c])
                 step[i, c] = value
                 out[i, c] = x[i, c] + value
 
 
-@kept(parallel=True)
-def multiply_and_dot(pointers, columns, values, p, out, parts):
+@cached_njit(parallel=True)
+def multiply_sparse_and_dot(pointers, columns, values, p, out, partial_sums):
     """Compute out = A p, and partial_sums[:, :3] = p'out of each block of rows."""
     rows = len(out)
-    for block in prange((rows + BLOCK - 1) // BLOCK):
+    for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
         t0, t1, t2 = 0.0, 0.0, 0.0
-        for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
-            s = gather(values, columns, pointers[i], pointers[i + 1], p)
+        for i in range(block * ROWS_PER_BLOCK, min(rows, (block + 1) * ROWS_PER_BLOCK)):
+            s = sparse_row_product(values, columns, pointers[i], pointers[i + 1], p)
             out[i, 0], out[i, 1], out[i, 2] = s[0], s[1], s[2]
             t0 += s[0] * p[i, 0]
             t1 += s[1] * p[i, 1]
             t2 += s[2] * p[i, 2]
-        parts[block, 0], parts[block, 1], parts[block, 2] = t0, t1, t2
+        partial_sums[block, 0], partial_sums[block, 1], partial_sums[block, 2] = t0, t1, t2
 
 
-@kept(parallel=True)
-def advance(alpha, p, image, x, r, rounded, parts):
+@cached_njit(parallel=True)
+def update_iterate_and_residual(alpha, p, image, x, r, rounded, partial_sums):
     """Update x += alpha p and r -= alpha image.
 
     Args:
@@ -102,42 +102,42 @@ def advance(alpha, p, image, x, r, rounded, parts):
         partial_sums: columns 0 to 2 get the largest |x| of each block.
     """
     rows = len(x)
-    for block in prange((rows + BLOCK - 1) // BLOCK):
+    for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
         for c in range(3):
-            parts[block, c] = 0.0
-        for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
+            partial_sums[block, c] = 0.0
+        for i in range(block * ROWS_PER_BLOCK, min(rows, (block + 1) * ROWS_PER_BLOCK)):
             for c in range(3):
                 x[i, c] += alpha[c] * p[i, c]
                 r[i, c] -= alpha[c] * image[i, c]
                 rounded[i, c] = r[i, c]
-                parts[block, c] = max(parts[block, c], abs(x[i, c]))
+                partial_sums[block, c] = max(partial_sums[block, c], abs(x[i, c]))
 
 
-@kept(parallel=True)
-def compare(r, z, parts):
+@cached_njit(parallel=True)
+def dot_and_max(r, z, partial_sums):
     """Write r'z of each block of rows, and its largest |z|, to partial_sums[:, :6], by column."""
     rows = len(r)
-    for block in prange((rows + BLOCK - 1) // BLOCK):
+    for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
         for c in range(3):
             dot, large = 0.0, 0.0
-            for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
+            for i in range(block * ROWS_PER_BLOCK, min(rows, (block + 1) * ROWS_PER_BLOCK)):
                 dot += r[i, c] * z[i, c]
                 large = max(large, abs(z[i, c]))
-            parts[block, c], parts[block, 3 + c] = dot, large
+            partial_sums[block, c], partial_sums[block, 3 + c] = dot, large
 
 
-@kept(parallel=True)
-def turn(beta, z, p):
+@cached_njit(parallel=True)
+def update_direction(beta, z, p):
     """Compute p = z + beta p."""
     rows = len(p)
-    for block in prange((rows + BLOCK - 1) // BLOCK):
-        for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
+    for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
+        for i in range(block * ROWS_PER_BLOCK, min(rows, (block + 1) * ROWS_PER_BLOCK)):
             for c in range(3):
                 p[i, c] = z[i, c] + beta[c] * p[i, c]
 
 
-@kept()
-def aggregate(pointers, columns, values, strength, dominance):
+@cached_njit()
+def build_aggregates(pointers, columns, values, strength, dominance):
     """Build the aggregates of a graph (Vanek, Mandel and Brezina 1996).
 
     Args:
@@ -202,8 +202,8 @@ def aggregate(pointers, columns, values, strength, dominance):
     return of, count
 
 
-@kept()
-def filtered(pointers, columns, values, strength):
+@cached_njit()
+def filter_weak_entries(pointers, columns, values, strength):
     """Return the entries of A (nnz,), with weak off-diagonal ones lumped into the diagonal.
 
     Args:
@@ -226,8 +226,8 @@ def filtered(pointers, columns, values, strength):
     return out
 
 
-@kept()
-def gauss_seidel(pointers, columns, values, x, sweeps):
+@cached_njit()
+def sweep_gauss_seidel(pointers, columns, values, x, num_sweeps):
     """Perform Gauss-Seidel sweeps for A x = 0 on x (n, q) in place.
 
     Args:
@@ -236,7 +236,7 @@ def gauss_seidel(pointers, columns, values, x, sweeps):
         num_sweeps: number of sweeps.
     """
     n, count = x.shape
-    for _ in range(sweeps):
+    for _ in range(num_sweeps):
         for i in range(n):
             own, x[i] = 1.0, 0.0
             for e in range(pointers[i], pointers[i + 1]):

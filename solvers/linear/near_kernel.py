@@ -19,27 +19,27 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import coo_array, csr_array, dia_array
 
-from solvers.linear.krylov import Iteration
-from solvers.linear.multigrid import chebyshev_weights, largest_eigenvalue
-from solvers.linear.multigrid_kernels import aggregate, gauss_seidel
+from solvers.linear.krylov import ConjugateGradientIteration
+from solvers.linear.multigrid import compute_chebyshev_weights, estimate_largest_eigenvalue
+from solvers.linear.multigrid_kernels import build_aggregates, sweep_gauss_seidel
 
-Vector = NDArray[np.float64]
+FloatVector = NDArray[np.float64]
 
-_COARSEST, _FULL = 400, 4000
+_MAX_COARSE_SIZE, _MAX_DENSE_COARSE_SIZE = 400, 4000
 """Sizes up to which a level is factorised densely; the second one if its matrix has a quarter of all entries."""
 
-_SLOW = 0.7
+_MAX_COARSENING_RATIO = 0.7
 """Size relative to the level above, beyond which a coarser level is not worthwhile."""
 
-_WIDE = 0.5
+_MAX_UNKNOWN_FRACTION = 0.5
 """Aggregates are merged until their vectors number at most this fraction of the unknowns."""
 
-_STRENGTH, _DOMINANCE = 0.25, 10.0
-_SHIFT = 1e-12
+_STRENGTH_THRESHOLD, _DOMINANCE_RATIO = 0.25, 10.0
+_COARSE_DIAGONAL_SHIFT = 1e-12
 """Shift of the coarsest matrix, relative to its diagonal, which makes its factorisation robust to round-off."""
 
 
-def near_kernel(A: csr_array, components: int, sweeps: int) -> NDArray[np.float64]:
+def compute_near_nullspace(A: csr_array, num_components: int, num_sweeps: int) -> NDArray[np.float64]:
     """Compute near-null-space vectors by Gauss-Seidel sweeps on random ones.
 
     Args:
@@ -50,50 +50,50 @@ def near_kernel(A: csr_array, components: int, sweeps: int) -> NDArray[np.float6
     Returns:
         Vectors (n, q), each scaled to a largest entry of 1.
     """
-    B = np.random.default_rng(0).uniform(size=(A.shape[0], components))  # always the same
-    gauss_seidel(A.indptr, A.indices, A.data, B, sweeps)
-    return scaled(B)
+    B = np.random.default_rng(0).uniform(size=(A.shape[0], num_components))  # always the same
+    sweep_gauss_seidel(A.indptr, A.indices, A.data, B, num_sweeps)
+    return normalise_columns(B)
 
 
-def coarsest(A: csr_array) -> bool:
+def is_coarsest_level(A: csr_array) -> bool:
     """Return whether A is factorised directly."""
     n = A.shape[0]
-    return n <= _COARSEST or (n <= _FULL and 4 * A.nnz >= n * n)
+    return n <= _MAX_COARSE_SIZE or (n <= _MAX_DENSE_COARSE_SIZE and 4 * A.nnz >= n * n)
 
 
-def scaled(B: NDArray[np.float64]) -> NDArray[np.float64]:
+def normalise_columns(B: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the columns of B (n, q) divided by their largest entries; zero columns remain."""
     largest = np.abs(B).max(axis=0, initial=0.0)
     return B / np.where(largest > 0.0, largest, 1.0)
 
 
-class Prolongation:
+class ProlongationHierarchy:
     """Prolongation matrices P of all levels, for A and for others with its pattern.
 
     Attributes:
         prolongators: P (n, coarse unknowns) of each level, the finest first.
     """
 
-    def __init__(self, A: csr_array, B: NDArray[np.float64], smoothed: bool = False) -> None:
-        self.levels: list[csr_array] = []
+    def __init__(self, A: csr_array, B: NDArray[np.float64], smooth_prolongators: bool = False) -> None:
+        self.prolongators: list[csr_array] = []
         nodes = np.arange(A.shape[0])
-        while not coarsest(A):
-            P, B, nodes = _prolonged(A, B, nodes)
-            if not 0 < P.shape[1] <= _SLOW * P.shape[0]:
+        while not is_coarsest_level(A):
+            P, B, nodes = _build_prolongator(A, B, nodes)
+            if not 0 < P.shape[1] <= _MAX_COARSENING_RATIO * P.shape[0]:
                 break
-            if smoothed:
+            if smooth_prolongators:
                 diagonal = A.diagonal()
-                scale = 4.0 / 3.0 / largest_eigenvalue(A, diagonal) / diagonal
+                scale = 4.0 / 3.0 / estimate_largest_eigenvalue(A, diagonal) / diagonal
                 P = csr_array(P - csr_array(dia_array((scale[None, :], np.array([0])), shape=A.shape)) @ (A @ P))
-            self.levels.append(P)
+            self.prolongators.append(P)
             A = csr_array(P.T @ csr_array(A @ P))
 
 
-def _prolonged(
+def _build_prolongator(
     A: csr_array, B: NDArray[np.float64], nodes: NDArray[np.int64]
 ) -> tuple[csr_array, NDArray[np.float64], NDArray[np.int64]]:
     """Return P, B_coarse and the coarse nodes; unknowns are grouped by nodes (n,), which are aggregated as a whole."""
-    owner = _aggregates(A, nodes, _WIDE * len(nodes) / max(1, B.shape[1]))
+    owner = _aggregate_unknowns(A, nodes, _MAX_UNKNOWN_FRACTION * len(nodes) / max(1, B.shape[1]))
     count = int(owner.max(initial=-1)) + 1
     inside = np.flatnonzero(owner >= 0)
     order = inside[np.argsort(owner[inside], kind="stable")]
@@ -120,19 +120,21 @@ def _prolonged(
     )
 
 
-def _aggregates(A: csr_array, nodes: NDArray[np.int64], most: float) -> NDArray[np.int64]:
+def _aggregate_unknowns(A: csr_array, nodes: NDArray[np.int64], max_aggregates: float) -> NDArray[np.int64]:
     """Return the aggregate of each unknown (n,), -1 for none; they are aggregated again while there are too many."""
     owner, before = nodes, -1
     while True:
-        condensed = _condensed(A, owner)
-        of, count = aggregate(condensed.indptr, condensed.indices, condensed.data, _STRENGTH, _DOMINANCE)
+        condensed = _condense_blocks(A, owner)
+        of, count = build_aggregates(
+            condensed.indptr, condensed.indices, condensed.data, _STRENGTH_THRESHOLD, _DOMINANCE_RATIO
+        )
         owner = np.where(owner >= 0, of[owner], -1)
-        if count <= most or count == before:
+        if count <= max_aggregates or count == before:
             return owner
         before = count
 
 
-def _condensed(A: csr_array, nodes: NDArray[np.int64]) -> csr_array:
+def _condense_blocks(A: csr_array, nodes: NDArray[np.int64]) -> csr_array:
     """Return the Frobenius norms of A's blocks by nodes, -1 for none; A itself if each unknown is a node."""
     n, count = len(nodes), int(nodes.max(initial=-1)) + 1
     if count == n:
@@ -146,24 +148,26 @@ def _condensed(A: csr_array, nodes: NDArray[np.int64]) -> csr_array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Level:
+class _NearNullspaceLevel:
     """A level above the coarsest: matrix, prolongation, restriction and smoother."""
 
     A: csr_array
     P: csr_array
     R: csr_array
-    inverse_diagonal: Vector
-    weights: list[tuple[np.float32, np.float32]]
+    inverse_diagonal: FloatVector
+    smoother_weights: list[tuple[np.float32, np.float32]]
 
     @classmethod
-    def of(cls, A: csr_array, P: csr_array) -> _Level:
+    def from_matrices(cls, A: csr_array, P: csr_array) -> _NearNullspaceLevel:
         diagonal = A.diagonal()
-        return cls(A, P, csr_array(P.T), 1.0 / diagonal, chebyshev_weights(largest_eigenvalue(A, diagonal)))
+        return cls(
+            A, P, csr_array(P.T), 1.0 / diagonal, compute_chebyshev_weights(estimate_largest_eigenvalue(A, diagonal))
+        )
 
-    def smoothed(self, b: Vector, x: Vector | None = None) -> Vector:
+    def apply_smoother(self, b: FloatVector, x: FloatVector | None = None) -> FloatVector:
         """Apply the Chebyshev smoother to A x = b, starting at x or at zero."""
         step = np.zeros_like(b)
-        for keep, scale in self.weights:
+        for keep, scale in self.smoother_weights:
             left = b if x is None else b - self.A @ x
             step = keep * step + scale * self.inverse_diagonal * left
             x = step if x is None else x + step
@@ -171,7 +175,7 @@ class _Level:
         return x
 
 
-class Cycle:
+class VCycle:
     """V-cycle for A, with the prolongations of this or an earlier matrix.
 
     Attributes:
@@ -179,47 +183,47 @@ class Cycle:
         matrix_bytes: bytes of the matrices that a cycle reads.
     """
 
-    def __init__(self, A: csr_array, prolongation: Prolongation) -> None:
-        self._levels: list[_Level] = []
-        for P in prolongation.levels:
-            self._levels.append(_Level.of(A, P))
+    def __init__(self, A: csr_array, prolongation: ProlongationHierarchy) -> None:
+        self._levels: list[_NearNullspaceLevel] = []
+        for P in prolongation.prolongators:
+            self._levels.append(_NearNullspaceLevel.from_matrices(A, P))
             A = csr_array(self._levels[-1].R @ csr_array(A @ P))
-        self.sizes = [*(level.A.shape[0] for level in self._levels), A.shape[0]]
-        self.bytes = 12 * sum(4 * level.A.nnz + 2 * level.P.nnz for level in self._levels)
+        self.level_sizes = [*(level.A.shape[0] for level in self._levels), A.shape[0]]
+        self.matrix_bytes = 12 * sum(4 * level.A.nnz + 2 * level.P.nnz for level in self._levels)
         self._factor = None
-        if coarsest(A):
+        if is_coarsest_level(A):
             dense = A.toarray()
-            self._factor = cho_factor(dense + _SHIFT * np.diag(np.diag(dense)), lower=True)
-            self.bytes += 8 * A.shape[0] ** 2
+            self._factor = cho_factor(dense + _COARSE_DIAGONAL_SHIFT * np.diag(np.diag(dense)), lower=True)
+            self.matrix_bytes += 8 * A.shape[0] ** 2
         else:  # nothing there can be gathered: each unknown is its own diagonal's, nearly
-            self._last = _Level.of(A, A)
-            self.bytes += 12 * A.nnz
+            self._coarsest_smoother = _NearNullspaceLevel.from_matrices(A, A)
+            self.matrix_bytes += 12 * A.nnz
 
-    def apply(self, r: Vector) -> Vector:
+    def apply_cycle(self, r: FloatVector) -> FloatVector:
         """Return z near A^-1 r, (n,)."""
-        return self._cycled(0, r)
+        return self._run_v_cycle(0, r)
 
-    def _cycled(self, depth: int, b: Vector) -> Vector:
+    def _run_v_cycle(self, depth: int, b: FloatVector) -> FloatVector:
         if depth == len(self._levels):
-            return self._last.smoothed(b) if self._factor is None else cho_solve(self._factor, b)
+            return self._coarsest_smoother.apply_smoother(b) if self._factor is None else cho_solve(self._factor, b)
         level = self._levels[depth]
-        x = level.smoothed(b)
-        x = x + level.P @ self._cycled(depth + 1, level.R @ (b - level.A @ x))
-        return level.smoothed(b, x)
+        x = level.apply_smoother(b)
+        x = x + level.P @ self._run_v_cycle(depth + 1, level.R @ (b - level.A @ x))
+        return level.apply_smoother(b, x)
 
 
-class Solving(Iteration):
+class PreconditionedSolve(ConjugateGradientIteration):
     """Preconditioned conjugate gradients for A x = b from zero.
 
     The iteration ends once |b - A x| is at most rtol |b|.
     """
 
-    def __init__(self, A: csr_array, cycle: Cycle, b: Vector, tolerance: float) -> None:
-        self._A, self._cycle, self._limit = A, cycle, tolerance * norm(b)
+    def __init__(self, A: csr_array, cycle: VCycle, b: FloatVector, rtol: float) -> None:
+        self._A, self._cycle, self._atol = A, cycle, rtol * ordered_norm(b)
         self.x, self._r = np.zeros_like(b), b.copy()
         self._p = np.zeros_like(b)
 
-    def solve(self, most: int) -> int:
+    def solve(self, max_iterations: int) -> int:
         """Iterate; `x` contains the solution.
 
         Args:
@@ -228,37 +232,37 @@ class Solving(Iteration):
         Returns:
             Number of iterations.
         """
-        return self.iterate(self._preconditioned(), most)[0]
+        return self.run_iterations(self._apply_preconditioner(), max_iterations)[0]
 
-    def _preconditioned(self) -> float:
-        self._z = self._cycle.apply(self._r)
-        return _dot(self._r, self._z)
+    def _apply_preconditioner(self) -> float:
+        self._z = self._cycle.apply_cycle(self._r)
+        return _ordered_dot(self._r, self._z)
 
-    def turn(self, product: float, before: float) -> float:
+    def update_direction(self, product: float, previous_product: float) -> float:
         """Update the search direction p; return p'Ap."""
-        self._p = self._z + (product / before) * self._p
+        self._p = self._z + (product / previous_product) * self._p
         self._image = self._A @ self._p
-        return _dot(self._p, self._image)
+        return _ordered_dot(self._p, self._image)
 
-    def go(self, product: float, curvature: float) -> float:
+    def update_iterate(self, product: float, curvature: float) -> float:
         """Update x and r, and apply the preconditioner; return r'z."""
         self.x += (product / curvature) * self._p
         self._r -= (product / curvature) * self._image
-        return self._preconditioned()
+        return self._apply_preconditioner()
 
-    def convex(self, curvature: float) -> bool:
+    def is_convex(self, curvature: float) -> bool:
         """Return whether the curvature is positive; round-off may make it zero."""
         return curvature > 0.0
 
-    def near(self, product: float) -> bool:
+    def is_converged(self, product: float) -> bool:
         """Return whether the residual norm is within the tolerance."""
-        return norm(self._r) <= self._limit or not product > 0.0
+        return ordered_norm(self._r) <= self._atol or not product > 0.0
 
 
-def norm(x: Vector) -> float:
+def ordered_norm(x: FloatVector) -> float:
     """Return |x|, summed in a fixed order."""
-    return float(np.sqrt(_dot(x, x)))
+    return float(np.sqrt(_ordered_dot(x, x)))
 
 
-def _dot(x: Vector, y: Vector) -> float:
+def _ordered_dot(x: FloatVector, y: FloatVector) -> float:
     return float(np.einsum("i,i->", x, y))

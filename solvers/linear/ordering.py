@@ -13,16 +13,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import kept, part
-from solvers.linear.minimum_degree import minimum_degree, of_piece
-from solvers.linear.refinement import refine
-from solvers.linear.separator import LANDMARKS, TOGETHER, separate
+from solvers.compiling import cached_njit, jit_inner_allocating
+from solvers.linear.minimum_degree import minimum_degree_order, order_subgraph
+from solvers.linear.refinement import refine_separator
+from solvers.linear.separator import FIELDS_PER_BLOCK, NUM_LANDMARKS, find_separator
 
-_LEAF = 96
+_MAX_LEAF_SIZE = 96
 """Pieces up to this size are not dissected: below it a separator saves less than minimum degree does."""
 
 
-def nested_dissection(pointers: NDArray[np.int64], neighbours: NDArray[np.int32]) -> NDArray[np.int32]:
+def nested_dissection_order(pointers: NDArray[np.int64], neighbours: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return the elimination order of a graph's vertices.
 
     Args:
@@ -34,20 +34,20 @@ def nested_dissection(pointers: NDArray[np.int64], neighbours: NDArray[np.int32]
     """
     n = len(pointers) - 1
     order = np.arange(n, dtype=np.int32)
-    if n <= _LEAF:  # many meshes: that takes a fifth of the time to compile
-        minimum_degree(pointers, neighbours, order)
+    if n <= _MAX_LEAF_SIZE:  # many meshes: that takes a fifth of the time to compile
+        minimum_degree_order(pointers, neighbours, order)
     else:
-        _dissect(pointers, neighbours, order, _LEAF)
+        _dissect_graph(pointers, neighbours, order, _MAX_LEAF_SIZE)
     return order
 
 
-@kept()
-def _dissect(pointers, neighbours, order, leaf):
+@cached_njit()
+def _dissect_graph(pointers, neighbours, order, leaf):
     """Sort `order` into elimination order: of every piece, its parts first and its separator last."""
     n = len(order)
     owner = np.zeros(n, np.int32)  # the piece that a vertex is in; -1 once it is in a separator
-    dist = np.zeros((n, LANDMARKS), np.int32)
-    field = np.empty((n, TOGETHER), np.int32)
+    dist = np.zeros((n, NUM_LANDMARKS), np.int32)
+    field = np.empty((n, FIELDS_PER_BLOCK), np.int32)
     local = np.full(n, -1, np.int32)
     scratch = np.empty(n, np.int32)
     stack = [(0, n, False)]  # first, end, known to be connected
@@ -59,16 +59,16 @@ def _dissect(pointers, neighbours, order, leaf):
         for v in piece:
             owner[v] = pieces
         if end - first <= leaf:
-            of_piece(pointers, neighbours, piece, local)
+            order_subgraph(pointers, neighbours, piece, local)
             continue
         if not connected:
             _split_components(pointers, neighbours, owner, pieces, order, first, end, leaf, scratch, stack)
             continue
-        side = separate(pointers, neighbours, owner, pieces, piece, dist, field, scratch)
+        side = find_separator(pointers, neighbours, owner, pieces, piece, dist, field, scratch)
         if len(side) == 0:  # nearly complete: nothing separates it
-            of_piece(pointers, neighbours, piece, local)
+            order_subgraph(pointers, neighbours, piece, local)
             continue
-        refine(pointers, neighbours, piece, side, local)
+        refine_separator(pointers, neighbours, piece, side, local)
         at = begun = first
         for kind in range(3):
             begun = at
@@ -84,7 +84,7 @@ def _dissect(pointers, neighbours, order, leaf):
             order[i] = scratch[i]
 
 
-@part
+@jit_inner_allocating
 def _split_components(pointers, neighbours, owner, piece, order, first, end, leaf, queue, stack):
     """Push the components of a piece to the stack; small ones are combined up to the leaf size."""
     at, begun = first, first

@@ -10,15 +10,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, part
-from solvers.linear.separator import SMALLEST_SIDE
+from solvers.compiling import jit_inner, jit_inner_allocating
+from solvers.linear.separator import MIN_SIDE_FRACTION
 
-_PASSES = 4
-_PATIENCE = 60
+_MAX_PASSES = 4
+_MAX_STALLED_MOVES = 60
 """Number of consecutive moves without improvement after which a refinement pass ends."""
 
 
-class _Cut(NamedTuple):
+class _SeparatorState(NamedTuple):
     """State of a bisected piece during refinement; its vertices have local indices.
 
     Attributes:
@@ -36,17 +36,17 @@ class _Cut(NamedTuple):
     pointers: NDArray[np.int64]
     neighbours: NDArray[np.int32]
     piece: NDArray[np.int32]
-    local: NDArray[np.int32]
+    local_index: NDArray[np.int32]
     side: NDArray[np.int8]
-    counts: NDArray[np.int64]
-    pull: NDArray[np.int64]
-    moved: NDArray[np.bool_]
+    side_counts: NDArray[np.int64]
+    pulled_neighbours: NDArray[np.int64]
+    is_locked: NDArray[np.bool_]
     separator: NDArray[np.int64]
-    trail: NDArray[np.int64]
+    move_log: NDArray[np.int64]
 
 
-@part
-def refine(pointers, neighbours, piece, side, local):
+@jit_inner_allocating
+def refine_separator(pointers, neighbours, piece, side, local):
     """Shrink a separator by moving its vertices to a side.
 
     A move pulls the neighbours on the other side into the separator. A pass moves each vertex at most once, always the
@@ -63,7 +63,7 @@ def refine(pointers, neighbours, piece, side, local):
     for i in range(size):
         local[piece[i]] = i
         counts[side[i]] += 1
-    cut = _Cut(
+    cut = _SeparatorState(
         pointers,
         neighbours,
         piece,
@@ -75,36 +75,36 @@ def refine(pointers, neighbours, piece, side, local):
         np.empty(size, np.int64),
         np.empty((2 * size, 2), np.int64),
     )
-    for _ in range(_PASSES):
-        if not _improve(cut):
+    for _ in range(_MAX_PASSES):
+        if not _run_refinement_pass(cut):
             break
     for i in range(size):
         local[piece[i]] = -1
 
 
-@inner
-def _improve(cut):
+@jit_inner
+def _run_refinement_pass(cut):
     """Run one pass; return whether it shrank the separator or improved the balance."""
-    counts, side, piece, moved, pointers = cut.counts, cut.side, cut.piece, cut.moved, cut.pointers
+    counts, side, piece, moved, pointers = cut.side_counts, cut.side, cut.piece, cut.is_locked, cut.pointers
     moved[:] = False
     listed = 0
     for i in range(len(piece)):
         if side[i] == 2:
             cut.separator[listed] = i
             listed += 1
-            _count_pull(cut, i)
+            _count_pulled_neighbours(cut, i)
     best, best_gap, best_at, at, since = counts[2], abs(counts[0] - counts[1]), 0, 0, 0
-    while since < _PATIENCE:
-        choice, to = _choose(cut, listed)
+    while since < _MAX_STALLED_MOVES:
+        choice, to = _select_move(cut, listed)
         if choice < 0:
             break
         i = cut.separator[choice]
-        if at + 1 + pointers[piece[i] + 1] - pointers[piece[i]] > len(cut.trail):
+        if at + 1 + pointers[piece[i] + 1] - pointers[piece[i]] > len(cut.move_log):
             break
         listed -= 1
         cut.separator[choice] = cut.separator[listed]
         moved[i] = True
-        at, listed = _move(cut, i, to, at, listed)
+        at, listed = _apply_move(cut, i, to, at, listed)
         gap = abs(counts[0] - counts[1])
         if counts[2] < best or (counts[2] == best and gap < best_gap):
             best, best_gap, best_at, since = counts[2], gap, at, 0
@@ -112,17 +112,17 @@ def _improve(cut):
             since += 1
     while at > best_at:
         at -= 1
-        i, was = cut.trail[at, 0], cut.trail[at, 1]
+        i, was = cut.move_log[at, 0], cut.move_log[at, 1]
         counts[side[i]] -= 1
         counts[was] += 1
         side[i] = was
     return best_at > 0
 
 
-@inner
-def _choose(cut, listed):
+@jit_inner
+def _select_move(cut, listed):
     """Return the listed vertex whose move shrinks the separator most, -1 for none, and its target side."""
-    counts, pull, limit = cut.counts, cut.pull, (1.0 - SMALLEST_SIDE) * len(cut.piece)
+    counts, pull, limit = cut.side_counts, cut.pulled_neighbours, (1.0 - MIN_SIDE_FRACTION) * len(cut.piece)
     choice, best, to = -1, -(1 << 60), 0
     for k in range(listed):
         i = cut.separator[k]
@@ -134,11 +134,11 @@ def _choose(cut, listed):
     return choice, to
 
 
-@inner
-def _move(cut, i, to, at, listed):
+@jit_inner
+def _apply_move(cut, i, to, at, listed):
     """Move i out of the separator, and its neighbours on the other side in; return the ends of log and list."""
-    side, pull, local = cut.side, cut.pull, cut.local
-    at = _put(cut, i, to, at)
+    side, pull, local = cut.side, cut.pulled_neighbours, cut.local_index
+    at = _assign_side(cut, i, to, at)
     v = cut.piece[i]
     for e in range(cut.pointers[v], cut.pointers[v + 1]):
         j = local[cut.neighbours[e]]
@@ -147,9 +147,9 @@ def _move(cut, i, to, at, listed):
         if side[j] == 2:
             pull[j, 1 - to] += 1
         elif side[j] == 1 - to:
-            at = _put(cut, j, 2, at)
-            _count_pull(cut, j)
-            if not cut.moved[j]:
+            at = _assign_side(cut, j, 2, at)
+            _count_pulled_neighbours(cut, j)
+            if not cut.is_locked[j]:
                 cut.separator[listed] = j
                 listed += 1
             w = cut.piece[j]
@@ -160,24 +160,24 @@ def _move(cut, i, to, at, listed):
     return at, listed
 
 
-@inner
-def _put(cut, i, side, at):
+@jit_inner
+def _assign_side(cut, i, side, at):
     """Assign a vertex to a side and log the change; return the end of the log."""
     was = cut.side[i]
-    cut.trail[at, 0], cut.trail[at, 1] = i, was
-    cut.counts[was] -= 1
-    cut.counts[side] += 1
+    cut.move_log[at, 0], cut.move_log[at, 1] = i, was
+    cut.side_counts[was] -= 1
+    cut.side_counts[side] += 1
     cut.side[i] = side
     return at + 1
 
 
-@inner
-def _count_pull(cut, i):
+@jit_inner
+def _count_pulled_neighbours(cut, i):
     """Count i's neighbours on either side."""
     v = cut.piece[i]
-    cut.pull[i, 0] = 0
-    cut.pull[i, 1] = 0
+    cut.pulled_neighbours[i, 0] = 0
+    cut.pulled_neighbours[i, 1] = 0
     for e in range(cut.pointers[v], cut.pointers[v + 1]):
-        j = cut.local[cut.neighbours[e]]
+        j = cut.local_index[cut.neighbours[e]]
         if j >= 0 and cut.side[j] < 2:
-            cut.pull[i, 1 - cut.side[j]] += 1
+            cut.pulled_neighbours[i, 1 - cut.side[j]] += 1

@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from solvers.compiling import kernel
+from solvers.compiling import jit_kernel
 from solvers.problem import Positions
 
-PATCH = 32
+SUBDOMAIN_SIZE = 32
 """Nodes of a subdomain: the number of threads of a device that run in lockstep."""
 
 
-class Patches:
+class SubdomainHierarchy:
     """Positions of the blocks of a matrix in subdomains; subdomain_order (f,): its rows, grouped by subdomain."""
 
     def __init__(self, graph: csr_array, order: NDArray[np.int64]) -> None:
@@ -31,86 +31,88 @@ class Patches:
             graph: pattern of blocks (f, f).
             order: rows grouped by subdomain, (f,).
         """
-        self.order, n, entries = order, len(order), graph.nnz
+        self.subdomain_order, n, entries = order, len(order), graph.nnz
         place = np.empty(n, np.int64)
         place[order] = np.arange(n)
         i, j = place[np.repeat(np.arange(n), np.diff(graph.indptr))], place[graph.indices]
         self._levels = list[tuple[int, csr_array]]()
         while True:
-            inside = np.flatnonzero(i // PATCH == j // PATCH)
-            at, patches = i[inside] * PATCH + j[inside] % PATCH, -(-n // PATCH)
+            inside = np.flatnonzero(i // SUBDOMAIN_SIZE == j // SUBDOMAIN_SIZE)
+            at, patches = i[inside] * SUBDOMAIN_SIZE + j[inside] % SUBDOMAIN_SIZE, -(-n // SUBDOMAIN_SIZE)
             ones = np.ones(len(inside))
-            self._levels.append((n, csr_array((ones, (at, inside)), shape=(patches * PATCH**2, entries))))
-            if n <= PATCH:
+            self._levels.append((n, csr_array((ones, (at, inside)), shape=(patches * SUBDOMAIN_SIZE**2, entries))))
+            if n <= SUBDOMAIN_SIZE:
                 break
-            i, j, n = i // PATCH, j // PATCH, patches
+            i, j, n = i // SUBDOMAIN_SIZE, j // SUBDOMAIN_SIZE, patches
 
-    def inverted(self, blocks: NDArray[np.float64]) -> Schwarz:
+    def build_preconditioner(self, blocks: NDArray[np.float64]) -> AdditiveSchwarz:
         """Return S of the positive definite matrix with blocks (b, 3, 3)."""
         inverses = list[NDArray[np.float64]]()
         for n, places in self._levels:
-            dense = (places @ blocks.reshape(-1, 9)).reshape(-1, PATCH, PATCH, 3, 3)
-            dense = dense.transpose(0, 1, 3, 2, 4).reshape(-1, 3 * PATCH, 3 * PATCH)
-            spare = np.arange(3 * n, len(dense) * 3 * PATCH)
-            at = spare // (3 * PATCH), spare % (3 * PATCH), spare % (3 * PATCH)
+            dense = (places @ blocks.reshape(-1, 9)).reshape(-1, SUBDOMAIN_SIZE, SUBDOMAIN_SIZE, 3, 3)
+            dense = dense.transpose(0, 1, 3, 2, 4).reshape(-1, 3 * SUBDOMAIN_SIZE, 3 * SUBDOMAIN_SIZE)
+            spare = np.arange(3 * n, len(dense) * 3 * SUBDOMAIN_SIZE)
+            at = spare // (3 * SUBDOMAIN_SIZE), spare % (3 * SUBDOMAIN_SIZE), spare % (3 * SUBDOMAIN_SIZE)
             dense[at] = 1.0
             found = np.linalg.inv(dense)
             found[at] = 0.0
             inverses.append(0.5 * (found + found.transpose(0, 2, 1)))
-        return Schwarz(self.order, inverses)
+        return AdditiveSchwarz(self.subdomain_order, inverses)
 
 
-class Schwarz:
+class AdditiveSchwarz:
     """Preconditioner S; subdomain_inverses: (subdomains, 3 SUBDOMAIN_SIZE, 3 SUBDOMAIN_SIZE) of each level.
 
     Rows and columns beyond a level's last node are zero.
     """
 
     def __init__(self, order: NDArray[np.int64], inverses: list[NDArray[np.float64]]) -> None:
-        self._order, self.inverses = order, inverses
+        self._order, self.subdomain_inverses = order, inverses
 
-    def solve(self, b: Positions) -> Positions:
+    def apply_preconditioner(self, b: Positions) -> Positions:
         """Return S b, (f, 3)."""
         n, r = len(b), b[self._order]
         x, out = np.zeros_like(r), np.empty_like(r)
-        for level, inverses in enumerate(self.inverses):
-            padded = np.zeros((len(inverses) * PATCH, 3))
+        for level, inverses in enumerate(self.subdomain_inverses):
+            padded = np.zeros((len(inverses) * SUBDOMAIN_SIZE, 3))
             padded[: len(r)] = r
-            moved = inverses @ padded.reshape(-1, 3 * PATCH, 1)
-            x += np.repeat(moved.reshape(-1, 3), PATCH**level, axis=0)[:n]
-            r = padded.reshape(-1, PATCH, 3).sum(axis=1)
+            moved = inverses @ padded.reshape(-1, 3 * SUBDOMAIN_SIZE, 1)
+            x += np.repeat(moved.reshape(-1, 3), SUBDOMAIN_SIZE**level, axis=0)[:n]
+            r = padded.reshape(-1, SUBDOMAIN_SIZE, 3).sum(axis=1)
         out[self._order] = x
         return out
 
 
-def ordered(Q: csr_array) -> NDArray[np.int64]:
+def order_into_subdomains(Q: csr_array) -> NDArray[np.int64]:
     """Return the vertices (f,) in an order that forms subdomains on all levels.
 
     Each SUBDOMAIN_SIZE consecutive vertices are neighbours, and so are as many consecutive subdomains, and so on.
     """
     orders, graph = list[NDArray[np.int64]](), csr_array(Q)
-    while (n := len(graph.indptr) - 1) > PATCH:
+    while (n := len(graph.indptr) - 1) > SUBDOMAIN_SIZE:
         order = np.empty(n, np.int64)
-        grow(np.asarray(graph.indptr, np.int64), np.asarray(graph.indices, np.int64), order, *np.zeros((3, n), int))
+        grow_subdomains(
+            np.asarray(graph.indptr, np.int64), np.asarray(graph.indices, np.int64), order, *np.zeros((3, n), int)
+        )
         orders.append(order)
         of = np.empty(n, np.int64)
-        of[order] = np.arange(n) // PATCH
-        P = _merging(of)
+        of[order] = np.arange(n) // SUBDOMAIN_SIZE
+        P = _build_aggregation_matrix(of)
         graph = csr_array(P.T @ abs(graph) @ P)
     whole = np.arange(len(graph.indptr) - 1)
     for order in reversed(orders):
-        at = PATCH * whole[:, None] + np.arange(PATCH)
+        at = SUBDOMAIN_SIZE * whole[:, None] + np.arange(SUBDOMAIN_SIZE)
         whole = order[at[at < len(order)]]
     return whole
 
 
-def _merging(of: NDArray[np.int64]) -> csr_array:
+def _build_aggregation_matrix(of: NDArray[np.int64]) -> csr_array:
     """Return the matrix P (n, N) that maps each node to the values of its aggregate `of` (n,)."""
     return csr_array((np.ones(len(of)), (np.arange(len(of)), of)))
 
 
-@kernel
-def grow(pointers, neighbours, order, state, queue, border):
+@jit_kernel
+def grow_subdomains(pointers, neighbours, order, state, queue, border):
     """Order the nodes of a graph so that subdomains grow from the border of earlier ones.
 
     Args:
@@ -121,7 +123,7 @@ def grow(pointers, neighbours, order, state, queue, border):
     """
     n, done, first, left, right = len(order), 0, 0, 0, 0
     while done < n:
-        head, tail, most = 0, 0, min(n, done + PATCH)
+        head, tail, most = 0, 0, min(n, done + SUBDOMAIN_SIZE)
         while done < most:
             if head == tail:
                 seed = -1

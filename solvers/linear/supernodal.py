@@ -19,24 +19,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from solvers.linear.supernodal_factor import Matrix, Panels, factorise, keep_sums
-from solvers.linear.supernodal_solve import Factor, solve_by
-from solvers.linear.supernodes import LANES, WIDTH
-from solvers.linear.symbolic import Symbolic, structure
-from solvers.linear.team import Team
-from solvers.memory import aligned
+from solvers.linear.supernodal_factor import FactorPanels, SparseRows, factorise_supernodes, preserve_column_sums
+from solvers.linear.supernodal_solve import SupernodalFactor, solve_from_arrays
+from solvers.linear.supernodes import COLUMN_LANES, MAX_PANEL_WIDTH
+from solvers.linear.symbolic import SymbolicFactor, analyse_graph
+from solvers.linear.team import ThreadTeam
+from solvers.memory import allocate_aligned
 from solvers.problem import NotPositiveDefinite, Positions
 
 Precision = Literal["float64", "float32", "float16"]
 
-_SPARE = LANES - 1
+_NUM_PADDING_ROWS = COLUMN_LANES - 1
 """Number of copies of the last row at the end of a supernode's row list, for zero rows that complete a tile."""
 
-_WORTH_THREADS = 4e6
+_MIN_THREADED_BYTES = 4e6
 """Bytes of panels beyond which a second thread speeds up a single solve (a sheet of 110 vertices a side)."""
 
 
-class Layout(NamedTuple):
+class PanelLayout(NamedTuple):
     """Memory layout of the panels of a factor.
 
     A supernode is divided into chunks of at most MAX_PANEL_WIDTH columns, with a panel each.
@@ -54,22 +54,22 @@ class Layout(NamedTuple):
     """
 
     chunks: NDArray[np.int64]
-    chunk_of: NDArray[np.int64]
-    places: NDArray[np.int32]
-    by_slot: NDArray[np.uint32]
-    by_vertex: NDArray[np.uint32]
-    spans: NDArray[np.int64]
-    squares: int
-    panels: int
-    rows: int
+    first_chunk: NDArray[np.int64]
+    row_slots: NDArray[np.int32]
+    order_by_slot: NDArray[np.uint32]
+    order_by_vertex: NDArray[np.uint32]
+    group_spans: NDArray[np.int64]
+    num_inverse_entries: int
+    num_panel_entries: int
+    num_work_rows: int
 
     @classmethod
-    def of(cls, s: Symbolic) -> Layout:
+    def from_symbolic(cls, s: SymbolicFactor) -> PanelLayout:
         """Build the layout of a symbolic factor."""
-        width, below = s.width.astype(np.int64), np.diff(s.row_start)
-        chunk_of, node, done, own, rows, quads = _chunks(width, below)
-        squares, panels = LANES**2 * quads**2, rows * quads * LANES
-        base = np.concatenate([[0], np.cumsum(width + below + _SPARE)])
+        width, below = s.num_columns.astype(np.int64), np.diff(s.row_start)
+        chunk_of, node, done, own, rows, quads = _cut_chunks(width, below)
+        squares, panels = COLUMN_LANES**2 * quads**2, rows * quads * COLUMN_LANES
+        base = np.concatenate([[0], np.cumsum(width + below + _NUM_PADDING_ROWS)])
         columns = [
             np.cumsum(squares) - squares,
             np.cumsum(panels) - panels,
@@ -77,21 +77,21 @@ class Layout(NamedTuple):
             own,
             rows,
             quads,
-            s.first[node] + done,
+            s.first_slot[node] + done,
         ]
-        used = np.flatnonzero(s.vertex >= 0)
-        parts = np.stack([width, below, np.full(len(width), _SPARE)], axis=1)
+        used = np.flatnonzero(s.vertex_of_slot >= 0)
+        parts = np.stack([width, below, np.full(len(width), _NUM_PADDING_ROWS)], axis=1)
         kind = np.repeat(np.tile([0, 1, 2], len(width)), parts.ravel())
         places = np.empty(base[-1], np.int32)
         places[kind == 0] = used
         places[kind == 1] = s.rows
-        places[kind == 2] = np.repeat(places[base[1:] - _SPARE - 1], _SPARE)
+        places[kind == 2] = np.repeat(places[base[1:] - _NUM_PADDING_ROWS - 1], _NUM_PADDING_ROWS)
 
         bounds = s.group_start
-        slots = s.first[bounds]
+        slots = s.first_slot[bounds]
         ends = np.stack([chunk_of[bounds], np.searchsorted(used, slots), slots], axis=1)
         spans = np.stack([ends[:-1], ends[1:]], axis=2).reshape(-1, 6)
-        vertex = np.concatenate([np.sort(s.vertex[used[i:j]]) for i, j in spans[:, 2:4]])
+        vertex = np.concatenate([np.sort(s.vertex_of_slot[used[i:j]]) for i, j in spans[:, 2:4]])
         top, end = spans[-1, 4:]
         for g, (begin, stop) in enumerate(pairwise(base[bounds[:-1]])):
             part = places[begin:stop]
@@ -104,8 +104,8 @@ class Layout(NamedTuple):
             np.stack(columns, axis=1),
             chunk_of,
             places,
-            np.stack([s.vertex[used], used], axis=1).astype(np.uint32),
-            np.stack([vertex, s.slot[vertex]], axis=1).astype(np.uint32),
+            np.stack([s.vertex_of_slot[used], used], axis=1).astype(np.uint32),
+            np.stack([vertex, s.slot_of_vertex[vertex]], axis=1).astype(np.uint32),
             np.ascontiguousarray(spans, np.int64),
             int(squares.sum()),
             int(panels.sum()),
@@ -113,33 +113,33 @@ class Layout(NamedTuple):
         )
 
 
-def _chunks(width: NDArray[np.int64], below: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
+def _cut_chunks(width: NDArray[np.int64], below: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
     """Return `first_chunk`, and per chunk: supernode, preceding columns, own columns, rows below, column quads."""
-    many = -(-width // WIDTH)
+    many = -(-width // MAX_PANEL_WIDTH)
     chunk_of = np.concatenate([[0], np.cumsum(many)])
     node = np.repeat(np.arange(len(width)), many)
-    done = (np.arange(len(node)) - chunk_of[node]) * WIDTH
-    own = np.minimum(WIDTH, width[node] - done)
+    done = (np.arange(len(node)) - chunk_of[node]) * MAX_PANEL_WIDTH
+    own = np.minimum(MAX_PANEL_WIDTH, width[node] - done)
     rows = width[node] - done - own + below[node]
-    return chunk_of, node, done, own, -(-rows // LANES) * LANES, -(-own // LANES)
+    return chunk_of, node, done, own, -(-rows // COLUMN_LANES) * COLUMN_LANES, -(-own // COLUMN_LANES)
 
 
-def stored(s: Symbolic) -> tuple[int, int]:
+def count_stored_entries(s: SymbolicFactor) -> tuple[int, int]:
     """Return the number of entries of all S and of all W."""
-    *_, rows, quads = _chunks(s.width.astype(np.int64), np.diff(s.row_start))
-    return int(LANES**2 * quads @ quads), int(LANES * rows @ quads)
+    *_, rows, quads = _cut_chunks(s.num_columns.astype(np.int64), np.diff(s.row_start))
+    return int(COLUMN_LANES**2 * quads @ quads), int(COLUMN_LANES * rows @ quads)
 
 
-def _rounded(entries: NDArray[Any], dtype: np.dtype) -> NDArray[Any]:
+def _cast_entries(entries: NDArray[Any], dtype: np.dtype) -> NDArray[Any]:
     """Return the entries in a type; the same array if they have it already."""
     if entries.dtype == dtype:
         return entries
-    out = aligned(len(entries), dtype)
+    out = allocate_aligned(len(entries), dtype)
     out[:] = entries
     return out
 
 
-class Supernodal:
+class SupernodalCholesky:
     """Supernodal Cholesky factorisation of a sparse symmetric positive definite Q.
 
     The factorisation is in float64. Solves are in float64 for float64 panels, and in float32 for others. Solves of one
@@ -154,7 +154,9 @@ class Supernodal:
         inverse_blocks, panels, layout: all S, all W (float16 viewed as uint16), and their layout.
     """
 
-    def __init__(self, Q: csr_array, *, precision: Precision = "float64", symbolic: Symbolic | None = None) -> None:
+    def __init__(
+        self, Q: csr_array, *, precision: Precision = "float64", symbolic_factor: SymbolicFactor | None = None
+    ) -> None:
         """Factorise a matrix.
 
         Args:
@@ -171,37 +173,39 @@ class Supernodal:
             raise NotPositiveDefinite(f"Q is not finite in row {v}: a stiffness, a mass or a pin weight there is not")
         pointers = np.asarray(Q.indptr, np.int64)
         neighbours = np.asarray(Q.indices, np.int32)
-        s = symbolic or structure(pointers, neighbours)
-        layout = Layout.of(s)
-        squares, panels = aligned(layout.squares), aligned(layout.panels)
-        into = Panels(layout.chunk_of, layout.chunks, squares, panels)
-        v = factorise(Matrix(pointers, neighbours, Q.data), s, into)
+        s = symbolic_factor or analyse_graph(pointers, neighbours)
+        layout = PanelLayout.from_symbolic(s)
+        squares, panels = allocate_aligned(layout.num_inverse_entries), allocate_aligned(layout.num_panel_entries)
+        into = FactorPanels(layout.first_chunk, layout.chunks, squares, panels)
+        v = factorise_supernodes(SparseRows(pointers, neighbours, Q.data), s, into)
         if v >= 0:
             raise NotPositiveDefinite(
                 f"Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point at vertex {v}: nothing "
                 "determines its position, or stiffnesses, masses and pin weights lie too far apart or are negative"
             )
         self.nonzeros: int | None = s.nonzeros
-        work = aligned(4 * layout.rows, np.float64 if precision == "float64" else np.float32)
+        work = allocate_aligned(4 * layout.num_work_rows, np.float64 if precision == "float64" else np.float32)
         if precision == "float16":
-            keep_sums(panels, panels - panels.astype(np.float16), layout.chunks)
-        squares, panels = _rounded(squares, work.dtype), _rounded(panels, np.dtype(precision))
+            preserve_column_sums(panels, panels - panels.astype(np.float16), layout.chunks)
+        squares, panels = _cast_entries(squares, work.dtype), _cast_entries(panels, np.dtype(precision))
         if precision == "float16":
             panels = panels.view(np.uint16)  # which Numba has arrays of
-        self.panel_bytes = squares.nbytes + panels.nbytes
+        self.factor_bytes = squares.nbytes + panels.nbytes
         below, quads = layout.chunks[:, 4:6].T
-        entries = LANES * quads * (LANES * quads + 2 * below)
+        entries = COLUMN_LANES * quads * (COLUMN_LANES * quads + 2 * below)
         self.flops = int(2 * 3 * entries.sum())
-        self.shares = [float(entries[a:e].sum() / max(1, entries.sum())) for a, e in layout.spans[:, :2]]
-        self.squares, self.panels, self.layout = squares, panels, layout
-        lists = layout.places, layout.chunks, layout.spans, layout.by_slot, layout.by_vertex
-        self._factor = Factor(squares, panels, *lists, work, Team.of(len(self.shares) - 1))
+        self.work_shares = [float(entries[a:e].sum() / max(1, entries.sum())) for a, e in layout.group_spans[:, :2]]
+        self.inverse_blocks, self.panels, self.layout = squares, panels, layout
+        lists = layout.row_slots, layout.chunks, layout.group_spans, layout.order_by_slot, layout.order_by_vertex
+        self._factor = SupernodalFactor(
+            squares, panels, *lists, work, ThreadTeam.from_task_count(len(self.work_shares) - 1)
+        )
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Write Q^-1 b to `out`, (n, 3) each; b is not modified and must not be `out`."""
-        solve_by(*self._factor, b, out, self.threads())
+        solve_from_arrays(*self._factor, b, out, self.choose_num_threads())
 
-    def threads(self) -> int | None:
+    def choose_num_threads(self) -> int | None:
         """Return the number of threads of a solve, None for one."""
-        threads = min(numba.get_num_threads(), len(self.shares) - 1)
-        return threads if threads > 1 and self.panel_bytes >= _WORTH_THREADS else None
+        threads = min(numba.get_num_threads(), len(self.work_shares) - 1)
+        return threads if threads > 1 and self.factor_bytes >= _MIN_THREADED_BYTES else None

@@ -12,21 +12,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from solvers.compiling import inner
-from solvers.vectors.supernodal import add_forward
+from solvers.compiling import jit_inner
+from solvers.vectors.supernodal import add_panel_product
 
-_NO_DIGITS = 4.0 * np.finfo(np.float64).eps
+_PIVOT_ROUNDOFF = 4.0 * np.finfo(np.float64).eps
 """Pivots below this fraction of the matrix entry are round-off."""
 
 
-@inner
-def in_tile(row, col, width):
+@jit_inner
+def tile_offset(row, col, width):
     """Return the offset of an entry in a panel of tiles of four rows, stored by columns."""
     return (row >> 2) * 4 * width + 4 * col + (row & 3)
 
 
-@inner
-def eliminate(front, size, start, own, below, vertex, matrix, into, k):
+@jit_inner
+def eliminate_chunk(front, size, start, num_columns, below, vertex, matrix, factor_panels, k):
     """Eliminate chunk k from a front, and write its panel.
 
     Args:
@@ -43,26 +43,31 @@ def eliminate(front, size, start, own, below, vertex, matrix, into, k):
     Returns:
         The vertex whose pivot is not positive, or -1.
     """
-    square, at, real, width = into.chunks[k, 0], into.chunks[k, 1], into.chunks[k, 3], 4 * into.chunks[k, 5]
+    square, at, real, width = (
+        factor_panels.chunks[k, 0],
+        factor_panels.chunks[k, 1],
+        factor_panels.chunks[k, 3],
+        4 * factor_panels.chunks[k, 5],
+    )
     panel, count = front.panel, size - start
     for strip in range(width // 4):
         source = 4 * ((start // 4 + strip) * size + start)
         for r in range(count):
             for c in range(4):
                 panel[r, 4 * strip + c] = front.entries[source + 4 * r + c]
-    bad = _cholesky(panel, width, vertex[start:], matrix)
+    bad = _factorise_diagonal_block(panel, width, vertex[start:], matrix)
     if bad >= 0:
         return bad
-    _invert(panel, width, front.inverse)
-    _write_square(front.inverse, real, width, into.squares, square)
-    _divide(front, width, count)
-    _write_panel(front, width, start, own, below, vertex, into.panels, at)
-    _subtract(front, size, start, width)
+    _invert_triangle(panel, width, front.inverse)
+    _write_inverse_block(front.inverse, real, width, factor_panels.inverse_blocks, square)
+    _solve_below_diagonal(front, width, count)
+    _write_panel(front, width, start, num_columns, below, vertex, factor_panels.panels, at)
+    _subtract_outer_product(front, size, start, width)
     return -1
 
 
-@inner
-def _cholesky(panel, width, vertex, matrix):
+@jit_inner
+def _factorise_diagonal_block(panel, width, vertex, matrix):
     """Compute L11 in place; return the vertex whose pivot is not positive, or -1."""
     for j in range(width):
         pivot = panel[j, j]
@@ -72,7 +77,7 @@ def _cholesky(panel, width, vertex, matrix):
             for e in range(matrix.pointers[v], matrix.pointers[v + 1]):
                 if matrix.neighbours[e] == v:
                     scale += matrix.values[e]
-        if not pivot > _NO_DIGITS * scale:
+        if not pivot > _PIVOT_ROUNDOFF * scale:
             return v
         root = np.sqrt(pivot)
         panel[j, j] = root
@@ -84,8 +89,8 @@ def _cholesky(panel, width, vertex, matrix):
     return -1
 
 
-@inner
-def _invert(panel, width, inverse):
+@jit_inner
+def _invert_triangle(panel, width, inverse):
     """Compute L11^-1, column by column."""
     for j in range(width):
         for i in range(width):
@@ -98,21 +103,21 @@ def _invert(panel, width, inverse):
             inverse[i, j] = total / panel[i, i]
 
 
-@inner
-def _write_square(inverse, real, width, squares, begin):
+@jit_inner
+def _write_inverse_block(inverse, real, width, squares, begin):
     """Compute S = L11^-T L11^-1."""
     for i in range(real):
         for j in range(real):
             total = 0.0
             for k in range(max(i, j), real):
                 total += inverse[k, i] * inverse[k, j]
-            squares[begin + in_tile(i, j, width)] = total
+            squares[begin + tile_offset(i, j, width)] = total
 
 
-@inner
-def _divide(front, width, count):
+@jit_inner
+def _solve_below_diagonal(front, width, count):
     """Compute L21 = A21 L11^-T into `tiles`."""
-    panel, inverse, row = front.panel, front.inverse, front.row
+    panel, inverse, row = front.panel, front.inverse, front.row_scratch
     for r in range(width, count):
         for j in range(width):
             row[j] = 0.0
@@ -121,45 +126,45 @@ def _divide(front, width, count):
             for j in range(width):
                 row[j] += factor * inverse[j, k]
         for j in range(width):
-            front.tiles[in_tile(r, j, width)] = row[j]
+            front.tiles[tile_offset(r, j, width)] = row[j]
 
 
-@inner
-def _write_panel(front, width, start, own, below, vertex, panels, begin):
+@jit_inner
+def _write_panel(front, width, start, num_columns, below, vertex, panels, begin):
     """Compute W = -L21 L11^-1, for the rows that are vertices."""
-    tiles, inverse, row = front.tiles, front.inverse, front.row
+    tiles, inverse, row = front.tiles, front.inverse, front.row_scratch
     done = 0
-    for local in range(start + width, own + below):
-        if local < own and vertex[local] < 0:
+    for local in range(start + width, num_columns + below):
+        if local < num_columns and vertex[local] < 0:
             continue
         for j in range(width):
             row[j] = 0.0
         for k in range(width):
-            factor = tiles[in_tile(local - start, k, width)]
+            factor = tiles[tile_offset(local - start, k, width)]
             for j in range(width):
                 row[j] -= factor * inverse[k, j]
         for j in range(width):
-            panels[begin + in_tile(done, j, width)] = row[j]
+            panels[begin + tile_offset(done, j, width)] = row[j]
         done += 1
 
 
-@inner
-def _subtract(front, size, start, width):
+@jit_inner
+def _subtract_outer_product(front, size, start, width):
     """Subtract L21 L21' from the front, strip by strip, by the product of a forward substitution."""
-    tiles, index, entries = front.tiles, front.numbers, front.entries
-    flat = front.block
+    tiles, index, entries = front.tiles, front.row_numbers, front.entries
+    flat = front.block_scratch
     for strip in range((start + width) // 4, size // 4):
         r = 4 * strip - start
         for c in range(4):
             for j in range(width):
-                flat[4 * j + c] = -tiles[in_tile(r + c, j, width)]
+                flat[4 * j + c] = -tiles[tile_offset(r + c, j, width)]
         begin = strip * size + 4 * strip
         count = size - 4 * strip
         if width == 16:
-            add_forward(tiles, r * width, index, 0, count, flat, 0, entries, begin, 4, 4)
+            add_panel_product(tiles, r * width, index, 0, count, flat, 0, entries, begin, 4, 4)
         elif width == 12:
-            add_forward(tiles, r * width, index, 0, count, flat, 0, entries, begin, 4, 3)
+            add_panel_product(tiles, r * width, index, 0, count, flat, 0, entries, begin, 4, 3)
         elif width == 8:
-            add_forward(tiles, r * width, index, 0, count, flat, 0, entries, begin, 4, 2)
+            add_panel_product(tiles, r * width, index, 0, count, flat, 0, entries, begin, 4, 2)
         else:
-            add_forward(tiles, r * width, index, 0, count, flat, 0, entries, begin, 4, 1)
+            add_panel_product(tiles, r * width, index, 0, count, flat, 0, entries, begin, 4, 1)

@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kept, part
-from solvers.linear.supernodal_chunk import eliminate, in_tile
-from solvers.linear.supernodes import WIDTH
+from solvers.compiling import cached_njit, jit_inner, jit_inner_allocating
+from solvers.linear.supernodal_chunk import eliminate_chunk, tile_offset
+from solvers.linear.supernodes import MAX_PANEL_WIDTH
 
 
-class Matrix(NamedTuple):
+class SparseRows(NamedTuple):
     """A sparse matrix in compressed rows: pointers (n + 1,), neighbours and values of the entries."""
 
     pointers: NDArray[np.int64]
@@ -25,19 +25,19 @@ class Matrix(NamedTuple):
     values: NDArray[np.float64]
 
 
-class Panels(NamedTuple):
+class FactorPanels(NamedTuple):
     """Output of the factorisation: all S and W, and their layout.
 
     first_chunk (s + 1,) and chunks (c, 7): see `solvers.linalg.cholesky.supernodal_cholesky.PanelLayout`.
     """
 
-    chunk_of: NDArray[np.int64]
+    first_chunk: NDArray[np.int64]
     chunks: NDArray[np.int64]
-    squares: NDArray[np.float64]
+    inverse_blocks: NDArray[np.float64]
     panels: NDArray[np.float64]
 
 
-class _Front(NamedTuple):
+class _FrontalMatrix(NamedTuple):
     """A front, and scratch for a chunk of its columns.
 
     Attributes:
@@ -51,17 +51,17 @@ class _Front(NamedTuple):
     """
 
     entries: NDArray[np.float64]
-    place: NDArray[np.int64]
+    slot_row: NDArray[np.int64]
     panel: NDArray[np.float64]
     inverse: NDArray[np.float64]
     tiles: NDArray[np.float64]
-    row: NDArray[np.float64]
-    block: NDArray[np.float64]
-    numbers: NDArray[np.int32]
+    row_scratch: NDArray[np.float64]
+    block_scratch: NDArray[np.float64]
+    row_numbers: NDArray[np.int32]
 
 
-@kept()
-def factorise(matrix, structure, into):
+@cached_njit()
+def factorise_supernodes(matrix, symbolic_factor, factor_panels):
     """Factorise a matrix in the postorder of its supernodes.
 
     Args:
@@ -72,120 +72,127 @@ def factorise(matrix, structure, into):
     Returns:
         The vertex whose pivot is not positive, or -1.
     """
-    child, sibling, largest, room = _plan(structure)
-    first, row_start, rows, vertex = structure.first, structure.row_start, structure.rows, structure.vertex
+    child, sibling, largest, room = _plan_update_stack(symbolic_factor)
+    first, row_start, rows, vertex = (
+        symbolic_factor.first_slot,
+        symbolic_factor.row_start,
+        symbolic_factor.rows,
+        symbolic_factor.vertex_of_slot,
+    )
     stack = np.empty(room)
     begun = np.zeros(len(child), np.int64)  # where a supernode's update matrix lies
-    front = _Front(
+    front = _FrontalMatrix(
         np.empty(largest * largest),
         np.empty(len(vertex), np.int64),
-        np.empty((largest, WIDTH)),
-        np.empty((WIDTH, WIDTH)),
-        np.empty(largest * WIDTH),
-        np.empty(WIDTH),
-        np.empty(4 * WIDTH),
+        np.empty((largest, MAX_PANEL_WIDTH)),
+        np.empty((MAX_PANEL_WIDTH, MAX_PANEL_WIDTH)),
+        np.empty(largest * MAX_PANEL_WIDTH),
+        np.empty(MAX_PANEL_WIDTH),
+        np.empty(4 * MAX_PANEL_WIDTH),
         np.arange(largest).astype(np.int32),
     )
     top = 0
-    for s in structure.sequence:
+    for s in symbolic_factor.postorder:
         own = first[s + 1] - first[s]
         below = row_start[s + 1] - row_start[s]
-        size = own + _padded(below)
-        _assemble(front, matrix, structure, s, size)
+        size = own + _round_up_to_strips(below)
+        _assemble_front(front, matrix, symbolic_factor, s, size)
         c = child[s]
         while c >= 0:
             top = begun[c]  # the last in this list was the first on the stack
-            _extend_add(front.entries, size, stack, top, rows, row_start[c], row_start[c + 1], front.place)
+            _extend_add(front.entries, size, stack, top, rows, row_start[c], row_start[c + 1], front.slot_row)
             c = sibling[c]
-        for k in range(into.chunk_of[s], into.chunk_of[s + 1]):
-            start = (k - into.chunk_of[s]) * WIDTH
-            bad = eliminate(front, size, start, own, below, vertex[first[s] : first[s + 1]], matrix, into, k)
+        for k in range(factor_panels.first_chunk[s], factor_panels.first_chunk[s + 1]):
+            start = (k - factor_panels.first_chunk[s]) * MAX_PANEL_WIDTH
+            bad = eliminate_chunk(
+                front, size, start, own, below, vertex[first[s] : first[s + 1]], matrix, factor_panels, k
+            )
             if bad >= 0:
                 return bad
         begun[s] = top
-        top = _push(front.entries, size, own, stack, top)
+        top = _push_update(front.entries, size, own, stack, top)
     return -1
 
 
-@part
-def _plan(structure):
+@jit_inner_allocating
+def _plan_update_stack(symbolic_factor):
     """Plan the stack of update matrices.
 
     Returns the children of each supernode as linked lists (`child`, `sibling`), the largest front size, and the stack
     size.
     """
-    nodes = len(structure.parent)
+    nodes = len(symbolic_factor.parent)
     child = np.full(nodes, -1, np.int64)
     sibling = np.full(nodes, -1, np.int64)
     largest, room, depth = 0, 0, 0
-    for s in structure.sequence:
-        below = _padded(structure.row_start[s + 1] - structure.row_start[s])
-        largest = max(largest, structure.first[s + 1] - structure.first[s] + below)
+    for s in symbolic_factor.postorder:
+        below = _round_up_to_strips(symbolic_factor.row_start[s + 1] - symbolic_factor.row_start[s])
+        largest = max(largest, symbolic_factor.first_slot[s + 1] - symbolic_factor.first_slot[s] + below)
         c = child[s]
         while c >= 0:
-            depth -= _padded(structure.row_start[c + 1] - structure.row_start[c]) ** 2
+            depth -= _round_up_to_strips(symbolic_factor.row_start[c + 1] - symbolic_factor.row_start[c]) ** 2
             c = sibling[c]
         depth += below**2
         room = max(room, depth)
-        parent = structure.parent[s]
+        parent = symbolic_factor.parent[s]
         if parent >= 0:
             sibling[s] = child[parent]
             child[parent] = s
     return child, sibling, largest, room
 
 
-@inner
-def _assemble(front, matrix, structure, s, size):
+@jit_inner
+def _assemble_front(front, matrix, symbolic_factor, s, size):
     """Assemble the matrix entries of a supernode's columns in the front, zero elsewhere; write the rows of slots."""
-    entries, place = front.entries, front.place
-    first, end = structure.first[s], structure.first[s + 1]
-    row, row_end = structure.row_start[s], structure.row_start[s + 1]
+    entries, place = front.entries, front.slot_row
+    first, end = symbolic_factor.first_slot[s], symbolic_factor.first_slot[s + 1]
+    row, row_end = symbolic_factor.row_start[s], symbolic_factor.row_start[s + 1]
     entries[: size * size] = 0.0
     for i in range(first, end):
         place[i] = i - first
     for k in range(row_end - row):
-        place[structure.rows[row + k]] = end - first + k
+        place[symbolic_factor.rows[row + k]] = end - first + k
     for i in range(first, end):
         col = i - first
-        v = structure.vertex[i]
+        v = symbolic_factor.vertex_of_slot[i]
         if v < 0:
-            entries[_at(size, col, col)] = 1.0
+            entries[_entry_offset(size, col, col)] = 1.0
             continue
         for e in range(matrix.pointers[v], matrix.pointers[v + 1]):
-            j = structure.slot[matrix.neighbours[e]]
+            j = symbolic_factor.slot_of_vertex[matrix.neighbours[e]]
             if j >= i:
-                entries[_at(size, place[j], col)] += matrix.values[e]
+                entries[_entry_offset(size, place[j], col)] += matrix.values[e]
 
 
-@inner
-def _push(entries, size, own, stack, top):
+@jit_inner
+def _push_update(entries, size, num_columns, stack, top):
     """Push the remainder of a front on the stack; return the new end of the stack."""
-    rest = size - own
+    rest = size - num_columns
     for strip in range(rest // 4):
-        source = 4 * ((strip + own // 4) * size + own)
+        source = 4 * ((strip + num_columns // 4) * size + num_columns)
         target = top + 4 * strip * rest
         for k in range(16 * strip, 4 * rest):
             stack[target + k] = entries[source + k]
     return top + rest * rest
 
 
-@inner
-def _padded(count):
+@jit_inner
+def _round_up_to_strips(count):
     """Return the count rounded up to whole strips."""
     return (count + 3) // 4 * 4
 
 
-@inner
-def _at(size, row, col):
+@jit_inner
+def _entry_offset(size, row, col):
     """Return the offset of an entry in a front."""
     return 4 * ((col >> 2) * size + row) + (col & 3)
 
 
-@inner
+@jit_inner
 def _extend_add(front, size, stack, begin, rows, start, end, place):
     """Add a child's update matrix to its parent's front."""
     count = end - start
-    height = _padded(count)
+    height = _round_up_to_strips(count)
     for b in range(count):
         source = begin + 4 * (b >> 2) * height + (b & 3)
         col = place[rows[start + b]]
@@ -194,8 +201,8 @@ def _extend_add(front, size, stack, begin, rows, start, end, place):
             front[target + 4 * place[rows[start + a]]] += stack[source + 4 * a]
 
 
-@kept()
-def keep_sums(panels, rounding, chunks):
+@cached_njit()
+def preserve_column_sums(panels, rounding, chunks):
     """Add the total rounding error of each column of W to its smallest entry.
 
     That entry has the smallest rounding error.
@@ -216,7 +223,7 @@ def keep_sums(panels, rounding, chunks):
             lost = 0.0
             least = offset + 4 * j
             for r in range(below):
-                at = offset + in_tile(r, j, width)
+                at = offset + tile_offset(r, j, width)
                 lost += rounding[at]
                 if abs(panels[at]) < abs(panels[least]):
                     least = at

@@ -11,40 +11,40 @@ from heapq import heapify, heappop, heappush
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, kept, part
+from solvers.compiling import cached_njit, jit_inner, jit_inner_allocating
 
-WIDTH = 16
+MAX_PANEL_WIDTH = 16
 """Maximum number of columns of a panel."""
 
-LANES = 4
+COLUMN_LANES = 4
 """Columns of a supernode are padded to a multiple of this number."""
 
-_PER_PANEL, _PER_ROW = 30.0, 3.0
+_PANEL_COST, _ROW_COST = 30.0, 3.0
 """Cost of a panel and of a panel row, in units of an entry: both measured, neither critical."""
 
-GROUPS = 4
+NUM_SUBTREE_GROUPS = 4
 """Number of groups of subtrees, of about equal cost, that threads can process in parallel."""
 
-_WORTH_GROUPS = 3e4
+_MIN_GROUPED_COST = 3e4
 """Cost of a solve below which a single group is used (a sheet of 28 x 28 vertices). One group is then faster by 1 to 7
 % on one thread, and waking a second thread consumes most of its gain: speedup 1.1 at 16 x 16, 1.3 at 20 x 20, 1.6 at
 32 x 32."""
 
 
-@inner
-def _cost(width, rows):
+@jit_inner
+def _solve_cost(width, rows):
     """Return the cost of a supernode in a solve, in units of an entry."""
     total = 0.0
     while width > 0:
-        chunk = min(width, WIDTH)
+        chunk = min(width, MAX_PANEL_WIDTH)
         width -= chunk
-        padded = (chunk + LANES - 1) // LANES * LANES
-        total += _PER_PANEL + (rows + width) * (padded + _PER_ROW) + chunk * (0.5 * padded + _PER_ROW)
+        padded = (chunk + COLUMN_LANES - 1) // COLUMN_LANES * COLUMN_LANES
+        total += _PANEL_COST + (rows + width) * (padded + _ROW_COST) + chunk * (0.5 * padded + _ROW_COST)
     return total
 
 
-@kept()
-def amalgamate(parent, count):
+@cached_njit()
+def amalgamate_supernodes(parent, count):
     """Amalgamate supernodes.
 
     Args:
@@ -54,8 +54,8 @@ def amalgamate(parent, count):
     Returns:
         The tree of supernodes, the supernode of each column, and the cost of each supernode.
     """
-    tree, of_column, width, rows = _fundamental(parent, count)
-    into = _absorb(tree, width, rows)
+    tree, of_column, width, rows = _find_fundamental_supernodes(parent, count)
+    into = _merge_children(tree, width, rows)
     name = np.full(len(tree), -1, np.int32)
     kept = 0
     for s in range(len(tree)):
@@ -68,7 +68,7 @@ def amalgamate(parent, count):
     cost = np.empty(kept)
     for s in range(len(tree)):
         if into[s] == s:
-            cost[name[s]] = _cost(width[s], rows[s])
+            cost[name[s]] = _solve_cost(width[s], rows[s])
             if tree[s] >= 0:
                 merged[name[s]] = name[tree[s]]
     for j in range(len(of_column)):
@@ -76,8 +76,8 @@ def amalgamate(parent, count):
     return merged, of_column, cost
 
 
-@part
-def _fundamental(parent, count):
+@jit_inner_allocating
+def _find_fundamental_supernodes(parent, count):
     """Find columns of one structure; return the tree of these nodes, each column's node, and node widths and rows."""
     n = len(parent)
     of_column = np.empty(n, np.int32)
@@ -99,8 +99,8 @@ def _fundamental(parent, count):
     return tree, of_column, width, rows
 
 
-@part
-def _absorb(tree, width, rows):
+@jit_inner_allocating
+def _merge_children(tree, width, rows):
     """Return the node that each node is merged into, itself if it remains; `width` is updated."""
     nodes = len(tree)
     child = np.full(nodes, -1, np.int32)
@@ -112,7 +112,7 @@ def _absorb(tree, width, rows):
     into = np.arange(nodes)
     for s in range(nodes):  # children come first, so theirs are settled
         while True:
-            best, before = _gain_most(s, child, sibling, width, rows)
+            best, before = _find_best_merge(s, child, sibling, width, rows)
             if best < 0:
                 break
             into[best] = s
@@ -130,14 +130,14 @@ def _absorb(tree, width, rows):
     return into
 
 
-@inner
-def _gain_most(s, child, sibling, width, rows):
+@jit_inner
+def _find_best_merge(s, child, sibling, width, rows):
     """Return the child whose merge gains most, -1 for none, and the child before it in the list."""
     best, best_gain, before_best, before = -1, 0.0, -1, -1
     c = child[s]
     while c >= 0:
-        apart = _cost(width[c], rows[c]) + _cost(width[s], rows[s])
-        gain = apart - _cost(width[c] + width[s], rows[s])
+        apart = _solve_cost(width[c], rows[c]) + _solve_cost(width[s], rows[s])
+        gain = apart - _solve_cost(width[c] + width[s], rows[s])
         if gain >= best_gain:
             best, best_gain, before_best = c, gain, before
         before = c
@@ -145,7 +145,7 @@ def _gain_most(s, child, sibling, width, rows):
     return best, before_best
 
 
-def groups(parent: NDArray[np.int32], cost: NDArray[np.float64]) -> NDArray[np.int32]:
+def group_subtrees(parent: NDArray[np.int32], cost: NDArray[np.float64]) -> NDArray[np.int32]:
     """Assign each node of a forest to a group of whole subtrees, NUM_SUBTREE_GROUPS for the top.
 
     The heaviest subtree is split, with its root assigned to the top, until none exceeds a group's share. The lightest
@@ -164,18 +164,18 @@ def groups(parent: NDArray[np.int32], cost: NDArray[np.float64]) -> NDArray[np.i
     roots = children.get(-1, [])
     whole = float(total[roots].sum())
     top = []
-    if whole < _WORTH_GROUPS:
+    if whole < _MIN_GROUPED_COST:
         return np.zeros(len(parent), np.int32)
     heap = [(-total[v], v) for v in roots]
     heapify(heap)
-    while heap and -heap[0][0] > 1.1 * whole / GROUPS:
+    while heap and -heap[0][0] > 1.1 * whole / NUM_SUBTREE_GROUPS:
         v = heappop(heap)[1]
         top.append(v)
         for c in children.get(v, []):
             heappush(heap, (-total[c], c))
     group = np.full(len(parent), -1, np.int32)
-    group[top] = GROUPS
-    load = np.zeros(GROUPS)
+    group[top] = NUM_SUBTREE_GROUPS
+    load = np.zeros(NUM_SUBTREE_GROUPS)
     for _, v in sorted(heap):
         lightest = int(np.argmin(load))
         group[v] = lightest

@@ -13,12 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import kept
-from solvers.linear.ordering import nested_dissection
-from solvers.linear.supernodes import GROUPS, LANES, amalgamate, groups
+from solvers.compiling import cached_njit
+from solvers.linear.ordering import nested_dissection_order
+from solvers.linear.supernodes import COLUMN_LANES, NUM_SUBTREE_GROUPS, amalgamate_supernodes, group_subtrees
 
 
-class Symbolic(NamedTuple):
+class SymbolicFactor(NamedTuple):
     """Structure of L over slots, the positions in the work vector.
 
     Slots are padded so that each supernode starts at a multiple of COLUMN_LANES.
@@ -38,51 +38,53 @@ class Symbolic(NamedTuple):
         nonzeros: entries of L before amalgamation, including the diagonal.
     """
 
-    slot: NDArray[np.int32]
-    vertex: NDArray[np.int32]
+    slot_of_vertex: NDArray[np.int32]
+    vertex_of_slot: NDArray[np.int32]
     parent: NDArray[np.int32]
-    first: NDArray[np.int32]
-    width: NDArray[np.int32]
+    first_slot: NDArray[np.int32]
+    num_columns: NDArray[np.int32]
     row_start: NDArray[np.int64]
     rows: NDArray[np.int32]
-    sequence: NDArray[np.int32]
+    postorder: NDArray[np.int32]
     group_start: NDArray[np.int64]
     nonzeros: int
 
 
-_Known = list[tuple[NDArray[np.int64], NDArray[np.int32], Symbolic]]
+_AnalysisCache = list[tuple[NDArray[np.int64], NDArray[np.int32], SymbolicFactor]]
 
-_known: ContextVar[_Known | None] = ContextVar("_known", default=None)
+_analysis_cache: ContextVar[_AnalysisCache | None] = ContextVar("_known", default=None)
 
 
 @contextmanager
-def analysed_once() -> Iterator[None]:
+def cache_symbolic_analysis() -> Iterator[None]:
     """Within this context, `analyse_graph` analyses each graph once, however many matrices share it."""
-    token = _known.set([])
+    token = _analysis_cache.set([])
     try:
         yield
     finally:
-        _known.reset(token)
+        _analysis_cache.reset(token)
 
 
-def structure(pointers: NDArray[np.int64], neighbours: NDArray[np.int32]) -> Symbolic:
+def analyse_graph(pointers: NDArray[np.int64], neighbours: NDArray[np.int32]) -> SymbolicFactor:
     """Analyse a graph with the nested dissection order; the result must not be modified.
 
     Args:
         pointers: row pointers (n + 1,) of the graph in CSR form.
         neighbours: column indices.
     """
-    known = _known.get()
+    known = _analysis_cache.get()
     for p, n, found in known or ():
         if np.array_equal(p, pointers) and np.array_equal(n, neighbours):
             return found
-    found = analyse(pointers, neighbours, nested_dissection(pointers, neighbours))
+    found = analyse_with_order(pointers, neighbours, nested_dissection_order(pointers, neighbours))
     if known is not None:
         known.append((pointers, neighbours, found))
     return found
 
 
-def analyse(pointers: NDArray[np.int64], neighbours: NDArray[np.int32], order: NDArray[np.int32]) -> Symbolic:
+def analyse_with_order(
+    pointers: NDArray[np.int64], neighbours: NDArray[np.int32], order: NDArray[np.int32]
+) -> SymbolicFactor:
     """Analyse a graph with a given elimination order, up to a postorder of its tree.
 
     Args:
@@ -90,27 +92,27 @@ def analyse(pointers: NDArray[np.int64], neighbours: NDArray[np.int32], order: N
         neighbours: column indices.
         order: vertices in the order of elimination (n,).
     """
-    place = _inverse(order)
-    post = _postorder(_elimination_tree(pointers, neighbours, order, place))
+    place = _invert_permutation(order)
+    post = _compute_postorder(_build_elimination_tree(pointers, neighbours, order, place))
     order = order[post]
-    place = _inverse(order)
-    parent = _elimination_tree(pointers, neighbours, order, place)
-    count = _column_counts(pointers, neighbours, order, place, parent)
-    tree, of_column, cost = amalgamate(parent, count)
+    place = _invert_permutation(order)
+    parent = _build_elimination_tree(pointers, neighbours, order, place)
+    count = _count_column_entries(pointers, neighbours, order, place, parent)
+    tree, of_column, cost = amalgamate_supernodes(parent, count)
 
-    post = _postorder(tree)
-    group = groups(tree, cost)
+    post = _compute_postorder(tree)
+    group = group_subtrees(tree, cost)
     by_number = post[np.argsort(group[post], kind="stable")]
-    number = _inverse(by_number)
+    number = _invert_permutation(by_number)
     upper = tree[by_number]
     node_parent = np.where(upper < 0, np.int32(-1), number[upper])
-    group_start = np.searchsorted(group[by_number], np.arange(GROUPS + 2))
+    group_start = np.searchsorted(group[by_number], np.arange(NUM_SUBTREE_GROUPS + 2))
 
     node = number[of_column]
     column = np.argsort(node, kind="stable")  # within a node the columns keep their order
     width = np.bincount(node, minlength=len(tree)).astype(np.int32)
     first = np.zeros(len(tree) + 1, np.int32)
-    np.cumsum((width + LANES - 1) // LANES * LANES, out=first[1:])
+    np.cumsum((width + COLUMN_LANES - 1) // COLUMN_LANES * COLUMN_LANES, out=first[1:])
     start = np.cumsum(width) - width
     slots = (np.arange(len(order)) + np.repeat(first[:-1] - start, width)).astype(np.int32)
     vertex = np.full(first[-1], -1, np.int32)
@@ -118,21 +120,21 @@ def analyse(pointers: NDArray[np.int64], neighbours: NDArray[np.int32], order: N
     vertex[slots] = order[column]
     slot[order[column]] = slots
     node_of_slot = np.repeat(np.arange(len(tree), dtype=np.int32), np.diff(first))
-    row_start, rows = _structure(pointers, neighbours, slot, vertex, node_parent, node_of_slot, len(tree))
-    return Symbolic(
+    row_start, rows = _find_supernode_rows(pointers, neighbours, slot, vertex, node_parent, node_of_slot, len(tree))
+    return SymbolicFactor(
         slot, vertex, node_parent, first, width, row_start, rows, number[post], group_start, int(count.sum())
     )  # fmt: skip
 
 
-def _inverse(order: NDArray[np.int32]) -> NDArray[np.int32]:
+def _invert_permutation(order: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return the inverse of a permutation."""
     place = np.empty(len(order), np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
     return place
 
 
-@kept()
-def _elimination_tree(pointers, neighbours, order, place):
+@cached_njit()
+def _build_elimination_tree(pointers, neighbours, order, place):
     """Return the parent of each column, -1 for a root (Davis 2006, section 4.1)."""
     n = len(order)
     parent = np.full(n, -1, np.int32)
@@ -150,8 +152,8 @@ def _elimination_tree(pointers, neighbours, order, place):
     return parent
 
 
-@kept()
-def _postorder(parent):
+@cached_njit()
+def _compute_postorder(parent):
     """Return the nodes of a forest in postorder, with children in ascending order."""
     n = len(parent)
     child = np.full(n, -1, np.int32)
@@ -179,8 +181,8 @@ def _postorder(parent):
     return post
 
 
-@kept()
-def _column_counts(pointers, neighbours, order, place, parent):
+@cached_njit()
+def _count_column_entries(pointers, neighbours, order, place, parent):
     """Return the entries of each column of L with its diagonal: row i has those on the paths from its entries to i."""
     n = len(order)
     count = np.ones(n, np.int64)
@@ -197,8 +199,8 @@ def _column_counts(pointers, neighbours, order, place, parent):
     return count
 
 
-@kept()
-def _structure(pointers, neighbours, slot, vertex, parent, node_of_slot, nodes):
+@cached_njit()
+def _find_supernode_rows(pointers, neighbours, slot, vertex, parent, node_of_slot, nodes):
     """Return the rows below each supernode, by slot: row i belongs to those on the paths from its entries to i."""
     start = np.zeros(nodes + 1, np.int64)
     rows = np.empty(0, np.int32)

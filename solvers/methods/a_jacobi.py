@@ -23,27 +23,27 @@ from typing import TYPE_CHECKING, ClassVar, cast
 import numpy as np
 from scipy.sparse import csr_array, dia_array
 
-from solvers.about import About, Reference
-from solvers.contact.touching import without_contact
-from solvers.core.acceleration import Interpreted, Scheme
-from solvers.core.driver import Iterating, Iterative
-from solvers.core.fixed_objective import Objective
+from solvers.about import Citation, SolverInfo
+from solvers.contact.touching import without_vertex_contact
+from solvers.core.acceleration import AccelerationScheme, InterpretedState
+from solvers.core.driver import IterativeSolver, SolverState
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
-from solvers.core.prefactored import PreparedLocalGlobal, prepared, projective
-from solvers.kernels.accelerate_coefficients import CHEBYSHEV
-from solvers.linear.multigrid import largest_eigenvalue
-from solvers.matrices import without_zeros
+from solvers.core.prefactored import PreparedLocalGlobal, prepare_local_global, require_projective
+from solvers.kernels.accelerate_coefficients import CHEBYSHEV_RULE
+from solvers.linear.multigrid import estimate_largest_eigenvalue
+from solvers.matrices import drop_zeros
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, StepProblem, System, Unsupported
 
 if TYPE_CHECKING:
-    from solvers.contact.local_global import Idle
+    from solvers.contact.local_global import ContactFreeSolver
 
-_SCHEME = Scheme("a-jacobi", CHEBYSHEV, 1, 0, True)
-_MOST = 8
+_A_JACOBI_SCHEME = AccelerationScheme("a-jacobi", CHEBYSHEV_RULE, 1, 0, True)
+_MAX_SWEEPS = 8
 """Maximum number of sweeps: with more, a row of S on a cloth has hundreds of entries."""
 
-_ROUNDED = 2.0 + 1e-12
+_MAX_SPRING_EIGENVALUE = 2.0 + 1e-12
 """Largest eigenvalue of D^-1 Q for springs, with an allowance for round-off."""
 
 
@@ -55,11 +55,11 @@ class AggregatedJacobi:
         jacobi_sweeps: l, the number of Jacobi sweeps per iteration, 1 to 8.
     """
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
-    about: ClassVar[About] = About(
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "accelerated local-global",
-        Reference(
+        Citation(
             "Lan, Lei and Ma, Guanqun and Yang, Yin and Zheng, Changxi and Li, Minchen and Jiang, Chenfanfu",
             2022,
             "Penetration-free projective dynamics on the GPU",
@@ -71,7 +71,7 @@ class AggregatedJacobi:
 
     def __post_init__(self) -> None:
         """Raise ValueError if a parameter is out of range."""
-        require_sweeps(self.sweeps)
+        require_valid_sweeps(self.sweeps)
 
     def prepare(self, system: System) -> PreparedAggregatedJacobi:
         """Prepare the method for a system.
@@ -80,24 +80,26 @@ class AggregatedJacobi:
             Unsupported: if an energy is not projective; contact is not.
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
-        if without_contact(system) is not system:
+        if without_vertex_contact(system) is not system:
             raise Unsupported(
                 "a-jacobi: its matrix is computed once from Q, which does not include contact of vertices (Contact); "
                 "use numba, chebyshev or vbd"
             )
-        energies = projective(system, "a-jacobi")
-        measure = cast("Idle", CompiledLocalGlobal().prepare(system))
-        base = prepared(system, energies, lambda Q: (Aggregated(Q, self.sweeps), f"{self.sweeps} sweeps of Jacobi"))
-        return PreparedAggregatedJacobi(base, measure, Objective(system))
+        energies = require_projective(system, "a-jacobi")
+        measure = cast("ContactFreeSolver", CompiledLocalGlobal().prepare(system))
+        base = prepare_local_global(
+            system, energies, lambda Q: (AggregatedSweeps(Q, self.sweeps), f"{self.sweeps} sweeps of Jacobi")
+        )
+        return PreparedAggregatedJacobi(base, measure, FixedObjective(system))
 
 
-def require_sweeps(sweeps: int) -> None:
+def require_valid_sweeps(sweeps: int) -> None:
     """Raise ValueError unless the number of sweeps is in the supported range."""
-    if not 1 <= sweeps <= _MOST:
-        raise ValueError(f"sweeps: should be from 1 to {_MOST}, not {sweeps}")
+    if not 1 <= sweeps <= _MAX_SWEEPS:
+        raise ValueError(f"sweeps: should be from 1 to {_MAX_SWEEPS}, not {sweeps}")
 
 
-class Aggregated:
+class AggregatedSweeps:
     """Several Jacobi sweeps for Q x = b from x = 0, as one sparse matrix.
 
     Attributes:
@@ -105,8 +107,8 @@ class Aggregated:
     """
 
     def __init__(self, Q: csr_array, sweeps: int) -> None:
-        n, largest = len(Q.indptr) - 1, largest_eigenvalue(Q, Q.diagonal())
-        damped = 0.5 * largest if largest > _ROUNDED else 1.0
+        n, largest = len(Q.indptr) - 1, estimate_largest_eigenvalue(Q, Q.diagonal())
+        damped = 0.5 * largest if largest > _MAX_SPRING_EIGENVALUE else 1.0
         inverse = csr_array(dia_array((1.0 / (damped * Q.diagonal())[None, :], np.array([0])), shape=(n, n)))
         S = term = inverse
         for _ in range(sweeps - 1):
@@ -114,8 +116,8 @@ class Aggregated:
             S = csr_array(S + term)
         if sweeps % 2:
             S = csr_array(S / (1.0 + max(0.0, largest / damped - 1.0) ** sweeps))
-        self.matrix = without_zeros(S)
-        self.nonzeros: int | None = int(self.matrix.nnz)
+        self.matrix = drop_zeros(S)
+        self.num_nonzeros: int | None = int(self.matrix.nnz)
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Compute S b.
@@ -127,7 +129,7 @@ class Aggregated:
         out[:] = self.matrix @ b
 
 
-class PreparedAggregatedJacobi(Iterative):
+class PreparedAggregatedJacobi(IterativeSolver):
     """A-Jacobi, prepared for a system.
 
     Attributes:
@@ -135,38 +137,40 @@ class PreparedAggregatedJacobi(Iterative):
         residual_solver: computes the residual at p by one local-global iteration; it has no other use.
     """
 
-    def __init__(self, base: PreparedLocalGlobal, measure: Idle, objective: Objective) -> None:
-        self.base, self.measure, self.objective = base, measure, objective
-        self.choice = f"{base.choice}; for the residual alone {measure.choice}"
-        self.facts = base.facts
+    def __init__(self, base: PreparedLocalGlobal, measure: ContactFreeSolver, objective: FixedObjective) -> None:
+        self.local_global, self.residual_solver, self.fixed_objective = base, measure, objective
+        self.description = f"{base.description}; for the residual alone {measure.description}"
+        self.stats = base.stats
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        return _Iterating(self, problem, guess)
+        return _AggregatedJacobiState(self, problem, initial_guess)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """Return the residual [J^(1/2)] at positions p (n, 3) [m]."""
-        return self.measure.gauge(problem)(p)
+        return self.residual_solver.build_residual(problem)(p)
 
-    def scale(self, problem: StepProblem) -> float:
+    def residual_scale(self, problem: StepProblem) -> float:
         """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
-        return self.base.scale(problem)
+        return self.local_global.residual_scale(problem)
 
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """Return the gradient and the product with S as callables, at the initial guess."""
-        step = StepObjective(self.objective, problem)
-        p = step.placed(problem.first_guess)
+        step = StepObjective(self.fixed_objective, problem)
+        p = step.apply_exact_pins(problem.initial_guess)
         gradient, out = step.gradient(p), np.zeros_like(p)
-        return {"local": lambda: step.gradient(p), "global": lambda: self.base.correction(gradient, out)}
+        return {"local": lambda: step.gradient(p), "global": lambda: self.local_global.solve_correction(gradient, out)}
 
 
-class _Iterating(Interpreted):
+class _AggregatedJacobiState(InterpretedState):
     """State of an A-Jacobi solve; the residual is measured with the factor of Q."""
 
     def __init__(self, prepared: PreparedAggregatedJacobi, problem: StepProblem, guess: Positions) -> None:
-        super().__init__(prepared.base, _SCHEME, StepObjective(prepared.objective, problem), guess)
-        self._gauge = prepared.measure.gauge(problem)
+        super().__init__(
+            prepared.local_global, _A_JACOBI_SCHEME, StepObjective(prepared.fixed_objective, problem), guess
+        )
+        self._compute_residual = prepared.residual_solver.build_residual(problem)
 
     def residual(self) -> float:
         """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
-        return self._gauge(self.positions)
+        return self._compute_residual(self.positions)

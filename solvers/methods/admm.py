@@ -25,17 +25,17 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.about import About, Reference
-from solvers.core.driver import Iterating, Iterative
-from solvers.core.fixed_objective import Objective
+from solvers.about import Citation, SolverInfo
+from solvers.core.driver import IterativeSolver, SolverState
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
-from solvers.core.prefactored import PreparedLocalGlobal, prepared, projective
-from solvers.energies.edges import Edges
+from solvers.core.prefactored import PreparedLocalGlobal, prepare_local_global, require_projective
+from solvers.energies.edges import EdgeEnergy
 from solvers.energies.quadratic import Quadratic
 from solvers.energies.springs import Springs
 from solvers.energies.strain_limits import StrainLimits
 from solvers.kernels import admm as kernels
-from solvers.linear.choice import factorise
+from solvers.linear.choice import build_linear_solver
 from solvers.problem import Energy, Positions, StepProblem, System, Unsupported, is_lagged
 
 
@@ -47,11 +47,11 @@ class Admm:
         weight: W, relative to the stiffness of each edge.
     """
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = False
-    about: ClassVar[About] = About(
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = False
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "accelerated local-global",
-        Reference(
+        Citation(
             "Overby, Matthew and Brown, George E. and Li, Jie and Narain, Rahul",
             2017,
             "ADMM ⊇ Projective Dynamics: Fast Simulation of Hyperelastic Models with Dynamic Constraints",
@@ -79,16 +79,20 @@ class Admm:
                 f"admm: projects springs and strain limits, and solves for quadratic forms; the scene has "
                 f"{', '.join(sorted(others))} as well"
             )
-        energies = projective(system, "admm")
-        weighted = [replace(e, stiffness=self.weight * e.stiffness) if isinstance(e, Edges) else e for e in energies]
-        base = measure = prepared(system, weighted, lambda Q: factorise(Q))
+        energies = require_projective(system, "admm")
+        weighted = [
+            replace(e, stiffness=self.weight * e.stiffness) if isinstance(e, EdgeEnergy) else e for e in energies
+        ]
+        base = measure = prepare_local_global(system, weighted, lambda Q: build_linear_solver(Q))
         if self.weight != 1.0:
-            measure = prepared(system, energies, lambda Q: factorise(Q))
-        return PreparedAdmm(base, measure, Objective(system), _Projected.of(system.energies), self.weight)
+            measure = prepare_local_global(system, energies, lambda Q: build_linear_solver(Q))
+        return PreparedAdmm(
+            base, measure, FixedObjective(system), _ProjectedEdges.from_energies(system.energies), self.weight
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class _Projected:
+class _ProjectedEdges:
     """Edges of all springs and strain limits, with the lengths of zero energy.
 
     Attributes:
@@ -100,24 +104,24 @@ class _Projected:
 
     edges: NDArray[np.int64]
     stiffness: NDArray[np.float64]
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
+    min_length: NDArray[np.float64]
+    max_length: NDArray[np.float64]
     rest_direction: NDArray[np.float64]
 
     @classmethod
-    def of(cls, energies: Sequence[Energy]) -> _Projected:
-        springs = Springs.joined([energy for energy in energies if isinstance(energy, Springs)])
+    def from_energies(cls, energies: Sequence[Energy]) -> _ProjectedEdges:
+        springs = Springs.from_parts([energy for energy in energies if isinstance(energy, Springs)])
         limits = [energy for energy in energies if isinstance(energy, StrainLimits)]
         return cls(
             np.concatenate([springs.edges, *(e.edges for e in limits)]),
             np.concatenate([springs.stiffness, *(e.stiffness for e in limits)]),
-            np.concatenate([springs.rest_length, *(e.low for e in limits)]),
-            np.concatenate([springs.rest_length, *(e.high for e in limits)]),
+            np.concatenate([springs.rest_length, *(e.min_length for e in limits)]),
+            np.concatenate([springs.rest_length, *(e.max_length for e in limits)]),
             np.concatenate([springs.rest_direction, *(e.rest_direction for e in limits)]),
         )
 
 
-class PreparedAdmm(Iterative):
+class PreparedAdmm(IterativeSolver):
     """ADMM, prepared for a system.
 
     Attributes:
@@ -129,48 +133,69 @@ class PreparedAdmm(Iterative):
         self,
         base: PreparedLocalGlobal,
         measure: PreparedLocalGlobal,
-        objective: Objective,
-        edges: _Projected,
+        objective: FixedObjective,
+        edges: _ProjectedEdges,
         weight: float,
     ) -> None:
-        self.base, self.measure, self.objective, self.edges, self.weight = base, measure, objective, edges, weight
-        self.choice, self.facts = base.choice, base.facts
+        self.local_global, self.residual_metric, self.fixed_objective, self.projected_edges, self.weight = (
+            base,
+            measure,
+            objective,
+            edges,
+            weight,
+        )
+        self.description, self.stats = base.description, base.stats
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        return _Iterating(self, problem, guess)
+        return _AdmmState(self, problem, initial_guess)
 
-    def scale(self, problem: StepProblem) -> float:
+    def residual_scale(self, problem: StepProblem) -> float:
         """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
-        return self.measure.scale(problem)
+        return self.residual_metric.residual_scale(problem)
 
 
-class _Iterating(Iterating):
+class _AdmmState(SolverState):
     """State of an ADMM solve: positions and scaled dual variables.
 
     The scaled dual variable u (m, 3) [m] has a row per edge.
     """
 
     def __init__(self, prepared: PreparedAdmm, problem: StepProblem, guess: Positions) -> None:
-        self._base, self._measure, edges = prepared.base, prepared.measure, prepared.edges
+        self._local_global, self._residual_metric, edges = (
+            prepared.local_global,
+            prepared.residual_metric,
+            prepared.projected_edges,
+        )
         if any(isinstance(energy, StrainLimits) and is_lagged(energy) for energy in problem.system.energies):
-            edges = _Projected.of(problem.energies)
-        self._edges = edges.edges, edges.stiffness, edges.low, edges.high, edges.rest_direction, prepared.weight
-        self._step = StepObjective(prepared.objective, problem)
-        self._constant = self._base.constant(problem)
+            edges = _ProjectedEdges.from_energies(problem.energies)
+        self._edges = (
+            edges.edges,
+            edges.stiffness,
+            edges.min_length,
+            edges.max_length,
+            edges.rest_direction,
+            prepared.weight,
+        )
+        self._step = StepObjective(prepared.fixed_objective, problem)
+        self._constant_term = self._local_global.constant_right_hand_side(problem)
         for energy in problem.energies:
             if isinstance(energy, Quadratic):
-                energy.add_projection(problem.target, self._constant)
-        self.positions = self._base.placed(guess, problem)
-        self._right, self._u = np.empty_like(self.positions), np.zeros((len(edges.edges), 3))
+                energy.add_projection(problem.inertial_target, self._constant_term)
+        self.positions = self._local_global.apply_exact_pins(guess, problem)
+        self._right_hand_side, self._scaled_dual = np.empty_like(self.positions), np.zeros((len(edges.edges), 3))
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents any further change."""
-        kernels.project(*self._edges, self.positions, self._constant, self._u, self._right)
-        self._base.correction(self._right, self.positions)
+        kernels.run_local_step(
+            *self._edges, self.positions, self._constant_term, self._scaled_dual, self._right_hand_side
+        )
+        self._local_global.solve_correction(self._right_hand_side, self.positions)
         return True
 
     def residual(self) -> float:
         """Return the residual; costs a gradient and a solve in addition to those of the iteration."""
         gradient = self._step.gradient(self.positions)
-        return self._measure.residual(self._measure.correction(gradient, np.zeros_like(gradient)))
+        return self._residual_metric.correction_residual(
+            self._residual_metric.solve_correction(gradient, np.zeros_like(gradient))
+        )

@@ -15,15 +15,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from solvers.about import About, Reference
-from solvers.core.acceleration import Scheme
-from solvers.kernels.accelerate_coefficients import ANDERSON
-from solvers.methods.quasi_newton import PreparedAccelerated, Windowed, prepare
+from solvers.about import Citation, SolverInfo
+from solvers.core.acceleration import AccelerationScheme
+from solvers.kernels.accelerate_coefficients import ANDERSON_RULE
+from solvers.methods.quasi_newton import PreparedAccelerated, WindowedAcceleration, prepare_accelerated
 from solvers.problem import System
 
 
 @dataclass(frozen=True)
-class Anderson(Windowed):
+class Anderson(WindowedAcceleration):
     """Anderson acceleration.
 
     Args:
@@ -32,9 +32,9 @@ class Anderson(Windowed):
         precision: floating-point type of its stored entries.
     """
 
-    about: ClassVar[About] = About(
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "accelerated local-global",
-        Reference(
+        Citation(
             "Peng, Yue and Deng, Bailin and Zhang, Juyong and Geng, Fanyu and Qin, Wenjie and Liu, Ligang",
             2018,
             "Anderson acceleration for geometry optimization and physics simulation",
@@ -49,4 +49,6 @@ class Anderson(Windowed):
             Unsupported: if an energy is neither projective nor contact.
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
-        return prepare(system, Scheme("anderson", ANDERSON, self.pairs, 0, True), self.linear, self.precision)
+        return prepare_accelerated(
+            system, AccelerationScheme("anderson", ANDERSON_RULE, self.pairs, 0, True), self.linear, self.precision
+        )

@@ -35,22 +35,28 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.about import About, Reference
-from solvers.core.bounds import is_bounded
-from solvers.core.driver import Iterating, Iterative
-from solvers.core.multipliers import Multipliers
-from solvers.energies.augmented import Augmented, augmented, joined, off, penalties
+from solvers.about import Citation, SolverInfo
+from solvers.core.bounds import is_barrier_energy
+from solvers.core.driver import IterativeSolver, SolverState
+from solvers.core.multipliers import LagrangeMultipliers
+from solvers.energies.augmented import (
+    AugmentedLagrangian,
+    build_augmented_system,
+    compute_penalty_stiffness,
+    concatenate_constraints,
+    length_errors,
+)
 from solvers.energies.springs import Springs
-from solvers.held import Lengths
+from solvers.held import LengthConstraints
 from solvers.kernels import avbd as kernels
 from solvers.kernels import loop
-from solvers.kernels.loop import Limits
+from solvers.kernels.loop import LoopLimits
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.methods.vbd import PreparedVertexBlockDescent, Sweeps, VertexBlockDescent
-from solvers.problem import Positions, Prepared, StepProblem, System, Unsupported
+from solvers.methods.vbd import PreparedVertexBlockDescent, SweepState, VertexBlockDescent
+from solvers.problem import Positions, PreparedSolver, StepProblem, System, Unsupported
 
 if TYPE_CHECKING:
-    from solvers.contact.local_global import Idle
+    from solvers.contact.local_global import ContactFreeSolver
 
 
 @dataclass(frozen=True)
@@ -67,12 +73,12 @@ class AugmentedVertexBlockDescent:
         spectral_radius: as in `VertexBlockDescent`, used if nothing is constrained or ramped.
     """
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = False
-    keeps_lengths: ClassVar[bool] = True
-    about: ClassVar[About] = About(
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = False
+    supports_length_constraints: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "vertex block descent",
-        Reference(
+        Citation(
             "Giles, Chris and Diaz, Elie and Yuksel, Cem",
             2025,
             "Augmented vertex block descent",
@@ -95,7 +101,7 @@ class AugmentedVertexBlockDescent:
                 raise ValueError(f"{name}: should be {wanted}, not {came}")
         VertexBlockDescent(self.spectral_radius)
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:
@@ -103,30 +109,32 @@ class AugmentedVertexBlockDescent:
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
         usual = VertexBlockDescent(self.spectral_radius)
-        if not (system.lengths or self.softened):
+        if not (system.length_constraints or self.softened):
             return usual.prepare(system)
-        if any(map(is_bounded, system.energies)):
+        if any(map(is_barrier_energy, system.energies)):
             raise Unsupported(
                 "avbd: does not support surface contact together with length constraints; remove self-contact and "
                 "surface-contact, or give springs and strain limits a numerical stiffness"
             )
-        edges, energies, k = joined(system.lengths), system.energies, np.empty(0)
+        edges, energies, k = concatenate_constraints(system.length_constraints), system.energies, np.empty(0)
         if self.softened:
-            springs = Springs.joined([energy for energy in energies if isinstance(energy, Springs)])
+            springs = Springs.from_parts([energy for energy in energies if isinstance(energy, Springs)])
             energies = tuple(energy for energy in energies if not isinstance(energy, Springs))
             r, k = springs.rest_length, springs.stiffness
-            edges = joined([edges, Lengths(springs.edges, r, r, springs.rest_direction)])
-        exact = np.arange(len(edges.low)) < len(edges.low) - len(k)
+            edges = concatenate_constraints([edges, LengthConstraints(springs.edges, r, r, springs.rest_direction)])
+        exact = np.arange(len(edges.min_length)) < len(edges.min_length) - len(k)
         bare = replace(system, energies=energies)
-        least = penalties(bare, edges)
+        least = compute_penalty_stiffness(bare, edges)
         most = np.concatenate([self.bound * least[exact], k])
         least = np.minimum(least, most)
-        made = usual.prepare(augmented(bare, edges, least, np.zeros(len(least))))
-        return PreparedAugmented(system, cast(PreparedVertexBlockDescent, made), self, edges, least, most, exact)
+        made = usual.prepare(build_augmented_system(bare, edges, least, np.zeros(len(least))))
+        return PreparedAugmentedVertexBlockDescent(
+            system, cast(PreparedVertexBlockDescent, made), self, edges, least, most, exact
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedAugmented(Iterative):
+class PreparedAugmentedVertexBlockDescent(IterativeSolver):
     """AVBD, prepared for a system.
 
     Attributes:
@@ -136,40 +144,44 @@ class PreparedAugmented(Iterative):
         exact_mask: (m,), whether an edge is constrained.
     """
 
-    keeps_lengths: ClassVar[bool] = True
+    supports_length_constraints: ClassVar[bool] = True
 
     system: System
-    made: PreparedVertexBlockDescent
-    method: AugmentedVertexBlockDescent
-    edges: Lengths
-    least: NDArray[np.float64]
-    most: NDArray[np.float64]
-    exact: NDArray[np.bool_]
+    vertex_block_descent: PreparedVertexBlockDescent
+    parameters: AugmentedVertexBlockDescent
+    augmented_edges: LengthConstraints
+    min_stiffness: NDArray[np.float64]
+    max_stiffness: NDArray[np.float64]
+    exact_mask: NDArray[np.bool_]
 
     @cached_property
-    def multipliers(self) -> Multipliers:
+    def least_squares_multipliers(self) -> LagrangeMultipliers:
         """Return the least-squares multipliers of the length constraints."""
-        return Multipliers(self._with(np.zeros(len(self.least))), self._exact_lengths, self.least[self.exact])
+        return LagrangeMultipliers(
+            self._augment_system(np.zeros(len(self.min_stiffness))),
+            self._exact_lengths,
+            self.min_stiffness[self.exact_mask],
+        )
 
     @property
-    def choice(self) -> str:
+    def description(self) -> str:
         """Description of the prepared solver."""
-        return self.made.choice
+        return self.vertex_block_descent.description
 
     @property
-    def facts(self) -> dict[str, float]:
+    def stats(self) -> dict[str, float]:
         """Exact counts of the prepared data."""
-        return self.made.facts
+        return self.vertex_block_descent.stats
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        return Augmenting(self, problem, guess)
+        return AugmentedSweepState(self, problem, initial_guess)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """Return the residual [J^(1/2)] at positions p (n, 3) with zero tensions."""
-        return self.residual(problem, p, np.zeros(len(self.least)))
+        return self.augmented_residual(problem, p, np.zeros(len(self.min_stiffness)))
 
-    def residual(self, problem: StepProblem, p: Positions, tension: NDArray[np.float64]) -> float:
+    def augmented_residual(self, problem: StepProblem, p: Positions, tension: NDArray[np.float64]) -> float:
         """Return |Q^-1 grad L|_Q [J^(1/2)] of the augmented Lagrangian.
 
         Args:
@@ -180,97 +192,103 @@ class PreparedAugmented(Iterative):
         Returns:
             The residual of L with the initial stiffnesses, which are part of Q.
         """
-        return self._gauge.gauge(replace(problem, system=self._with(tension)))(p)
+        return self._residual_solver.build_residual(replace(problem, system=self._augment_system(tension)))(p)
 
-    def _with(self, tension: NDArray[np.float64]) -> System:
+    def _augment_system(self, tension: NDArray[np.float64]) -> System:
         """Return the system of L: the constrained lengths and the other energies."""
-        exact = self.exact
-        return augmented(self.system, self._exact_lengths, self.least[exact], tension[exact])
+        exact = self.exact_mask
+        return build_augmented_system(self.system, self._exact_lengths, self.min_stiffness[exact], tension[exact])
 
     @cached_property
-    def _exact_lengths(self) -> Lengths:
-        e, exact = self.edges, self.exact
-        return Lengths(e.edges[exact], e.low[exact], e.high[exact], e.rest_direction[exact])
+    def _exact_lengths(self) -> LengthConstraints:
+        e, exact = self.augmented_edges, self.exact_mask
+        return LengthConstraints(e.edges[exact], e.min_length[exact], e.max_length[exact], e.rest_direction[exact])
 
     @cached_property
-    def _gauge(self) -> Idle:
+    def _residual_solver(self) -> ContactFreeSolver:
         """Return the residual solver: that of `VertexBlockDescent`, or with full spring stiffness if ramped."""
-        if self.exact.all():
-            return self.made.measure
-        return cast("Idle", CompiledLocalGlobal().prepare(self._with(np.zeros(len(self.least)))))
+        if self.exact_mask.all():
+            return self.vertex_block_descent.residual_solver
+        return cast(
+            "ContactFreeSolver", CompiledLocalGlobal().prepare(self._augment_system(np.zeros(len(self.min_stiffness))))
+        )
 
 
-class Augmenting(Sweeps):
+class AugmentedSweepState(SweepState):
     """State of an AVBD solve: sweeps and dual updates of one step problem."""
 
-    def __init__(self, prepared: PreparedAugmented, problem: StepProblem, guess: Positions) -> None:
-        made, method, edges = prepared.made, prepared.method, prepared.edges
+    def __init__(self, prepared: PreparedAugmentedVertexBlockDescent, problem: StepProblem, guess: Positions) -> None:
+        made, method, edges = prepared.vertex_block_descent, prepared.parameters, prepared.augmented_edges
         super().__init__(made, replace(problem, system=made.system), guess)
-        self._augmented, self._problem = prepared, problem
-        kept = problem.start.kept
-        begun = np.zeros((len(prepared.least), 2)) if kept is None else method.decay * kept
-        past = method.stabilisation * np.where(prepared.exact, off(edges, problem.start.positions), 0.0)
-        base = np.ones(made.system.vertices + 2)
-        first = cast(Augmented, made.system.energies[-1])
-        base[made.row] = made.majorant - first.stiffness_matrix(made.system.vertices).diagonal()
-        self._duals = kernels.Duals(
-            edges.low + past,
-            edges.high + past,
-            prepared.exact,
-            method.ramp * prepared.least / np.where(edges.high > 0.0, edges.high, 1.0),
-            prepared.most,
-            prepared.most * edges.high,
-            np.clip(begun[:, 1], prepared.least, prepared.most),
-            np.where(prepared.exact, begun[:, 0], 0.0),
+        self._augmented_solver, self._problem = prepared, problem
+        kept = problem.step_start.warm_start
+        begun = np.zeros((len(prepared.min_stiffness), 2)) if kept is None else method.decay * kept
+        past = method.stabilisation * np.where(
+            prepared.exact_mask, length_errors(edges, problem.step_start.positions), 0.0
+        )
+        base = np.ones(made.system.num_vertices + 2)
+        first = cast(AugmentedLagrangian, made.system.energies[-1])
+        base[made.row_of_vertex] = made.hessian_majorant - first.stiffness_matrix(made.system.num_vertices).diagonal()
+        self._duals = kernels.DualState(
+            edges.min_length + past,
+            edges.max_length + past,
+            prepared.exact_mask,
+            method.ramp * prepared.min_stiffness / np.where(edges.max_length > 0.0, edges.max_length, 1.0),
+            prepared.max_stiffness,
+            prepared.max_stiffness * edges.max_length,
+            np.clip(begun[:, 1], prepared.min_stiffness, prepared.max_stiffness),
+            np.where(prepared.exact_mask, begun[:, 0], 0.0),
             base,
             np.empty_like(base),
         )
-        *others, hard = cast(tuple[Any, ...], self._beside)
-        self._hard = hard._replace(numbers=hard.numbers.copy())
-        self._beside = (*others, self._hard)
-        self._blocks = self._blocks._replace(majorant=self._blocks.majorant.copy())
-        self._kernel = kernels.augmenting(made.beside.kernel)
-        kernels.place(self._blocks, self._hard, self._duals, self._rows)
+        *others, hard = cast(tuple[Any, ...], self._element_data)
+        self._constraint_elements = hard._replace(numbers=hard.numbers.copy())
+        self._element_data = (*others, self._constraint_elements)
+        self._colour_packets = self._colour_packets._replace(majorant=self._colour_packets.majorant.copy())
+        self._kernel = kernels.build_augmented_iteration(made.vertex_elements.iteration_kernel)
+        kernels.write_edge_parameters(self._colour_packets, self._constraint_elements, self._duals, self._rows)
 
     @property
-    def kept(self) -> NDArray[np.float64]:
+    def warm_start(self) -> NDArray[np.float64]:
         """Tensions [N] and stiffnesses [N/m], (m, 2), for the warm start of the next step."""
         return np.column_stack([self._duals.tension, self._duals.stiffness])
 
     def residual(self) -> float:
         """Return the residual with the current tensions; it may be small while lengths are wrong."""
-        return self._augmented.residual(self._problem, self.positions, self._duals.tension)
+        return self._augmented_solver.augmented_residual(self._problem, self.positions, self._duals.tension)
 
-    def residual_of_step(self) -> float:
+    def constrained_residual(self) -> float:
         """Return the residual [J^(1/2)] with least-squares multipliers, which includes length errors."""
         if not np.isfinite(self.positions).all():
             return self.residual()
-        tension = np.zeros(len(self._duals.exact))
-        tension[self._duals.exact] = self._augmented.multipliers.at(self._problem, self.positions)
-        return self._augmented.residual(self._problem, self.positions, tension)
+        tension = np.zeros(len(self._duals.exact_mask))
+        tension[self._duals.exact_mask] = self._augmented_solver.least_squares_multipliers.multipliers_at(
+            self._problem, self.positions
+        )
+        return self._augmented_solver.augmented_residual(self._problem, self.positions, tension)
 
-    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Run iterations within the limits; the returned residual is `constrained_residual`.
 
         `constrained_residual` requires a factorisation. It is evaluated once the residual with the method's own
         tensions is small enough, and again each time the number of iterations has grown by half since.
         """
-        count, residual, ended = super().iterate(limits)
-        if limits.wanted == loop.NEVER or not self._duals.exact.any():
+        count, residual, ended = super().run_iterations(limits)
+        if limits.residual_mode == loop.RESIDUAL_NEVER or not self._duals.exact_mask.any():
             return count, residual, ended
-        residual, since = self.residual_of_step(), 0
-        while ended == loop.TOLERANCE and not residual <= limits.limit:
-            some = min(1 + since // 2, limits.iterations - count)
+        residual, since = self.constrained_residual(), 0
+        while ended == loop.REASON_TOLERANCE and not residual <= limits.residual_limit:
+            some = min(1 + since // 2, limits.max_iterations - count)
             if some == 0:
-                return count, residual, loop.ITERATIONS
-            self.sweep(some)
-            count, since, residual = count + some, since + some, self.residual_of_step()
+                return count, residual, loop.REASON_ITERATIONS
+            self.run_sweeps(some)
+            count, since, residual = count + some, since + some, self.constrained_residual()
         return count, residual, ended
 
-    def sweep(self, iterations: int) -> None:
+    def run_sweeps(self, num_iterations: int) -> None:
         """Run sweeps, each followed by a dual update."""
         self._kernel(
-            self._blocks, self._spaces, self._beside, self._right,
-            self._work, self._rows, iterations, self._hard, self._duals,
+            self._colour_packets, self._half_spaces, self._element_data, self._right_hand_side,
+            self._sweep_scratch, self._rows, num_iterations, self._constraint_elements, self._duals,
         )  # fmt: skip
-        self.positions = self._rows.reshape(-1, 4)[self._prepared.row, :3].copy()
+        self.positions = self._rows.reshape(-1, 4)[self._prepared.row_of_vertex, :3].copy()

@@ -22,11 +22,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from solvers.about import About, Reference
-from solvers.core.acceleration import Scheme
-from solvers.kernels.accelerate_coefficients import CHEBYSHEV
-from solvers.linear.choice import Linear, Precision
-from solvers.methods.quasi_newton import PreparedAccelerated, prepare
+from solvers.about import Citation, SolverInfo
+from solvers.core.acceleration import AccelerationScheme
+from solvers.kernels.accelerate_coefficients import CHEBYSHEV_RULE
+from solvers.linear.choice import LinearSolverName, Precision
+from solvers.methods.quasi_newton import PreparedAccelerated, prepare_accelerated
 from solvers.problem import System
 
 
@@ -39,11 +39,11 @@ class Chebyshev:
         precision: floating-point type of its stored entries.
     """
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
-    about: ClassVar[About] = About(
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "accelerated local-global",
-        Reference(
+        Citation(
             "Wang, Huamin",
             2015,
             "A Chebyshev semi-iterative approach for accelerating projective and position-based dynamics",
@@ -51,7 +51,7 @@ class Chebyshev:
         ),
     )
 
-    linear: Linear = "auto"
+    linear: LinearSolverName = "auto"
     precision: Precision = "float64"
 
     def prepare(self, system: System) -> PreparedAccelerated:
@@ -61,4 +61,6 @@ class Chebyshev:
             Unsupported: if an energy is neither projective nor contact.
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
-        return prepare(system, Scheme("chebyshev", CHEBYSHEV, 1, 0, True), self.linear, self.precision)
+        return prepare_accelerated(
+            system, AccelerationScheme("chebyshev", CHEBYSHEV_RULE, 1, 0, True), self.linear, self.precision
+        )

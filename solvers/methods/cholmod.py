@@ -9,22 +9,22 @@ from ctypes import c_int64
 from dataclasses import dataclass
 from typing import ClassVar
 
-from solvers.about import LIU_2013, LOCAL_GLOBAL, About
+from solvers.about import LIU_2013, LOCAL_GLOBAL_FAMILY, SolverInfo
 from solvers.core import native
-from solvers.core.prefactored import Iterations, PreparedLocalGlobal, only_springs
-from solvers.kernels.loop import EACH, ITERATIONS, Limits
+from solvers.core.prefactored import LocalGlobalState, PreparedLocalGlobal, require_only_springs
+from solvers.kernels.loop import REASON_ITERATIONS, RESIDUAL_EACH, LoopLimits
 from solvers.problem import Positions, StepProblem, System
 
-NEEDS = "CHOLMOD (Debian: libsuitesparse-dev) and C++17"
+CHOLMOD_REQUIREMENTS = "CHOLMOD (Debian: libsuitesparse-dev) and C++17"
 
 
 @dataclass(frozen=True)
 class CholmodLocalGlobal:
     """Local-global in C++ for springs: one loop over springs, and solves with CHOLMOD's simplicial factor."""
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
-    about: ClassVar[About] = About(LOCAL_GLOBAL, LIU_2013)
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(LOCAL_GLOBAL_FAMILY, LIU_2013)
 
     def prepare(self, system: System) -> PreparedCholmod:
         """Prepare the method for a system.
@@ -33,28 +33,28 @@ class CholmodLocalGlobal:
             Unsupported: for energies other than springs, and if no C++ compiler is available.
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
-        springs = only_springs(system, "cholmod")
-        library = native.library(native.HEADERS / "cholmod.cpp", NEEDS, ["-lcholmod"])
-        compiled = native.Native(library, system, springs)
-        return native.prepared(PreparedCholmod, system, springs, compiled, "CHOLMOD's simplicial factor")
+        springs = require_only_springs(system, "cholmod")
+        library = native.load_library(native.HEADER_FOLDER / "cholmod.cpp", CHOLMOD_REQUIREMENTS, ["-lcholmod"])
+        compiled = native.CppBackend(library, system, springs)
+        return native.prepare_cpp_backend(PreparedCholmod, system, springs, compiled, "CHOLMOD's simplicial factor")
 
 
 class PreparedCholmod(PreparedLocalGlobal):
     """CHOLMOD local-global, prepared; iterations without residual checks stay in C++."""
 
-    def begin(self, problem: StepProblem, guess: Positions) -> _Iterations:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> _CholmodState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        return _Iterations(self, problem, guess)
+        return _CholmodState(self, problem, initial_guess)
 
 
-class _Iterations(Iterations):
-    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+class _CholmodState(LocalGlobalState):
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Run iterations within the limits; return their number, the residual and the reason of the end."""
-        if limits.wanted == EACH or limits.iterations < 2:
-            return super().iterate(limits)
+        if limits.residual_mode == RESIDUAL_EACH or limits.max_iterations < 2:
+            return super().run_iterations(limits)
         compiled = self.base.factor
-        assert isinstance(compiled, native.Native)
-        given = map(native.address, (self.positions, self.constant))
-        compiled.library.iterate(compiled.made, c_int64(limits.iterations - 1), *given)
-        count, residual, _ = super().iterate(limits._replace(iterations=1))
-        return limits.iterations - 1 + count, residual, ITERATIONS
+        assert isinstance(compiled, native.CppBackend)
+        given = map(native.array_address, (self.positions, self.right_hand_side))
+        compiled.library.iterate(compiled.handle, c_int64(limits.max_iterations - 1), *given)
+        count, residual, _ = super().run_iterations(limits._replace(max_iterations=1))
+        return limits.max_iterations - 1 + count, residual, REASON_ITERATIONS

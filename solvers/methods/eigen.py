@@ -5,21 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from solvers.about import LIU_2013, LOCAL_GLOBAL, About
+from solvers.about import LIU_2013, LOCAL_GLOBAL_FAMILY, SolverInfo
 from solvers.core import native
-from solvers.core.prefactored import PreparedLocalGlobal, only_springs
+from solvers.core.prefactored import PreparedLocalGlobal, require_only_springs
 from solvers.problem import System
 
-NEEDS = "Eigen 3.4 (Debian: libeigen3-dev) and C++17"
+EIGEN_REQUIREMENTS = "Eigen 3.4 (Debian: libeigen3-dev) and C++17"
 
 
 @dataclass(frozen=True)
 class EigenLocalGlobal:
     """Local-global in C++ for springs, with Eigen's sparse matrices and SimplicialLLT."""
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
-    about: ClassVar[About] = About(LOCAL_GLOBAL, LIU_2013)
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(LOCAL_GLOBAL_FAMILY, LIU_2013)
 
     def prepare(self, system: System) -> PreparedLocalGlobal:
         """Prepare the method for a system.
@@ -28,6 +28,8 @@ class EigenLocalGlobal:
             Unsupported: for energies other than springs, and if no C++ compiler is available.
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
-        springs = only_springs(system, "eigen")
-        compiled = native.Native(native.library(native.HEADERS / "eigen.cpp", NEEDS), system, springs)
-        return native.prepared(PreparedLocalGlobal, system, springs, compiled, "Eigen's SimplicialLLT")
+        springs = require_only_springs(system, "eigen")
+        compiled = native.CppBackend(
+            native.load_library(native.HEADER_FOLDER / "eigen.cpp", EIGEN_REQUIREMENTS), system, springs
+        )
+        return native.prepare_cpp_backend(PreparedLocalGlobal, system, springs, compiled, "Eigen's SimplicialLLT")

@@ -17,47 +17,54 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.about import About, Reference
+from solvers.about import Citation, SolverInfo
 from solvers.core import vertex_terms
-from solvers.core.driver import Iterating, Iterative
+from solvers.core.driver import IterativeSolver, SolverState
 from solvers.core.explicit_tables import (
     BLANES_MOAN_4,
     BLANES_MOAN_6,
     RUNGE_KUTTA_4,
     TSITOURAS_5,
-    VERLET,
-    Composition,
-    Tableau,
-    dormand_prince_8,
-    in_time,
-    most_steps,
+    VELOCITY_VERLET,
+    ExplicitTableau,
+    SplittingMethod,
+    build_dormand_prince_8,
+    compute_max_steps,
+    integrate_drag,
 )
-from solvers.core.forces import ForceParts, Whole, frequency, rows_of_four
-from solvers.core.substeps import Substepping, Substeps
-from solvers.kernels.explicit_steps import Coefficients, Forces, Scratch, Subdivision, compose, integrate
-from solvers.problem import Positions, Prepared, StepProblem, System, Unsupported
+from solvers.core.forces import ExplicitForces, SingleIterateState, estimate_max_frequency, pad_rows
+from solvers.core.substeps import PreparedSubstepping, SubstepChoice
+from solvers.kernels.explicit_steps import (
+    AdaptiveSteps,
+    FrameForces,
+    StageScratch,
+    TableauCoefficients,
+    integrate_adaptive,
+    run_splitting,
+)
+from solvers.problem import Positions, PreparedSolver, StepProblem, System, Unsupported
 
-_SAFETY = 0.95
+_STABILITY_SAFETY = 0.95
 """Fraction of the stability limit: at the limit a vibration neither grows nor decays, and springs are nonlinear."""
 
-_MOST = 1e9
+_MAX_SPRING_EVALUATIONS = 1e9
 """Maximum number of spring evaluations in a step, some seconds: compiled code cannot be interrupted meanwhile."""
 
 
 @dataclass(frozen=True)
-class Explicit:
+class ExplicitSolver:
     """Base class of the explicit solvers."""
 
-    minimises: ClassVar[bool] = False
-    descends: ClassVar[bool] = False
-    name: ClassVar[str]
-    coefficients: ClassVar[Composition | Tableau]
+    is_minimiser: ClassVar[bool] = False
+    is_monotone: ClassVar[bool] = False
+    solver_name: ClassVar[str]
+    coefficients: ClassVar[SplittingMethod | ExplicitTableau]
 
-    def method(self) -> Composition | Tableau:
+    def build_coefficients(self) -> SplittingMethod | ExplicitTableau:
         """Return the coefficients of the method."""
         return self.coefficients
 
-    def _prepared(self, system: System, substeps: int, error: float) -> Prepared:
+    def _prepare_explicit(self, system: System, substeps: int, error: float) -> PreparedSolver:
         """Prepare the method for a system.
 
         Args:
@@ -65,18 +72,18 @@ class Explicit:
             substeps: multiple of the smallest stable number of substeps.
             error: tolerance relative to the mean spring length, 0 for fixed substeps.
         """
-        vertex_terms.require_implicit_euler(system, self.name)
-        vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), self.name)
-        method, parts = self.method(), ForceParts.of(system, self.name)
-        omega = frequency(system)
-        rate = omega + float(parts.drag.max(initial=0.0))
-        needed = substeps * max(1.0, ceil(system.time_step * rate / (_SAFETY * method.limit)))
-        if needed * method.evaluations * max(1, len(parts.springs.edges)) > _MOST:
+        vertex_terms.require_implicit_euler(system, self.solver_name)
+        vertex_terms.require_mass(system, np.where(system.unpinned_mask, system.mass, np.inf), self.solver_name)
+        method, parts = self.build_coefficients(), ExplicitForces.from_system(system, self.solver_name)
+        omega = estimate_max_frequency(system)
+        rate = omega + float(parts.drag_rate.max(initial=0.0))
+        needed = substeps * max(1.0, ceil(system.time_step * rate / (_STABILITY_SAFETY * method.stability_limit)))
+        if needed * method.num_evaluations * max(1, len(parts.springs.edges)) > _MAX_SPRING_EVALUATIONS:
             raise Unsupported(
-                f"{self.name}: is stable with {needed:.3g} substeps a step of {method.evaluations} evaluations, which "
-                f"for {len(parts.springs.edges)} springs are beyond the {_MOST:.0e} allowed; take a shorter time step"
+                f"{self.solver_name}: is stable with {needed:.3g} substeps a step of {method.num_evaluations} evaluations, which "
+                f"for {len(parts.springs.edges)} springs are beyond the {_MAX_SPRING_EVALUATIONS:.0e} allowed; take a shorter time step"
             )
-        soft = int((~system.pins.exact).sum())
+        soft = int((~system.pins.exact_mask).sum())
         exact = f"; {soft} pins by penalty taken as exact" if soft else ""
         told = (
             f"steps by an error of {error:.3g}"
@@ -86,12 +93,12 @@ class Explicit:
         lengths = parts.springs.rest_length
         tolerance = error * (float(lengths.mean()) if len(lengths) else 1.0)
         choice = f"{told}, for vibrations of at most {omega:.3g} rad/s{exact}"
-        taken = Substeps(int(needed), tolerance, rate, choice)
+        taken = SubstepChoice(int(needed), tolerance, rate, choice)
         return PreparedExplicit(method, taken, system, parts)
 
 
 @dataclass(frozen=True)
-class _Fixed(Explicit):
+class _FixedStepSolver(ExplicitSolver):
     """Explicit solver with fixed substeps.
 
     Args:
@@ -100,7 +107,7 @@ class _Fixed(Explicit):
 
     refine: int = 1
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:
@@ -108,12 +115,12 @@ class _Fixed(Explicit):
                 other than `own` and implicit Euler; for unpinned vertices without mass; for too many substeps.
         """
         if not self.refine >= 1:
-            raise Unsupported(f"{self.name}: refine came as {self.refine}; wanted 1 or more")
-        return self._prepared(system, self.refine, 0.0)
+            raise Unsupported(f"{self.solver_name}: refine came as {self.refine}; wanted 1 or more")
+        return self._prepare_explicit(system, self.refine, 0.0)
 
 
 @dataclass(frozen=True)
-class _Controlled(Explicit):
+class _AdaptiveStepSolver(ExplicitSolver):
     """Explicit solver with adaptive substeps.
 
     Args:
@@ -123,120 +130,126 @@ class _Controlled(Explicit):
 
     error: float = 1e-6
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:
             Unsupported: as for fixed substeps, and for a tolerance outside [1e-14, 1].
         """
         if not 1e-14 <= self.error <= 1.0:
-            raise Unsupported(f"{self.name}: error came as {self.error}; wanted a number from 1e-14 to 1")
-        return self._prepared(system, 1, self.error)
+            raise Unsupported(f"{self.solver_name}: error came as {self.error}; wanted a number from 1e-14 to 1")
+        return self._prepare_explicit(system, 1, self.error)
 
 
-def _about(authors: str, year: int, title: str, doi: str = "", *, even: bool = False) -> About:
-    return About("explicit", Reference(authors, year, title, doi), own_steps=True, to_error=True, even=even)
+def _explicit_info(authors: str, year: int, title: str, doi: str = "", *, has_fixed_step: bool = False) -> SolverInfo:
+    return SolverInfo(
+        "explicit",
+        Citation(authors, year, title, doi),
+        is_substepping=True,
+        supports_error_control=True,
+        has_fixed_step=has_fixed_step,
+    )
 
 
-_HAIRER = _about(
+_HAIRER_INFO = _explicit_info(
     "Hairer, Ernst and Norsett, Syvert Paul and Wanner, Gerhard",
     1993,
     "Solving Ordinary Differential Equations I",
     "10.1007/978-3-540-78862-1",
 )
-_BLANES_MOAN = _about(
+_BLANES_MOAN_INFO = _explicit_info(
     "Blanes, Sergio and Moan, Per Christian",
     2002,
     "Practical symplectic partitioned Runge-Kutta and Runge-Kutta-Nyström methods",
     "10.1016/S0377-0427(01)00492-7",
-    even=True,
+    has_fixed_step=True,
 )
 
 
 @dataclass(frozen=True)
-class VelocityVerlet(_Fixed):
+class VelocityVerlet(_FixedStepSolver):
     """Velocity Verlet: kick, drift, kick; symplectic, order 2, one force evaluation per substep."""
 
-    name: ClassVar[str] = "velocity-verlet"
-    about: ClassVar[About] = _about(
+    solver_name: ClassVar[str] = "velocity-verlet"
+    solver_info: ClassVar[SolverInfo] = _explicit_info(
         "Swope, William C. and Andersen, Hans C. and Berens, Peter H. and Wilson, Kent R.",
         1982,
         "A computer simulation method for the calculation of equilibrium constants",
         "10.1063/1.442716",
-        even=True,
+        has_fixed_step=True,
     )
-    coefficients: ClassVar[Composition | Tableau] = VERLET
+    coefficients: ClassVar[SplittingMethod | ExplicitTableau] = VELOCITY_VERLET
 
 
 @dataclass(frozen=True)
-class BlanesMoan4(_Fixed):
+class BlanesMoan4(_FixedStepSolver):
     """Symplectic composition of Blanes and Moan, order 4, six force evaluations per substep."""
 
-    name: ClassVar[str] = "blanes-moan-4"
-    about: ClassVar[About] = _BLANES_MOAN
-    coefficients: ClassVar[Composition | Tableau] = BLANES_MOAN_4
+    solver_name: ClassVar[str] = "blanes-moan-4"
+    solver_info: ClassVar[SolverInfo] = _BLANES_MOAN_INFO
+    coefficients: ClassVar[SplittingMethod | ExplicitTableau] = BLANES_MOAN_4
 
 
 @dataclass(frozen=True)
-class BlanesMoan6(_Fixed):
+class BlanesMoan6(_FixedStepSolver):
     """Symplectic composition of Blanes and Moan, order 6, ten force evaluations per substep."""
 
-    name: ClassVar[str] = "blanes-moan-6"
-    about: ClassVar[About] = _BLANES_MOAN
-    coefficients: ClassVar[Composition | Tableau] = BLANES_MOAN_6
+    solver_name: ClassVar[str] = "blanes-moan-6"
+    solver_info: ClassVar[SolverInfo] = _BLANES_MOAN_INFO
+    coefficients: ClassVar[SplittingMethod | ExplicitTableau] = BLANES_MOAN_6
 
 
 @dataclass(frozen=True)
-class RungeKutta4(_Fixed):
+class RungeKutta4(_FixedStepSolver):
     """Kutta's Runge-Kutta method of order 4, four force evaluations per substep."""
 
-    name: ClassVar[str] = "runge-kutta-4"
-    about: ClassVar[About] = replace(_HAIRER, to_error=False, even=True)
-    coefficients: ClassVar[Composition | Tableau] = RUNGE_KUTTA_4
+    solver_name: ClassVar[str] = "runge-kutta-4"
+    solver_info: ClassVar[SolverInfo] = replace(_HAIRER_INFO, supports_error_control=False, has_fixed_step=True)
+    coefficients: ClassVar[SplittingMethod | ExplicitTableau] = RUNGE_KUTTA_4
 
 
 @dataclass(frozen=True)
-class Tsitouras5(_Controlled):
+class Tsitouras5(_AdaptiveStepSolver):
     """Tsitouras's embedded pair of orders 5 and 4, six force evaluations per substep."""
 
-    name: ClassVar[str] = "tsitouras-5"
-    about: ClassVar[About] = _about(
+    solver_name: ClassVar[str] = "tsitouras-5"
+    solver_info: ClassVar[SolverInfo] = _explicit_info(
         "Tsitouras, Charalampos",
         2011,
         "Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying assumption",
         "10.1016/j.camwa.2011.06.002",
     )
-    coefficients: ClassVar[Composition | Tableau] = TSITOURAS_5
+    coefficients: ClassVar[SplittingMethod | ExplicitTableau] = TSITOURAS_5
 
 
 @dataclass(frozen=True)
-class DormandPrince8(_Controlled):
+class DormandPrince8(_AdaptiveStepSolver):
     """Dormand and Prince's method of order 8, error orders 5 and 3, twelve force evaluations per substep."""
 
-    name: ClassVar[str] = "dormand-prince-8"
-    about: ClassVar[About] = _HAIRER
+    solver_name: ClassVar[str] = "dormand-prince-8"
+    solver_info: ClassVar[SolverInfo] = _HAIRER_INFO
 
-    def method(self) -> Composition | Tableau:
+    def build_coefficients(self) -> SplittingMethod | ExplicitTableau:
         """Return the coefficients, taken from SciPy."""
-        return dormand_prince_8()
+        return build_dormand_prince_8()
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedExplicit(Substepping, Iterative):
+class PreparedExplicit(PreparedSubstepping, IterativeSolver):
     """Explicit integrator, prepared for a system; runs on the CPU."""
 
     system: System
-    parts: ForceParts
-    facts: dict[str, float] = field(default_factory=dict[str, float])
+    explicit_forces: ExplicitForces
+    stats: dict[str, float] = field(default_factory=dict[str, float])
 
     @property
-    def choice(self) -> str:
+    def description(self) -> str:
         """Description of the chosen substeps."""
-        return self.substeps.choice
+        return self.substep_choice.description
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve whose only iteration is the whole step."""
-        return Whole(*self.step(problem)[:2])
+        return SingleIterateState(*self.step(problem)[:2])
 
     def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, NDArray[np.float64]]:
         """Integrate one step.
@@ -248,50 +261,74 @@ class PreparedExplicit(Substepping, Iterative):
         Returns:
             Positions and velocities (n, 3) at the end of the step, and the statistics of `integrate`.
         """
-        s, pins, start, frame = self.system, self.system.pins.vertices, problem.start, self.system.time_step
+        s, pins, start, frame = self.system, self.system.pins.vertices, problem.step_start, self.system.time_step
         begin, end = np.ascontiguousarray(start.positions[pins]), problem.pin_targets.copy()
-        p, v = rows_of_four(start.positions, far=True), rows_of_four(start.velocity)
+        p, v = pad_rows(start.positions, pad_far=True), pad_rows(start.velocity)
         v.reshape(-1, 4)[pins] = 0.0
-        force = rows_of_four(problem.force + self.parts.load)
-        inverse = _of_rows(np.divide(1.0, s.mass, out=np.zeros(s.vertices), where=s.unpinned))
-        right, x = self.parts.bundles.right(np.zeros(s.vertices + 2), force), self.parts
-        forces = Forces(x.bundles, right, x.pairs, x.weight, x.held, inverse, _of_rows(x.drag), pins.copy(), begin, end)
-        count = self.substeps.count
+        force = pad_rows(problem.external_force + self.explicit_forces.constant_force)
+        inverse = _expand_to_rows(np.divide(1.0, s.mass, out=np.zeros(s.num_vertices), where=s.unpinned_mask))
+        right, x = (
+            self.explicit_forces.spring_packets.build_right_hand_side(np.zeros(s.num_vertices + 2), force),
+            self.explicit_forces,
+        )
+        forces = FrameForces(
+            x.spring_packets,
+            right,
+            x.form_pairs,
+            x.form_weight,
+            x.form_vertex_weight,
+            inverse,
+            _expand_to_rows(x.drag_rate),
+            pins.copy(),
+            begin,
+            end,
+        )
+        count = self.substep_choice.num_substeps
         told = np.array([count, 0.0, frame / count, frame])
-        if isinstance(self.method, Composition):
+        if isinstance(self.method, SplittingMethod):
             self._compose(forces, self.method, p, v)
         else:
             self._integrate(forces, self.method, p, v, h, told)
-        velocity = v.reshape(-1, 4)[: s.vertices, :3].copy()
+        velocity = v.reshape(-1, 4)[: s.num_vertices, :3].copy()
         velocity[pins] = (end - begin) / frame
-        return p.reshape(-1, 4)[: s.vertices, :3].copy(), velocity, told
+        return p.reshape(-1, 4)[: s.num_vertices, :3].copy(), velocity, told
 
-    def _compose(self, forces: Forces, method: Composition, p: NDArray[np.float64], v: NDArray[np.float64]) -> None:
-        count = self.substeps.count
+    def _compose(
+        self, forces: FrameForces, method: SplittingMethod, p: NDArray[np.float64], v: NDArray[np.float64]
+    ) -> None:
+        count = self.substep_choice.num_substeps
         h = self.system.time_step / count
-        kept, gained = in_time(method.kicks, h, forces.drag)
-        compose(forces, method.drifts, kept, gained, count, h, p, v, np.zeros_like(v))
+        kept, gained = integrate_drag(method.kicks, h, forces.drag_rate)
+        run_splitting(forces, method.drifts, kept, gained, count, h, p, v, np.zeros_like(v))
 
     def _integrate(
         self,
-        forces: Forces,
-        method: Tableau,
+        forces: FrameForces,
+        method: ExplicitTableau,
         p: NDArray[np.float64],
         v: NDArray[np.float64],
         h: float | None,
-        told: NDArray[np.float64],
+        step_stats: NDArray[np.float64],
     ) -> None:
-        frame, taken, fixed = self.system.time_step, self.substeps, not self.substeps.tolerance
-        first = frame / taken.count if fixed else min(frame, h or (1.0 / taken.rate if taken.rate else frame))
-        errors = np.zeros((1, len(method.a))) if fixed else method.errors
-        most = float(most_steps(taken.count, taken.tolerance))
-        steps = Subdivision(frame, taken.tolerance or 1.0, most, first)
-        stages = Coefficients(method.a, method.times, errors, method.power)
-        integrate(forces, stages, steps, p, v, Scratch.of(len(method.a), len(p)), told)
-        if told[3] < frame:
-            raise RuntimeError(method.unfinished(told[0] + told[1], told[2], told[3], frame, taken.tolerance))
+        frame, taken, fixed = self.system.time_step, self.substep_choice, not self.substep_choice.tolerance
+        first = (
+            frame / taken.num_substeps
+            if fixed
+            else min(frame, h or (1.0 / taken.fastest_rate if taken.fastest_rate else frame))
+        )
+        errors = np.zeros((1, len(method.a))) if fixed else method.error_weights
+        most = float(compute_max_steps(taken.num_substeps, taken.tolerance))
+        steps = AdaptiveSteps(frame, taken.tolerance or 1.0, most, first)
+        stages = TableauCoefficients(method.a, method.stage_times, errors, method.error_exponent)
+        integrate_adaptive(forces, stages, steps, p, v, StageScratch.from_sizes(len(method.a), len(p)), step_stats)
+        if step_stats[3] < frame:
+            raise RuntimeError(
+                method.format_step_failure(
+                    step_stats[0] + step_stats[1], step_stats[2], step_stats[3], frame, taken.tolerance
+                )
+            )
 
 
-def _of_rows(of_vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+def _expand_to_rows(of_vertices: NDArray[np.float64]) -> NDArray[np.float64]:
     """Repeat the value of each vertex for the four numbers of its row; zero for padding rows."""
-    return rows_of_four(np.repeat(of_vertices[:, None], 3, axis=1))
+    return pad_rows(np.repeat(of_vertices[:, None], 3, axis=1))

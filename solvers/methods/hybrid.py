@@ -37,35 +37,35 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.about import About, Reference
-from solvers.core.acceleration import Accelerating
-from solvers.core.bounds import without_bounded
-from solvers.core.descent import Metric, Point, PreparedDescent, lower, near
-from solvers.core.fixed_objective import Objective
+from solvers.about import Citation, SolverInfo
+from solvers.core.acceleration import AcceleratedState
+from solvers.core.bounds import without_barriers
+from solvers.core.descent import DescentPoint, PreparedDescent, ResidualMetric, has_active_barrier, pick_lower_start
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
-from solvers.core.predicting import Predicting, gained
-from solvers.kernels.loop import NEVER, STALLED, Limits, at_most
-from solvers.linear.symbolic import analysed_once
+from solvers.core.predicting import PredictedTensionNewton, objective_decrease
+from solvers.kernels.loop import REASON_STALLED, RESIDUAL_NEVER, LoopLimits, iteration_limit
+from solvers.linear.symbolic import cache_symbolic_analysis
 from solvers.methods.lbfgs import Lbfgs
-from solvers.methods.newton import NewtonMethod
+from solvers.methods.newton import NewtonIteration
 from solvers.methods.quasi_newton import PreparedAccelerated
 from solvers.problem import Positions, System
 
-_ROUND, _FIRST = 10, ((2, 2, 3, 3), (5, 5))
+_ROUND_ITERATIONS, _FIRST_ROUNDS = 10, ((2, 2, 3, 3), (5, 5))
 """Iterations per round of L-BFGS, and between the iterates of the first rounds: an easy step needs few iterations, of
 which at most a third are then superfluous."""
 
-_PROBE, _RELAXED = 4, 5
+_PROBE_ITERATIONS, _RELAXATION_ITERATIONS = 4, 5
 """Iterations before the suitability of L-BFGS is assessed, and L-BFGS iterations after a Newton step."""
 
-_QUICK = 0.5
+_FAST_RESIDUAL_RATIO = 0.5
 """Largest ratio of residuals after the very first iterations at which L-BFGS is considered suitable."""
 
-_SLOW = 0.7
+_SLOW_DECREASE_RATIO = 0.7
 """Convergence counts as slow, and a Newton step is tried, if a round still decreases the objective by more than this
 fraction of the decrease of the previous round."""
 
-_LITTLE = 2e-6
+_NEGLIGIBLE_DECREASE = 2e-6
 """Fraction of the decrease since the start: a round below it leaves about a millionth, to a saddle or a minimum."""
 
 _FLOPS_PER_ENTRY = 270.0
@@ -74,20 +74,20 @@ with all overheads."""
 
 
 @dataclass(frozen=True)
-class Hybrid:
+class HybridNewton:
     """L-BFGS far from the minimum, then Newton's method with predicted tensions, then Newton's method."""
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
-    about: ClassVar[About] = About(
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "hybrid",
-        Reference(
+        Citation(
             "Tournier, Maxime and Nesme, Matthieu and Gilles, Benjamin and Faure, François",
             2015,
             "Stable constrained dynamics",
             "10.1145/2766969",
         ),
-        first=True,
+        is_family_default=True,
     )
 
     def prepare(self, system: System) -> PreparedDescent:
@@ -97,46 +97,52 @@ class Hybrid:
             NotPositiveDefinite: if the system leaves some positions undetermined.
             Unsupported: if Q does not fit in memory.
         """
-        with analysed_once():
-            metric, objective = Metric(system), Objective(system)
-            lbfgs = Lbfgs(precision="float32").by_factor(without_bounded(system))
-            method, factor = HybridMethod(objective, metric, lbfgs), objective.matrix.factor
-        facts = metric.facts | {"nnz_hessian_factor": float(factor.nonzeros)}
-        choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; for L-BFGS, {lbfgs.choice}"
-        choice += objective.interpreted
+        with cache_symbolic_analysis():
+            metric, objective = ResidualMetric(system), FixedObjective(system)
+            lbfgs = Lbfgs(precision="float32").prepare_with_factor(without_barriers(system))
+            method, factor = HybridIteration(objective, metric, lbfgs), objective.hessian_matrix.factor
+        facts = metric.stats | {"nnz_hessian_factor": float(factor.nonzeros)}
+        choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; for L-BFGS, {lbfgs.description}"
+        choice += objective.interpreted_energies
         return PreparedDescent(objective, metric, method, choice, facts)
 
 
-class HybridMethod:
+class HybridIteration:
     """The iteration for one system: a round of L-BFGS, or a step of one of the Newton methods."""
 
-    def __init__(self, objective: Objective, metric: Metric, lbfgs: PreparedAccelerated) -> None:
-        self.metric, self._newton, self._lbfgs = metric, NewtonMethod(metric), lbfgs
-        self.diagonal: NDArray[np.float64] = np.repeat(metric.diagonal, 3)
-        self.inertia: NDArray[np.float64] = np.repeat(objective.system.inertia[objective.system.free], 3)
-        factor = objective.matrix.factor
-        self._cost = 9.0 * max(1.0, factor.flops) / (_FLOPS_PER_ENTRY * max(1, factor.nonzeros))
+    def __init__(self, objective: FixedObjective, metric: ResidualMetric, lbfgs: PreparedAccelerated) -> None:
+        self.metric, self._newton, self._lbfgs = metric, NewtonIteration(metric), lbfgs
+        self.system_diagonal: NDArray[np.float64] = np.repeat(metric.free_diagonal, 3)
+        self.inertia_diagonal: NDArray[np.float64] = np.repeat(
+            objective.system.inertia_diagonal[objective.system.free_vertices], 3
+        )
+        factor = objective.hessian_matrix.factor
+        self._newton_step_cost = 9.0 * max(1.0, factor.flops) / (_FLOPS_PER_ENTRY * max(1, factor.nonzeros))
 
-    def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
+    def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
         """Yield the points after `start`; restarts after an escape from a saddle."""
-        point = lower(step, start)
-        while not point.stalled:
-            for following in () if step.touched or near(step, point.positions) else self._approach(step, point):
-                if not _clear(step, point, following):
+        point = pick_lower_start(step, start)
+        while not point.is_stalled:
+            for following in (
+                ()
+                if step.has_contact_elements or has_active_barrier(step, point.positions)
+                else self._iterate_approach(step, point)
+            ):
+                if not _is_collision_free(step, point, following):
                     break
                 point = following
                 yield point
-            for following in self._newton.points(step, point):
+            for following in self._newton.iterate_points(step, point):
                 point = following
                 yield point
-                if point.left:
+                if point.is_past_saddle:
                     break
 
-    def _approach(self, step: StepObjective, start: Point) -> Iterator[Point]:
+    def _iterate_approach(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
         """Yield the points after `start`, until the exact method becomes faster."""
-        point, rounds = start, iter(_FIRST)
-        predicting: Predicting | None = None
-        run: Accelerating | None = self._begun(step, point.positions)
+        point, rounds = start, iter(_FIRST_ROUNDS)
+        predicting: PredictedTensionNewton | None = None
+        run: AcceleratedState | None = self._start_lbfgs(step, point.positions)
         before, done = run.residual(), 0
         gain, newton_gain, fallen = np.inf, 0.0, 0.0
         ended = unsuited = False
@@ -144,65 +150,68 @@ class HybridMethod:
             if gain > newton_gain:
                 last, began = gain, point
                 if run is None:
-                    run, fallen = self._begun(step, point.positions), 0.0
-                for count in next(rounds, (_ROUND,)):
-                    _, residual, verdict = run.iterate(at_most(count))
-                    point, done = _reached(run), done + count
+                    run, fallen = self._start_lbfgs(step, point.positions), 0.0
+                for count in next(rounds, (_ROUND_ITERATIONS,)):
+                    _, residual, verdict = run.run_iterations(iteration_limit(count))
+                    point, done = _current_point(run), done + count
                     yield point
-                    ended = verdict == STALLED or residual**2 <= self.metric.round_off(point.positions)
-                    unsuited = done == _PROBE and residual > _QUICK * before
+                    ended = verdict == REASON_STALLED or residual**2 <= self.metric.energy_roundoff(point.positions)
+                    unsuited = done == _PROBE_ITERATIONS and residual > _FAST_RESIDUAL_RATIO * before
                     if ended or unsuited:
                         break
-                gain, fallen = run.fallen - fallen or gained(step, began, point), run.fallen
+                gain, fallen = (
+                    run.objective_decrease - fallen or objective_decrease(step, began, point),
+                    run.objective_decrease,
+                )
                 if unsuited:
-                    predicting, gain = Predicting(self, step, start), 0.0
-                little = _LITTLE * fallen if predicting is None else 0.0
-                if newton_gain == 0.0 and (gain <= little or gain > _SLOW * last or unsuited):
+                    predicting, gain = PredictedTensionNewton(self, step, start), 0.0
+                little = _NEGLIGIBLE_DECREASE * fallen if predicting is None else 0.0
+                if newton_gain == 0.0 and (gain <= little or gain > _SLOW_DECREASE_RATIO * last or unsuited):
                     newton_gain = np.inf
             else:
                 run = None
                 if predicting is None:
-                    predicting = Predicting(self, step, start)
-                    following, fall, beside = predicting.begin(point)
+                    predicting = PredictedTensionNewton(self, step, start)
+                    following, fall, beside = predicting.compute_first_step(point)
                     gain = np.inf if beside else gain
                     fall = 0.0 if beside else fall
                 else:
-                    following, fall, ended = predicting.next(point)
-                newton_gain = fall / self._cost
+                    following, fall, ended = predicting.compute_next_step(point)
+                newton_gain = fall / self._newton_step_cost
                 gain = gain or newton_gain
                 if following is not point:
                     point = following
                     yield point
 
-    def _begun(self, step: StepObjective, p: Positions) -> Accelerating:
+    def _start_lbfgs(self, step: StepObjective, p: Positions) -> AcceleratedState:
         """Start L-BFGS at p, without surface contact."""
         problem = step.problem
-        if step.bounded:
-            problem = replace(problem, system=without_bounded(problem.system))
-        return self._lbfgs.begin(problem, p)
+        if step.barrier_energies:
+            problem = replace(problem, system=without_barriers(problem.system))
+        return self._lbfgs.init_state(problem, p)
 
-    def certifies(self, step: StepObjective, at: Point) -> bool:
+    def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
         """Return whether the stationary point `at` is a minimum, as far as the method can determine."""
-        return self._newton.certifies(step, at)
+        return self._newton.can_terminate(step, at)
 
-    def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
+    def iteration_phases(self, step: StepObjective, at: DescentPoint) -> dict[str, Callable[[], object]]:
         """Return the phases of Newton's method, and a round of L-BFGS, as callables."""
-        return self._newton.phases(step, at) | {"lbfgs": lambda: self.relaxed(step, at.positions)}
+        return self._newton.iteration_phases(step, at) | {"lbfgs": lambda: self.relax_point(step, at.positions)}
 
-    def relaxed(self, step: StepObjective, p: Positions) -> Point:
+    def relax_point(self, step: StepObjective, p: Positions) -> DescentPoint:
         """Return the point after a few iterations of L-BFGS from p."""
-        run = self._begun(step, p)
-        run.iterate(Limits(_RELAXED, 0.0, 0.0, NEVER))
-        return _reached(run)
+        run = self._start_lbfgs(step, p)
+        run.run_iterations(LoopLimits(_RELAXATION_ITERATIONS, 0.0, 0.0, RESIDUAL_NEVER))
+        return _current_point(run)
 
 
-def _clear(step: StepObjective, before: Point, after: Point) -> bool:
+def _is_collision_free(step: StepObjective, before: DescentPoint, after: DescentPoint) -> bool:
     """Return whether the displacement between two points is collision-free and ends without active contacts."""
-    if not step.bounded:
+    if not step.barrier_energies:
         return True
     way = after.positions - before.positions
-    return step.reach(before.positions, way) == 1.0 and not near(step, after.positions)
+    return step.max_step_size(before.positions, way) == 1.0 and not has_active_barrier(step, after.positions)
 
 
-def _reached(run: Accelerating) -> Point:
-    return Point(run.positions.copy(), run.gradient())
+def _current_point(run: AcceleratedState) -> DescentPoint:
+    return DescentPoint(run.positions.copy(), run.gradient())

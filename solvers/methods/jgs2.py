@@ -29,21 +29,21 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, eye_array, kron
 
 from solvers import matrices, memory
-from solvers.about import About, Reference
-from solvers.contact.touching import is_contact
+from solvers.about import Citation, SolverInfo
+from solvers.contact.touching import is_vertex_contact
 from solvers.core import vertex_terms
-from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
-from solvers.core.fixed_objective import Objective
+from solvers.core.descent import DescentPoint, PreparedDescent, ResidualMetric, backtracking_line_search, inner_product
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
-from solvers.core.pattern import Matrix
-from solvers.energies.edges import directions
+from solvers.core.pattern import BlockMatrix
+from solvers.energies.edges import unit_directions
 from solvers.energies.springs import Springs
 from solvers.kernels import jgs2 as kernels
-from solvers.kernels.jgs2 import Patches, PatchScratch
+from solvers.kernels.jgs2 import PatchScratch, VertexPatches
 from solvers.linear.factors import DenseCholesky
 from solvers.problem import NotPositiveDefinite, Positions, ProjectiveEnergy, System, Unsupported
 
-_NEAR_NOTHING = 1e-10
+_DEGENERATE_ROTATION_SHIFT = 1e-10
 """Weight of the identity added to the rotation estimate: it decides where springs do not, as for points on a line."""
 
 
@@ -56,11 +56,11 @@ class Jgs2:
         lateral_stiffness_ratio: lateral stiffness of a spring at rest, relative to its stiffness, 0 to 1.
     """
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
-    about: ClassVar[About] = About(
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "vertex block descent",
-        Reference(
+        Citation(
             "Lan, Lei and Lu, Zixuan and Yuan, Chun and Xu, Weiwei and Su, Hao and Wang, Huamin and Jiang, Chenfanfu "
             "and Yang, Yin",
             2025,
@@ -86,23 +86,29 @@ class Jgs2:
             Unsupported: for contact, for energies that are not projective, and if the responses do not fit in memory.
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
-        unknown = {type(e).__name__ for e in system.energies if is_contact(e) or not isinstance(e, ProjectiveEnergy)}
+        unknown = {
+            type(e).__name__ for e in system.energies if is_vertex_contact(e) or not isinstance(e, ProjectiveEnergy)
+        }
         if unknown:
             raise Unsupported(
                 f"jgs2: what answers to a vertex is computed once, from the rest shape, and that says nothing of "
                 f"{', '.join(sorted(unknown))}; take newton, lbfgs or hybrid"
             )
-        metric, objective = Metric(system), Objective(system)
-        patches = answering(at_rest(system, objective.springs, self.lateral), objective.matrix.graph, self.rings)
-        mean = len(patches.near) / max(1, len(patches.start) - 1)
-        choice = (
-            f"on average {mean:.1f} vertices answer to one, in {memory.in_words(patches.response.nbytes)}; residuals "
-            f"by {metric.choice}{objective.interpreted}"
+        metric, objective = ResidualMetric(system), FixedObjective(system)
+        patches = compute_responses(
+            assemble_rest_hessian(system, objective.springs, self.lateral), objective.hessian_matrix.graph, self.rings
         )
-        return PreparedDescent(objective, metric, _Method(metric, objective.springs, patches), choice, metric.facts)
+        mean = len(patches.patch_vertices) / max(1, len(patches.patch_starts) - 1)
+        choice = (
+            f"on average {mean:.1f} vertices answer to one, in {memory.format_bytes(patches.response.nbytes)}; residuals "
+            f"by {metric.description}{objective.interpreted_energies}"
+        )
+        return PreparedDescent(
+            objective, metric, _Jgs2Iteration(metric, objective.springs, patches), choice, metric.stats
+        )
 
 
-def at_rest(system: System, springs: Springs, lateral: float) -> csr_array:
+def assemble_rest_hessian(system: System, springs: Springs, lateral: float) -> csr_array:
     """Assemble the Hessian H0 of the rest shape.
 
     Args:
@@ -114,15 +120,17 @@ def at_rest(system: System, springs: Springs, lateral: float) -> csr_array:
         H0 [N/m] over the coordinates of the free vertices, (3f, 3f).
     """
     others = [e for e in system.energies if isinstance(e, ProjectiveEnergy) and not isinstance(e, Springs)]
-    held = vertex_terms.held(system)
+    held = vertex_terms.compute_anchor_stiffness(system)
     held[np.isinf(held)] = 0.0
-    shares = reduce(lambda total, share: total + share, matrices.shares(system, others), matrices.diagonal(held))
-    whole = csr_array(kron(shares, eye_array(3))) + springs.hessian_at_rest(lateral, system.vertices)
-    free = (3 * system.free[:, None] + np.arange(3)).ravel()
+    shares = reduce(
+        lambda total, share: total + share, matrices.stiffness_shares(system, others), matrices.diagonal_matrix(held)
+    )
+    whole = csr_array(kron(shares, eye_array(3))) + springs.rest_hessian(lateral, system.num_vertices)
+    free = (3 * system.free_vertices[:, None] + np.arange(3)).ravel()
     return csr_array(csr_array(csr_array(whole)[free])[:, free])
 
 
-def answering(H: csr_array, graph: csr_array, rings: int) -> Patches:
+def compute_responses(H: csr_array, graph: csr_array, rings: int) -> VertexPatches:
     """Compute the responses W of all vertices.
 
     A vertex whose patch has no Cholesky factor gets a patch of its own.
@@ -145,44 +153,44 @@ def answering(H: csr_array, graph: csr_array, rings: int) -> Patches:
             break
         reach = wider
     reach.sort_indices()
-    needs, free = 72.0 * reach.nnz, memory.of_machine()
+    needs, free = 72.0 * reach.nnz, memory.compute_memory_limit()
     if needs > free:
         raise Unsupported(
-            f"jgs2: the vertices within {rings} rings of each answer to it in {memory.in_words(needs)} of memory, "
-            f"where {memory.in_words(free)} may be taken; take fewer rings, or a coarser mesh"
+            f"jgs2: the vertices within {rings} rings of each answer to it in {memory.format_bytes(needs)} of memory, "
+            f"where {memory.format_bytes(free)} may be taken; take fewer rings, or a coarser mesh"
         )
     start, near = np.asarray(reach.indptr, np.int64), np.asarray(reach.indices, np.int64)
-    response, known = np.zeros((len(near), 3, 3)), _Patch(H)
+    response, known = np.zeros((len(near), 3, 3)), _PatchFactor(H)
     for i in range(f):
         at = slice(start[i], start[i + 1])
-        response[at] = known.response(near[at], i)
-    return Patches(start, near, response)
+        response[at] = known.compute_response(near[at], i)
+    return VertexPatches(start, near, response)
 
 
-class _Patch:
+class _PatchFactor:
     """Factor of H on a patch of vertices, reused if the next vertex has the same patch."""
 
     def __init__(self, H: csr_array) -> None:
-        self._H, self._near = H, np.empty(0, np.int64)
+        self._H, self._patch_vertices = H, np.empty(0, np.int64)
         self._factor: DenseCholesky | None = None
         self._inverse = np.empty((0, 0))
 
-    def response(self, near: NDArray[np.int64], vertex: int) -> NDArray[np.float64]:
+    def compute_response(self, patch_vertices: NDArray[np.int64], vertex: int) -> NDArray[np.float64]:
         """Compute the response W (k, 3, 3) of a vertex; `patch_vertices` (k,) are those of its patch."""
-        if not np.array_equal(near, self._near):
-            self._near, self._factor = near, self._factorised(near)
-        own, alone = int(np.searchsorted(near, vertex)), np.zeros((len(near), 3, 3))
+        if not np.array_equal(patch_vertices, self._patch_vertices):
+            self._patch_vertices, self._factor = patch_vertices, self._factorise_patch(patch_vertices)
+        own, alone = int(np.searchsorted(patch_vertices, vertex)), np.zeros((len(patch_vertices), 3, 3))
         alone[own] = np.eye(3)
         if self._factor is None:
             return alone
-        X = self._columns(self._factor, own).reshape(-1, 3, 3)
+        X = self._inverse_columns(self._factor, own).reshape(-1, 3, 3)
         W = X @ np.linalg.inv(X[own])
         W[own] = np.eye(3)
         return W if np.isfinite(W).all() else alone
 
-    def _columns(self, factor: DenseCholesky, own: int) -> NDArray[np.float64]:
+    def _inverse_columns(self, factor: DenseCholesky, own: int) -> NDArray[np.float64]:
         """Return the columns of the inverse for patch vertex `own`, (3k, 3)."""
-        rows, columns = 3 * len(self._near), slice(3 * own, 3 * own + 3)
+        rows, columns = 3 * len(self._patch_vertices), slice(3 * own, 3 * own + 3)
         if rows < self._H.shape[0]:
             out = np.empty((rows, 3))
             factor.solve(np.eye(rows, 3, -3 * own), out)
@@ -192,7 +200,7 @@ class _Patch:
             factor.solve(np.eye(rows), self._inverse)
         return self._inverse[:, columns]
 
-    def _factorised(self, near: NDArray[np.int64]) -> DenseCholesky | None:
+    def _factorise_patch(self, near: NDArray[np.int64]) -> DenseCholesky | None:
         rows = (3 * near[:, None] + np.arange(3)).ravel()
         try:
             return DenseCholesky(csr_array(csr_array(self._H[rows])[:, rows]).toarray())
@@ -200,82 +208,93 @@ class _Patch:
             return None
 
 
-class _Turns:
+class _VertexRotations:
     """Rotations of the free vertices, estimated from all springs with a rest length."""
 
     def __init__(self, system: System, springs: Springs) -> None:
         i, j = springs.edges.T
         said = (springs.rest_length > 0.0) & (i != j)
-        self._edges, self._rest = springs.edges[said], springs.rest_direction[said]
+        self._edges, self._rest_directions = springs.edges[said], springs.rest_direction[said]
         k = springs.stiffness[said]
         weight = k / k.max(initial=np.finfo(np.float64).tiny)
         count, rows = len(k), self._edges.T.ravel()
-        shares = csr_array((np.tile(weight, 2), (rows, np.tile(np.arange(count), 2))), shape=(system.vertices, count))
-        self._shares = csr_array(shares[system.free])
+        shares = csr_array(
+            (np.tile(weight, 2), (rows, np.tile(np.arange(count), 2))), shape=(system.num_vertices, count)
+        )
+        self._shares = csr_array(shares[system.free_vertices])
 
-    def at(self, p: Positions) -> NDArray[np.float64]:
+    def compute_rotations(self, p: Positions) -> NDArray[np.float64]:
         """Compute the rotations R (f, 3, 3) at positions p (n, 3).
 
         n is the direction of an incident spring, n0 its direction at rest.
         """
         i, j = self._edges.T
-        _, unit = directions(p[i] - p[j], self._rest)
-        sums = (self._shares @ (unit[:, :, None] * self._rest[:, None, :]).reshape(-1, 9)).reshape(-1, 3, 3)
+        _, unit = unit_directions(p[i] - p[j], self._rest_directions)
+        sums = (self._shares @ (unit[:, :, None] * self._rest_directions[:, None, :]).reshape(-1, 9)).reshape(-1, 3, 3)
         size = np.linalg.norm(sums, axis=(1, 2))[:, None, None]
-        left, _, right = np.linalg.svd(sums + np.where(size > 0.0, _NEAR_NOTHING * size, 1.0) * np.eye(3))
+        left, _, right = np.linalg.svd(sums + np.where(size > 0.0, _DEGENERATE_ROTATION_SHIFT * size, 1.0) * np.eye(3))
         left[np.linalg.det(left @ right) < 0.0, :, 2] *= -1.0
         return left @ right
 
 
-class _Method:
+class _Jgs2Iteration:
     """The JGS2 iteration for one system."""
 
-    def __init__(self, metric: Metric, springs: Springs, patches: Patches) -> None:
-        self._metric, self._turns, self._free = metric, _Turns(metric.system, springs), metric.system.free
-        f = len(self._free)
-        alone = Patches(np.arange(f + 1), np.arange(f), np.tile(np.eye(3), (f, 1, 1)))
-        ways = (patches, alone) if len(patches.near) > f else (alone,)
-        self._ways = [(way, PatchScratch.of(way)) for way in ways]
+    def __init__(self, metric: ResidualMetric, springs: Springs, patches: VertexPatches) -> None:
+        self._metric, self._rotations, self._free_vertices = (
+            metric,
+            _VertexRotations(metric.system, springs),
+            metric.system.free_vertices,
+        )
+        f = len(self._free_vertices)
+        alone = VertexPatches(np.arange(f + 1), np.arange(f), np.tile(np.eye(3), (f, 1, 1)))
+        ways = (patches, alone) if len(patches.patch_vertices) > f else (alone,)
+        self._patch_variants = [(way, PatchScratch.from_patches(way)) for way in ways]
 
-    def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
+    def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
         """Yield the points after `start`."""
         point = start
-        while not point.stalled:
-            point = self._next(step, point) or point._replace(stalled=True)
+        while not point.is_stalled:
+            point = self._next_point(step, point) or point._replace(is_stalled=True)
             yield point
 
-    def certifies(self, step: StepObjective, at: Point) -> bool:
+    def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
         """Return whether `at` may be the last point; clamped elements cannot separate saddles from minima."""
         return True
 
-    def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
+    def iteration_phases(self, step: StepObjective, at: DescentPoint) -> dict[str, Callable[[], object]]:
         """Return the gradient, the Hessian, the rotations and the vertex steps as callables."""
-        hessian, turns = step.hessian(at.positions).convex(), self._turns.at(at.positions)
+        hessian, turns = step.hessian(at.positions).assemble_clamped(), self._rotations.compute_rotations(at.positions)
         return {
             "gradient": lambda: step.gradient(at.positions),
-            "hessian": lambda: step.hessian(at.positions).convex(),
-            "rotations": lambda: self._turns.at(at.positions),
-            "steps": lambda: self._direction(hessian, turns, at, *self._ways[0]),
+            "hessian": lambda: step.hessian(at.positions).assemble_clamped(),
+            "rotations": lambda: self._rotations.compute_rotations(at.positions),
+            "steps": lambda: self._compute_direction(hessian, turns, at, *self._patch_variants[0]),
         }
 
-    def _next(self, step: StepObjective, at: Point) -> Point | None:
+    def _next_point(self, step: StepObjective, at: DescentPoint) -> DescentPoint | None:
         """Return the next point, None if round-off prevents descent."""
-        hessian, turns = step.hessian(at.positions).convex(), self._turns.at(at.positions)
-        for way in self._ways:
-            direction = self._direction(hessian, turns, at, *way)
-            if -dot(at.gradient, direction) > self._metric.round_off(at.positions):
-                found = search(step, at, direction)
+        hessian, turns = step.hessian(at.positions).assemble_clamped(), self._rotations.compute_rotations(at.positions)
+        for way in self._patch_variants:
+            direction = self._compute_direction(hessian, turns, at, *way)
+            if -inner_product(at.gradient, direction) > self._metric.energy_roundoff(at.positions):
+                found = backtracking_line_search(step, at, direction)
                 if found is not None:
                     return found
         return None
 
-    def _direction(
-        self, hessian: Matrix, turns: NDArray[np.float64], at: Point, patches: Patches, scratch: PatchScratch
+    def _compute_direction(
+        self,
+        hessian: BlockMatrix,
+        turns: NDArray[np.float64],
+        at: DescentPoint,
+        patches: VertexPatches,
+        scratch: PatchScratch,
     ) -> Positions:
         """Compute the steps of all vertices (n, 3), zero for pinned vertices."""
-        graph, free = hessian.graph, self._free
+        graph, free = hessian.graph, self._free_vertices
         steps, out = np.empty((len(free), 3)), np.zeros_like(at.positions)
         pointers, columns = np.asarray(graph.indptr, np.int64), np.asarray(graph.indices, np.int64)
-        kernels.directions(patches, turns, pointers, columns, hessian.values, at.gradient[free], scratch, steps)
+        kernels.compute_directions(patches, turns, pointers, columns, hessian.values, at.gradient[free], scratch, steps)
         out[free] = steps
         return out

@@ -19,23 +19,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from solvers.about import About, Reference
-from solvers.contact.touching import without_contact
-from solvers.core.acceleration import Interpreted, Scheme
-from solvers.core.bounds import without_bounded
-from solvers.core.descent import Metric
-from solvers.core.driver import Iterating, Iterative
-from solvers.core.fixed_objective import Objective
+from solvers.about import Citation, SolverInfo
+from solvers.contact.touching import without_vertex_contact
+from solvers.core.acceleration import AccelerationScheme, InterpretedState
+from solvers.core.bounds import without_barriers
+from solvers.core.descent import ResidualMetric
+from solvers.core.driver import IterativeSolver, SolverState
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
-from solvers.core.prefactored import PreparedLocalGlobal, prepared
-from solvers.kernels.accelerate_coefficients import LBFGS
-from solvers.methods.a_jacobi import Aggregated, require_sweeps
-from solvers.methods.quasi_newton import PreparedAccelerated, Windowed, prepare
-from solvers.problem import Positions, Prepared, ProjectiveEnergy, StepProblem, System, Unsupported
+from solvers.core.prefactored import PreparedLocalGlobal, prepare_local_global
+from solvers.kernels.accelerate_coefficients import LBFGS_RULE
+from solvers.methods.a_jacobi import AggregatedSweeps, require_valid_sweeps
+from solvers.methods.quasi_newton import PreparedAccelerated, WindowedAcceleration, prepare_accelerated
+from solvers.problem import Positions, PreparedSolver, ProjectiveEnergy, StepProblem, System, Unsupported
 
 
 @dataclass(frozen=True)
-class Lbfgs(Windowed):
+class Lbfgs(WindowedAcceleration):
     """L-BFGS, preconditioned.
 
     Args:
@@ -46,18 +46,18 @@ class Lbfgs(Windowed):
         jacobi_sweeps: number of Jacobi sweeps of that approximation, 1 to 8.
     """
 
-    unstated: ClassVar[frozenset[str]] = frozenset({"preconditioner", "sweeps"})
+    omitted_defaults: ClassVar[frozenset[str]] = frozenset({"preconditioner", "sweeps"})
 
-    about: ClassVar[About] = About(
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "quasi-Newton",
-        Reference(
+        Citation(
             "Liu, Tiantian and Bouaziz, Sofien and Kavan, Ladislav",
             2017,
             "Quasi-Newton methods for real-time simulation of hyperelastic materials",
             "10.1145/2990496",
         ),
-        first=True,
-        to_error=True,
+        is_family_default=True,
+        supports_error_control=True,
     )
 
     preconditioner: Literal["factor", "a-jacobi"] = "factor"
@@ -66,7 +66,7 @@ class Lbfgs(Windowed):
     def __post_init__(self) -> None:
         """Raise ValueError if a parameter is out of range."""
         super().__post_init__()
-        require_sweeps(self.sweeps)
+        require_valid_sweeps(self.sweeps)
         if self.preconditioner == "factor":
             return
         if self.linear != "auto":
@@ -74,60 +74,72 @@ class Lbfgs(Windowed):
         if self.precision != "float64":
             raise ValueError(f"precision: {self.precision} is of a factor's entries")
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:
             NotPositiveDefinite: if the system leaves some positions undetermined.
             Unsupported: if Q does not fit in memory, and for contact with the Jacobi preconditioner.
         """
-        if self.preconditioner == "a-jacobi" and without_bounded(without_contact(system)) is not system:
+        if self.preconditioner == "a-jacobi" and without_barriers(without_vertex_contact(system)) is not system:
             raise Unsupported(
                 "lbfgs, preconditioner: a-jacobi: its matrix, which is made once, has no rows for what begins to "
                 "touch; take preconditioner: factor"
             )
         if self.preconditioner == "factor":
-            return self.by_factor(system)
-        words, scheme, metric = f"{self.sweeps} sweeps of Jacobi", self._scheme, Metric(system)
+            return self.prepare_with_factor(system)
+        words, scheme, metric = f"{self.sweeps} sweeps of Jacobi", self._acceleration_scheme, ResidualMetric(system)
         energies = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
-        base = prepared(system, energies, lambda Q: (Aggregated(Q, self.sweeps), words))
-        return _Prepared(base, metric, scheme, Objective(system))
+        base = prepare_local_global(system, energies, lambda Q: (AggregatedSweeps(Q, self.sweeps), words))
+        return _PreparedLbfgsJacobi(base, metric, scheme, FixedObjective(system))
 
-    def by_factor(self, system: System) -> PreparedAccelerated:
+    def prepare_with_factor(self, system: System) -> PreparedAccelerated:
         """Prepare with the factor of Q; raises as `prepare` does."""
-        return prepare(system, self._scheme, self.linear, self.precision)
+        return prepare_accelerated(system, self._acceleration_scheme, self.linear, self.precision)
 
     @property
-    def _scheme(self) -> Scheme:
-        return Scheme("lbfgs", LBFGS, self.pairs, 5, False)
+    def _acceleration_scheme(self) -> AccelerationScheme:
+        return AccelerationScheme("lbfgs", LBFGS_RULE, self.pairs, 5, False)
 
 
-class _Prepared(Iterative):
+class _PreparedLbfgsJacobi(IterativeSolver):
     """L-BFGS with S in place of the factor of Q, prepared.
 
     Residuals are measured by a separate metric.
     """
 
-    def __init__(self, base: PreparedLocalGlobal, metric: Metric, scheme: Scheme, objective: Objective) -> None:
-        self._base, self._metric, self._scheme, self._objective = base, metric, scheme, objective
-        self.choice = f"{base.choice}; for the residual alone {metric.choice}"
-        self.facts = base.facts
+    def __init__(
+        self, base: PreparedLocalGlobal, metric: ResidualMetric, scheme: AccelerationScheme, objective: FixedObjective
+    ) -> None:
+        self._local_global, self._metric, self._acceleration_scheme, self._fixed_objective = (
+            base,
+            metric,
+            scheme,
+            objective,
+        )
+        self.description = f"{base.description}; for the residual alone {metric.description}"
+        self.stats = base.stats
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        step = StepObjective(self._objective, problem)
-        return _Iterating(self._metric, self._base, self._scheme, step, guess)
+        step = StepObjective(self._fixed_objective, problem)
+        return _LbfgsJacobiState(self._metric, self._local_global, self._acceleration_scheme, step, initial_guess)
 
-    def scale(self, problem: StepProblem) -> float:
+    def residual_scale(self, problem: StepProblem) -> float:
         """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
-        return self._base.scale(problem)
+        return self._local_global.residual_scale(problem)
 
 
-class _Iterating(Interpreted):
+class _LbfgsJacobiState(InterpretedState):
     """State of a solve with the Jacobi preconditioner; residuals are measured with the factor of Q."""
 
     def __init__(
-        self, metric: Metric, base: PreparedLocalGlobal, scheme: Scheme, step: StepObjective, guess: Positions
+        self,
+        metric: ResidualMetric,
+        base: PreparedLocalGlobal,
+        scheme: AccelerationScheme,
+        step: StepObjective,
+        guess: Positions,
     ) -> None:
         super().__init__(base, scheme, step, guess)
         self._metric = metric

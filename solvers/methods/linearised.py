@@ -19,19 +19,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers import matrices
-from solvers.about import About, Reference
-from solvers.contact.touching import is_contact
-from solvers.core.bounds import is_bounded
-from solvers.core.definite import factorised
-from solvers.core.driver import Iterating, Iterative
-from solvers.core.fixed_objective import Objective
-from solvers.core.forces import Whole
+from solvers.about import Citation, SolverInfo
+from solvers.contact.touching import is_vertex_contact
+from solvers.core.bounds import is_barrier_energy
+from solvers.core.definite import factorise_shifted
+from solvers.core.driver import IterativeSolver, SolverState
+from solvers.core.fixed_objective import FixedObjective
+from solvers.core.forces import SingleIterateState
 from solvers.core.objective import StepObjective
 from solvers.problem import (
     NotPositiveDefinite,
     Positions,
     ProjectiveEnergy,
-    ResidualOf,
+    ResidualIterate,
     StepProblem,
     System,
     Unsupported,
@@ -42,63 +42,63 @@ from solvers.problem import (
 class BaraffWitkin:
     """Linearised implicit Euler: one iterate, independent of stop rule and initial guess."""
 
-    minimises: ClassVar[bool] = False
-    descends: ClassVar[bool] = False
-    about: ClassVar[About] = About(
+    is_minimiser: ClassVar[bool] = False
+    is_monotone: ClassVar[bool] = False
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "linearly implicit",
-        Reference("Baraff, David and Witkin, Andrew", 1998, "Large steps in cloth simulation", "10.1145/280814.280821"),
-        first=True,
+        Citation("Baraff, David and Witkin, Andrew", 1998, "Large steps in cloth simulation", "10.1145/280814.280821"),
+        is_family_default=True,
     )
 
-    def prepare(self, system: System) -> PreparedLinearised:
+    def prepare(self, system: System) -> PreparedBaraffWitkin:
         """Prepare the method for a system.
 
         Raises:
             Unsupported: for contact, which starts and ends within a step, and for integrators with several stages,
                 which require solved stages.
         """
-        if system.speed is not None:
+        if system.velocity_factor is not None:
             raise Unsupported(
                 "baraff-witkin: linearises a single stage per step, and this integrator requires solved stages; "
                 "use implicit-euler, bdf2 or midpoint, or a Rosenbrock method: ros2, ros3p, rodas"
             )
-        if met := next((e for e in system.energies if is_contact(e) or is_bounded(e)), None):
+        if met := next((e for e in system.energies if is_vertex_contact(e) or is_barrier_energy(e)), None):
             raise Unsupported(
                 f"baraff-witkin: linearises at the step's start, where it cannot know of what is touched in the step; "
                 f"the scene has {type(met).__name__}; take a solver that minimises"
             )
-        objective = Objective(system)
-        Q = matrices.assemble(system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)])
-        factor = objective.matrix.factor
-        choice = f"a factor of the Hessian with {factor.nonzeros:,} entries{objective.interpreted}"
+        objective = FixedObjective(system)
+        Q = matrices.assemble_system_matrix(system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)])
+        factor = objective.hessian_matrix.factor
+        choice = f"a factor of the Hessian with {factor.nonzeros:,} entries{objective.interpreted_energies}"
         facts = {"nnz_hessian_factor": float(factor.nonzeros)}
-        diagonal: NDArray[np.float64] = np.repeat(np.asarray(Q.diagonal(), np.float64)[system.free], 3)
-        return PreparedLinearised(objective, diagonal, choice, facts)
+        diagonal: NDArray[np.float64] = np.repeat(np.asarray(Q.diagonal(), np.float64)[system.free_vertices], 3)
+        return PreparedBaraffWitkin(objective, diagonal, choice, facts)
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedLinearised(Iterative):
+class PreparedBaraffWitkin(IterativeSolver):
     """Linearised implicit Euler, prepared for a system.
 
     `system_diagonal` is the diagonal of the free part of Q (3 f,) [N/m].
     """
 
-    residual_of: ClassVar[ResidualOf] = "none"
+    residual_iterate: ClassVar[ResidualIterate] = "none"
 
-    objective: Objective
-    diagonal: NDArray[np.float64]
-    choice: str
-    facts: dict[str, float] = field(default_factory=dict[str, float])
+    fixed_objective: FixedObjective
+    system_diagonal: NDArray[np.float64]
+    description: str
+    stats: dict[str, float] = field(default_factory=dict[str, float])
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve whose only iteration is the whole step.
 
         Raises:
             NotPositiveDefinite: if no modification of the Hessian has a Cholesky factor.
         """
-        step = StepObjective(self.objective, problem)
-        p = step.placed(problem.current)
+        step = StepObjective(self.fixed_objective, problem)
+        p = step.apply_exact_pins(problem.current_positions)
         hessian = step.hessian(p)
-        if factorised(hessian, self.diagonal) is None:
+        if factorise_shifted(hessian, self.system_diagonal) is None:
             raise NotPositiveDefinite("the Hessian at the step's start is not finite, or no multiple of Q balances it")
-        return Whole(step.placed(p - hessian.solve(step.gradient(p))), None)
+        return SingleIterateState(step.apply_exact_pins(p - hessian.solve(step.gradient(p))), None)

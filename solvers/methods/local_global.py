@@ -22,25 +22,31 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers import matrices, memory
-from solvers.about import LIU_2013, LOCAL_GLOBAL, About
-from solvers.contact.touching import without_contact
-from solvers.core.bounds import without_bounded
-from solvers.core.prefactored import PreparedLocalGlobal, facts, only_springs, prepared, projective
-from solvers.energies.springs import TINY
+from solvers.about import LIU_2013, LOCAL_GLOBAL_FAMILY, SolverInfo
+from solvers.contact.touching import without_vertex_contact
+from solvers.core.bounds import without_barriers
+from solvers.core.prefactored import (
+    PreparedLocalGlobal,
+    factor_stats,
+    prepare_local_global,
+    require_only_springs,
+    require_projective,
+)
+from solvers.energies.springs import ZERO_LENGTH
 from solvers.linear.factors import DenseCholesky, SparseLU
-from solvers.problem import Positions, Prepared, System, Unsupported
+from solvers.problem import Positions, PreparedSolver, System, Unsupported
 
-_LARGE = 2**19
+_LARGE_MATRIX_ENTRIES = 2**19
 """Entries of a matrix that exceeds the cache of any core."""
 
 
-def _times(matrix: NDArray[np.float64], x: Positions) -> Positions:
+def _multiply_dense(matrix: NDArray[np.float64], x: Positions) -> Positions:
     """Multiply a dense matrix by x (k, 3).
 
     A large product is computed as (x' matrix')' with the same sums in half of the time: BLAS copies one of the two
     factors before the product, and this order avoids a copy of the whole matrix.
     """
-    if matrix.size < _LARGE:
+    if matrix.size < _LARGE_MATRIX_ENTRIES:
         return matrix @ x
     return np.ascontiguousarray((np.ascontiguousarray(x.T) @ matrix.T).T)
 
@@ -52,9 +58,9 @@ class DenseLocalGlobal:
     For small meshes, and for comparison with the paper line by line.
     """
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
-    about: ClassVar[About] = About(LOCAL_GLOBAL, LIU_2013)
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(LOCAL_GLOBAL_FAMILY, LIU_2013)
 
     def prepare(self, system: System) -> PreparedLocalGlobal:
         """Prepare the method for a system.
@@ -63,31 +69,31 @@ class DenseLocalGlobal:
             Unsupported: for energies other than springs, and if the matrices do not fit in memory.
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
-        springs, n = only_springs(system, "dense"), system.vertices
-        needs, room = 24.0 * n * (len(springs.edges) + n), memory.of_machine()  # three matrices of each shape
+        springs, n = require_only_springs(system, "dense"), system.num_vertices
+        needs, room = 24.0 * n * (len(springs.edges) + n), memory.compute_memory_limit()  # three matrices of each shape
         if needs > room:
             raise Unsupported(
                 f"dense: its matrices of {n:,} vertices and {len(springs.edges):,} springs take "
-                f"{memory.in_words(needs)} of memory, where {memory.in_words(room)} may be taken; "
+                f"{memory.format_bytes(needs)} of memory, where {memory.format_bytes(room)} may be taken; "
                 "take sparse or numba, or a coarser mesh"
             )
-        _, vertices, weight = system.penalty
+        _, vertices, weight = system.penalty_pins
         A = matrices.signed_incidence_matrix_dense(springs.edges, n)
         M = matrices.mass_matrix_dense(system.mass)
         C = matrices.selection_matrix_dense(vertices, n)
-        Q = matrices.system_matrix_dense(A, springs.stiffness, system.factor * M, system.time_step, C, weight)
-        matrices.require_determined(system, csr_array(Q))
+        Q = matrices.system_matrix_dense(A, springs.stiffness, system.inertia_factor * M, system.time_step, C, weight)
+        matrices.require_determined_positions(system, csr_array(Q))
         AtK = np.ascontiguousarray(A.T * springs.stiffness)
         r, rest_direction = springs.rest_length[:, None], springs.rest_direction
 
         def project(p: Positions, y: Positions, out: Positions) -> None:
-            v = _times(A, p)
+            v = _multiply_dense(A, p)
             length = np.sqrt(np.einsum("ij,ij->i", v, v))[:, None]
-            d = r * np.where(length <= TINY, rest_direction, v / np.maximum(length, TINY))
-            np.add(_times(AtK, d), y, out=out)
+            d = r * np.where(length <= ZERO_LENGTH, rest_direction, v / np.maximum(length, ZERO_LENGTH))
+            np.add(_multiply_dense(AtK, d), y, out=out)
 
-        free = system.free
-        exact = system.pins.vertices[system.pins.exact]
+        free = system.free_vertices
+        exact = system.pins.vertices[system.pins.exact_mask]
         factor = DenseCholesky(Q[np.ix_(free, free)])
         return PreparedLocalGlobal(
             system,
@@ -95,8 +101,8 @@ class DenseLocalGlobal:
             factor,
             csr_array(Q[np.ix_(free, exact)]),
             lambda e: matrices.energy_norm(Q, e),
-            float(np.diag(Q)[system.unpinned].sum()),
-            facts(int(np.count_nonzero(Q)), factor),
+            float(np.diag(Q)[system.unpinned_mask].sum()),
+            factor_stats(int(np.count_nonzero(Q)), factor),
             "dense Cholesky",
         )
 
@@ -105,23 +111,23 @@ class DenseLocalGlobal:
 class SparseLocalGlobal:
     """Local-global with SciPy sparse matrices and one sparse factorisation, for all projective energies."""
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
-    about: ClassVar[About] = About(LOCAL_GLOBAL, LIU_2013)
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(LOCAL_GLOBAL_FAMILY, LIU_2013)
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:
             Unsupported: if an energy is not projective.
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
-        if without_contact(system) is not system:
-            from solvers.contact.local_global import local_global  # for those who need it
+        if without_vertex_contact(system) is not system:
+            from solvers.contact.local_global import prepare_with_half_spaces  # for those who need it
 
-            return local_global(self, system)
-        if without_bounded(system) is not system:
-            from solvers.contact.pairs_local_global import local_global
+            return prepare_with_half_spaces(self, system)
+        if without_barriers(system) is not system:
+            from solvers.contact.pairs_local_global import prepare_with_barriers
 
-            return local_global(self, system)
-        return prepared(system, projective(system, "sparse"), lambda Q: (SparseLU(Q), "SuperLU"))
+            return prepare_with_barriers(self, system)
+        return prepare_local_global(system, require_projective(system, "sparse"), lambda Q: (SparseLU(Q), "SuperLU"))

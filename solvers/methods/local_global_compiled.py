@@ -12,16 +12,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from solvers.about import LIU_2013, LOCAL_GLOBAL, About
-from solvers.contact.touching import without_contact
-from solvers.core.bounds import without_bounded
-from solvers.core.compiled import FAR, PreparedCompiled, compiled
-from solvers.core.prefactored import Project, prepared, projective
+from solvers.about import LIU_2013, LOCAL_GLOBAL_FAMILY, SolverInfo
+from solvers.contact.touching import without_vertex_contact
+from solvers.core.bounds import without_barriers
+from solvers.core.compiled import PADDING_COORDINATE, PreparedCompiledLocalGlobal, compile_iterations
+from solvers.core.prefactored import LocalStep, prepare_local_global, require_projective
 from solvers.energies.springs import Springs
 from solvers.kernels import springs as kernels
-from solvers.linear.choice import Linear, Precision, factorise
-from solvers.memory import aligned
-from solvers.problem import Positions, Prepared, System
+from solvers.linear.choice import LinearSolverName, Precision, build_linear_solver
+from solvers.memory import allocate_aligned
+from solvers.problem import Positions, PreparedSolver, System
 
 
 @dataclass(frozen=True)
@@ -33,52 +33,52 @@ class CompiledLocalGlobal:
         precision: floating-point type of its stored entries.
     """
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
-    about: ClassVar[About] = About(LOCAL_GLOBAL, LIU_2013, first=True)
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(LOCAL_GLOBAL_FAMILY, LIU_2013, is_family_default=True)
 
-    linear: Linear = "auto"
+    linear: LinearSolverName = "auto"
     precision: Precision = "float64"
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:
             Unsupported: if an energy is neither projective nor contact.
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
-        if without_contact(system) is not system:
-            from solvers.contact.local_global import local_global  # for those who need it
+        if without_vertex_contact(system) is not system:
+            from solvers.contact.local_global import prepare_with_half_spaces  # for those who need it
 
-            return local_global(self, system)
-        if without_bounded(system) is not system:
-            from solvers.contact.pairs_local_global import local_global
+            return prepare_with_half_spaces(self, system)
+        if without_barriers(system) is not system:
+            from solvers.contact.pairs_local_global import prepare_with_barriers
 
-            return local_global(self, system)
-        energies = projective(system, "numba")
+            return prepare_with_barriers(self, system)
+        energies = require_projective(system, "numba")
         springs = [energy for energy in energies if isinstance(energy, Springs)]
-        alone = [Springs.joined(springs)] if len(springs) == len(energies) else []
-        base = prepared(
+        alone = [Springs.from_parts(springs)] if len(springs) == len(energies) else []
+        base = prepare_local_global(
             system,
             alone or energies,
-            lambda Q: factorise(Q, self.linear, self.precision),
-            rounded=self.precision != "float64",
+            lambda Q: build_linear_solver(Q, self.linear, self.precision),
+            is_low_precision=self.precision != "float64",
         )
-        found = compiled(base)
-        if isinstance(found, PreparedCompiled):
+        found = compile_iterations(base)
+        if isinstance(found, PreparedCompiledLocalGlobal):
             return found
-        local = {"project": _projection(alone[0], system.vertices)} if alone else {}
-        return replace(base, choice=f"{base.choice}; {found}", **local)
+        local = {"project": _compile_local_step(alone[0], system.num_vertices)} if alone else {}
+        return replace(base, description=f"{base.description}; {found}", **local)
 
 
-def _projection(springs: Springs, n: int) -> Project:
+def _compile_local_step(springs: Springs, n: int) -> LocalStep:
     """Compile the local step for a linear solver that is called from Python."""
-    bundles, _ = kernels.Bundles.of(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
-    x, b = (aligned(4 * (n + 2)) for _ in range(2))
-    x[4 * (n + 1)] = FAR
-    zero = bundles.right(np.zeros(n + 2))
+    bundles, _ = kernels.SpringPackets.from_springs(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
+    x, b = (allocate_aligned(4 * (n + 2)) for _ in range(2))
+    x[4 * (n + 1)] = PADDING_COORDINATE
+    zero = bundles.build_right_hand_side(np.zeros(n + 2))
 
     def project(p: Positions, y: Positions, out: Positions) -> None:
-        kernels.project(bundles, p, y, x, b, zero, out)
+        kernels.run_local_step(bundles, p, y, x, b, zero, out)
 
     return project

@@ -29,23 +29,31 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, eye_array
 
-from solvers.about import About, Reference
+from solvers.about import Citation, SolverInfo
 from solvers.core import vertex_terms
-from solvers.core.driver import Iterating, Iterative
-from solvers.core.prefactored import only_springs
-from solvers.energies.edges import directions
-from solvers.linear.near_kernel import Cycle, Prolongation, Solving, coarsest, near_kernel, norm, scaled
-from solvers.matrices import diagonal, signed_incidence_matrix_sparse, without_zeros
-from solvers.problem import Positions, ResidualOf, StepProblem, System
+from solvers.core.driver import IterativeSolver, SolverState
+from solvers.core.prefactored import require_only_springs
+from solvers.energies.edges import unit_directions
+from solvers.linear.near_kernel import (
+    PreconditionedSolve,
+    ProlongationHierarchy,
+    VCycle,
+    compute_near_nullspace,
+    is_coarsest_level,
+    normalise_columns,
+    ordered_norm,
+)
+from solvers.matrices import diagonal_matrix, drop_zeros, signed_incidence_matrix_sparse
+from solvers.problem import Positions, ResidualIterate, StepProblem, System
 from solvers.round_off import EPS
 
-_SWEEPS = 30
+_NEAR_NULL_SWEEPS = 30
 """Gauss-Seidel sweeps on random vectors that yield near-null-space vectors."""
 
-_NEAR, _MOST = 1e-5, 100
+_CG_RTOL, _MAX_CG_ITERATIONS = 1e-5, 100
 """Relative residual at which a linear solve ends, and its maximum number of iterations."""
 
-_SHORTEST = 2.0**-30
+_MIN_STEP_LENGTH = 2.0**-30
 """Shortest step size: a shorter step is round-off."""
 
 
@@ -60,11 +68,11 @@ class MultigridXpbd:
         smooth_prolongation: whether prolongations are smoothed.
     """
 
-    minimises: ClassVar[bool] = False
-    descends: ClassVar[bool] = False
-    about: ClassVar[About] = About(
+    is_minimiser: ClassVar[bool] = False
+    is_monotone: ClassVar[bool] = False
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "position-based",
-        Reference(
+        Citation(
             "Li, Chunlei and Yu, Peng and Liu, Tiantian and Yu, Siyuan and Xiao, Yuting and Li, Shuai and Hao, Aimin "
             "and Gao, Yang and Zhao, Qinping",
             2025,
@@ -89,16 +97,16 @@ class MultigridXpbd:
         Raises:
             Unsupported: for energies other than springs, and for unpinned vertices without mass.
         """
-        springs, held = only_springs(system, "mgpbd"), vertex_terms.held(system)
+        springs, held = require_only_springs(system, "mgpbd"), vertex_terms.compute_anchor_stiffness(system)
         vertex_terms.require_mass(system, held, "mgpbd")
         keep = np.flatnonzero(springs.edges[:, 0] != springs.edges[:, 1])  # self-loops stretch nothing
         incidence, root = (
             signed_incidence_matrix_sparse(springs.edges[keep], len(held)),
             np.sqrt(springs.stiffness[keep]),
         )
-        half = csr_array(diagonal(root) @ incidence)
+        half = csr_array(diagonal_matrix(root) @ incidence)
         one = csr_array(eye_array(len(keep)))
-        coupling = without_zeros(one + csr_array(half @ diagonal(1.0 / held)) @ csr_array(half.T))  # rows in order
+        coupling = drop_zeros(one + csr_array(half @ diagonal_matrix(1.0 / held)) @ csr_array(half.T))  # rows in order
         return PreparedMultigridXpbd(
             self,
             system,
@@ -114,7 +122,7 @@ class MultigridXpbd:
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedMultigridXpbd(Iterative):
+class PreparedMultigridXpbd(IterativeSolver):
     """MGPBD, prepared for a system.
 
     Attributes:
@@ -126,47 +134,51 @@ class PreparedMultigridXpbd(Iterative):
         vertex_compliance: 1/q (n,) [m/N].
     """
 
-    residual_of: ClassVar[ResidualOf] = "none"
+    residual_iterate: ClassVar[ResidualIterate] = "none"
 
-    solver: MultigridXpbd
+    parameters: MultigridXpbd
     system: System
-    incidence: csr_array
-    coupling: csr_array
-    root: NDArray[np.float64]
+    incidence_matrix: csr_array
+    coupling_matrix: csr_array
+    root_stiffness: NDArray[np.float64]
     rest_length: NDArray[np.float64]
     rest_direction: NDArray[np.float64]
-    compliance: NDArray[np.float64]
-    choice: str
-    facts: dict[str, float] = field(default_factory=dict)
+    vertex_compliance: NDArray[np.float64]
+    description: str
+    stats: dict[str, float] = field(default_factory=dict)
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Dual:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> MgpbdState:
         """Start a solve at the positions that the vertices have without springs."""
-        return Dual(self, vertex_terms.anchors(problem))
+        return MgpbdState(self, vertex_terms.compute_anchor_positions(problem))
 
-    def stretched(self, p: Positions) -> tuple[NDArray[np.float64], Positions]:
+    def scaled_constraints(self, p: Positions) -> tuple[NDArray[np.float64], Positions]:
         """Compute K^1/2 C(p) (m,) [J^(1/2)] and the spring directions N (m, 3) at positions p (n, 3)."""
-        length, unit = directions(self.incidence @ p, self.rest_direction)
-        return self.root * (length - self.rest_length), unit
+        length, unit = unit_directions(self.incidence_matrix @ p, self.rest_direction)
+        return self.root_stiffness * (length - self.rest_length), unit
 
-    def matrix(self, unit: Positions) -> csr_array:
+    def dual_matrix(self, directions: Positions) -> csr_array:
         """Assemble the dual matrix A (m, m) for spring directions N (m, 3)."""
-        G = self.coupling
-        rows = np.repeat(np.arange(len(unit)), np.diff(G.indptr))
-        entries = G.data * np.einsum("ij,ij->i", unit[rows], unit[G.indices])
+        G = self.coupling_matrix
+        rows = np.repeat(np.arange(len(directions)), np.diff(G.indptr))
+        entries = G.data * np.einsum("ij,ij->i", directions[rows], directions[G.indices])
         return csr_array((entries, G.indices, G.indptr), shape=G.shape)
 
-    def prolongation(self, A: csr_array) -> Prolongation:
+    def build_prolongation(self, A: csr_array) -> ProlongationHierarchy:
         """Build the prolongation for A and its successors by the rule of the solver."""
-        made = self.solver
-        if coarsest(A):
-            return Prolongation(A, np.empty((A.shape[0], 0)))
+        made = self.parameters
+        if is_coarsest_level(A):
+            return ProlongationHierarchy(A, np.empty((A.shape[0], 0)))
         if made.components:
-            return Prolongation(A, near_kernel(A, made.components, _SWEEPS), made.smoothed)
-        equal = np.divide(1.0, self.root, out=np.zeros_like(self.root), where=self.root > 0.0)
-        return Prolongation(A, scaled(equal[:, None]), made.smoothed)
+            return ProlongationHierarchy(
+                A, compute_near_nullspace(A, made.components, _NEAR_NULL_SWEEPS), made.smoothed
+            )
+        equal = np.divide(
+            1.0, self.root_stiffness, out=np.zeros_like(self.root_stiffness), where=self.root_stiffness > 0.0
+        )
+        return ProlongationHierarchy(A, normalise_columns(equal[:, None]), made.smoothed)
 
 
-class Dual(Iterating):
+class MgpbdState(SolverState):
     """State of an MGPBD solve.
 
     Attributes:
@@ -176,31 +188,35 @@ class Dual(Iterating):
     """
 
     def __init__(self, prepared: PreparedMultigridXpbd, p: Positions) -> None:
-        self._prepared, self.positions, self.iterations, self._count = prepared, p, 0, 0
-        self.tension = np.zeros_like(prepared.root)
-        self.misfit, self._unit = prepared.stretched(p)
+        self._prepared, self.positions, self.num_cg_iterations, self._num_iterations = prepared, p, 0, 0
+        self.scaled_tension = np.zeros_like(prepared.root_stiffness)
+        self.dual_residual, self._directions = prepared.scaled_constraints(p)
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         """Update all springs; return False at round-off."""
-        made, before = self._prepared, norm(self.misfit)
-        round_off = EPS * norm(np.abs(self.misfit + self.tension) + made.root * made.rest_length)
+        made, before = self._prepared, ordered_norm(self.dual_residual)
+        round_off = EPS * ordered_norm(
+            np.abs(self.dual_residual + self.scaled_tension) + made.root_stiffness * made.rest_length
+        )
         if not round_off < before < np.inf:
             return False
-        A = made.matrix(self._unit)
-        if self._count % made.solver.setup == 0:
-            self._prolongation = made.prolongation(A)
-        solving = Solving(A, Cycle(A, self._prolongation), self.misfit, _NEAR)
-        self.iterations = solving.solve(_MOST)
+        A = made.dual_matrix(self._directions)
+        if self._num_iterations % made.parameters.setup == 0:
+            self._prolongation = made.build_prolongation(A)
+        solving = PreconditionedSolve(A, VCycle(A, self._prolongation), self.dual_residual, _CG_RTOL)
+        self.num_cg_iterations = solving.solve(_MAX_CG_ITERATIONS)
         change = solving.x
-        way = made.compliance[:, None] * (made.incidence.T @ ((made.root * change)[:, None] * self._unit))
+        way = made.vertex_compliance[:, None] * (
+            made.incidence_matrix.T @ ((made.root_stiffness * change)[:, None] * self._directions)
+        )
         length = 1.0
-        while length >= _SHORTEST:
-            p, tension = self.positions - length * way, self.tension + length * change
-            stretched, unit = made.stretched(p)
+        while length >= _MIN_STEP_LENGTH:
+            p, tension = self.positions - length * way, self.scaled_tension + length * change
+            stretched, unit = made.scaled_constraints(p)
             misfit = stretched - tension
-            if norm(misfit) < before:
-                self.positions, self.tension, self.misfit, self._unit = p, tension, misfit, unit
-                self._count += 1
+            if ordered_norm(misfit) < before:
+                self.positions, self.scaled_tension, self.dual_residual, self._directions = p, tension, misfit, unit
+                self._num_iterations += 1
                 return True
             length *= 0.5
         return False

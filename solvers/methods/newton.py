@@ -22,41 +22,48 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.about import About, Reference
-from solvers.contact.touching import is_contact
-from solvers.core.bounds import is_bounded
-from solvers.core.definite import LEVELS, RULES, Close, Graded, Indefinite, Rule
-from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
-from solvers.core.fixed_objective import Objective
+from solvers.about import Citation, SolverInfo
+from solvers.contact.touching import is_vertex_contact
+from solvers.core.bounds import is_barrier_energy
+from solvers.core.definite import (
+    REGULARISATION_RULES,
+    SHIFT_SCHEDULE,
+    ContactScheduleRule,
+    IndefiniteStrategy,
+    RegularisationRule,
+    ShiftScheduleRule,
+)
+from solvers.core.descent import DescentPoint, PreparedDescent, ResidualMetric, backtracking_line_search, inner_product
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
-from solvers.core.saddles import certified, leave
+from solvers.core.saddles import escape_saddle, is_positive_definite
 from solvers.problem import Positions, System, Unsupported
 
 if TYPE_CHECKING:
-    from solvers.contact.settling import Settling
+    from solvers.contact.settling import FrictionGaussSeidel
 
-_SLIGHT = 1e-12
+_SADDLE_SLOPE_RATIO = 1e-12
 """Fraction of the steepest slope of a solve below which an exact Hessian without a factor indicates a saddle."""
 
 
 @dataclass(frozen=True)
-class Newton:
+class NewtonSolver:
     """Newton's method; at convergence or stagnation, negative curvature is at the level of round-off.
 
     Args:
         indefinite_strategy: modification of indefinite Hessians (`hessian_regularisation`).
     """
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
-    about: ClassVar[About] = About(
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "Newton",
-        Reference("Nocedal, Jorge and Wright, Stephen J.", 2006, "Numerical Optimization", "10.1007/978-0-387-40065-5"),
-        first=True,
-        to_error=True,
+        Citation("Nocedal, Jorge and Wright, Stephen J.", 2006, "Numerical Optimization", "10.1007/978-0-387-40065-5"),
+        is_family_default=True,
+        supports_error_control=True,
     )
 
-    indefinite: Indefinite = "graded"
+    indefinite: IndefiniteStrategy = "graded"
 
     def prepare(self, system: System) -> PreparedDescent:
         """Prepare the method for a system.
@@ -66,93 +73,110 @@ class Newton:
             Unsupported: if Q does not fit in memory, and for energies without an element-wise form that
                 `indefinite_strategy` requires.
         """
-        metric, objective = Metric(system), Objective(system)
-        whole = {type(system.energies[k]).__name__ for k in objective.own if not is_bounded(system.energies[k])}
+        metric, objective = ResidualMetric(system), FixedObjective(system)
+        whole = {
+            type(system.energies[k]).__name__
+            for k in objective.other_energy_indices
+            if not is_barrier_energy(system.energies[k])
+        }
         if whole and self.indefinite != "graded":
             raise Unsupported(
                 f"newton, indefinite: {self.indefinite}: changes second derivatives element by element, and there are "
                 f"none of {', '.join(sorted(whole))}; take indefinite: graded"
             )
-        factor = objective.matrix.factor
-        facts = metric.facts | {"nnz_hessian_factor": float(factor.nonzeros)}
-        choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; residuals by {metric.choice}"
-        choice += objective.interpreted
-        return PreparedDescent(objective, metric, NewtonMethod(metric, self.indefinite), choice, facts)
+        factor = objective.hessian_matrix.factor
+        facts = metric.stats | {"nnz_hessian_factor": float(factor.nonzeros)}
+        choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; residuals by {metric.description}"
+        choice += objective.interpreted_energies
+        return PreparedDescent(objective, metric, NewtonIteration(metric, self.indefinite), choice, facts)
 
 
-class NewtonMethod:
+class NewtonIteration:
     """The iteration of Newton's method for one system."""
 
-    def __init__(self, metric: Metric, indefinite: Indefinite = "graded") -> None:
-        self._metric, self._rule = metric, RULES[indefinite]
-        self._diagonal: NDArray[np.float64] = np.repeat(metric.diagonal, 3)
-        self._settling = settling_for(metric)
+    def __init__(self, metric: ResidualMetric, indefinite: IndefiniteStrategy = "graded") -> None:
+        self._metric, self._modification_rule = metric, REGULARISATION_RULES[indefinite]
+        self._system_diagonal: NDArray[np.float64] = np.repeat(metric.free_diagonal, 3)
+        self._friction_search = make_friction_search(metric)
 
-    def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
+    def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
         """Yield the points after `start`."""
-        point, steepest, rule = start, 0.0, self._rule()
-        if step.bounded and type(rule) is Graded:
-            rule = Close()
-        if self._settling and step.touched:
-            point = self._settling.start(step, point)
-        while not point.stalled:
-            point, steepest = self._next(step, point, steepest, rule)
+        point, steepest, rule = start, 0.0, self._modification_rule()
+        if step.barrier_energies and type(rule) is ShiftScheduleRule:
+            rule = ContactScheduleRule()
+        if self._friction_search and step.has_contact_elements:
+            point = self._friction_search.relax_initial_point(step, point)
+        while not point.is_stalled:
+            point, steepest = self._next_point(step, point, steepest, rule)
             yield point
 
-    def certifies(self, step: StepObjective, at: Point) -> bool:
+    def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
         """Return whether the stationary point `at` is a minimum, as far as the method can determine."""
-        return certified(step, at.positions)
+        return is_positive_definite(step, at.positions)
 
-    def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
+    def iteration_phases(self, step: StepObjective, at: DescentPoint) -> dict[str, Callable[[], object]]:
         """Return the gradient, the Hessian with its factorisation, and a solve as callables."""
-        hessian, (keep, by) = step.hessian(at.positions), LEVELS[-1]  # any other may have no factor to solve with
-        hessian.factorise(keep, by * self._diagonal)
+        hessian, (keep, by) = (
+            step.hessian(at.positions),
+            SHIFT_SCHEDULE[-1],
+        )  # any other may have no factor to solve with
+        hessian.factorise(keep, by * self._system_diagonal)
         return {
             "gradient": lambda: step.gradient(at.positions),
-            "factor": lambda: hessian.factorise(keep, by * self._diagonal),
+            "factor": lambda: hessian.factorise(keep, by * self._system_diagonal),
             "solve": lambda: hessian.solve(at.gradient),
         }
 
-    def _next(self, step: StepObjective, at: Point, steepest: float, rule: Rule) -> tuple[Point, float]:
+    def _next_point(
+        self, step: StepObjective, at: DescentPoint, steepest: float, rule: RegularisationRule
+    ) -> tuple[DescentPoint, float]:
         """Return the next point, and the steepest slope so far [J]."""
         hessian = step.hessian(at.positions)
-        level = rule.factorised(hessian, at, self._diagonal)
+        level = rule.factorise_hessian(hessian, at, self._system_diagonal)
         if level is None:
-            return at._replace(stalled=True), steepest
+            return at._replace(is_stalled=True), steepest
         direction = -hessian.solve(at.gradient)
-        fall = -dot(at.gradient, direction)
+        fall = -inner_product(at.gradient, direction)
         steepest = max(fall, steepest)
-        known = fall > self._metric.round_off(at.positions)
-        slight = fall <= _SLIGHT * steepest
-        if level > 0 and (slight or not known) and type(rule) is not Graded:
-            return self._next(step, at, steepest, Graded())
+        known = fall > self._metric.energy_roundoff(at.positions)
+        slight = fall <= _SADDLE_SLOPE_RATIO * steepest
+        if level > 0 and (slight or not known) and type(rule) is not ShiftScheduleRule:
+            return self._next_point(step, at, steepest, ShiftScheduleRule())
         found = None
         if known and not (slight and level > 0):
-            found = self._descent(step, at, direction, level == 0)
+            found = self._search_direction(step, at, direction, level == 0)
         if found is None and level > 0:
-            found = leave(step, at, hessian, self._diagonal) or (search(step, at, direction) if known else None)
+            found = escape_saddle(step, at, hessian, self._system_diagonal) or (
+                backtracking_line_search(step, at, direction) if known else None
+            )
         if found is not None:
-            rule.took(step, hessian, at, found)
-        return found or at._replace(stalled=True), steepest
+            rule.record_step(step, hessian, at, found)
+        return found or at._replace(is_stalled=True), steepest
 
-    def _descent(self, step: StepObjective, at: Point, direction: Positions, exact: bool) -> Point | None:
+    def _search_direction(
+        self, step: StepObjective, at: DescentPoint, direction: Positions, exact: bool
+    ) -> DescentPoint | None:
         """Return a lower point along a direction, or None; `exact` means an unmodified Hessian."""
-        if self._settling is None or not exact or not step.touched:
-            return search(step, at, direction)
-        return self._settling.search(step, at, direction, lambda point: self._exact(step, point))
+        if self._friction_search is None or not exact or not step.has_contact_elements:
+            return backtracking_line_search(step, at, direction)
+        return self._friction_search.watchdog_search(
+            step, at, direction, lambda point: self._exact_newton_direction(step, point)
+        )
 
     @staticmethod
-    def _exact(step: StepObjective, at: Point) -> Positions | None:
+    def _exact_newton_direction(step: StepObjective, at: DescentPoint) -> Positions | None:
         """Return the direction of the exact Hessian, None if it is not positive definite."""
         hessian = step.hessian(at.positions)
         return -hessian.solve(at.gradient) if hessian.factorise() else None
 
 
-def settling_for(metric: Metric) -> Settling | None:
+def make_friction_search(metric: ResidualMetric) -> FrictionGaussSeidel | None:
     """Return the friction search of Newton's methods; None without contact, and with surface contact."""
     energies = metric.system.energies
-    if not any(is_contact(energy) for energy in energies) or any(is_bounded(energy) for energy in energies):
+    if not any(is_vertex_contact(energy) for energy in energies) or any(
+        is_barrier_energy(energy) for energy in energies
+    ):
         return None  # its sweeps know of no bounds
-    from solvers.contact.settling import Settling  # for those who need it
+    from solvers.contact.settling import FrictionGaussSeidel  # for those who need it
 
-    return Settling(metric)
+    return FrictionGaussSeidel(metric)

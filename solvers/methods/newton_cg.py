@@ -17,45 +17,45 @@ from typing import ClassVar
 
 import numpy as np
 
-from solvers.about import About, Reference
-from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
-from solvers.core.fixed_objective import Objective
+from solvers.about import Citation, SolverInfo
+from solvers.core.descent import DescentPoint, PreparedDescent, ResidualMetric, backtracking_line_search, inner_product
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import Hessian, StepObjective
-from solvers.core.preconditioning import Preconditioner, Preconditioning, Scaled, preconditioning
-from solvers.device import Precise
+from solvers.core.preconditioning import Preconditioner, PreconditionerName, ScaledPreconditioner, build_preconditioner
+from solvers.device import PrecisionOptions
 from solvers.kernels import conjugate
-from solvers.linear.inverse import Inverse
-from solvers.linear.krylov import CURVED, Iteration
-from solvers.linear.supernodal import Supernodal
-from solvers.methods.newton import settling_for
-from solvers.problem import Positions, Prepared, System
+from solvers.linear.inverse import DenseInverse
+from solvers.linear.krylov import NEGATIVE_CURVATURE, ConjugateGradientIteration
+from solvers.linear.supernodal import SupernodalCholesky
+from solvers.methods.newton import make_friction_search
+from solvers.problem import Positions, PreparedSolver, System
 
-_LOOSE, _TIGHT = 0.5, 1e-10
+_MAX_ETA, _MIN_ETA = 0.5, 1e-10
 """Upper and lower bound of eta."""
 
-_TOUCHED = 1e-4
+_MAX_ETA_IN_CONTACT = 1e-4
 """Upper bound of eta with active contacts: sticking friction acts within 1e-8 m, and a direction with a small error on
 that scale leads to where another quadratic model holds."""
 
-_MOST = 1000
+_MAX_CG_ITERATIONS = 1000
 """Maximum number of conjugate gradient iterations: the stiffest springs need it for a few digits."""
 
 
 @dataclass(frozen=True)
-class NewtonCG(Precise):
+class NewtonCG(PrecisionOptions):
     """Newton's method without a factorisation of the Hessian; needs as much memory as local-global.
 
     Args:
         preconditioner: of conjugate gradients (`solvers.methods.base.preconditioners`); a device supports schwarz only.
     """
 
-    unstated: ClassVar[frozenset[str]] = Precise.unstated | {"preconditioner"}
+    omitted_defaults: ClassVar[frozenset[str]] = PrecisionOptions.omitted_defaults | {"preconditioner"}
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
-    about: ClassVar[About] = About(
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "Newton",
-        Reference(
+        Citation(
             "Dembo, Ron S. and Steihaug, Trond",
             1983,
             "Truncated-Newton algorithms for large-scale unconstrained optimization",
@@ -63,9 +63,9 @@ class NewtonCG(Precise):
         ),
     )
 
-    preconditioner: Preconditioning = "factor"
+    preconditioner: PreconditionerName = "factor"
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:
@@ -73,92 +73,107 @@ class NewtonCG(Precise):
             Unsupported: if Q does not fit in memory, and for block preconditioners with energies without elements.
         """
         if self.device == "cuda":
-            from solvers.cuda.device import ready  # for those who ask for it
+            from solvers.cuda.device import require_device  # for those who ask for it
 
-            ready("newton-cg")
-            from solvers.cuda.newton_cg import prepare
+            require_device("newton-cg")
+            from solvers.cuda.newton_cg import prepare_newton_cg
 
-            return prepare(system, self.preconditioner, self.real, (_LOOSE, _TIGHT), _MOST)
-        metric = Metric(system)
-        objective = Objective(system)
-        method = TruncatedNewton(metric, objective, self.preconditioner)
-        return PreparedDescent(objective, metric, method, metric.choice + objective.interpreted, metric.facts)
+            return prepare_newton_cg(
+                system, self.preconditioner, self.real_dtype, (_MAX_ETA, _MIN_ETA), _MAX_CG_ITERATIONS
+            )
+        metric = ResidualMetric(system)
+        objective = FixedObjective(system)
+        method = TruncatedNewtonIteration(metric, objective, self.preconditioner)
+        return PreparedDescent(
+            objective, metric, method, metric.description + objective.interpreted_energies, metric.stats
+        )
 
 
-class TruncatedNewton:
+class TruncatedNewtonIteration:
     """The iteration for one system; `compiled_cg` is the fused CG kernel, None if unavailable."""
 
-    def __init__(self, metric: Metric, objective: Objective, by: Preconditioning = "factor") -> None:
-        self._metric, self._at = metric, preconditioning(by, metric, objective, "newton-cg")
-        factor = _known(metric) if by == "factor" else None
-        self.compiled = _Compiled(objective, factor) if factor else None
-        self._settling = settling_for(metric)
+    def __init__(
+        self, metric: ResidualMetric, objective: FixedObjective, preconditioner: PreconditionerName = "factor"
+    ) -> None:
+        self._metric, self._linearise_at = metric, build_preconditioner(preconditioner, metric, objective, "newton-cg")
+        factor = _compiled_factor(metric) if preconditioner == "factor" else None
+        self.compiled_cg = _CompiledCG(objective, factor) if factor else None
+        self._friction_search = make_friction_search(metric)
 
-    def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
+    def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
         """Yield the points after `start`."""
-        loose = _TOUCHED if step.touched else _LOOSE
-        point, eta = self._settling.start(step, start) if self._settling and step.touched else start, loose
-        hessian, solve = self._at(step, point.positions)
+        loose = _MAX_ETA_IN_CONTACT if step.has_contact_elements else _MAX_ETA
+        point, eta = (
+            self._friction_search.relax_initial_point(step, start)
+            if self._friction_search and step.has_contact_elements
+            else start,
+            loose,
+        )
+        hessian, solve = self._linearise_at(step, point.positions)
         descent = solve(point.gradient)
-        while not point.stalled:
+        while not point.is_stalled:
             found = None
-            if dot(point.gradient, descent) > self._metric.round_off(point.positions):
-                direction = self._direction(step, hessian, solve, point, descent, eta)
-                found = self._along(step, point, direction, eta) or search(step, point, -descent)
+            if inner_product(point.gradient, descent) > self._metric.energy_roundoff(point.positions):
+                direction = self._compute_direction(step, hessian, solve, point, descent, eta)
+                found = self._search_direction(step, point, direction, eta) or backtracking_line_search(
+                    step, point, -descent
+                )
             if found is None:
-                yield point._replace(stalled=True)
+                yield point._replace(is_stalled=True)
                 return
-            hessian, solve = self._at(step, found.positions)
-            before, descent = dot(point.gradient, descent), solve(found.gradient)
+            hessian, solve = self._linearise_at(step, found.positions)
+            before, descent = inner_product(point.gradient, descent), solve(found.gradient)
             # Safeguard of Eisenstat and Walker: eta decreases no faster than its own square.
-            following = 0.9 * dot(found.gradient, descent) / before
-            eta = min(loose, max(_TIGHT, following, 0.9 * eta**2 if 0.9 * eta**2 > 0.1 else 0.0))
+            following = 0.9 * inner_product(found.gradient, descent) / before
+            eta = min(loose, max(_MIN_ETA, following, 0.9 * eta**2 if 0.9 * eta**2 > 0.1 else 0.0))
             point = found
             yield point
 
-    def _along(self, step: StepObjective, at: Point, direction: Positions, eta: float) -> Point | None:
+    def _search_direction(
+        self, step: StepObjective, at: DescentPoint, direction: Positions, eta: float
+    ) -> DescentPoint | None:
         """Return a lower point along a direction, or None."""
-        if self._settling is None or not step.touched:
-            return search(step, at, direction)
+        if self._friction_search is None or not step.has_contact_elements:
+            return backtracking_line_search(step, at, direction)
 
-        def following(point: Point) -> Positions:
-            hessian, solve = self._at(step, point.positions)
-            return self._direction(step, hessian, solve, point, solve(point.gradient), eta)
+        def following(point: DescentPoint) -> Positions:
+            hessian, solve = self._linearise_at(step, point.positions)
+            return self._compute_direction(step, hessian, solve, point, solve(point.gradient), eta)
 
-        return self._settling.search(step, at, direction, following)
+        return self._friction_search.watchdog_search(step, at, direction, following)
 
-    def certifies(self, step: StepObjective, at: Point) -> bool:
+    def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
         """Return True: without a factor, definiteness is unknown."""
         return True
 
-    def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
+    def iteration_phases(self, step: StepObjective, at: DescentPoint) -> dict[str, Callable[[], object]]:
         """Return the gradient, a product with the Hessian and the preconditioner as callables."""
-        hessian, solve = self._at(step, at.positions)
+        hessian, solve = self._linearise_at(step, at.positions)
         return {
             "gradient": lambda: step.gradient(at.positions),
-            "product": lambda: hessian.multiply(at.gradient),
+            "product": lambda: hessian.matvec(at.gradient),
             "solve": lambda: solve(at.gradient),
         }
 
-    def _direction(
+    def _compute_direction(
         self,
         step: StepObjective,
         hessian: Hessian,
         solve: Preconditioner,
-        at: Point,
+        at: DescentPoint,
         descent: Positions,
         eta: float,
     ) -> Positions:
         """Solve H d = -g approximately; `descent` is the preconditioned gradient."""
-        if self.compiled and not step.own:
-            return self.compiled.direction(hessian, solve, at, descent, eta)
-        product = dot(at.gradient, descent)
-        newton = _Newton(hessian, solve, at.gradient, descent, eta**2 * product)
-        count, ended = newton.iterate(product, _MOST)
-        return newton.p if ended == CURVED and count == 0 else newton.d
+        if self.compiled_cg and not step.other_energies:
+            return self.compiled_cg.compute_direction(hessian, solve, at, descent, eta)
+        product = inner_product(at.gradient, descent)
+        newton = _NewtonSystemCG(hessian, solve, at.gradient, descent, eta**2 * product)
+        count, ended = newton.run_iterations(product, _MAX_CG_ITERATIONS)
+        return newton.search_direction if ended == NEGATIVE_CURVATURE and count == 0 else newton.solution
 
 
-class _Newton(Iteration):
+class _NewtonSystemCG(ConjugateGradientIteration):
     """Conjugate gradients for H d = -g.
 
     Args:
@@ -173,55 +188,60 @@ class _Newton(Iteration):
         self, hessian: Hessian, solve: Preconditioner, gradient: Positions, descent: Positions, limit: float
     ) -> None:
         self._hessian, self._solve, self._limit = hessian, solve, limit
-        self.d, self.p, self._r, self._z = np.zeros_like(descent), np.zeros_like(descent), -gradient, -descent
+        self.solution, self.search_direction, self._residual, self._preconditioned_residual = (
+            np.zeros_like(descent),
+            np.zeros_like(descent),
+            -gradient,
+            -descent,
+        )
 
-    def turn(self, product: float, before: float) -> float:
+    def update_direction(self, product: float, before: float) -> float:
         """Update the search direction p; return p'Ap."""
-        self.p *= product / before
-        self.p += self._z
-        self._product = self._hessian.multiply(self.p)
-        return dot(self.p, self._product)
+        self.search_direction *= product / before
+        self.search_direction += self._preconditioned_residual
+        self._product = self._hessian.matvec(self.search_direction)
+        return inner_product(self.search_direction, self._product)
 
-    def go(self, product: float, curvature: float) -> float:
+    def update_iterate(self, product: float, curvature: float) -> float:
         """Update the iterate, r and z; return r'z."""
         length = product / curvature
-        self.d += length * self.p
-        self._r -= length * self._product
-        self._z = self._solve(self._r)
-        return dot(self._r, self._z)
+        self.solution += length * self.search_direction
+        self._residual -= length * self._product
+        self._preconditioned_residual = self._solve(self._residual)
+        return inner_product(self._residual, self._preconditioned_residual)
 
-    def convex(self, curvature: float) -> bool:
+    def is_convex(self, curvature: float) -> bool:
         """Return whether the curvature along p is positive."""
         return not curvature <= 0.0
 
-    def near(self, product: float) -> bool:
+    def is_converged(self, product: float) -> bool:
         """Return whether r'z has reached the tolerance."""
         return product <= self._limit
 
 
-def _known(metric: Metric) -> Supernodal | None:
+def _compiled_factor(metric: ResidualMetric) -> SupernodalCholesky | None:
     """Return a factor of the metric that kernels support, however small; None if Q has none."""
-    if isinstance(metric.factor, Inverse):
-        return Supernodal(metric.inner)
-    return metric.factor if isinstance(metric.factor, Supernodal) else None
+    if isinstance(metric.factor, DenseInverse):
+        return SupernodalCholesky(metric.free_block)
+    return metric.factor if isinstance(metric.factor, SupernodalCholesky) else None
 
 
-class _Compiled:
+class _CompiledCG:
     """Conjugate gradients in one kernel, for springs, quadratic forms and elements."""
 
-    def __init__(self, objective: Objective, factor: Supernodal) -> None:
+    def __init__(self, objective: FixedObjective, factor: SupernodalCholesky) -> None:
         system = objective.system
-        self._threads, self._held = factor.threads, system.pins.vertices[system.pins.exact]
-        self._factor = conjugate.among(factor, system.free)
-        self._scratch = np.zeros((4, system.vertices, 3))
+        self._thread_count, self._exact_pins = factor.choose_num_threads, system.pins.vertices[system.pins.exact_mask]
+        self._factor = conjugate.embed_factor(factor, system.free_vertices)
+        self._scratch = np.zeros((4, system.num_vertices, 3))
 
-    def direction(
-        self, hessian: Hessian, solve: Preconditioner, at: Point, descent: Positions, eta: float
+    def compute_direction(
+        self, hessian: Hessian, solve: Preconditioner, at: DescentPoint, descent: Positions, eta: float
     ) -> Positions:
         """Solve H d = -g approximately; `descent` is the preconditioned gradient."""
         d = np.empty_like(descent)
-        shrunk = solve.shrunk if isinstance(solve, Scaled) else None
-        solving = self._factor, self._threads(), self._held, shrunk
-        newton = conjugate.Newton(hessian.compiled, *solving, d, *self._scratch)
-        conjugate.direction(newton, at.gradient, descent, eta, _MOST)
+        shrunk = solve.inverse_scaling if isinstance(solve, ScaledPreconditioner) else None
+        solving = self._factor, self._thread_count(), self._exact_pins, shrunk
+        newton = conjugate.NewtonEquation(hessian.kernel_arguments, *solving, d, *self._scratch)
+        conjugate.solve_direction(newton, at.gradient, descent, eta, _MAX_CG_ITERATIONS)
         return d

@@ -21,14 +21,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from solvers.about import About, Reference
-from solvers.contact.touching import without_contact
-from solvers.core.descent import Metric, Point, dot, search
-from solvers.core.driver import Iterating, Iterative, largest
-from solvers.core.fixed_objective import Objective
+from solvers.about import Citation, SolverInfo
+from solvers.contact.touching import without_vertex_contact
+from solvers.core.descent import DescentPoint, ResidualMetric, backtracking_line_search, inner_product
+from solvers.core.driver import IterativeSolver, SolverState, compute_max_coordinate
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
-from solvers.core.preconditioning import At, Preconditioning, preconditioning
-from solvers.problem import Positions, Prepared, StepProblem, System, Unsupported
+from solvers.core.preconditioning import PreconditionerBuilder, PreconditionerName, build_preconditioner
+from solvers.problem import Positions, PreparedSolver, StepProblem, System, Unsupported
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,13 @@ class NonlinearCG:
         preconditioner: see `solvers.methods.base.preconditioners`.
     """
 
-    unstated: ClassVar[frozenset[str]] = frozenset({"preconditioner"})
+    omitted_defaults: ClassVar[frozenset[str]] = frozenset({"preconditioner"})
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
-    about: ClassVar[About] = About(
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "accelerated local-global",
-        Reference(
+        Citation(
             "Shen, Xing and Cai, Runyuan and Bi, Mengxiao and Lv, Tangjie",
             2024,
             "Preconditioned nonlinear conjugate gradient method for real-time interior-point hyperelasticity",
@@ -53,9 +53,9 @@ class NonlinearCG:
         ),
     )
 
-    preconditioner: Preconditioning = "factor"
+    preconditioner: PreconditionerName = "factor"
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:
@@ -63,89 +63,103 @@ class NonlinearCG:
             Unsupported: for contact of single vertices, if Q does not fit in memory, and for block preconditioners with
                 energies without elements.
         """
-        if without_contact(system) is not system:
+        if without_vertex_contact(system) is not system:
             raise Unsupported(
                 "pncg: does not support contact of single vertices (Contact), for which no quadratic model is valid "
                 "along a direction; use lbfgs or newton, or surface-contact"
             )
-        metric, objective = Metric(system), Objective(system)
-        at = preconditioning(self.preconditioner, metric, objective, "pncg")
-        return PreparedPncg(metric, objective, at, metric.choice + objective.interpreted, metric.facts)
+        metric, objective = ResidualMetric(system), FixedObjective(system)
+        at = build_preconditioner(self.preconditioner, metric, objective, "pncg")
+        return PreparedNonlinearCG(
+            metric, objective, at, metric.description + objective.interpreted_energies, metric.stats
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedPncg(Iterative):
+class PreparedNonlinearCG(IterativeSolver):
     """Nonlinear conjugate gradients, prepared for a system."""
 
-    metric: Metric
-    objective: Objective
-    at: At
-    choice: str
-    facts: dict[str, float]
+    metric: ResidualMetric
+    fixed_objective: FixedObjective
+    linearise_at: PreconditionerBuilder
+    description: str
+    stats: dict[str, float]
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        return _Iterating(self.metric, self.at, StepObjective(self.objective, problem), guess)
+        return _NonlinearCGState(
+            self.metric, self.linearise_at, StepObjective(self.fixed_objective, problem), initial_guess
+        )
 
-    def scale(self, problem: StepProblem) -> float:
+    def residual_scale(self, problem: StepProblem) -> float:
         """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
-        return largest(problem) * self.metric.trace**0.5
+        return compute_max_coordinate(problem) * self.metric.unpinned_trace**0.5
 
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """Return the gradient, a Hessian product and the preconditioner as callables, at the initial guess."""
-        step = StepObjective(self.objective, problem)
-        p = step.placed(problem.first_guess)
-        (hessian, solve), gradient = self.at(step, p), step.gradient(p)
+        step = StepObjective(self.fixed_objective, problem)
+        p = step.apply_exact_pins(problem.initial_guess)
+        (hessian, solve), gradient = self.linearise_at(step, p), step.gradient(p)
         return {
             "gradient": lambda: step.gradient(p),
-            "product": lambda: hessian.multiply(gradient),
+            "product": lambda: hessian.matvec(gradient),
             "solve": lambda: solve(gradient),
         }
 
 
-class _Iterating(Iterating):
+class _NonlinearCGState(SolverState):
     """State of a solve: the current point, and the direction that led to it."""
 
-    def __init__(self, metric: Metric, preconditioned: At, step: StepObjective, guess: Positions) -> None:
-        self._metric, self._preconditioned, self._step = metric, preconditioned, step
-        p = step.placed(guess)
-        self._came, self._beta = np.zeros_like(p), 0.0
-        self._arrive(Point(p, step.gradient(p)))
+    def __init__(
+        self, metric: ResidualMetric, linearise_at: PreconditionerBuilder, step: StepObjective, guess: Positions
+    ) -> None:
+        self._metric, self._linearise_at, self._step = metric, linearise_at, step
+        p = step.apply_exact_pins(guess)
+        self._previous_direction, self._beta = np.zeros_like(p), 0.0
+        self._set_point(DescentPoint(p, step.gradient(p)))
 
-    def _arrive(self, at: Point) -> None:
-        self._at, self.positions = at, at.positions
-        self._hessian, self._solve = self._preconditioned(self._step, at.positions)
+    def _set_point(self, at: DescentPoint) -> None:
+        self._current_point, self.positions = at, at.positions
+        self._hessian, self._solve = self._linearise_at(self._step, at.positions)
         self._z = self._solve(at.gradient)
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents any further change."""
-        at, z = self._at, self._z
-        if not dot(at.gradient, z) > self._metric.round_off(at.positions):
+        at, z = self._current_point, self._z
+        if not inner_product(at.gradient, z) > self._metric.energy_roundoff(at.positions):
             return False
-        direction = self._beta * self._came - z
-        found = self._along(direction) if self._beta else None
+        direction = self._beta * self._previous_direction - z
+        found = self._search_quadratic_model(direction) if self._beta else None
         if found is None:
             direction = -z
-            found = self._along(direction) or search(self._step, at, direction)
+            found = self._search_quadratic_model(direction) or backtracking_line_search(self._step, at, direction)
         if found is None:
             return False
-        self._arrive(found)
+        self._set_point(found)
         y = found.gradient - at.gradient
-        change = dot(direction, y)
-        beta = dot(y, self._z) - dot(self._z - z, y) * dot(found.gradient, direction) / change if change > 0.0 else 0.0
-        self._came, self._beta = direction, beta / change if np.isfinite(beta) and change > 0.0 else 0.0
+        change = inner_product(direction, y)
+        beta = (
+            inner_product(y, self._z)
+            - inner_product(self._z - z, y) * inner_product(found.gradient, direction) / change
+            if change > 0.0
+            else 0.0
+        )
+        self._previous_direction, self._beta = direction, beta / change if np.isfinite(beta) and change > 0.0 else 0.0
         return True
 
-    def _along(self, direction: Positions) -> Point | None:
+    def _search_quadratic_model(self, direction: Positions) -> DescentPoint | None:
         """Return a lower point by the quadratic model; None without descent or with negative curvature."""
-        slope, curvature = dot(self._at.gradient, direction), dot(direction, self._hessian.multiply(direction))
+        slope, curvature = (
+            inner_product(self._current_point.gradient, direction),
+            inner_product(direction, self._hessian.matvec(direction)),
+        )
         if not (slope < 0.0 < curvature):
             return None
-        return search(self._step, self._at, direction, first=-slope / curvature)
+        return backtracking_line_search(self._step, self._current_point, direction, initial_step=-slope / curvature)
 
     def residual(self) -> float:
         """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
-        gradient = self._at.gradient
+        gradient = self._current_point.gradient
         if self._solve == self._metric.solve:
-            return self._metric.norm(self._z.copy(), gradient)
+            return self._metric.correction_norm(self._z.copy(), gradient)
         return self._metric.residual(gradient)

@@ -17,27 +17,35 @@ from typing import ClassVar
 
 import numpy as np
 
-from solvers.contact.touching import without_contact
-from solvers.core.acceleration import Accelerating, Engine, Interpreted, Scheme, window_for
-from solvers.core.bounds import without_bounded
-from solvers.core.compiled import FAR, PreparedCompiled, compiled
-from solvers.core.driver import Iterative, largest
-from solvers.core.fixed_objective import Objective
+from solvers.contact.touching import without_vertex_contact
+from solvers.core.acceleration import (
+    AcceleratedState,
+    AccelerationEngine,
+    AccelerationScheme,
+    InterpretedState,
+    allocate_window,
+)
+from solvers.core.bounds import without_barriers
+from solvers.core.compiled import PADDING_COORDINATE, PreparedCompiledLocalGlobal, compile_iterations
+from solvers.core.driver import IterativeSolver, compute_max_coordinate
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
-from solvers.core.parts import Parts
-from solvers.core.prefactored import PreparedLocalGlobal, prepared, projective
+from solvers.core.parts import SpringForm
+from solvers.core.prefactored import PreparedLocalGlobal, prepare_local_global, require_projective
 from solvers.kernels import accelerate_step, step_ends
-from solvers.kernels.accelerate import Window
-from solvers.kernels.accelerate_coefficients import require_pairs
-from solvers.kernels.accelerate_springs import Shares
-from solvers.kernels.edges import Edges
-from solvers.kernels.loop import ONE, Limits, at_most
-from solvers.linear.choice import Linear, Precision, factorise
-from solvers.memory import aligned
+from solvers.kernels.accelerate import AccelerationWindow
+from solvers.kernels.accelerate_coefficients import require_history_size
+from solvers.kernels.accelerate_springs import ObjectiveWeights
+from solvers.kernels.edges import EdgeElements
+from solvers.kernels.loop import ONE_ITERATION, LoopLimits, iteration_limit
+from solvers.linear.choice import LinearSolverName, Precision, build_linear_solver
+from solvers.memory import allocate_aligned
 from solvers.problem import Positions, ProjectiveEnergy, StepProblem, System
 
 
-def prepare(system: System, scheme: Scheme, linear: Linear, precision: Precision) -> PreparedAccelerated:
+def prepare_accelerated(
+    system: System, scheme: AccelerationScheme, linear: LinearSolverName, precision: Precision
+) -> PreparedAccelerated:
     """Factorise Q and compile the iteration.
 
     Args:
@@ -50,26 +58,26 @@ def prepare(system: System, scheme: Scheme, linear: Linear, precision: Precision
         Unsupported: for energies that the method does not support.
         NotPositiveDefinite: if the system leaves some positions undetermined.
     """
-    bare = without_contact(system)
+    bare = without_vertex_contact(system)
     energies = (
-        projective(without_bounded(bare), scheme.name)
-        if scheme.projective
+        require_projective(without_barriers(bare), scheme.name)
+        if scheme.needs_projective
         else [energy for energy in bare.energies if isinstance(energy, ProjectiveEnergy)]
     )
-    base = prepared(bare, energies, lambda Q: factorise(Q, linear, precision))
-    found = compiled(base, corrects=True)
-    known = isinstance(found, PreparedCompiled)
-    base = found.base if known else replace(base, choice=f"{base.choice}; {found}")
-    engine: Engine = _Compiled(scheme, found) if known else _Any(scheme, system, base)
+    base = prepare_local_global(bare, energies, lambda Q: build_linear_solver(Q, linear, precision))
+    found = compile_iterations(base, use_corrections=True)
+    known = isinstance(found, PreparedCompiledLocalGlobal)
+    base = found.base if known else replace(base, description=f"{base.description}; {found}")
+    engine: AccelerationEngine = _CompiledEngine(scheme, found) if known else _InterpretedEngine(scheme, system, base)
     if bare is not system:
-        from solvers.contact.quasi_newton import Touching  # for those who need it
+        from solvers.contact.quasi_newton import ContactEngine  # for those who need it
 
-        engine = Touching(scheme, system, base, engine)
+        engine = ContactEngine(scheme, system, base, engine)
     return PreparedAccelerated(base, engine)
 
 
 @dataclass(frozen=True)
-class Windowed:
+class WindowedAcceleration:
     """Base class of methods with a history of recent iterations.
 
     Args:
@@ -78,132 +86,146 @@ class Windowed:
         precision: floating-point type of its stored entries.
     """
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
 
     pairs: int = 5
-    linear: Linear = "auto"
+    linear: LinearSolverName = "auto"
     precision: Precision = "float64"
 
     def __post_init__(self) -> None:
         """Raise ValueError if a parameter is out of range."""
-        require_pairs(self.pairs)
+        require_history_size(self.pairs)
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedAccelerated(Iterative):
+class PreparedAccelerated(IterativeSolver):
     """An accelerated method, prepared: `local_global` has the prefactored Q, `acceleration_engine` iterates."""
 
-    base: PreparedLocalGlobal
-    engine: Engine
+    local_global: PreparedLocalGlobal
+    acceleration_engine: AccelerationEngine
 
     @property
-    def facts(self) -> dict[str, float]:
+    def stats(self) -> dict[str, float]:
         """Exact counts of the prepared data."""
-        return self.base.facts
+        return self.local_global.stats
 
     @property
-    def choice(self) -> str:
+    def description(self) -> str:
         """Description of the linear solver."""
-        return self.base.choice
+        return self.local_global.description
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        return self.engine.begin(problem, guess)
+        return self.acceleration_engine.init_state(problem, initial_guess)
 
-    def scale(self, problem: StepProblem) -> float:
+    def residual_scale(self, problem: StepProblem) -> float:
         """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
-        return largest(problem) * self.base.trace**0.5
+        return compute_max_coordinate(problem) * self.local_global.unpinned_trace**0.5
 
 
-class _Compiled:
+class _CompiledEngine:
     """Compiled iteration for springs and similar energies, with a factor that is split into blocks."""
 
-    def __init__(self, scheme: Scheme, compiled: PreparedCompiled) -> None:
-        self._scheme = scheme
-        self._parts, self._edges, self._form = compiled.parts, compiled.edges, compiled.form
-        plan, bundles, self._rows = compiled.plan, compiled.bundles, compiled.rows
+    def __init__(self, scheme: AccelerationScheme, compiled: PreparedCompiledLocalGlobal) -> None:
+        self._acceleration_scheme = scheme
+        self._spring_form, self._edges, self._form = compiled.spring_form, compiled.edges, compiled.norm_packets
+        plan, bundles, self._rows = compiled.iteration_plan, compiled.spring_packets, compiled.vertex_rows
         pins = compiled.base.system.pins
-        self._entries = 4 * int(plan.blocks[:, 1].max())
-        self._plan, self._bundles, self._far = plan, bundles, compiled.far
-        self._shares = Shares.of(bundles, plan.held, self._rows.row[pins.vertices[pins.exact]])
-        self._idle: list[_State] = []
+        self._block_entries = 4 * int(plan.block_table[:, 1].max())
+        self._plan, self._spring_packets, self._padding_row = plan, bundles, compiled.padding_row
+        self._shares = ObjectiveWeights.from_packets(
+            bundles, plan.anchor_stiffness, self._rows.row_of_vertex[pins.vertices[pins.exact_mask]]
+        )
+        self._free_states: list[_AccelerationMemory] = []
 
-    def _new(self) -> _State:
-        whole = 4 * len(self._plan.held)
-        window = window_for(self._scheme, self._entries, whole, self._plan.squares.dtype)
-        window.trial[4 * self._far] = FAR
-        x = aligned(whole, self._plan.squares.dtype)
-        vectors = self._bundles.right(self._plan.held), x, aligned(whole), np.zeros(3)
-        return accelerate_step.Step(self._plan, self._bundles, self._form, self._shares, self._rows, *vectors), window
+    def _allocate_state(self) -> _AccelerationMemory:
+        whole = 4 * len(self._plan.anchor_stiffness)
+        window = allocate_window(self._acceleration_scheme, self._block_entries, whole, self._plan.inverse_blocks.dtype)
+        window.trial_position[4 * self._padding_row] = PADDING_COORDINATE
+        x = allocate_aligned(whole, self._plan.inverse_blocks.dtype)
+        vectors = (
+            self._spring_packets.build_right_hand_side(self._plan.anchor_stiffness),
+            x,
+            allocate_aligned(whole),
+            np.zeros(3),
+        )
+        return accelerate_step.AcceleratedStep(
+            self._plan, self._spring_packets, self._form, self._shares, self._rows, *vectors
+        ), window
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        state = self._idle.pop() if self._idle else self._new()
-        edges, given = self._parts.begun(self._edges, problem), (problem, guess)
-        return _CompiledAccelerating(self._idle, state, self._parts, edges, *given)
+        state = self._free_states.pop() if self._free_states else self._allocate_state()
+        edges, given = self._spring_form.update_edges(self._edges, problem), (problem, initial_guess)
+        return _CompiledAccelerationState(self._free_states, state, self._spring_form, edges, *given)
 
 
-_State = tuple[accelerate_step.Step, Window]
+_AccelerationMemory = tuple[accelerate_step.AcceleratedStep, AccelerationWindow]
 """Work arrays of a solve."""
 
 
-class _CompiledAccelerating(Accelerating):
+class _CompiledAccelerationState(AcceleratedState):
     """State of a compiled solve; `free_states` receives its work arrays when it is deleted."""
 
     def __init__(
         self,
-        idle: list[_State],
-        state: _State,
-        parts: Parts,
-        edges: Edges | None,
+        free_states: list[_AccelerationMemory],
+        state: _AccelerationMemory,
+        parts: SpringForm,
+        edges: EdgeElements | None,
         problem: StepProblem,
         guess: Positions,
     ) -> None:
-        self._idle, self._memory = idle, state
+        self._free_states, self._memory = free_states, state
         step, window = state
         self._state = step, edges, window
         # The kernels are compiled for writable arrays.
-        given = [np.array(x, order="C") for x in (problem.target, parts.force(problem), problem.pin_targets, guess)]
-        step.objective[2] = parts.negative(guess)
+        given = [
+            np.array(x, order="C")
+            for x in (problem.inertial_target, parts.compute_force(problem), problem.pin_targets, guess)
+        ]
+        step.objective_values[2] = parts.negative_energy(guess)
         self.positions = np.empty_like(guess)
-        accelerate_step.start(*self._state, *given)
-        step.objective[1] += parts.size(guess)
+        accelerate_step.start_solve(*self._state, *given)
+        step.objective_values[1] += parts.edge_energy_scale(guess)
 
-    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Run iterations within the limits; return their number, the residual and the reason of the end."""
-        return accelerate_step.run(*self._state, limits, self.positions)
+        return accelerate_step.run_solve(*self._state, limits, self.positions)
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents any further change."""
-        return self.iterate(ONE)[0] == 1
+        return self.run_iterations(ONE_ITERATION)[0] == 1
 
     def residual(self) -> float:
         """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
-        return self.iterate(at_most(0))[1]
+        return self.run_iterations(iteration_limit(0))[1]
 
     @property
-    def fallen(self) -> float:
+    def objective_decrease(self) -> float:
         """Decrease of the objective so far [J], unless round-off hides it."""
-        return float(self._state[-1].now["fallen"][0])
+        return float(self._state[-1].window_state["fallen"][0])
 
     def gradient(self) -> Positions:
         """Return the gradient of the objective (n, 3) [N] at the current point."""
         step, _, window = self._state
         out = np.empty_like(self.positions)
-        step_ends.fetch(step.rows, window.descent, out)
+        step_ends.read_positions(step.vertex_rows, window.descent, out)
         return np.negative(out, out=out)
 
     def __del__(self) -> None:
-        self._idle.append(self._memory)
+        self._free_states.append(self._memory)
 
 
-class _Any:
+class _InterpretedEngine:
     """Interpreted iteration for all energies and all factors."""
 
-    def __init__(self, scheme: Scheme, system: System, base: PreparedLocalGlobal) -> None:
-        self._scheme, self._base, self._objective = scheme, base, Objective(system)
+    def __init__(self, scheme: AccelerationScheme, system: System, base: PreparedLocalGlobal) -> None:
+        self._acceleration_scheme, self._local_global, self._fixed_objective = scheme, base, FixedObjective(system)
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        return Interpreted(self._base, self._scheme, StepObjective(self._objective, problem), guess)
+        return InterpretedState(
+            self._local_global, self._acceleration_scheme, StepObjective(self._fixed_objective, problem), initial_guess
+        )

@@ -19,34 +19,34 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.about import About, Reference
+from solvers.about import Citation, SolverInfo
 from solvers.core import vertex_terms
-from solvers.core.bounds import is_bounded
-from solvers.core.definite import factorised
-from solvers.core.driver import Iterating, Iterative
-from solvers.core.fixed_objective import Objective
-from solvers.core.forces import Whole
+from solvers.core.bounds import is_barrier_energy
+from solvers.core.definite import factorise_shifted
+from solvers.core.driver import IterativeSolver, SolverState
+from solvers.core.fixed_objective import FixedObjective
+from solvers.core.forces import SingleIterateState
 from solvers.core.objective import StepObjective
 from solvers.energies.quadratic import drag_of_vertices
-from solvers.methods.rosenbrock_tables import RODAS, ROS2, ROS3P, Rosenbrock
+from solvers.methods.rosenbrock_tables import RODAS_TABLEAU, ROS2_TABLEAU, ROS3P_TABLEAU, RosenbrockTableau
 from solvers.problem import (
     NotPositiveDefinite,
     Positions,
-    ResidualOf,
+    ResidualIterate,
     StepProblem,
     System,
     Unsupported,
     is_lagged,
 )
 
-_CAUTION, _FEWEST, _LARGEST = 0.9, 0.2, 6.0
+_STEP_SAFETY, _MIN_STEP_FACTOR, _MAX_STEP_FACTOR = 0.9, 0.2, 6.0
 """Safety factor of the step size; bounds of its decrease and increase from one step to the next."""
-_FLOOR, _MOST = 1e-9, 100_000
+_MIN_STEP_FRACTION, _MAX_STEPS = 1e-9, 100_000
 """Shortest step, relative to a frame; maximum number of attempted steps in a frame."""
 
 
 @dataclass(frozen=True)
-class _Linear:
+class _RosenbrockSolver:
     """Base class of the Rosenbrock solvers.
 
     Args:
@@ -58,10 +58,10 @@ class _Linear:
     refine: int = 1
     error: float = 0.0
 
-    minimises: ClassVar[bool] = False
-    descends: ClassVar[bool] = False
-    name: ClassVar[str]
-    table: ClassVar[Rosenbrock]
+    is_minimiser: ClassVar[bool] = False
+    is_monotone: ClassVar[bool] = False
+    solver_name: ClassVar[str]
+    coefficients: ClassVar[RosenbrockTableau]
 
     def prepare(self, system: System) -> PreparedRosenbrock:
         """Prepare the method for a system.
@@ -72,42 +72,42 @@ class _Linear:
         """
         if self.refine < 1 or not 0.0 <= self.error <= 1.0:
             raise Unsupported(
-                f"{self.name}: refine came as {self.refine} and error as {self.error}; wanted 1 or more, and a number "
+                f"{self.solver_name}: refine came as {self.refine} and error as {self.error}; wanted 1 or more, and a number "
                 "from 0 to 1"
             )
-        vertex_terms.require_implicit_euler(system, self.name)
-        vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), self.name)
-        drag, kept = np.zeros(system.vertices), list[Any]()
+        vertex_terms.require_implicit_euler(system, self.solver_name)
+        vertex_terms.require_mass(system, np.where(system.unpinned_mask, system.mass, np.inf), self.solver_name)
+        drag, kept = np.zeros(system.num_vertices), list[Any]()
         for energy in system.energies:
             if (c := drag_of_vertices(energy)) is not None:
                 drag += c
-            elif is_lagged(energy) or is_bounded(energy):
+            elif is_lagged(energy) or is_barrier_energy(energy):
                 raise Unsupported(
-                    f"{self.name}: needs the exact derivatives of all forces, and knows energies of the positions "
+                    f"{self.solver_name}: needs the exact derivatives of all forces, and knows energies of the positions "
                     f"alone and drag on vertices; the scene has {type(energy).__name__} as well"
                 )
             else:
                 kept.append(energy)
-        objective = Objective(replace(system, energies=tuple(kept), factor=0.0))
-        lengths, factor = objective.springs.rest_length, objective.matrix.factor
+        objective = FixedObjective(replace(system, energies=tuple(kept), inertia_factor=0.0))
+        lengths, factor = objective.springs.rest_length, objective.hessian_matrix.factor
         tolerance = self.error * (float(lengths.mean()) if len(lengths) else 1.0)
         told = f"steps by an error of {self.error:.3g}" if self.error else f"{self.refine} steps a frame"
-        choice = f"{told}, a factor of the Hessian with {factor.nonzeros:,} entries{objective.interpreted}"
+        choice = f"{told}, a factor of the Hessian with {factor.nonzeros:,} entries{objective.interpreted_energies}"
         facts = {"nnz_hessian_factor": float(factor.nonzeros)}
-        return PreparedRosenbrock(system, self.table, objective, drag, self.refine, tolerance, choice, facts)
+        return PreparedRosenbrock(system, self.coefficients, objective, drag, self.refine, tolerance, choice, facts)
 
 
-def _about(authors: str, year: int, title: str, doi: str) -> About:
-    return About("linearly implicit", Reference(authors, year, title, doi), own_steps=True)
+def _rosenbrock_info(authors: str, year: int, title: str, doi: str) -> SolverInfo:
+    return SolverInfo("linearly implicit", Citation(authors, year, title, doi), is_substepping=True)
 
 
 @dataclass(frozen=True)
-class Ros2(_Linear):
+class Ros2(_RosenbrockSolver):
     """ROS2: two stages, order 2 for any matrix; L-stable."""
 
-    name: ClassVar[str] = "ros2"
-    table: ClassVar[Rosenbrock] = ROS2
-    about: ClassVar[About] = _about(
+    solver_name: ClassVar[str] = "ros2"
+    coefficients: ClassVar[RosenbrockTableau] = ROS2_TABLEAU
+    solver_info: ClassVar[SolverInfo] = _rosenbrock_info(
         "Verwer, Jan G. and Spee, Edwin J. and Blom, Joke G. and Hundsdorfer, Willem",
         1999,
         "A second-order Rosenbrock method applied to photochemical dispersion problems",
@@ -116,12 +116,12 @@ class Ros2(_Linear):
 
 
 @dataclass(frozen=True)
-class Ros3P(_Linear):
+class Ros3P(_RosenbrockSolver):
     """ROS3P: three stages, order 3; A-stable."""
 
-    name: ClassVar[str] = "ros3p"
-    table: ClassVar[Rosenbrock] = ROS3P
-    about: ClassVar[About] = _about(
+    solver_name: ClassVar[str] = "ros3p"
+    coefficients: ClassVar[RosenbrockTableau] = ROS3P_TABLEAU
+    solver_info: ClassVar[SolverInfo] = _rosenbrock_info(
         "Lang, Jens and Verwer, Jan",
         2001,
         "ROS3P: an accurate third-order Rosenbrock solver designed for parabolic problems",
@@ -130,35 +130,35 @@ class Ros3P(_Linear):
 
 
 @dataclass(frozen=True)
-class Rodas(_Linear):
+class Rodas(_RosenbrockSolver):
     """RODAS: six stages, order 4 with an error estimate of order 3; L-stable and stiffly accurate."""
 
-    name: ClassVar[str] = "rodas"
-    table: ClassVar[Rosenbrock] = RODAS
-    about: ClassVar[About] = replace(
-        _about(
+    solver_name: ClassVar[str] = "rodas"
+    coefficients: ClassVar[RosenbrockTableau] = RODAS_TABLEAU
+    solver_info: ClassVar[SolverInfo] = replace(
+        _rosenbrock_info(
             "Hairer, Ernst and Wanner, Gerhard",
             1996,
             "Solving Ordinary Differential Equations II",
             "10.1007/978-3-642-05221-7",
         ),
-        to_error=True,
+        supports_error_control=True,
     )
 
 
-class Told(NamedTuple):
+class AdaptiveStepStats(NamedTuple):
     """Statistics of adaptive steps in a frame.
 
     Numbers of accepted and rejected steps, the last step size [s], and the reached time of the frame [s].
     """
 
-    accepted: int
-    rejected: int
-    step: float
-    reached: float
+    num_accepted_steps: int
+    num_rejected_steps: int
+    last_step_size: float
+    reached_time: float
 
 
-class _Moved(NamedTuple):
+class _StepResult(NamedTuple):
     """Positions and velocities (n, 3) after a step, and its error estimate for both."""
 
     positions: Positions
@@ -167,7 +167,7 @@ class _Moved(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedRosenbrock(Iterative):
+class PreparedRosenbrock(IterativeSolver):
     """A Rosenbrock method, prepared for a system.
 
     Attributes:
@@ -178,37 +178,37 @@ class PreparedRosenbrock(Iterative):
         num_factorisations: factorisations of an attempted step.
     """
 
-    residual_of: ClassVar[ResidualOf] = "none"
-    factorisations: ClassVar[int] = 1
+    residual_iterate: ClassVar[ResidualIterate] = "none"
+    num_factorisations: ClassVar[int] = 1
 
     system: System
-    table: Rosenbrock
-    objective: Objective
+    coefficients: RosenbrockTableau
+    fixed_objective: FixedObjective
     drag: NDArray[np.float64]
     refine: int
-    tolerance: float
-    choice: str
-    facts: dict[str, float] = field(default_factory=dict[str, float])
+    error_tolerance: float
+    description: str
+    stats: dict[str, float] = field(default_factory=dict[str, float])
 
     @property
     def order(self) -> int:
         """Order of the error estimate."""
-        return self.table.order
+        return self.coefficients.order
 
     @property
-    def evaluations(self) -> int:
+    def num_evaluations(self) -> int:
         """Number of solves in a step."""
-        return len(self.table.a)
+        return len(self.coefficients.a)
 
-    def within(self, tolerance: float) -> PreparedRosenbrock:
+    def with_tolerance(self, tolerance: float) -> PreparedRosenbrock:
         """Return a copy with adaptive steps of the given error tolerance [m]."""
-        return replace(self, tolerance=tolerance)
+        return replace(self, error_tolerance=tolerance)
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve whose only iteration is the whole frame."""
-        return Whole(*self.step(problem)[:2])
+        return SingleIterateState(*self.step(problem)[:2])
 
-    def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, Told]:
+    def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, AdaptiveStepStats]:
         """Integrate one frame; exact pins move at constant velocity.
 
         Args:
@@ -222,65 +222,73 @@ class PreparedRosenbrock(Iterative):
             RuntimeError: if no step size meets the error tolerance.
         """
         frame = self.system.time_step
-        within = _Frame(self, problem)
-        p, v = within.begun()
-        if not self.tolerance:
+        within = _FrameIntegration(self, problem)
+        p, v = within.initial_motion()
+        if not self.error_tolerance:
             for k in range(self.refine):
-                p, v, _ = within.moved(p, v, frame / self.refine, exact=False) or within.lost(k * frame / self.refine)
-            return within.carried(p, 1.0), v, Told(self.refine, 0, frame / self.refine, frame)
+                p, v, _ = within.try_step(p, v, frame / self.refine, require_exact=False) or within.raise_failure(
+                    k * frame / self.refine
+                )
+            return within.apply_pins(p, 1.0), v, AdaptiveStepStats(self.refine, 0, frame / self.refine, frame)
         t, accepted, rejected, h, before = 0.0, 0, 0, min(frame, h or frame), 1.0
-        power = 1.0 + min(self.table.order, self.table.embedded)
+        power = 1.0 + min(self.coefficients.order, self.coefficients.embedded_order)
         while t < frame:
             last = t + 1.0000001 * h >= frame
             length = frame - t if last else h
-            made = within.moved(p, v, length)
-            ratio = within.size(made) / self.tolerance if made else np.inf
+            made = within.try_step(p, v, length)
+            ratio = within.error_norm(made) / self.error_tolerance if made else np.inf
             if ratio <= 1.0 and made:
                 accepted, t = accepted + 1, frame if last else t + length
-                p, v = within.carried(made.positions, t / frame), made.velocity
-                change = _CAUTION * max(ratio, 1e-10) ** (-0.7 / power) * before ** (0.4 / power)
+                p, v = within.apply_pins(made.positions, t / frame), made.velocity
+                change = _STEP_SAFETY * max(ratio, 1e-10) ** (-0.7 / power) * before ** (0.4 / power)
                 before = max(ratio, 1e-4)
-                h = max(h, length * change) if last else length * min(_LARGEST, max(_FEWEST, change))
+                h = max(h, length * change) if last else length * min(_MAX_STEP_FACTOR, max(_MIN_STEP_FACTOR, change))
             else:
                 rejected += 1
-                h = length * (max(_FEWEST, _CAUTION * ratio ** (-1.0 / power)) if ratio < np.inf else 0.5)
-            if h < _FLOOR * frame or accepted + rejected >= _MOST:
+                h = length * (max(_MIN_STEP_FACTOR, _STEP_SAFETY * ratio ** (-1.0 / power)) if ratio < np.inf else 0.5)
+            if h < _MIN_STEP_FRACTION * frame or accepted + rejected >= _MAX_STEPS:
                 raise RuntimeError(
-                    f"the error of {self.tolerance:.3g} m was not kept within {accepted + rejected} steps, the last of "
+                    f"the error of {self.error_tolerance:.3g} m was not kept within {accepted + rejected} steps, the last of "
                     f"{h:.3g} s: after {t:.6g} of {frame:.6g} s of the frame the forces are too sudden, or round-off "
                     "is larger; ask for a larger error"
                 )
-        return p, v, Told(accepted, rejected, h, t)
+        return p, v, AdaptiveStepStats(accepted, rejected, h, t)
 
 
-class _Frame:
+class _FrameIntegration:
     """Integration of one frame: its forces, and the motion of its pins."""
 
     def __init__(self, prepared: PreparedRosenbrock, problem: StepProblem) -> None:
-        self._of, self._start = prepared, problem.start
+        self._prepared, self._start = prepared, problem.step_start
         system, pins = prepared.system, prepared.system.pins
-        p, targets = problem.start.positions, problem.pin_targets
-        inner = StepProblem(prepared.objective.system, p, problem.force, targets, p, p, problem.start)
-        self._step = StepObjective(prepared.objective, inner)
-        self._held, self._frame = pins.vertices[pins.exact], system.time_step
-        self._from, self._to = p[self._held], targets[pins.exact]
-        self._pace = (self._to - self._from) / self._frame
-        self._moving = bool(self._pace.any())
+        p, targets = problem.step_start.positions, problem.pin_targets
+        inner = StepProblem(
+            prepared.fixed_objective.system, p, problem.external_force, targets, p, p, problem.step_start
+        )
+        self._step = StepObjective(prepared.fixed_objective, inner)
+        self._exact_pins, self._frame = pins.vertices[pins.exact_mask], system.time_step
+        self._start_targets, self._end_targets = p[self._exact_pins], targets[pins.exact_mask]
+        self._pin_velocity = (self._end_targets - self._start_targets) / self._frame
+        self._has_moving_pins = bool(self._pin_velocity.any())
         self._mass, self._drag = system.mass[:, None], prepared.drag[:, None]
-        self._free = system.free
+        self._free = system.free_vertices
 
-    def begun(self) -> tuple[Positions, Positions]:
+    def initial_motion(self) -> tuple[Positions, Positions]:
         """Return the motion at the start of the frame, with the velocity of the pins."""
         v = self._start.velocity.copy()
-        v[self._held] = self._pace
+        v[self._exact_pins] = self._pin_velocity
         return self._start.positions.copy(), v
 
-    def carried(self, p: Positions, part: float) -> Positions:
+    def apply_pins(self, p: Positions, fraction: float) -> Positions:
         """Return p with exactly pinned vertices moved to their targets at a fraction of the frame."""
-        p[self._held] = self._to if part == 1.0 else self._from + part * (self._to - self._from)
+        p[self._exact_pins] = (
+            self._end_targets
+            if fraction == 1.0
+            else self._start_targets + fraction * (self._end_targets - self._start_targets)
+        )
         return p
 
-    def size(self, made: _Moved) -> float:
+    def error_norm(self, made: _StepResult) -> float:
         """Return the norm of a step's error estimate [m]."""
         parts = (made.error[0][self._free], self._frame * made.error[1][self._free])
         with np.errstate(over="ignore", invalid="ignore"):
@@ -288,11 +296,11 @@ class _Frame:
         return found if np.isfinite(found) else np.inf
 
     @staticmethod
-    def lost(time: float) -> _Moved:
+    def raise_failure(time: float) -> _StepResult:
         """Raise NotPositiveDefinite for a step at a time of the frame [s]."""
         raise NotPositiveDefinite(f"after {time:.6g} s of the frame the Hessian is not finite, or nothing balances it")
 
-    def moved(self, p: Positions, v: Positions, h: float, *, exact: bool = True) -> _Moved | None:
+    def try_step(self, p: Positions, v: Positions, h: float, *, require_exact: bool = True) -> _StepResult | None:
         """Attempt one step.
 
         Args:
@@ -304,31 +312,46 @@ class _Frame:
         Returns:
             The motion after the step, None if the matrix has no factor.
         """
-        table, step, m, d = self._of.table, self._step, self._mass, self._drag
+        table, step, m, d = self._prepared.coefficients, self._step, self._mass, self._drag
         s = 1.0 / (table.gamma * h)
         hessian = step.hessian(p)
         inertia = np.repeat((s * s * m + s * d)[self._free, 0], 3)
-        if not (hessian.factorise(1.0, inertia) if exact else factorised(hessian, inertia, inertia) is not None):
+        if not (
+            hessian.factorise(1.0, inertia)
+            if require_exact
+            else factorise_shifted(hessian, inertia, inertia) is not None
+        ):
             return None
         us, ws = list[Positions](), list[Positions]()
         for a, c in zip(table.a, table.c, strict=True):
-            at, speed = (_sum(x, a, parts) for x, parts in ((p, us), (v, ws)))
-            r = _sum(speed, c, us, 1.0 / h)
-            right = m * _sum(np.zeros_like(v), c, ws, 1.0 / h) + (s * m + d) * r - d * speed - step.gradient(at)
+            at, speed = (_linear_combination(x, a, parts) for x, parts in ((p, us), (v, ws)))
+            r = _linear_combination(speed, c, us, 1.0 / h)
+            right = (
+                m * _linear_combination(np.zeros_like(v), c, ws, 1.0 / h)
+                + (s * m + d) * r
+                - d * speed
+                - step.gradient(at)
+            )
             u = np.zeros_like(p)
-            if self._moving:
-                u[self._held] = r[self._held] / s
-                right -= hessian.multiply(u)
+            if self._has_moving_pins:
+                u[self._exact_pins] = r[self._exact_pins] / s
+                right -= hessian.matvec(u)
             u[self._free] = hessian.solve(right)[self._free]
             us.append(u)
             ws.append(s * u - r)
         zero = np.zeros_like(p)
-        w = _sum(v, table.m, ws)
-        w[self._held] = self._pace
-        return _Moved(_sum(p, table.m, us), w, (_sum(zero, table.e, us), _sum(zero, table.e, ws)))
+        w = _linear_combination(v, table.m, ws)
+        w[self._exact_pins] = self._pin_velocity
+        return _StepResult(
+            _linear_combination(p, table.m, us),
+            w,
+            (_linear_combination(zero, table.e, us), _linear_combination(zero, table.e, ws)),
+        )
 
 
-def _sum(x: Positions, weights: tuple[float, ...], parts: list[Positions], factor: float = 1.0) -> Positions:
+def _linear_combination(
+    x: Positions, weights: tuple[float, ...], parts: list[Positions], factor: float = 1.0
+) -> Positions:
     """Return x + factor sum_j weights_j parts_j as a new array."""
     out = x.copy()
     for weight, part in zip(weights, parts, strict=False):

@@ -16,11 +16,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-Row = tuple[float, ...]
+TableauRow = tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Rosenbrock:
+class RosenbrockTableau:
     """Coefficients of a Rosenbrock method.
 
     Attributes:
@@ -31,38 +31,38 @@ class Rosenbrock:
     """
 
     order: int
-    embedded: int
+    embedded_order: int
     gamma: float
-    a: tuple[Row, ...]
-    c: tuple[Row, ...]
-    m: Row
-    e: Row
+    a: tuple[TableauRow, ...]
+    c: tuple[TableauRow, ...]
+    m: TableauRow
+    e: TableauRow
 
 
-_TWO = 1.0 - 0.5**0.5
-ROS2 = Rosenbrock(
+_ROS2_GAMMA = 1.0 - 0.5**0.5
+ROS2_TABLEAU = RosenbrockTableau(
     2,
     1,
-    _TWO,
-    ((), (1.0 / _TWO,)),
-    ((), (-2.0 / _TWO,)),
-    (1.5 / _TWO, 0.5 / _TWO),
-    (0.5 / _TWO, 0.5 / _TWO),
+    _ROS2_GAMMA,
+    ((), (1.0 / _ROS2_GAMMA,)),
+    ((), (-2.0 / _ROS2_GAMMA,)),
+    (1.5 / _ROS2_GAMMA, 0.5 / _ROS2_GAMMA),
+    (0.5 / _ROS2_GAMMA, 0.5 / _ROS2_GAMMA),
 )
 
-_M3 = (2.0, 0.5773502691896258, 0.4226497308103742)
-ROS3P = Rosenbrock(
+_ROS3P_WEIGHTS = (2.0, 0.5773502691896258, 0.4226497308103742)
+ROS3P_TABLEAU = RosenbrockTableau(
     3,
     2,
     0.5 + 3.0**0.5 / 6.0,
     ((), (1.267949192431123,), (1.267949192431123, 0.0)),
     ((), (-1.607695154586736,), (-3.464101615137755, -1.732050807568877)),
-    _M3,
-    (_M3[0] - 2.113248654051871, _M3[1] - 1.0, _M3[2] - 0.4226497308103742),
+    _ROS3P_WEIGHTS,
+    (_ROS3P_WEIGHTS[0] - 2.113248654051871, _ROS3P_WEIGHTS[1] - 1.0, _ROS3P_WEIGHTS[2] - 0.4226497308103742),
 )
 
-_LAST = (1.221224509226641, 6.019134481288629, 12.53708332932087, -0.687886036105895)
-RODAS = Rosenbrock(
+_RODAS_LAST_ROW = (1.221224509226641, 6.019134481288629, 12.53708332932087, -0.687886036105895)
+RODAS_TABLEAU = RosenbrockTableau(
     4,
     3,
     0.25,
@@ -71,8 +71,8 @@ RODAS = Rosenbrock(
         (1.544,),
         (0.9466785280815826, 0.2557011698983284),
         (3.314825187068521, 2.896124015972201, 0.9986419139977817),
-        _LAST,
-        (*_LAST, 1.0),
+        _RODAS_LAST_ROW,
+        (*_RODAS_LAST_ROW, 1.0),
     ),
     (
         (),
@@ -82,6 +82,6 @@ RODAS = Rosenbrock(
         (7.496443313967647, -10.24680431464352, -33.99990352819905, 11.70890893206160),
         (8.083246795921522, -7.981132988064893, -31.52159432874371, 16.31930543123136, -6.058818238834054),
     ),
-    (*_LAST, 1.0, 1.0),
+    (*_RODAS_LAST_ROW, 1.0, 1.0),
     (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
 )

@@ -20,20 +20,20 @@ from typing import ClassVar
 
 import numpy as np
 
-from solvers.about import About, Reference
+from solvers.about import Citation, SolverInfo
 from solvers.core import vertex_terms
-from solvers.core.driver import Iterating, Iterative
-from solvers.core.forces import Whole, rows_of_four
-from solvers.core.prefactored import only_springs
+from solvers.core.driver import IterativeSolver, SolverState
+from solvers.core.forces import SingleIterateState, pad_rows
+from solvers.core.prefactored import require_only_springs
 from solvers.energies.springs import Springs
-from solvers.kernels.explicit import advance
-from solvers.kernels.springs import Bundles
-from solvers.problem import Positions, Prepared, ResidualOf, StepProblem, System, Unsupported
+from solvers.kernels.explicit import run_symplectic_euler
+from solvers.kernels.springs import SpringPackets
+from solvers.problem import Positions, PreparedSolver, ResidualIterate, StepProblem, System, Unsupported
 
-_SAFETY = 0.95
+_STABILITY_SAFETY = 0.95
 """Fraction of the stability limit: at the limit a vibration neither grows nor decays, and springs are nonlinear."""
 
-_MOST = 1e10
+_MAX_SPRING_EVALUATIONS = 1e10
 """Maximum number of spring evaluations in a step, tens of seconds: compiled code cannot be interrupted meanwhile."""
 
 
@@ -45,46 +45,46 @@ class SymplecticEuler:
     velocity, and forces are constant within a step.
     """
 
-    minimises: ClassVar[bool] = False
-    descends: ClassVar[bool] = False
-    about: ClassVar[About] = About(
+    is_minimiser: ClassVar[bool] = False
+    is_monotone: ClassVar[bool] = False
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "explicit",
-        Reference(
+        Citation(
             "Hairer, Ernst and Lubich, Christian and Wanner, Gerhard",
             2006,
             "Geometric Numerical Integration",
             "10.1007/3-540-30666-8",
         ),
-        own_steps=True,
-        first=True,
+        is_substepping=True,
+        is_family_default=True,
     )
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:
             Unsupported: for energies other than springs, integrators other than implicit Euler, unpinned vertices
                 without mass, and steps that need too many substeps.
         """
-        springs, n = only_springs(system, "symplectic-euler"), system.vertices
+        springs, n = require_only_springs(system, "symplectic-euler"), system.num_vertices
         vertex_terms.require_implicit_euler(system, "symplectic-euler")
-        vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), "symplectic-euler")
-        omega = frequency_bound(system, springs)
-        needed = max(1.0, ceil(system.time_step * omega / (2.0 * _SAFETY)))
-        if needed * max(1, len(springs.edges)) > _MOST:
+        vertex_terms.require_mass(system, np.where(system.unpinned_mask, system.mass, np.inf), "symplectic-euler")
+        omega = bound_max_frequency(system, springs)
+        needed = max(1.0, ceil(system.time_step * omega / (2.0 * _STABILITY_SAFETY)))
+        if needed * max(1, len(springs.edges)) > _MAX_SPRING_EVALUATIONS:
             raise Unsupported(
                 f"symplectic-euler: is stable with {needed:.3g} substeps a step, which for {len(springs.edges)} "
-                f"springs are more than the {_MOST:.0e} evaluations that are allowed; take a shorter time step"
+                f"springs are more than the {_MAX_SPRING_EVALUATIONS:.0e} evaluations that are allowed; take a shorter time step"
             )
-        soft = int((~system.pins.exact).sum())
+        soft = int((~system.pins.exact_mask).sum())
         taken = f"; {soft} pins by penalty taken as exact" if soft else ""
         choice = f"{needed:.0f} substeps for vibrations of at most {omega:.3g} rad/s{taken}"
-        part = np.where(system.unpinned, 0, -1)
-        bundles, _ = Bundles.of(springs, np.arange(n), part, 1, n, n + 1)
+        part = np.where(system.unpinned_mask, 0, -1)
+        bundles, _ = SpringPackets.from_springs(springs, np.arange(n), part, 1, n, n + 1)
         return PreparedSymplecticEuler(system, bundles, int(needed), choice)
 
 
-def frequency_bound(system: System, springs: Springs) -> float:
+def bound_max_frequency(system: System, springs: Springs) -> float:
     """Return an upper bound of the largest angular frequency [rad/s] of the springs in any shape.
 
     Args:
@@ -93,37 +93,39 @@ def frequency_bound(system: System, springs: Springs) -> float:
     """
     edges = springs.edges[springs.edges[:, 0] != springs.edges[:, 1]]
     k = springs.stiffness[springs.edges[:, 0] != springs.edges[:, 1]]
-    stiffness = np.bincount(edges.ravel(), np.repeat(k, 2), system.vertices)
-    rate = np.divide(stiffness, system.mass, out=np.zeros(system.vertices), where=system.unpinned)
+    stiffness = np.bincount(edges.ravel(), np.repeat(k, 2), system.num_vertices)
+    rate = np.divide(stiffness, system.mass, out=np.zeros(system.num_vertices), where=system.unpinned_mask)
     return float(np.sqrt(rate[edges].sum(axis=1).max(initial=0.0)))
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedSymplecticEuler(Iterative):
+class PreparedSymplecticEuler(IterativeSolver):
     """Symplectic Euler, prepared: SIMD packets of the springs at unpinned vertices, and substeps per step."""
 
-    residual_of: ClassVar[ResidualOf] = "none"
+    residual_iterate: ClassVar[ResidualIterate] = "none"
 
     system: System
-    bundles: Bundles
-    substeps: int
-    choice: str
-    facts: dict[str, float] = field(default_factory=dict)
+    spring_packets: SpringPackets
+    num_substeps: int
+    description: str
+    stats: dict[str, float] = field(default_factory=dict)
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve whose only iteration is the whole step."""
-        return Whole(*self._step(problem))
+        return SingleIterateState(*self._integrate_step(problem))
 
-    def _step(self, problem: StepProblem) -> tuple[Positions, Positions]:
-        s, pins, start = self.system, self.system.pins.vertices, problem.start
-        h = s.time_step / self.substeps
-        rate = np.divide(h, s.mass, out=np.zeros(s.vertices), where=s.unpinned)
+    def _integrate_step(self, problem: StepProblem) -> tuple[Positions, Positions]:
+        s, pins, start = self.system, self.system.pins.vertices, problem.step_start
+        h = s.time_step / self.num_substeps
+        rate = np.divide(h, s.mass, out=np.zeros(s.num_vertices), where=s.unpinned_mask)
         begin, end = start.positions[pins], problem.pin_targets.copy()
-        p = rows_of_four(start.positions, far=True)
-        v, force = rows_of_four(start.velocity), rows_of_four(problem.force)
+        p = pad_rows(start.positions, pad_far=True)
+        v, force = pad_rows(start.velocity), pad_rows(problem.external_force)
         v.reshape(-1, 4)[pins] = 0.0
-        force = self.bundles.right(np.zeros(s.vertices + 2), force)
-        advance(self.bundles, pins.copy(), begin, end, force, rate, h, self.substeps, p, v, np.zeros_like(v))
-        velocity = v.reshape(-1, 4)[: s.vertices, :3].copy()
+        force = self.spring_packets.build_right_hand_side(np.zeros(s.num_vertices + 2), force)
+        run_symplectic_euler(
+            self.spring_packets, pins.copy(), begin, end, force, rate, h, self.num_substeps, p, v, np.zeros_like(v)
+        )
+        velocity = v.reshape(-1, 4)[: s.num_vertices, :3].copy()
         velocity[pins] = (end - begin) / s.time_step
-        return p.reshape(-1, 4)[: s.vertices, :3].copy(), velocity
+        return p.reshape(-1, 4)[: s.num_vertices, :3].copy(), velocity

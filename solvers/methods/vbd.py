@@ -26,47 +26,47 @@ from typing import TYPE_CHECKING, ClassVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.about import About, Reference
-from solvers.contact.touching import ContactEnergy, touching, without_contact
+from solvers.about import Citation, SolverInfo
+from solvers.contact.touching import VertexContactEnergy, begin_active_contacts, without_vertex_contact
 from solvers.core import vertex_terms
-from solvers.core.bounds import is_bounded, without_bounded
-from solvers.core.driver import Iterating, Iterative, largest
-from solvers.core.parts import Parts, split
+from solvers.core.bounds import is_barrier_energy, without_barriers
+from solvers.core.driver import IterativeSolver, SolverState, compute_max_coordinate
+from solvers.core.parts import SpringForm, decompose_energies
 from solvers.core.vertex_blocks import VertexBlocks
-from solvers.core.vertex_elements import Beside
-from solvers.device import Precise
+from solvers.core.vertex_elements import VertexElements
+from solvers.device import PrecisionOptions
 from solvers.kernels import vbd as kernels
-from solvers.kernels.accelerate_springs import Shares
+from solvers.kernels.accelerate_springs import ObjectiveWeights
 from solvers.kernels.half_spaces import HalfSpaces
-from solvers.kernels.loop import EACH, ITERATIONS, LAST, Limits
-from solvers.memory import aligned
+from solvers.kernels.loop import REASON_ITERATIONS, RESIDUAL_EACH, RESIDUAL_LAST, LoopLimits
+from solvers.memory import allocate_aligned
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.problem import Positions, Prepared, StepProblem, System, Unsupported
+from solvers.problem import Positions, PreparedSolver, StepProblem, System, Unsupported
 from solvers.vectors.springs import LANES
-from solvers.vectors.vbd import NUMBERS
+from solvers.vectors.vbd import SPRING_SCRATCH_SIZE
 
 if TYPE_CHECKING:
-    from solvers.contact.energy import Planes
-    from solvers.contact.local_global import Idle
-    from solvers.core.fixed_objective import Objective
+    from solvers.contact.energy import ContactPlanes
+    from solvers.contact.local_global import ContactFreeSolver
+    from solvers.core.fixed_objective import FixedObjective
 
-_FAR = 1e100
+_PADDING_COORDINATE = 1e100
 """Coordinate at which padding springs of a packet end: far from all vertices, whatever the unit of length."""
 
 
 @dataclass(frozen=True)
-class VertexBlockDescent(Precise):
+class VertexBlockDescent(PrecisionOptions):
     """Vertex block descent for springs, quadratic forms, elements of projective energies, and contact.
 
     Args:
         spectral_radius: rho of the Chebyshev acceleration, in [0, 1); 0 disables it.
     """
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
-    about: ClassVar[About] = About(
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "vertex block descent",
-        Reference(
+        Citation(
             "Chen, Anka He and Liu, Ziheng and Yang, Yin and Yuksel, Cem",
             2024,
             "Vertex block descent",
@@ -82,7 +82,7 @@ class VertexBlockDescent(Precise):
         if not 0.0 <= self.spectral_radius < 1.0:
             raise ValueError(f"spectral_radius: should be at least 0 and less than 1, not {self.spectral_radius}")
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:
@@ -90,41 +90,45 @@ class VertexBlockDescent(Precise):
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
         if self.device == "cuda":
-            from solvers.cuda.device import ready  # for those who ask for it
+            from solvers.cuda.device import require_device  # for those who ask for it
 
-            ready("vbd")
-        bare, n = without_bounded(without_contact(system)), system.vertices
-        parts, beside = split(bare), Beside.of(system)
-        unknown = {*parts.unknown} - {type(energy).__name__ for energy in beside.energies}
+            require_device("vbd")
+        bare, n = without_barriers(without_vertex_contact(system)), system.num_vertices
+        parts, beside = decompose_energies(bare), VertexElements.from_system(system)
+        unknown = {*parts.unsupported_energies} - {type(energy).__name__ for energy in beside.energies}
         if unknown:
             raise Unsupported(
                 f"vbd: {', '.join(sorted(unknown))} states no elements of a projective energy, and so neither whose "
                 "neighbours its vertices are nor a bound of the second derivatives; a vertex's step needs both, the "
                 "neighbours for the colouring and the bound for the fallback step that cannot raise the energy"
             )
-        made = VertexBlocks.of(system, parts, beside)
+        made = VertexBlocks.from_system(system, parts, beside)
         if self.device == "cuda":
-            from solvers.cuda.vbd import prepare  # for those who ask for it
+            from solvers.cuda.vbd import prepare_vbd  # for those who ask for it
 
-            return prepare(system, parts, made, self.spectral_radius, self.real)
-        gauge = cast("Idle", CompiledLocalGlobal().prepare(system))
-        shares = Shares.of(made.bundles, made.held, made.row[system.pins.vertices[system.pins.exact]])
+            return prepare_vbd(system, parts, made, self.spectral_radius, self.real_dtype)
+        gauge = cast("ContactFreeSolver", CompiledLocalGlobal().prepare(system))
+        shares = ObjectiveWeights.from_packets(
+            made.spring_packets, made.anchor_stiffness, made.row_of_vertex[system.pins.vertices[system.pins.exact_mask]]
+        )
         return PreparedVertexBlockDescent(
             system,
             parts,
-            beside.among(made.row, n + 2),
+            beside.with_rows(made.row_of_vertex, n + 2),
             self.spectral_radius,
-            kernels.Blocks(made.bundles, shares, made.free, made.bundles.in_lanes(made.majorant)),
-            made.row,
-            made.held,
-            made.majorant[made.row],
+            kernels.ColourPackets(
+                made.spring_packets, shares, made.num_free, made.spring_packets.gather_lanes(made.majorant)
+            ),
+            made.row_of_vertex,
+            made.anchor_stiffness,
+            made.majorant[made.row_of_vertex],
             gauge,
-            f"vertices in {made.colours} colours; for the residual alone {gauge.choice}",
+            f"vertices in {made.num_colours} colours; for the residual alone {gauge.description}",
         )
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedVertexBlockDescent(Iterative):
+class PreparedVertexBlockDescent(IterativeSolver):
     """Vertex block descent, prepared for a system.
 
     Attributes:
@@ -138,134 +142,151 @@ class PreparedVertexBlockDescent(Iterative):
     """
 
     system: System
-    parts: Parts
-    beside: Beside
+    spring_form: SpringForm
+    vertex_elements: VertexElements
     spectral_radius: float
-    blocks: kernels.Blocks
-    row: NDArray[np.int64]
-    held: NDArray[np.float64]
-    majorant: NDArray[np.float64]
-    measure: Idle
-    choice: str
+    colour_packets: kernels.ColourPackets
+    row_of_vertex: NDArray[np.int64]
+    anchor_stiffness: NDArray[np.float64]
+    hessian_majorant: NDArray[np.float64]
+    residual_solver: ContactFreeSolver
+    description: str
 
     @property
-    def facts(self) -> dict[str, float]:
+    def stats(self) -> dict[str, float]:
         """Exact counts of the prepared data."""
-        return self.measure.facts
+        return self.residual_solver.stats
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        sweeps = Sweeps(self, problem, guess)
-        if not any(map(is_bounded, self.system.energies)):
+        sweeps = SweepState(self, problem, initial_guess)
+        if not any(map(is_barrier_energy, self.system.energies)):
             return sweeps
-        from solvers.contact.pairs_vbd import Guarded  # for those who need it
+        from solvers.contact.pairs_vbd import BarrierVbdState  # for those who need it
         from solvers.core.objective import StepObjective
 
-        step, gauge = StepObjective(self._objective, problem), self.measure.gauge(problem)
-        return Guarded(sweeps, step, guess, self.majorant, self.spectral_radius, gauge)
+        step, gauge = StepObjective(self._fixed_objective, problem), self.residual_solver.build_residual(problem)
+        return BarrierVbdState(sweeps, step, initial_guess, self.hessian_majorant, self.spectral_radius, gauge)
 
     @cached_property
-    def _objective(self) -> Objective:
-        from solvers.core.fixed_objective import Objective
+    def _fixed_objective(self) -> FixedObjective:
+        from solvers.core.fixed_objective import FixedObjective
 
-        return Objective(self.system)
+        return FixedObjective(self.system)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """Return the residual at p, by a local-global iteration if no contact is active."""
-        return self.measure.gauge(problem)(p)
+        return self.residual_solver.build_residual(problem)(p)
 
-    def scale(self, problem: StepProblem) -> float:
+    def residual_scale(self, problem: StepProblem) -> float:
         """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
-        return largest(problem) * float(self.majorant[self.system.unpinned].sum()) ** 0.5
+        return compute_max_coordinate(problem) * float(self.hessian_majorant[self.system.unpinned_mask].sum()) ** 0.5
 
-    def in_rows(self, x: Positions) -> NDArray[np.float64]:
+    def pack_rows(self, x: Positions) -> NDArray[np.float64]:
         """Pack x (n, 3) into rows of four numbers.
 
         Two padding rows for the packets follow.
         """
-        out = aligned(4 * (len(x) + 2))
-        out.reshape(-1, 4)[self.row, :3] = x
+        out = allocate_aligned(4 * (len(x) + 2))
+        out.reshape(-1, 4)[self.row_of_vertex, :3] = x
         return out
 
-    def spaces(self, contacts: list[ContactEnergy]) -> HalfSpaces:
+    def build_half_spaces(self, contacts: list[VertexContactEnergy]) -> HalfSpaces:
         """Build the half-spaces of the contacts."""
-        from solvers.contact.bundles import half_spaces  # for those who need it
+        from solvers.contact.bundles import pack_half_spaces  # for those who need it
 
-        return half_spaces(contacts, self.row, self.blocks.bundles, self.blocks.unknowns)
+        return pack_half_spaces(
+            contacts, self.row_of_vertex, self.colour_packets.spring_packets, self.colour_packets.num_free
+        )
 
 
-class Sweeps(Iterating):
+class SweepState(SolverState):
     """State of a solve: sweeps over all vertices in one step problem."""
 
     def __init__(self, prepared: PreparedVertexBlockDescent, problem: StepProblem, guess: Positions) -> None:
-        contacts, blocks = touching(problem), prepared.blocks
-        self._beside = prepared.beside.begun(problem)
-        self._prepared, self._blocks, self._gauge = prepared, blocks, prepared.measure.gauge(problem)
-        pull = vertex_terms.pull(replace(problem, force=prepared.parts.force(problem)))
-        p, y = (prepared.in_rows(x) for x in (vertex_terms.placed(guess, problem), pull))
-        self._right = blocks.bundles.right(prepared.held, y)
-        self._spaces = prepared.spaces(contacts) if contacts else None
-        p[-4] = _FAR
-        entries = int(np.diff(blocks.bundles.start).max(initial=0))
-        scratch = aligned(NUMBERS * LANES * entries), aligned(9 * LANES)
-        self._work = kernels.SweepScratch(
+        contacts, blocks = begin_active_contacts(problem), prepared.colour_packets
+        self._element_data = prepared.vertex_elements.update_elements(problem)
+        self._prepared, self._colour_packets, self._compute_residual = (
+            prepared,
+            blocks,
+            prepared.residual_solver.build_residual(problem),
+        )
+        pull = vertex_terms.compute_anchor_force(
+            replace(problem, external_force=prepared.spring_form.compute_force(problem))
+        )
+        p, y = (prepared.pack_rows(x) for x in (vertex_terms.apply_exact_pins(guess, problem), pull))
+        self._right_hand_side = blocks.spring_packets.build_right_hand_side(prepared.anchor_stiffness, y)
+        self._half_spaces = prepared.build_half_spaces(contacts) if contacts else None
+        p[-4] = _PADDING_COORDINATE
+        entries = int(np.diff(blocks.spring_packets.packet_start).max(initial=0))
+        scratch = allocate_aligned(SPRING_SCRATCH_SIZE * LANES * entries), allocate_aligned(9 * LANES)
+        self._sweep_scratch = kernels.SweepScratch(
             p.copy(), p.copy(), np.zeros_like(p), *scratch, np.zeros(1), np.full(1, np.nan)
         )
         self._rows, self.positions = p, guess
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents any further change."""
-        self.sweep(1)
+        self.run_sweeps(1)
         return True
 
     def residual(self) -> float:
         """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
-        return self._gauge(self.positions)
+        return self._compute_residual(self.positions)
 
-    def alone(self, p: Positions) -> Positions:
+    def sweep_without_contact(self, p: Positions) -> Positions:
         """Return the positions (n, 3) after a sweep from p without contact planes."""
         if p is not self.positions:
-            self._begin_at(p)
-        self.sweep(1)
+            self._restart_at(p)
+        self.run_sweeps(1)
         return self.positions
 
-    def pushed(self, p: Positions, planes: Planes) -> Positions:
+    def sweep_with_planes(self, p: Positions, planes: ContactPlanes) -> Positions:
         """Return the positions (n, 3) after a sweep from p with the given contact planes."""
-        from solvers.contact.bundles import of_planes
+        from solvers.contact.bundles import pack_contact_planes
 
         made = self._prepared
-        self._begin_at(p)
-        touched = self._spaces
-        self._spaces = of_planes(
-            planes, np.ones(len(planes.vertices)), made.row, made.blocks.bundles, made.blocks.unknowns, both=True
+        self._restart_at(p)
+        touched = self._half_spaces
+        self._half_spaces = pack_contact_planes(
+            planes,
+            np.ones(len(planes.vertices)),
+            made.row_of_vertex,
+            made.colour_packets.spring_packets,
+            made.colour_packets.num_free,
+            is_two_sided=True,
         )
-        self.sweep(1)
-        self._spaces = touched
+        self.run_sweeps(1)
+        self._half_spaces = touched
         return self.positions
 
-    def _begin_at(self, p: Positions) -> None:
+    def _restart_at(self, p: Positions) -> None:
         """Restart the sweeps at p."""
-        self._rows.reshape(-1, 4)[self._prepared.row, :3] = p
-        self._work.omega[0], self._work.level[0] = 0.0, np.nan
+        self._rows.reshape(-1, 4)[self._prepared.row_of_vertex, :3] = p
+        self._sweep_scratch.omega[0], self._sweep_scratch.objective_value[0] = 0.0, np.nan
 
-    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Run iterations within the limits, in one call if no residual can end them."""
-        if limits.wanted == EACH:
-            return super().iterate(limits)
-        self.sweep(limits.iterations)
-        return limits.iterations, self.residual() if limits.wanted == LAST else float("nan"), ITERATIONS
+        if limits.residual_mode == RESIDUAL_EACH:
+            return super().run_iterations(limits)
+        self.run_sweeps(limits.max_iterations)
+        return (
+            limits.max_iterations,
+            self.residual() if limits.residual_mode == RESIDUAL_LAST else float("nan"),
+            REASON_ITERATIONS,
+        )
 
-    def sweep(self, iterations: int) -> None:
+    def run_sweeps(self, num_iterations: int) -> None:
         """Run sweeps over all vertices."""
         made = self._prepared
-        made.beside.kernel(
-            self._blocks,
-            self._spaces,
-            self._beside,
-            self._right,
+        made.vertex_elements.iteration_kernel(
+            self._colour_packets,
+            self._half_spaces,
+            self._element_data,
+            self._right_hand_side,
             made.spectral_radius,
-            self._work,
+            self._sweep_scratch,
             self._rows,
-            iterations,
+            num_iterations,
         )
-        self.positions = self._rows.reshape(-1, 4)[made.row, :3].copy()
+        self.positions = self._rows.reshape(-1, 4)[made.row_of_vertex, :3].copy()

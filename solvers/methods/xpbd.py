@@ -24,25 +24,25 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.about import About, Reference
+from solvers.about import Citation, SolverInfo
 from solvers.core import colouring, vertex_terms
-from solvers.core.driver import Iterating, Iterative, Substeps
-from solvers.core.prefactored import only_springs
-from solvers.device import Precise
+from solvers.core.driver import IterativeSolver, SolverState, SubsteppingState
+from solvers.core.prefactored import require_only_springs
+from solvers.device import PrecisionOptions
 from solvers.kernels import xpbd as kernels
-from solvers.kernels.loop import ITERATIONS, ONE, Limits
-from solvers.problem import Positions, Prepared, ResidualOf, StepProblem, System
+from solvers.kernels.loop import ONE_ITERATION, REASON_ITERATIONS, LoopLimits
+from solvers.problem import Positions, PreparedSolver, ResidualIterate, StepProblem, System
 
 
 @dataclass(frozen=True)
-class Xpbd(Precise):
+class Xpbd(PrecisionOptions):
     """XPBD; uses neither the initial guess nor a tolerance."""
 
-    minimises: ClassVar[bool] = False
-    descends: ClassVar[bool] = False
-    about: ClassVar[About] = About(
+    is_minimiser: ClassVar[bool] = False
+    is_monotone: ClassVar[bool] = False
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "position-based",
-        Reference(
+        Citation(
             "Macklin, Miles and Müller, Matthias and Chentanez, Nuttapong",
             2016,
             "XPBD: position-based simulation of compliant constrained dynamics",
@@ -50,58 +50,58 @@ class Xpbd(Precise):
         ),
     )
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:
             Unsupported: for energies other than springs, and for unpinned vertices without mass.
         """
-        held = vertex_terms.held(system)
+        held = vertex_terms.compute_anchor_stiffness(system)
         if self.device == "cuda":
-            return _on_device(self, system, held, "xpbd", small=False)
-        constraints, _, choice = _prepared(system, held, "xpbd")
-        return PreparedXpbd(system, constraints, *_eased(constraints, held), choice)
+            return _prepare_on_device(self, system, held, "xpbd", small_steps=False)
+        constraints, _, choice = _colour_constraints(system, held, "xpbd")
+        return PreparedXpbd(system, constraints, *_compute_compliance(constraints, held), choice)
 
 
 @dataclass(frozen=True)
-class XpbdSmallSteps(Precise):
+class XpbdSmallSteps(PrecisionOptions):
     """XPBD with small steps: as many substeps of one iteration as the stop rule has iterations.
 
     The k-th iterate is the whole step in k substeps. Pins move at constant velocity, and forces are constant within a
     step. Neither the initial guess nor a tolerance is used.
     """
 
-    minimises: ClassVar[bool] = False
-    descends: ClassVar[bool] = False
-    about: ClassVar[About] = About(
+    is_minimiser: ClassVar[bool] = False
+    is_monotone: ClassVar[bool] = False
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
         "position-based",
-        Reference(
+        Citation(
             "Macklin, Miles and Storey, Kier and Lu, Michelle and Terdiman, Pierre and Chentanez, Nuttapong and "
             "Jeschke, Stefan and Müller, Matthias",
             2019,
             "Small steps in physics simulation",
             "10.1145/3309486.3340247",
         ),
-        own_steps=True,
-        first=True,
+        is_substepping=True,
+        is_family_default=True,
     )
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:
             Unsupported: as for `Xpbd`, and for integrators other than implicit Euler.
         """
         vertex_terms.require_implicit_euler(system, "xpbd-small-steps")
-        held = vertex_terms.held(system)
+        held = vertex_terms.compute_anchor_stiffness(system)
         if self.device == "cuda":
-            return _on_device(self, system, held, "xpbd-small-steps", small=True)
-        constraints, _, choice = _prepared(system, held, "xpbd-small-steps")
-        return PreparedSmallSteps(system, constraints, choice)
+            return _prepare_on_device(self, system, held, "xpbd-small-steps", small_steps=True)
+        constraints, _, choice = _colour_constraints(system, held, "xpbd-small-steps")
+        return PreparedXpbdSmallSteps(system, constraints, choice)
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedXpbd(Iterative):
+class PreparedXpbd(IterativeSolver):
     """XPBD, prepared for a system.
 
     Attributes:
@@ -110,97 +110,112 @@ class PreparedXpbd(Iterative):
         constraint_relaxation: (m,), documented with the kernels.
     """
 
-    residual_of: ClassVar[ResidualOf] = "none"
+    residual_iterate: ClassVar[ResidualIterate] = "none"
 
     system: System
-    constraints: kernels.Constraints
-    compliance: NDArray[np.float64]
-    ease: NDArray[np.float64]
-    choice: str
-    facts: dict[str, float] = field(default_factory=dict)
+    coloured_constraints: kernels.SpringConstraints
+    vertex_compliance: NDArray[np.float64]
+    constraint_relaxation: NDArray[np.float64]
+    description: str
+    stats: dict[str, float] = field(default_factory=dict)
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Passes:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> XpbdState:
         """Start a solve at the positions that the vertices have without springs."""
-        return Passes(self, vertex_terms.anchors(problem))
+        return XpbdState(self, vertex_terms.compute_anchor_positions(problem))
 
 
-class Passes(Iterating):
+class XpbdState(SolverState):
     """State of an XPBD solve; `spring_tensions` t (m,) [N] in the order of `coloured_constraints`."""
 
     def __init__(self, prepared: PreparedXpbd, p: Positions) -> None:
-        self._prepared, self.tension, self.positions = prepared, np.zeros_like(prepared.ease), p
+        self._prepared, self.spring_tensions, self.positions = (
+            prepared,
+            np.zeros_like(prepared.constraint_relaxation),
+            p,
+        )
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents any further change."""
-        self.iterate(ONE)
+        self.run_iterations(ONE_ITERATION)
         return True
 
-    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Run iterations within the limits; return their number, the residual and the reason of the end."""
         made = self._prepared
-        kernels.iterate(made.constraints, made.ease, made.compliance, self.tension, self.positions, limits.iterations)
-        return limits.iterations, float("nan"), ITERATIONS
+        kernels.run_iterations(
+            made.coloured_constraints,
+            made.constraint_relaxation,
+            made.vertex_compliance,
+            self.spring_tensions,
+            self.positions,
+            limits.max_iterations,
+        )
+        return limits.max_iterations, float("nan"), REASON_ITERATIONS
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedSmallSteps(Iterative):
+class PreparedXpbdSmallSteps(IterativeSolver):
     """XPBD with small steps, prepared; `coloured_constraints` are the springs by colour."""
 
-    residual_of: ClassVar[ResidualOf] = "none"
+    residual_iterate: ClassVar[ResidualIterate] = "none"
 
     system: System
-    constraints: kernels.Constraints
-    choice: str
-    facts: dict[str, float] = field(default_factory=dict)
+    coloured_constraints: kernels.SpringConstraints
+    description: str
+    stats: dict[str, float] = field(default_factory=dict)
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve at the start of the step."""
-        return Substeps(self.step, problem)
+        return SubsteppingState(self.step, problem)
 
     def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
         """Integrate the step in `substeps` substeps; return positions [m] and velocities [m/s]."""
-        s, pins, start = self.system, self.system.pins, problem.start
+        s, pins, start = self.system, self.system.pins, problem.step_start
         h = s.time_step / substeps
-        compliance, ease = _eased(self.constraints, vertex_terms.held(replace(s, time_step=h)))
+        compliance, ease = _compute_compliance(
+            self.coloured_constraints, vertex_terms.compute_anchor_stiffness(replace(s, time_step=h))
+        )
         begin = start.positions[pins.vertices]
-        pinned = kernels.Pinned(pins.vertices.copy(), pins.weight.copy(), begin, problem.pin_targets.copy())
+        pinned = kernels.PinMotion(pins.vertices.copy(), pins.weight.copy(), begin, problem.pin_targets.copy())
         p, v = start.positions.copy(), start.velocity.copy()
-        force, before = problem.force.copy(), np.empty_like(p)
-        kernels.substeps(self.constraints, ease, compliance, pinned, force, before, p, v, h, substeps)
+        force, before = problem.external_force.copy(), np.empty_like(p)
+        kernels.run_substeps(self.coloured_constraints, ease, compliance, pinned, force, before, p, v, h, substeps)
         return p, v
 
 
-def _on_device(method: Precise, system: System, held: NDArray[np.float64], solver: str, *, small: bool) -> Prepared:
+def _prepare_on_device(
+    method: PrecisionOptions, system: System, anchor_stiffness: NDArray[np.float64], solver: str, *, small_steps: bool
+) -> PreparedSolver:
     """Prepare the method on a CUDA device (`solvers.cuda.device_xpbd`)."""
-    from solvers.cuda.device import ready  # for those who ask for it
+    from solvers.cuda.device import require_device  # for those who ask for it
 
-    ready(solver)
-    from solvers.cuda.xpbd import prepare
+    require_device(solver)
+    from solvers.cuda.xpbd import prepare_xpbd
 
-    constraints, first, choice = _prepared(system, held, solver)
-    return prepare(system, constraints, first, method.real, choice, small=small)
+    constraints, first, choice = _colour_constraints(system, anchor_stiffness, solver)
+    return prepare_xpbd(system, constraints, first, method.real_dtype, choice, small_steps=small_steps)
 
 
-def _prepared(
-    system: System, held: NDArray[np.float64], solver: str
-) -> tuple[kernels.Constraints, NDArray[np.int64], str]:
+def _colour_constraints(
+    system: System, anchor_stiffness: NDArray[np.float64], solver: str
+) -> tuple[kernels.SpringConstraints, NDArray[np.int64], str]:
     """Group the springs by colour, without self-loops, which have no elongation.
 
     Returns:
         The constraints, the first constraint of each colour (colours + 1,), and a description.
     """
-    springs = only_springs(system, solver)
-    vertex_terms.require_mass(system, held, solver)
+    springs = require_only_springs(system, solver)
+    vertex_terms.require_mass(system, anchor_stiffness, solver)
     keep = np.flatnonzero(springs.edges[:, 0] != springs.edges[:, 1])
-    coloured = colouring.of_springs(springs.edges[keep], system.vertices)
-    constraints = kernels.Constraints.of(springs, keep[coloured.order])
-    return constraints, coloured.start, f"springs in {coloured.colours} colours"
+    coloured = colouring.colour_springs(springs.edges[keep], system.num_vertices)
+    constraints = kernels.SpringConstraints.from_springs(springs, keep[coloured.item_order])
+    return constraints, coloured.colour_starts, f"springs in {coloured.num_colours} colours"
 
 
-def _eased(
-    constraints: kernels.Constraints, held: NDArray[np.float64]
+def _compute_compliance(
+    constraints: kernels.SpringConstraints, anchor_stiffness: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Compute the compliance 1/q (n,) [m/N], and the relative displacement of each spring (m,)."""
-    compliance = 1.0 / held
-    i, j = constraints.ends.T
+    compliance = 1.0 / anchor_stiffness
+    i, j = constraints.end_vertices.T
     return compliance, 1.0 / (1.0 + constraints.stiffness * (compliance[i] + compliance[j]))

@@ -17,24 +17,24 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from solvers.vectors.intrinsics import F64, I64, Vectors, unpacked
-from solvers.vectors.springs import LANES, WIDE, constant
+from solvers.vectors.intrinsics import F64, I64, VectorBuilder, unpack_arguments
+from solvers.vectors.springs import LANES, PACKET_TYPE, constant_packet
 
-_TOGETHER = 4
+_NUM_ACCUMULATORS = 4
 """Number of vectors that accumulate in parallel."""
 
 
-def _sums(*pairs: tuple[int, int]) -> Callable[..., Any]:
+def _dot_products_code(*pairs: tuple[int, int]) -> Callable[..., Any]:
     """Return the code of the dot products of pairs of arrays, over their first `count` entries."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        *arrays, count = unpacked(context, builder, signature, args)
-        v = Vectors(context, builder)
-        whole = builder.and_(count, I64(-_TOGETHER * LANES))
+        *arrays, count = unpack_arguments(context, builder, signature, args)
+        v = VectorBuilder(context, builder)
+        whole = builder.and_(count, I64(-_NUM_ACCUMULATORS * LANES))
 
         def read(array: Any, place: Any, lanes: int) -> Any:
             kept = array.type.pointee
-            narrow, wide = (ir.VectorType(kept, lanes), WIDE) if lanes > 1 else (kept, F64)
+            narrow, wide = (ir.VectorType(kept, lanes), PACKET_TYPE) if lanes > 1 else (kept, F64)
             term = v.load(builder.gep(array, [place]), narrow)
             return term if kept == F64 else builder.fpext(term, wide)
 
@@ -43,14 +43,14 @@ def _sums(*pairs: tuple[int, int]) -> Callable[..., Any]:
             for (a, b), total in zip(pairs, sums, strict=True):
                 builder.store(v.multiply_add(terms[a], terms[b], builder.load(total)), total)
 
-        wide = [[cgutils.alloca_once(builder, WIDE) for _ in pairs] for _ in range(_TOGETHER)]
+        wide = [[cgutils.alloca_once(builder, PACKET_TYPE) for _ in pairs] for _ in range(_NUM_ACCUMULATORS)]
         for total in (total for sums in wide for total in sums):
-            builder.store(constant(0.0), total)
-        with cgutils.for_range_slice(builder, I64(0), whole, I64(_TOGETHER * LANES), I64) as (place, _):
+            builder.store(constant_packet(0.0), total)
+        with cgutils.for_range_slice(builder, I64(0), whole, I64(_NUM_ACCUMULATORS * LANES), I64) as (place, _):
             for k, sums in enumerate(wide):
                 add(builder.add(place, I64(k * LANES)), LANES, sums)
         sums = [
-            cgutils.alloca_once_value(builder, v.total(v.paired([builder.load(total) for total in totals])))
+            cgutils.alloca_once_value(builder, v.sum_lanes(v.sum_pairwise([builder.load(total) for total in totals])))
             for totals in zip(*wide, strict=True)
         ]
         with cgutils.for_range_slice(builder, whole, count, I64(1), I64) as (place, _):
@@ -61,16 +61,16 @@ def _sums(*pairs: tuple[int, int]) -> Callable[..., Any]:
     return generate
 
 
-def _dot(typingctx: Any, a: Any, b: Any, count: Any) -> Any:
+def _dot_code(typingctx: Any, a: Any, b: Any, count: Any) -> Any:
     """Return the dot product of a and b."""
-    return types.float64(a, b, count), _sums((0, 1))
+    return types.float64(a, b, count), _dot_products_code((0, 1))
 
 
-def _dots(typingctx: Any, s: Any, w: Any, g: Any, count: Any) -> Any:
+def _dot_pair_code(typingctx: Any, s: Any, w: Any, g: Any, count: Any) -> Any:
     """Return the dot products of s and g, and of w and g."""
-    return types.UniTuple(types.float64, 2)(s, w, g, count), _sums((0, 2), (1, 2))
+    return types.UniTuple(types.float64, 2)(s, w, g, count), _dot_products_code((0, 2), (1, 2))
 
 
 # Numba passes the first argument itself, which type checkers cannot see.
-dot: Any = intrinsic(_dot)
-dots: Any = intrinsic(_dots)
+ordered_dot: Any = intrinsic(_dot_code)
+ordered_dot_pair: Any = intrinsic(_dot_pair_code)

@@ -20,10 +20,10 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import intrinsic, models, register_model
 
 from solvers.vectors.intrinsics import I8, I64
-from solvers.vectors.springs import LANES, MASK, WIDE, Eights
+from solvers.vectors.springs import LANES, MASK_TYPE, PACKET_TYPE, PacketBuilder
 
 
-class _Eight(types.Type):
+class _Float64x8Type(types.Type):
     """Numba type of a packet of eight float64."""
 
     def can_convert_from(self, typingctx: Any, other: Any) -> Any:
@@ -31,31 +31,31 @@ class _Eight(types.Type):
         return Conversion.promote if isinstance(other, types.Float) else None
 
 
-class _Flags(types.Type):
+class _Mask8Type(types.Type):
     """Numba type of a mask of eight lanes."""
 
 
-EIGHT, FLAGS = _Eight("eight float64"), _Flags("eight flags")
+FLOAT64X8, MASK8 = _Float64x8Type("eight float64"), _Mask8Type("eight flags")
 
 
-@register_model(_Eight)
-class _EightModel(models.PrimitiveModel):
+@register_model(_Float64x8Type)
+class _Float64x8Model(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, WIDE)
+        super().__init__(manager, kind, PACKET_TYPE)
 
 
-@register_model(_Flags)
-class _FlagsModel(models.PrimitiveModel):
+@register_model(_Mask8Type)
+class _Mask8Model(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, MASK)
+        super().__init__(manager, kind, MASK_TYPE)
 
 
-@lower_cast(types.Float, EIGHT)
-def _spread(context: Any, builder: Any, kind: Any, wanted: Any, value: Any) -> Any:
-    return Eights(context, builder).spread(context.cast(builder, value, kind, types.float64), LANES)
+@lower_cast(types.Float, FLOAT64X8)
+def _broadcast_scalar(context: Any, builder: Any, kind: Any, wanted: Any, value: Any) -> Any:
+    return PacketBuilder(context, builder).broadcast_scalar(context.cast(builder, value, kind, types.float64), LANES)
 
 
-def _state(symbol: Any, kind: Any, result: Any, emit: Callable[[Any, Any, Any], Any]) -> None:
+def _register_operator(symbol: Any, kind: Any, result: Any, emit: Callable[[Any, Any, Any], Any]) -> None:
     """Register a binary operator of two packets, or of two masks."""
 
     class Template(AbstractTemplate):
@@ -68,30 +68,30 @@ def _state(symbol: Any, kind: Any, result: Any, emit: Callable[[Any, Any, Any], 
     lower_builtin(symbol, kind, kind)(lambda context, builder, sig, args: emit(builder, *args))
 
 
-_state(operator.add, EIGHT, EIGHT, lambda b, x, y: b.fadd(x, y))
-_state(operator.sub, EIGHT, EIGHT, lambda b, x, y: b.fsub(x, y))
-_state(operator.mul, EIGHT, EIGHT, lambda b, x, y: b.fmul(x, y))
-_state(operator.lt, EIGHT, FLAGS, lambda b, x, y: b.fcmp_ordered("<", x, y))
-_state(operator.le, EIGHT, FLAGS, lambda b, x, y: b.fcmp_ordered("<=", x, y))
-_state(operator.gt, EIGHT, FLAGS, lambda b, x, y: b.fcmp_ordered(">", x, y))
-_state(operator.ge, EIGHT, FLAGS, lambda b, x, y: b.fcmp_ordered(">=", x, y))
-_state(operator.and_, FLAGS, FLAGS, lambda b, x, y: b.and_(x, y))
-_state(operator.or_, FLAGS, FLAGS, lambda b, x, y: b.or_(x, y))
+_register_operator(operator.add, FLOAT64X8, FLOAT64X8, lambda b, x, y: b.fadd(x, y))
+_register_operator(operator.sub, FLOAT64X8, FLOAT64X8, lambda b, x, y: b.fsub(x, y))
+_register_operator(operator.mul, FLOAT64X8, FLOAT64X8, lambda b, x, y: b.fmul(x, y))
+_register_operator(operator.lt, FLOAT64X8, MASK8, lambda b, x, y: b.fcmp_ordered("<", x, y))
+_register_operator(operator.le, FLOAT64X8, MASK8, lambda b, x, y: b.fcmp_ordered("<=", x, y))
+_register_operator(operator.gt, FLOAT64X8, MASK8, lambda b, x, y: b.fcmp_ordered(">", x, y))
+_register_operator(operator.ge, FLOAT64X8, MASK8, lambda b, x, y: b.fcmp_ordered(">=", x, y))
+_register_operator(operator.and_, MASK8, MASK8, lambda b, x, y: b.and_(x, y))
+_register_operator(operator.or_, MASK8, MASK8, lambda b, x, y: b.or_(x, y))
 
 
-def _choose(typingctx: Any, flag: Any, x: Any, y: Any) -> Any:
+def _where_code(typingctx: Any, flag: Any, x: Any, y: Any) -> Any:
     """Return x where the flag is set, else y, for floats or packets."""
-    kind = EIGHT if flag is FLAGS else types.float64
+    kind = FLOAT64X8 if flag is MASK8 else types.float64
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.select(*args)
+        return builder.build_query(*args)
 
     return kind(flag, kind, kind), generate
 
 
-def _divide(typingctx: Any, x: Any, y: Any) -> Any:
+def _divide_packet_code(typingctx: Any, x: Any, y: Any) -> Any:
     """Return x/y of floats or packets."""
-    kind = EIGHT if EIGHT in (x, y) else types.float64
+    kind = FLOAT64X8 if FLOAT64X8 in (x, y) else types.float64
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.fdiv(*args)
@@ -99,25 +99,25 @@ def _divide(typingctx: Any, x: Any, y: Any) -> Any:
     return kind(kind, kind), generate
 
 
-def _square_root(typingctx: Any, x: Any) -> Any:
+def _sqrt_packet_code(typingctx: Any, x: Any) -> Any:
     """Return the square root of a float or a packet."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        name, kind = "llvm.sqrt.v8f64" if x is EIGHT else "llvm.sqrt.f64", args[0].type
+        name, kind = "llvm.sqrt.v8f64" if x is FLOAT64X8 else "llvm.sqrt.f64", args[0].type
         found = builder.module.globals.get(name) or ir.Function(builder.module, ir.FunctionType(kind, [kind]), name)
         return builder.call(found, args)
 
     return x(x), generate
 
 
-def _rows(typingctx: Any, x: Any, vertices: Any, first: Any, last: Any, column: Any) -> Any:
+def _gather_rows_code(typingctx: Any, x: Any, vertices: Any, first: Any, last: Any, column: Any) -> Any:
     """Gather x, y and z of eight rows of x (n, 4) as packets.
 
     The rows are those in a column of vertices (m, k), contiguous, from `first` on; lanes beyond `last` repeat that one.
     """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        (kind, known, *_), (rows, named, *numbers), v = signature.args, args, Eights(context, builder)
+        (kind, known, *_), (rows, named, *numbers), v = signature.args, args, PacketBuilder(context, builder)
         start, names = (context.make_array(a)(context, builder, b) for a, b in ((kind, rows), (known, named)))
         begin, end, at = numbers
         width, places = builder.extract_value(names.shape, 1), []
@@ -126,34 +126,34 @@ def _rows(typingctx: Any, x: Any, vertices: Any, first: Any, last: Any, column: 
             here = builder.select(builder.icmp_signed("<", here, end), here, end)
             place = builder.gep(names.data, [builder.add(builder.mul(here, width), at)])
             places.append(builder.mul(builder.load(place), I64(4)))
-        return context.make_tuple(builder, signature.return_type, v.gather(start.data, places))
+        return context.make_tuple(builder, signature.return_type, v.gather_rows(start.data, places))
 
     integers = types.int64, types.int64, types.int64
-    return types.UniTuple(EIGHT, 3)(x, vertices, *integers), generate
+    return types.UniTuple(FLOAT64X8, 3)(x, vertices, *integers), generate
 
 
-def _loaded(typingctx: Any, array: Any, place: Any) -> Any:
+def _load_packet_code(typingctx: Any, array: Any, place: Any) -> Any:
     """Load eight numbers of a contiguous array from a flat index on."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, args[0]).data
-        return Eights(context, builder).load(builder.gep(data, [args[1]]), WIDE)
+        return PacketBuilder(context, builder).load(builder.gep(data, [args[1]]), PACKET_TYPE)
 
-    return EIGHT(array, types.int64), generate
+    return FLOAT64X8(array, types.int64), generate
 
 
-def _stored(typingctx: Any, value: Any, array: Any, place: Any) -> Any:
+def _store_packet_code(typingctx: Any, value: Any, array: Any, place: Any) -> Any:
     """Store eight numbers in a contiguous array from a flat index on."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = context.make_array(signature.args[1])(context, builder, args[1]).data
-        Eights(context, builder).store(args[0], builder.gep(data, [args[2]]))
+        PacketBuilder(context, builder).store(args[0], builder.gep(data, [args[2]]))
         return context.get_dummy_value()
 
-    return types.void(EIGHT, array, types.int64), generate
+    return types.void(FLOAT64X8, array, types.int64), generate
 
 
-def _as_bits(typingctx: Any, flags: Any) -> Any:
+def _mask_to_bits_code(typingctx: Any, flags: Any) -> Any:
     """Return a mask as the bits of an integer, with the first lane as the lowest bit."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -162,7 +162,7 @@ def _as_bits(typingctx: Any, flags: Any) -> Any:
     return types.int64(flags), generate
 
 
-def _lowest_bit(typingctx: Any, bits: Any) -> Any:
+def _lowest_set_bit_code(typingctx: Any, bits: Any) -> Any:
     """Return the index of the lowest set bit of a nonzero integer."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -172,11 +172,11 @@ def _lowest_bit(typingctx: Any, bits: Any) -> Any:
 
 
 # Numba passes the first argument itself, which type checkers cannot see.
-where: Any = intrinsic(_choose)
-ratio: Any = intrinsic(_divide)
-root: Any = intrinsic(_square_root)
-rows: Any = intrinsic(_rows)
-loaded: Any = intrinsic(_loaded)
-stored: Any = intrinsic(_stored)
-bits: Any = intrinsic(_as_bits)
-lowest: Any = intrinsic(_lowest_bit)
+where: Any = intrinsic(_where_code)
+divide_packet: Any = intrinsic(_divide_packet_code)
+sqrt_packet: Any = intrinsic(_sqrt_packet_code)
+gather_rows: Any = intrinsic(_gather_rows_code)
+load_packet: Any = intrinsic(_load_packet_code)
+store_packet: Any = intrinsic(_store_packet_code)
+mask_to_bits: Any = intrinsic(_mask_to_bits_code)
+lowest_set_bit: Any = intrinsic(_lowest_set_bit_code)

@@ -14,10 +14,10 @@ from numba.extending import intrinsic
 
 I8, I32, I64, F64 = ir.IntType(8), ir.IntType(32), ir.IntType(64), ir.DoubleType()
 
-_BYTES = {ir.HalfType(): 2, ir.FloatType(): 4}
+_ELEMENT_BYTES = {ir.HalfType(): 2, ir.FloatType(): 4}
 
 
-def signature(*kinds: Any, compiled_in: int = 1) -> Any:
+def literal_signature(*kinds: Any, compiled_in: int = 1) -> Any:
     """Return a void signature whose last `compiled_in` arguments are literal integers; raise TypingError otherwise."""
     usual, literal = map(types.unliteral, kinds[:-compiled_in]), kinds[-compiled_in:]
     if not all(isinstance(kind, types.IntegerLiteral) for kind in literal):
@@ -25,47 +25,49 @@ def signature(*kinds: Any, compiled_in: int = 1) -> Any:
     return types.void(*usual, *literal)
 
 
-def unpacked(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
+def unpack_arguments(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
     """Return a kernel's arguments as LLVM values.
 
     Arrays become pointers to their data, numbers int64, literals Python integers, and named tuples are unpacked alike.
     """
-    return [_unpacked(context, builder, *both) for both in zip(signature.args, args, strict=True)]
+    return [_unpack_argument(context, builder, *both) for both in zip(signature.args, args, strict=True)]
 
 
-def _unpacked(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+def _unpack_argument(context: Any, builder: Any, kind: Any, value: Any) -> Any:
     if isinstance(kind, types.Array):
         return context.make_array(kind)(context, builder, value).data
     if isinstance(kind, types.IntegerLiteral):
         return kind.literal_value
     if hasattr(kind, "instance_class"):
         fields = [builder.extract_value(value, k) for k in range(len(kind))]
-        return kind.instance_class(*(_unpacked(context, builder, *both) for both in zip(kind, fields, strict=True)))
+        return kind.instance_class(
+            *(_unpack_argument(context, builder, *both) for both in zip(kind, fields, strict=True))
+        )
     return context.cast(builder, value, kind, types.int64)
 
 
-class Vectors:
+class VectorBuilder:
     """Builder of vector code; has_avx512: whether registers have 512 bits."""
 
     def __init__(self, context: Any, builder: Any) -> None:
         self.builder = builder
-        self.wide = "+avx512f" in context.codegen().magic_tuple()[2]
+        self.has_avx512 = "+avx512f" in context.codegen().magic_tuple()[2]
 
     def load(self, pointer: Any, kind: Any) -> Any:
         """Load a number or a vector, with the alignment of its items, the only one that NumPy guarantees."""
-        return self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()), align=_alignment(kind))
+        return self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()), align=_alignment_of(kind))
 
     def store(self, value: Any, pointer: Any) -> None:
         """Store a number or a vector, with the alignment of its items."""
         place = self.builder.bitcast(pointer, value.type.as_pointer())
-        self.builder.store(value, place, align=_alignment(value.type))
+        self.builder.store(value, place, align=_alignment_of(value.type))
 
     def shuffle(self, a: Any, b: Any, lanes: Any) -> Any:
         """Return lanes of two vectors, numbered through both."""
         lanes = list(lanes)
         return self.builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, len(lanes)), lanes))
 
-    def spread(self, value: Any, lanes: int) -> Any:
+    def broadcast_scalar(self, value: Any, lanes: int) -> Any:
         """Return a vector with a number in all lanes."""
         kind = ir.VectorType(value.type, lanes)
         single = self.builder.insert_element(ir.Constant(kind, ir.Undefined), value, I32(0))
@@ -80,32 +82,32 @@ class Vectors:
         """Return c - a b."""
         return self.builder.fsub(c, self.builder.fmul(a, b, flags=("contract",)), flags=("contract",))
 
-    def total(self, a: Any) -> Any:
+    def sum_lanes(self, a: Any) -> Any:
         """Return the sum of the lanes, taken pairwise."""
-        return self.paired([self.builder.extract_element(a, I32(lane)) for lane in range(a.type.count)])
+        return self.sum_pairwise([self.builder.extract_element(a, I32(lane)) for lane in range(a.type.count)])
 
-    def paired(self, terms: list[Any]) -> Any:
+    def sum_pairwise(self, terms: list[Any]) -> Any:
         """Return the sum of a power of two of terms, taken pairwise."""
         while len(terms) > 1:
             terms = [self.builder.fadd(p, q) for p, q in zip(terms[::2], terms[1::2], strict=True)]
         return terms[0]
 
-    def folded(self, a: Any) -> Any:
+    def sum_by_halves(self, a: Any) -> Any:
         """Return the sum of the lanes by repeatedly adding one half to the other."""
         while (count := a.type.count // 2) > 0:
             a = self.builder.fadd(*(self.shuffle(a, a, range(k, k + count)) for k in (0, count)))
         return self.builder.extract_element(a, I32(0))
 
-    def any(self, mask: Any) -> Any:
+    def any_lane(self, mask: Any) -> Any:
         """Return whether any of eight lanes is true."""
         return self.builder.icmp_unsigned("!=", self.builder.bitcast(mask, I8), I8(0))
 
 
-def _alignment(kind: Any) -> int:
-    return _BYTES.get(getattr(kind, "element", kind), 8)
+def _alignment_of(kind: Any) -> int:
+    return _ELEMENT_BYTES.get(getattr(kind, "element", kind), 8)
 
 
-def ask(builder: Any, pointer: Any, distance: int = 0) -> None:
+def prefetch_line(builder: Any, pointer: Any, distance: int = 0) -> None:
     """Prefetch the cache line at a distance in bytes from a pointer."""
     byte = I8.as_pointer()
     kind = ir.FunctionType(ir.VoidType(), [byte, I32, I32, I32])
@@ -113,15 +115,17 @@ def ask(builder: Any, pointer: Any, distance: int = 0) -> None:
     builder.call(builder.module.declare_intrinsic("llvm.prefetch.p0", fnty=kind), [at, I32(0), I32(3), I32(1)])
 
 
-def _ask_for(typingctx: Any, array: Any, place: Any) -> Any:
+def _prefetch_entry_code(typingctx: Any, array: Any, place: Any) -> Any:
     """Prefetch the entry of a contiguous array at a flat index."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        start, at = unpacked(context, builder, signature, args)
-        ask(builder, builder.gep(start, [at]))
+        start, at = unpack_arguments(context, builder, signature, args)
+        prefetch_line(builder, builder.gep(start, [at]))
         return context.get_dummy_value()
 
     return types.void(array, types.int64), generate
 
 
-ask_for: Any = intrinsic(_ask_for)  # Numba passes the first argument itself, which type checkers do not know
+prefetch_entry: Any = intrinsic(
+    _prefetch_entry_code
+)  # Numba passes the first argument itself, which type checkers do not know

@@ -12,21 +12,21 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from solvers.vectors.intrinsics import I32, I64, Vectors, unpacked
+from solvers.vectors.intrinsics import I32, I64, VectorBuilder, unpack_arguments
 
 
-def _gather(typingctx: Any, values: Any, columns: Any, begin: Any, end: Any, x: Any) -> Any:
+def _sparse_row_product_code(typingctx: Any, values: Any, columns: Any, begin: Any, end: Any, x: Any) -> Any:
     """Return the sum over begin <= e < end of values[e] x[columns[e]], as four numbers of x's type."""
     number = x.dtype
     declared = types.UniTuple(number, 4)(values, columns, types.int64, types.int64, x)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        values, columns, begin, end, x = unpacked(context, builder, signature, args)
-        v, row = Vectors(context, builder), ir.VectorType(context.get_data_type(number), 4)
+        values, columns, begin, end, x = unpack_arguments(context, builder, signature, args)
+        v, row = VectorBuilder(context, builder), ir.VectorType(context.get_data_type(number), 4)
         total = cgutils.alloca_once_value(builder, ir.Constant(row, None))
         with cgutils.for_range_slice(builder, begin, end, I64(1), intp=I64) as (e, _):
             place = builder.mul(builder.sext(builder.load(builder.gep(columns, [e])), I64), I64(4))
-            value = v.spread(builder.load(builder.gep(values, [e])), 4)
+            value = v.broadcast_scalar(builder.load(builder.gep(values, [e])), 4)
             source = v.load(builder.gep(x, [place]), row)
             builder.store(v.multiply_add(value, source, builder.load(total)), total)
         result = builder.load(total)
@@ -36,4 +36,6 @@ def _gather(typingctx: Any, values: Any, columns: Any, begin: Any, end: Any, x: 
     return declared, generate
 
 
-gather: Any = intrinsic(_gather)  # Numba passes the first argument itself, which type checkers do not know
+sparse_row_product: Any = intrinsic(
+    _sparse_row_product_code
+)  # Numba passes the first argument itself, which type checkers do not know

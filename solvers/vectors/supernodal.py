@@ -22,106 +22,114 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from solvers.vectors.intrinsics import I64, Vectors, ask, signature, unpacked
+from solvers.vectors.intrinsics import I64, VectorBuilder, literal_signature, prefetch_line, unpack_arguments
 
-_AHEAD = 4096
+_PREFETCH_BYTES = 4096
 """Prefetch distance in bytes of the downward pass, which the hardware prefetcher predicts less well."""
 
 
-class _Tiles(Vectors):
+class _TileBuilder(VectorBuilder):
     """Builder for tiles of 4 m columns in 512-bit vectors; `element_type` is the work vector's type."""
 
     def __init__(self, context: Any, builder: Any, element: types.Float, m: int) -> None:
         super().__init__(context, builder)
-        self.element = context.get_value_type(element)
-        self.size = element.bitwidth // 8
-        self.lanes = 16 // self.size  # of a vector
-        self.vectors = 4 * m // self.lanes  # of a tile
-        self.entries = 16 * m  # of a tile
+        self.element_type = context.get_value_type(element)
+        self.element_bytes = element.bitwidth // 8
+        self.lanes_per_vector = 16 // self.element_bytes  # of a vector
+        self.vectors_per_tile = 4 * m // self.lanes_per_vector  # of a tile
+        self.entries_per_tile = 16 * m  # of a tile
 
-    def zero(self, lanes: int) -> ir.Constant:
-        return ir.Constant(ir.VectorType(self.element, 4 * lanes), [0.0] * (4 * lanes))
+    def zero_vector(self, lanes: int) -> ir.Constant:
+        return ir.Constant(ir.VectorType(self.element_type, 4 * lanes), [0.0] * (4 * lanes))
 
-    def lane(self, pointer: Any, lanes: int = 1) -> Any:
+    def load_lanes(self, pointer: Any, lanes: int = 1) -> Any:
         """Load a number of lanes of four numbers."""
-        return self.load(pointer, ir.VectorType(self.element, 4 * lanes))
+        return self.load(pointer, ir.VectorType(self.element_type, 4 * lanes))
 
-    def panel(self, tile: Any, kind: types.Array, z: int) -> Any:
+    def load_panel_vector(self, tile: Any, kind: types.Array, z: int) -> Any:
         """Load vector z of a tile of a panel; float16 is widened."""
-        at = self.builder.gep(tile, [I64(4 * self.lanes * z)])
+        at = self.builder.gep(tile, [I64(4 * self.lanes_per_vector * z)])
         if kind.dtype != types.uint16:
-            return self.lane(at, self.lanes)
-        half, wide = (ir.VectorType(e, 4 * self.lanes) for e in (ir.HalfType(), self.element))
+            return self.load_lanes(at, self.lanes_per_vector)
+        half, wide = (ir.VectorType(e, 4 * self.lanes_per_vector) for e in (ir.HalfType(), self.element_type))
         return self.builder.fpext(self.load(at, half), wide)
 
-    def picked(self, a: Any, b: Any, lanes: list[int]) -> Any:
+    def pick_lanes(self, a: Any, b: Any, lanes: list[int]) -> Any:
         """Return lanes of two vectors, numbered through both."""
         return self.shuffle(a, b, [4 * lane + i for lane in lanes for i in range(4)])
 
-    def mixed(self, a: Any, b: Any, places: tuple[int, ...]) -> Any:
+    def shuffle_within_lanes(self, a: Any, b: Any, places: tuple[int, ...]) -> Any:
         """Permute numbers within each lane; places are numbered through both vectors' lanes."""
         n = a.type.count
         return self.shuffle(a, b, [n * (i // 4) + lane + i % 4 for lane in range(0, n, 4) for i in places])
 
-    def joined(self, rows: list[Any]) -> Any:
+    def join_vectors(self, rows: list[Any]) -> Any:
         """Concatenate one, two or four vectors."""
         while len(rows) > 1:
             many = rows[0].type.count // 4
-            rows = [self.picked(a, b, list(range(2 * many))) for a, b in zip(rows[::2], rows[1::2], strict=True)]
+            rows = [self.pick_lanes(a, b, list(range(2 * many))) for a, b in zip(rows[::2], rows[1::2], strict=True)]
         return rows[0]
 
-    def repeated(self, vector: Any, c: int) -> Any:
+    def repeat_entry(self, vector: Any, c: int) -> Any:
         """Return number c of each lane, repeated four times."""
         return self.shuffle(vector, vector, [i // 4 * 4 + c for i in range(vector.type.count)])
 
-    def add(self, a: Any, b: Any) -> Any:
+    def add_vectors(self, a: Any, b: Any) -> Any:
         return self.builder.fadd(a, b)
 
-    def rows(self, totals: list[Any]) -> list[Any]:
+    def reduce_to_rows(self, totals: list[Any]) -> list[Any]:
         """Sum the lanes of three or four vectors; return them as four rows, padded with zero."""
-        vectors, even = [*totals, self.zero(self.lanes)][:4], list(range(0, 2 * self.lanes, 2))
-        for _ in range(self.lanes // 2):  # until a lane is a sum
+        vectors, even = (
+            [*totals, self.zero_vector(self.lanes_per_vector)][:4],
+            list(range(0, 2 * self.lanes_per_vector, 2)),
+        )
+        for _ in range(self.lanes_per_vector // 2):  # until a lane is a sum
             vectors = [
-                self.add(self.picked(a, b, even), self.picked(a, b, [lane + 1 for lane in even]))
+                self.add_vectors(self.pick_lanes(a, b, even), self.pick_lanes(a, b, [lane + 1 for lane in even]))
                 for a, b in zip(vectors[::2], vectors[1::2], strict=True)
             ]
-        whole = self.joined(vectors)
+        whole = self.join_vectors(vectors)
         turned = self.shuffle(whole, whole, [4 * c + r for r in range(4) for c in range(4)])
-        return [self.picked(turned, turned, [r]) for r in range(4)]
+        return [self.pick_lanes(turned, turned, [r]) for r in range(4)]
 
-    def transposed(self, rows: list[Any]) -> list[Any]:
+    def transpose_rows(self, rows: list[Any]) -> list[Any]:
         """Return x, y and z of four rows, repeated in each lane of a vector."""
-        if self.lanes == 2:
-            whole = self.joined(rows)
+        if self.lanes_per_vector == 2:
+            whole = self.join_vectors(rows)
             return [self.shuffle(whole, whole, [4 * r + c for r in range(4)] * 2) for c in range(3)]
-        rows = [self.picked(row, row, [0] * 4) for row in rows]  # so that all that follows stays within lanes
+        rows = [self.pick_lanes(row, row, [0] * 4) for row in rows]  # so that all that follows stays within lanes
         (xy01, z01), (xy23, z23) = (
-            [self.mixed(a, b, at) for at in ((0, 4, 1, 5), (2, 6, 3, 7))] for a, b in (rows[:2], rows[2:])
+            [self.shuffle_within_lanes(a, b, at) for at in ((0, 4, 1, 5), (2, 6, 3, 7))]
+            for a, b in (rows[:2], rows[2:])
         )
-        x, y = (self.mixed(xy01, xy23, at) for at in ((0, 1, 4, 5), (2, 3, 6, 7)))
-        return [x, y, self.mixed(z01, z23, (0, 1, 4, 5))]
+        x, y = (self.shuffle_within_lanes(xy01, xy23, at) for at in ((0, 1, 4, 5), (2, 3, 6, 7)))
+        return [x, y, self.shuffle_within_lanes(z01, z23, (0, 1, 4, 5))]
 
-    def summed(self, x: Any, y: Any, z: Any) -> Any:
+    def sum_within_lanes(self, x: Any, y: Any, z: Any) -> Any:
         """Return each lane's sums of x, y and z, and zero."""
         xy, z0 = (
-            self.add(self.mixed(a, b, (0, 4, 1, 5)), self.mixed(a, b, (2, 6, 3, 7)))
-            for a, b in ((x, y), (z, self.zero(self.lanes)))
+            self.add_vectors(
+                self.shuffle_within_lanes(a, b, (0, 4, 1, 5)), self.shuffle_within_lanes(a, b, (2, 6, 3, 7))
+            )
+            for a, b in ((x, y), (z, self.zero_vector(self.lanes_per_vector)))
         )
-        return self.add(self.mixed(xy, z0, (0, 1, 4, 5)), self.mixed(xy, z0, (2, 3, 6, 7)))
+        return self.add_vectors(
+            self.shuffle_within_lanes(xy, z0, (0, 1, 4, 5)), self.shuffle_within_lanes(xy, z0, (2, 3, 6, 7))
+        )
 
-    def ask(self, tile: Any, kind: Any) -> None:
+    def prefetch_tile(self, tile: Any, kind: Any) -> None:
         """Prefetch the cache lines _PREFETCH_BYTES before those of a tile."""
-        for line in reversed(range(0, self.entries * kind.dtype.bitwidth // 8, 64)):
-            ask(self.builder, tile, line - _AHEAD)
+        for line in reversed(range(0, self.entries_per_tile * kind.dtype.bitwidth // 8, 64)):
+            prefetch_line(self.builder, tile, line - _PREFETCH_BYTES)
 
 
-def _named(builder: Any, index: Any, first: Any, rows: Any) -> list[Any]:
+def _row_pointers(builder: Any, index: Any, first: Any, rows: Any) -> list[Any]:
     """Return pointers to the four rows in `index` from `first` on."""
     names = [builder.zext(builder.load(builder.gep(index, [builder.add(first, I64(r))])), I64) for r in range(4)]
     return [builder.gep(rows, [builder.mul(name, I64(4))]) for name in names]
 
 
-def _add_forward(
+def _panel_product_code(
     typingctx: Any, panel: Any, offset: Any, index: Any, at: Any, count: Any, x: Any, x_row: Any, y: Any, y_row: Any,
     numbers: Any, quads: Any,
 ) -> Any:  # fmt: skip
@@ -129,32 +137,34 @@ def _add_forward(
 
     W starts at `offset`. numbers: how many numbers of a row of x are not zero, 3 or 4.
     """
-    declared = signature(panel, offset, index, at, count, x, x_row, y, y_row, numbers, quads, compiled_in=2)
+    declared = literal_signature(panel, offset, index, at, count, x, x_row, y, y_row, numbers, quads, compiled_in=2)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        panel, offset, index, at, count, x, x_row, y, y_row, numbers, m = unpacked(context, builder, signature, args)
+        panel, offset, index, at, count, x, x_row, y, y_row, numbers, m = unpack_arguments(
+            context, builder, signature, args
+        )
         kind = signature.args[0]
-        t = _Tiles(context, builder, signature.args[7].dtype, m)
+        t = _TileBuilder(context, builder, signature.args[7].dtype, m)
         panel, index = builder.gep(panel, [offset]), builder.gep(index, [at])
         x, y = (builder.gep(rows, [builder.mul(first, I64(4))]) for rows, first in ((x, x_row), (y, y_row)))
-        columns = [t.lane(builder.gep(x, [I64(4 * j)])) for j in range(4 * m)]
-        held = [t.joined(columns[j : j + t.lanes]) for j in range(0, 4 * m, t.lanes)]
-        factors = [[t.repeated(vector, c) for c in range(numbers)] for vector in held]
+        columns = [t.load_lanes(builder.gep(x, [I64(4 * j)])) for j in range(4 * m)]
+        held = [t.join_vectors(columns[j : j + t.lanes_per_vector]) for j in range(0, 4 * m, t.lanes_per_vector)]
+        factors = [[t.repeat_entry(vector, c) for c in range(numbers)] for vector in held]
         with cgutils.for_range(builder, builder.lshr(count, I64(2))) as loop:
             first = builder.mul(loop.index, I64(4))
-            tile = builder.gep(panel, [builder.mul(loop.index, I64(t.entries))])
+            tile = builder.gep(panel, [builder.mul(loop.index, I64(t.entries_per_tile))])
             sums: list[Any] = [None] * numbers
             for z, three in enumerate(factors):
-                w = t.panel(tile, kind, z)
+                w = t.load_panel_vector(tile, kind, z)
                 sums = [t.multiply_add(w, factor, total) for factor, total in zip(three, sums, strict=True)]
-            for row, place in zip(t.rows(sums), _named(builder, index, first, y), strict=True):
-                t.store(t.add(row, t.lane(place)), place)
+            for row, place in zip(t.reduce_to_rows(sums), _row_pointers(builder, index, first, y), strict=True):
+                t.store(t.add_vectors(row, t.load_lanes(place)), place)
         return context.get_dummy_value()
 
     return declared, generate
 
 
-def _set_backward(
+def _transposed_product_code(
     typingctx: Any, square: Any, start: Any, own: Any, panel: Any, offset: Any, index: Any, at: Any, below: Any, y: Any,
     x_row: Any, quads: Any,
 ) -> Any:  # fmt: skip
@@ -163,22 +173,24 @@ def _set_backward(
     The first sum is over r < 4 quads, with S from `start` on; it is omitted if `own` is zero. The second one is over
     r < below, a multiple of four, with W from `offset` on.
     """
-    declared = signature(square, start, own, panel, offset, index, at, below, y, x_row, quads)
+    declared = literal_signature(square, start, own, panel, offset, index, at, below, y, x_row, quads)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        square, start, own, panel, offset, index, at, below, y, x_row, m = unpacked(context, builder, signature, args)
+        square, start, own, panel, offset, index, at, below, y, x_row, m = unpack_arguments(
+            context, builder, signature, args
+        )
         square_kind, panel_kind = signature.args[0], signature.args[3]
-        t = _Tiles(context, builder, signature.args[8].dtype, m)
+        t = _TileBuilder(context, builder, signature.args[8].dtype, m)
         square, panel, index = (builder.gep(a, [begin]) for a, begin in ((square, start), (panel, offset), (index, at)))
         out = builder.gep(y, [builder.mul(x_row, I64(4))])
-        vector = t.zero(t.lanes)
-        sums = [[cgutils.alloca_once_value(builder, vector) for _ in range(3)] for _ in range(t.vectors)]
+        vector = t.zero_vector(t.lanes_per_vector)
+        sums = [[cgutils.alloca_once_value(builder, vector) for _ in range(3)] for _ in range(t.vectors_per_tile)]
 
         def add(tile: Any, kind: Any, places: list[Any]) -> None:
-            t.ask(tile, kind)
-            factors = t.transposed([t.lane(place) for place in places])
+            t.prefetch_tile(tile, kind)
+            factors = t.transpose_rows([t.load_lanes(place) for place in places])
             for z, three in reversed(list(enumerate(sums))):
-                w = t.panel(tile, kind, z)
+                w = t.load_panel_vector(tile, kind, z)
                 for factor, total in zip(factors, three, strict=True):
                     builder.store(t.multiply_add(w, factor, builder.load(total)), total)
 
@@ -187,20 +199,20 @@ def _set_backward(
         tiles = builder.lshr(below, I64(2))
         with cgutils.for_range(builder, tiles) as loop:
             k = builder.sub(builder.sub(tiles, I64(1)), loop.index)
-            tile = builder.gep(panel, [builder.mul(k, I64(t.entries))])
-            add(tile, panel_kind, _named(builder, index, builder.mul(k, I64(4)), y))
+            tile = builder.gep(panel, [builder.mul(k, I64(t.entries_per_tile))])
+            add(tile, panel_kind, _row_pointers(builder, index, builder.mul(k, I64(4)), y))
         with builder.if_then(builder.icmp_signed(">", own, I64(0)), likely=True):
             for k in reversed(range(m)):
                 places = [builder.gep(out, [I64(4 * (4 * k + r))]) for r in range(4)]
-                add(builder.gep(square, [I64(t.entries * k)]), square_kind, places)
-        done = [t.summed(*(builder.load(total) for total in three)) for three in sums]
+                add(builder.gep(square, [I64(t.entries_per_tile * k)]), square_kind, places)
+        done = [t.sum_within_lanes(*(builder.load(total) for total in three)) for three in sums]
         for z, rows in enumerate(done):
-            t.store(rows, builder.gep(out, [I64(4 * t.lanes * z)]))
+            t.store(rows, builder.gep(out, [I64(4 * t.lanes_per_vector * z)]))
         return context.get_dummy_value()
 
     return declared, generate
 
 
 # Numba passes the first argument itself, which type checkers cannot see.
-add_forward: Any = intrinsic(_add_forward)
-set_backward: Any = intrinsic(_set_backward)
+add_panel_product: Any = intrinsic(_panel_product_code)
+set_transposed_product: Any = intrinsic(_transposed_product_code)

@@ -22,22 +22,22 @@ import numpy as np
 import pytest
 
 from harness.config.load import load_scene
-from harness.experiments.accuracy.units import references
-from harness.reference.frozen import bind
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.springs import Springs
+from harness.experiments.accuracy.units import open_reference_store
+from harness.reference.frozen import build_exact_scene
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.springs import SpringsEffect
 from harness.scenes.spec import IntegratorName, SceneSpec
-from harness.simulation.step import prepare, simulate
-from solvers.core.fixed_objective import Objective
+from harness.simulation.step import prepare, simulate_scene
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
-from solvers.methods.newton import certified
+from solvers.methods.newton import is_positive_definite
 from solvers.problem import Positions, StepProblem, StopRule
-from solvers.registry import SOLVERS, load
+from solvers.registry import SOLVERS, load_target
 from tests.bench.gates import STOP, Gate, Work
 
 ROOT = Path(__file__).resolve().parents[2]
 FLAG = ROOT.parent / "shared" / "scenes" / "flag.json"
-STORE = references(ROOT / "results")
+STORE = open_reference_store(ROOT / "results")
 
 ITERATIONS = {"sparse": 4000, "numba": 20_000}
 """Of local-global, the most that a gate waits for."""
@@ -56,21 +56,21 @@ class Scored:
 
 def gap(spec: SceneSpec, size: int, frame: int, guess: str = "current") -> Scored:
     """A frozen step, graded by the energy gap; that of the first guess is 1."""
-    frozen = STORE.frames(spec, size, [frame])[frame]
-    lowest, problem = STORE.reference(frozen).best.g, frozen.stated(guess)
-    whole = problem.value(problem.first_guess) - lowest
+    frozen = STORE.load_frames(spec, size, [frame])[frame]
+    lowest, problem = STORE.find_minima(frozen).lowest.objective, frozen.build_problem(guess)
+    whole = problem.value(problem.initial_guess) - lowest
     return Scored(problem, lambda p: (problem.value(p) - lowest) / whole)
 
 
 def stationary(spec: SceneSpec, frame: int) -> Scored:
     """A frozen step, graded by the gradient's largest entry; that at the current positions is 1. Only where the Hessian
     is positive definite is an error finite."""
-    problem = STORE.frames(spec, 0, [frame])[frame].problem
-    objective = StepObjective(Objective(problem.system), problem)
-    whole = np.abs(problem.gradient(problem.current)).max()
+    problem = STORE.load_frames(spec, 0, [frame])[frame].problem
+    objective = StepObjective(FixedObjective(problem.system), problem)
+    whole = np.abs(problem.gradient(problem.current_positions)).max()
 
     def error(p: Positions) -> float:
-        return float(np.abs(problem.gradient(p)).max() / whole) if certified(objective, p) else np.inf
+        return float(np.abs(problem.gradient(p)).max() / whole) if is_positive_definite(objective, p) else np.inf
 
     return Scored(problem, error)
 
@@ -88,12 +88,12 @@ def flag(stiffness: float | None = None) -> SceneSpec:
     if stiffness is None:
         return spec
     pins = spec.effects[-1]
-    return spec.model_copy(update={"effects": (Springs(rule="fixed", stretch=stiffness), Gravity(), pins)})
+    return spec.model_copy(update={"effects": (SpringsEffect(rule="fixed", stretch=stiffness), GravityEffect(), pins)})
 
 
 def reached(solver: str, scored: Scored, error: float, most: int) -> tuple[int, bool]:
     """After how many iterations a solve is at an error, to 2 %, and whether it is after `most`."""
-    iterates, done = load(SOLVERS[solver])().prepare(scored.problem.system).iterates(scored.problem), 0
+    iterates, done = load_target(SOLVERS[solver])().prepare(scored.problem.system).iterates(scored.problem), 0
     while done < most:
         more = min(most, max(done + 1, done * 51 // 50)) - done
         *_, p = islice(iterates, more)
@@ -105,7 +105,7 @@ def reached(solver: str, scored: Scored, error: float, most: int) -> tuple[int, 
 
 def solved(solver: str, scored: Scored, iterations: int) -> Work:
     """So many iterations; the last positions [m]."""
-    prepared = load(SOLVERS[solver])().prepare(scored.problem.system)
+    prepared = load_target(SOLVERS[solver])().prepare(scored.problem.system)
     return lambda: prepared.solve(scored.problem, StopRule(iterations)).positions
 
 
@@ -164,12 +164,12 @@ SIZE, SECONDS = 9, 0.5
 
 def simulated(name: str, way: Way) -> Work:
     """The whole simulation; the last positions [m]."""
-    built = bind(scene(name).stepped(1.0 / way.steps), SIZE, way.integrator)
-    prepared, frames = prepare(built, load(SOLVERS[way.solver])()), round(SECONDS * way.steps)
+    built = build_exact_scene(scene(name).with_time_step(1.0 / way.steps), SIZE, way.integrator)
+    prepared, frames = prepare(built, load_target(SOLVERS[way.solver])()), round(SECONDS * way.steps)
 
     def work() -> Positions:
-        p = built.mesh.rest
-        for step in simulate(built, prepared, way.stop, first_guess="current", frames=frames):
+        p = built.mesh.rest_positions
+        for step in simulate_scene(built, prepared, way.stop, initial_guess="current", frames=frames):
             p = step.positions
         return p
 
@@ -180,7 +180,7 @@ def trajectory_gates(name: str, error: float, best: Way, **limits: float) -> Ite
     """The cheapest way to a total error that is known, beside implicit Euler with 50 iterations; limits: as above."""
 
     def wrong(way: Way) -> float:
-        return STORE.trajectory(scene(name), SIZE, [SECONDS], error=error).error(0, simulated(name, way)())
+        return STORE.load_trajectory(scene(name), SIZE, [SECONDS], error=error).measure_error(0, simulated(name, way)())
 
     def candidate() -> Work:
         assert wrong(best) <= error, f"{best} errs by more than {error:g}"

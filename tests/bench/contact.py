@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from harness.scenes.bind import build
-from harness.scenes.effects.contact import Contact
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.grid import Grid
+from harness.scenes.bind import build_scene
+from harness.scenes.effects.contact import ContactEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.grid import GridMesh
 from harness.scenes.spec import SceneSpec
-from harness.simulation.step import simulate
+from harness.simulation.step import simulate_scene
 from tests.bench.gates import STOP, Gate, Work, last, prepare
 
-FAR = Contact.model_validate(
+FAR = ContactEffect.model_validate(
     {
         "obstacles": [{"kind": "plane", "point": (0, -5, 0)}, {"kind": "sphere", "center": (0, -4, 0), "radius": 0.5}],
         "friction": 0.5,
@@ -22,13 +22,15 @@ FAR = Contact.model_validate(
 )
 
 
-def fallen(*effects: Contact, size: int, frames: int) -> Work:
+def fallen(*effects: ContactEffect, size: int, frames: int) -> Work:
     """Whole steps of the compiled backend; the last positions [m]."""
-    given = Springs(stretch=1000.0), Gravity(), Pins(at=("top_corners",)), *effects
-    spec = SceneSpec(mesh=Grid(), mass=1.0, time_step=1 / 30, frames=1, effects=given, path=Path("sheet.yaml"))
-    scene = build(spec, size)
+    given = SpringsEffect(stretch=1000.0), GravityEffect(), PinsEffect(at=("top_corners",)), *effects
+    spec = SceneSpec(mesh=GridMesh(), mass=1.0, time_step=1 / 30, frames=1, effects=given, path=Path("sheet.yaml"))
+    scene = build_scene(spec, size)
     prepared = prepare("numba", scene)
-    return lambda: last(step.solution for step in simulate(scene, prepared, STOP, first_guess="current", frames=frames))
+    return lambda: last(
+        step.solution for step in simulate_scene(scene, prepared, STOP, initial_guess="current", frames=frames)
+    )
 
 
 CONTACT = (

@@ -24,24 +24,24 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from harness.base.machine import pinned_threads
+from harness.base.machine import limit_threads
 from harness.config.load import load_scene
-from harness.scenes.bind import build
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins as PinsEffect
-from harness.scenes.effects.springs import Springs as SpringsEffect
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.solids import Block
-from harness.simulation.step import State, prepare, problem, simulate
-from solvers.core.prefactored import only_springs
+from harness.scenes.bind import build_scene
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect as PinsEffect
+from harness.scenes.effects.springs import SpringsEffect as SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.solids import BlockMesh
+from harness.simulation.step import MotionState, build_problem, prepare, simulate_scene
+from solvers.core.prefactored import require_only_springs
 from solvers.integrators import Motion
-from solvers.linear.near_kernel import Cycle, Solving
-from solvers.methods.hybrid import Hybrid
+from solvers.linear.near_kernel import PreconditionedSolve, VCycle
+from solvers.methods.hybrid import HybridNewton
 from solvers.methods.mgpbd import MultigridXpbd
-from solvers.methods.newton import Newton
+from solvers.methods.newton import NewtonSolver
 from solvers.methods.xpbd import PreparedXpbd, Xpbd
 from solvers.problem import StepProblem, StopRule
-from tests.scenes import first_problem, scene
+from tests.scenes import build_first_problem, build_test_scene
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 CLOTHS = {
@@ -80,22 +80,28 @@ class Course(NamedTuple):
 
 def cloth(path: str, size: int) -> StepProblem:
     """The third step of a cloth from rest."""
-    made = build(load_scene(CONFIGS / path), size)
-    *_, last = simulate(made, prepare(made, Hybrid()), StopRule(500, 1e-6), first_guess="current", frames=3)
+    made = build_scene(load_scene(CONFIGS / path), size)
+    *_, last = simulate_scene(
+        made, prepare(made, HybridNewton()), StopRule(500, 1e-6), initial_guess="current", frames=3
+    )
     return last.problem
 
 
 def cube(size: int, modulus: float) -> StepProblem:
     """The first step of a cube of a metre and a ton that was pressed flat."""
-    made = scene(Block(height=1.0, depth=1.0), SpringsEffect(stretch=modulus), size=size, mass=1000.0, time_step=0.01)
-    flat = made.mesh.rest * [1.0, 0.0, 1.0]
-    return problem(made, State(Motion(flat, np.zeros_like(flat)), None, 0), "current")
+    made = build_test_scene(
+        BlockMesh(height=1.0, depth=1.0), SpringsEffect(stretch=modulus), size=size, mass=1000.0, time_step=0.01
+    )
+    flat = made.mesh.rest_positions * [1.0, 0.0, 1.0]
+    return build_problem(made, MotionState(Motion(flat, np.zeros_like(flat)), None, 0), "current")
 
 
 def chain() -> StepProblem:
     """The first step of a chain that is held at both ends."""
     pins = PinsEffect.model_validate({"at": ["ends"], "weight": "exact"})
-    return first_problem(scene(Chain(length=2.0), SpringsEffect(stretch=1e4), Gravity(), pins, size=3000))
+    return build_first_problem(
+        build_test_scene(ChainMesh(length=2.0), SpringsEffect(stretch=1e4), GravityEffect(), pins, size=3000)
+    )
 
 
 PROBLEMS: dict[str, Callable[[], StepProblem]] = {
@@ -119,24 +125,24 @@ def xpbd(stated: StepProblem) -> Iterator[Reached]:
     """XPBD, before its first iteration and after each."""
     made = Xpbd().prepare(stated.system)
     assert isinstance(made, PreparedXpbd)
-    run, own = made.begin(stated, stated.first_guess), made.constraints
-    root, (i, j), seconds = np.sqrt(own.stiffness), own.ends.T, 0.0
+    run, own = made.init_state(stated, stated.initial_guess), made.coloured_constraints
+    root, (i, j), seconds = np.sqrt(own.stiffness), own.end_vertices.T, 0.0
     while True:
         p = run.positions
         stretched = root * (np.linalg.norm(p[i] - p[j], axis=1) - own.rest_length)
-        yield Reached(float(np.linalg.norm(stretched - run.tension / root)), p, 0, seconds)
+        yield Reached(float(np.linalg.norm(stretched - run.spring_tensions / root)), p, 0, seconds)
         began = time.process_time()
-        run.advance()
+        run.step_state()
         seconds += time.process_time() - began
 
 
 def mgpbd(stated: StepProblem, solver: MultigridXpbd) -> Iterator[Reached]:
     """MGPBD, likewise; it ends where nothing moves any more."""
-    run, moved, seconds = solver.prepare(stated.system).begin(stated, stated.first_guess), True, 0.0
+    run, moved, seconds = solver.prepare(stated.system).init_state(stated, stated.initial_guess), True, 0.0
     while moved:
-        yield Reached(float(np.linalg.norm(run.misfit)), run.positions, run.iterations, seconds)
+        yield Reached(float(np.linalg.norm(run.dual_residual)), run.positions, run.num_cg_iterations, seconds)
         began = time.process_time()
-        moved = run.advance()
+        moved = run.step_state()
         seconds += time.process_time() - began
 
 
@@ -157,10 +163,10 @@ def course(run: Iterator[Reached], most: int) -> Course:
 def courses(name: str) -> list[str]:
     """The row of a problem."""
     stated = PROBLEMS[name]()
-    minimum = Newton().prepare(stated.system).solve(stated, StopRule(2000, 1e-9)).positions
-    way = float(np.abs(minimum - stated.current).max())
+    minimum = NewtonSolver().prepare(stated.system).solve(stated, StopRule(2000, 1e-9)).positions
+    way = float(np.abs(minimum - stated.current_positions).max())
     plain, global_ = course(xpbd(stated), MOST["xpbd"]), course(mgpbd(stated, MultigridXpbd()), MOST["mgpbd"])
-    row = [name, f"{len(only_springs(stated.system, name).edges):,}"]
+    row = [name, f"{len(require_only_springs(stated.system, name).edges):,}"]
     for found in (plain, global_):
         row.append(", ".join("-" if (k := found.until(level)) is None else f"{k:,}" for level in LEVELS))
         row.append(f"{np.abs(found.end - minimum).max() / way:.1e}")
@@ -179,14 +185,14 @@ def setups(name: str) -> list[str]:
     row = [name]
     for label, solver in MADE.items():
         made = solver.prepare(stated.system)
-        run = made.begin(stated, stated.first_guess)
-        A = made.matrix(made.stretched(run.positions)[1])
-        prolongation = made.prolongation(A)
+        run = made.init_state(stated, stated.initial_guess)
+        A = made.dual_matrix(made.scaled_constraints(run.positions)[1])
+        prolongation = made.build_prolongation(A)
         if label == ALONE:
-            prolongation.levels.clear()
-        cycle = Cycle(A, prolongation)
-        count = Solving(A, cycle, run.misfit, 1e-6).solve(2000)
-        row.append(f"{count:,}, {1e-6 * (cycle.bytes + 12 * A.nnz):.1f}")
+            prolongation.prolongators.clear()
+        cycle = VCycle(A, prolongation)
+        count = PreconditionedSolve(A, cycle, run.dual_residual, 1e-6).solve(2000)
+        row.append(f"{count:,}, {1e-6 * (cycle.matrix_bytes + 12 * A.nnz):.1f}")
     return row
 
 
@@ -202,7 +208,7 @@ def main() -> None:
         *("linear iterations", "time, over xpbd's"),
     )
     table = Table(*(("step", *MADE) if given.setup else columns), box=SIMPLE_HEAD)
-    with pinned_threads(1):
+    with limit_threads(1):
         for name in given.names:
             table.add_row(*(setups if given.setup else courses)(name))
     Console(width=150).print(table)

@@ -15,11 +15,11 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from harness.base.machine import pinned_threads
+from harness.base.machine import limit_threads
 from harness.config.load import load_scene
-from harness.experiments.ablation.prices import price, ready
+from harness.experiments.ablation.prices import measure_overhead, prepare_scene
 from solvers.problem import StopRule, Unsupported
-from solvers.registry import SOLVERS, load
+from solvers.registry import SOLVERS, load_target
 
 PRICES = Path(__file__).parents[2] / "configs" / "prices.yaml"
 STOP = StopRule(5000, 1e-6)
@@ -61,18 +61,18 @@ def main() -> None:
     table = Table(box=SIMPLE_HEAD, title=f"an iteration with the effect over one without, {asked.size} vertices a side")
     for heading in ("effect", *asked.solvers):
         table.add_column(heading, justify="right")
-    with pinned_threads(1):
+    with limit_threads(1):
         for effect in asked.effects:
             cells = []
             for solver in asked.solvers:
-                made = load(SOLVERS[solver])()
+                made = load_target(SOLVERS[solver])()
                 try:
-                    both = ready(whole, asked.size, made, effect), ready(whole, asked.size, made)
-                    found = price(effect, *both, STOP, frames=asked.frames, rounds=asked.rounds)
+                    both = prepare_scene(whole, asked.size, made, effect), prepare_scene(whole, asked.size, made)
+                    found = measure_overhead(effect, *both, STOP, frames=asked.frames, max_rounds=asked.rounds)
                 except Unsupported:
                     cells.append("refused")
                     continue
-                ratio, limit = found.price.middle, LIMITS[solver][KINDS[effect]]
+                ratio, limit = found.ratio_interval.estimate, LIMITS[solver][KINDS[effect]]
                 beyond = "" if ratio <= limit else " !"
                 cells.append(f"{ratio:.2f} ({1e3 * found.seconds:.3g} ms; limit {limit:g}{beyond})")
             table.add_row(effect, *cells)

@@ -21,15 +21,15 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from harness.base.machine import pinned_threads
+from harness.base.machine import limit_threads
 from harness.config.load import load_scene
-from harness.reference.frozen import bind
-from harness.reference.oracle import Oracle
+from harness.reference.frozen import build_exact_scene
+from harness.reference.oracle import ReferenceEvaluator
 from harness.scenes.bind import Scene
-from harness.simulation.step import prepare, simulate, start
-from solvers.core.forces import frequency
+from harness.simulation.step import build_initial_state, prepare, simulate_scene
+from solvers.core.forces import estimate_max_frequency
 from solvers.problem import Positions, StopRule, Unsupported
-from solvers.registry import EVERY, load
+from solvers.registry import SOLVER_TABLE, load_target
 
 SCENES = [Path(__file__).parents[2] / "configs" / "scenes" / f"{name}.yaml" for name in ("curtain", "stiff-cloth-sway")]
 ENGINES: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -49,20 +49,24 @@ FAR = 10.0
 def energy(scene: Scene, p: Positions, v: Positions) -> tuple[float, float]:
     """All of it, and the kinetic part [J]."""
     kinetic = 0.5 * float(scene.system.mass @ np.einsum("ij,ij->i", v, v))
-    return kinetic + scene.springs.value(p) - float(np.einsum("ij,ij->", scene.load, p)), kinetic
+    return kinetic + scene.all_springs.value(p) - float(np.einsum("ij,ij->", scene.constant_force, p)), kinetic
 
 
 def cell(scene: Scene, solver: Any, stop: StopRule, frames: int) -> str:
     """Residual and drift."""
-    oracle, size, begun = Oracle(scene.system), scene.mesh.size or 1.0, start(scene).now
+    oracle, size, begun = (
+        ReferenceEvaluator(scene.system),
+        scene.mesh.bounding_box_diagonal or 1.0,
+        build_initial_state(scene).motion,
+    )
     first, most = energy(scene, *begun)
     last, left = first, list[float]()
     try:
-        for step in simulate(scene, prepare(scene, solver), stop, first_guess="current", frames=frames):
-            p, v = step.state.now
-            if not np.isfinite(p).all() or np.abs(p - scene.mesh.rest).max() > FAR * size:
+        for step in simulate_scene(scene, prepare(scene, solver), stop, initial_guess="current", frames=frames):
+            p, v = step.state.motion
+            if not np.isfinite(p).all() or np.abs(p - scene.mesh.rest_positions).max() > FAR * size:
                 return "–"
-            left.append(oracle.stationarity(step.problem, p).reached)
+            left.append(oracle.measure_stationarity(step.problem, p).stationarity)
             last, kinetic = energy(scene, p, v)
             most = max(most, kinetic)
     except Unsupported:
@@ -72,13 +76,18 @@ def cell(scene: Scene, solver: Any, stop: StopRule, frames: int) -> str:
 
 def rows(path: Path, size: int, frames: int, substeps: list[int]) -> Iterator[tuple[str, ...]]:
     """Of one scene."""
-    scene = bind(load_scene(path), size, "own")
+    scene = build_exact_scene(load_scene(path), size, "own")
     for name, parameters in ENGINES:
-        made = load(EVERY[name])(**parameters)
+        made = load_target(SOLVER_TABLE[name])(**parameters)
         words = " ".join(map(str, (name, *parameters.values())))
         yield words, *(cell(scene, made, StopRule(number), frames) for number in substeps)
     for name, integrator, stop in OURS:
-        yield f"{name}, {integrator}", cell(bind(load_scene(path), size, integrator), load(EVERY[name])(), stop, frames)
+        yield (
+            f"{name}, {integrator}",
+            cell(
+                build_exact_scene(load_scene(path), size, integrator), load_target(SOLVER_TABLE[name])(), stop, frames
+            ),
+        )
 
 
 def main() -> None:
@@ -89,10 +98,10 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=30)
     parser.add_argument("--substeps", type=int, nargs="+", default=[4, 16, 64, 256])
     asked = parser.parse_args()
-    with pinned_threads(1):
+    with limit_threads(1):
         for path in asked.scenes:
-            system = bind(load_scene(path), asked.size, "own").system
-            least = frequency(system) * system.time_step / 2.0
+            system = build_exact_scene(load_scene(path), asked.size, "own").system
+            least = estimate_max_frequency(system) * system.time_step / 2.0
             title = f"{path.stem} {asked.size}: omega h is 2 at {least:.3g} substeps"
             table = Table("substeps", *map(str, asked.substeps), box=SIMPLE_HEAD, title=title)
             for row in rows(path, asked.size, asked.frames, asked.substeps):

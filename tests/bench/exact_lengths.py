@@ -20,60 +20,65 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from harness.base.machine import pinned_threads
+from harness.base.machine import limit_threads
 from harness.scenes.bind import Scene
-from harness.scenes.effects.ether_drag import EtherDrag
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
-from harness.simulation.step import problem, simulate, start
+from harness.scenes.effects.ether_drag import EtherDragEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.simulation.step import build_initial_state, build_problem, simulate_scene
 from solvers.energies import springs
-from solvers.energies.augmented import joined, off
+from solvers.energies.augmented import concatenate_constraints, length_errors
 from solvers.methods.avbd import AugmentedVertexBlockDescent as Avbd
-from solvers.methods.avbd import PreparedAugmented
-from solvers.methods.newton import Newton
+from solvers.methods.avbd import PreparedAugmentedVertexBlockDescent
+from solvers.methods.newton import NewtonSolver
 from solvers.methods.vbd import VertexBlockDescent as Vbd
 from solvers.methods.xpbd import PreparedXpbd, Xpbd, XpbdSmallSteps
-from solvers.problem import Prepared, Solver, StepProblem, StopRule
-from tests.scenes import scene
+from solvers.problem import PreparedSolver, Solver, StepProblem, StopRule
+from tests.scenes import build_test_scene
 
 FRAME, LINKS, HEAVY = 1 / 60, 50, 50_000.0
-FIRST = Pins.model_validate({"at": ["first"], "weight": "exact"})
-ENDS = Pins.model_validate({"at": ["ends"], "weight": "exact"})
+FIRST = PinsEffect.model_validate({"at": ["first"], "weight": "exact"})
+ENDS = PinsEffect.model_validate({"at": ["ends"], "weight": "exact"})
 STEEP = Avbd(ramp=1e5, stabilisation=0.95)
 FIRM = 1e12
 """The stiffness [N/m] of springs that are to be exact: XPBD takes any, and stretches by it are below round-off."""
 
 
-def pendulum(stiffness: float | str, mesh: Chain, heavy: float = HEAVY) -> Scene:
+def pendulum(stiffness: float | str, mesh: ChainMesh, heavy: float = HEAVY) -> Scene:
     """A chain of vertices of a kilogram and a heavy one; stiffness: of its springs [N/m], or `exact`."""
-    held = Springs.model_validate({"stretch": stiffness, "rule": "fixed"})
-    made = scene(mesh, held, Gravity(), FIRST, size=LINKS + 1, mass=float(LINKS), time_step=FRAME)
+    held = SpringsEffect.model_validate({"stretch": stiffness, "rule": "fixed"})
+    made = build_test_scene(mesh, held, GravityEffect(), FIRST, size=LINKS + 1, mass=float(LINKS), time_step=FRAME)
     mass = made.system.mass.copy()
     mass[-1] = heavy * mass[1]
-    load = made.load * (mass / made.system.mass)[:, None]
-    return replace(made, system=replace(made.system, mass=mass), load=load)
+    load = made.constant_force * (mass / made.system.mass)[:, None]
+    return replace(made, system=replace(made.system, mass=mass), constant_force=load)
 
 
 def errors(made: Scene, solver: Solver, iterations: int, seconds: float) -> tuple[float, float, float]:
     """The worst link's error over its length, in the mean and at most, and how far the bob falls over the chain's
     length, which is 1 of an exact one; infinite where it is no number."""
-    lengths = joined(pendulum("exact", Chain()).system.lengths)
-    run = simulate(made, solver.prepare(made.system), StopRule(iterations), first_guess="inertial",
+    lengths = concatenate_constraints(pendulum("exact", ChainMesh()).system.length_constraints)
+    run = simulate_scene(made, solver.prepare(made.system), StopRule(iterations), initial_guess="inertial",
                    frames=round(seconds / FRAME))  # fmt: skip
-    told = [(np.abs(off(lengths, p) / lengths.high).max(), -p[-1, 1]) for p in (step.positions for step in run)]
+    told = [
+        (np.abs(length_errors(lengths, p) / lengths.max_length).max(), -p[-1, 1])
+        for p in (step.positions for step in run)
+    ]
     found, fallen = np.array(told).T
     if not np.isfinite(found).all():
         return np.inf, np.inf, np.inf
-    return float(found.mean()), float(found.max()), float(fallen.max() / lengths.high.sum())
+    return float(found.mean()), float(found.max()), float(fallen.max() / lengths.max_length.sum())
 
 
 def swinging() -> Table:
     """The first table."""
     table = Table("method", "iterations", "mean", "largest", "fall", box=SIMPLE_HEAD)
-    exact, firm = (pendulum(k, Chain()) for k in ("exact", FIRM))
-    stiff, stiffer = (pendulum(HEAVY * 9.81 * LINKS / by, Chain()) for by in (1e-3, 1e-4))  # stretch by the bob at rest
+    exact, firm = (pendulum(k, ChainMesh()) for k in ("exact", FIRM))
+    stiff, stiffer = (
+        pendulum(HEAVY * 9.81 * LINKS / by, ChainMesh()) for by in (1e-3, 1e-4)
+    )  # stretch by the bob at rest
     of = [
         ("avbd", exact, Avbd()),
         ("avbd, ramp: 100000, stabilisation: 0.95", exact, STEEP),
@@ -90,7 +95,7 @@ def swinging() -> Table:
 
 def ratios() -> Table:
     """The second table."""
-    chain = scene(Chain(), Springs(stretch=1e4, rule="fixed"), Gravity(), ENDS, EtherDrag(rate=2.0), size=12,
+    chain = build_test_scene(ChainMesh(), SpringsEffect(stretch=1e4, rule="fixed"), GravityEffect(), ENDS, EtherDragEffect(rate=2.0), size=12,
                   mass=11.0, time_step=FRAME)  # fmt: skip
     (found,) = chain.system.energies
     assert isinstance(found, springs.Springs)
@@ -98,11 +103,13 @@ def ratios() -> Table:
     chain = replace(chain, system=replace(chain.system, energies=(replace(found, stiffness=k),)))
 
     def end(solver: Solver, iterations: int) -> np.ndarray:
-        run = simulate(chain, solver.prepare(chain.system), StopRule(iterations), first_guess="inertial", frames=240)
+        run = simulate_scene(
+            chain, solver.prepare(chain.system), StopRule(iterations), initial_guess="inertial", frames=240
+        )
         return [step.positions for step in run][-1]
 
-    wanted = end(Newton(), 200)
-    sag = np.abs(wanted - chain.mesh.rest).max()
+    wanted = end(NewtonSolver(), 200)
+    sag = np.abs(wanted - chain.mesh.rest_positions).max()
     table = Table("method", "iterations", "off, over the sag", box=SIMPLE_HEAD)
     for name, solver in {
         "avbd, softened": Avbd(softened=True),
@@ -118,7 +125,7 @@ def ratios() -> Table:
 def costs() -> Table:
     """The third table."""
     table = Table("method", "CPU time of an iteration, over vbd's", "bytes", box=SIMPLE_HEAD)
-    exact, firm, stiff = (pendulum(k, Chain()) for k in ("exact", FIRM, HEAVY * 9.81 * LINKS / 1e-3))
+    exact, firm, stiff = (pendulum(k, ChainMesh()) for k in ("exact", FIRM, HEAVY * 9.81 * LINKS / 1e-3))
     usual = None
     for name, made, solver in (
         ("vbd, spectral_radius: 0", stiff, Vbd(spectral_radius=0.0)),
@@ -126,13 +133,13 @@ def costs() -> Table:
         ("xpbd", firm, Xpbd()),
     ):
         prepared = solver.prepare(made.system)
-        took = _of_one(prepared, problem(made, start(made), "inertial"))
+        took = _of_one(prepared, build_problem(made, build_initial_state(made), "inertial"))
         usual = usual or took
         table.add_row(name, f"{took / usual:.1f}", f"{_bytes(prepared):,}")
     return table
 
 
-def _of_one(prepared: Prepared, stated: StepProblem) -> float:
+def _of_one(prepared: PreparedSolver, stated: StepProblem) -> float:
     """Processor time [s] of an iteration, the least of five times a thousand."""
 
     def once() -> float:
@@ -147,12 +154,17 @@ def _bytes(prepared: Any) -> int:
     """Of the arrays that an iteration goes through, each once, and the positions [B]."""
     made = getattr(prepared, "made", prepared)
     through = (
-        (prepared.constraints, prepared.ease, prepared.compliance, prepared.ease)
+        (
+            prepared.coloured_constraints,
+            prepared.constraint_relaxation,
+            prepared.vertex_compliance,
+            prepared.constraint_relaxation,
+        )
         if isinstance(prepared, PreparedXpbd)
-        else (made.blocks, made.beside.around, made.held)
+        else (made.colour_packets, made.vertex_elements.around, made.anchor_stiffness)
     )
-    duals = 7 * 8 * len(prepared.least) if isinstance(prepared, PreparedAugmented) else 0
-    return _size(through) + duals + 24 * prepared.system.vertices
+    duals = 7 * 8 * len(prepared.min_stiffness) if isinstance(prepared, PreparedAugmentedVertexBlockDescent) else 0
+    return _size(through) + duals + 24 * prepared.system.num_vertices
 
 
 def _size(x: Any) -> int:
@@ -161,7 +173,7 @@ def _size(x: Any) -> int:
 
 def main() -> None:
     """Print the tables."""
-    with pinned_threads(1):
+    with limit_threads(1):
         for table in (swinging(), ratios(), costs()):
             Console(width=120).print(table)
 

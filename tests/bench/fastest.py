@@ -27,14 +27,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.base.machine import pinned_threads
+from harness.base.machine import limit_threads
 from harness.config.accuracy import CurveSpec
 from harness.config.accuracy_load import load_accuracy
-from harness.experiments.accuracy.scales import distances
-from harness.experiments.accuracy.solves import GradedStep
-from harness.experiments.accuracy.units import references
-from solvers.problem import Positions, Prepared, StepProblem, Unsupported
-from solvers.registry import EVERY, load
+from harness.experiments.accuracy.scales import compute_vertex_distances
+from harness.experiments.accuracy.solves import SnapshotEvaluation
+from harness.experiments.accuracy.units import open_reference_store
+from solvers.problem import Positions, PreparedSolver, StepProblem, Unsupported
+from solvers.registry import SOLVER_TABLE, load_target
 
 ROOT = Path(__file__).resolve().parents[2]
 TARGETS = {"gap": (1e-3, 1e-4, 1e-6), "error": (1e-3, 1e-6)}
@@ -50,7 +50,7 @@ class Racer(NamedTuple):
     """A method on a step: its name, what solves, after how many iterations it is at which gap, and seconds of that."""
 
     name: str
-    prepared: Prepared
+    prepared: PreparedSolver
     needs: dict[float, int]
     seconds: dict[float, float]
 
@@ -73,29 +73,29 @@ class Ratio:
         return self.seconds > COUNTS
 
 
-def steps(config: Path, only: str) -> Iterator[tuple[GradedStep, list[CurveSpec]]]:
+def steps(config: Path, only: str) -> Iterator[tuple[SnapshotEvaluation, list[CurveSpec]]]:
     """The frozen steps of a config whose words are among their names, each once, and who is to solve them."""
-    store = references(ROOT / "results")
+    store = open_reference_store(ROOT / "results")
     asked: dict[tuple[str, str, str | int], list[CurveSpec]] = {}
     for spec in load_accuracy(config).curves:
         asked.setdefault((spec.case.title, spec.case.integrator, spec.moment), []).append(spec)
     known: set[str] = set()
     for (title, _, moment), specs in asked.items():
         if all(word in f"{title} {moment}" for word in only.split()):
-            step = GradedStep.find(specs[0].case, moment, store)
-            if step.frozen.digest not in known and step.reference.minima:
-                known.add(step.frozen.digest)
+            step = SnapshotEvaluation.load_snapshot(specs[0].case, moment, store)
+            if step.step_snapshot.digest not in known and step.known_minima.minima:
+                known.add(step.step_snapshot.digest)
                 yield step, specs
 
 
-def grading(step: GradedStep, problem: StepProblem, measure: str) -> Callable[[Positions], float]:
+def grading(step: SnapshotEvaluation, problem: StepProblem, measure: str) -> Callable[[Positions], float]:
     """What tells the gap or the error of positions."""
-    lowest, system = step.reference.best, problem.system
+    lowest, system = step.known_minima.lowest, problem.system
     if measure == "error":
-        start = distances(system, problem.current, lowest.positions)[0]
-        return lambda p: distances(system, p, lowest.positions)[0] / start
-    scale = problem.value(problem.current) - lowest.g
-    return lambda p: (problem.value(p) - lowest.g) / scale
+        start = compute_vertex_distances(system, problem.current_positions, lowest.positions)[0]
+        return lambda p: compute_vertex_distances(system, p, lowest.positions)[0] / start
+    scale = problem.value(problem.current_positions) - lowest.objective
+    return lambda p: (problem.value(p) - lowest.objective) / scale
 
 
 def racer(
@@ -103,7 +103,7 @@ def racer(
 ) -> Racer | None:
     """The first pass of a method, up to the last of the accuracies; None where it takes no such scene."""
     try:
-        prepared = load(EVERY[spec.solver.name])(**spec.solver.parameters).prepare(problem.system)
+        prepared = load_target(SOLVER_TABLE[spec.solver.name])(**spec.solver.parameters).prepare(problem.system)
         next(prepared.iterates(problem))  # compiles
     except Unsupported:
         return None
@@ -117,12 +117,12 @@ def racer(
         for target in targets:
             if left <= target and target not in needs:
                 needs[target], seconds[target] = number, spent
-        if len(needs) == len(targets) or spent > spec.how.time_limit or not np.isfinite(left):
+        if len(needs) == len(targets) or spent > spec.measurement.time_limit or not np.isfinite(left):
             break
     return Racer(spec.solver.name, prepared, needs, seconds)
 
 
-def timed(prepared: Prepared, problem: StepProblem, stamps: Sequence[int]) -> list[float]:
+def timed(prepared: PreparedSolver, problem: StepProblem, stamps: Sequence[int]) -> list[float]:
     """Seconds of the thread's processor time to each of these iterates, ascending."""
     wanted, found = set(stamps), dict[int, float]()
     gc.disable()  # a collection in the middle would be counted as the solver's
@@ -170,12 +170,14 @@ def ratio(
     return Ratio(step, target, fastest, least, float(quartile(mine)) / least, float(low), float(high))
 
 
-def ratios(step: GradedStep, specs: Sequence[CurveSpec], name: str, rounds: int, measure: str) -> Iterator[Ratio]:
+def ratios(
+    step: SnapshotEvaluation, specs: Sequence[CurveSpec], name: str, rounds: int, measure: str
+) -> Iterator[Ratio]:
     """Of one step, from each first guess."""
     rng, targets = np.random.default_rng(0), TARGETS[measure]
     draws = rng.integers(rounds, size=(DRAWS, rounds))
-    for guess in specs[0].first_guesses:
-        problem = step.frozen.stated(guess)
+    for guess in specs[0].initial_guesses:
+        problem = step.step_snapshot.build_problem(guess)
         graded = grading(step, problem, measure)
         racers = [found for spec in specs if (found := racer(spec, problem, graded, targets))]
         least = {t: min((one.seconds[t] for one in racers if t in one.seconds), default=np.inf) for t in targets}
@@ -185,7 +187,7 @@ def ratios(step: GradedStep, specs: Sequence[CurveSpec], name: str, rounds: int,
             if one.needs and (one.name == name or any(s <= HOPELESS * least[t] for t, s in one.seconds.items()))
         ]
         times = {name: {}} | raced(near, problem, rounds)
-        words = f"{step.case.title} {step.moment} {guess}"
+        words = f"{step.case.title} {step.snapshot_name} {guess}"
         found = (ratio(words, target, name, times, draws) for target in targets)
         yield from (one for one in found if one is not None)
 
@@ -221,7 +223,7 @@ def main() -> None:
     given = parser.parse_args()
     found, targets = list[Ratio](), TARGETS[given.measure]
     print(row(f"step, first guess; {given.measure}", [f"{target:g}" for target in targets]))
-    with pinned_threads(1):
+    with limit_threads(1):
         for step, specs in steps(given.config, given.only):
             of_step = list(ratios(step, specs, given.solver, given.rounds, given.measure))
             print(*lines(of_step, targets), sep="\n", flush=True)

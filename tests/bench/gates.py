@@ -16,25 +16,25 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from harness.experiments.gates.abba import Clock
-from harness.experiments.gates.sequential import ALPHA
+from harness.experiments.gates.abba import ClockName
+from harness.experiments.gates.sequential import DEFAULT_ALPHA
 from harness.record.base import RecordingInfo
 from harness.record.rerun import RerunRecorder
-from harness.scenes.bind import Scene, build
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.grid import Grid
+from harness.scenes.bind import Scene, build_scene
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.grid import GridMesh
 from harness.scenes.spec import SceneSpec
-from harness.simulation.measure import Settings
-from harness.simulation.observe import observe
-from harness.simulation.step import Step, simulate
+from harness.simulation.measure import SteppingSettings
+from harness.simulation.observe import observe_run
+from harness.simulation.step import SimulationStep, simulate_scene
 from solvers.core.prefactored import PreparedLocalGlobal
-from solvers.problem import Positions, Prepared, Solution, StopRule
-from solvers.registry import SOLVERS, load
+from solvers.problem import Positions, PreparedSolver, Solution, StopRule
+from solvers.registry import SOLVERS, load_target
 
 THREADS = 1
-STOP = StopRule(iterations=50)
+STOP = StopRule(max_iterations=50)
 Work = Callable[[], Positions]
 
 
@@ -57,36 +57,38 @@ class Gate:
     limit: float
     why: str
     guards: tuple[str, ...]
-    clock: Clock = "cpu"
+    clock: ClockName = "cpu"
     tolerance: float | None = 0.0
     goal: float | None = None
     budget: float | None = None
-    error: float = ALPHA
+    error: float = DEFAULT_ALPHA
     short: bool = False
 
 
 def sheet(size: int) -> Scene:
     """A cloth with sides and both diagonals, lying flat, that falls about two pinned corners."""
-    effects = (Springs(stretch=1000.0), Gravity(), Pins(at=("top_corners",)))
-    spec = SceneSpec(mesh=Grid(), mass=1.0, time_step=1 / 30, frames=1, effects=effects, path=Path("sheet.yaml"))
-    return build(spec, size)
+    effects = (SpringsEffect(stretch=1000.0), GravityEffect(), PinsEffect(at=("top_corners",)))
+    spec = SceneSpec(mesh=GridMesh(), mass=1.0, time_step=1 / 30, frames=1, effects=effects, path=Path("sheet.yaml"))
+    return build_scene(spec, size)
 
 
 def prepare(solver: str, scene: Scene, **parameters: str) -> PreparedLocalGlobal:
     """A solver by name, prepared for the scene."""
-    return load(SOLVERS[solver])(**parameters).prepare(scene.system)
+    return load_target(SOLVERS[solver])(**parameters).prepare(scene.system)
 
 
-def steps(scene: Scene, prepared: Prepared, frames: int) -> list[Step]:
+def steps(scene: Scene, prepared: PreparedSolver, frames: int) -> list[SimulationStep]:
     """The scene's first steps."""
-    return list(simulate(scene, prepared, STOP, first_guess="current", frames=frames))
+    return list(simulate_scene(scene, prepared, STOP, initial_guess="current", frames=frames))
 
 
 def simulated(solver: str, size: int, frames: int) -> Work:
     """Whole steps through the harness; the last positions [m]."""
     scene = sheet(size)
     prepared = prepare(solver, scene)
-    return lambda: last(step.solution for step in simulate(scene, prepared, STOP, first_guess="current", frames=frames))
+    return lambda: last(
+        step.solution for step in simulate_scene(scene, prepared, STOP, initial_guess="current", frames=frames)
+    )
 
 
 def solved(solver: str, size: int, frames: int) -> Work:
@@ -107,12 +109,12 @@ def projected(solver: str, size: int, repeats: int, **parameters: str) -> Work:
     """The local step alone, at stretched positions; A'K d [N]."""
     scene = sheet(size)
     prepared = prepare(solver, scene, **parameters)
-    p = 1.1 * scene.mesh.rest
+    p = 1.1 * scene.mesh.rest_positions
     nothing, out = np.zeros_like(p), np.empty_like(p)
 
     def work() -> Positions:
         for _ in range(repeats):
-            prepared.project(p, nothing, out)
+            prepared.local_step(p, nothing, out)
         return out
 
     return work
@@ -131,24 +133,33 @@ def recorded(solver: str, size: int, frames: int) -> Work:
     return work
 
 
-def record(scene: Scene, prepared: Prepared, frames: int, path: Path) -> Positions:
+def record(scene: Scene, prepared: PreparedSolver, frames: int, path: Path) -> Positions:
     """The second pass of a run over the scene's first steps; the last positions [m]."""
     info = RecordingInfo(
         title="sheet",
         run_id="sheet",
         mesh=scene.mesh,
-        springs=scene.springs.edges,
-        rest_lengths=scene.springs.rest_length,
-        pinned=scene.system.pins.vertices,
+        springs=scene.all_springs.edges,
+        rest_lengths=scene.all_springs.rest_length,
+        pinned_vertices=scene.system.pins.vertices,
         time_step=scene.system.time_step,
         strain_range=0.1,
         properties={"scene": "sheet"},
     )
     recorder = RerunRecorder(path, info)
-    stored = np.empty((frames, *scene.mesh.rest.shape))
-    settings = Settings(STOP, "current", frames, 1)
-    observe(scene, prepared, settings, recorder=recorder, convergence=(), stored=stored, judge=None, tick=lambda: None)
-    recorder.close({})
+    stored = np.empty((frames, *scene.mesh.rest_positions.shape))
+    settings = SteppingSettings(STOP, "current", frames, 1)
+    observe_run(
+        scene,
+        prepared,
+        settings,
+        recorder=recorder,
+        convergence_frames=(),
+        positions_out=stored,
+        verify_step=None,
+        tick=lambda: None,
+    )
+    recorder.finish_recording({})
     return stored[-1]
 
 

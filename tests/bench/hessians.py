@@ -21,20 +21,20 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from harness.base.machine import pinned_threads
+from harness.base.machine import limit_threads
 from harness.config.load import load_scene
-from harness.scenes.bind import build
-from harness.simulation.step import Step, prepare, simulate
+from harness.scenes.bind import build_scene
+from harness.simulation.step import SimulationStep, prepare, simulate_scene
 from solvers.core import definite
-from solvers.core.definite import Indefinite
-from solvers.core.eigenvalues import Filtered, Filtering
+from solvers.core.definite import IndefiniteStrategy
+from solvers.core.eigenvalues import ProjectedHessian, PsdProjection
 from solvers.core.objective import Hessian
-from solvers.methods.newton import Newton
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import StopRule
 
 SCENES = sorted((Path(__file__).parents[2] / "configs" / "hessians").glob("*.yaml"))
 STOP = StopRule(1000, 1e-6)
-RULES: tuple[Indefinite, ...] = tuple(definite.RULES)
+RULES: tuple[IndefiniteStrategy, ...] = tuple(definite.REGULARISATION_RULES)
 
 
 @dataclass
@@ -57,25 +57,25 @@ class Tally:
 def counted() -> Iterator[list[int]]:
     """How many elements each filtered Hessian looked at, from now on."""
     looked: list[int] = []
-    filtered = Hessian.filtered
+    filtered = Hessian.project_to_psd
 
-    def counting(self: Hessian, by: Filtering) -> Filtered:
+    def counting(self: Hessian, by: PsdProjection) -> ProjectedHessian:
         found = filtered(self, by)
-        looked.append(found.looked)
+        looked.append(found.num_examined)
         return found
 
     with patch.object(Hessian, "filtered", counting):
         yield looked
 
 
-def measured(path: Path) -> dict[Indefinite, Tally]:
+def measured(path: Path) -> dict[IndefiniteStrategy, Tally]:
     """A scene by each rule."""
     spec = load_scene(path)
-    made = build(spec, spec.default_size or 0)
+    made = build_scene(spec, spec.default_size or 0)
     edges = sum(len(getattr(energy, "edges", ())) for energy in made.system.energies)
-    tallies: dict[Indefinite, Tally] = {rule: Tally() for rule in RULES}
-    runs: dict[Indefinite, Iterator[Step]] = {
-        rule: simulate(made, prepare(made, Newton(rule)), STOP, first_guess="current", frames=spec.frames)
+    tallies: dict[IndefiniteStrategy, Tally] = {rule: Tally() for rule in RULES}
+    runs: dict[IndefiniteStrategy, Iterator[SimulationStep]] = {
+        rule: simulate_scene(made, prepare(made, NewtonSolver(rule)), STOP, initial_guess="current", frames=spec.frames)
         for rule in RULES
     }
     for _ in range(spec.frames):
@@ -86,9 +86,9 @@ def measured(path: Path) -> dict[Indefinite, Tally]:
                 solution = next(run).solution
                 tally.seconds += time.process_time() - began
             tally.looked += sum(looked)
-            tally.iterations += solution.iterations
-            tally.elements += solution.iterations * edges
-            tally.ended &= solution.stopped != "iterations"
+            tally.iterations += solution.num_iterations
+            tally.elements += solution.num_iterations * edges
+            tally.ended &= solution.termination_reason != "iterations"
     return tallies
 
 
@@ -98,7 +98,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", type=Path, default=SCENES, metavar="SCENE")
     table = Table("scene", *RULES, box=SIMPLE_HEAD)
     scenes = parser.parse_args().scenes
-    with pinned_threads(1):
+    with limit_threads(1):
         measured(scenes[0])  # compiles
         for path in scenes:
             found = measured(path)

@@ -21,15 +21,15 @@ from pathlib import Path
 from time import perf_counter, process_time
 from typing import NamedTuple
 
-from harness.base.machine import pinned_threads
+from harness.base.machine import limit_threads
 from harness.config.load import load_sweep
 from harness.config.sweep import RunSpec
-from harness.reference.oracle import Oracle
-from harness.scenes.bind import build
-from harness.simulation.algebraic import stop_rule
-from harness.simulation.step import prepare, problem, simulate, start
+from harness.reference.oracle import ReferenceEvaluator
+from harness.scenes.bind import build_scene
+from harness.simulation.algebraic import build_stop_rule
+from harness.simulation.step import build_initial_state, build_problem, prepare, simulate_scene
 from solvers.problem import StopRule
-from solvers.registry import SOLVERS, load
+from solvers.registry import SOLVERS, load_target
 
 GROWTH = Path(__file__).parents[2] / "configs" / "growth-large.yaml"
 
@@ -49,27 +49,29 @@ class Took(NamedTuple):
 
 def took(run: RunSpec) -> Took:
     """Do a run, and look at each of its steps when the clocks stand."""
-    with pinned_threads(1):
-        scene = build(run.scene, run.size, run.integrator)
-        stop = stop_rule(run.iterations, run.tolerance)
+    with limit_threads(1):
+        scene = build_scene(run.scene, run.size, run.integrator)
+        stop = build_stop_rule(run.iterations, run.tolerance)
         assert isinstance(stop, StopRule), "a tolerance by the step's own error has no yardstick to be relative to"
         began = process_time()
-        prepared = prepare(scene, load(SOLVERS[str(run.solver.name)])(**run.solver.parameters))
+        prepared = prepare(scene, load_target(SOLVERS[str(run.solver.name)])(**run.solver.parameters))
         ready = process_time() - began
-        first = problem(scene, start(scene), run.first_guess)
-        prepared.solve(first, StopRule(1, stop.tolerance))
-        oracle, step, wall, iterations, left = Oracle(scene.system), 0.0, 0.0, 0, 0.0
-        steps = simulate(scene, prepared, stop, first_guess=run.first_guess, frames=run.frames)
+        first = build_problem(scene, build_initial_state(scene), run.first_guess)
+        prepared.solve(first, StopRule(1, stop.rtol))
+        oracle, step, wall, iterations, left = ReferenceEvaluator(scene.system), 0.0, 0.0, 0, 0.0
+        steps = simulate_scene(scene, prepared, stop, initial_guess=run.first_guess, frames=run.frames)
         for _ in range(run.frames):
             began, then = process_time(), perf_counter()
             done = next(steps)
             step, wall = step + process_time() - began, wall + perf_counter() - then
-            iterations += done.iterations
+            iterations += done.num_iterations
             stated = done.problem
-            left = max(left, oracle.residual(stated, done.solution.positions) / oracle.yardstick(stated))
+            left = max(
+                left, oracle.compute_residual(stated, done.solution.positions) / oracle.compute_initial_residual(stated)
+            )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     frames = run.frames
-    return Took(len(scene.mesh.rest), ready, step / frames, wall / frames, iterations / frames, left, peak)
+    return Took(len(scene.mesh.rest_positions), ready, step / frames, wall / frames, iterations / frames, left, peak)
 
 
 def main() -> None:
@@ -80,7 +82,7 @@ def main() -> None:
     asked = parser.parse_args()
     smallest: dict[tuple[str, str, str], Took] = {}
     print("run | vertices | prepare s | step s | wall s | iterations | left | peak GiB | growth")
-    for run in load_sweep(asked.config).runs():
+    for run in load_sweep(asked.config).list_runs():
         title = f"{run.title} {run.first_guess}"
         if asked.only not in title:
             continue

@@ -31,17 +31,17 @@ from rich.console import Console
 from rich.table import Table
 from scipy.sparse import csr_array
 
-from harness.base.machine import describe, pinned_threads
-from harness.scenes.touching import outline
+from harness.base.machine import describe_machine, limit_threads
+from harness.scenes.touching import collision_primitives
 from solvers.contact.self_contact import SelfContact
-from solvers.contact.surface import Surface
-from solvers.core.bounds import without_bounded
-from solvers.core.descent import Metric, Point, search
-from solvers.core.fixed_objective import Objective
+from solvers.contact.surface import CollisionMesh
+from solvers.core.bounds import without_barriers
+from solvers.core.descent import DescentPoint, ResidualMetric, backtracking_line_search
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
 from solvers.energies.springs import Springs
-from solvers.problem import Energy, Pins, Positions, Start, StepProblem, StopRule, System
-from solvers.registry import SOLVERS, load
+from solvers.problem import DirichletPins, Energy, Positions, StepProblem, StepStart, StopRule, System
+from solvers.registry import SOLVERS, load_target
 from tests.bench.pairs import Folded, folded, seconds
 
 OURS = ("hybrid", "newton", "lbfgs")
@@ -55,14 +55,14 @@ STIFFNESS = 0.1
 def stated(made: Folded, contact: Energy) -> StepProblem:
     """The step. Vertices of the lowest layer are held exactly."""
     mesh, p = made.mesh, made.p
-    springs = Springs.at_rest(p, mesh.springs, np.full(len(mesh.springs), STRETCH))
+    springs = Springs.from_rest_shape(p, mesh.springs, np.full(len(mesh.springs), STRETCH))
     lowest = np.flatnonzero(p[:, 1] < 0.5 * made.reach)
-    pins = Pins(lowest, np.full(len(lowest), np.inf))
-    system = System(MASS * mesh.shares, TIME_STEP, (springs, contact), pins)
+    pins = DirichletPins(lowest, np.full(len(lowest), np.inf))
+    system = System(MASS * mesh.mass_fractions, TIME_STEP, (springs, contact), pins)
     force, velocity = np.zeros_like(p), np.zeros_like(p)
     force[:, 1], velocity[:, 1] = -9.81 * system.mass, -FAST
     velocity[lowest] = 0.0
-    start = Start(p, velocity, 0.0, p, system.rate, TIME_STEP)
+    start = StepStart(p, velocity, 0.0, p, system.velocity_rate, TIME_STEP)
     return StepProblem(system, p + TIME_STEP * velocity, force, p[lowest], p, p, start)
 
 
@@ -94,16 +94,16 @@ class Ipctk:
     neighbours: as of ours, whose matrix this has; spent: CPU time [s] by what it went into.
     """
 
-    def __init__(self, made: Folded, stiffness: float, surface: Surface) -> None:
+    def __init__(self, made: Folded, stiffness: float, surface: CollisionMesh) -> None:
         """stiffness: of our barrier [N/m], the force of which this one has in the middle of the range."""
         import ipctk
 
-        self.neighbours = SelfContact(surface).neighbours
+        self.candidate_vertices = SelfContact(surface).candidate_vertices
         of: Any = ipctk
         of.set_num_threads(1)
         self._of, self._thickness, self._reach = of, made.thickness, made.reach
-        edges, triangles = outline(made.mesh)[0].astype(np.int32), made.mesh.triangles
-        self._surface = of.CollisionMesh(np.asfortranarray(made.mesh.rest), edges, triangles)
+        edges, triangles = collision_primitives(made.mesh)[0].astype(np.int32), made.mesh.triangles
+        self._surface = of.CollisionMesh(np.asfortranarray(made.mesh.rest_positions), edges, triangles)
         t, r = made.thickness, made.reach
         middle, most = (t + 0.5 * r) ** 2 - t**2, (2.0 * t + r) * r
         slope = (most - middle) * (2.0 * np.log(middle / most) - most / middle + 1.0) * 2.0 * (t + 0.5 * r)
@@ -124,7 +124,7 @@ class Ipctk:
                 return found
         V, collisions = np.asfortranarray(p), self._of.NormalCollisions()
         args = (self._surface, V, self._reach, self._thickness, self._of.LBVH())
-        self._timed("pairs", lambda: collisions.build(*args))
+        self._timed("pairs", lambda: collisions.build_mesh(*args))
         value, gradient = self._timed("value and gradient", lambda: self._slopes(collisions, V))
         found = Found(p.copy(), collisions, value, gradient.reshape(-1, 3))
         self._known = [*self._known[-1:], found]
@@ -148,7 +148,7 @@ class Ipctk:
         H = self._timed("Hessian", lambda: self._potential.hessian(*args))
         return csr_array((H.data, H.indices, H.indptr), shape=H.shape)  # it is symmetric
 
-    def blocks(self, p: Positions, keep: float = 0.0) -> Blocks:
+    def hessian_blocks(self, p: Positions, keep: float = 0.0) -> Blocks:
         """The clamped Hessian."""
         if self._bent is None or not np.array_equal(self._bent[0], p):
             H: Any = self.hessian(p).tobsr((3, 3))
@@ -156,15 +156,17 @@ class Ipctk:
             self._bent = p.copy(), Blocks(np.column_stack([rows, H.indices]).astype(np.int64), H.data)
         return self._bent[1]
 
-    def coupled(self, p: Positions) -> NDArray[np.int64]:
+    def block_vertices(self, p: Positions) -> NDArray[np.int64]:
         """See `solvers.core.bounds.Bounded`."""
-        return self.blocks(p).vertices
+        return self.hessian_blocks(p).vertices
 
-    def add_curvature(self, p: Positions, keep: float, places: NDArray[np.int64], values: NDArray[np.float64]) -> None:
+    def add_hessian_blocks(
+        self, p: Positions, keep: float, places: NDArray[np.int64], values: NDArray[np.float64]
+    ) -> None:
         """See `solvers.core.bounds.Bounded`; clamped."""
-        self.blocks(p).add(places, values)
+        self.hessian_blocks(p).add(places, values)
 
-    def largest_step(self, p: Positions, direction: Positions) -> float:
+    def collision_free_step_size(self, p: Positions, direction: Positions) -> float:
         """See `solvers.core.bounds.Bounded`."""
         V, W = np.asfortranarray(p), np.asfortranarray(p + direction)
         return self._timed("CCD", lambda: self._safe(V, W))
@@ -181,16 +183,16 @@ Solved = tuple[Positions, int]
 
 def newton_ipc(problem: StepProblem) -> Callable[[], Solved]:
     """A solve by Newton-IPC, whose tolerance holds where it ends."""
-    metric, whole = Metric(problem.system), Objective(problem.system)
-    assert whole.matrix.factor.nonzeros  # analysed now, as what ours prepare
+    metric, whole = ResidualMetric(problem.system), FixedObjective(problem.system)
+    assert whole.hessian_matrix.factor.nonzeros  # analysed now, as what ours prepare
 
     def solve() -> Solved:
-        step, p = StepObjective(whole, problem), problem.first_guess
-        at, count = Point(p, step.gradient(p)), 0
+        step, p = StepObjective(whole, problem), problem.initial_guess
+        at, count = DescentPoint(p, step.gradient(p)), 0
         limit = TOLERANCE * metric.residual(at.gradient)
         while metric.residual(at.gradient) > limit:
             hessian = step.hessian(at.positions)
-            found = search(step, at, -hessian.solve(at.gradient)) if hessian.factorise(0.0) else None
+            found = backtracking_line_search(step, at, -hessian.solve(at.gradient)) if hessian.factorise(0.0) else None
             if found is None or count == MOST:
                 raise RuntimeError(f"Newton-IPC has not converged in {count} iterations")
             at, count = found, count + 1
@@ -201,11 +203,11 @@ def newton_ipc(problem: StepProblem) -> Callable[[], Solved]:
 
 def ours(problem: StepProblem, name: str) -> Callable[[], Solved | None]:
     """A solve by one of our solvers; None where it does not converge."""
-    prepared = load(SOLVERS[name])().prepare(problem.system)
+    prepared = load_target(SOLVERS[name])().prepare(problem.system)
 
     def solve() -> Solved | None:
         found = prepared.solve(problem, StopRule(MOST, TOLERANCE))
-        return (found.positions, found.iterations) if found.stopped == "tolerance" else None
+        return (found.positions, found.num_iterations) if found.termination_reason == "tolerance" else None
 
     return solve
 
@@ -216,12 +218,14 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--rounds", type=int, default=3)
     asked, console = parser.parse_args(), Console(highlight=False)
-    with pinned_threads(1):
+    with limit_threads(1):
         made = folded(asked.size)
         mesh, k = made.mesh, np.full(len(made.p), STIFFNESS)
-        surface = Surface.of(mesh.rest, outline(mesh)[0], mesh.triangles, k, made.thickness, made.reach)
+        surface = CollisionMesh.from_rest_shape(
+            mesh.rest_positions, collision_primitives(mesh)[0], mesh.triangles, k, made.thickness, made.reach
+        )
         problem = stated(made, SelfContact(surface))
-        bare = replace(problem, system=without_bounded(problem.system))
+        bare = replace(problem, system=without_barriers(problem.system))
         barrier = Ipctk(made, STIFFNESS, surface)
         theirs = stated(made, barrier)
         # All is done once, and so compiled and in the caches.
@@ -234,9 +238,9 @@ def main() -> None:
                 seconds(newton_ipc(theirs)),
                 {name: (seconds(ours(problem, name)), seconds(ours(bare, name))) for name in OURS if ends[name]},
             )
-            for _ in range(asked.rounds)
+            for _ in range(asked.timed_trajectories)
         ]
-    title = f"{asked.size} x {asked.size}: Newton-IPC in {count} iterations; {describe().cpu}"
+    title = f"{asked.size} x {asked.size}: Newton-IPC in {count} iterations; {describe_machine().cpu}"
     columns = ("", "iterations", "Newton-IPC takes", "between", "steps without contact", "ranges from its end")
     table = Table(*columns, title=title, box=SIMPLE_HEAD)
     for name, end in ends.items():

@@ -25,12 +25,12 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from harness.base.machine import describe, pinned_threads
+from harness.base.machine import describe_machine, limit_threads
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.touching import outline
+from harness.scenes.mesh.grid import GridMesh
+from harness.scenes.touching import collision_primitives
 from solvers.contact.self_contact import SelfContact
-from solvers.contact.surface import Surface
+from solvers.contact.surface import CollisionMesh
 from solvers.problem import Positions
 
 GAP, LAYERS = 0.004, 4
@@ -49,12 +49,12 @@ class Folded(NamedTuple):
 
 def folded(size: int) -> Folded:
     """Columns go to and fro, one layer above the other, vertex over vertex but for a little noise."""
-    mesh, rng = Grid(diagonals="one").build(size), np.random.default_rng(0)
+    mesh, rng = GridMesh(diagonals="one").build_mesh(size), np.random.default_rng(0)
     gap, h, columns = GAP * 63 / (size - 1), 1 / (size - 1), -(-size // LAYERS)
     layer, along = np.divmod(np.arange(size), columns)
     x = np.where(layer % 2 == 0, along, columns - 1 - along) * h
-    rows = len(mesh.rest) // size
-    p = np.stack([np.tile(x, rows), np.tile(layer * gap, rows), mesh.rest[:, 2]], axis=1)
+    rows = len(mesh.rest_positions) // size
+    p = np.stack([np.tile(x, rows), np.tile(layer * gap, rows), mesh.rest_positions[:, 2]], axis=1)
     p += 0.02 * gap * rng.normal(size=p.shape)
     return Folded(mesh, p, 0.3 * gap * rng.normal(size=p.shape), 0.25 * gap, gap)
 
@@ -63,7 +63,11 @@ def ours(made: Folded) -> tuple[dict[str, Callable[[], object]], SelfContact]:
     """What is timed, by name."""
     mesh, p, d, thickness, reach = made
     k = np.ones(len(p))
-    contact = SelfContact(Surface.of(mesh.rest, outline(mesh)[0], mesh.triangles, k, thickness, reach))
+    contact = SelfContact(
+        CollisionMesh.from_rest_shape(
+            mesh.rest_positions, collision_primitives(mesh)[0], mesh.triangles, k, thickness, reach
+        )
+    )
 
     places = cycle([p, p + 1e-12, p - 1e-12])  # what was found at the last two is known, and no more
 
@@ -73,15 +77,15 @@ def ours(made: Folded) -> tuple[dict[str, Callable[[], object]], SelfContact]:
         return contact.value(q)
 
     def bent() -> object:
-        return contact.blocks(next(places), 0.0)
+        return contact.hessian_blocks(next(places), 0.0)
 
     def anew() -> float:
-        contact.kept.clear()
+        contact.candidate_caches.clear()
         return slopes()
 
     def step() -> float:
-        contact.kept.clear()
-        return contact.largest_step(p, d)
+        contact.candidate_caches.clear()
+        return contact.collision_free_step_size(p, d)
 
     return {
         "value + gradient": anew,
@@ -99,10 +103,12 @@ def theirs(made: Folded) -> tuple[dict[str, Callable[[], object]], int]:
     of: Any = ipctk
     mesh, p, d, thickness, reach = made
     V, W = np.asfortranarray(p), np.asfortranarray(p + d)
-    surface = of.CollisionMesh(np.asfortranarray(mesh.rest), outline(mesh)[0].astype(np.int32), mesh.triangles)
+    surface = of.CollisionMesh(
+        np.asfortranarray(mesh.rest_positions), collision_primitives(mesh)[0].astype(np.int32), mesh.triangles
+    )
     potential = of.BarrierPotential(reach, 1.0)
     known = of.NormalCollisions()
-    known.build(surface, V, reach, thickness, of.LBVH())
+    known.build_mesh(surface, V, reach, thickness, of.LBVH())
 
     def slopes(found: Any) -> float:
         potential.gradient(found, surface, V)
@@ -110,7 +116,7 @@ def theirs(made: Folded) -> tuple[dict[str, Callable[[], object]], int]:
 
     def anew() -> float:
         found = of.NormalCollisions()
-        found.build(surface, V, reach, thickness, of.LBVH())
+        found.build_mesh(surface, V, reach, thickness, of.LBVH())
         return slopes(found)
 
     def step() -> float:
@@ -139,7 +145,7 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128])
     parser.add_argument("--rounds", type=int, default=5)
     asked, console = parser.parse_args(), Console()
-    with pinned_threads(1):
+    with limit_threads(1):
         for size in asked.sizes:
             made = folded(size)
             (one, contact), (other, pairs) = ours(made), theirs(made)
@@ -151,8 +157,10 @@ def main() -> None:
                 ratios = sorted(b / a for a, b in both)
                 ends = f"{ratios[0]:.2f} and {ratios[-1]:.2f}"
                 table.add_row(name, f"{median(ratios):.2f} times", ends, f"{1e3 * min(a for a, _ in both):.3g}")
-            in_range = len(contact.blocks(made.p).vertices)
-            table.title = f"{size} x {size}: {in_range:,} contacts in range, by ipctk {pairs:,}; {describe().cpu}"
+            in_range = len(contact.hessian_blocks(made.p).vertices)
+            table.title = (
+                f"{size} x {size}: {in_range:,} contacts in range, by ipctk {pairs:,}; {describe_machine().cpu}"
+            )
             console.print(table)
 
 

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from solvers.contact.closest import at, edge_edge_way, point_triangle_way
-from solvers.vectors.block import ROWS
-from solvers.vectors.springs import LANES, RIGHT
+from solvers.contact.closest import edge_edge_distance_vector, load_point, point_triangle_distance_vector
+from solvers.vectors.block import TILE_ROWS
+from solvers.vectors.springs import LANES, RHS_STRIDE
 
 
 def refuse(bundles, number, x, right, out):
@@ -24,12 +24,12 @@ def refuse_energy(bundles, shares, number, x, right, out):
 
 def energy(bundles, number, x, measure):
     """Half of each spring's k |v|^2, and what holds each vertex."""
-    own, neighbour, kinds, weights = bundles.own, bundles.neighbour, bundles.kind, bundles.weights
+    own, neighbour, kinds, weights = bundles.own, bundles.neighbour, bundles.weight_offset, bundles.weights
     total = 0.0
     for lane in range(LANES):
         i = own[LANES * number + lane]
         total += measure[LANES * number + lane] * (x[i] ** 2 + x[i + 1] ** 2 + x[i + 2] ** 2)
-        for entry in range(bundles.start[number], bundles.start[number + 1]):
+        for entry in range(bundles.packet_start[number], bundles.packet_start[number + 1]):
             j = neighbour[LANES * entry + lane]
             v0, v1, v2 = x[i] - x[j], x[i + 1] - x[j + 1], x[i + 2] - x[j + 2]
             total += 0.5 * weights[kinds[entry] + LANES + lane] * (v0 * v0 + v1 * v1 + v2 * v2)
@@ -38,9 +38,9 @@ def energy(bundles, number, x, measure):
 
 def newton(bundles, number, x, right, majorant, near):
     """Vertex block descent: a Newton step of each vertex; springs that are short are not looked for."""
-    own, neighbour, kind, weights = bundles.own, bundles.neighbour, bundles.kind, bundles.weights
+    own, neighbour, kind, weights = bundles.own, bundles.neighbour, bundles.weight_offset, bundles.weights
     for lane in range(LANES):
-        i, at = own[LANES * number + lane], RIGHT * number + lane
+        i, at = own[LANES * number + lane], RHS_STRIDE * number + lane
         held = right[at + 3 * LANES]
         p0, p1, p2 = x[i], x[i + 1], x[i + 2]
         load0, load1, load2 = (
@@ -50,7 +50,7 @@ def newton(bundles, number, x, right, majorant, near):
         )
         g0, g1, g2 = load0, load1, load2
         a, b, c, d, e, f = held, 0.0, 0.0, held, 0.0, held
-        for entry in range(bundles.start[number], bundles.start[number + 1]):
+        for entry in range(bundles.packet_start[number], bundles.packet_start[number + 1]):
             j, w = neighbour[LANES * entry + lane], kind[entry] + lane
             v0, v1, v2 = p0 - x[j], p1 - x[j + 1], p2 - x[j + 2]
             pull, k, root = weights[w], weights[w + LANES], 1.0 / np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
@@ -70,7 +70,7 @@ def newton(bundles, number, x, right, majorant, near):
         s0 = g0 / a - l1 * s1 - l2 * s2
         least = 1e-14 * (a + d + f)
         rise = 0.5 * held * (s0 * s0 + s1 * s1 + s2 * s2) - s0 * load0 - s1 * load1 - s2 * load2
-        for entry in range(bundles.start[number], bundles.start[number + 1]):
+        for entry in range(bundles.packet_start[number], bundles.packet_start[number + 1]):
             j, w = neighbour[LANES * entry + lane], kind[entry] + lane
             v0, v1, v2 = p0 - x[j], p1 - x[j + 1], p2 - x[j + 2]
             m0, m1, m2 = v0 + s0, v1 + s1, v2 + s2
@@ -159,7 +159,7 @@ def subtract_product(L, at, top, stride, depth, C, to, step, strips, columns):
     for j in range(columns):
         for k in range(depth):
             factor = L[top + j + stride * k]
-            for r in range(ROWS * strips):
+            for r in range(TILE_ROWS * strips):
                 C[to + r + step * j] -= L[at + r + stride * k] * factor
 
 
@@ -167,9 +167,9 @@ def divide(L, at, stride, triangle, strips, columns):
     """A tile divided by its own triangle."""
     for j in range(columns):
         for k in range(j):
-            for r in range(at, at + ROWS * strips):
+            for r in range(at, at + TILE_ROWS * strips):
                 L[r + stride * j] -= L[r + stride * k] * triangle[j, k]
-        for r in range(at, at + ROWS * strips):
+        for r in range(at, at + TILE_ROWS * strips):
             L[r + stride * j] *= triangle[j, j]
 
 
@@ -196,7 +196,7 @@ def solve_columns(L, at, stride, x, to, strips, columns):
             x[to + j] -= L[at + stride * k + j] * x[to + k]
         x[to + j] *= L[at + stride * j + j]
     for j in range(columns):
-        for r in range(columns, columns + ROWS * strips):
+        for r in range(columns, columns + TILE_ROWS * strips):
             x[to + r] -= L[at + stride * j + r] * x[to + j]
 
 
@@ -204,7 +204,7 @@ def solve_rows(L, at, stride, x, to, strips, columns):
     """A tile's pass backwards."""
     for j in range(columns - 1, -1, -1):
         total = x[to + j]
-        for r in range(columns, columns + ROWS * strips):
+        for r in range(columns, columns + TILE_ROWS * strips):
             total -= L[at + stride * j + r] * x[to + r]
         for k in range(columns - 1, j, -1):
             total -= L[at + stride * j + k] * x[to + k]
@@ -222,11 +222,11 @@ def eight(vertices, x, first, last, edges, limit, tile):
     left = 0
     for lane in range(8):
         v = vertices[min(first + lane, last)]
-        a, b, c, d = at(x, v[0]), at(x, v[1]), at(x, v[2]), at(x, v[3])
+        a, b, c, d = load_point(x, v[0]), load_point(x, v[1]), load_point(x, v[2]), load_point(x, v[3])
         if edges:
-            c0, c1, c2, c3, z, area = edge_edge_way(a, b, c, d)
+            c0, c1, c2, c3, z, area = edge_edge_distance_vector(a, b, c, d)
         else:
-            c0, c1, c2, c3, z = point_triangle_way(a, b, c, d)
+            c0, c1, c2, c3, z = point_triangle_distance_vector(a, b, c, d)
             area = 0.0
         squared = z[0] * z[0] + z[1] * z[1] + z[2] * z[2]
         for row, value in enumerate((c0, c1, c2, c3, z[0], z[1], z[2], squared, area)):

@@ -18,12 +18,12 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from harness.base.machine import pinned_threads
+from harness.base.machine import limit_threads
 from harness.config.load import load_scene
-from harness.scenes.bind import build
-from harness.simulation.step import prepare, simulate
+from harness.scenes.bind import build_scene
+from harness.simulation.step import prepare, simulate_scene
 from solvers.core.objective import Hessian
-from solvers.core.preconditioning import Preconditioning
+from solvers.core.preconditioning import PreconditionerName
 from solvers.methods import newton_cg
 from solvers.methods.newton_cg import NewtonCG
 from solvers.methods.pncg import NonlinearCG
@@ -32,14 +32,14 @@ from solvers.problem import Positions, Solver, StopRule
 FOLDER = Path(__file__).parents[2] / "configs" / "hessians"
 SCENES = tuple(FOLDER / f"{name}-pressed-0.yaml" for name in ("block", "cloth-100", "cloth-1e4"))
 STOP = StopRule(5000, 1e-6)
-NAMES: tuple[Preconditioning, ...] = get_args(Preconditioning)
+NAMES: tuple[PreconditionerName, ...] = get_args(PreconditionerName)
 
 
 def told(path: Path, solver: Solver) -> str:
     """The cell of a scene and a solver."""
     spec = load_scene(path)
-    made = build(spec, spec.default_size or 0)
-    products, multiply = [0], Hessian.multiply
+    made = build_scene(spec, spec.default_size or 0)
+    products, multiply = [0], Hessian.matvec
 
     def counting(self: Hessian, x: Positions) -> Positions:
         products[0] += 1
@@ -47,9 +47,9 @@ def told(path: Path, solver: Solver) -> str:
 
     iterations, ended = 0, True
     with patch.object(Hessian, "multiply", counting), patch.object(newton_cg, "_known", lambda metric: None):
-        for step in simulate(made, prepare(made, solver), STOP, first_guess="current", frames=spec.frames):
-            iterations += step.solution.iterations
-            ended &= step.solution.stopped != "iterations"
+        for step in simulate_scene(made, prepare(made, solver), STOP, initial_guess="current", frames=spec.frames):
+            iterations += step.solution.num_iterations
+            ended &= step.solution.termination_reason != "iterations"
     took = f"{'' if ended else '>'}{iterations}"
     return took if isinstance(solver, NonlinearCG) else f"{took}, {products[0]}"
 
@@ -59,7 +59,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("scenes", nargs="*", type=Path, default=SCENES, metavar="SCENE")
     table = Table("scene", "solver", *NAMES, box=SIMPLE_HEAD)
-    with pinned_threads(1):
+    with limit_threads(1):
         for path in parser.parse_args().scenes:
             for name, solver in (("newton-cg", NewtonCG), ("pncg", NonlinearCG)):
                 table.add_row(path.stem, name, *(told(path, solver(preconditioner=by)) for by in NAMES))

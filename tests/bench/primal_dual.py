@@ -21,18 +21,18 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from harness.base.machine import pinned_threads
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
+from harness.base.machine import limit_threads
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
 from solvers.energies import springs
 from solvers.methods.jgs2 import Jgs2
-from solvers.methods.newton import Newton
+from solvers.methods.newton import NewtonSolver
 from solvers.methods.vbd import VertexBlockDescent
 from solvers.methods.xpbd import Xpbd
 from solvers.problem import Solver, StepProblem, StopRule
-from tests.scenes import first_problem, scene
+from tests.scenes import build_first_problem, build_test_scene
 
 RATIOS = (1.0, 10.0, 100.0, 1e3, 1e4)
 METHODS: dict[str, Solver] = {
@@ -47,23 +47,25 @@ LEVEL, MOST = 1e-3, 100_000
 
 def hanging(stiffness: float, stiffer: float = 1.0, heavier: float = 1.0) -> StepProblem:
     """The chain's first step. stiffness: of springs [N/m]; stiffer: every second one; heavier: the last vertex."""
-    pins = Pins.model_validate({"at": ["first"], "weight": "exact"})
-    down = Chain(direction=(0.0, -1.0, 0.0))
-    stated = first_problem(scene(down, Springs(rule="fixed", stretch=stiffness), Gravity(), pins, size=17, mass=1.0))
+    pins = PinsEffect.model_validate({"at": ["first"], "weight": "exact"})
+    down = ChainMesh(direction=(0.0, -1.0, 0.0))
+    stated = build_first_problem(
+        build_test_scene(down, SpringsEffect(rule="fixed", stretch=stiffness), GravityEffect(), pins, size=17, mass=1.0)
+    )
     mass = stated.system.mass.copy()
     mass[-1] *= heavier
     (found,) = stated.system.energies
     assert isinstance(found, springs.Springs)
     k = np.where(np.arange(len(found.edges)) % 2, stiffer, 1.0) * found.stiffness
     energies = (replace(found, stiffness=k),)
-    force = stated.force * (mass / stated.system.mass)[:, None]
-    return replace(stated, system=replace(stated.system, mass=mass, energies=energies), force=force)
+    force = stated.external_force * (mass / stated.system.mass)[:, None]
+    return replace(stated, system=replace(stated.system, mass=mass, energies=energies), external_force=force)
 
 
 def iterations(solver: Solver, stated: StepProblem) -> int | None:
     """How many until all vertices are as near to the minimum as is asked."""
-    end = Newton().prepare(stated.system).solve(stated, StopRule(200, 1e-12)).positions
-    way = float(np.abs(end - stated.current).max())
+    end = NewtonSolver().prepare(stated.system).solve(stated, StopRule(200, 1e-12)).positions
+    way = float(np.abs(end - stated.current_positions).max())
     for k, p in enumerate(islice(solver.prepare(stated.system).iterates(stated), MOST), 1):
         if np.abs(p - end).max() <= LEVEL * way:
             return k
@@ -79,7 +81,7 @@ def row(name: str, problems: Iterator[StepProblem]) -> list[str]:
 def main() -> None:
     """Print both tables."""
     columns = tuple(f"{ratio:,.0f}" for ratio in RATIOS)
-    with pinned_threads(1):
+    with limit_threads(1):
         stiffer, heavier = Table("stiffer springs, by", *columns), Table("a heavier end, by", *columns)
         for name in METHODS:
             stiffer.add_row(*row(name, (hanging(1e3, stiffer=ratio) for ratio in RATIOS)))

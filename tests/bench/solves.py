@@ -8,11 +8,11 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from harness.scenes.bind import Scene
-from harness.simulation.step import problem, start
+from harness.simulation.step import build_initial_state, build_problem
 from solvers import matrices
-from solvers.linear.choice import Linear
-from solvers.linear.factors import Factor, SimplicialCholesky, SparseLU
-from solvers.linear.supernodal import Supernodal
+from solvers.linear.choice import LinearSolverName
+from solvers.linear.factors import LinearSolver, SimplicialCholesky, SparseLU
+from solvers.linear.supernodal import SupernodalCholesky
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions
 from tests.bench.gates import STOP, Gate, Work, sheet
@@ -22,15 +22,15 @@ GUARDS = ("test_a_supernodal_factor_is_as_large_as_stored",)
 
 def system_matrix(scene: Scene) -> csr_array:
     """Q of a scene of springs."""
-    return matrices.assemble(scene.system, [scene.springs])
+    return matrices.assemble_system_matrix(scene.system, [scene.all_springs])
 
 
-def solves(factorise: Callable[[csr_array], Factor], size: int, repeats: int) -> Work:
+def solves(factorise: Callable[[csr_array], LinearSolver], size: int, repeats: int) -> Work:
     """The solve alone, of the sheet's Q and a known answer of size one; what was found."""
     scene = sheet(size)
     Q = system_matrix(scene)
     factor = factorise(Q)
-    b = np.ascontiguousarray(Q @ np.random.default_rng(size).uniform(-1.0, 1.0, (scene.system.vertices, 3)))
+    b = np.ascontiguousarray(Q @ np.random.default_rng(size).uniform(-1.0, 1.0, (scene.system.num_vertices, 3)))
     out = np.empty_like(b)
 
     def work() -> Positions:
@@ -41,19 +41,19 @@ def solves(factorise: Callable[[csr_array], Factor], size: int, repeats: int) ->
     return work
 
 
-def stepped(linear: Linear, size: int, repeats: int) -> Work:
+def stepped(linear: LinearSolverName, size: int, repeats: int) -> Work:
     """Whole steps of the compiled backend with a linear solver, from the sheet at rest; the positions [m]."""
     scene = sheet(size)
     prepared = CompiledLocalGlobal(linear=linear).prepare(scene.system)
-    stated = problem(scene, start(scene), "current")
+    stated = build_problem(scene, build_initial_state(scene), "current")
     return lambda: [prepared.solve(stated, STOP) for _ in range(repeats)][-1].positions
 
 
-def _gate(against: str, factorise: Callable[[csr_array], Factor], size: int, limit: float, why: str) -> Gate:
+def _gate(against: str, factorise: Callable[[csr_array], LinearSolver], size: int, limit: float, why: str) -> Gate:
     repeats = max(4, 50 * 64**2 // size**2)
     return Gate(
         name=f"supernodal-solve-against-{against}-{size}",
-        candidate=lambda: solves(Supernodal, size, repeats),
+        candidate=lambda: solves(SupernodalCholesky, size, repeats),
         yardstick=lambda: solves(factorise, size, repeats),
         tolerance=1e-9,  # two factorisations, with pin weights of 1e10 among stiffnesses of 1e3
         limit=limit,

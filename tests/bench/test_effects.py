@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from harness.base.machine import pinned_threads
+from harness.base.machine import limit_threads
 from harness.config.load import load_scene
-from harness.experiments.ablation.prices import price, ready
-from solvers.registry import SOLVERS, load
+from harness.experiments.ablation.prices import measure_overhead, prepare_scene
+from solvers.registry import SOLVERS, load_target
 from tests.bench.effects import GATES, KINDS, PRICES, SOLVED, STOP
 
 
@@ -16,9 +16,9 @@ from tests.bench.effects import GATES, KINDS, PRICES, SOLVED, STOP
 @pytest.mark.parametrize("solver", SOLVED)
 def test_an_effect_stays_below_its_limit(solver: str, effect: str):
     """By the lower end of the interval: a price that is beyond the limit for sure fails, noise does not."""
-    made, scene = load(SOLVERS[solver])(), load_scene(PRICES)
-    with pinned_threads(1):
-        both = ready(scene, 33, made, effect), ready(scene, 33, made)
-        found = price(effect, *both, STOP, frames=3, rounds=5)
-    assert found.price.low <= GATES[solver][KINDS[effect]]
-    assert found.price.middle >= 1.0 / 3.0  # what tells so much less has not done the work
+    made, scene = load_target(SOLVERS[solver])(), load_scene(PRICES)
+    with limit_threads(1):
+        both = prepare_scene(scene, 33, made, effect), prepare_scene(scene, 33, made)
+        found = measure_overhead(effect, *both, STOP, frames=3, max_rounds=5)
+    assert found.ratio_interval.low <= GATES[solver][KINDS[effect]]
+    assert found.ratio_interval.estimate >= 1.0 / 3.0  # what tells so much less has not done the work

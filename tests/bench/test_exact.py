@@ -13,18 +13,18 @@ from typing import Any
 
 import pytest
 
-from harness.base.machine import pinned_threads
+from harness.base.machine import limit_threads
 from harness.experiments.gates import instructions
 from harness.scenes.bind import Scene
-from harness.simulation.step import problem, simulate, start
+from harness.simulation.step import build_initial_state, build_problem, simulate_scene
 from solvers.linear.block import BlockCholesky
-from solvers.linear.supernodal import Supernodal
+from solvers.linear.supernodal import SupernodalCholesky
 from solvers.problem import StopRule
-from solvers.registry import SOLVERS, load
+from solvers.registry import SOLVERS, load_target
 from tests.bench.contact import FAR, fallen
 from tests.bench.gates import STOP, THREADS, prepare, record, sheet, simulated, steps
 from tests.bench.solves import system_matrix
-from tests.scenes import SCENES
+from tests.scenes import SCENE_BUILDERS
 
 
 @pytest.mark.parametrize(
@@ -39,9 +39,9 @@ from tests.scenes import SCENES
 )
 def test_matrices_have_as_many_entries_as_stored(solver: str, size: int, system: int, factor: int):
     scene = sheet(size)
-    facts = prepare(solver, scene).facts
+    facts = prepare(solver, scene).stats
     # Q has an entry for each vertex and two for each spring; the factor's number is that of the ordering.
-    assert system == len(scene.mesh.rest) + 2 * len(scene.mesh.springs)
+    assert system == len(scene.mesh.rest_positions) + 2 * len(scene.mesh.springs)
     assert (facts["nnz_system"], facts["nnz_factor"]) == (system, factor)
 
 
@@ -51,29 +51,29 @@ def test_matrices_have_as_many_entries_as_stored(solver: str, size: int, system:
         (sheet(32), 19_161, 303_104, 367_392),
         (sheet(64), 103_273, 1_426_432, 1_802_400),
         (sheet(128), 527_787, 6_629_888, 8_609_952),
-        (SCENES["block"](1e10), 6_157, 73_728, 94_752),
-        (SCENES["skirt"](1e10), 5_150, 84_992, 101_568),
+        (SCENE_BUILDERS["block"](1e10), 6_157, 73_728, 94_752),
+        (SCENE_BUILDERS["skirt"](1e10), 5_150, 84_992, 101_568),
     ],
     ids=["sheet 32", "sheet 64", "sheet 128", "block", "skirt"],
 )
 def test_a_supernodal_factor_is_as_large_as_stored(scene: Scene, nonzeros: int, panel_bytes: int, flops: int):
-    factor = Supernodal(system_matrix(scene))
-    assert (factor.nonzeros, factor.panel_bytes, factor.flops) == (nonzeros, panel_bytes, flops)
+    factor = SupernodalCholesky(system_matrix(scene))
+    assert (factor.nonzeros, factor.factor_bytes, factor.flops) == (nonzeros, panel_bytes, flops)
     # Half of the bytes for half of the precision; the work is the same.
-    single = Supernodal(system_matrix(scene), precision="float32")
-    assert (single.panel_bytes, single.flops) == (panel_bytes // 2, flops)
+    single = SupernodalCholesky(system_matrix(scene), precision="float32")
+    assert (single.factor_bytes, single.flops) == (panel_bytes // 2, flops)
 
 
 @pytest.mark.parametrize("solver", ["dense", "sparse", "numba"])
 @pytest.mark.parametrize(("size", "iterations"), [(8, [542, 504]), (16, [506, 613])])
 def test_a_tolerance_takes_as_many_iterations_as_stored(solver: str, size: int, iterations: list[int]):
     scene = sheet(size)
-    stop = StopRule(iterations=1000, tolerance=1e-3)
-    with pinned_threads(THREADS):  # dense products of this size lose more by a second thread than they gain
-        steps = list(simulate(scene, prepare(solver, scene), stop, first_guess="current", frames=2))
+    stop = StopRule(max_iterations=1000, rtol=1e-3)
+    with limit_threads(THREADS):  # dense products of this size lose more by a second thread than they gain
+        steps = list(simulate_scene(scene, prepare(solver, scene), stop, initial_guess="current", frames=2))
     # Here an iteration changes the residual by 0.1 to 1 %, round-off by 1e-9: the number is the same everywhere.
-    assert [step.solution.iterations for step in steps] == iterations
-    assert {step.solution.stopped for step in steps} == {"tolerance"}
+    assert [step.solution.num_iterations for step in steps] == iterations
+    assert {step.solution.termination_reason for step in steps} == {"tolerance"}
 
 
 def test_a_recording_takes_at_most_20_bytes_a_vertex_and_frame(tmp_path: Path):
@@ -85,7 +85,7 @@ def test_a_recording_takes_at_most_20_bytes_a_vertex_and_frame(tmp_path: Path):
         record(scene, prepared, count, path)
         sizes.append(path.stat().st_size)
     # The difference leaves out what is written once. Springs are in every 40th frame, so 40 frames are a cycle.
-    per_vertex = (sizes[1] - sizes[0]) / (frames[1] - frames[0]) / len(scene.mesh.rest)
+    per_vertex = (sizes[1] - sizes[0]) / (frames[1] - frames[0]) / len(scene.mesh.rest_positions)
     assert per_vertex <= 20.0
     # The compressed size depends a little on the last bits of the positions and on the library's version.
     assert per_vertex == pytest.approx(16.3, rel=0.03)
@@ -102,7 +102,7 @@ class Factorisations:
 @pytest.fixture
 def factorisations(monkeypatch: pytest.MonkeyPatch) -> Factorisations:
     """Counts the factorisations of the test."""
-    found, kept, once = Factorisations(), BlockCholesky.factorise, BlockCholesky.solve_anew
+    found, kept, once = Factorisations(), BlockCholesky.factorise, BlockCholesky.factorise_and_solve
 
     def factorise(self: BlockCholesky, *given: Any) -> Any:
         found.kept += 1
@@ -129,16 +129,16 @@ def factorisations(monkeypatch: pytest.MonkeyPatch) -> Factorisations:
 def test_an_accuracy_takes_as_many_iterations_as_stored(
     solver: str, size: int, iterations: list[int], kept: int, once: int, factorisations: Factorisations
 ):
-    scene, stop = sheet(size), StopRule(iterations=1000, tolerance=1e-6)
-    with pinned_threads(THREADS):
-        prepared = load(SOLVERS[solver])().prepare(scene.system)
-        found = list(simulate(scene, prepared, stop, first_guess="current", frames=3))
-    assert {step.solution.stopped for step in found} == {"tolerance"}
+    scene, stop = sheet(size), StopRule(max_iterations=1000, rtol=1e-6)
+    with limit_threads(THREADS):
+        prepared = load_target(SOLVERS[solver])().prepare(scene.system)
+        found = list(simulate_scene(scene, prepared, stop, initial_guess="current", frames=3))
+    assert {step.solution.termination_reason for step in found} == {"tolerance"}
     # Newton's method converges quadratically, where round-off decides nothing. The hybrid begins with L-BFGS in
     # float32, whose path may end an iteration earlier or later in each of its rounds on another processor, and where
     # that leaves a Newton step to do it takes a factorisation, or some on an indefinite Hessian.
     room, more = (0, 0) if solver == "newton" else (2, 4)
-    assert [step.solution.iterations for step in found] == pytest.approx(iterations, abs=room)
+    assert [step.solution.num_iterations for step in found] == pytest.approx(iterations, abs=room)
     assert factorisations.kept == pytest.approx(kept, abs=room)
     assert factorisations.once == pytest.approx(once, abs=more)
 
@@ -165,8 +165,8 @@ def arrays(work: Callable[[], object], size: int) -> int:
 def test_a_step_allocates_as_many_arrays_as_stored(solver: str, stated: int, solved: int, whole: int):
     scene = sheet(64)
     prepared = prepare(solver, scene)
-    posed = problem(scene, start(scene), "current")
-    assert arrays(lambda: problem(scene, start(scene), "current"), 64) == stated
+    posed = build_problem(scene, build_initial_state(scene), "current")
+    assert arrays(lambda: build_problem(scene, build_initial_state(scene), "current"), 64) == stated
     assert arrays(lambda: prepared.solve(posed, STOP), 64) == solved
     assert arrays(lambda: steps(scene, prepared, 1), 64) == whole
 
@@ -178,10 +178,12 @@ def test_idle_contact_allocates_no_array_more():
 @pytest.mark.parametrize(("solver", "frames"), [("numba", 4), ("sparse", 2)])
 def test_the_same_work_retires_the_same_instructions(solver: str, frames: int):
     work = simulated(solver, 16, frames)
-    with pinned_threads(THREADS):
+    with limit_threads(THREADS):
         work()
-        first, second = instructions.count(work), instructions.count(work)
+        first, second = instructions.count_events(work), instructions.count_events(work)
     if first is None or second is None:
-        assert instructions.reason()  # it says why: a virtual machine hides the counter, or the kernel refuses it
+        assert (
+            instructions.explain_unavailable()
+        )  # it says why: a virtual machine hides the counter, or the kernel refuses it
     else:
         assert second == pytest.approx(first, rel=1e-3)  # the interpreter's own housekeeping, once in a while

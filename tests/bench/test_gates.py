@@ -3,9 +3,9 @@
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from harness.base.machine import pinned_threads
-from harness.experiments.gates.plugin import Race
-from harness.experiments.gates.scenes import CLOCKS
+from harness.base.machine import limit_threads
+from harness.experiments.gates.plugin import PairedBenchmark
+from harness.experiments.gates.scenes import CLOCK_FUNCTIONS
 from tests.bench import test_exact
 from tests.bench.accuracy import ACCURACY
 from tests.bench.contact import CONTACT
@@ -17,12 +17,12 @@ ALL = (*GATES, *SOLVES, *CONTACT, *ACCURACY)
 
 def marks(gate: Gate) -> list[pytest.MarkDecorator]:
     """Marks of a gate's test: the clock of pytest-benchmark's own figures, and whether it is of the short set."""
-    return [pytest.mark.benchmark(timer=CLOCKS[gate.clock]), *([pytest.mark.short] if gate.short else [])]
+    return [pytest.mark.benchmark(timer=CLOCK_FUNCTIONS[gate.clock]), *([pytest.mark.short] if gate.short else [])]
 
 
 @pytest.mark.parametrize("gate", [pytest.param(gate, id=gate.name, marks=marks(gate)) for gate in ALL])
-def test_the_gate_holds(gate: Gate, benchmark: BenchmarkFixture, race: Race):
-    with pinned_threads(THREADS):
+def test_the_gate_holds(gate: Gate, benchmark: BenchmarkFixture, race: PairedBenchmark):
+    with limit_threads(THREADS):
         candidate = gate.candidate()
         if gate.tolerance is None and benchmark.disabled:
             benchmark.pedantic(candidate)

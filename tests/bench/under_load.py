@@ -17,12 +17,12 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from harness.base.machine import pinned_threads
-from harness.experiments.gates.abba import Racers, Result, race
-from harness.experiments.gates.agreement import difference
-from harness.experiments.gates.scenes import calls_of, timed
-from harness.experiments.gates.sequential import Rule, Verdict
-from harness.experiments.gates.study import competing
+from harness.base.machine import limit_threads
+from harness.experiments.gates.abba import BenchmarkResult, ProgramPair, run_paired_benchmark
+from harness.experiments.gates.agreement import describe_difference
+from harness.experiments.gates.scenes import build_timer, choose_num_calls
+from harness.experiments.gates.sequential import SequentialTest, SequentialVerdict
+from harness.experiments.gates.study import run_background_load
 from tests.bench.contact import CONTACT
 from tests.bench.gates import GATES, THREADS, Gate
 
@@ -30,15 +30,15 @@ NAMED = {gate.name: gate for gate in (*GATES, *CONTACT)}
 ASKED = ("harness-against-bare-solver-64", "numba-against-sparse-64", "idle-contact-against-none-64")
 
 
-def held(gate: Gate, budget: float) -> Result:
+def held(gate: Gate, budget: float) -> BenchmarkResult:
     """One race of a gate, as `race` of the plugin for pytest has it."""
     candidate, yardstick = gate.candidate(), gate.yardstick()
     assert gate.tolerance is not None, f"{gate.name}: has no answers to compare"
-    if said := difference(candidate(), yardstick(), gate.tolerance):
+    if said := describe_difference(candidate(), yardstick(), gate.tolerance):
         raise AssertionError(f"{gate.name}: {said}")
-    calls = calls_of(candidate, yardstick)
-    a, b = (timed(work, calls, gate.clock) for work in (candidate, yardstick))
-    return race(Racers(a, b), Rule(gate.limit, gate.error), budget=budget)
+    calls = choose_num_calls(candidate, yardstick)
+    a, b = (build_timer(work, calls, gate.clock) for work in (candidate, yardstick))
+    return run_paired_benchmark(ProgramPair(a, b), SequentialTest(gate.limit, gate.error), time_budget=budget)
 
 
 def main() -> None:
@@ -52,18 +52,22 @@ def main() -> None:
     if unknown := sorted({*asked.gates} - NAMED.keys()):
         parser.error(f"{', '.join(unknown)}: no such gate; there are {', '.join(NAMED)}")
     console = Console(width=120)
-    found: dict[str, list[Result]] = {name: [] for name in asked.gates or ASKED}
-    with pinned_threads(THREADS), competing(asked.condition):
+    found: dict[str, list[BenchmarkResult]] = {name: [] for name in asked.gates or ASKED}
+    with limit_threads(THREADS), run_background_load(asked.condition):
         for number in range(asked.times):
             for name, results in found.items():
                 results.append(held(NAMED[name], asked.budget))
                 console.print(f"{number + 1} of {asked.times}, {name}: {results[-1]}", style="dim")
     table = Table("gate", "limit", "fails", "holds", "cannot tell", "ratio", "median s", "load", box=SIMPLE_HEAD)
     for name, results in found.items():
-        answers = Counter(result.answer for result in results)
-        counts = (str(answers[verdict]) for verdict in (Verdict.FAILS, Verdict.HOLDS, Verdict.UNDECIDED))
+        answers = Counter(result.verdict for result in results)
+        counts = (
+            str(answers[verdict])
+            for verdict in (SequentialVerdict.FAIL, SequentialVerdict.PASS, SequentialVerdict.INCONCLUSIVE)
+        )
         ratio, seconds, load = (
-            median(values) for values in zip(*((r.interval.ratio, r.elapsed, r.load) for r in results), strict=True)
+            median(values)
+            for values in zip(*((r.interval.ratio, r.elapsed_seconds, r.load_average) for r in results), strict=True)
         )
         table.add_row(name, f"{NAMED[name].limit}", *counts, f"{ratio:.3f}", f"{seconds:.1f}", f"{load:.1f}")
     console.print(table)

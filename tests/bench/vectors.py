@@ -21,17 +21,17 @@ import numpy as np
 from numba import njit  # noqa: TID251
 from scipy.sparse import csr_array
 
-from harness.base.machine import describe, pinned_threads
-from harness.experiments.gates.abba import CALL, Turn, orders
-from harness.experiments.gates.sequential import interval
-from harness.scenes.touching import outline
-from harness.simulation.step import problem, start
+from harness.base.machine import describe_machine, limit_threads
+from harness.experiments.gates.abba import MIN_CALL_SECONDS, TimedBlock, draw_block_orders
+from harness.experiments.gates.sequential import compute_interval
+from harness.scenes.touching import collision_primitives
+from harness.simulation.step import build_initial_state, build_problem
 from solvers.contact import contacts
-from solvers.contact.surface import Surface
+from solvers.contact.surface import CollisionMesh
 from solvers.kernels import accelerate, accelerate_springs, accelerate_step, springs, vbd
 from solvers.linear import block, block_factor, multigrid_kernels, supernodal, supernodal_solve
 from solvers.linear.conjugate_gradients import ConjugateGradients
-from solvers.linear.supernodal import Supernodal
+from solvers.linear.supernodal import SupernodalCholesky
 from solvers.problem import Positions
 from tests.bench import plain
 from tests.bench.gates import STOP, prepare, sheet
@@ -109,41 +109,53 @@ def given(module: Any, name: str, work: Callable[[], object]) -> tuple[Any, ...]
 def solving(solver: str) -> Callable[[], object]:
     """A solver's first step of the sheet of 64 x 64 vertices."""
     scene = sheet(SIZE)
-    stated, prepared = problem(scene, start(scene), "current"), prepare(solver, scene)
+    stated, prepared = build_problem(scene, build_initial_state(scene), "current"), prepare(solver, scene)
     return lambda: prepared.solve(stated, STOP)
 
 
 def of_springs() -> Iterator[Case]:
     """Over bundles of eight vertices with their springs."""
     state, _, window, _, _ = given(accelerate_step, "run", solving("lbfgs"))
-    parts, p, out = state.bundles, window.trial, window.descent_there.copy()
+    parts, p, out = state.spring_packets, window.trial_position, window.trial_descent.copy()
     whole = 0, len(parts.start) - 1
     short = {"project": plain.refuse, "correct": plain.refuse}
-    yield Case("projections", springs.add_projection, (parts, *whole, p, state.right, out, 0), short, (5,))
-    yield Case("gradient", springs.add_descent, (parts, *whole, p, state.right, out, 0), short, (5,))
-    norm = state.form, 0, len(state.form.start) - 1, window.direction.copy(), state.plan.measure
+    yield Case("projections", springs.add_projection, (parts, *whole, p, state.right_hand_side, out, 0), short, (5,))
+    yield Case("gradient", springs.add_descent, (parts, *whole, p, state.right_hand_side, out, 0), short, (5,))
+    norm = (
+        state.norm_packets,
+        0,
+        len(state.norm_packets.start) - 1,
+        window.direction.copy(),
+        state.iteration_plan.measure,
+    )
     yield Case("norm of Q", springs.squared_norm, norm, {"energy": plain.energy}, ())
 
 
 def of_descent() -> Iterator[Case]:
     """Over the same bundles, with the objective."""
     state, _, window, _, _ = given(accelerate_step, "run", solving("lbfgs"))
-    descent = state.bundles, state.shares, window.trial, state.right, window.descent_there.copy()
+    descent = (
+        state.spring_packets,
+        state.objective_weights,
+        window.trial_position,
+        state.right_hand_side,
+        window.trial_descent.copy(),
+    )
     none = {"descend": plain.refuse_energy}
-    yield Case("objective and gradient", accelerate_springs.descend, descent, none, (4,))
+    yield Case("objective and gradient", accelerate_springs.value_and_descent, descent, none, (4,))
 
 
 def of_dots() -> Iterator[Case]:
     """Over the vectors of L-BFGS."""
     _, _, window, _, _ = given(accelerate_step, "run", solving("lbfgs"))
     both = {"dot": plain.dot, "dots": plain.dots}
-    yield Case("a step of L-BFGS", accelerate.accept, (window, window.correction.copy()), both, ())
+    yield Case("a step of L-BFGS", accelerate.accept_trial, (window, window.correction.copy()), both, ())
 
 
 def of_vbd() -> Iterator[Case]:
     """Over colours."""
     blocks, spaces, beside, right, _, work, p, _ = given(vbd, "iterate", solving("vbd"))
-    yield Case("sweep", vbd._sweep, (blocks, spaces, beside, right, p, work), {"descend": plain.newton}, (4,))
+    yield Case("sweep", vbd._sweep_vertices, (blocks, spaces, beside, right, p, work), {"descend": plain.newton}, (4,))
 
 
 def of_supernodal() -> Iterator[Case]:
@@ -151,9 +163,9 @@ def of_supernodal() -> Iterator[Case]:
     Q, b = system()
     panel = {"add_forward": plain.add_forward, "set_backward": plain.set_backward}
     for precision in ("float64", "float32"):
-        factor = Supernodal(Q, precision=precision)
+        factor = SupernodalCholesky(Q, precision=precision)
         solve = given(supernodal, "solve_by", lambda factor=factor: factor.solve(b, np.empty_like(b)))
-        yield Case(f"solve, {precision}", supernodal_solve.solve_by, solve, panel, (10,))
+        yield Case(f"solve, {precision}", supernodal_solve.solve_from_arrays, solve, panel, (10,))
 
 
 def of_block() -> Iterator[Case]:
@@ -161,8 +173,8 @@ def of_block() -> Iterator[Case]:
     names = ("subtract_product", "divide", "factorise_corner", "solve_columns", "solve_rows", "add")
     tiles = {name: getattr(plain, name) for name in names}
     newton = solving("newton")
-    yield Case("factorisation", block_factor.factorise, given(block, "factorise", newton), tiles, (2,))
-    yield Case("solve", block_factor.solve, given(block, "solve", newton), tiles, (2,))
+    yield Case("factorisation", block_factor.factorise_blocks, given(block, "factorise", newton), tiles, (2,))
+    yield Case("solve", block_factor.solve_blocks, given(block, "solve", newton), tiles, (2,))
 
 
 def of_rows() -> Iterator[Case]:
@@ -177,19 +189,21 @@ def of_rows() -> Iterator[Case]:
 def system() -> tuple[csr_array, Positions]:
     """Q of the sheet, and a right-hand side."""
     scene = sheet(SIZE)
-    return system_matrix(scene), np.random.default_rng(0).uniform(-1.0, 1.0, (scene.system.vertices, 3))
+    return system_matrix(scene), np.random.default_rng(0).uniform(-1.0, 1.0, (scene.system.num_vertices, 3))
 
 
 def of_eights() -> Iterator[Case]:
     """Over pairs of four layers that touch."""
     made = folded(SIZE)
     mesh, p = made.mesh, made.p
-    surface = Surface.of(mesh.rest, outline(mesh)[0], mesh.triangles, np.ones(len(p)), made.thickness, made.reach)
-    pairs = surface.within(p, 1.5 * (made.thickness + made.reach))
-    space = contacts.room(len(pairs.vertices), made.thickness, made.reach)
+    surface = CollisionMesh.from_rest_shape(
+        mesh.rest_positions, collision_primitives(mesh)[0], mesh.triangles, np.ones(len(p)), made.thickness, made.reach
+    )
+    pairs = surface.find_proximity_candidates(p, 1.5 * (made.thickness + made.reach))
+    space = contacts.allocate_collisions(len(pairs.vertices), made.thickness, made.reach)
     slots = np.empty(1 << (2 * len(pairs.vertices)).bit_length(), np.int32)
-    arguments = pairs, contacts.padded(p), np.empty((9, 8)), slots, space
-    yield Case("closest points of pairs", contacts.gather, arguments, {"eight": plain.eight}, (2, 3))
+    arguments = pairs, contacts.pad_positions(p), np.empty((9, 8)), slots, space
+    yield Case("closest points of pairs", contacts.gather_collisions, arguments, {"eight": plain.eight}, (2, 3))
 
 
 CASES = {
@@ -217,12 +231,12 @@ def ratio(case: Case) -> tuple[float, float, float]:
     for one, other in zip(*answers, strict=True):
         assert np.abs(one - other).max() <= ROUND_OFF * np.abs(other).max(), f"{case.what}: others"
     once = min(_seconds(kernel, case, 3) for kernel in kernels)
-    repeats = max(1, ceil(CALL / once / 2))
+    repeats = max(1, ceil(MIN_CALL_SECONDS / once / 2))
     turns = []
-    for order in islice(orders(), TURNS):
+    for order in islice(draw_block_orders(), TURNS):
         seconds = tuple(_seconds(kernels["AB".index(who)], case, repeats) for who in order)
-        turns.append(Turn(order, seconds).log_ratio)
-    found = interval(turns)
+        turns.append(TimedBlock(order, seconds).log_ratio)
+    found = compute_interval(turns)
     return found.ratio, found.low, found.high
 
 
@@ -238,9 +252,9 @@ def _seconds(kernel: Any, case: Case, repeats: int) -> float:
 
 def main() -> None:
     """Measure the files that are named, or all, and print a table."""
-    print(f"{describe().cpu}, one thread, {SIZE} x {SIZE} vertices; load {getloadavg()[0]:.1f}\n")
+    print(f"{describe_machine().cpu}, one thread, {SIZE} x {SIZE} vertices; load {getloadavg()[0]:.1f}\n")
     print("| file | what | plain Numba takes | between |\n|---|---|---|---|")
-    with pinned_threads(1):
+    with limit_threads(1):
         for file in sys.argv[1:] or CASES:
             for case in CASES[file]():
                 median, low, high = ratio(case)

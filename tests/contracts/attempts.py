@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from harness.base import child
 
-LIMITS = child.Allowance(20.0, 2**31)
+LIMITS = child.CallLimits(20.0, 2**31)
 """What an answer may take: 20 s of processor time, and 2 GiB of memory beyond that of a bare interpreter."""
 
 
@@ -28,14 +28,14 @@ class Outcome:
 
 def attempt(folder: Path, arguments: list[str]) -> Outcome:
     """What a command line comes to in a folder, of which `results` is the folder of results. Raises child.NoAnswer."""
-    return child.call(_attempt, folder, arguments, limits=LIMITS)
+    return child.call_in_sandbox(_attempt, folder, arguments, limits=LIMITS)
 
 
 def _attempt(folder: Path, arguments: list[str]) -> Outcome:
     from harness.cli import app
     from harness.scenes.mesh import files
 
-    files.SECONDS = 1.0  # some of these would be read for ever
+    files.MIN_READ_SECONDS = 1.0  # some of these would be read for ever
     os.chdir(folder)
     (folder / "temporary").mkdir(exist_ok=True)
     tempfile.tempdir = os.environ["TMPDIR"] = str(folder / "temporary")  # what is left there is seen

@@ -15,10 +15,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.base import rows
-from harness.config.load import load_any
-from harness.experiments.archive.publish import publish
+from harness.config.load import load_config
+from harness.experiments.archive.publish import publish_results
 from tests.contracts.hostile import BOMB, scene
-from tests.dummies import dummy_rows
+from tests.dummies import build_dummy_rows
 
 SWEEP = "scenes: [cloth.yaml]\nsizes: [4]\nsolvers: [sparse]\n"
 ROWS = "results/sweep/rows/a.parquet"
@@ -33,15 +33,15 @@ def good_results(folder: Path) -> None:
     (folder / "sweep.yaml").write_text(SWEEP)
     (folder / "results" / "sweep" / "rows").mkdir(parents=True)
     (folder / "results" / "sweep" / ".config").write_text("../../sweep.yaml\n")
-    (run,) = load_any(folder / "sweep.yaml").runs()
-    made = [row | {"run_id": run.run_id("00000000"), "solver": "sparse"} for row in dummy_rows(0)]
-    rows.write(folder / "results" / "sweep" / "rows" / "a.parquet", made)
+    (run,) = load_config(folder / "sweep.yaml").list_runs()
+    made = [row | {"run_id": run.compute_run_id("00000000"), "solver": "sparse"} for row in build_dummy_rows(0)]
+    rows.write_rows(folder / "results" / "sweep" / "rows" / "a.parquet", made)
 
 
 def good_archive(folder: Path) -> Content:
     """The files of an archive of such results."""
     good_results(folder)
-    publish(folder / "results", folder / "good.zip", lambda line: None)
+    publish_results(folder / "results", folder / "good.zip", lambda line: None)
     with zipfile.ZipFile(folder / "good.zip") as packed:
         return {name: packed.read(name) for name in packed.namelist()}
 

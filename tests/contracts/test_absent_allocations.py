@@ -12,32 +12,47 @@ import numpy as np
 import pytest
 
 from harness.scenes.bind import Scene
-from harness.scenes.effects.base import Effect
-from harness.scenes.effects.constant_force import ConstantForce
-from harness.scenes.effects.ether_drag import EtherDrag
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.effects.wind import Wind
-from harness.scenes.mesh.grid import Grid
-from harness.simulation.step import prepare, simulate
+from harness.scenes.effects.base import SceneEffect
+from harness.scenes.effects.constant_force import ConstantForceEffect
+from harness.scenes.effects.ether_drag import EtherDragEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.effects.wind import WindEffect
+from harness.scenes.mesh.grid import GridMesh
+from harness.simulation.step import prepare, simulate_scene
 from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import Prepared, StopRule
-from tests.effects import ATTACHED, BEND, DASHPOTS, DRAG, LIMITS, RAYLEIGH
-from tests.scenes import scene
+from solvers.problem import PreparedSolver, StopRule
+from tests.effects import (
+    AIR_DRAG_EFFECT,
+    ATTACHMENT_EFFECT,
+    BENDING_EFFECT,
+    DASHPOT_EFFECT,
+    RAYLEIGH_EFFECT,
+    STRAIN_LIMIT_EFFECT,
+)
+from tests.scenes import build_test_scene
 
 SIDE = 20
-PRESENT: tuple[Effect, ...] = (BEND, LIMITS, DASHPOTS, RAYLEIGH, DRAG, ATTACHED, Wind(per="triangle"))
-IDLE: dict[str, Effect] = {
-    "bending": BEND.model_copy(update={"stiffness": 0.0}),
-    "strain limits": LIMITS.model_copy(update={"stiffness": 0.0}),
-    "dashpots": DASHPOTS.model_copy(update={"stretch": 0.0}),
-    "rayleigh": RAYLEIGH.model_copy(update={"mass": 0.0, "stiffness": 0.0}),
-    "air drag": DRAG.model_copy(update={"coefficient": 0.0}),
-    "attachments": ATTACHED.model_copy(update={"stiffness": 0.0}),
-    "wind": Wind(per="triangle", strength=0.0),
-    "constant force": ConstantForce(force=(0.0, 0.0, 0.0)),
-    "ether drag": EtherDrag(rate=0.0),
+PRESENT: tuple[SceneEffect, ...] = (
+    BENDING_EFFECT,
+    STRAIN_LIMIT_EFFECT,
+    DASHPOT_EFFECT,
+    RAYLEIGH_EFFECT,
+    AIR_DRAG_EFFECT,
+    ATTACHMENT_EFFECT,
+    WindEffect(per="triangle"),
+)
+IDLE: dict[str, SceneEffect] = {
+    "bending": BENDING_EFFECT.model_copy(update={"stiffness": 0.0}),
+    "strain limits": STRAIN_LIMIT_EFFECT.model_copy(update={"stiffness": 0.0}),
+    "dashpots": DASHPOT_EFFECT.model_copy(update={"stretch": 0.0}),
+    "rayleigh": RAYLEIGH_EFFECT.model_copy(update={"mass": 0.0, "stiffness": 0.0}),
+    "air drag": AIR_DRAG_EFFECT.model_copy(update={"coefficient": 0.0}),
+    "attachments": ATTACHMENT_EFFECT.model_copy(update={"stiffness": 0.0}),
+    "wind": WindEffect(per="triangle", strength=0.0),
+    "constant force": ConstantForceEffect(force=(0.0, 0.0, 0.0)),
+    "ether drag": EtherDragEffect(rate=0.0),
 }
 
 
@@ -63,10 +78,10 @@ def _referents(one: object) -> Iterable[object]:
     return gc.get_referents(one)
 
 
-def bound(*effects: Effect) -> tuple[Scene, Prepared]:
-    pins = Pins(at=("top_corners",))
-    made = scene(Grid(), Springs(stretch=300.0), Gravity(), pins, *effects, size=SIDE)
-    made = replace(made, halved=None)  # a recipe, which holds what the effects were described by
+def bound(*effects: SceneEffect) -> tuple[Scene, PreparedSolver]:
+    pins = PinsEffect(at=("top_corners",))
+    made = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), GravityEffect(), pins, *effects, size=SIDE)
+    made = replace(made, build_coarser=None)  # a recipe, which holds what the effects were described by
     return made, prepare(made, SparseLocalGlobal())
 
 
@@ -77,12 +92,12 @@ def plain() -> tuple[int, int]:
     return arrays(made, prepared), most_in_a_step(made, prepared)
 
 
-def most_in_a_step(made: Scene, prepared: Prepared) -> int:
+def most_in_a_step(made: Scene, prepared: PreparedSolver) -> int:
     """The most bytes that a step which is not the first allocates at once; the least of some runs, for Python itself
     allocates now and then."""
     most = []
     for _turn in range(4):
-        run = simulate(made, prepared, StopRule(5), first_guess="current", frames=3)
+        run = simulate_scene(made, prepared, StopRule(5), initial_guess="current", frames=3)
         for _ in range(2):
             next(run)
         gc.collect()
@@ -94,16 +109,16 @@ def most_in_a_step(made: Scene, prepared: Prepared) -> int:
 
 
 @pytest.mark.parametrize("effect", IDLE.values(), ids=IDLE)
-def test_an_effect_that_does_nothing_has_no_array(effect: Effect):
+def test_an_effect_that_does_nothing_has_no_array(effect: SceneEffect):
     assert arrays(*bound(effect)) == plain()[0]
 
 
 @pytest.mark.parametrize("effect", PRESENT, ids=lambda effect: effect.kind)
-def test_an_effect_that_does_something_has_arrays(effect: Effect):
+def test_an_effect_that_does_something_has_arrays(effect: SceneEffect):
     assert arrays(*bound(effect)) > plain()[0]
 
 
 @pytest.mark.parametrize("effect", IDLE.values(), ids=IDLE)
-def test_a_step_allocates_nothing_for_an_effect_that_does_nothing(effect: Effect):
+def test_a_step_allocates_nothing_for_an_effect_that_does_nothing(effect: SceneEffect):
     # An array of one number at each vertex has 3200 bytes; what Python itself allocates differs by some hundreds.
     assert abs(most_in_a_step(*bound(effect)) - plain()[1]) < 8 * SIDE**2

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 
 from harness.config.load import load_scene
-from harness.scenes.bind import build
-from harness.scenes.effects.effect_names import EFFECTS
-from solvers.matrices import assemble
-from tests.effects import BEND, DASHPOTS, DRAG, LIMITS, cloth
+from harness.scenes.bind import build_scene
+from harness.scenes.effects.effect_names import EFFECT_CLASSES
+from solvers.matrices import assemble_system_matrix
+from tests.effects import AIR_DRAG_EFFECT, BENDING_EFFECT, DASHPOT_EFFECT, STRAIN_LIMIT_EFFECT, build_effect_cloth
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = ROOT / "configs" / "scenes" / "hanging-cloth.yaml"
 LISTED = {"springs", "gravity", "ether-drag", "pins"}
-ABSENT = sorted(set(EFFECTS) - LISTED)
+ABSENT = sorted(set(EFFECT_CLASSES) - LISTED)
 
 ENERGIES = {
     "bending": ["solvers.energies.bending", "solvers.energies.quadratic"],
@@ -74,7 +74,7 @@ def probe(*, hidden: Sequence[str] = (), load: bool = False) -> dict:
 
 
 def modules(effects: list[str]) -> list[str]:
-    own = [EFFECTS[kind].partition(":")[0] for kind in effects]
+    own = [EFFECT_CLASSES[kind].partition(":")[0] for kind in effects]
     return own + [module for kind in effects for module in ENERGIES.get(kind, [])]
 
 
@@ -110,18 +110,24 @@ def test_every_energy_module_belongs_to_an_effect():
 
 def test_the_system_matrix_has_no_entry_from_an_absent_effect():
     bare, dashpots, limits, drag, bend = (
-        assemble(made.system, [*made.system.energies])  # pyright: ignore[reportArgumentType]
-        for made in (cloth(), cloth(DASHPOTS), cloth(LIMITS), cloth(DRAG), cloth(BEND))
+        assemble_system_matrix(made.system, [*made.system.energies])  # pyright: ignore[reportArgumentType]
+        for made in (
+            build_effect_cloth(),
+            build_effect_cloth(DASHPOT_EFFECT),
+            build_effect_cloth(STRAIN_LIMIT_EFFECT),
+            build_effect_cloth(AIR_DRAG_EFFECT),
+            build_effect_cloth(BENDING_EFFECT),
+        )
     )
     # These lie where springs and masses lie, so Q has other numbers and no more of them; bending reaches further.
     assert bare.nnz == dashpots.nnz == limits.nnz == drag.nnz < bend.nnz
-    made = cloth()
-    springs, n = made.springs, len(made.mesh.rest)
+    made = build_effect_cloth()
+    springs, n = made.all_springs, len(made.mesh.rest_positions)
     assert bare.nnz == n + 2 * len(np.unique(np.sort(springs.edges, axis=1), axis=0))
 
 
 def test_a_scene_has_nothing_but_what_it_lists():
-    made = build(load_scene(SCENE), 6)
+    made = build_scene(load_scene(SCENE), 6)
     assert [type(energy).__name__ for energy in made.system.energies] == ["Springs"]
-    assert (made.forces, made.moving, len(made.filters)) == ((), (), 1)
-    assert made.pins_at(3.0) is made.pin_targets
+    assert (made.varying_forces, made.pin_motions, len(made.velocity_filters)) == ((), (), 1)
+    assert made.pin_targets_at(3.0) is made.pin_targets

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 
 from harness.base import rows
-from harness.base.progress import Display
+from harness.base.progress import ProgressDisplay
 from harness.cli import main
 from harness.config.accuracy_load import load_accuracy
-from harness.experiments.accuracy.accuracy_rows import SCHEMA
-from harness.experiments.accuracy.studies import run_accuracy
+from harness.experiments.accuracy.accuracy_rows import ACCURACY_SCHEMA
+from harness.experiments.accuracy.studies import run_accuracy_study
 from harness.record.reader import read_replay
 from harness.reference import store
-from harness.reference.minimiser import ROUGH, KnownMinima, certify
+from harness.reference.minimiser import INACCURATE, KnownMinima, certify_minimum
 from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import Positions, Prepared, System
+from solvers.problem import Positions, PreparedSolver, System
 from solvers.registry import SOLVERS
-from tests.displays import Quiet
+from tests.displays import SilentDisplay
 
 SCENE = """
 mesh: {kind: grid}
@@ -54,20 +54,20 @@ class Home:
         self.config, self.folder = folder / "config.yaml", folder / "results" / "config"
         self.config.write_text(config)
 
-    def run(self, display: Display | None = None, *, isolated: bool = False) -> int:
+    def run(self, display: ProgressDisplay | None = None, *, isolated: bool = False) -> int:
         """How many units were done. isolated: in workers."""
-        display = display or Quiet()
-        run_accuracy(load_accuracy(self.config), self.folder, display, lambda line: None, isolated=isolated)
+        display = display or SilentDisplay()
+        run_accuracy_study(load_accuracy(self.config), self.folder, display, lambda line: None, isolated=isolated)
         return getattr(display, "finished_units", 0)
 
     def rows(self, kind: str, **values: Any) -> list[dict[str, Any]]:
         """The rows of a kind that have these values, file by file."""
-        table = rows.read(sorted((self.folder / "accuracy").glob("*.parquet")), SCHEMA).to_pylist()
+        table = rows.read_rows(sorted((self.folder / "accuracy").glob("*.parquet")), ACCURACY_SCHEMA).to_pylist()
         return [row for row in table if row["kind"] == kind and all(row[key] == v for key, v in values.items())]
 
     def told(self) -> list[str]:
         """All rows, less their times; as text, because what is not a number equals nothing."""
-        table = rows.read(sorted((self.folder / "accuracy").glob("*.parquet")), SCHEMA)
+        table = rows.read_rows(sorted((self.folder / "accuracy").glob("*.parquet")), ACCURACY_SCHEMA)
         return list(map(repr, table.drop_columns(list(TIMES)).to_pylist()))
 
     def written(self) -> dict[str, int]:
@@ -75,7 +75,7 @@ class Home:
 
     def units(self) -> Iterator[Path]:
         for path in sorted((self.folder / "accuracy").glob("*.parquet")):
-            if rows.read([path], SCHEMA)["kind"][0].as_py() != "problem":
+            if rows.read_rows([path], ACCURACY_SCHEMA)["kind"][0].as_py() != "problem":
                 yield path
 
 
@@ -147,7 +147,7 @@ def test_what_is_done_is_not_done_again(home: Home) -> None:
 def test_a_config_that_was_stopped_goes_on_where_it_was(home: Home, tmp_path: Path, after: int) -> None:
     stopped = Home(tmp_path / "home")
     with pytest.raises(KeyboardInterrupt):
-        stopped.run(Quiet(stop_after=after))
+        stopped.run(SilentDisplay(stop_after=after))
     there = stopped.written()
     assert len(there) == after
     assert stopped.run() == UNITS - after
@@ -170,11 +170,13 @@ def test_what_is_not_asked_for_any_more_stays_and_is_not_counted(tmp_path: Path)
     made.run()
     before = set(made.written())
     made.config.write_text(made.config.read_text().replace("[early, violent]", "early"))
-    files = run_accuracy(load_accuracy(made.config), made.folder, Quiet(), lambda line: None, isolated=False)
+    files = run_accuracy_study(
+        load_accuracy(made.config), made.folder, SilentDisplay(), lambda line: None, isolated=False
+    )
     assert set(made.written()) == before
-    moments = rows.read(files, SCHEMA)["moment"].to_pylist()
+    moments = rows.read_rows(files, ACCURACY_SCHEMA)["moment"].to_pylist()
     assert set(moments) == {"early"}
-    assert "problem" in rows.read(files, SCHEMA)["kind"].to_pylist()
+    assert "problem" in rows.read_rows(files, ACCURACY_SCHEMA)["kind"].to_pylist()
 
 
 def test_moments_that_are_one_step_are_measured_once(tmp_path: Path) -> None:
@@ -189,7 +191,9 @@ def test_a_minimum_that_is_not_certified_is_told_and_nothing_is_graded_by_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(store, "find_minima", lambda problem, solver: KnownMinima((), "it ended on a saddle"))
-    monkeypatch.setattr(store, "polish", lambda problem, p, solver: replace(certify(problem, p), kind=ROUGH))
+    monkeypatch.setattr(
+        store, "polish", lambda problem, p, solver: replace(certify_minimum(problem, p), kind=INACCURATE)
+    )
     made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, violent]", "early"))
     made.run()
     (problem,) = made.rows("problem")
@@ -203,10 +207,10 @@ def test_a_minimum_that_is_not_certified_is_told_and_nothing_is_graded_by_it(
 class Broken:
     """A solver that fails in its first iteration."""
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         prepared: Any = SparseLocalGlobal().prepare(system)
 
         class Failing:
@@ -236,7 +240,7 @@ def test_a_solver_that_fails_is_a_row_and_the_others_are_measured(
 class Crashing(Broken):
     """A solver that takes its process along."""
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         os.abort()
 
 

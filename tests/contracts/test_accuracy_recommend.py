@@ -13,19 +13,19 @@ import pyarrow.parquet as pq
 import pytest
 
 from harness.base import rows
-from harness.base.claim import claimed
+from harness.base.claim import claim_folder
 from harness.base.errors import InputError, RunFailed
-from harness.base.yaml import scalar
+from harness.base.yaml import parse_scalar
 from harness.cli import main
-from harness.config.load import load_any, load_scene
+from harness.config.load import load_config, load_scene
 from harness.config.sweep import SolverSpec
 from harness.experiments.accuracy import recommend as module
 from harness.experiments.accuracy import work
-from harness.experiments.accuracy.accuracy_rows import SCHEMA
-from harness.experiments.accuracy.recommend import Recommendation, recommend
-from harness.experiments.accuracy.units import references, trajectory_of
-from harness.reference.store import Store
-from tests.displays import Quiet
+from harness.experiments.accuracy.accuracy_rows import ACCURACY_SCHEMA
+from harness.experiments.accuracy.recommend import MethodRecommendation, recommend_method
+from harness.experiments.accuracy.units import load_reference_trajectory, open_reference_store
+from harness.reference.store import ReferenceStore
+from tests.displays import SilentDisplay
 
 SCENE = """
 mesh: {kind: chain, length: 2.0}
@@ -56,12 +56,12 @@ def scene(tmp_path: Path) -> Path:
     return tmp_path / "chain.yaml"
 
 
-def asked(scene: Path, error: float, **more: Any) -> tuple[Recommendation, int]:
+def asked(scene: Path, error: float, **more: Any) -> tuple[MethodRecommendation, int]:
     """The answer, and how many simulations were measured for it."""
-    display, results = Quiet(), scene.parent / "results"
+    display, results = SilentDisplay(), scene.parent / "results"
     options: dict[str, Any] = {"size": None, "horizon": 0.2, "time_limit": 60.0} | more
     options = {"say": lambda line: None} | options
-    found = recommend(scene, error, results=results, display=display, **options)
+    found = recommend_method(scene, error, results=results, display=display, **options)
     return found, display.finished_units
 
 
@@ -74,17 +74,25 @@ def test_the_cheapest_that_keeps_to_the_error_is_recommended_and_checked(scene: 
     found, count = asked(scene, 0.1, say=said.append)
     assert count == len(measured(scene)) <= COUNT
     assert any(line.startswith(f"chain 4: {count} of {COUNT} settings measured") for line in said)
-    table = rows.read(measured(scene), SCHEMA).to_pylist()
+    table = rows.read_rows(measured(scene), ACCURACY_SCHEMA).to_pylist()
     within = [row for row in table if row["error"] <= 0.1]
     assert 0 < len(within) < len(table), "the error separates nothing"
     cheapest = min(within, key=lambda row: row["seconds_per_simulated"])
-    assert (found.best.error, found.best.cost) == (cheapest["error"], cheapest["seconds_per_simulated"])
-    assert found.best.spec.case.scene.time_step == cheapest["time_step"]
-    assert found.checked.error == found.best.error  # the same simulation gives the same positions
-    assert found.checked.cost > 0.0
-    slower = replace(found, checked=replace(found.best, cost=2.0 * found.best.cost))
-    other = replace(found, checked=replace(found.best, error=2.0 * found.best.error))
-    assert replace(found, checked=found.best).verdict.startswith("as predicted")
+    assert (found.best_method.error, found.best_method.seconds_per_simulated_second) == (
+        cheapest["error"],
+        cheapest["seconds_per_simulated"],
+    )
+    assert found.best_method.work_spec.case.scene.time_step == cheapest["time_step"]
+    assert found.checked_method.error == found.best_method.error  # the same simulation gives the same positions
+    assert found.checked_method.seconds_per_simulated_second > 0.0
+    slower = replace(
+        found,
+        checked_method=replace(
+            found.best_method, seconds_per_simulated_second=2.0 * found.best_method.seconds_per_simulated_second
+        ),
+    )
+    other = replace(found, checked_method=replace(found.best_method, error=2.0 * found.best_method.error))
+    assert replace(found, checked_method=found.best_method).verdict.startswith("as predicted")
     assert "the time 2 times that" in slower.verdict
     assert other.verdict.startswith("not as predicted")
 
@@ -93,7 +101,7 @@ def test_what_was_measured_is_not_measured_again(scene: Path) -> None:
     first, _ = asked(scene, 0.1)
     again, count = asked(scene, 0.1)
     assert count == 0
-    assert again.best == first.best
+    assert again.best_method == first.best_method
 
 
 @pytest.mark.long
@@ -115,7 +123,7 @@ def test_the_results_of_another_scene_of_this_name_are_left_alone(scene: Path) -
     (scene.parent / "other").mkdir()
     other = scene.parent / "other" / scene.name
     other.write_text(SCENE)
-    claimed(scene.parent / "results" / f"recommend-{scene.stem}", other)
+    claim_folder(scene.parent / "results" / f"recommend-{scene.stem}", other)
     with pytest.raises(InputError, match="holds the results of another file of this name"):
         asked(scene, 0.1)
     assert not measured(scene)
@@ -132,7 +140,7 @@ def test_a_budget_that_is_used_up_is_stated_and_the_search_goes_on_from_there(sc
         asked(scene, 0.1, budget=1e-9)
     found, count = asked(scene, 0.1)
     assert count > 0
-    assert found.best.error <= 0.1
+    assert found.best_method.error <= 0.1
 
 
 @pytest.mark.parametrize("option", ["error", "horizon", "time_limit", "budget"])
@@ -165,8 +173,12 @@ def test_the_command_shows_what_it_predicts_and_what_it_measured(
     said = (told.out + told.err).splitlines()
     command = next(line for line in said if line.startswith("  springbench run "))
     _, _, config, *given = shlex.split(command)
-    options = {name[2:].replace("-", "_"): scalar(value) for name, value in zip(given[::2], given[1::2], strict=True)}
-    (run,) = load_any(Path(config), solvers=[options.pop("solver")], sizes=[options.pop("size")], **options).runs()
+    options = {
+        name[2:].replace("-", "_"): parse_scalar(value) for name, value in zip(given[::2], given[1::2], strict=True)
+    }
+    (run,) = load_config(
+        Path(config), solvers=[options.pop("solver")], sizes=[options.pop("size")], **options
+    ).list_runs()
     assert run.solver.name == "sparse"
     assert run.frames * run.scene.time_step == pytest.approx(0.2)
 
@@ -182,8 +194,8 @@ def test_a_scene_without_a_reference_is_refused_before_anything_is_measured(scen
 
 
 def test_compiling_counts_against_no_time_limit(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    spec = module._grid(scene, load_scene(scene), 4, 0.2, 60.0).work[0]
-    first, slow = [True], work.simulate
+    spec = module._build_study(scene, load_scene(scene), 4, 0.2, 60.0).work[0]
+    first, slow = [True], work.simulate_scene
 
     def simulate(*given: Any, **more: Any) -> Any:
         for step in slow(*given, **more):
@@ -192,17 +204,19 @@ def test_compiling_counts_against_no_time_limit(scene: Path, monkeypatch: pytest
             yield step
 
     monkeypatch.setattr(work, "simulate", simulate)
-    limited = replace(spec, how=replace(spec.how, time_limit=0.25))
-    row = work.work_rows(limited, trajectory_of(limited, references(scene.parent / "results")), lambda: None)[0]
+    limited = replace(spec, measurement=replace(spec.measurement, time_limit=0.25))
+    row = work.build_work_rows(
+        limited, load_reference_trajectory(limited, open_reference_store(scene.parent / "results")), lambda: None
+    )[0]
     assert row["status"] == "ok", row
     assert not first
 
 
 def test_steps_that_a_solver_takes_within_a_frame_are_printed() -> None:
     path = Path(__file__).parents[2] / "configs" / "scenes" / "chain.yaml"
-    spec = module._grid(path, load_scene(path), 4, 0.2, 60.0).work[0]
+    spec = module._build_study(path, load_scene(path), 4, 0.2, 60.0).work[0]
     spec = replace(spec, solver=SolverSpec("velocity-verlet", {}))
-    way = module.Recommended(spec, 1e-3, 1.0, "integrated", "1140 substeps of 2.9e-05 s")
+    way = module.MeasuredMethod(spec, 1e-3, 1.0, "integrated", "1140 substeps of 2.9e-05 s")
     assert str(way).startswith(f"solver {spec.solver.name}, 1140 substeps of 2.9e-05 s, in each frame of ")
     assert "time step" not in str(way)
 
@@ -210,9 +224,11 @@ def test_steps_that_a_solver_takes_within_a_frame_are_printed() -> None:
 def test_without_a_horizon_it_is_the_longest_at_which_the_error_can_be_measured(tmp_path: Path) -> None:
     path = Path(__file__).parents[2] / "configs" / "scenes" / "hanging-cloth.yaml"
     spec, said = load_scene(path), list[str]()
-    longest = module._longest(path, spec, 12, 1e-7, Store(tmp_path), said.append)
-    assert 0.5 < longest < module.HORIZON
+    longest = module._find_longest_t_end(path, spec, 12, 1e-7, ReferenceStore(tmp_path), said.append)
+    assert 0.5 < longest < module.DEFAULT_T_END
     assert f"up to {longest:g} s" in said[0]
-    assert module._longest(path, spec, 12, 1e-2, Store(tmp_path), said.append) == module.HORIZON
+    assert (
+        module._find_longest_t_end(path, spec, 12, 1e-2, ReferenceStore(tmp_path), said.append) == module.DEFAULT_T_END
+    )
     with pytest.raises(RunFailed, match="cannot be reached or measured"):
-        module._longest(path, spec, 12, 1e-14, Store(tmp_path), said.append)
+        module._find_longest_t_end(path, spec, 12, 1e-14, ReferenceStore(tmp_path), said.append)

@@ -14,12 +14,17 @@ from harness.base import rows
 from harness.cli import app
 from harness.config.load import load_scene
 from harness.config.sweep import SolverSpec
-from harness.experiments.accuracy.accuracy_rows import SCHEMA
-from harness.experiments.asked.known import known, problem, promising, way_rows
-from harness.experiments.asked.libraries import LIBRARIES
-from harness.experiments.asked.search import foresee, search
-from harness.experiments.asked.ways import Asked
-from harness.experiments.provenance import provenance
+from harness.experiments.accuracy.accuracy_rows import ACCURACY_SCHEMA
+from harness.experiments.asked.known import (
+    build_trial_rows,
+    format_problem_id,
+    read_stored_trials,
+    select_promising_methods,
+)
+from harness.experiments.asked.libraries import THIRD_PARTY_INTEGRATORS
+from harness.experiments.asked.search import compute_predictability_horizon, search_cheapest_method
+from harness.experiments.asked.ways import ErrorTarget
+from harness.experiments.provenance import build_provenance_columns
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
 
@@ -48,7 +53,7 @@ def rows_of(folder: Path, *options: str) -> list[dict[str, Any]]:
     given = ["run", str(SCENES / "chain.yaml"), "--size", "5", "--error", "1e-3", "--horizon", "0.2", *options]
     found = CliRunner().invoke(app, [*given, "--results", str(folder)])
     assert found.exit_code == 0, found.output
-    return rows.read((folder / "chain" / "accuracy").glob("*.parquet"), SCHEMA).to_pylist()
+    return rows.read_rows((folder / "chain" / "accuracy").glob("*.parquet"), ACCURACY_SCHEMA).to_pylist()
 
 
 def test_a_run_to_an_error_leaves_its_row_its_recording_and_its_positions(tmp_path):
@@ -66,28 +71,32 @@ def test_what_rows_measured_before_tell_to_be_dear_is_not_tried_again(tmp_path, 
     few = [("own", SolverSpec(name, {})) for name in ("velocity-verlet", "blanes-moan-4", "rodas")]  # the last is dear
     monkeypatch.setattr("harness.experiments.asked.ways.tried", lambda: few)
     monkeypatch.setattr("harness.experiments.asked.known.tried", lambda: few)
-    asked = Asked.of(load_scene(SCENES / "single-spring.yaml"), 2, 0.2)
-    seen = foresee(asked, 1e-3, lambda line: None)
-    answer = search(asked, 1e-3, seen, lambda line: None)
+    asked = ErrorTarget.from_scene(load_scene(SCENES / "single-spring.yaml"), 2, 0.2)
+    seen = compute_predictability_horizon(asked, 1e-3, lambda line: None)
+    answer = search_cheapest_method(asked, 1e-3, seen, lambda line: None)
     promises: dict[str, float] = {"velocity-verlet": 1.0, "blanes-moan-4": 1.9, "rodas": 2.1}
-    answer = replace(answer, tried=tuple((one, promises[one.way.solver]) for one, _ in answer.tried))
-    shared = {"problem": problem(asked), "asked": 1e-3} | provenance()
-    rows.write(tmp_path / "s-2-asked-0.001.parquet", [shared | row for row in way_rows(answer, [], 1e-3)], SCHEMA)
+    answer = replace(answer, trials=tuple((one, promises[one.method.solver]) for one, _ in answer.trials))
+    shared = {"problem": format_problem_id(asked), "asked": 1e-3} | build_provenance_columns()
+    rows.write_rows(
+        tmp_path / "s-2-asked-0.001.parquet",
+        [shared | row for row in build_trial_rows(answer, [], 1e-3)],
+        ACCURACY_SCHEMA,
+    )
 
-    found = known(tmp_path, asked)
-    assert promising(found, 4e-3) == (1e-3, few[:2])
-    assert promising(found, 2e-2) == (1e-3, [])
-    assert promising([], 1e-3)[1] == []
-    again = way_rows(replace(answer, tried=answer.tried[:1]), found, 1e-3)
+    found = read_stored_trials(tmp_path, asked)
+    assert select_promising_methods(found, 4e-3) == (1e-3, few[:2])
+    assert select_promising_methods(found, 2e-2) == (1e-3, [])
+    assert select_promising_methods([], 1e-3)[1] == []
+    again = build_trial_rows(replace(answer, trials=answer.trials[:1]), found, 1e-3)
     assert {row["solver"] for row in again} == set(promises), "what is not tried again is not forgotten"
-    assert not known(tmp_path, replace(asked, frames=asked.frames + 1))
+    assert not read_stored_trials(tmp_path, replace(asked, num_frames=asked.num_frames + 1))
     monkeypatch.setattr("harness.base.machine.code_hash", lambda: "other")
-    assert not known(tmp_path, asked)
+    assert not read_stored_trials(tmp_path, asked)
 
 
 @pytest.mark.long
 def test_peers_have_rows_beside_it(tmp_path):
     beside = [row for row in rows_of(tmp_path, "--peers") if row["kind"] == "peer"]
-    assert [peer["solver"] for peer in beside] == list(LIBRARIES)
+    assert [peer["solver"] for peer in beside] == list(THIRD_PARTY_INTEGRATORS)
     assert all(peer["reason"] or peer["estimated"] <= 1e-3 for peer in beside)
     assert [peer["status"] for peer in beside][:2] == ["ok", "ok"]

@@ -12,36 +12,42 @@ import pytest
 from harness.base.errors import RunFailed
 from harness.config.load import load_scene
 from harness.experiments.asked import ways as module
-from harness.experiments.asked.halving import halved
-from harness.experiments.asked.libraries import pattern
-from harness.experiments.asked.search import foresee, search
-from harness.experiments.asked.ways import Asked, tried, ways
-from harness.reference.growth import growth
-from harness.reference.motion import Field, moving
-from harness.reference.store import Store
-from harness.reference.trajectory import PERTURBATION, RTOL, Unpredictable, _dop853, integrate
-from harness.scenes.bind import Scene, build
-from harness.scenes.effects.air_drag import AirDrag
-from harness.scenes.effects.contact import Contact
-from harness.scenes.effects.dashpots import Dashpots
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
+from harness.experiments.asked.halving import estimate_by_step_doubling
+from harness.experiments.asked.libraries import build_jacobian_sparsity
+from harness.experiments.asked.search import compute_predictability_horizon, search_cheapest_method
+from harness.experiments.asked.ways import ErrorTarget, list_candidate_methods, prepare_candidate_methods
+from harness.reference.growth import estimate_growth
+from harness.reference.motion import OdeField, build_ode_scene
+from harness.reference.store import ReferenceStore
+from harness.reference.trajectory import (
+    CHECK_PERTURBATION,
+    INTEGRATION_RTOL,
+    UnpredictableMotion,
+    _integrate_dop853,
+    integrate_motion,
+)
+from harness.scenes.bind import Scene, build_scene
+from harness.scenes.effects.air_drag import AirDragEffect
+from harness.scenes.effects.contact import ContactEffect
+from harness.scenes.effects.dashpots import DashpotsEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
 from harness.scenes.spec import SceneSpec
-from harness.simulation.controlled import Implicit, Stuck, hermite
-from harness.simulation.own_steps import Own, OwnEven
-from harness.simulation.step import prepare, simulate
+from harness.simulation.controlled import AdaptiveImplicitStepper, StepSizeUnderflow, interpolate_hermite
+from harness.simulation.own_steps import AdaptiveSubstepper, FixedSubstepper
+from harness.simulation.step import prepare, simulate_scene
 from solvers.integrators import Motion
 from solvers.methods.explicit import VelocityVerlet
-from solvers.methods.newton import Newton
+from solvers.methods.newton import NewtonSolver
 from solvers.methods.rosenbrock import Rodas
 from solvers.problem import StopRule
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
-HELD = Pins(at=("first",), weight="exact")
-MOVED = Pins.model_validate(
+HELD = PinsEffect(at=("first",), weight="exact")
+MOVED = PinsEffect.model_validate(
     {"at": ["first"], "weight": "exact", "motion": {"keys": [{"time": 0.0}, {"time": 1.0, "offset": [0.5, 1.0, 0.0]}]}}
 )
 END, FRAMES = 0.5, 10
@@ -51,57 +57,62 @@ OWN = ["velocity-verlet", "blanes-moan-4", "blanes-moan-6", "tsitouras-5", "dorm
 
 def chain(*effects: Any, size: int = 5) -> SceneSpec:
     """Of 1 kg, thrown."""
-    given = {"mesh": Chain(), "effects": effects, "velocity": (0.5, 1.0, 2.0), "time_step": END / FRAMES}
+    given = {"mesh": ChainMesh(), "effects": effects, "velocity": (0.5, 1.0, 2.0), "time_step": END / FRAMES}
     return SceneSpec(mass=1.0, frames=FRAMES, path=Path("scene.yaml"), default_size=size, **given)
 
 
-def implicit(spec: SceneSpec, integrator: str, forces: tuple[Any, ...] = ()) -> Implicit:
+def implicit(spec: SceneSpec, integrator: str, forces: tuple[Any, ...] = ()) -> AdaptiveImplicitStepper:
     def bound(h: float) -> Scene:
-        return replace(build(spec.stepped(h), 5, integrator), forces=forces)
+        return replace(build_scene(spec.with_time_step(h), 5, integrator), varying_forces=forces)
 
-    return Implicit(bound, Newton(), END, FRAMES)
+    return AdaptiveImplicitStepper(bound, NewtonSolver(), END, FRAMES)
 
 
-SWINGING = chain(Springs(stretch=40.0), Gravity(), HELD)
+SWINGING = chain(SpringsEffect(stretch=40.0), GravityEffect(), HELD)
 
 
 @pytest.mark.parametrize("integrator", ["tr-bdf2", "esdirk-3", "esdirk-4", "sdirk-4"])
 def test_a_closer_tolerance_gives_a_smaller_error_by_more_steps_and_few_factors(integrator):
-    truth = integrate(build(SWINGING, 5, "own"), [END])
-    paths = [implicit(SWINGING, integrator).follow(tolerance) for tolerance in (1e-3, 1e-6)]
-    coarse, fine = (truth.error(0, path.positions[-1]) for path in paths)
+    truth = integrate_motion(build_scene(SWINGING, 5, "own"), [END])
+    paths = [implicit(SWINGING, integrator).integrate_motion(tolerance) for tolerance in (1e-3, 1e-6)]
+    coarse, fine = (truth.measure_error(0, path.positions[-1]) for path in paths)
     assert fine < 0.1 * coarse  # a thousandth to the power 3/4 or 2/3 is a hundredth, steps being halves
     assert fine < 1e-3
     for path in paths:
         assert path.positions.shape == (FRAMES + 1, 5, 3)
-        assert path.factorisations <= 1 + np.log2(path.steps[1] / path.steps[0]) + path.rejected
-        assert path.accepted >= END / path.steps[1]
+        assert (
+            path.num_factorisations
+            <= 1 + np.log2(path.step_size_range[1] / path.step_size_range[0]) + path.num_rejected_steps
+        )
+        assert path.num_accepted_steps >= END / path.step_size_range[1]
 
 
 def test_a_tolerance_is_changed_by_the_order_of_a_step():
     """Errors of steps are of order h^(k + 1), those of the end of h^k."""
     way = implicit(SWINGING, "esdirk-4")
-    assert way.changed(1e-3, 0.1) == pytest.approx(10.0**-4.25)
-    assert way.changed(1e-3, 0.1, 1.0) == pytest.approx(1e-5)
+    assert way.scale_setting(1e-3, 0.1) == pytest.approx(10.0**-4.25)
+    assert way.scale_setting(1e-3, 0.1, 1.0) == pytest.approx(1e-5)
 
 
 def test_frames_lie_on_the_motion_though_steps_are_longer_than_they_are():
-    path = implicit(SWINGING, "esdirk-4").follow(3e-4)
-    assert path.steps[1] > END / FRAMES
-    truth = integrate(build(SWINGING, 5, "own"), list(np.linspace(0.0, END, FRAMES + 1)[1:]))
+    path = implicit(SWINGING, "esdirk-4").integrate_motion(3e-4)
+    assert path.step_size_range[1] > END / FRAMES
+    truth = integrate_motion(build_scene(SWINGING, 5, "own"), list(np.linspace(0.0, END, FRAMES + 1)[1:]))
     away = np.abs(path.positions[1:] - truth.positions).max()
     assert away < 0.03 * np.abs(truth.positions[-1] - path.positions[0]).max()  # h^4/384 of a cubic, and its tolerance
 
 
 def test_steps_grow_again_after_what_made_them_short():
     """Dashpots stop the throw within a thousandth of a second; what is left is slow."""
-    path = implicit(chain(Springs(stretch=40.0), Dashpots(stretch=100.0), Gravity(), HELD), "esdirk-4").follow(1e-5)
-    assert path.steps[1] >= 16 * path.steps[0]
-    assert path.accepted < 100
+    path = implicit(
+        chain(SpringsEffect(stretch=40.0), DashpotsEffect(stretch=100.0), GravityEffect(), HELD), "esdirk-4"
+    ).integrate_motion(1e-5)
+    assert path.step_size_range[1] >= 16 * path.step_size_range[0]
+    assert path.num_accepted_steps < 100
 
 
 def test_the_same_motion_has_the_same_bits():
-    one, two = (implicit(SWINGING, "esdirk-4").follow(1e-5) for _ in "ab")
+    one, two = (implicit(SWINGING, "esdirk-4").integrate_motion(1e-5) for _ in "ab")
     np.testing.assert_array_equal(one.positions, two.positions)
 
 
@@ -110,9 +121,9 @@ def test_a_step_below_the_floor_ends_with_the_frame_the_cause_and_what_was_reach
         return np.full_like(p, np.nan if t > 0.22 else 0.0)
 
     with pytest.raises(
-        Stuck, match=r"frame 5, after 0\.2\d+ s: even a step of .* not solved; up to there \d+ steps kept"
+        StepSizeUnderflow, match=r"frame 5, after 0\.2\d+ s: even a step of .* not solved; up to there \d+ steps kept"
     ):
-        implicit(chain(Springs(stretch=40.0), HELD), "esdirk-4", (breaks,)).follow(1e-3)
+        implicit(chain(SpringsEffect(stretch=40.0), HELD), "esdirk-4", (breaks,)).integrate_motion(1e-3)
 
 
 def test_hermites_cubic_is_exact_for_cubics():
@@ -122,7 +133,7 @@ def test_hermites_cubic_is_exact_for_cubics():
     def at(t: float) -> Motion:
         return Motion(c[0] + t * (c[1] + t * (c[2] + t * c[3])), c[1] + t * (2.0 * c[2] + 3.0 * t * c[3]))
 
-    found = hermite(at(0.5), at(2.0), 1.5, 0.3)
+    found = interpolate_hermite(at(0.5), at(2.0), 1.5, 0.3)
     # Some roundings of numbers near 10.
     np.testing.assert_allclose(found, at(0.95).positions, rtol=0, atol=1e-13)
 
@@ -132,37 +143,44 @@ def test_hermites_cubic_is_exact_for_cubics():
 def test_the_error_is_never_above_the_one_that_was_asked_for_whichever_way_wins(
     scene, size, horizon, error, monkeypatch
 ):
-    asked = Asked.of(load_scene(SCENES / f"{scene}.yaml"), size, horizon)
+    asked = ErrorTarget.from_scene(load_scene(SCENES / f"{scene}.yaml"), size, horizon)
     told = list[str]()
-    seen, truth = foresee(asked, error, told.append), integrate(asked.bound(asked.frame, "own"), [horizon])
-    for way in ways(asked, told.append):
+    seen, truth = (
+        compute_predictability_horizon(asked, error, told.append),
+        integrate_motion(asked.build_scene(asked.frame_seconds, "own"), [horizon]),
+    )
+    for way in prepare_candidate_methods(asked, told.append):
         monkeypatch.setattr("harness.experiments.asked.search.ways", lambda *_, way=way: [way])
-        found = search(asked, error, seen, told.append).best
-        true = truth.error(0, found.path.positions[-1])
-        assert true <= found.estimated <= error, found.way
+        found = search_cheapest_method(asked, error, seen, told.append).best_trial
+        true = truth.measure_error(0, found.trajectory.positions[-1])
+        assert true <= found.error_estimated <= error, found.method
         # The doubt, and the closer tolerance, which no estimate is below.
-        assert found.estimated <= 1.5 * true + 0.02 * error, found.way
+        assert found.error_estimated <= 1.5 * true + 0.02 * error, found.method
     assert any("an error of" in line for line in told)
 
 
 def steps_of(spec: SceneSpec, size: int) -> list[Any]:
-    scene = build(spec, size, "own")
-    return [*simulate(scene, prepare(scene, VelocityVerlet()), StopRule(1), first_guess="current", frames=10)]
+    scene = build_scene(spec, size, "own")
+    return [*simulate_scene(scene, prepare(scene, VelocityVerlet()), StopRule(1), initial_guess="current", frames=10)]
 
 
 def perturbed(spec: SceneSpec, size: int, times: list[float]) -> np.ndarray:
     """What 1e-12 of the size at the start becomes, relative to the displacement, by the reference's own method."""
-    field = Field(moving(spec, size))
-    begun, half, length = field.start, len(field.start) // 2, build(spec, size).mesh.size or 1.0
+    field = OdeField(build_ode_scene(spec, size))
+    begun, half, length = (
+        field.initial_state,
+        len(field.initial_state) // 2,
+        build_scene(spec, size).mesh.bounding_box_diagonal or 1.0,
+    )
     nudge = np.zeros_like(begun)
-    nudge[:half] = PERTURBATION * length * np.random.default_rng(0).choice([-1.0, 1.0], half)
-    one, two = (_dop853(field, y, times, RTOL * length) for y in (begun, begun + nudge))
+    nudge[:half] = CHECK_PERTURBATION * length * np.random.default_rng(0).choice([-1.0, 1.0], half)
+    one, two = (_integrate_dop853(field, y, times, INTEGRATION_RTOL * length) for y in (begun, begun + nudge))
     return np.linalg.norm((two - one)[:, :half], axis=1) / np.linalg.norm((one - begun)[:, :half], axis=1)
 
 
 CRUMPLING = SceneSpec(
-    mesh=Grid(),
-    effects=(Springs(stretch=300.0, shear=60.0), Gravity(), Pins(at=("top_corners",), weight="exact")),
+    mesh=GridMesh(),
+    effects=(SpringsEffect(stretch=300.0, shear=60.0), GravityEffect(), PinsEffect(at=("top_corners",), weight="exact")),
     mass=0.3, time_step=1 / 30, frames=60, path=Path("cloth.yaml"), default_size=9,
 )  # fmt: skip
 
@@ -171,67 +189,84 @@ CRUMPLING = SceneSpec(
     ("spec", "size", "end"),
     [
         (CRUMPLING, 7, 1.0),
-        (chain(Springs(stretch=40.0), Gravity(), AirDrag(law="quadratic", coefficient=0.5), HELD), 5, 0.5),
-        (chain(Springs(stretch=40.0), Gravity(), MOVED), 5, 0.3),
+        (
+            chain(SpringsEffect(stretch=40.0), GravityEffect(), AirDragEffect(law="quadratic", coefficient=0.5), HELD),
+            5,
+            0.5,
+        ),
+        (chain(SpringsEffect(stretch=40.0), GravityEffect(), MOVED), 5, 0.3),
     ],
     ids=["crumpling", "drag", "moving pin"],
 )
 def test_the_estimated_growth_is_that_of_perturbed_integrations(spec, size, end):
-    found = growth(spec, size, end)
+    found = estimate_growth(spec, size, end)
     times = [float(t) for t in found.times[5::10]]
-    np.testing.assert_allclose(found.at(times), perturbed(spec, size, times), rtol=0.5)  # over some orders of magnitude
+    np.testing.assert_allclose(
+        found.interpolate_growth(times), perturbed(spec, size, times), rtol=0.5
+    )  # over some orders of magnitude
 
 
 def test_growth_does_not_depend_on_the_time_step_and_ends_where_nothing_is_known():
-    one, other = (growth(CRUMPLING.stepped(h), 9, 3.0) for h in (1 / 30, 1 / 240))
-    np.testing.assert_array_equal(one.grown, other.grown)
-    assert one.grown[-1] == 1.0
-    assert (np.diff(one.grown >= 1.0) >= 0).all()
+    one, other = (estimate_growth(CRUMPLING.with_time_step(h), 9, 3.0) for h in (1 / 30, 1 / 240))
+    np.testing.assert_array_equal(one.growth_factor, other.growth_factor)
+    assert one.growth_factor[-1] == 1.0
+    assert (np.diff(one.growth_factor >= 1.0) >= 0).all()
 
 
 def test_a_refusal_names_the_longest_horizon_that_works(tmp_path):
-    asked, error = Asked.of(CRUMPLING, 7, 1.6), 1e-7
-    with pytest.raises(Unpredictable, match=r"after 1.6 s .* a --horizon of [\d.]+ s or less") as refused:
-        foresee(asked, error, lambda line: None)
+    asked, error = ErrorTarget.from_scene(CRUMPLING, 7, 1.6), 1e-7
+    with pytest.raises(UnpredictableMotion, match=r"after 1.6 s .* a --horizon of [\d.]+ s or less") as refused:
+        compute_predictability_horizon(asked, error, lambda line: None)
     horizon = float(str(refused.value).rpartition("--horizon of ")[2].split()[0])
     assert 0.3 < horizon < 1.6
-    foresee(Asked.of(CRUMPLING, 7, horizon), error, lambda line: None)
-    kept = Store(tmp_path)
-    assert kept.trajectory(CRUMPLING, 7, [horizon], error=error).growth[0] <= 0.1 * error
-    with pytest.raises(Unpredictable, match=f"a --horizon of {horizon:g} s or less"):
-        kept.trajectory(CRUMPLING, 7, [1.6], error=error)
+    compute_predictability_horizon(ErrorTarget.from_scene(CRUMPLING, 7, horizon), error, lambda line: None)
+    kept = ReferenceStore(tmp_path)
+    assert kept.load_trajectory(CRUMPLING, 7, [horizon], error=error).growth[0] <= 0.1 * error
+    with pytest.raises(UnpredictableMotion, match=f"a --horizon of {horizon:g} s or less"):
+        kept.load_trajectory(CRUMPLING, 7, [1.6], error=error)
 
 
 def test_an_error_below_round_off_is_refused_with_the_one_that_can_be_had():
-    pendulum = Asked.of(load_scene(SCENES / "single-spring.yaml"), 2, 1.0)
-    assert growth(pendulum.scene, 2, 1.0).least < 1e-9  # 1e-12 of the size grows with the time, and no faster
-    with pytest.raises(Unpredictable, match=r"error of 1e-14 cannot .*; ask for an --error of \de-1[0-2] or more"):
-        foresee(pendulum, 1e-14, lambda line: None)
+    pendulum = ErrorTarget.from_scene(load_scene(SCENES / "single-spring.yaml"), 2, 1.0)
+    assert (
+        estimate_growth(pendulum.scene, 2, 1.0).min_error < 1e-9
+    )  # 1e-12 of the size grows with the time, and no faster
+    with pytest.raises(
+        UnpredictableMotion, match=r"error of 1e-14 cannot .*; ask for an --error of \de-1[0-2] or more"
+    ):
+        compute_predictability_horizon(pendulum, 1e-14, lambda line: None)
 
 
 def test_what_only_round_off_moves_is_at_rest(tmp_path):
     """A flat cloth without a load, pinned at its corners."""
-    spec = CRUMPLING.model_copy(update={"effects": (Springs(stretch=10.0), Pins(at=("corners",), weight="exact"))})
+    spec = CRUMPLING.model_copy(
+        update={"effects": (SpringsEffect(stretch=10.0), PinsEffect(at=("corners",), weight="exact"))}
+    )
     assert len({step.positions.tobytes() for step in steps_of(spec, 5)}) > 1, "round-off does move it"
     for ask in (
-        lambda: foresee(Asked.of(spec, 5, 1.0), 1e-3, lambda line: None),
-        lambda: Store(tmp_path).trajectory(spec, 5, [1.0], error=1e-3),
+        lambda: compute_predictability_horizon(ErrorTarget.from_scene(spec, 5, 1.0), 1e-3, lambda line: None),
+        lambda: ReferenceStore(tmp_path).load_trajectory(spec, 5, [1.0], error=1e-3),
     ):
-        with pytest.raises(Unpredictable, match="nothing moves up to the horizon"):
+        with pytest.raises(UnpredictableMotion, match="nothing moves up to the horizon"):
             ask()
 
 
 def test_the_pattern_of_the_jacobian_holds_all_that_differs_from_zero():
-    scene = build(chain(Springs(stretch=40.0), Dashpots(stretch=1.0), Gravity(), HELD), 5, "newmark")
-    field = Field(scene)
-    y, found = field.start + 0.1 * np.random.default_rng(2).normal(size=24), pattern(scene).toarray() > 0
+    scene = build_scene(
+        chain(SpringsEffect(stretch=40.0), DashpotsEffect(stretch=1.0), GravityEffect(), HELD), 5, "newmark"
+    )
+    field = OdeField(scene)
+    y, found = (
+        field.initial_state + 0.1 * np.random.default_rng(2).normal(size=24),
+        build_jacobian_sparsity(scene).toarray() > 0,
+    )
     changes = np.array([field(0.0, y + step) - field(0.0, y) for step in 1e-4 * np.eye(24)]).T
     assert (found | (np.abs(changes) < 1e-14)).all()  # round-off of forces of some newtons
     assert not found.all()
 
 
 def test_ways_are_what_solvers_and_integrators_say_of_themselves():
-    assert {(integrator, solver.name) for integrator, solver in tried()} == {
+    assert {(integrator, solver.name) for integrator, solver in list_candidate_methods()} == {
         *((integrator, solver) for solver in ("lbfgs", "newton") for integrator in ("esdirk-4", "midpoint")),
         *(("own", solver) for solver in OWN),
     }
@@ -241,14 +276,14 @@ def test_ways_are_what_solvers_and_integrators_say_of_themselves():
     ("effect", "what"),
     [
         (MOVED, "moving pins"),
-        (AirDrag(law="quadratic", coefficient=0.5), "forces of place, speed and time"),
+        (AirDragEffect(law="quadratic", coefficient=0.5), "forces of place, speed and time"),
     ],
 )
 def test_methods_that_would_lose_their_order_without_telling_are_named_with_the_reason(effect, what):
     held = () if effect is MOVED else (HELD,)
-    told, asked = list[str](), Asked(chain(Springs(stretch=40.0), effect, *held), 5, 0.1, 2)
-    found = ways(asked, told.append)
-    assert {way.solver: way.follower.order for way in found if way.integrator == "own"} == dict.fromkeys(OWN[:3], 1)
+    told, asked = list[str](), ErrorTarget(chain(SpringsEffect(stretch=40.0), effect, *held), 5, 0.1, 2)
+    found = prepare_candidate_methods(asked, told.append)
+    assert {way.solver: way.stepper.order for way in found if way.integrator == "own"} == dict.fromkeys(OWN[:3], 1)
     assert {way.integrator for way in found} == {"own", "esdirk-4", "midpoint"}
     assert [line.split(":")[0].removeprefix("  not by ") for line in told] == OWN[3:]
     assert all(what in line for line in told)
@@ -257,57 +292,74 @@ def test_methods_that_would_lose_their_order_without_telling_are_named_with_the_
 def test_steps_of_one_length_are_no_longer_than_is_stable_and_as_short_as_the_error_asks_for():
     """Of order 2: the step that a hundredth of the error asks for is a tenth."""
     even, truth = (
-        OwnEven(build(SWINGING, 5, "own"), VelocityVerlet(), FRAMES, lambda h: build(SWINGING.stepped(h), 5, "own")),
-        integrate(build(SWINGING, 5, "own"), [END]),
+        FixedSubstepper(
+            build_scene(SWINGING, 5, "own"),
+            VelocityVerlet(),
+            FRAMES,
+            lambda h: build_scene(SWINGING.with_time_step(h), 5, "own"),
+        ),
+        integrate_motion(build_scene(SWINGING, 5, "own"), [END]),
     )
-    assert even.first(1e-3) == even.changed(1.0, 100.0) == 1.0
-    assert even.changed(4.0, 0.01) == pytest.approx(40.0)
-    coarse, fine = (even.follow(setting) for setting in (4.0, even.changed(4.0, 0.01)))
-    assert fine.accepted == pytest.approx(10 * coarse.accepted, rel=0.1)  # whole numbers of steps in a frame
-    errors = [truth.error(0, path.positions[-1]) for path in (coarse, fine)]
+    assert even.initial_setting(1e-3) == even.scale_setting(1.0, 100.0) == 1.0
+    assert even.scale_setting(4.0, 0.01) == pytest.approx(40.0)
+    coarse, fine = (even.integrate_motion(setting) for setting in (4.0, even.scale_setting(4.0, 0.01)))
+    assert fine.num_accepted_steps == pytest.approx(
+        10 * coarse.num_accepted_steps, rel=0.1
+    )  # whole numbers of steps in a frame
+    errors = [truth.measure_error(0, path.positions[-1]) for path in (coarse, fine)]
     assert errors[1] == pytest.approx(0.01 * errors[0], rel=0.2)
 
 
 def test_forces_of_the_speed_are_even_within_pieces_of_a_frame_as_short_as_the_error_asks_for():
-    spec = chain(Springs(stretch=40.0), AirDrag(law="quadratic", coefficient=0.5), HELD)
-    even = OwnEven(build(spec, 5, "own"), VelocityVerlet(), FRAMES, lambda h: build(spec.stepped(h), 5, "own"))
-    truth = integrate(build(spec, 5, "own"), [END])
-    assert even.changed(2.0, 0.25) == 8.0
-    coarse, fine = (even.follow(setting) for setting in (2.0, 16.0))
+    spec = chain(SpringsEffect(stretch=40.0), AirDragEffect(law="quadratic", coefficient=0.5), HELD)
+    even = FixedSubstepper(
+        build_scene(spec, 5, "own"), VelocityVerlet(), FRAMES, lambda h: build_scene(spec.with_time_step(h), 5, "own")
+    )
+    truth = integrate_motion(build_scene(spec, 5, "own"), [END])
+    assert even.scale_setting(2.0, 0.25) == 8.0
+    coarse, fine = (even.integrate_motion(setting) for setting in (2.0, 16.0))
     assert coarse.positions.shape == fine.positions.shape == (FRAMES + 1, 5, 3)
-    errors = [truth.error(0, path.positions[-1]) for path in (coarse, fine)]
+    errors = [truth.measure_error(0, path.positions[-1]) for path in (coarse, fine)]
     assert errors[1] < errors[0] / 7  # an eighth of what is of order 1, less of what the substeps leave
 
 
 def test_a_rosenbrock_method_keeps_to_an_error_that_is_asked_for():
-    truth = integrate(build(SWINGING, 5, "own"), [END])
-    scene = build(SWINGING, 5, "own")
-    coarse, fine = (Own(scene, Rodas(), FRAMES).follow(tolerance) for tolerance in (1e-3, 1e-6))
-    assert fine.accepted > coarse.accepted
-    assert [path.factorisations for path in (coarse, fine)] == [p.accepted + p.rejected for p in (coarse, fine)]
-    assert truth.error(0, fine.positions[-1]) < 0.1 * truth.error(0, coarse.positions[-1])
+    truth = integrate_motion(build_scene(SWINGING, 5, "own"), [END])
+    scene = build_scene(SWINGING, 5, "own")
+    coarse, fine = (
+        AdaptiveSubstepper(scene, Rodas(), FRAMES).integrate_motion(tolerance) for tolerance in (1e-3, 1e-6)
+    )
+    assert fine.num_accepted_steps > coarse.num_accepted_steps
+    assert [path.num_factorisations for path in (coarse, fine)] == [
+        p.num_accepted_steps + p.num_rejected_steps for p in (coarse, fine)
+    ]
+    assert truth.measure_error(0, fine.positions[-1]) < 0.1 * truth.measure_error(0, coarse.positions[-1])
 
 
 def test_drag_that_grows_with_the_square_of_the_speed_is_graded_too(tmp_path):
     """As a force: where frames split, it is a filter, which has no equation of motion."""
-    spec = chain(Springs(stretch=40.0), AirDrag(law="quadratic", coefficient=0.5), HELD)
-    found = Store(tmp_path).trajectory(spec, 5, [0.1], error=1e-3)
-    asked = Asked(spec, 5, 0.1, 2)
-    path = Implicit(lambda h: asked.bound(h, "esdirk-4"), Newton(), asked.horizon, asked.frames).follow(1e-6)
-    assert found.error(0, path.positions[-1]) < 1e-3
+    spec = chain(SpringsEffect(stretch=40.0), AirDragEffect(law="quadratic", coefficient=0.5), HELD)
+    found = ReferenceStore(tmp_path).load_trajectory(spec, 5, [0.1], error=1e-3)
+    asked = ErrorTarget(spec, 5, 0.1, 2)
+    path = AdaptiveImplicitStepper(
+        lambda h: asked.build_scene(h, "esdirk-4"), NewtonSolver(), asked.t_end, asked.num_frames
+    ).integrate_motion(1e-6)
+    assert found.measure_error(0, path.positions[-1]) < 1e-3
 
 
 def test_contact_is_refused_with_what_can_be_had(monkeypatch):
     """Which is the difference that halving the steps makes: half as much each time, for the order is 1."""
-    floor = Contact.model_validate({"obstacles": [{"kind": "plane", "point": [0.0, -9.0, 0.0]}]})
-    spec = chain(Springs(stretch=40.0), Gravity(), HELD, floor)
+    floor = ContactEffect.model_validate({"obstacles": [{"kind": "plane", "point": [0.0, -9.0, 0.0]}]})
+    spec = chain(SpringsEffect(stretch=40.0), GravityEffect(), HELD, floor)
     monkeypatch.setattr(module, "_SPENT", 0.5)
     with pytest.raises(RunFailed, match=r"contact begins and ends within steps.*steps of .* s end within .* of where"):
-        Asked.of(spec, 5, END)
-    asked = Asked(chain(Springs(stretch=40.0), Gravity(), HELD), 5, END, FRAMES)
-    found = halved(asked.bound, END, FRAMES, seconds=0.5)
-    error = integrate(asked.bound(asked.frame, "own"), [END]).error
-    scene, steps = asked.bound(found.step, "implicit-euler"), round(END / found.step)
-    path = simulate(scene, prepare(scene, Newton()), StopRule(50, 1e-9), first_guess="current", frames=steps)
+        ErrorTarget.from_scene(spec, 5, END)
+    asked = ErrorTarget(chain(SpringsEffect(stretch=40.0), GravityEffect(), HELD), 5, END, FRAMES)
+    found = estimate_by_step_doubling(asked.build_scene, END, FRAMES, time_budget=0.5)
+    error = integrate_motion(asked.build_scene(asked.frame_seconds, "own"), [END]).measure_error
+    scene, steps = asked.build_scene(found.time_step, "implicit-euler"), round(END / found.time_step)
+    path = simulate_scene(
+        scene, prepare(scene, NewtonSolver()), StopRule(50, 1e-9), initial_guess="current", frames=steps
+    )
     true = error(0, [step.positions for step in path][-1])
-    assert found.moved == pytest.approx(0.5 * true, rel=0.3)  # h - h/2, and what is of order 2
+    assert found.relative_change == pytest.approx(0.5 * true, rel=0.3)  # h - h/2, and what is of order 2

@@ -10,18 +10,25 @@ import numba
 import numpy as np
 import pytest
 
-from harness.config.load import scene_from_assignment
-from harness.scenes.bind import Scene, build
-from harness.simulation.step import FIRST_GUESSES
-from solvers.core.prefactored import only_springs
-from solvers.linear.choice import Linear
+from harness.config.load import convert_assignment_scene
+from harness.scenes.bind import Scene, build_scene
+from harness.simulation.step import INITIAL_GUESSES
+from solvers.core.prefactored import require_only_springs
+from solvers.linear.choice import LinearSolverName
 from solvers.methods.local_global import DenseLocalGlobal
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, Solver
-from tests.scenes import BACKENDS, SCENES, THREADS, first_problem, random_problem, trajectory
+from tests.scenes import (
+    LOCAL_GLOBAL_BACKENDS,
+    SCENE_BUILDERS,
+    THREAD_COUNT,
+    build_first_problem,
+    build_random_problem,
+    simulate_trajectory,
+)
 
-FORCED: tuple[Linear, ...] = ("inverse", "cholespy", "supernodal", "cg")
-WAYS: tuple[Solver, ...] = (*BACKENDS, *(CompiledLocalGlobal(linear) for linear in FORCED))
+FORCED: tuple[LinearSolverName, ...] = ("inverse", "cholespy", "supernodal", "cg")
+WAYS: tuple[Solver, ...] = (*LOCAL_GLOBAL_BACKENDS, *(CompiledLocalGlobal(linear) for linear in FORCED))
 """The backends, and the compiled one with every linear solver that it could choose."""
 
 AGREEMENT = 1e-10
@@ -38,7 +45,7 @@ ASSIGNMENT = Path(__file__).resolve().parents[3] / "shared" / "scenes"
 
 small = pytest.mark.parametrize("name", SMALL)
 pins = pytest.mark.parametrize("weight", WEIGHTS.values(), ids=list(WEIGHTS))
-first_guesses = pytest.mark.parametrize("first_guess", FIRST_GUESSES)
+first_guesses = pytest.mark.parametrize("first_guess", INITIAL_GUESSES)
 
 
 def apart(found: list[Positions]) -> float:
@@ -54,39 +61,50 @@ def after_iterations(backend: Solver, problem, count: int) -> Positions:
 @small
 @pins
 def test_backends_agree_after_a_hundred_steps(name, weight):
-    made = SCENES[name](weight)
-    assert apart([trajectory(made, backend, 100) for backend in WAYS]) <= AGREEMENT * made.mesh.size
+    made = SCENE_BUILDERS[name](weight)
+    assert (
+        apart([simulate_trajectory(made, backend, 100) for backend in WAYS])
+        <= AGREEMENT * made.mesh.bounding_box_diagonal
+    )
 
 
 @pins
 @first_guesses
 def test_backends_agree_from_every_first_guess(weight, first_guess):
-    made = SCENES["cloth"](weight)
-    found = [trajectory(made, backend, 20, first_guess=first_guess) for backend in WAYS]
-    assert apart(found) <= AGREEMENT * made.mesh.size
+    made = SCENE_BUILDERS["cloth"](weight)
+    found = [simulate_trajectory(made, backend, 20, initial_guess=first_guess) for backend in WAYS]
+    assert apart(found) <= AGREEMENT * made.mesh.bounding_box_diagonal
 
 
 @pytest.mark.parametrize("name", LARGE)
 @pins
 def test_backends_agree_on_a_step_of_a_large_scene(name, weight):
-    made = SCENES[name](weight)
-    problem = first_problem(made)
-    assert apart([after_iterations(backend, problem, 15) for backend in WAYS]) <= AGREEMENT * made.mesh.size
+    made = SCENE_BUILDERS[name](weight)
+    problem = build_first_problem(made)
+    assert (
+        apart([after_iterations(backend, problem, 15) for backend in WAYS])
+        <= AGREEMENT * made.mesh.bounding_box_diagonal
+    )
 
 
-@pytest.mark.parametrize("name", [SLOW if name == "stiff-cloth" else name for name in SCENES])
+@pytest.mark.parametrize("name", [SLOW if name == "stiff-cloth" else name for name in SCENE_BUILDERS])
 def test_backends_agree_from_random_positions(name):
-    made = SCENES[name](1e10)
-    problem = first_problem(made)
+    made = SCENE_BUILDERS[name](1e10)
+    problem = build_first_problem(made)
     rng = np.random.default_rng(0)
-    guess = problem.current + 0.3 * made.mesh.size * rng.normal(size=problem.current.shape)
-    problem = replace(problem, first_guess=guess)
-    assert apart([after_iterations(backend, problem, 10) for backend in WAYS]) <= AGREEMENT * made.mesh.size
+    guess = problem.current_positions + 0.3 * made.mesh.bounding_box_diagonal * rng.normal(
+        size=problem.current_positions.shape
+    )
+    problem = replace(problem, initial_guess=guess)
+    assert (
+        apart([after_iterations(backend, problem, 10) for backend in WAYS])
+        <= AGREEMENT * made.mesh.bounding_box_diagonal
+    )
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_backends_agree_on_random_networks(seed):
-    problem = random_problem(seed)
+    problem = build_random_problem(seed)
     assert apart([after_iterations(backend, problem, 30) for backend in WAYS]) <= AGREEMENT
 
 
@@ -94,26 +112,26 @@ def test_backends_agree_on_random_networks(seed):
 @pytest.mark.parametrize("name", ["single-spring-horizontal", "horizontal-chain", "net"])
 def test_backends_agree_on_the_assignments_small_scenes(name):
     made = assignment_scene(name)
-    found = [trajectory(made, backend, 100, first_guess="assignment") for backend in WAYS]
-    assert apart(found) <= AGREEMENT * made.mesh.size
+    found = [simulate_trajectory(made, backend, 100, initial_guess="assignment") for backend in WAYS]
+    assert apart(found) <= AGREEMENT * made.mesh.bounding_box_diagonal
 
 
 @pytest.mark.skipif(not ASSIGNMENT.is_dir(), reason="the assignment's scenes are not beside the repository")
 @pytest.mark.long
 def test_all_but_the_dense_backend_agree_on_the_assignments_flag():
     made = assignment_scene("flag")
-    found = [trajectory(made, backend, 12, first_guess="assignment") for backend in WAYS[1:]]
-    assert apart(found) <= AGREEMENT * made.mesh.size
+    found = [simulate_trajectory(made, backend, 12, initial_guess="assignment") for backend in WAYS[1:]]
+    assert apart(found) <= AGREEMENT * made.mesh.bounding_box_diagonal
 
 
 def assignment_scene(name: str) -> Scene:
-    return build(scene_from_assignment(ASSIGNMENT / f"{name}.json"), 0)
+    return build_scene(convert_assignment_scene(ASSIGNMENT / f"{name}.json"), 0)
 
 
-@pytest.mark.skipif(THREADS < 2, reason="Numba was started with one thread")
+@pytest.mark.skipif(THREAD_COUNT < 2, reason="Numba was started with one thread")
 @pytest.mark.parametrize("name", ["chain", "stiff-cloth", "block", "skirt"])
 def test_the_compiled_backend_gives_the_same_bits_with_any_number_of_threads(name):
-    problem = first_problem(SCENES[name](1e10))
+    problem = build_first_problem(SCENE_BUILDERS[name](1e10))
     before, found = numba.get_num_threads(), []
     try:
         for threads in (1, 2):
@@ -126,20 +144,20 @@ def test_the_compiled_backend_gives_the_same_bits_with_any_number_of_threads(nam
 
 def test_the_dense_backend_is_the_formulas_of_the_paper():
     """One iteration, written out with the matrices' names."""
-    problem = random_problem(3, weights=(1e4,))
+    problem = build_random_problem(3, weights=(1e4,))
     s = problem.system
-    springs = only_springs(s, "the test")
-    n, m = s.vertices, len(springs.edges)
+    springs = require_only_springs(s, "the test")
+    n, m = s.num_vertices, len(springs.edges)
     A, C, K = np.zeros((m, n)), np.zeros((1, n)), np.diag(springs.stiffness)
     for e, (i, j) in enumerate(springs.edges):
         A[e, i] += 1.0
         A[e, j] -= 1.0
     C[0, 0] = 1.0
     M, dt, w, r = np.diag(s.mass), s.time_step, 1e4, springs.rest_length
-    v = A @ problem.first_guess
+    v = A @ problem.initial_guess
     length = np.linalg.norm(v, axis=1)
     d = (r / np.where(length, length, 1.0))[:, None] * v
     Q = A.T @ K @ A + M / dt**2 + w * C.T @ C
-    y = M @ problem.target / dt**2 + problem.force + w * C.T @ problem.pin_targets
+    y = M @ problem.inertial_target / dt**2 + problem.external_force + w * C.T @ problem.pin_targets
     wanted = np.linalg.solve(Q, A.T @ K @ d + y)
     np.testing.assert_allclose(after_iterations(DenseLocalGlobal(), problem, 1), wanted, rtol=0, atol=AGREEMENT)

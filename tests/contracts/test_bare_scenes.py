@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 from harness.cli import app
 from harness.record.reader import read_replay
-from tests.often import often
+from tests.often import mark_rare_cases
 
 SCENES = {
     "falls": "[{kind: gravity}]",
@@ -18,7 +18,7 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", often(SCENES, ["nothing", "falls"]))
+@pytest.mark.parametrize("name", mark_rare_cases(SCENES, ["nothing", "falls"]))
 def test_a_bare_scene_runs_and_is_recorded(name: str, tmp_path: Path):
     scene = tmp_path / f"{name}.yaml"
     scene.write_text(

@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 
 from harness.base import rows
-from harness.config.load import load_any
+from harness.config.load import load_config
 from harness.experiments.sweep import run_sweep
-from tests.displays import Quiet
-from tests.own_solvers import SCENE
+from tests.displays import SilentDisplay
+from tests.own_solvers import SCENE_SOURCE
 
 pytest.importorskip("dask_jobqueue", reason="pip install 'springbench[cluster]'")
 
@@ -58,19 +58,26 @@ def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[Path]:
 
 
 def test_runs_are_done_by_jobs_that_are_submitted_and_cancelled(tmp_path: Path, jobs: Path):
-    (tmp_path / "scene.yaml").write_text(SCENE)
+    (tmp_path / "scene.yaml").write_text(SCENE_SOURCE)
     (tmp_path / "sweep.yaml").write_text(SWEEP)
     options = "cores: 1, processes: 1, memory: 1GiB, walltime: '00:10:00', account: springs"
     (tmp_path / "slurm.yaml").write_text(
         f"{{kind: SLURM, jobs: 2, {options}, interface: lo, local_directory: {tmp_path}}}"
     )
     (tmp_path / "r").mkdir()
-    found = load_any(tmp_path / "sweep.yaml")
+    found = load_config(tmp_path / "sweep.yaml")
     told: list[Any] = []
-    table = run_sweep("sweep", found.runs(), tmp_path / "r", Quiet(), told.append, on=str(tmp_path / "slurm.yaml"))
+    table = run_sweep(
+        "sweep",
+        found.list_runs(),
+        tmp_path / "r",
+        SilentDisplay(),
+        told.append,
+        scheduler_address=str(tmp_path / "slurm.yaml"),
+    )
     assert set(table["status"].to_pylist()) == {"ok"}
     assert len(set(table["run_id"].to_pylist())) == 3
-    assert rows.read((tmp_path / "r" / "rows").glob("*.parquet")).num_rows == table.num_rows
+    assert rows.read_rows((tmp_path / "r" / "rows").glob("*.parquet")).num_rows == table.num_rows
     scripts = [path.read_text() for path in jobs.glob("*.sh")]
     assert len(scripts) == 2
     assert all("#SBATCH -A springs" in text and "distributed.cli.dask_worker" in text for text in scripts)

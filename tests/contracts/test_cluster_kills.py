@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from harness.base import rows
-from tests.own_solvers import SCENE
+from tests.own_solvers import SCENE_SOURCE
 
 ROOT = Path(__file__).resolve().parents[2]
 RUNS, PATIENCE = 12, 240.0
@@ -89,7 +89,7 @@ class Sweep(NamedTuple):
 
     @classmethod
     def made(cls, folder: Path) -> Sweep:
-        (folder / "scene.yaml").write_text(SCENE)
+        (folder / "scene.yaml").write_text(SCENE_SOURCE)
         (folder / "sweep.yaml").write_text(SWEEP)
         return cls(folder / "sweep.yaml", folder / "r" / "sweep" / "rows")
 
@@ -110,7 +110,7 @@ class Sweep(NamedTuple):
         after = self.done()
         assert before.items() <= after.items()
         assert len(after) == RUNS
-        assert set(rows.read(self.rows / name for name in after)["status"].to_pylist()) == {"ok"}
+        assert set(rows.read_rows(self.rows / name for name in after)["status"].to_pylist()) == {"ok"}
         assert not [*self.rows.parent.rglob("*partial*")]
         return " ".join(words.split())
 

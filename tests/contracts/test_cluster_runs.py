@@ -17,33 +17,33 @@ import pytest
 from distributed import Client, LocalCluster
 from distributed.security import Security
 
-from harness.base.machine import node
-from harness.config.load import load_any
-from harness.experiments.ability import NAMES as MACHINE
-from harness.experiments.scheduler import scheduler
+from harness.base.machine import compute_node_id
+from harness.config.load import load_config
+from harness.experiments.ability import CALIBRATION_COLUMNS as MACHINE
+from harness.experiments.scheduler import open_scheduler
 from harness.experiments.sweep import run_sweep
-from tests.displays import Quiet
-from tests.own_solvers import SCENE, SOURCE, own
+from tests.displays import SilentDisplay
+from tests.own_solvers import SCENE_SOURCE, SOLVER_SOURCE, write_plugin_solver
 
 
 def done(sweep: Path, results: Path, address: str) -> pa.Table:
-    found = load_any(sweep)
+    found = load_config(sweep)
     results.mkdir(exist_ok=True)
-    return run_sweep(found.name, found.runs(), results, Quiet(), print, on=address)
+    return run_sweep(found.name, found.list_runs(), results, SilentDisplay(), print, scheduler_address=address)
 
 
 def test_runs_are_done_by_workers_and_a_crash_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    made = own(tmp_path, monkeypatch, solving="import os; os._exit(3)")
+    made = write_plugin_solver(tmp_path, monkeypatch, solve_code="import os; os._exit(3)")
     quiet: Any = {"dashboard_address": None}
     with LocalCluster(n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", **quiet) as started:
         found: Any = started
-        table = done(made.sweep, tmp_path / "r", found.scheduler_address)
+        table = done(made.sweep_path, tmp_path / "r", found.scheduler_address)
         assert len(found.workers) == 1
     first = {row["solver"]: row for row in table.to_pylist()}
     assert first["sparse"]["status"] == "ok", first["sparse"]["reason"]
     assert first["mine"]["status"] == "failed"
     assert "ended its process with exit code 3" in first["mine"]["reason"]
-    assert {row["node"] for row in first.values()} == {node()}
+    assert {row["node"] for row in first.values()} == {compute_node_id()}
     assert not [*(tmp_path / "r").rglob("*partial*")]
 
 
@@ -68,7 +68,7 @@ def refused(place: tuple[str, int], security: Security | None) -> bool:
 
 
 def test_nobody_without_the_certificate_reaches_a_cluster_of_this_machine():
-    with scheduler("local:1") as found, Client(found, timeout=60.0) as client:
+    with open_scheduler("local:1") as found, Client(found, timeout=60.0) as client:
         assert client.submit(os.getpid).result() != os.getpid()
         me = psutil.Process()
         there = [c for process in (me, *me.children(recursive=True)) for c in process.net_connections()]
@@ -105,8 +105,8 @@ def lock_by(folder: Path, *, shared: bool) -> None:
 @pytest.mark.parametrize("shared", [True, False], ids=["locked", "without-the-lock"])
 def test_of_four_workers_of_a_machine_one_is_timed_at_a_time(tmp_path: Path, shared: bool):
     noted = tmp_path / "noted"
-    (tmp_path / "noting.py").write_text(SOURCE.replace("pass  # while solving", NOTE.format(noted=str(noted))))
-    (tmp_path / "scene.yaml").write_text(SCENE)
+    (tmp_path / "noting.py").write_text(SOLVER_SOURCE.replace("pass  # while solving", NOTE.format(noted=str(noted))))
+    (tmp_path / "scene.yaml").write_text(SCENE_SOURCE)
     sweep = tmp_path / "sweep.yaml"
     options = f"frames: {FRAMES}, rounds: {ROUNDS}, iterations: {list(range(1, RUNS + 1))}, record: false"
     sweep.write_text(f"scenes: [scene.yaml]\nsolvers: ['./noting.py:Mine']\noptions: {{{options}, pictures: false}}\n")
@@ -163,8 +163,8 @@ def all_but_times(table: pa.Table) -> list[str]:
 @pytest.mark.long
 def test_workers_that_are_killed_lose_nothing_and_repeat_the_runs_at_hand_alone(tmp_path: Path):
     told = tmp_path / "told"
-    (tmp_path / "counted.py").write_text(SOURCE.replace("pass  # while solving", TELL.format(told=str(told))))
-    (tmp_path / "scene.yaml").write_text(SCENE)
+    (tmp_path / "counted.py").write_text(SOLVER_SOURCE.replace("pass  # while solving", TELL.format(told=str(told))))
+    (tmp_path / "scene.yaml").write_text(SCENE_SOURCE)
     sweep = tmp_path / "sweep.yaml"
     options = f"frames: 2, rounds: 1, iterations: {list(range(1, MANY + 1))}, record: false, pictures: false"
     sweep.write_text(f"scenes: [scene.yaml]\nsolvers: ['./counted.py:Mine']\noptions: {{{options}}}\n")

@@ -10,28 +10,30 @@ import numpy as np
 import pytest
 
 from harness.scenes.bind import Scene
-from harness.scenes.effects.pins import Pins
-from harness.simulation.step import prepare, simulate
+from harness.scenes.effects.pins import PinsEffect
+from harness.simulation.step import prepare, simulate_scene
 from solvers.contact import local_global as method
 from solvers.problem import Positions, Solver, StepProblem, StopRule, Unsupported
-from solvers.registry import SOLVERS, load
-from tests.contacts import OBSTACLES, contact, sheet, steps
+from solvers.registry import SOLVERS, load_target
+from tests.contacts import OBSTACLE_SPECS, build_contact, build_sheet, collect_steps
 
-SOLVED: dict[str, Solver] = {name: load(target)() for name, target in SOLVERS.items()}
+SOLVED: dict[str, Solver] = {name: load_target(target)() for name, target in SOLVERS.items()}
 PREFACTORED = ("sparse", "numba", "anderson", "chebyshev", "lbfgs")
 TAKE = (*PREFACTORED, "vbd", "hybrid", "newton", "newton-cg")
-FLOOR = contact(OBSTACLES["plane"], friction=0.4)
+FLOOR = build_contact(OBSTACLE_SPECS["plane"], friction=0.4)
 FALL = (0.5, -6.0, 0.0)
 
 
 def held(weight: float | str) -> Scene:
-    return sheet(FLOOR, Pins.model_validate({"at": ["top_corners"], "weight": weight}), velocity=FALL)
+    return build_sheet(FLOOR, PinsEffect.model_validate({"at": ["top_corners"], "weight": weight}), velocity=FALL)
 
 
 SCENES = {
-    "frictionless": lambda: sheet(contact(OBSTACLES["plane"]), velocity=FALL),
-    "friction": lambda: sheet(FLOOR, velocity=FALL),
-    "two obstacles": lambda: sheet(contact(OBSTACLES["sphere"], OBSTACLES["capsule"], friction=0.2), velocity=FALL),
+    "frictionless": lambda: build_sheet(build_contact(OBSTACLE_SPECS["plane"]), velocity=FALL),
+    "friction": lambda: build_sheet(FLOOR, velocity=FALL),
+    "two obstacles": lambda: build_sheet(
+        build_contact(OBSTACLE_SPECS["sphere"], OBSTACLE_SPECS["capsule"], friction=0.2), velocity=FALL
+    ),
     "held by penalty": lambda: held(1e10),
     "held exactly": lambda: held("exact"),
 }
@@ -40,9 +42,9 @@ SCENES = {
 @cache
 def landed(scene: str) -> tuple[StepProblem, Positions]:
     """The step at which most presses and something grips, and its minimum by Newton's method."""
-    step = steps(SCENES[scene](), 4, stop=StopRule(100, 1e-12))[-1]
+    step = collect_steps(SCENES[scene](), 4, stop=StopRule(100, 1e-12))[-1]
     energy = step.problem.energies[-1]
-    assert len(energy.rows(step.problem.current, step.solution.positions, cautious=False).vertices) > 3  # pyright: ignore[reportAttributeAccessIssue]
+    assert len(energy.rows(step.problem.current_positions, step.solution.positions, cautious=False).vertices) > 3  # pyright: ignore[reportAttributeAccessIssue]
     return step.problem, step.solution.positions
 
 
@@ -61,17 +63,17 @@ def test_others_refuse_contact_by_name(solver):
         SOLVED[solver].prepare(SCENES["friction"]().system)
 
 
-@pytest.mark.parametrize("few", [method._FEW, 0], ids=["Woodbury", "conjugate gradients"])
+@pytest.mark.parametrize("few", [method._MAX_WOODBURY_ROWS, 0], ids=["Woodbury", "conjugate gradients"])
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("solver", [*PREFACTORED, "vbd"])
 def test_no_iteration_raises_the_objective(solver, scene, few, monkeypatch):
     monkeypatch.setattr(method, "_FEW", few)
     problem, wanted = landed(scene)
-    problem = replace(problem, first_guess=problem.target)  # deep inside
-    values = [problem.value(problem.first_guess)]
+    problem = replace(problem, initial_guess=problem.inertial_target)  # deep inside
+    values = [problem.value(problem.initial_guess)]
     for p in islice(SOLVED[solver].prepare(problem.system).iterates(problem), 30):
         values.append(problem.value(p))
-        assert values[-1] <= values[-2] + 1e-12 * problem.magnitude(p)  # sums of some hundred terms
+        assert values[-1] <= values[-2] + 1e-12 * problem.value_scale(p)  # sums of some hundred terms
     scale = values[0] - problem.value(wanted)
     assert values[-1] - problem.value(wanted) <= 1e-2 * scale
 
@@ -80,30 +82,32 @@ def test_no_iteration_raises_the_objective(solver, scene, few, monkeypatch):
 def test_conjugate_gradients_correct_as_woodburys_formula_does(scene, monkeypatch):
     problem, _ = landed(scene)
     rng = np.random.default_rng(0)
-    prepared = method.local_global(SOLVED["sparse"], problem.system)
-    corrections, (energy,) = prepared.corrections, method.touching(problem)
-    p = problem.current
+    prepared = method.prepare_with_half_spaces(SOLVED["sparse"], problem.system)
+    corrections, (energy,) = prepared.corrections, method.begin_active_contacts(problem)
+    p = problem.current_positions
     gradient = rng.normal(size=p.shape)
-    gradient[problem.system.pins.vertices[problem.system.pins.exact]] = 0.0
-    plain = corrections.plain(gradient)
-    exact, rows = corrections.around([energy], p, gradient, plain, cautious=True)
+    gradient[problem.system.pins.vertices[problem.system.pins.exact_mask]] = 0.0
+    plain = corrections.solve_without_contact(gradient)
+    exact, rows = corrections.solve_with_contact([energy], p, gradient, plain, majorise=True)
     monkeypatch.setattr(method, "_FEW", 0)
     monkeypatch.setattr(method, "_ITERATIONS", 2000)
     monkeypatch.setattr(method, "_TOLERANCE", 1e-12)
-    found = corrections.displacement(rows, gradient, plain)
+    found = corrections.solve_with_rows(rows, gradient, plain)
     # Weights lie six orders above Q: so many digits of sixteen are lost, on both ways.
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-6 * np.abs(exact).max())
 
 
 @pytest.mark.parametrize("solver", [*PREFACTORED, "vbd"])
 def test_contact_that_is_idle_changes_no_bit(solver):
-    far = contact({"kind": "plane", "point": (0, -50, 0)}, friction=0.5)
+    far = build_contact({"kind": "plane", "point": (0, -50, 0)}, friction=0.5)
     runs = [
         [
             step.positions
-            for step in simulate(made, prepare(made, SOLVED[solver]), StopRule(10), first_guess="current", frames=4)
+            for step in simulate_scene(
+                made, prepare(made, SOLVED[solver]), StopRule(10), initial_guess="current", frames=4
+            )
         ]
-        for made in (sheet(), sheet(far))
+        for made in (build_sheet(), build_sheet(far))
     ]
     np.testing.assert_array_equal(runs[0], runs[1])
 

@@ -8,17 +8,19 @@ from functools import cache
 import numpy as np
 import pytest
 
-from harness.simulation.step import prepare, simulate
-from solvers.core.fixed_objective import Objective
+from harness.simulation.step import prepare, simulate_scene
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
-from solvers.core.saddles import certified
+from solvers.core.saddles import is_positive_definite
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import Positions, Solver, StepProblem, StopRule, Unsupported
-from solvers.registry import SOLVERS, load
-from tests.effects import SCENES, integrated, stepped
+from solvers.registry import SOLVERS, load_target
+from tests.effects import EFFECT_SCENES, build_moving_problem, with_integrator
 
 SOLVED: dict[str, Solver] = {
-    name: solver for name, solver in ((name, load(target)()) for name, target in SOLVERS.items()) if solver.minimises
+    name: solver
+    for name, solver in ((name, load_target(target)()) for name, target in SOLVERS.items())
+    if solver.minimises
 }
 INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
 TAKE_ALL = {"newton", "newton-cg", "hybrid", "lbfgs"}
@@ -43,11 +45,11 @@ def takes(solver: str, scene: str) -> bool:
 @cache
 def minimum(scene: str, integrator: str) -> tuple[StepProblem, Positions]:
     """The problem of a scene's step and its minimum, by Newton's method."""
-    problem = stepped(SCENES[scene](), integrator)
+    problem = build_moving_problem(EFFECT_SCENES[scene](), integrator)
     return problem, SOLVED["newton"].prepare(problem.system).solve(problem, StopRule(100, 1e-12)).positions
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("scene", EFFECT_SCENES)
 @pytest.mark.parametrize("solver", SOLVED)
 def test_solvers_agree_at_convergence_or_refuse_by_name(solver, scene):
     for integrator in INTEGRATORS if "all" in scene and "gas" not in scene else INTEGRATORS[:1]:
@@ -66,44 +68,44 @@ def test_solvers_agree_at_convergence_or_refuse_by_name(solver, scene):
                 assert_minimum(problem, far)
                 assert problem.value(far) < problem.value(wanted)
             if near:
-                problem = replace(problem, first_guess=wanted + near * NOISE.normal(size=wanted.shape))
+                problem = replace(problem, initial_guess=wanted + near * NOISE.normal(size=wanted.shape))
             found = prepared.solve(problem, STOP).positions
             # Local-global converges linearly: its last step, 1e-11 of the first, is up to 1e-3 of what is left to go.
             np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("scene", EFFECT_SCENES)
 def test_the_minimum_is_one(scene):
     assert_minimum(*minimum(scene, "implicit-euler"))
 
 
 def assert_minimum(problem: StepProblem, p: Positions) -> None:
     """No force is left, and no curvature is negative."""
-    forces = np.abs(problem.gradient(problem.current)).max()
+    forces = np.abs(problem.gradient(problem.current_positions)).max()
     assert np.abs(problem.gradient(p)).max() <= 1e-6 * forces  # the pins of 1e10 N/m and positions of 1e-16: 1e-6 N
-    assert certified(StepObjective(Objective(problem.system), problem), p)
+    assert is_positive_definite(StepObjective(FixedObjective(problem.system), problem), p)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("scene", [name for name in SCENES if "gas" not in name])
+@pytest.mark.parametrize("scene", [name for name in EFFECT_SCENES if "gas" not in name])
 def test_local_global_descends_with_every_projective_energy(scene, integrator):
-    problem = stepped(SCENES[scene](), integrator)
+    problem = build_moving_problem(EFFECT_SCENES[scene](), integrator)
     values, iterates = (
-        [problem.value(problem.first_guess)],
+        [problem.value(problem.initial_guess)],
         SparseLocalGlobal().prepare(problem.system).iterates(problem),
     )
     for _ in range(40):
         p = next(iterates)
-        assert problem.value(p) <= values[-1] + 1e-13 * problem.magnitude(p)  # sums of some hundred terms
+        assert problem.value(p) <= values[-1] + 1e-13 * problem.value_scale(p)  # sums of some hundred terms
         values.append(problem.value(p))
     assert values[-1] < values[0]
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("scene", EFFECT_SCENES)
 def test_a_scene_runs_for_a_while_and_stays_finite(scene, integrator):
-    made = integrated(SCENES[scene](), integrator)
+    made = with_integrator(EFFECT_SCENES[scene](), integrator)
     solver = SOLVED["lbfgs"]
-    for step in simulate(made, prepare(made, solver), StopRule(30), first_guess="current", frames=15):
+    for step in simulate_scene(made, prepare(made, solver), StopRule(30), initial_guess="current", frames=15):
         assert np.isfinite(step.positions).all()
         assert np.abs(step.positions).max() < 5.0  # sheets and balloons of a metre, and falls of half a second

@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.reference.trajectory import Trajectory, integrate
-from harness.scenes.bind import Scene, build
-from harness.scenes.effects.effect_names import EFFECTS
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.mesh.surfaces import Balloon
+from harness.reference.trajectory import ReferenceTrajectory, integrate_motion
+from harness.scenes.bind import Scene, build_scene
+from harness.scenes.effects.effect_names import EFFECT_CLASSES
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
+from harness.scenes.mesh.surfaces import BalloonMesh
 from harness.scenes.spec import SceneSpec
-from harness.simulation.step import prepare, simulate
+from harness.simulation.step import prepare, simulate_scene
 from solvers.integrators import INTEGRATORS
-from solvers.methods.newton import Newton
-from solvers.plugins import load
+from solvers.methods.newton import NewtonSolver
+from solvers.plugins import load_target
 from solvers.problem import StopRule
 
 END, ROUGH_END = 0.15, 0.3
@@ -38,7 +38,7 @@ SWUNG = HELD | {"motion": {"keys": [{"time": 0.0}, {"time": 1.0, "offset": [0.5,
 DOWN = (0.5, 1.0, 2.0)
 
 
-CHAIN = Chain()
+CHAIN = ChainMesh()
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,9 @@ SMOOTH: dict[str, Case] = {
     "ether-drag": Case((SPRINGS, GRAVITY, {"kind": "ether-drag", "rate": 3.0}, HELD), velocity=(0.0, 0.0, 0.0)),
     "dashpots": Case((SPRINGS, GRAVITY, {"kind": "dashpots", "stretch": 0.4}, HELD)),
     "rayleigh": Case((SPRINGS, GRAVITY, {"kind": "rayleigh", "mass": 0.5, "stiffness": 0.02}, HELD)),
-    "bending": Case((SPRINGS, {"kind": "bending", "stiffness": 0.05}, HUNG), Grid(), 4, steps=32),
-    "wind": Case((SPRINGS, {"kind": "wind", "field": "assignment", "strength": 0.5}, HUNG), Grid(), 4, steps=32),
-    "gas": Case(({"kind": "springs", "stretch": 40.0}, {"kind": "gas", "pressure": 100.0}), Balloon(), 3, steps=48),
+    "bending": Case((SPRINGS, {"kind": "bending", "stiffness": 0.05}, HUNG), GridMesh(), 4, steps=32),
+    "wind": Case((SPRINGS, {"kind": "wind", "field": "assignment", "strength": 0.5}, HUNG), GridMesh(), 4, steps=32),
+    "gas": Case(({"kind": "springs", "stretch": 40.0}, {"kind": "gas", "pressure": 100.0}), BalloonMesh(), 3, steps=48),
 }
 STILL = (0.0, 0.0, 0.0)
 PLANE = {"kind": "plane", "point": [0, -0.05, 0]}
@@ -83,25 +83,25 @@ ROUGH: dict[str, Case] = {
 
 
 def scene(case: Case, integrator: str, time_step: float) -> Scene:
-    listed = tuple(load(EFFECTS[effect["kind"]]).model_validate(effect) for effect in case.effects)
+    listed = tuple(load_target(EFFECT_CLASSES[effect["kind"]]).model_validate(effect) for effect in case.effects)
     given: dict[str, Any] = {"mesh": case.mesh, "effects": listed, "velocity": case.velocity, "time_step": time_step}
-    return build(SceneSpec(mass=1.0, frames=1, path=Path("scene.yaml"), **given), case.size, integrator)
+    return build_scene(SceneSpec(mass=1.0, frames=1, path=Path("scene.yaml"), **given), case.size, integrator)
 
 
 @cache
-def truth(effect: str) -> Trajectory:
-    return integrate(scene(SMOOTH[effect], "esdirk-4", 0.1), [END])
+def truth(effect: str) -> ReferenceTrajectory:
+    return integrate_motion(scene(SMOOTH[effect], "esdirk-4", 0.1), [END])
 
 
 def end(case: Case, integrator: str, steps: int, seconds: float = END) -> np.ndarray:
     made = scene(case, integrator, seconds / steps)
     stop = StopRule(100, 1e-13)
-    *_, last = simulate(made, prepare(made, Newton()), stop, first_guess="inertial", frames=steps)
+    *_, last = simulate_scene(made, prepare(made, NewtonSolver()), stop, initial_guess="inertial", frames=steps)
     return last.positions
 
 
 def test_every_effect_states_it() -> None:
-    stated = {name: load(target).exact_to for name, target in EFFECTS.items()}
+    stated = {name: load_target(target).exact_to for name, target in EFFECT_CLASSES.items()}
     assert {name for name, order in stated.items() if isinf(order)} == set(SMOOTH)
     assert {name for name, order in stated.items() if order == 1.0} == set(ROUGH)
 
@@ -113,8 +113,8 @@ def test_every_effect_states_it() -> None:
 @pytest.mark.parametrize("effect", [pytest.param(e, marks=[pytest.mark.long] * (e == "gas")) for e in SMOOTH])
 def test_integrators_keep_their_order_up_to_it(effect, integrator):
     order, case = INTEGRATORS[integrator].order, SMOOTH[effect]
-    errors = [truth(effect).error(0, end(case, integrator, n)) for n in (case.steps, 2 * case.steps)]
-    stated = min(order, load(EFFECTS[effect]).exact_to)
+    errors = [truth(effect).measure_error(0, end(case, integrator, n)) for n in (case.steps, 2 * case.steps)]
+    stated = min(order, load_target(EFFECT_CLASSES[effect]).exact_to)
     # The next term of the error is smaller by a time step times the fastest frequency; signs may make it larger.
     assert np.log2(errors[0] / errors[1]) > stated - 0.35
 
@@ -130,4 +130,4 @@ def test_what_begins_within_steps_has_order_1(effect):
     # Where in a step contact begins scatters single errors; over a factor of 8 that counts for little. Those of other
     # integrators scatter more.
     assert 0.6 < np.log2(errors[0] / errors[1]) / 3.0 < 1.7
-    assert load(EFFECTS[effect]).exact_to == 1.0
+    assert load_target(EFFECT_CLASSES[effect]).exact_to == 1.0

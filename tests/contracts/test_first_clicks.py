@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from harness.base import rows as base_rows
 from harness.cli import app
 from harness.record.reader import read_replay
-from tests.browser import chromium
+from tests.browser import launch_chromium
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
 SWEEP = """
@@ -33,7 +33,7 @@ def did(*words: str) -> str:
 
 def ends(folder: Path) -> dict[str, dict[str, str]]:
     """The last row of each solver's runs of the largest size, by the medians of their times."""
-    table = [row for path in folder.glob("*.parquet") for row in base_rows.read([path]).to_pylist()]
+    table = [row for path in folder.glob("*.parquet") for row in base_rows.read_rows([path]).to_pylist()]
     steps = [row for row in table if row["phase"] == "step" and row["size"] == 8]
     solvers = {row["solver"] for row in steps}
     taken = {s: median(row["seconds"] for row in steps if row["solver"] == s) for s in solvers}
@@ -50,7 +50,7 @@ def test_three_clicks_lead_to_the_fastest_solver_its_last_frame_and_the_command_
     (tmp_path / "study.yaml").write_text(SWEEP)
     last_line = did("run", "study.yaml").splitlines()[-1]
     fastest, row = next(iter(ends(tmp_path / "results" / "study" / "rows").items()))
-    with chromium() as browser:
+    with launch_chromium() as browser:
         page, clicks = browser.new_page(viewport={"width": 1280, "height": 800}), 0
 
         page.goto(last_line.rpartition(" ")[2])

@@ -78,12 +78,12 @@ def test_a_full_disk_is_said_by_name_and_what_failed_is_done_again(size: str, co
         assert "shut down prematurely" not in told.stderr
         left = [path for path in results.rglob("*") if "partial" in path.name]
         assert left == []
-        done = rows.read(results.glob("sweep/rows/*.parquet"))
+        done = rows.read_rows(results.glob("sweep/rows/*.parquet"))
         assert set(done["status"].to_pylist()) <= {"ok"}
         subprocess.run(["mount", "-o", "remount,size=64m", results], check=True)
         again = start(config, results)
         assert again.returncode == 0, again.stderr
-        assert len(set(rows.read(results.glob("sweep/rows/*.parquet"))["run_id"].to_pylist())) == 2
+        assert len(set(rows.read_rows(results.glob("sweep/rows/*.parquet"))["run_id"].to_pylist())) == 2
 
 
 LARGEST = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (2**16, resource.RLIM_INFINITY))"
@@ -94,7 +94,7 @@ def test_a_limit_to_the_size_of_files_is_no_outcome_of_a_run_either(config: Path
     assert told.returncode == 1, told.stderr
     assert "cannot be written: File too large" in told.stderr
     assert "Traceback" not in told.stderr
-    outcomes = rows.read(tmp_path.rglob("rows/*.parquet")).select(["status", "reason"]).to_pylist()
+    outcomes = rows.read_rows(tmp_path.rglob("rows/*.parquet")).select(["status", "reason"]).to_pylist()
     assert list(tmp_path.rglob("*.parquet")) == [], outcomes
 
 

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from harness.cli import app
 from tests.contracts.hostile_plugins import FAILED, FINE, HOSTILE, MISTAKE, Hostile, write
-from tests.often import often
+from tests.often import mark_rare_cases
 
 HANGS = 90.0
 """Seconds after which a command counts as hanging; its own limits end it within 20 s on an idle machine."""
@@ -29,7 +29,7 @@ def state() -> tuple[object, ...]:
     return os.getcwd(), sys.stdout, sys.stderr, np.linalg.norm, os.environ.get("PATH")
 
 
-@pytest.mark.parametrize("name", often(HOSTILE, SAMPLE))
+@pytest.mark.parametrize("name", mark_rare_cases(HOSTILE, SAMPLE))
 def test_a_command_survives_its_plugins(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     case = HOSTILE[name]
     write(tmp_path, case)

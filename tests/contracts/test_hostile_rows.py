@@ -12,14 +12,14 @@ import pytest
 from rich.console import Console
 
 from harness.base.errors import InputError
-from harness.base.rows import read
-from harness.base.shelf import FILE
-from harness.report.learned import sentences
-from harness.report.medians import medians
-from harness.report.site.folders import folder_of
-from harness.report.site.script import write
-from harness.report.timing_plot import draw_timing
-from harness.report.timing_table import runs, summary_table
+from harness.base.rows import read_rows
+from harness.base.shelf import FILE_COLUMN
+from harness.report.learned import summarise_sweep
+from harness.report.medians import write_medians
+from harness.report.site.folders import locate_folder
+from harness.report.site.script import write_script
+from harness.report.timing_plot import draw_timing_plot
+from harness.report.timing_table import build_summary_table, read_run_times
 from tests import accuracy_rows, site_results
 from tests.contracts.attempts import Outcome, attempt
 from tests.contracts.hostile_rows import LEFT_OUT, SHOWN, rows_with, write_cases
@@ -55,16 +55,18 @@ def test_odd_rows_that_fit_are_shown(tmp_path: Path):
 @pytest.mark.long
 @pytest.mark.parametrize("name", SHOWN)
 def test_odd_rows_are_told_at_the_end_of_a_sweep(tmp_path: Path, name: str):
-    table = read(write_cases(tmp_path / "cases", {name: SHOWN[name]}))
-    Console(file=StringIO()).print(summary_table(table))
-    sentences(runs(table))
-    draw_timing(table, tmp_path / "timing.png", name)
-    medians(table, tmp_path)
+    table = read_rows(write_cases(tmp_path / "cases", {name: SHOWN[name]}))
+    Console(file=StringIO()).print(build_summary_table(table))
+    summarise_sweep(read_run_times(table))
+    draw_timing_plot(table, tmp_path / "timing.png", name)
+    write_medians(table, tmp_path)
 
 
 FILES = {
     "a column twice": lambda path: pq.write_table(pa.table([["a"], ["b"]], names=["run_id", "run_id"]), path),
-    "a column of files": lambda path: pq.write_table(rows_with("reason", "").append_column(FILE, [["x"] * 32]), path),
+    "a column of files": lambda path: pq.write_table(
+        rows_with("reason", "").append_column(FILE_COLUMN, [["x"] * 32]), path
+    ),
     "a size in words": lambda path: pq.write_table(pa.table({"run_id": ["a"], "size": ["four"]}), path),
     "a status in a list": lambda path: pq.write_table(pa.table({"run_id": ["a"], "status": [["ok"]]}), path),
     "text that is no UTF-8": lambda path: pq.write_table(
@@ -89,10 +91,11 @@ def test_a_hostile_file_of_rows_is_named_within_limits(tmp_path: Path, name: str
 
 @pytest.mark.parametrize("unit", ["../../evil", "/evil", "..", "", ".hidden", "a/b", "x" * 300, "a\0b"])
 def test_a_unit_of_packed_rows_is_no_path(tmp_path: Path, unit: str):
-    folder = site_results.write(tmp_path / "results", 2)
+    folder = site_results.write_site_results(tmp_path / "results", 2)
     packed = pq.read_table(folder / "rows.parquet")
     pq.write_table(
-        packed.set_column(packed.column_names.index(FILE), FILE, [[unit] * len(packed)]), folder / "rows.parquet"
+        packed.set_column(packed.column_names.index(FILE_COLUMN), FILE_COLUMN, [[unit] * len(packed)]),
+        folder / "rows.parquet",
     )
     found = reported(tmp_path)
     assert found.code == 2
@@ -103,48 +106,52 @@ def test_a_unit_of_packed_rows_is_no_path(tmp_path: Path, unit: str):
     "recording", ["/etc/hostname", "../../secret.rrd", "a/../../secret.rrd", "a\0b", "recordings/" + "x" * 300]
 )
 def test_a_recording_is_looked_for_below_its_folder(tmp_path: Path, recording: str):
-    told = accuracy_rows.problem("net", 6, "early") + list(accuracy_rows.curve("net", 6, "early", "numba"))
+    told = accuracy_rows.build_snapshot_rows("net", 6, "early") + list(
+        accuracy_rows.build_curve_rows("net", 6, "early", "numba")
+    )
     for row in told:
         if row["kind"] == "curve":
             row["recording"] = recording
-    accuracy_rows.write(tmp_path / "results" / "study", told)
+    accuracy_rows.write_accuracy_rows(tmp_path / "results" / "study", told)
     found = reported(tmp_path)
     assert "recording: came" in " ".join(found.said.split())
 
 
 def test_rows_of_accuracy_that_do_not_belong_together_are_refused(tmp_path: Path):
-    told = accuracy_rows.problem("net", 6, "early") + list(accuracy_rows.curve("net", 6, "early", "numba"))
+    told = accuracy_rows.build_snapshot_rows("net", 6, "early") + list(
+        accuracy_rows.build_curve_rows("net", 6, "early", "numba")
+    )
     for row in told:
         row["g0"] = row["time_step"] = None
-    accuracy_rows.write(tmp_path / "results" / "study", told)
+    accuracy_rows.write_accuracy_rows(tmp_path / "results" / "study", told)
     assert reported(tmp_path).code in (0, 2)
 
 
 def test_who_reads_without_leaving_out_is_told_of_every_file(tmp_path: Path):
     files = write_cases(tmp_path / "cases", dict(list(LEFT_OUT.items())[:2]))
     with pytest.raises(InputError) as told:
-        read(files)
+        read_rows(files)
     assert [(mistake.key, mistake.file) for mistake in told.value.mistakes] == [("run_id", file) for file in files]
 
 
 def test_folders_have_safe_links_and_names_of_their_own():
     names = ["javascript:alert(1)", "a b", "a~b", "a/b", "a", "this", "..x", "ä", "%2e%2e", "a?b#c", "x" * 200]
-    found = [folder_of(Path("results", name), Path("results")) for name in [*names, "."]]
+    found = [locate_folder(Path("results", name), Path("results")) for name in [*names, "."]]
     assert len({folder.slug for folder in found}) == len(found)
     for folder in found:
-        assert folder.up.startswith("./")
-        assert not set(folder.up) & set(":?#& "), folder.up
+        assert folder.relative_url.startswith("./")
+        assert not set(folder.relative_url) & set(":?#& "), folder.relative_url
         assert set(folder.slug) <= set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789._~-"), (
             folder.slug
         )
         assert len(folder.slug) < 120
-    assert found[0].up == "./javascript%3Aalert%281%29/"
+    assert found[0].relative_url == "./javascript%3Aalert%281%29/"
     assert [folder.slug for folder in found[3:5]] == ["a~b", "a"]
 
 
 def test_a_key_is_never_the_prototype_of_what_a_script_gives(tmp_path: Path):
     value = {"__proto__": 1, 'a"__proto__': 2, "b": '"__proto__":'}
-    words = write(tmp_path / "x.js", "x", value).read_text()
+    words = write_script(tmp_path / "x.js", "x", value).read_text()
     assert words.count('["__proto__"]:') == 1
     assert (
         json.loads(words.partition(", ")[2].strip().removesuffix(");").replace('["__proto__"]:', '"__proto__":', 1))

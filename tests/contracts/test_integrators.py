@@ -15,24 +15,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.reference.trajectory import Trajectory, integrate
-from harness.scenes.bind import Scene, build
-from harness.scenes.effects.air_drag import AirDrag
-from harness.scenes.effects.base import Effect
-from harness.scenes.effects.dashpots import Dashpots
-from harness.scenes.effects.ether_drag import EtherDrag
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.rayleigh import Rayleigh
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
+from harness.reference.trajectory import ReferenceTrajectory, integrate_motion
+from harness.scenes.bind import Scene, build_scene
+from harness.scenes.effects.air_drag import AirDragEffect
+from harness.scenes.effects.base import SceneEffect
+from harness.scenes.effects.dashpots import DashpotsEffect
+from harness.scenes.effects.ether_drag import EtherDragEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.rayleigh import RayleighEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
 from harness.scenes.spec import MeshSource, SceneSpec
-from harness.simulation.step import State, prepare, simulate, start
+from harness.simulation.step import MotionState, build_initial_state, prepare, simulate_scene
 from solvers.integrators import INTEGRATORS, Motion
-from solvers.methods.newton import Newton
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import Positions, Solver, StopRule
-from solvers.registry import SOLVERS, load
+from solvers.registry import SOLVERS, load_target
 
 CONVERGED = StopRule(100, 1e-13)
 
@@ -42,34 +42,34 @@ integrators = pytest.mark.parametrize("name", [name for name in INTEGRATORS if n
 def made(
     name: str,
     mesh: MeshSource,
-    *effects: Effect,
+    *effects: SceneEffect,
     size: int,
     time_step: float,
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Scene:
     """A scene of 1 kg by an integrator."""
     given = {"mesh": mesh, "effects": effects, "velocity": velocity, "time_step": time_step}
-    return build(SceneSpec(mass=1.0, frames=1, path=Path("scene.yaml"), **given), size, name)
+    return build_scene(SceneSpec(mass=1.0, frames=1, path=Path("scene.yaml"), **given), size, name)
 
 
 def run(
-    scene: Scene, steps: int, solver: Solver | None = None, stop: StopRule = CONVERGED, state: State | None = None
+    scene: Scene, steps: int, solver: Solver | None = None, stop: StopRule = CONVERGED, state: MotionState | None = None
 ) -> list[Motion]:
     """The motions at the start and after each step."""
-    state, prepared = state or start(scene), prepare(scene, solver or Newton())
-    path = simulate(scene, prepared, stop, first_guess="inertial", frames=steps, state=state)
-    return [state.now, *(step.state.now for step in path)]
+    state, prepared = state or build_initial_state(scene), prepare(scene, solver or NewtonSolver())
+    path = simulate_scene(scene, prepared, stop, initial_guess="inertial", frames=steps, initial_state=state)
+    return [state.motion, *(step.state.motion for step in path)]
 
 
-HELD = Pins(at=("first",), weight="exact")
-SWUNG = Pins.model_validate(
+HELD = PinsEffect(at=("first",), weight="exact")
+SWUNG = PinsEffect.model_validate(
     {
         "at": ["first"],
         "weight": "exact",
         "motion": {"keys": [{"time": 0.0}, {"time": 1.0, "offset": [0.5, 1.0, 0.0], "turn": 40.0}]},
     }
 )
-SOFT = Springs(stretch=20.0)
+SOFT = SpringsEffect(stretch=20.0)
 
 
 def gusts(p: Positions, v: Positions, t: float) -> Positions:
@@ -77,15 +77,15 @@ def gusts(p: Positions, v: Positions, t: float) -> Positions:
     return np.sin(9.0 * t + p[:, :1]) * np.array([0.4, 1.0, -0.8]) - 0.3 * v
 
 
-PROBLEMS: dict[str, tuple[tuple[Effect, ...], tuple, tuple[float, float, float]]] = {
-    "swinging": ((SOFT, Gravity(), HELD), (), (0.5, 1.0, 2.0)),
+PROBLEMS: dict[str, tuple[tuple[SceneEffect, ...], tuple, tuple[float, float, float]]] = {
+    "swinging": ((SOFT, GravityEffect(), HELD), (), (0.5, 1.0, 2.0)),
     "under a force of time, place and speed": ((SOFT, HELD), (gusts,), (1.0, 0.0, 0.5)),
-    "slowed by ether drag": ((SOFT, Gravity(), EtherDrag(rate=3.0), HELD), (), (0.0, 0.0, 0.0)),
-    "slowed by quadratic drag": ((SOFT, AirDrag(law="quadratic", coefficient=3.0), HELD), (), (1.0, 0.0, 2.0)),
-    "slowed by air": ((SOFT, Gravity(), AirDrag(coefficient=2.0), HELD), (), (1.0, 0.0, 2.0)),
-    "slowed by dashpots": ((SOFT, Gravity(), Dashpots(stretch=0.4), HELD), (), (1.0, 0.0, 2.0)),
-    "slowed by Rayleigh's damping": ((SOFT, Gravity(), Rayleigh(mass=0.5, stiffness=0.02), HELD), (), (1.0, 0.0, 2.0)),
-    "swung by its pin": ((SOFT, Gravity(), SWUNG), (), (0.5, 1.0, 0.0)),
+    "slowed by ether drag": ((SOFT, GravityEffect(), EtherDragEffect(rate=3.0), HELD), (), (0.0, 0.0, 0.0)),
+    "slowed by quadratic drag": ((SOFT, AirDragEffect(law="quadratic", coefficient=3.0), HELD), (), (1.0, 0.0, 2.0)),
+    "slowed by air": ((SOFT, GravityEffect(), AirDragEffect(coefficient=2.0), HELD), (), (1.0, 0.0, 2.0)),
+    "slowed by dashpots": ((SOFT, GravityEffect(), DashpotsEffect(stretch=0.4), HELD), (), (1.0, 0.0, 2.0)),
+    "slowed by Rayleigh's damping": ((SOFT, GravityEffect(), RayleighEffect(mass=0.5, stiffness=0.02), HELD), (), (1.0, 0.0, 2.0)),
+    "swung by its pin": ((SOFT, GravityEffect(), SWUNG), (), (0.5, 1.0, 0.0)),
 }  # fmt: skip
 
 
@@ -96,11 +96,11 @@ END = 0.15
 
 
 @cache
-def truth(problem: str) -> Trajectory:
+def truth(problem: str) -> ReferenceTrajectory:
     """The motion at the end, which no integrator has a share in; forces take the place of filters."""
     effects, forces, velocity = PROBLEMS[problem]
-    scene = made("esdirk-4", Chain(), *effects, size=4, time_step=0.1, velocity=velocity)
-    return integrate(replace(scene, forces=(*scene.forces, *forces)), [END])
+    scene = made("esdirk-4", ChainMesh(), *effects, size=4, time_step=0.1, velocity=velocity)
+    return integrate_motion(replace(scene, varying_forces=(*scene.varying_forces, *forces)), [END])
 
 
 @integrators
@@ -109,23 +109,23 @@ def test_the_error_falls_with_the_methods_order(name, problem):
     effects, forces, velocity = PROBLEMS[problem]
     errors = []
     for steps in (12, 24):
-        scene = made(name, Chain(), *effects, size=4, time_step=END / steps, velocity=velocity)
-        scene = replace(scene, forces=(*scene.forces, *forces))
-        errors.append(truth(problem).error(0, run(scene, steps)[-1].positions))
+        scene = made(name, ChainMesh(), *effects, size=4, time_step=END / steps, velocity=velocity)
+        scene = replace(scene, varying_forces=(*scene.varying_forces, *forces))
+        errors.append(truth(problem).measure_error(0, run(scene, steps)[-1].positions))
     found = np.log2(errors[0] / errors[1])
     # The next term of the error is smaller by a time step times the fastest frequency or rate of decay, at most 0.2.
     assert found == pytest.approx(SPLIT.get((problem, name), INTEGRATORS[name].order), abs=0.2)
 
 
-FREE = (Grid(), Springs(stretch=300.0))
+FREE = (GridMesh(), SpringsEffect(stretch=300.0))
 RNG = np.random.default_rng(4)
 
 
-def thrown(scene: Scene, *, spin: float, noise: float = 0.0) -> State:
+def thrown(scene: Scene, *, spin: float, noise: float = 0.0) -> MotionState:
     """The rest shape, spinning about the vertical [1/s], with random speeds besides [m/s]."""
-    arm = scene.mesh.rest - scene.mesh.rest.mean(axis=0)
+    arm = scene.mesh.rest_positions - scene.mesh.rest_positions.mean(axis=0)
     velocity = np.cross([0.0, spin, 0.0], arm) + noise * np.random.default_rng(4).normal(size=arm.shape)
-    return State(Motion(scene.mesh.rest, velocity), None, 0)
+    return MotionState(Motion(scene.mesh.rest_positions, velocity), None, 0)
 
 
 @integrators
@@ -172,7 +172,7 @@ def test_angular_momentum_obeys_the_methods_law(name):
 def quadratic(name: str) -> Scene:
     """A net of springs without rest length, whose energy is quadratic."""
     scene = made(name, *FREE, size=4, time_step=1 / 10)
-    springs = replace(scene.springs, rest_length=np.zeros(len(scene.springs.edges)))
+    springs = replace(scene.all_springs, rest_length=np.zeros(len(scene.all_springs.edges)))
     return replace(scene, system=replace(scene.system, energies=(springs,)))
 
 
@@ -202,26 +202,36 @@ def test_the_others_damp_a_quadratic_energy(name):
 @pytest.mark.parametrize("name", ["midpoint", "newmark"])
 def test_the_energy_stays_near_over_a_hundred_thousand_steps(name):
     """Midpoint is symplectic; the trapezoidal rule, Newmark's mean acceleration, is conjugate to it."""
-    scene = made(name, Chain(), Springs(rule="fixed", stretch=25.0), size=3, time_step=0.02)  # omega h = .3
-    begun = State(Motion(1.1 * scene.mesh.rest, np.random.default_rng(0).normal(size=(3, 3))), None, 0)
-    path = simulate(scene, prepare(scene, Newton()), CONVERGED, first_guess="inertial", frames=100_000, state=begun)
-    found = energies(scene, [begun.now, *(step.state.now for step in path if step.index % 500 == 0)])
+    scene = made(name, ChainMesh(), SpringsEffect(rule="fixed", stretch=25.0), size=3, time_step=0.02)  # omega h = .3
+    begun = MotionState(Motion(1.1 * scene.mesh.rest_positions, np.random.default_rng(0).normal(size=(3, 3))), None, 0)
+    path = simulate_scene(
+        scene, prepare(scene, NewtonSolver()), CONVERGED, initial_guess="inertial", frames=100_000, initial_state=begun
+    )
+    found = energies(scene, [begun.motion, *(step.state.motion for step in path if step.index % 500 == 0)])
     # It swings by (omega h)^2 at most, and does not drift.
     assert np.ptp(found) < 0.1 * found[0]
     assert abs(found[-100:].mean() - found[:100].mean()) < 0.02 * found[0]
 
 
-MINIMISERS = [name for name, target in SOLVERS.items() if load(target).minimises]
+MINIMISERS = [name for name, target in SOLVERS.items() if load_target(target).minimises]
 
 
 @pytest.mark.parametrize("name", ["implicit-euler", "bdf2", "midpoint", "generalised-alpha", "sdirk-3"])
 @pytest.mark.parametrize("solver", MINIMISERS)
 def test_every_minimiser_takes_the_steps_of_every_integrator(name, solver):
-    scene = made(name, Grid(), Springs(stretch=30.0), Gravity(), Pins(at=("top_corners",)), size=4, time_step=1 / 60)
+    scene = made(
+        name,
+        GridMesh(),
+        SpringsEffect(stretch=30.0),
+        GravityEffect(),
+        PinsEffect(at=("top_corners",)),
+        size=4,
+        time_step=1 / 60,
+    )
     stop = StopRule(20_000, 1e-11)
     by_newton, found = (
-        np.array([p for p, _ in run(scene, 6, one, stop)]) for one in (Newton(), load(SOLVERS[solver])())
+        np.array([p for p, _ in run(scene, 6, one, stop)]) for one in (NewtonSolver(), load_target(SOLVERS[solver])())
     )
     # 1e-11 of a step's residual is 1e-12 m along stiff springs, and some hundred times that along the softest way.
     np.testing.assert_allclose(found, by_newton, rtol=0, atol=1e-8)
-    assert np.abs(by_newton - scene.mesh.rest).max() > 0.01
+    assert np.abs(by_newton - scene.mesh.rest_positions).max() > 0.01

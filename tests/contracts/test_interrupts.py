@@ -39,8 +39,8 @@ def interrupt(process: subprocess.Popen[str], seconds: float) -> None:
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGINT)
         output, errors = process.communicate(timeout=120.0)
-        assert process.returncode == interrupts.EXIT_CODE, errors
-        assert errors.count(interrupts.MESSAGE) == 1
+        assert process.returncode == interrupts.INTERRUPT_EXIT_CODE, errors
+        assert errors.count(interrupts.INTERRUPT_MESSAGE) == 1
         assert "Traceback" not in errors + output
     else:
         assert process.returncode == 0, errors
@@ -100,7 +100,7 @@ def test_a_number_of_threads_without_a_meaning_is_refused(value: str):
 @pytest.mark.parametrize("arguments", [[], ["--csv"]])
 def test_a_terminal_that_writes_ascii_alone_gets_escape_sequences(arguments: list[str], tmp_path: Path):
     (tmp_path / "sweep" / "rows").mkdir(parents=True)
-    rows.write(tmp_path / "sweep" / "rows" / "a.parquet", [{"sweep": "sweep", "seconds": 0.5}])
+    rows.write_rows(tmp_path / "sweep" / "rows" / "a.parquet", [{"sweep": "sweep", "seconds": 0.5}])
     process = start(
         *("query", "SELECT 'fl\u00e4che' AS name", "--results", str(tmp_path), *arguments),
         PYTHONIOENCODING="ascii",

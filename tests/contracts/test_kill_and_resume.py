@@ -19,7 +19,7 @@ from matplotlib.image import imread
 
 from harness.base import rows
 from harness.cli import main
-from harness.experiments.ability import NAMES as MACHINE
+from harness.experiments.ability import CALIBRATION_COLUMNS as MACHINE
 from harness.record.reader import read_replay
 from harness.report import opengl
 
@@ -102,7 +102,7 @@ class Sweep:
         return {str(path.relative_to(self.folder)) for path in self.folder.rglob("*") if path.is_file()}
 
     def rows(self) -> list[dict[str, Any]]:
-        table = rows.read(sorted((self.folder / "rows").iterdir()))
+        table = rows.read_rows(sorted((self.folder / "rows").iterdir()))
         return table.drop_columns(list(WRITTEN_BY)).to_pylist()
 
     def complete(self) -> dict[Path, tuple[int, int]]:
@@ -171,7 +171,7 @@ def test_a_sweep_leaves_its_files_and_nothing_else(undisturbed: Undisturbed):
     expected |= {f"rows/{run}.parquet" for run in runs} | {f"recordings/{run}.rrd" for run in runs}
     if undisturbed.case.pictures:
         expected.add("pictures/timing.png")
-        if not opengl.problem():
+        if not opengl.find_opengl_problem():
             expected |= {f"pictures/{run}.png" for run in runs} | {"pictures/cloth-6-solvers.png"}
     assert undisturbed.sweep.files() == expected
 

@@ -12,18 +12,18 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from harness.config.load import load_any
-from harness.experiments.plan import Files
-from harness.experiments.run import execute
-from harness.record.base import Frame
+from harness.config.load import load_config
+from harness.experiments.plan import RunFiles
+from harness.experiments.run import execute_run
+from harness.record.base import RecordedFrame
 from harness.record.rerun import RerunRecorder
-from harness.record.shading import Shading
+from harness.record.shading import StrainShading
 from harness.simulation import clock as clocks
-from solvers.integrators import Integrator, Motion
+from solvers.integrators import Motion, SingleStageIntegrator
 from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import Positions, Prepared, Solution, Start, StepProblem, StopRule, System
+from solvers.problem import Positions, PreparedSolver, Solution, StepProblem, StepStart, StopRule, System
 from solvers.registry import SOLVERS
-from tests.undisturbed import undisturbed
+from tests.undisturbed import retry_if_preempted
 
 FRAMES = 6
 SCENE = f"""
@@ -45,8 +45,8 @@ spent = 0.0
 class Busy:
     """Local-global iterations that take their time; lies: phases instead of its own."""
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
     lies: ClassVar[dict[str, Callable[[], object]]] = {}
 
     def prepare(self, system: System) -> _Busy:
@@ -55,15 +55,15 @@ class Busy:
 
 @dataclass(frozen=True)
 class _Busy:
-    base: Prepared
+    base: PreparedSolver
 
     @property
-    def choice(self) -> str:
-        return self.base.choice
+    def description(self) -> str:
+        return self.base.description
 
     @property
-    def facts(self) -> dict[str, float]:
-        return self.base.facts
+    def stats(self) -> dict[str, float]:
+        return self.base.stats
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         return self.base.iterates(problem)
@@ -80,25 +80,25 @@ class _Busy:
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         return self.base.residual_at(problem, p)
 
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        return self.base.phases(problem) | Busy.lies
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        return self.base.iteration_phases(problem) | Busy.lies
 
 
 @pytest.fixture
-def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[list[dict[str, Any]], Files]]:
+def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[list[dict[str, Any]], RunFiles]]:
     """Does a run of the busy solver; its rows, and its files."""
     monkeypatch.setitem(SOLVERS, "busy", f"{__name__}:Busy")
     (tmp_path / "scene.yaml").write_text(SCENE)
-    (spec,) = load_any(tmp_path / "scene.yaml", solvers=["busy"], iterations=3, rounds=1).runs()
-    files = Files.of(spec, tmp_path)
-    files.rows.parent.mkdir()
-    return lambda: (execute(spec, files, lambda phase: None), files)
+    (spec,) = load_config(tmp_path / "scene.yaml", solvers=["busy"], iterations=3, rounds=1).list_runs()
+    files = RunFiles.for_run(spec, tmp_path)
+    files.rows_path.parent.mkdir()
+    return lambda: (execute_run(spec, files, lambda phase: None), files)
 
 
 def test_a_run_that_tells_the_truth_is_done(ran):
     found, files = ran()
     assert {row["status"] for row in found} == {"ok"}
-    assert files.recording.exists()
+    assert files.recording_path.exists()
     steps = [row for row in found if row["phase"] == "step"]
     assert all(row["pass_seconds"] >= FRAMES * SOLVE for row in steps)
     assert [row["frame"] for row in steps if row.get("recorded")] == [FRAMES]
@@ -114,10 +114,10 @@ CLOCKS = {
 @pytest.mark.parametrize("clock", CLOCKS.values(), ids=CLOCKS)
 def test_a_run_whose_steps_do_not_add_up_to_the_wall_time_fails(ran, monkeypatch: pytest.MonkeyPatch, clock):
     monkeypatch.setattr(clocks, "perf_counter", clock)
-    (row,), files = undisturbed(ran)
+    (row,), files = retry_if_preempted(ran)
     assert row["status"] == "failed"
     assert "the times of step add up to" in row["reason"]
-    assert not files.recording.exists()
+    assert not files.recording_path.exists()
 
 
 UNTOUCHED = np.ones((25, 3))
@@ -133,9 +133,9 @@ def test_a_run_with_a_phase_that_does_nothing_fails(ran, monkeypatch: pytest.Mon
 
 def late(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each frame has the positions of the one before."""
-    record, held = RerunRecorder.frame, []
+    record, held = RerunRecorder.record_frame, []
 
-    def frame(self: RerunRecorder, frame: Frame) -> None:
+    def frame(self: RerunRecorder, frame: RecordedFrame) -> None:
         held.append(frame.positions)
         record(self, replace(frame, positions=held[-2] if len(held) > 1 else held[0]))
 
@@ -144,13 +144,13 @@ def late(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def recoloured(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each frame has the colours of the first."""
-    strains, first = Shading.strains, []
+    strains, first = StrainShading.compute_strains, []
 
-    def of(self: Shading, p: Positions):
+    def of(self: StrainShading, p: Positions):
         first.append(strains(self, p))
         return first[0]
 
-    monkeypatch.setattr(Shading, "strains", of)
+    monkeypatch.setattr(StrainShading, "strains", of)
 
 
 RECORDINGS = {
@@ -165,18 +165,18 @@ def test_a_run_whose_recording_does_not_end_as_it_did_fails(ran, monkeypatch: py
     (row,), files = ran()
     assert row["status"] == "failed"
     assert reason in row["reason"]
-    assert not files.recording.exists()
+    assert not files.recording_path.exists()
 
 
 def test_a_run_whose_second_pass_goes_another_way_than_the_timed_one_fails(ran, monkeypatch: pytest.MonkeyPatch):
     steps = count()
-    advance = Integrator.advance
+    advance = SingleStageIntegrator.complete_step
 
-    def drifting(self: Integrator, start: Start, solution: Solution) -> Motion:
+    def drifting(self: SingleStageIntegrator, start: StepStart, solution: Solution) -> Motion:
         moved = advance(self, start, solution)
         return moved._replace(positions=moved.positions + 1e-9 * (next(steps) >= 2 * FRAMES))
 
-    monkeypatch.setattr(Integrator, "advance", drifting)
+    monkeypatch.setattr(SingleStageIntegrator, "advance", drifting)
     (row,), _ = ran()
     assert row["status"] == "failed"
     assert row["reason"] == "the recorded pass ended at other positions than the timed pass"

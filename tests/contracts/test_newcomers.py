@@ -12,28 +12,28 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from harness.base.model import Model
+from harness.base.model import ConfigModel
 from harness.config.accuracy_load import load_accuracy
-from harness.config.load import load_any
-from harness.config.schema import schema
-from harness.experiments.ablation.suggest import seen, suggestions
-from harness.experiments.accuracy.studies import run_accuracy
-from harness.experiments.plan import Files
-from harness.experiments.run import execute
-from harness.report.accuracy import draw
-from harness.report.robustness import RIGHT, read_cells
-from harness.report.site import update
-from harness.report.style import marks
-from harness.report.timing_plot import draw_timing
-from harness.report.timing_table import summary_table
-from harness.scenes.effects.base import Contribution, Seen, steady
-from harness.scenes.effects.effect_names import EFFECTS
+from harness.config.load import load_config
+from harness.config.schema import build_json_schema
+from harness.experiments.ablation.suggest import build_evidence, suggest_effects
+from harness.experiments.accuracy.studies import run_accuracy_study
+from harness.experiments.plan import RunFiles
+from harness.experiments.run import execute_run
+from harness.report.accuracy import draw_accuracy_report
+from harness.report.robustness import CORRECT, read_verified_runs
+from harness.report.site import update_page
+from harness.report.style import assign_solver_styles
+from harness.report.timing_plot import draw_timing_plot
+from harness.report.timing_table import build_summary_table
+from harness.scenes.effects.base import EffectContribution, ObservedMotion, build_constant_force
+from harness.scenes.effects.effect_names import EFFECT_CLASSES
 from harness.scenes.mesh.base import Mesh
-from solvers.about import About, Reference
+from solvers.about import Citation, SolverInfo
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.registry import SOLVERS
-from tests.displays import Quiet
-from tests.scenes import cloth
+from tests.displays import SilentDisplay
+from tests.scenes import build_cloth
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -65,27 +65,29 @@ work: [{horizon: 0.1, rounds: 1}]
 class Mine(SparseLocalGlobal):
     """A method that somebody else wrote."""
 
-    about: ClassVar[About] = About("of my own", Reference("Noether, Emmy", 1918, "Invariante Variationsprobleme"))
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
+        "of my own", Citation("Noether, Emmy", 1918, "Invariante Variationsprobleme")
+    )
 
 
-class Hum(Model):
+class Hum(ConfigModel):
     """A force on every vertex, and what calls for it."""
 
     kind: Literal["hum"] = "hum"
     force: float
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        return Contribution(forces=steady(np.full_like(mesh.rest, self.force)))
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
+        return EffectContribution(forces=build_constant_force(np.full_like(mesh.rest_positions, self.force)))
 
     @classmethod
-    def called_for(cls, seen: Seen) -> str:
+    def find_evidence(cls, seen: ObservedMotion) -> str:
         return f"nothing is heard in {len(seen.positions)} frames"
 
 
 @pytest.fixture(autouse=True)
 def added(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SOLVERS, "mine", f"{__name__}:Mine")
-    monkeypatch.setitem(EFFECTS, "hum", f"{__name__}:Hum")
+    monkeypatch.setitem(EFFECT_CLASSES, "hum", f"{__name__}:Hum")
 
 
 @pytest.fixture
@@ -115,55 +117,57 @@ def test_no_report_and_little_else_knows_a_solver_by_name():
 @pytest.mark.parametrize("folder", ["report", "experiments"])
 def test_no_report_and_no_experiment_knows_an_effect_by_name(folder: str):
     # `springs` is a column of rows: how many a mesh has.
-    assert constants(f"harness/{folder}") & set(EFFECTS) <= {"springs"}
+    assert constants(f"harness/{folder}") & set(EFFECT_CLASSES) <= {"springs"}
 
 
 def test_a_sweep_and_its_reports_take_a_new_solver_and_effect(configs: Path):
     import pyarrow as pa
 
-    from harness.base.columns import SCHEMA
+    from harness.base.columns import RUN_SCHEMA
 
     found = []
     (configs / "rows").mkdir()
-    for run in load_any(configs / "sweep.yaml").runs():
-        found += execute(run, Files.of(run, configs), lambda phase: None)
+    for run in load_config(configs / "sweep.yaml").list_runs():
+        found += execute_run(run, RunFiles.for_run(run, configs), lambda phase: None)
     mine = next(row for row in found if row["solver"] == "mine")
     assert (mine["status"], mine["family"], mine["minimises"]) == ("ok", "of my own", True)
     assert json.loads(mine["reference"])["year"] == 1918
-    cells = {cell.solver: cell for cell in read_cells(configs)}
-    assert cells["mine"].outcome == cells["sparse"].outcome == RIGHT
-    table = pa.Table.from_pylist(found, schema=SCHEMA)
-    draw_timing(table, configs / "timing.png", "Time")
-    assert "mine: Noether 1918" in str(summary_table(table).caption)
+    cells = {cell.solver: cell for cell in read_verified_runs(configs)}
+    assert cells["mine"].outcome == cells["sparse"].outcome == CORRECT
+    table = pa.Table.from_pylist(found, schema=RUN_SCHEMA)
+    draw_timing_plot(table, configs / "timing.png", "Time")
+    assert "mine: Noether 1918" in str(build_summary_table(table).caption)
 
 
 def test_the_accuracy_report_takes_a_new_solver_and_effect(configs: Path):
     asked = load_accuracy(configs / "accuracy.yaml")
-    files = run_accuracy(asked, configs / "results", Quiet(), lambda line: None, isolated=False)
-    drawn = {path.name: path for path in draw(configs / "results", files)}
+    files = run_accuracy_study(asked, configs / "results", SilentDisplay(), lambda line: None, isolated=False)
+    drawn = {path.name: path for path in draw_accuracy_report(configs / "results", files)}
     assert "@misc{noether1918," in drawn["references.bib"].read_text()
     assert "mine: Noether 1918, Invariante Variationsprobleme" in drawn["findings.md"].read_text()
-    update(configs / "results")
+    update_page(configs / "results")
     told = (configs / "results" / "site" / "data" / "this" / "work.js").read_text()
     assert "Noether 1918" in told
 
 
 def test_a_new_solver_has_a_look_that_nobody_else_has():
-    looks = marks()
+    looks = assign_solver_styles()
     assert looks["mine"] not in [look for name, look in looks.items() if name != "mine"]
     assert looks["mine"].color not in {look.color for name, look in looks.items() if name != "mine"}
-    assert looks["mine"] == marks(["yours", "one more"])["mine"]
+    assert looks["mine"] == assign_solver_styles(["yours", "one more"])["mine"]
 
 
 def test_a_motion_calls_for_a_new_effect():
-    made = cloth(3)
-    still = np.tile(made.mesh.rest, (2, 1, 1))
-    found = {s.effect: s.evidence for s in suggestions(seen(made, set(), still, 0.0 * still), set())}
+    made = build_cloth(3)
+    still = np.tile(made.mesh.rest_positions, (2, 1, 1))
+    found = {s.effect_kind: s.evidence for s in suggest_effects(build_evidence(made, set(), still, 0.0 * still), set())}
     assert found["hum"] == "nothing is heard in 2 frames"
-    assert "hum" not in {s.effect for s in suggestions(seen(made, {"hum"}, still, 0.0 * still), {"hum"})}
+    assert "hum" not in {
+        s.effect_kind for s in suggest_effects(build_evidence(made, {"hum"}, still, 0.0 * still), {"hum"})
+    }
 
 
 def test_the_schema_has_both():
-    text = json.dumps(schema())
+    text = json.dumps(build_json_schema())
     assert '"mine"' in text
     assert '"hum"' in text

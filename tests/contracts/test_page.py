@@ -8,17 +8,17 @@ from typing import Any
 
 import pytest
 
-from harness.report.site import update
+from harness.report.site import update_page
 from tests import accuracy_rows, figure_results, gate_results, site_results
-from tests.browser import chromium
-from tests.site_results import fails, run
+from tests.browser import launch_chromium
+from tests.site_results import build_run_columns, is_failing_run
 
 COUNT = 300
 VIEWS = {
     "overview": "overview",
     "runs": "runs",
-    "a run": f"runs?run=made/{run(3)['run_id']}",
-    "two runs": f"compare?sel=made/{run(0)['run_id']},made/{run(1)['run_id']}",
+    "a run": f"runs?run=made/{build_run_columns(3)['run_id']}",
+    "two runs": f"compare?sel=made/{build_run_columns(0)['run_id']},made/{build_run_columns(1)['run_id']}",
     "plots": "plots?sweep=made",
     "convergence": "plots?sweep=study&plot=convergence",
     **{
@@ -35,15 +35,15 @@ FITS = "document.documentElement.scrollWidth <= innerWidth"
 
 
 def results(folder: Path, count: int) -> Path:
-    made = site_results.write(folder, count)
+    made = site_results.write_site_results(folder, count)
     for number in range(4):
-        site_results.picture(made / "pictures" / f"{run(number)['file']}.png")
-    rows = accuracy_rows.problem("net", 6, "early", branches=2)
+        site_results.write_foreign_picture(made / "pictures" / f"{build_run_columns(number)['file']}.png")
+    rows = accuracy_rows.build_snapshot_rows("net", 6, "early", minima_count=2)
     for solver in ("numba", "newton", "lbfgs"):
-        rows += list(accuracy_rows.curve("net", 6, "early", solver))
-    rows.append(accuracy_rows.failure("net", 6, "early", "dense", "failed", "why"))
-    accuracy_rows.write(folder / "study", rows)
-    return update(folder)
+        rows += list(accuracy_rows.build_curve_rows("net", 6, "early", solver))
+    rows.append(accuracy_rows.build_failure_row("net", 6, "early", "dense", "failed", "why"))
+    accuracy_rows.write_accuracy_rows(folder / "study", rows)
+    return update_page(folder)
 
 
 @pytest.fixture(scope="module")
@@ -55,18 +55,20 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> str:
 def studies(tmp_path_factory: pytest.TempPathFactory) -> str:
     """A page with every kind of study."""
     folder = tmp_path_factory.mktemp("studies")
-    figure_results.accuracy(folder / "accuracy")
-    figure_results.sweep(folder / "cases")
-    figure_results.speed(folder / "machine")
-    figure_results.ablation(folder / "effects")
-    figure_results.engines(folder / "engines")
-    gate_results.write(folder / "bench" / "Linux-CPython-3.11-64bit", {"solve": gate_results.series(2, 8, (4, 1.2))})
+    figure_results.write_accuracy_results(folder / "accuracy")
+    figure_results.write_sweep_results(folder / "cases")
+    figure_results.write_speed_results(folder / "machine")
+    figure_results.write_ablation_results(folder / "effects")
+    figure_results.write_engine_results(folder / "engines")
+    gate_results.write_benchmark_files(
+        folder / "bench" / "Linux-CPython-3.11-64bit", {"solve": gate_results.build_ratio_series(2, 8, (4, 1.2))}
+    )
     return results(folder, COUNT).as_uri()
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with chromium() as found:
+    with launch_chromium() as found:
         yield found
 
 
@@ -163,16 +165,16 @@ def test_the_table_sorts_filters_and_says_so_in_the_url(tab: Tab, page: str):
     assert "xpbd" in first.inner_text(), "the fastest of the smallest size"
     assert "doi:" in first.locator(".who").get_attribute("title"), "where the solver comes from, on pointing at it"
     shown.get_by_label("Status").select_option("unsupported")
-    assert tab.rows() == sum(fails(k) for k in range(COUNT))
+    assert tab.rows() == sum(is_failing_run(k) for k in range(COUNT))
     shown.get_by_label("Status").select_option("ok")
     shown.get_by_label("Solver").select_option("newton")
     shown.get_by_label("Search").fill("curtain 12")
     shown.wait_for_function("location.hash.includes('q=curtain')")
     left = tab.rows()
     expected = sum(
-        (r["solver"], r["scene"], r["size"]) == ("newton", "curtain", 12) and not fails(k)
+        (r["solver"], r["scene"], r["size"]) == ("newton", "curtain", 12) and not is_failing_run(k)
         for k in range(COUNT)
-        for r in [run(k)]
+        for r in [build_run_columns(k)]
     )
     assert 0 < left <= expected + 20
     address = tab.view()
@@ -213,8 +215,8 @@ def test_a_failure_is_told_in_words_with_the_number_of_its_runs(tab: Tab, page: 
     shown = tab.open(page)
     row = shown.get_by_role("row").filter(has_text="unsupported")
     assert row.count() == 1
-    assert str(sum(fails(k) for k in range(COUNT))) in row.inner_text()
-    assert site_results.REASON in row.inner_text(), "words cannot end a script"
+    assert str(sum(is_failing_run(k) for k in range(COUNT))) in row.inner_text()
+    assert site_results.UNSUPPORTED_REASON in row.inner_text(), "words cannot end a script"
 
 
 def test_a_point_of_a_curve_leads_to_its_solve_by_keys(tab: Tab, page: str):
@@ -283,7 +285,7 @@ FRAGMENTS = (
 
 
 def test_the_ratio_of_two_runs_is_that_of_their_ms_a_step(tab: Tab, page: str):
-    shown = tab.open(page, f"compare?sel=made/{run(0)['run_id']},made/{run(1)['run_id']}")
+    shown = tab.open(page, f"compare?sel=made/{build_run_columns(0)['run_id']},made/{build_run_columns(1)['run_id']}")
     row = shown.locator("table tr", has_text="times as long as the first")
     assert row.locator("td").all_inner_texts() == ["1", "0.2 (0.2 to 0.2)"], "5 ms and 1 ms for 100 vertices"
 
@@ -302,9 +304,9 @@ HOSTILE = "javascript:document.title='taken'"
 
 def test_no_folder_or_name_runs_as_code(browser: Any, tmp_path: Path):
     for name in (HOSTILE, "a b?c#d", "%2e%2e", "constructor"):
-        made = site_results.write(tmp_path, 4, name)
-        site_results.picture(made / "pictures" / f"{run(0)['file']}.png")
-    made = update(tmp_path)
+        made = site_results.write_site_results(tmp_path, 4, name)
+        site_results.write_foreign_picture(made / "pictures" / f"{build_run_columns(0)['file']}.png")
+    made = update_page(tmp_path)
     tab = Tab(browser)
     tab.page.on("dialog", lambda dialog: tab.said.append(dialog.message))
     shown = tab.open(made.as_uri())

@@ -9,32 +9,40 @@ import pytest
 from harness.config.load import load_scene
 from harness.config.sweep import SolverSpec
 from harness.experiments.asked import libraries
-from harness.experiments.asked.libraries import LIBRARIES, InitialValueProblem
-from harness.experiments.asked.peers import peers
-from harness.experiments.asked.search import foresee, search
-from harness.experiments.asked.ways import Asked
-from harness.reference.motion import Field
-from harness.reference.trajectory import integrate
+from harness.experiments.asked.libraries import THIRD_PARTY_INTEGRATORS, InitialValueProblem
+from harness.experiments.asked.peers import compare_third_party
+from harness.experiments.asked.search import compute_predictability_horizon, search_cheapest_method
+from harness.experiments.asked.ways import ErrorTarget
+from harness.reference.motion import OdeField
+from harness.reference.trajectory import integrate_motion
 
 SPRING = Path(__file__).parents[2] / "configs" / "scenes" / "single-spring.yaml"
 
 
 @pytest.mark.parametrize("name", ["cvode-adams", "cvode-bdf"])
 def test_cvode_follows_the_motion_to_its_tolerance(name):
-    asked = Asked.of(load_scene(SPRING), 2, 0.5)
-    scene, truth = asked.bound(asked.frame, "newmark"), integrate(asked.bound(asked.frame, "own"), [0.5])
-    field = Field(scene)
-    ends = (LIBRARIES[name].end(InitialValueProblem(field, field.start, scene, 0.5, tol, tol)) for tol in (1e-5, 1e-8))
-    coarse, fine = (truth.error(0, field.motion(0.5, end)[0].copy()) for end in ends)
+    asked = ErrorTarget.from_scene(load_scene(SPRING), 2, 0.5)
+    scene, truth = (
+        asked.build_scene(asked.frame_seconds, "newmark"),
+        integrate_motion(asked.build_scene(asked.frame_seconds, "own"), [0.5]),
+    )
+    field = OdeField(scene)
+    ends = (
+        THIRD_PARTY_INTEGRATORS[name].integrate_to_end(
+            InitialValueProblem(field, field.initial_state, scene, 0.5, tol, tol)
+        )
+        for tol in (1e-5, 1e-8)
+    )
+    coarse, fine = (truth.measure_error(0, field.unpack_state(0.5, end)[0].copy()) for end in ends)
     assert fine < 1e-5
     assert fine < 0.1 * coarse
 
 
 def test_a_peer_that_is_not_installed_is_a_row_that_says_which_command_installs_it(monkeypatch):
     monkeypatch.setattr(libraries, "find_spec", lambda name: None)
-    asked = Asked.of(load_scene(SPRING), 2, 0.1)
-    seen = foresee(asked, 1e-2, lambda line: None)
-    answer = search(asked, 1e-2, seen, lambda line: None, [("own", SolverSpec("velocity-verlet", {}))])
-    (peer,) = peers(asked, 1e-2, answer, ["cvode-bdf"])
+    asked = ErrorTarget.from_scene(load_scene(SPRING), 2, 0.1)
+    seen = compute_predictability_horizon(asked, 1e-2, lambda line: None)
+    answer = search_cheapest_method(asked, 1e-2, seen, lambda line: None, [("own", SolverSpec("velocity-verlet", {}))])
+    (peer,) = compare_third_party(asked, 1e-2, answer, ["cvode-bdf"])
     assert "pip install -e '.[sundials]'" in peer.reason
-    assert not LIBRARIES["scipy-radau"].missing
+    assert not THIRD_PARTY_INTEGRATORS["scipy-radau"].missing_reason

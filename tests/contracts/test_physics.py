@@ -9,25 +9,25 @@ import numpy as np
 import pytest
 
 from harness.scenes.bind import Scene
-from harness.scenes.effects.ether_drag import EtherDrag
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
-from harness.simulation.step import State, prepare, simulate
+from harness.scenes.effects.ether_drag import EtherDragEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
+from harness.simulation.step import MotionState, prepare, simulate_scene
 from solvers.integrators import Motion
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, StopRule
-from tests.scenes import BACKENDS, scene, static_shape, trajectory
+from tests.scenes import LOCAL_GLOBAL_BACKENDS, build_test_scene, compute_static_shape, simulate_trajectory
 
 G = 9.81
 DT = 1 / 30
 CONVERGED = StopRule(20_000, 1e-13)
 
-backends = pytest.mark.parametrize("backend", BACKENDS, ids=lambda b: type(b).__name__)
+backends = pytest.mark.parametrize("backend", LOCAL_GLOBAL_BACKENDS, ids=lambda b: type(b).__name__)
 
-FREE = scene(Grid(), Springs(stretch=300.0), size=6)
+FREE = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), size=6)
 """A cloth that nothing holds and nothing pulls at."""
 
 
@@ -35,14 +35,20 @@ def moving(
     made: Scene, velocity: Positions, steps: int, stop: StopRule = CONVERGED
 ) -> list[tuple[Positions, Positions]]:
     """Positions and velocities at the start and after each step."""
-    prepared, state = prepare(made, CompiledLocalGlobal()), State(Motion(made.mesh.rest, velocity), None, 0)
-    run = simulate(made, prepared, stop, first_guess="current", frames=steps, state=state)
-    return [(state.now.positions, velocity), *((now.positions, now.velocity) for now in (s.state.now for s in run))]
+    prepared, state = (
+        prepare(made, CompiledLocalGlobal()),
+        MotionState(Motion(made.mesh.rest_positions, velocity), None, 0),
+    )
+    run = simulate_scene(made, prepared, stop, initial_guess="current", frames=steps, initial_state=state)
+    return [
+        (state.motion.positions, velocity),
+        *((now.positions, now.velocity) for now in (s.state.motion for s in run)),
+    ]
 
 
 def spinning(made: Scene, rate: float) -> Positions:
     """The velocity of a rotation about the vertical through the middle [m/s]."""
-    arm = made.mesh.rest - made.mesh.rest.mean(axis=0)
+    arm = made.mesh.rest_positions - made.mesh.rest_positions.mean(axis=0)
     return np.cross([0.0, rate, 0.0], arm)
 
 
@@ -54,12 +60,18 @@ def angular_momentum(made: Scene, p: Positions, v: Positions) -> np.ndarray:
 @pytest.mark.parametrize("stretch", [5.0, 500.0, 5e6])
 def test_a_mass_on_a_spring_follows_the_recurrence_of_implicit_euler(backend, stretch):
     """(m/dt^2 + k) u' = m/dt^2 (2 u - u_before) + m g, along the spring's own axis, where it is linear."""
-    pins = Pins(at=("first",), weight="exact")
-    made = scene(
-        Chain(direction=(0.0, -1.0, 0.0)), Springs(stretch=stretch), Gravity(), pins, size=2, mass=2.0, time_step=DT
+    pins = PinsEffect(at=("first",), weight="exact")
+    made = build_test_scene(
+        ChainMesh(direction=(0.0, -1.0, 0.0)),
+        SpringsEffect(stretch=stretch),
+        GravityEffect(),
+        pins,
+        size=2,
+        mass=2.0,
+        time_step=DT,
     )
-    made = replace(made, velocity=(0.0, -0.5, 0.0))
-    extension = -trajectory(made, backend, 50)[:, 1, 1] - 1.0
+    made = replace(made, initial_velocity=(0.0, -0.5, 0.0))
+    extension = -simulate_trajectory(made, backend, 50)[:, 1, 1] - 1.0
     u, before, inertia = 0.0, -0.5 * DT, 1.0 / DT**2
     for found in extension:
         u, before = (inertia * (2 * u - before) + G) / (inertia + stretch), u
@@ -68,38 +80,47 @@ def test_a_mass_on_a_spring_follows_the_recurrence_of_implicit_euler(backend, st
 
 @pytest.mark.parametrize("stretch", [10.0, 500.0, 5e4])
 def test_a_mass_on_a_spring_hangs_at_the_extension_of_its_weight(stretch):
-    made = scene(
-        Chain(direction=(0.0, -1.0, 0.0)), Springs(stretch=stretch), Gravity(), Pins(at=("first",)), size=2, mass=2.0
+    made = build_test_scene(
+        ChainMesh(direction=(0.0, -1.0, 0.0)),
+        SpringsEffect(stretch=stretch),
+        GravityEffect(),
+        PinsEffect(at=("first",)),
+        size=2,
+        mass=2.0,
     )
     # The pin of 1e10 N/m gives way by 2e-9 m under 2 kg; inertia pulls with 1e-12 N/m.
-    assert static_shape(made)[1, 1] == pytest.approx(-1.0 - G / stretch, abs=1e-8)
+    assert compute_static_shape(made)[1, 1] == pytest.approx(-1.0 - G / stretch, abs=1e-8)
 
 
 @backends
 def test_a_free_cloth_falls_as_a_stone_does(backend):
     """y_n = -g dt^2 n (n + 1) / 2, by implicit Euler."""
-    made = scene(Grid(), Springs(stretch=300.0), Gravity(), size=6, time_step=DT)
-    p = trajectory(made, backend, 40)
+    made = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), GravityEffect(), size=6, time_step=DT)
+    p = simulate_trajectory(made, backend, 40)
     n = np.arange(1, 41)[:, None]
-    wanted = made.mesh.rest[:, 1] - G * DT**2 * n * (n + 1) / 2
+    wanted = made.mesh.rest_positions[:, 1] - G * DT**2 * n * (n + 1) / 2
     # A thousand roundings of a fall of 9 m, which the cloth's own vibration carries on: 1e-12 to 1e-11.
     np.testing.assert_allclose(p[:, :, 1], wanted, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(p[:, :, [0, 2]], made.mesh.rest[:, [0, 2]][None].repeat(40, 0), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(
+        p[:, :, [0, 2]], made.mesh.rest_positions[:, [0, 2]][None].repeat(40, 0), rtol=0, atol=1e-10
+    )
 
 
 @pytest.mark.parametrize("iterations", [1, 20])
 def test_linear_momentum_is_conserved_converged_or_not(iterations):
-    velocity = np.random.default_rng(0).normal(size=FREE.mesh.rest.shape)
+    velocity = np.random.default_rng(0).normal(size=FREE.mesh.rest_positions.shape)
     momenta = [FREE.system.mass @ v for _, v in moving(FREE, velocity, 20, StopRule(iterations))]
     # Round-off of positions, 1e-16, times stiffness over inertia, some tens, divided by dt.
     np.testing.assert_allclose(momenta, np.tile(momenta[0], (21, 1)), rtol=0, atol=1e-12)
 
 
 def test_the_centre_of_mass_moves_as_a_particle_under_drag_and_gravity():
-    made = scene(Grid(), Springs(stretch=300.0), Gravity(), EtherDrag(rate=2.0), size=6, time_step=DT)
-    velocity = np.random.default_rng(1).normal(size=made.mesh.rest.shape)
+    made = build_test_scene(
+        GridMesh(), SpringsEffect(stretch=300.0), GravityEffect(), EtherDragEffect(rate=2.0), size=6, time_step=DT
+    )
+    velocity = np.random.default_rng(1).normal(size=made.mesh.rest_positions.shape)
     share = made.system.mass / made.system.mass.sum()
-    centre, v = share @ made.mesh.rest, share @ velocity
+    centre, v = share @ made.mesh.rest_positions, share @ velocity
     for p, _ in moving(made, velocity, 20, StopRule(5))[1:]:
         v = np.exp(-2.0 * DT) * v + DT * np.array([0.0, -G, 0.0])
         centre = centre + DT * v
@@ -111,7 +132,7 @@ def test_angular_momentum_changes_by_exactly_what_implicit_euler_takes():
 
     Springs are central, sum p' x F(p') = 0, so sum p' x M v' = sum p' x M v, and p' = p + dt v'.
     """
-    velocity = spinning(FREE, 3.0) + 0.3 * np.random.default_rng(2).normal(size=FREE.mesh.rest.shape)
+    velocity = spinning(FREE, 3.0) + 0.3 * np.random.default_rng(2).normal(size=FREE.mesh.rest_positions.shape)
     steps = moving(FREE, velocity, 10)
     for (p, v), (after, faster) in pairwise(steps):
         taken = DT * np.cross(FREE.system.mass[:, None] * faster, v).sum(axis=0)
@@ -138,11 +159,11 @@ def test_implicit_euler_slows_a_spin_in_proportion_to_the_time_step():
 def test_a_step_never_ends_with_more_than_it_had(backend, iterations):
     """E(p') + |v' - v|^2_M / 2 <= E(p) + |v|^2_M / 2 after any number of iterations, since each of them descends."""
     mass, (springs,) = FREE.system.mass, FREE.system.energies
-    velocity = 2.0 * np.random.default_rng(3).normal(size=FREE.mesh.rest.shape)
-    state = State(Motion(FREE.mesh.rest, velocity), None, 0)
+    velocity = 2.0 * np.random.default_rng(3).normal(size=FREE.mesh.rest_positions.shape)
+    state = MotionState(Motion(FREE.mesh.rest_positions, velocity), None, 0)
     prepared, stop = backend.prepare(FREE.system), StopRule(iterations)
-    for step in simulate(FREE, prepared, stop, first_guess="current", frames=30, state=state):
-        (p, v), (after, v_after) = state.now, step.state.now
+    for step in simulate_scene(FREE, prepared, stop, initial_guess="current", frames=30, initial_state=state):
+        (p, v), (after, v_after) = state.motion, step.state.motion
         had = springs.value(p) + 0.5 * mass @ np.sum(v**2, axis=1)
         has = springs.value(after) + 0.5 * mass @ np.sum((v_after - v) ** 2, axis=1)
         assert has <= had * (1 + 1e-13)  # sums of some hundred terms

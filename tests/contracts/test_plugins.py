@@ -14,12 +14,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from harness.base.errors import InputError
-from harness.config.load import load_any
-from harness.experiments.code import code, parts
-from harness.report.sweep import Pictured, compared
-from solvers.plugins import Refused
-from solvers.registry import EVERY
-from tests.often import often
+from harness.config.load import load_config
+from harness.experiments.code import collect_source_parts, compute_source_fingerprint
+from harness.report.sweep import PictureJob, group_by_scene
+from solvers.plugins import InvalidPluginName
+from solvers.registry import SOLVER_TABLE
+from tests.often import mark_rare_cases
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -145,7 +145,7 @@ def beside(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("way", often(WAYS, ["beside", "entry-point"]))
+@pytest.mark.parametrize("way", mark_rare_cases(WAYS, ["beside", "entry-point"]))
 def test_a_sweep_runs_own_code_and_says_whose_it_is(way: str, beside: Path, installed: Path):
     (beside / "installed").symlink_to(installed)
     for mark in [*beside.rglob("*.was-run"), *installed.rglob("*.was-run")]:
@@ -209,31 +209,33 @@ def test_a_changed_file_is_another_run(beside: Path):
 
 def test_opened_or_not_a_run_has_one_name_and_one_code(beside: Path):
     sweep = configs(beside, WAYS["beside"])
-    closed, opened = (load_any(sweep, opens=opens).runs()[0] for opens in (False, True))
-    assert closed.identity() == opened.identity()
-    assert code(parts(closed)) == code(parts(opened))
-    shipped = load_any(ROOT / "configs" / "quickstart.yaml", opens=False).runs()[0]
-    assert not shipped.own()
+    closed, opened = (load_config(sweep, imports_code=opens).list_runs()[0] for opens in (False, True))
+    assert closed.build_identity() == opened.build_identity()
+    assert compute_source_fingerprint(collect_source_parts(closed)) == compute_source_fingerprint(
+        collect_source_parts(opened)
+    )
+    shipped = load_config(ROOT / "configs" / "quickstart.yaml", imports_code=False).list_runs()[0]
+    assert not shipped.find_plugins()
 
 
 def test_two_of_one_solver_are_told_apart_by_what_only_one_of_them_says(beside: Path):
     sweep = configs(beside, WAYS["beside"])
     sweep.write_text(sweep.read_text().replace("patience: 5}", "patience: 5}, './mine.py:Mine'"))
-    (group,) = compared([Pictured(run, beside, beside) for run in load_any(sweep).runs()], beside)
-    assert list(group.runs) == ["./mine.py:Mine, patience 5", "./mine.py:Mine"]
+    (group,) = group_by_scene([PictureJob(run, beside, beside) for run in load_config(sweep).list_runs()], beside)
+    assert list(group.jobs_by_label) == ["./mine.py:Mine, patience 5", "./mine.py:Mine"]
 
 
 def test_a_file_beside_the_config_travels_between_processes(beside: Path):
     import pickle
 
-    run = load_any(configs(beside, WAYS["beside"])).runs()[0]
+    run = load_config(configs(beside, WAYS["beside"])).list_runs()[0]
     (beside / "run.pickle").write_bytes(pickle.dumps(run))
     program = "import pickle; run = pickle.load(open('run.pickle', 'rb')); "
     program += "print(run.scene.opened().effects[1], run.identity())"
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     told = subprocess.run([sys.executable, "-c", program], cwd=beside, env=env, capture_output=True, text=True)
     assert told.stdout.split(" ", 2)[:2] == ["kind='hum'", "force=0.5"], told.stderr
-    assert told.stdout.rstrip().endswith(run.identity())
+    assert told.stdout.rstrip().endswith(run.build_identity())
 
 
 REFUSED = {
@@ -258,8 +260,8 @@ def test_code_elsewhere_is_refused(name: str, beside: Path):
     (inside / "mine.py").write_text(CODE)
     (inside / "link.py").symlink_to(beside / "mine.py")
     (inside / "linked").symlink_to(beside / "own")
-    with pytest.raises(Refused, match=r".") as caught:
-        EVERY.named(name, inside)
+    with pytest.raises(InvalidPluginName, match=r".") as caught:
+        SOLVER_TABLE.resolve_name(name, inside)
     assert REFUSED[name] in str(caught.value) or "from the config's folder on" in str(caught.value)
 
 
@@ -276,9 +278,9 @@ WRONG = {
 @pytest.mark.parametrize(("part", "name"), WRONG)
 def test_what_a_name_leads_to_is_checked_when_it_is_run(part: str, name: str, beside: Path):
     sweep = configs(beside, WAYS["beside"] | {part: name})
-    assert load_any(sweep, opens=False).runs()
+    assert load_config(sweep, imports_code=False).list_runs()
     with pytest.raises(InputError) as caught:
-        load_any(sweep)
+        load_config(sweep)
     assert WRONG[part, name] in str(caught.value)
 
 
@@ -286,4 +288,4 @@ def test_wrong_parameters_of_own_code_are_told_with_their_line(beside: Path):
     sweep = configs(beside, WAYS["beside"])
     sweep.write_text(sweep.read_text().replace("patience: 5", "patience: soon"))
     with pytest.raises(InputError, match=r"sweep\.yaml:2: solvers\[0\]\.patience: came \"soon\"; should be"):
-        load_any(sweep)
+        load_config(sweep)

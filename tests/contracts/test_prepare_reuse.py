@@ -14,8 +14,8 @@ import pytest
 
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import StepProblem, StopRule
-from solvers.registry import SOLVERS, load
-from tests.scenes import cloth, first_problem, frozen, random_problem
+from solvers.registry import SOLVERS, load_target
+from tests.scenes import build_cloth, build_first_problem, build_random_problem, make_read_only
 
 FORCED = {
     f"numba, {solver.linear} in {solver.precision}": solver
@@ -25,12 +25,12 @@ FORCED = {
         CompiledLocalGlobal("cg", "float64"),
     )
 }
-CHOICES = {name: load(target)() for name, target in SOLVERS.items()} | FORCED
+CHOICES = {name: load_target(target)() for name, target in SOLVERS.items()} | FORCED
 LARGE = "cloth large enough for threads, exact pins"
 PROBLEMS = {
-    "cloth": lambda: first_problem(cloth(9)),
-    LARGE: lambda: first_problem(cloth(30, "exact"), "inertial"),
-    "random": lambda: random_problem(4, weights=(1e4, np.inf, 1e2)),
+    "cloth": lambda: build_first_problem(build_cloth(9)),
+    LARGE: lambda: build_first_problem(build_cloth(30, "exact"), "inertial"),
+    "random": lambda: build_random_problem(4, weights=(1e4, np.inf, 1e2)),
 }
 CASES = [(name, choice) for name in PROBLEMS for choice in CHOICES if name != LARGE or choice.startswith("numba")]
 STOPS = {"count": StopRule(4), "tolerance": StopRule(30, 1e-2)}
@@ -38,30 +38,36 @@ STOPS = {"count": StopRule(4), "tolerance": StopRule(30, 1e-2)}
 
 def noise(problem: StepProblem, seed: int) -> np.ndarray:
     """A displacement (n, 3) [m] of a tenth of the scene's size."""
-    size = float(np.ptp(problem.current, axis=0).max())
-    return 0.1 * size * np.random.default_rng(seed).normal(size=problem.current.shape)
+    size = float(np.ptp(problem.current_positions, axis=0).max())
+    return 0.1 * size * np.random.default_rng(seed).normal(size=problem.current_positions.shape)
 
 
 def elsewhere(problem: StepProblem) -> StepProblem:
-    current = problem.current + noise(problem, 1)
+    current = problem.current_positions + noise(problem, 1)
     current[problem.system.pins.vertices] = problem.pin_targets
-    start = replace(problem.start, positions=current, velocity=noise(problem, 2), origin=current)
-    return replace(problem, current=current, first_guess=current, target=current + noise(problem, 3), start=start)
+    start = replace(problem.step_start, positions=current, velocity=noise(problem, 2), velocity_origin=current)
+    return replace(
+        problem,
+        current_positions=current,
+        initial_guess=current,
+        inertial_target=current + noise(problem, 3),
+        step_start=start,
+    )
 
 
 def pushed(problem: StepProblem) -> StepProblem:
-    return replace(problem, force=-2.0 * problem.force + noise(problem, 4))
+    return replace(problem, external_force=-2.0 * problem.external_force + noise(problem, 4))
 
 
 def pulled(problem: StepProblem) -> StepProblem:
     targets = problem.pin_targets + noise(problem, 5)[: len(problem.pin_targets)]
-    current = problem.current.copy()
+    current = problem.current_positions.copy()
     current[problem.system.pins.vertices] = targets
-    return replace(problem, pin_targets=targets, current=current)
+    return replace(problem, pin_targets=targets, current_positions=current)
 
 
 def guessed(problem: StepProblem) -> StepProblem:
-    return replace(problem, first_guess=problem.first_guess + noise(problem, 6))
+    return replace(problem, initial_guess=problem.initial_guess + noise(problem, 6))
 
 
 STEPS: tuple[Callable[[StepProblem], StepProblem], ...] = (
@@ -75,16 +81,21 @@ STEPS: tuple[Callable[[StepProblem], StepProblem], ...] = (
 
 @pytest.mark.parametrize(("name", "choice"), CASES)
 def test_one_preparation_serves_all_steps_of_a_system(name, choice):
-    solver, first = CHOICES[choice], frozen(PROBLEMS[name]())
+    solver, first = CHOICES[choice], make_read_only(PROBLEMS[name]())
     reused = solver.prepare(first.system)
     before = [reused.solve(first, stop).positions for stop in STOPS.values()]
     for step in STEPS:
-        problem, fresh = frozen(step(first)), solver.prepare(first.system)
+        problem, fresh = make_read_only(step(first)), solver.prepare(first.system)
         for k, stop in enumerate(STOPS.values()):
             found, expected = reused.solve(problem, stop), fresh.solve(problem, stop)
             np.testing.assert_array_equal(found.positions, expected.positions)
-            assert (found.iterations, found.stopped) == (expected.iterations, expected.stopped)
+            assert (found.num_iterations, found.termination_reason) == (
+                expected.num_iterations,
+                expected.termination_reason,
+            )
             # A residual that was not asked for is no number, and equals itself here.
-            np.testing.assert_array_equal([found.residual, found.yardstick], [expected.residual, expected.yardstick])
+            np.testing.assert_array_equal(
+                [found.residual, found.initial_residual], [expected.residual, expected.initial_residual]
+            )
             # The last step is another one in every respect: what was prepared, or solved before, does not answer it.
             assert step is not STEPS[-1] or not np.array_equal(found.positions, before[k])

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.config.load import load_any
-from harness.scenes.mesh.chain import Chain
+from harness.config.load import load_config
+from harness.scenes.mesh.chain import ChainMesh
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -22,14 +22,14 @@ def example(page: str, section: str, language: str) -> str:
 def test_the_sweep_of_the_readme_is_a_sweep(tmp_path: Path):
     (tmp_path / "scenes").symlink_to(ROOT / "configs" / "scenes")
     (tmp_path / "sweep.yaml").write_text(example("configs/README.md", "Writing a sweep", "yaml"))
-    runs = load_any(tmp_path / "sweep.yaml").runs()
+    runs = load_config(tmp_path / "sweep.yaml").list_runs()
     # two scenes, three sizes, three solvers, two limits, two guesses; less dense at 64; and one more
     assert len(runs) == 2 * 3 * 3 * 2 * 2 - 2 * 2 * 2 + 1
 
 
 def test_the_scene_of_the_readme_is_a_scene(tmp_path: Path):
     (tmp_path / "scene.yaml").write_text(example("configs/README.md", "Writing a scene", "yaml"))
-    (run,) = load_any(tmp_path / "scene.yaml").runs()
+    (run,) = load_config(tmp_path / "scene.yaml").list_runs()
     assert (run.size, run.frames, run.solver.name) == (48, 90, "hybrid")
     assert [type(effect).__name__ for effect in run.scene.effects] == ["Springs", "Gravity", "Wind", "Pins"]
 
@@ -38,10 +38,10 @@ def test_the_effect_of_the_readme_is_an_effect():
     names: dict = {"__name__": "linear_drag"}
     exec(compile(example("harness/README.md", "Adding an effect", "python"), "<README.md>", "exec"), names)
     assert len(example("harness/README.md", "Adding an effect", "python").splitlines()) <= 40
-    mesh = Chain().build(3)
+    mesh = ChainMesh().build_mesh(3)
     (drag,) = names["LinearDrag"](coefficient=2.0).bind(mesh, np.ones(3), 0.1).forces
     v = np.arange(9.0).reshape(3, 3)
-    assert drag(mesh.rest, v, 0.0) == pytest.approx(-2.0 * v)
+    assert drag(mesh.rest_positions, v, 0.0) == pytest.approx(-2.0 * v)
 
 
 PAGES = [page for page in ROOT.glob("**/*.md") if not {".venv", ".pytest_cache", "node_modules"} & set(page.parts)]

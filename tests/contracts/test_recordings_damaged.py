@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from harness.base.errors import InputError
-from harness.record.reader import read_replay, summary
-from harness.record.rerun import FLUSH
-from tests.recordings import foreign, info, record, waving
+from harness.record.reader import read_replay, summarise_recording
+from harness.record.rerun import FLUSH_INTERVAL
+from tests.recordings import build_recording_info, generate_waves, write_foreign_recording, write_recording
 
 RECORD = """
 import os, resource, signal, sys
@@ -73,21 +73,23 @@ def test_a_killed_run_leaves_all_frames_up_to_the_last_flush(tmp_path: Path):
     assert told.returncode == -signal.SIGKILL, told.stderr
     (left,) = tmp_path.iterdir()
     assert left.name != "a.rrd"
-    found, replay = summary(left), read_replay(left)
-    assert not found.complete
-    assert len(replay.frames) > 33 - FLUSH
-    expected = [frame.positions.astype(np.float32) for frame in waving(info(), len(replay.frames))]
+    found, replay = summarise_recording(left), read_replay(left)
+    assert not found.is_complete
+    assert len(replay.frames) > 33 - FLUSH_INTERVAL
+    expected = [
+        frame.positions.astype(np.float32) for frame in generate_waves(build_recording_info(), len(replay.frames))
+    ]
     np.testing.assert_array_equal(replay.positions, expected)
     assert len(replay.scalars["/strain/largest"][0]) == len(replay.frames)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.8, 0.99])
 def test_a_file_that_was_cut_is_read_up_to_the_cut(share: float, tmp_path: Path):
-    path = record(tmp_path / "a.rrd", count=60)
+    path = write_recording(tmp_path / "a.rrd", frame_count=60)
     whole = read_replay(path)
     os.truncate(path, int(share * path.stat().st_size))
-    replay, found = read_replay(path), summary(path)
-    assert not found.complete
+    replay, found = read_replay(path), summarise_recording(path)
+    assert not found.is_complete
     assert 0 < len(replay.frames) <= 60
     np.testing.assert_array_equal(replay.positions, whole.positions[: len(replay.frames)])
     assert [file.name for file in tmp_path.iterdir()] == ["a.rrd"]
@@ -101,7 +103,7 @@ STRANGERS: dict[str, tuple[Callable[[Path], object], str]] = {
     "noise": (lambda path: path.write_bytes(bytes(range(256)) * 9), "is not a Rerun recording"),
     "head": (lambda path: path.write_bytes(b"RRF2"), "Rerun recording"),
     "garbage": (lambda path: path.write_bytes(b"RRF2" + bytes(range(256)) * 9), "Rerun recording|can be read"),
-    "foreign": (foreign, "not of one run"),
+    "foreign": (write_foreign_recording, "not of one run"),
 }
 
 

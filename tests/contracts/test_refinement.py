@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
 from solvers.problem import Positions
-from tests.scenes import scene, static_shape
+from tests.scenes import build_test_scene, compute_static_shape
 
 G, MASS, LENGTH = 9.81, 1.5, 2.0
 
@@ -41,17 +41,17 @@ def elastic_catenary(ea: float, span: float, s: np.ndarray) -> np.ndarray:
 
 def hanging_chain(ea: float, span: float, size: int) -> Positions:
     """A chain whose ends are held `span` apart, at rest."""
-    made = scene(
-        Chain(length=LENGTH),
-        Springs(stretch=ea),
-        Gravity(),
-        Pins(at=("ends",), weight="exact"),
+    made = build_test_scene(
+        ChainMesh(length=LENGTH),
+        SpringsEffect(stretch=ea),
+        GravityEffect(),
+        PinsEffect(at=("ends",), weight="exact"),
         size=size,
         mass=MASS,
     )
     targets = made.pin_targets.copy()
     targets[1, 0] = span
-    return static_shape(replace(made, pin_targets=targets))
+    return compute_static_shape(replace(made, pin_targets=targets))
 
 
 CHAINS = [(20.0, 2.0), (100.0, 2.0), (100.0, 2.6), (50.0, 1.2), (300.0, 1.6)]
@@ -73,9 +73,11 @@ def test_a_hanging_chain_takes_the_shape_of_the_elastic_catenary(ea, span):
 
 def sag(size: int, **stiffness: float) -> float:
     """How far the middle of a level cloth, held all around, hangs down [m]."""
-    pins = Pins(at=("boundary",), weight="exact")
-    made = scene(Grid(skip_one=True), Springs.model_validate(stiffness), Gravity(), pins, size=size, mass=0.5)
-    p = static_shape(made)
+    pins = PinsEffect(at=("boundary",), weight="exact")
+    made = build_test_scene(
+        GridMesh(skip_one=True), SpringsEffect.model_validate(stiffness), GravityEffect(), pins, size=size, mass=0.5
+    )
+    p = compute_static_shape(made)
     return -p[len(p) // 2, 1]
 
 

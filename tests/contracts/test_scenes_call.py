@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from harness.config.load import load_any
-from harness.experiments.ablation.command import SOLVER, TOLERANCE
+from harness.config.load import load_config
+from harness.experiments.ablation.command import DEFAULT_ABLATION_SOLVER, DEFAULT_ABLATION_TOLERANCE
 from harness.experiments.ablation.unit import run_ablation
-from harness.report.ablation import of_kind, read, verdict
-from tests.displays import Quiet
+from harness.report.ablation import describe_effect, read_ablation, select_kind
+from tests.displays import SilentDisplay
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 QUICK: dict[str, int | None] = {"heavy-bob": None, "tower": 8, "hanging-cloth": 12}
@@ -44,10 +44,20 @@ CALLED = ("this scene calls for it", "without it this is another scene", "the sc
 @pytest.mark.parametrize("name", [*QUICK, *(pytest.param(name, marks=pytest.mark.long) for name in LONG | TOUCH)])
 def test_a_scene_has_the_effects_that_its_motion_calls_for_and_no_others(name: str, tmp_path: Path):
     size, folder = (QUICK | LONG | TOUCH)[name], CONFIGS / ("touch" if name in TOUCH else "scenes")
-    asked = {"solvers": [SOLVER], "tolerance": TOLERANCE, "sizes": [size] if size else [], "rounds": 1, "threads": 1}
-    sweep = load_any(folder / f"{name}.yaml", **asked)
-    rows = read(run_ablation(sweep, tmp_path, Quiet(), lambda line: None, pairs=False, isolated=False))
-    told = {row["name"]: verdict(row, rows) for row in of_kind(rows, "without")}
+    asked = {
+        "solvers": [DEFAULT_ABLATION_SOLVER],
+        "tolerance": DEFAULT_ABLATION_TOLERANCE,
+        "sizes": [size] if size else [],
+        "rounds": 1,
+        "threads": 1,
+    }
+    sweep = load_config(folder / f"{name}.yaml", **asked)
+    rows = read_ablation(
+        run_ablation(sweep, tmp_path, SilentDisplay(), lambda line: None, with_pairs=False, isolated=False)
+    )
+    told = {row["name"]: describe_effect(row, rows) for row in select_kind(rows, "without")}
     assert {name: words for name, words in told.items() if not any(called in words for called in CALLED)} == {}
     # Scenes that all solvers take leave out contact of a mesh with itself, which few solvers know.
-    assert {row["name"]: row["reason"] for row in of_kind(rows, "suggestion") if row["name"] != "self-contact"} == {}
+    assert {
+        row["name"]: row["reason"] for row in select_kind(rows, "suggestion") if row["name"] != "self-contact"
+    } == {}

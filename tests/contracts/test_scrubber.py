@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from harness.record.reader import read_replay
-from harness.report.site import update
+from harness.report.site import update_page
 from tests import accuracy_rows
-from tests.browser import chromium
-from tests.recordings import info, record
+from tests.browser import launch_chromium
+from tests.recordings import build_recording_info, write_recording
 
 AMPLITUDES = {"newton": 0.05, "lbfgs": 0.1}
 COLOURED = """canvas => {
@@ -29,21 +29,23 @@ COLOURED = """canvas => {
 
 def study(folder: Path) -> str:
     """A page with two solves of one step and their recordings, whose iterates differ."""
-    rows = accuracy_rows.problem("net", 6, "early")
+    rows = accuracy_rows.build_snapshot_rows("net", 6, "early")
     (folder / "study" / "recordings").mkdir(parents=True)
     for solver, amplitude in AMPLITUDES.items():
         name = f"recordings/net-6-early-{solver}.rrd"
-        record(folder / "study" / name, replace(info(), iterates=True), count=8, amplitude=amplitude)
-        rows += [row | {"recording": name} for row in accuracy_rows.curve("net", 6, "early", solver)]
-    accuracy_rows.write(folder / "study", rows)
-    return update(folder, recorded=True).as_uri()
+        write_recording(
+            folder / "study" / name, replace(build_recording_info(), is_solve=True), frame_count=8, amplitude=amplitude
+        )
+        rows += [row | {"recording": name} for row in accuracy_rows.build_curve_rows("net", 6, "early", solver)]
+    accuracy_rows.write_accuracy_rows(folder / "study", rows)
+    return update_page(folder, with_recordings=True).as_uri()
 
 
 @pytest.mark.long
 def test_each_iterate_is_shown_beside_the_reference_by_its_distance(tmp_path: Path):
     page = study(tmp_path)
     files = {solver: read_replay(tmp_path / f"study/recordings/net-6-early-{solver}.rrd") for solver in AMPLITUDES}
-    with chromium() as browser:
+    with launch_chromium() as browser:
         tab = browser.new_page(viewport={"width": 1280, "height": 1200})
         said: list[str] = []
         tab.on("console", lambda message: said.append(message.text))

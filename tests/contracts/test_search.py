@@ -13,10 +13,10 @@ import pytest
 
 from harness.base.errors import RunFailed
 from harness.config.load import load_scene
-from harness.experiments.asked.search import Answer, Found, search
-from harness.experiments.asked.ways import Asked, Way
-from harness.reference.growth import growth
-from harness.simulation.controlled import Follower, Path, TooSlow
+from harness.experiments.asked.search import SearchResult, Trial, search_cheapest_method
+from harness.experiments.asked.ways import ErrorTarget, Method
+from harness.reference.growth import estimate_growth
+from harness.simulation.controlled import Stepper, TimeBudgetExceeded, Trajectory
 
 SPRING = load_scene(File(__file__).parents[2] / "configs" / "scenes" / "single-spring.yaml")
 STEPS = 10
@@ -24,43 +24,43 @@ STEPS = 10
 
 
 @dataclass(frozen=True)
-class Formula(Follower):
+class Formula(Stepper):
     """Its free vertex ends at (1 + error(steps), 0, 0); seconds: of processor time a step; wall time is twice that."""
 
     error: Callable[[int], float]
     seconds: float
     stated: int = 2
-    even: ClassVar[bool] = True
+    has_fixed_step: ClassVar[bool] = True
 
     @property
     def order(self) -> int:
         return self.stated
 
-    def follow(self, setting: float, *, limit: float = inf) -> Path:
+    def integrate_motion(self, setting: float, *, cpu_limit: float = inf) -> Trajectory:
         steps = ceil(STEPS * setting)
-        if (took := steps * self.seconds) > limit:
-            raise TooSlow
+        if (took := steps * self.seconds) > cpu_limit:
+            raise TimeBudgetExceeded
         positions = np.zeros((2, 2, 3))
         positions[1, :, 0] = 1.0 + self.error(steps)
-        return Path(positions, steps, 0, 0, steps, (1.0, 1.0), 2.0 * took, (2.0 * took,), took)
+        return Trajectory(positions, steps, 0, 0, steps, (1.0, 1.0), 2.0 * took, (2.0 * took,), took)
 
 
 class Tolerant(Formula):
     """Its setting is a tolerance, from which the steps follow; it is never too slow."""
 
-    even: ClassVar[bool] = False
+    has_fixed_step: ClassVar[bool] = False
 
-    def follow(self, setting: float, *, limit: float = inf) -> Path:
-        return super().follow(max(1.0, setting ** (-1.0 / (self.order + 1.0))))
+    def integrate_motion(self, setting: float, *, cpu_limit: float = inf) -> Trajectory:
+        return super().integrate_motion(max(1.0, setting ** (-1.0 / (self.order + 1.0))))
 
 
-def found(monkeypatch: pytest.MonkeyPatch, error: float, told: list[str], **followers: Follower) -> Answer:
+def found(monkeypatch: pytest.MonkeyPatch, error: float, told: list[str], **followers: Stepper) -> SearchResult:
     """The answer among ways of these names, the last of which tells the errors of all."""
     exact = Tolerant(lambda steps: 5.0 * steps**-4.0, 0.5, 4)
-    named = [Way("own", name, one) for name, one in {**followers, "exact": exact}.items()]
+    named = [Method("own", name, one) for name, one in {**followers, "exact": exact}.items()]
     monkeypatch.setattr("harness.experiments.asked.search.ways", lambda *_: named)
-    asked = Asked.of(SPRING, 2, 0.2)
-    return search(asked, error, growth(SPRING, 2, 0.2), told.append)
+    asked = ErrorTarget.from_scene(SPRING, 2, 0.2)
+    return search_cheapest_method(asked, error, estimate_growth(SPRING, 2, 0.2), told.append)
 
 
 def test_the_order_is_measured_and_the_cost_predicted_by_it(monkeypatch):
@@ -68,7 +68,7 @@ def test_the_order_is_measured_and_the_cost_predicted_by_it(monkeypatch):
     first = Formula(lambda steps: 2.0 / steps, 1e-3)
     second = Formula(lambda steps: 20.0 / steps**2, 1e-2)
     answer = found(monkeypatch, 1e-3, [], first=first, second=second)
-    by_name = {one.way.solver: (one, promise) for one, promise in answer.tried}
+    by_name = {one.method.solver: (one, promise) for one, promise in answer.trials}
     assert by_name["first"][0].order == pytest.approx(1.0, abs=0.05)
     assert by_name["second"][0].order == pytest.approx(2.0, abs=0.05)
     # DOUBT times the error, at AIM for steps of one length: 2.5/N = 0.85e-3 and 25/N^2 = 0.85e-3.
@@ -80,10 +80,10 @@ def test_ways_are_sorted_chosen_and_printed_by_one_statistic(monkeypatch):
     told = list[str]()
     ways = {f"w{k}": Formula(lambda steps: 1.0 / steps**2, 1e-3 * cost) for k, cost in enumerate((3.0, 1.0, 2.0))}
     answer = found(monkeypatch, 1e-2, told, **ways)
-    promises = [promise for _, promise in answer.tried]
+    promises = [promise for _, promise in answer.trials]
     assert promises == sorted(promises)
-    assert answer.best.way is answer.tried[0][0].way
-    assert answer.best.way.solver == "w1"
+    assert answer.best_trial.method is answer.trials[0][0].method
+    assert answer.best_trial.method.solver == "w1"
     printed = [line.split(": ")[1].split(" s ")[0] for line in told if " predicted; " in line]
     assert printed == [f"{promise:.3g}" for promise in promises]
 
@@ -92,8 +92,8 @@ def test_a_way_that_comes_no_nearer_is_followed_by_the_next(monkeypatch):
     told = list[str]()
     stuck = Formula(lambda steps: 0.03 + 1.0 / steps**2, 1e-4)
     answer = found(monkeypatch, 1e-2, told, stuck=stuck, slower=Formula(lambda steps: 1.0 / steps, 1e-2))
-    assert answer.best.way.solver != "stuck"
-    assert answer.best.estimated <= 1e-2
+    assert answer.best_trial.method.solver != "stuck"
+    assert answer.best_trial.error_estimated <= 1e-2
     assert any(line.startswith("  stuck: reaches 3.") and "come no nearer" in line for line in told)
 
 
@@ -102,20 +102,22 @@ def test_a_way_that_takes_longer_than_the_next_promises_is_tried_after_it(monkey
     told = list[str]()
     late = Formula(lambda steps: 20.0 / steps**2 if steps < 40 else 0.0125 * (40 / steps) ** 0.5, 1e-4)
     answer = found(monkeypatch, 1e-3, told, late=late, steady=Formula(lambda steps: 1.0 / steps, 3e-4))
-    assert answer.tried[0][0].way.solver == "late"
-    assert answer.best.way.solver == "steady"
+    assert answer.trials[0][0].method.solver == "late"
+    assert answer.best_trial.method.solver == "steady"
     assert any(line.startswith("  late: takes more than") for line in told)
 
 
 def test_an_error_that_no_way_comes_near_is_refused_with_the_nearest(monkeypatch):
     lows = {"a": 0.3, "b": 0.2}
-    named = [Way("own", k, Formula(lambda steps, low=low: low + 1.0 / steps**2, 1e-3)) for k, low in lows.items()]
+    named = [Method("own", k, Formula(lambda steps, low=low: low + 1.0 / steps**2, 1e-3)) for k, low in lows.items()]
     monkeypatch.setattr("harness.experiments.asked.search.ways", lambda *_: named)
     monkeypatch.setattr("harness.experiments.asked.search._Search._closer", lambda *_: _truth())
     with pytest.raises(RunFailed, match=r"no steps keep to an error of 0.01: b came nearest and reached 0\.3"):
-        search(Asked.of(SPRING, 2, 0.2), 1e-2, growth(SPRING, 2, 0.2), lambda line: None)
+        search_cheapest_method(
+            ErrorTarget.from_scene(SPRING, 2, 0.2), 1e-2, estimate_growth(SPRING, 2, 0.2), lambda line: None
+        )
 
 
-def _truth() -> Found:
+def _truth() -> Trial:
     follower = Formula(lambda steps: 0.0, 1e-3)
-    return Found(Way("own", "truth", follower), 1.0, follower.follow(1.0), 0.0, 2)
+    return Trial(Method("own", "truth", follower), 1.0, follower.integrate_motion(1.0), 0.0, 2)

@@ -13,8 +13,8 @@ import pytest
 
 from harness.base import holding, rows
 from harness.base.errors import InputError
-from harness.base.holding import DONE, TAKEN, Claims
-from tests.own_solvers import SCENE
+from harness.base.holding import CLAIMED_ELSEWHERE, DONE_ELSEWHERE, UnitClaims
+from tests.own_solvers import SCENE_SOURCE
 
 ROOT = Path(__file__).resolve().parents[2]
 RUNS = 4
@@ -24,7 +24,7 @@ SWEEP = f"scenes: [scene.yaml]\nsizes: {list(range(3, 3 + RUNS))}\nsolvers: [spa
 
 
 def sweep(folder: Path) -> Path:
-    (folder / "scene.yaml").write_text(SCENE)
+    (folder / "scene.yaml").write_text(SCENE_SOURCE)
     (folder / "sweep.yaml").write_text(SWEEP)
     return folder / "sweep.yaml"
 
@@ -78,23 +78,23 @@ def claimed_elsewhere(folder: Path, unit: Path) -> subprocess.Popen[str]:
 
 def test_a_claim_holds_against_others_and_goes_with_its_process(tmp_path: Path):
     unit, free = tmp_path / "a.parquet", tmp_path / "b.parquet"
-    claims = Claims(tmp_path, [unit, free])
+    claims = UnitClaims(tmp_path, [unit, free])
     other = claimed_elsewhere(tmp_path, unit)
-    assert claims.take(unit) == TAKEN
-    assert claims.take(free) == ""
+    assert claims.try_claim(unit) == CLAIMED_ELSEWHERE
+    assert claims.try_claim(free) == ""
     other.kill()
     other.wait()
-    claims.wait([unit])
-    assert claims.take(unit) == ""
+    claims.wait_for_any([unit])
+    assert claims.try_claim(unit) == ""
     claims.close()
 
 
 def test_what_its_claimant_has_done_is_done_though_the_claim_is_kept(tmp_path: Path):
     unit = tmp_path / "a.parquet"
-    claims, other = Claims(tmp_path, [unit]), claimed_elsewhere(tmp_path, unit)
-    rows.write(unit, [{"run_id": "x"}])
-    claims.wait([unit])
-    assert claims.take(unit) == DONE
+    claims, other = UnitClaims(tmp_path, [unit]), claimed_elsewhere(tmp_path, unit)
+    rows.write_rows(unit, [{"run_id": "x"}])
+    claims.wait_for_any([unit])
+    assert claims.try_claim(unit) == DONE_ELSEWHERE
     other.kill()
     other.wait()
     claims.close()
@@ -102,25 +102,25 @@ def test_what_its_claimant_has_done_is_done_though_the_claim_is_kept(tmp_path: P
 
 def test_what_somebody_else_has_done_since_is_left_to_that(tmp_path: Path):
     unit = tmp_path / "a.parquet"
-    claims = Claims(tmp_path, [unit])
-    rows.write(unit, [{"run_id": "x"}])
-    assert claims.take(unit) == DONE
-    claims.wait([unit])
+    claims = UnitClaims(tmp_path, [unit])
+    rows.write_rows(unit, [{"run_id": "x"}])
+    assert claims.try_claim(unit) == DONE_ELSEWHERE
+    claims.wait_for_any([unit])
     claims.close()
 
 
 def test_whoever_packs_a_folder_has_it_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(holding, "_PATIENCE", 0.0)
     with (
-        holding.together(tmp_path),
+        holding.lock_folder_shared(tmp_path),
         pytest.raises(InputError, match="another springbench is running"),
-        holding.alone(tmp_path),
+        holding.lock_folder_exclusive(tmp_path),
     ):
         pass
     with (
-        holding.alone(tmp_path),
+        holding.lock_folder_exclusive(tmp_path),
         pytest.raises(InputError, match="has it for itself"),
-        holding.together(tmp_path),
+        holding.lock_folder_shared(tmp_path),
     ):
         pass
 
@@ -129,10 +129,10 @@ def test_the_first_and_the_last_remove_what_is_half_written(tmp_path: Path):
     half = tmp_path / "rows" / ".a.1.partial.parquet"
     half.parent.mkdir()
     half.touch()
-    with holding.together(tmp_path):
+    with holding.lock_folder_shared(tmp_path):
         assert not half.exists()
         half.touch()
-        with holding.together(tmp_path):
+        with holding.lock_folder_shared(tmp_path):
             assert half.exists()
         assert half.exists()
     assert not half.exists()

@@ -8,16 +8,16 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from harness.simulation.trace import EnergyNorm, trace
+from harness.simulation.trace import EnergyNorm, trace_convergence
 from solvers.energies.springs import Springs
 from solvers.linear.factors import SparseLU
-from solvers.matrices import assemble, energy_norm
+from solvers.matrices import assemble_system_matrix, energy_norm
 from solvers.methods.local_global import DenseLocalGlobal, PreparedLocalGlobal, SparseLocalGlobal
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.methods.newton import Newton
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import Positions, StepProblem, StopRule
-from solvers.registry import SOLVERS, load
-from tests.scenes import cloth, first_problem, frozen, random_problem
+from solvers.registry import SOLVERS, load_target
+from tests.scenes import build_cloth, build_first_problem, build_random_problem, make_read_only
 
 FORCED = {
     "numba, inverse in float32": CompiledLocalGlobal("inverse", "float32"),
@@ -25,12 +25,12 @@ FORCED = {
     "numba, supernodal": CompiledLocalGlobal("supernodal"),
     "numba, supernodal in float32": CompiledLocalGlobal("supernodal", "float32"),
     "numba, supernodal in float16": CompiledLocalGlobal("supernodal", "float16"),
-    "newton, clamp": Newton("clamp"),
-    "newton, absolute": Newton("absolute"),
-    "newton, trust-region": Newton("trust-region"),
-    "newton, progressive": Newton("progressive"),
+    "newton, clamp": NewtonSolver("clamp"),
+    "newton, absolute": NewtonSolver("absolute"),
+    "newton, trust-region": NewtonSolver("trust-region"),
+    "newton, progressive": NewtonSolver("progressive"),
 }
-CHOICES = {name: load(target)() for name, target in SOLVERS.items()} | FORCED
+CHOICES = {name: load_target(target)() for name, target in SOLVERS.items()} | FORCED
 LOCAL_GLOBAL = {
     name: solver
     for name, solver in CHOICES.items()
@@ -47,12 +47,14 @@ def over(choices):
 solvers = over(CHOICES)
 
 PROBLEMS = {
-    "cloth": lambda: first_problem(cloth(10)),
-    "cloth, exact pins, inertial guess": lambda: first_problem(cloth(10, "exact"), "inertial"),
-    "random": lambda: random_problem(0),
-    "random, not pinned": lambda: random_problem(1, weights=()),
+    "cloth": lambda: build_first_problem(build_cloth(10)),
+    "cloth, exact pins, inertial guess": lambda: build_first_problem(build_cloth(10, "exact"), "inertial"),
+    "random": lambda: build_random_problem(0),
+    "random, not pinned": lambda: build_random_problem(1, weights=()),
 }
-problems = pytest.mark.parametrize("problem", [frozen(make()) for make in PROBLEMS.values()], ids=list(PROBLEMS))
+problems = pytest.mark.parametrize(
+    "problem", [make_read_only(make()) for make in PROBLEMS.values()], ids=list(PROBLEMS)
+)
 
 
 def iterates(prepared, problem: StepProblem, count: int) -> list[Positions]:
@@ -66,9 +68,9 @@ def test_a_solve_ends_at_exactly_the_iterate_of_its_number(solver, problem, coun
     prepared = solver.prepare(problem.system)
     solution = prepared.solve(problem, StopRule(count))
     done = (
-        1 if solver.about.family in ("explicit", "linearly implicit") else count
+        1 if solver.solver_info.family in ("explicit", "linearly implicit") else count
     )  # a method that does not iterate has one iterate, again and again
-    assert solution.iterations == done or solution.stopped == "stalled"
+    assert solution.num_iterations == done or solution.termination_reason == "stalled"
     np.testing.assert_array_equal(solution.positions, iterates(prepared, problem, count)[-1])
 
 
@@ -85,7 +87,7 @@ def test_a_solve_that_a_tolerance_ends_does_so_at_exactly_an_iterate(solver, pro
 @problems
 def test_solves_that_interleave_do_not_disturb_each_other(solver, problem):
     prepared = solver.prepare(problem.system)
-    other = replace(problem, first_guess=problem.first_guess + 1.0, force=2.0 * problem.force)
+    other = replace(problem, initial_guess=problem.initial_guess + 1.0, external_force=2.0 * problem.external_force)
     alone = iterates(prepared, problem, 6), iterates(prepared, other, 6)
     together = zip(prepared.iterates(problem), prepared.iterates(other), strict=False)
     for (p, q), a, b in zip(islice(together, 6), *alone, strict=True):
@@ -107,11 +109,17 @@ def test_a_solution_belongs_to_its_caller(solver, problem):
     prepared = solver.prepare(problem.system)
     positions = prepared.solve(problem, StopRule(3)).positions
     kept = positions.copy()
-    prepared.solve(replace(problem, first_guess=problem.first_guess + 1.0), StopRule(4))
+    prepared.solve(replace(problem, first_guess=problem.initial_guess + 1.0), StopRule(4))
     np.testing.assert_array_equal(positions, kept)
     assert positions.flags.c_contiguous
     assert positions.dtype == np.float64
-    given = (problem.target, problem.force, problem.pin_targets, problem.current, problem.first_guess)
+    given = (
+        problem.inertial_target,
+        problem.external_force,
+        problem.pin_targets,
+        problem.current_positions,
+        problem.initial_guess,
+    )
     assert not any(np.shares_memory(positions, array) for array in given)
 
 
@@ -120,7 +128,7 @@ def test_a_solution_belongs_to_its_caller(solver, problem):
 def test_phases_may_run_at_any_time_and_leave_the_solver_as_it_was(solver, problem):
     prepared = solver.prepare(problem.system)
     before = iterates(prepared, problem, 3)
-    phases = prepared.phases(problem)
+    phases = prepared.iteration_phases(problem)
     for phase in (*phases.values(), *reversed(phases.values())):
         phase()
     for p, wanted in zip(iterates(prepared, problem, 3), before, strict=True):
@@ -129,7 +137,7 @@ def test_phases_may_run_at_any_time_and_leave_the_solver_as_it_was(solver, probl
 
 @over(LOCAL_GLOBAL)
 def test_local_global_has_a_local_and_a_global_phase(solver):
-    problem = random_problem(0)
+    problem = build_random_problem(0)
     assert set(solver.prepare(problem.system).phases(problem)) == {"local", "global"}
 
 
@@ -155,15 +163,15 @@ def test_a_global_phase_solves_for_what_its_right_hand_side_says(solver, problem
     """Q times what the global phase gives is the right-hand side that each backend states."""
     prepared = solver.prepare(problem.system)
     system, free = problem.system, problem.system.free
-    phases = prepared.phases(problem)
+    phases = prepared.iteration_phases(problem)
     phases["local"]()
     given = np.asarray(phases["global"]())
     if isinstance(prepared, PreparedLocalGlobal):
         expected = next(prepared.iterates(problem))
     else:  # where blocks take turns at both, the global step is timed with the constant part of the right-hand side
-        y = system.inertia[:, None] * problem.target + problem.force
+        y = system.inertia_diagonal[:, None] * problem.inertial_target + problem.external_force
         expected, solved = np.zeros_like(y), np.empty((len(free), 3))
-        Q = assemble(system, [energy for energy in system.energies if isinstance(energy, Springs)])
+        Q = assemble_system_matrix(system, [energy for energy in system.energies if isinstance(energy, Springs)])
         SparseLU(Q[free][:, free]).solve(y[free], solved)
         expected[free] = solved
     # Two factors of one matrix: round-off times its condition, 1e10 at penalty pins.
@@ -175,13 +183,13 @@ def test_a_global_phase_solves_for_what_its_right_hand_side_says(solver, problem
 def test_exactly_pinned_vertices_are_on_their_targets_in_every_iterate(solver, problem):
     pins = problem.system.pins
     for p in iterates(solver.prepare(problem.system), problem, 4):
-        np.testing.assert_array_equal(p[pins.vertices[pins.exact]], problem.pin_targets[pins.exact])
+        np.testing.assert_array_equal(p[pins.vertices[pins.exact_mask]], problem.pin_targets[pins.exact_mask])
 
 
 def stationarity(problem: StepProblem, p: Positions) -> float:
     """|Q^-1 grad g(p)|_Q [J^(1/2)] over the unpinned vertices, by SciPy."""
-    system, free = problem.system, problem.system.free
-    Q = assemble(system, [energy for energy in system.energies if isinstance(energy, Springs)])
+    system, free = problem.system, problem.system.free_vertices
+    Q = assemble_system_matrix(system, [energy for energy in system.energies if isinstance(energy, Springs)])
     e, solved = np.zeros_like(p), np.empty((len(free), 3))
     SparseLU(Q[free][:, free]).solve(problem.gradient(p)[free], solved)
     e[free] = solved
@@ -194,28 +202,30 @@ def stationarity(problem: StepProblem, p: Positions) -> float:
 @pytest.mark.parametrize("count", [1, 4])
 def test_the_reported_residual_is_that_of_the_iterate_it_names(solver, problem, count):
     prepared = solver.prepare(problem.system)
-    path = [problem.first_guess.copy(), *iterates(prepared, problem, count)]
+    path = [problem.initial_guess.copy(), *iterates(prepared, problem, count)]
     pins = problem.system.pins
-    path[0][pins.vertices[pins.exact]] = problem.pin_targets[pins.exact]
+    path[0][pins.vertices[pins.exact_mask]] = problem.pin_targets[pins.exact_mask]
     solution = prepared.solve(problem, StopRule(count))
-    scale = stationarity(problem, problem.current)
+    scale = stationarity(problem, problem.current_positions)
     # Two ways to add the same terms and two factors, which may be rounded: half of the digits of what the solve began
     # with, or of a correction's.
     relative = 1e-2 if "float16" in str(solver) else 1e-6
-    named = path[-1] if solution.residual_of == "returned" else path[-2]
+    named = path[-1] if solution.residual_iterate == "returned" else path[-2]
     returned = prepared.residual_at(problem, solution.positions)
     for found, at in (solution.residual, named), (returned, path[-1]):
         assert found == pytest.approx(stationarity(problem, at), rel=relative, abs=1e-8 * scale)
     np.testing.assert_array_equal(solution.positions, path[-1])
 
 
-@over({name: solver for name, solver in CHOICES.items() if not solver.minimises})
+@over({name: solver for name, solver in CHOICES.items() if not solver.is_minimiser})
 def test_a_method_that_does_not_minimise_names_no_residual(solver):
-    problem = random_problem(0)
+    problem = build_random_problem(0)
     prepared = solver.prepare(problem.system)
     solution = prepared.solve(problem, StopRule(3, 1e-3))
-    assert (solution.residual_of, solution.stopped) == ("none", "iterations")
-    assert np.isnan([solution.residual, solution.yardstick, prepared.residual_at(problem, solution.positions)]).all()
+    assert (solution.residual_iterate, solution.termination_reason) == ("none", "iterations")
+    assert np.isnan(
+        [solution.residual, solution.initial_residual, prepared.residual_at(problem, solution.positions)]
+    ).all()
 
 
 @over(LOCAL_GLOBAL)
@@ -223,7 +233,7 @@ def test_a_method_that_does_not_minimise_names_no_residual(solver):
 def test_the_reported_residual_is_the_length_of_the_last_step_in_the_norm_of_the_matrix(solver, problem):
     prepared = solver.prepare(problem.system)
     solution = prepared.solve(problem, StopRule(9, 1e-14))
-    curve = trace(prepared, problem, EnergyNorm(problem.system), 9)
+    curve = trace_convergence(prepared, problem, EnergyNorm(problem.system), 9)
     # Two ways to add the same terms; what is left of the sum after cancellation is good to half the digits.
     assert solution.residual == pytest.approx(curve.residuals[-1], rel=1e-7)
     assert curve.objective[-1] == problem.value(solution.positions)
@@ -231,6 +241,6 @@ def test_the_reported_residual_is_the_length_of_the_last_step_in_the_norm_of_the
 
 @solvers
 def test_the_facts_are_whole_numbers_by_name(solver):
-    facts = solver.prepare(random_problem(0).system).facts
-    assert not solver.minimises or facts["nnz_system"] > 0
+    facts = solver.prepare(build_random_problem(0).system).facts
+    assert not solver.is_minimiser or facts["nnz_system"] > 0
     assert all(float(value).is_integer() for value in facts.values())

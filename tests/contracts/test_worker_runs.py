@@ -17,10 +17,10 @@ from typer.testing import CliRunner, Result
 
 from harness.base import rows
 from harness.cli import app
-from harness.config.load import load_any
-from harness.experiments.plan import Files
-from tests.often import often
-from tests.own_solvers import OPTIONS, Own, own
+from harness.config.load import load_config
+from harness.experiments.plan import RunFiles
+from tests.often import mark_rare_cases
+from tests.own_solvers import SWEEP_OPTIONS, PluginSweep, write_plugin_solver
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -52,29 +52,35 @@ CASES = {
 }
 
 
-def limited(made: Own, limit: str) -> int:
+def limited(made: PluginSweep, limit: str) -> int:
     """Limit the solver's run, and leave the other out, which a busy machine might keep as long; how many remain."""
     if limit:
-        told = made.sweep.read_text().replace("[mine, sparse]", "[mine]").replace("options: {", f"options: {{{limit}, ")
-        made.sweep.write_text(told)
+        told = (
+            made.sweep_path.read_text()
+            .replace("[mine, sparse]", "[mine]")
+            .replace("options: {", f"options: {{{limit}, ")
+        )
+        made.sweep_path.write_text(told)
     return 1 if limit else 2
 
 
-def ran(made: Own, *more: str) -> Result:
-    return CliRunner().invoke(app, ["run", str(made.sweep), "--results", str(made.sweep.parent / "r"), *more])
+def ran(made: PluginSweep, *more: str) -> Result:
+    return CliRunner().invoke(app, ["run", str(made.sweep_path), "--results", str(made.sweep_path.parent / "r"), *more])
 
 
-def first_rows(made: Own) -> dict[str, dict[str, Any]]:
+def first_rows(made: PluginSweep) -> dict[str, dict[str, Any]]:
     """By solver, the first row of its run."""
-    folder = made.sweep.parent / "r" / "sweep"
-    found = (rows.first(Files.of(run, folder).rows) for run in load_any(made.sweep).runs())
+    folder = made.sweep_path.parent / "r" / "sweep"
+    found = (
+        rows.read_first_row(RunFiles.for_run(run, folder).rows_path) for run in load_config(made.sweep_path).list_runs()
+    )
     return {row["solver"]: row for row in found if isinstance(row, dict)}
 
 
-@pytest.mark.parametrize("name", often(CASES, ["a crash", "an exit by Python", "a loop", "too much memory"]))
+@pytest.mark.parametrize("name", mark_rare_cases(CASES, ["a crash", "an exit by Python", "a loop", "too much memory"]))
 def test_a_sweep_survives_its_solvers(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     case = CASES[name]
-    made = own(tmp_path, monkeypatch, solving=case.does)
+    made = write_plugin_solver(tmp_path, monkeypatch, solve_code=case.does)
     runs = limited(made, case.limit)
     told = ran(made)
     assert told.exit_code == 1, told.output
@@ -84,7 +90,7 @@ def test_a_sweep_survives_its_solvers(name: str, tmp_path: Path, monkeypatch: py
     assert [(row["status"], row["reason"]) for row in others] == [("ok", None)] * (runs - 1)
     mine = found["mine"]
     assert mine["status"] == case.status, mine["reason"]
-    assert case.said.format(line=made.line(case.does)) in mine["reason"]
+    assert case.said.format(line=made.source_line(case.does)) in mine["reason"]
     assert mine["solver"] == "mine"
     again = ran(made)
     assert again.exit_code == 1
@@ -96,20 +102,20 @@ def test_a_sweep_survives_its_solvers(name: str, tmp_path: Path, monkeypatch: py
 def test_a_run_that_took_too_long_is_done_again_with_another_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     flag = tmp_path / "quick"
     hangs = f"import pathlib\n        while not pathlib.Path({str(flag)!r}).exists(): hang = 1"
-    made = own(tmp_path, monkeypatch, solving=hangs)
+    made = write_plugin_solver(tmp_path, monkeypatch, solve_code=hangs)
     limited(made, "time_limit: 8")
     assert ran(made).exit_code == 1
     flag.touch()
     assert "1 of 1 runs are there already" in re.sub(r"\s+", " ", ran(made).output)
-    made.sweep.write_text(made.sweep.read_text().replace("time_limit: 8", "time_limit: 800"))
+    made.sweep_path.write_text(made.sweep_path.read_text().replace("time_limit: 8", "time_limit: 800"))
     assert (told := ran(made)).exit_code == 0, told.output
     assert {row["status"] for row in first_rows(made).values()} == {"ok"}
 
 
 def test_a_debugger_can_have_the_runs_in_its_own_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    made = own(tmp_path, monkeypatch, solving="import os; globals()['seen'] = os.getpid()")
+    made = write_plugin_solver(tmp_path, monkeypatch, solve_code="import os; globals()['seen'] = os.getpid()")
     assert (told := ran(made)).exit_code == 0, told.output
-    module = made.solver.stem
+    module = made.solver_path.stem
     assert not hasattr(sys.modules.get(module), "seen")
     assert ran(made, "--again", "--here").exit_code == 0
     assert sys.modules[module].seen == os.getpid()
@@ -118,12 +124,12 @@ def test_a_debugger_can_have_the_runs_in_its_own_process(tmp_path: Path, monkeyp
 LONG = "scenes: [scene.yaml]\nsolvers: [sparse]\noptions: {frames: 100000, rounds: 1, iterations: 50, record: false}\n"
 
 
-@pytest.mark.parametrize("how", often([signal.SIGKILL, signal.SIGTERM, signal.SIGINT], [signal.SIGKILL]))
+@pytest.mark.parametrize("how", mark_rare_cases([signal.SIGKILL, signal.SIGTERM, signal.SIGINT], [signal.SIGKILL]))
 def test_no_worker_stays_behind(how: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    made = own(tmp_path, monkeypatch)
-    made.sweep.write_text(LONG)
+    made = write_plugin_solver(tmp_path, monkeypatch)
+    made.sweep_path.write_text(LONG)
     process = subprocess.Popen(
-        [sys.executable, "-m", "harness", "run", str(made.sweep), "--results", str(tmp_path / "r")],
+        [sys.executable, "-m", "harness", "run", str(made.sweep_path), "--results", str(tmp_path / "r")],
         cwd=ROOT,
         stderr=subprocess.DEVNULL,
         # A shell that started these tests in the background has made its children deaf to Ctrl-C.
@@ -153,7 +159,9 @@ def busy(process: psutil.Process) -> bool:
 def test_a_worker_stays_from_run_to_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     note = tmp_path / "note"
     does = f"import os; open({str(note)!r}, 'a').write(str(os.getpid()) + ' ')"
-    made = own(tmp_path, monkeypatch, solving=does, options=OPTIONS + ", tolerance: [1e-2, 1e-3, 1e-4]")
+    made = write_plugin_solver(
+        tmp_path, monkeypatch, solve_code=does, options=SWEEP_OPTIONS + ", tolerance: [1e-2, 1e-3, 1e-4]"
+    )
     assert (told := ran(made, "--workers", "1")).exit_code == 0, told.output
     workers = set(note.read_text().split())
     assert len(workers) == 1
@@ -167,7 +175,7 @@ def test_a_drawing_process_that_is_lost_fails_the_command_and_keeps_what_was_mea
 
     monkeypatch.setattr(sweep, "get_ready", int)
     monkeypatch.setattr(sweep, "draw_sweep", leave)  # where it draws: that process is a fork of this one
-    made = own(tmp_path, monkeypatch, options="frames: 1, rounds: 1, iterations: 5")
+    made = write_plugin_solver(tmp_path, monkeypatch, options="frames: 1, rounds: 1, iterations: 5")
     told = ran(made)
     assert told.exit_code == 1
     assert "the process that draws ended its process with exit code 3" in " ".join(told.output.split())

@@ -48,7 +48,7 @@ def kernels() -> dict[str, Any]:
         if "kernels" not in own:
             continue
         for real in (np.float32, np.float64):
-            more = (schwarz.PATCH,) if "patch" in signature(own["kernels"]).parameters else ()
+            more = (schwarz.SUBDOMAIN_SIZE,) if "patch" in signature(own["kernels"]).parameters else ()
             made: Any = own["kernels"](real, *more)
             each = {made.py_func.__name__: made} if hasattr(made, "py_func") else made._asdict()
             found |= {f"{name}.{k}, {real.__name__}": v for k, v in each.items()}

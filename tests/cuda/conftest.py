@@ -15,7 +15,7 @@ from solvers.problem import Unsupported
 
 def _there() -> bool:
     try:
-        device.ready("tests")
+        device.require_device("tests")
     except Unsupported:
         return False
     return True
@@ -27,7 +27,7 @@ collect_ignore_glob = [] if _there() else ["test_*.py"]
 @pytest.fixture(autouse=True)
 def fast(monkeypatch: pytest.MonkeyPatch) -> None:
     """The simulator is, where it stands for a device."""
-    if device.simulated():
+    if device.is_simulated():
         from tests.cuda.simulator import hasten  # what it loads takes a second, which others need not wait for
 
         hasten(monkeypatch)

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.scenes.bind import Scene
-from harness.simulation.step import prepare, problem, simulate, start
-from solvers.core.fixed_objective import Objective
+from harness.simulation.step import build_initial_state, build_problem, prepare, simulate_scene
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
 from solvers.integrators import Motion
 from solvers.methods.newton_cg import NewtonCG
@@ -65,10 +65,10 @@ def outcome(made: Scene, method: str, precision: Precision) -> Outcome:
         found = ran(made, solver(device="cuda", precision=precision))
     except Unsupported as error:
         return Outcome(*_refused(str(error), made, solver))
-    wanted, begun = ran(made, solver()), start(made).now.positions
+    wanted, begun = ran(made, solver()), build_initial_state(made).motion.positions
     if not np.isfinite(found).all():
         return Outcome("wrong" if np.isfinite(wanted).all() else "right", "not finite")
-    length = float(made.springs.rest_length.mean()) if len(made.springs.rest_length) else 1.0
+    length = float(made.all_springs.rest_length.mean()) if len(made.all_springs.rest_length) else 1.0
     part, near = ROUND_OFF[precision]
     rounded = part * (length + (np.abs(begun).max() if precision == "float64" else 0.0))
     may = near * (length + np.abs(wanted - begun).max()) + rounded
@@ -89,17 +89,17 @@ def ran(made: Scene, solver: Any, changes: Frames | tuple[float, float] = (0.0, 
     """Where the first steps end, (frames, n, 3) [m]. changes (2, n, 3) [m]: of the start's positions, and of what its
     velocities move in a step."""
     prepared = prepare(made, solver)
-    state = start(made)
-    p, v = state.now
-    state = replace(state, now=Motion(p + changes[0], v + changes[1] / made.system.time_step))
-    run = simulate(made, prepared, STOP, first_guess="current", frames=FRAMES, state=state)
+    state = build_initial_state(made)
+    p, v = state.motion
+    state = replace(state, motion=Motion(p + changes[0], v + changes[1] / made.system.time_step))
+    run = simulate_scene(made, prepared, STOP, initial_guess="current", frames=FRAMES, initial_state=state)
     return np.array([step.positions for step in run])
 
 
 def _fall(made: Scene, p: Positions) -> float:
     """What the objective of the first step falls by to p [J]."""
-    stated = problem(made, start(made), "current")
-    return -StepObjective(Objective(made.system), stated).rise(p, stated.first_guess)[0]
+    stated = build_problem(made, build_initial_state(made), "current")
+    return -StepObjective(FixedObjective(made.system), stated).objective_change(p, stated.initial_guess)[0]
 
 
 def _refused(why: str, made: Scene, solver: Any) -> tuple[Literal["refused", "wrong"], str]:

@@ -16,7 +16,7 @@ PRECISIONS: tuple[Literal["float64", "float32"], ...] = ("float64", "float32")
 
 def spacing(problem: StepProblem) -> float:
     """The mean length of springs at rest [m]."""
-    return float(np.mean(Springs.joined([e for e in problem.energies if isinstance(e, Springs)]).rest_length))
+    return float(np.mean(Springs.from_parts([e for e in problem.energies if isinstance(e, Springs)]).rest_length))
 
 
 def iterates(solver: Any, problem: StepProblem, count: int) -> list[Positions]:

@@ -31,9 +31,9 @@ from solvers.problem import StopRule
 from tests.cuda import ahead
 from tests.cuda.near import PRECISIONS
 from tests.cuda.test_touching import touching
-from tests.effects import BEND, DASHPOTS, DRAG, stepped
-from tests.effects import cloth as cloth_with
-from tests.scenes import cloth, first_problem, random_problem
+from tests.effects import AIR_DRAG_EFFECT, BENDING_EFFECT, DASHPOT_EFFECT, build_moving_problem
+from tests.effects import build_effect_cloth as cloth_with
+from tests.scenes import build_cloth, build_first_problem, build_random_problem
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -89,21 +89,21 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> dict[str, set[bytes]]:
 
 def launch_all() -> None:
     """Have the methods launch every kernel, in both precisions."""
-    problems = random_problem(0, weights=(1e4, np.inf, 1e2)), first_problem(cloth(3, "exact"))
+    problems = build_random_problem(0, weights=(1e4, np.inf, 1e2)), build_first_problem(build_cloth(3, "exact"))
     for precision in PRECISIONS:
         for method in METHODS:
             for problem in problems:
                 method(device="cuda", precision=precision).prepare(problem.system).solve(problem, StopRule(8, 1e-3))
         touched = touching("sphere")
         VertexBlockDescent(device="cuda", precision=precision).prepare(touched.system).solve(touched, StopRule(2))
-        damped = stepped(cloth_with(BEND, DASHPOTS, DRAG))
+        damped = build_moving_problem(cloth_with(BENDING_EFFECT, DASHPOT_EFFECT, AIR_DRAG_EFFECT))
         newton = NewtonCG(preconditioner="schwarz", device="cuda", precision=precision)
         newton.prepare(damped.system).solve(damped, StopRule(2))
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not device.simulated(), reason="on a device each kernel that is launched is compiled")
-@pytest.mark.skipif(bool(missing()), reason=f"{missing()} is not installed; {device.INSTALL}")
+@pytest.mark.skipif(not device.is_simulated(), reason="on a device each kernel that is launched is compiled")
+@pytest.mark.skipif(bool(missing()), reason=f"{missing()} is not installed; {device.INSTALL_HINT}")
 def test_every_kernel_compiles_as_it_is_launched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(schwarz, "PATCH", 3)  # small scenes have levels, and the reference changes soon

@@ -8,24 +8,26 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.reference.oracle import Oracle
+from harness.reference.oracle import ReferenceEvaluator
 from solvers.core import vertex_terms
 from solvers.methods.newton_cg import NewtonCG
 from solvers.methods.vbd import VertexBlockDescent
 from solvers.problem import StepProblem
 from tests.cuda.test_touching import touching
-from tests.effects import BEND, DASHPOTS, DRAG, stepped
-from tests.effects import cloth as cloth_with
-from tests.scenes import SCENES, cloth, first_problem, random_problem
+from tests.effects import AIR_DRAG_EFFECT, BENDING_EFFECT, DASHPOT_EFFECT, build_moving_problem
+from tests.effects import build_effect_cloth as cloth_with
+from tests.scenes import SCENE_BUILDERS, build_cloth, build_first_problem, build_random_problem
 
 PROBLEMS: dict[str, Callable[[], StepProblem]] = {
-    "cloth, pinned exactly": lambda: first_problem(cloth(4, "exact")),
-    "chain": lambda: first_problem(SCENES["chain"]("exact")),
-    "random, not pinned": lambda: random_problem(1, weights=()),
-    "bending, dashpots and drag": lambda: stepped(cloth_with(BEND, DASHPOTS, DRAG)),
-    "random, pins by penalty": lambda: random_problem(0, weights=(1e4, np.inf, 1e2)),
+    "cloth, pinned exactly": lambda: build_first_problem(build_cloth(4, "exact")),
+    "chain": lambda: build_first_problem(SCENE_BUILDERS["chain"]("exact")),
+    "random, not pinned": lambda: build_random_problem(1, weights=()),
+    "bending, dashpots and drag": lambda: build_moving_problem(
+        cloth_with(BENDING_EFFECT, DASHPOT_EFFECT, AIR_DRAG_EFFECT)
+    ),
+    "random, pins by penalty": lambda: build_random_problem(0, weights=(1e4, np.inf, 1e2)),
     "a sheet on a sphere": lambda: touching("sphere"),
-    "chain, stiff pins": lambda: first_problem(SCENES["chain"](1e10)),
+    "chain, stiff pins": lambda: build_first_problem(SCENE_BUILDERS["chain"](1e10)),
 }
 ROUND_OFF = 1e-6
 """Of the oracle's factor, where pins are 1e10 times as stiff as what they are left out of; 1e-9 elsewhere."""
@@ -43,10 +45,10 @@ def test_it_is_the_oracles(name: str, method: str) -> None:
     problem = PROBLEMS[name]()
     if (method == "vbd" and "dashpots" in name) or (method != "vbd" and "sphere" in name):
         return
-    prepared, oracle = METHODS[method]().prepare(problem.system), Oracle(problem.system)
+    prepared, oracle = METHODS[method]().prepare(problem.system), ReferenceEvaluator(problem.system)
     rng = np.random.default_rng(0)
-    for p in (problem.first_guess, problem.first_guess + 0.01 * rng.normal(size=problem.target.shape)):
-        p = vertex_terms.placed(p, problem)
+    for p in (problem.initial_guess, problem.initial_guess + 0.01 * rng.normal(size=problem.inertial_target.shape)):
+        p = vertex_terms.apply_exact_pins(p, problem)
         told, begun = prepared.residual_at(problem, p), prepared.begin(problem, p)
-        assert told == pytest.approx(oracle.residual(problem, p), rel=ROUND_OFF)
+        assert told == pytest.approx(oracle.compute_residual(problem, p), rel=ROUND_OFF)
         assert begun.residual() == pytest.approx(told, rel=1e-9)

@@ -11,12 +11,12 @@ from typer.testing import CliRunner, Result
 
 from harness.base import rows
 from harness.cli import app
-from harness.config.load import load_any
-from harness.experiments.plan import Files
+from harness.config.load import load_config
+from harness.experiments.plan import RunFiles
 from solvers import device as where
 from solvers.cuda import device, run, target
 from solvers.problem import StepProblem
-from tests.scenes import CLOTH_FILE
+from tests.scenes import CLOTH_SCENE_YAML
 
 SWEEP = """
 scenes: [cloth.yaml]
@@ -28,11 +28,14 @@ options: {iterations: 40, tolerance: 1.0e-2, rounds: 1, frames: 2, threads: 1, p
 
 def ran(folder: Path) -> tuple[Result, list[list[dict[str, Any]]]]:
     """What the command says, and the rows of each run; in this process."""
-    (folder / "cloth.yaml").write_text(CLOTH_FILE)
+    (folder / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     sweep = folder / "sweep.yaml"
     sweep.write_text(SWEEP)
     told = CliRunner().invoke(app, ["run", str(sweep), "--results", str(folder / "r"), "--here"])
-    found = [rows.read([Files.of(run, folder / "r" / "sweep").rows]).to_pylist() for run in load_any(sweep).runs()]
+    found = [
+        rows.read_rows([RunFiles.for_run(run, folder / "r" / "sweep").rows_path]).to_pylist()
+        for run in load_config(sweep).list_runs()
+    ]
     return told, found
 
 
@@ -40,7 +43,7 @@ def test_rows_tell_of_the_device_and_timed_steps_ask_for_no_residual(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked, timed = list[float](), list[tuple[int, int]]()
-    residual, replay = run.DeviceIterating.residual, run.DeviceIterative.replay
+    residual, replay = run.DeviceSolverState.residual, run.DeviceSolver.replay_iterations
 
     def counted(self: Any) -> float:
         asked.append(residual(self))
@@ -52,19 +55,19 @@ def test_rows_tell_of_the_device_and_timed_steps_ask_for_no_residual(
         timed.append((iterations, len(asked) - before))
         return found
 
-    monkeypatch.setattr(run.DeviceIterating, "residual", counted)
-    monkeypatch.setattr(run.DeviceIterative, "replay", seen)
+    monkeypatch.setattr(run.DeviceSolverState, "residual", counted)
+    monkeypatch.setattr(run.DeviceSolver, "replay", seen)
     told, (here, there) = ran(tmp_path)
     assert told.exit_code == 0, told.output
-    assert {row["device"] for row in here} == {device.told()["device"]}
+    assert {row["device"] for row in here} == {device.describe_device()["device"]}
     assert {row["device"] for row in there} == {None}
     phases = Counter(row["phase"] for row in here)
     assert phases == {"prepare": 2, "step": 2}
     steps = [row for row in here if row["phase"] == "step"]
-    assert all((row["power_w"] is None) == device.simulated() for row in steps)
+    assert all((row["power_w"] is None) == device.is_simulated() for row in steps)
     assert {row["stopped"] for row in steps} == {"tolerance"}
     assert timed == [(row["iterations"], 0) for row in steps]
-    assert all(count % run.EVERY == 0 for count, _ in timed)
+    assert all(count % run.ITERATIONS_PER_RESIDUAL == 0 for count, _ in timed)
     assert asked
     assert "vbd, device cuda" in " ".join(told.output.split())
 
@@ -97,10 +100,10 @@ def test_a_device_that_fails_is_a_row_and_the_sweep_goes_on(
     def fails(self: Any, array: Any) -> Any:
         raise error
 
-    monkeypatch.setattr(target.Stream, "download", fails)
+    monkeypatch.setattr(target.DeviceStream, "download", fails)
     told, (here, there) = ran(tmp_path)
     assert told.exit_code == 1
     assert [row["status"] for row in here] == ["failed"]
     assert said in here[0]["reason"]
     assert {row["status"] for row in there} == {"ok"}
-    assert where.broken() is lost
+    assert where.is_device_lost() is lost

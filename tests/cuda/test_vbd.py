@@ -11,24 +11,24 @@ import numpy as np
 import pytest
 
 from solvers.core import vertex_terms
-from solvers.core.fixed_objective import Objective
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
 from solvers.cuda import vbd
-from solvers.cuda.run import EVERY, DeviceIterative
-from solvers.cuda.vbd_kernels import KNOWN
+from solvers.cuda.run import ITERATIONS_PER_RESIDUAL, DeviceSolver
+from solvers.cuda.vbd_kernels import OBJECTIVE
 from solvers.energies.springs import Springs
 from solvers.methods.vbd import VertexBlockDescent
 from solvers.problem import Positions, StepProblem, StopRule, Unsupported
-from tests.effects import BEND, LIMITS
-from tests.effects import cloth as cloth_with
-from tests.scenes import SCENES, cloth, first_problem, random_problem
+from tests.effects import BENDING_EFFECT, STRAIN_LIMIT_EFFECT
+from tests.effects import build_effect_cloth as cloth_with
+from tests.scenes import SCENE_BUILDERS, build_cloth, build_first_problem, build_random_problem
 
 PROBLEMS: dict[str, Callable[[], StepProblem]] = {
-    "chain": lambda: first_problem(SCENES["chain"](1e10)),
-    "cloth, exact pins, inertial guess": lambda: first_problem(cloth(4, "exact"), "inertial"),
-    "bending": lambda: first_problem(cloth_with(BEND)),
-    "random": lambda: random_problem(0, weights=(1e4, np.inf, 1e2)),
-    "random, not pinned": lambda: random_problem(1, weights=()),
+    "chain": lambda: build_first_problem(SCENE_BUILDERS["chain"](1e10)),
+    "cloth, exact pins, inertial guess": lambda: build_first_problem(build_cloth(4, "exact"), "inertial"),
+    "bending": lambda: build_first_problem(cloth_with(BENDING_EFFECT)),
+    "random": lambda: build_random_problem(0, weights=(1e4, np.inf, 1e2)),
+    "random, not pinned": lambda: build_random_problem(1, weights=()),
 }
 problems = pytest.mark.parametrize("make", PROBLEMS.values(), ids=list(PROBLEMS))
 radii = pytest.mark.parametrize("radius", [0.0, 0.999], ids="rho = {:g}".format)
@@ -52,16 +52,16 @@ PRECISIONS: tuple[Literal["float64", "float32"], ...] = ("float64", "float32")
 
 def spacing(problem: StepProblem) -> float:
     """The mean length of springs at rest [m]."""
-    return float(np.mean(Springs.joined([e for e in problem.energies if isinstance(e, Springs)]).rest_length))
+    return float(np.mean(Springs.from_parts([e for e in problem.energies if isinstance(e, Springs)]).rest_length))
 
 
 def iterates(method: VertexBlockDescent, problem: StepProblem, count: int) -> list[Positions]:
     return [p.copy() for p in islice(method.prepare(problem.system).iterates(problem), count)]
 
 
-def on_device(problem: StepProblem, radius: float = 0.999) -> DeviceIterative:
+def on_device(problem: StepProblem, radius: float = 0.999) -> DeviceSolver:
     prepared = VertexBlockDescent(radius, device="cuda").prepare(problem.system)
-    assert isinstance(prepared, DeviceIterative)
+    assert isinstance(prepared, DeviceSolver)
     return prepared
 
 
@@ -77,15 +77,15 @@ def test_iterates_are_those_of_the_processor(make: Callable[[], StepProblem], ra
 
 @pytest.mark.parametrize("name", STARTS)
 def test_wherever_it_begins_it_descends(name: str) -> None:
-    problem = first_problem(SCENES["chain"]("exact"))
-    start = STARTS[name](vertex_terms.placed(problem.first_guess, problem), np.random.default_rng(0))
-    problem = replace(problem, first_guess=vertex_terms.placed(start, problem))
-    step = StepObjective(Objective(problem.system), problem)
+    problem = build_first_problem(SCENE_BUILDERS["chain"]("exact"))
+    start = STARTS[name](vertex_terms.apply_exact_pins(problem.initial_guess, problem), np.random.default_rng(0))
+    problem = replace(problem, initial_guess=vertex_terms.apply_exact_pins(start, problem))
+    step = StepObjective(FixedObjective(problem.system), problem)
     wanted = iterates(VertexBlockDescent(0.0), problem, 5)
     for precision, round_off in zip(PRECISIONS, (1e-13, 1e-6), strict=True):
         found = iterates(VertexBlockDescent(0.0, device="cuda", precision=precision), problem, 5)
-        size = abs(step.rise(found[-1], problem.first_guess)[0])
-        rises = [step.rise(p, q)[0] for p, q in pairwise((problem.first_guess, *found))]
+        size = abs(step.objective_change(found[-1], problem.initial_guess)[0])
+        rises = [step.objective_change(p, q)[0] for p, q in pairwise((problem.initial_guess, *found))]
         assert np.isfinite(rises).all()
         assert max(rises) <= round_off * size, precision
         # Where a spring has no length the processor takes the eight vertices of a bundle apart, a device the one.
@@ -94,46 +94,46 @@ def test_wherever_it_begins_it_descends(name: str) -> None:
 
 
 def test_in_single_precision_it_ends_at_the_minimum_in_double() -> None:
-    problem = random_problem(0, weights=(1e4, np.inf, 1e2))
+    problem = build_random_problem(0, weights=(1e4, np.inf, 1e2))
     wanted = iterates(VertexBlockDescent(0.0), problem, 60)[-1]
-    found, _ = on_device(problem, 0.0).replay(problem, 60)
+    found, _ = on_device(problem, 0.0).replay_iterations(problem, 60)
     np.testing.assert_allclose(found.positions, wanted, rtol=0, atol=1e-10)
 
 
 def test_bits_do_not_depend_on_who_looks() -> None:
-    problem = first_problem(SCENES["chain"](1e10))
+    problem = build_first_problem(SCENE_BUILDERS["chain"](1e10))
     prepared = on_device(problem)
     looked_at = [p.copy() for p in islice(prepared.iterates(problem), 7)][-1]
-    *_, copied = islice(prepared.uncopied(problem), 7)
+    *_, copied = islice(prepared.iterates_without_copy(problem), 7)
     np.testing.assert_array_equal(copied(), looked_at)
-    np.testing.assert_array_equal(prepared.replay(problem, 7)[0].positions, looked_at)
+    np.testing.assert_array_equal(prepared.replay_iterations(problem, 7)[0].positions, looked_at)
     np.testing.assert_array_equal(prepared.solve(problem, StopRule(7)).positions, looked_at)
 
 
 @pytest.mark.parametrize("iterations", [1, 2])
 def test_the_objective_is_summed_over_all_vertices(iterations: int) -> None:
     """By threads that wait for each other, from the reference on; elsewhere it but decides whether to extrapolate."""
-    problem = random_problem(1, weights=())
-    run: Any = on_device(problem).begin(problem, problem.first_guess)
-    run.launch(iterations)
-    run._level(run._u, KNOWN, run._sums[0])
-    found, step = run.stream.download(run._sums[0]).sum(), StepObjective(Objective(problem.system), problem)
+    problem = build_random_problem(1, weights=())
+    run: Any = on_device(problem).init_state(problem, problem.initial_guess)
+    run.run_unchecked(iterations)
+    run._sum_objective(run._displacement, OBJECTIVE, run._sums[0])
+    found, step = run.stream.download(run._sums[0]).sum(), StepObjective(FixedObjective(problem.system), problem)
     assert len(run._sums[0]) > 1
-    assert found == pytest.approx(step.rise(problem.first_guess, run.positions)[0], rel=1e-5)
+    assert found == pytest.approx(step.objective_change(problem.initial_guess, run.positions)[0], rel=1e-5)
 
 
 def test_a_residual_may_end_it_after_each_few_iterations() -> None:
-    problem = first_problem(SCENES["chain"]("exact"))
+    problem = build_first_problem(SCENE_BUILDERS["chain"]("exact"))
     processor, device = VertexBlockDescent(0.0).prepare(problem.system), on_device(problem, 0.0)
     tolerance = 1e-2
     exact, found = (made.solve(problem, StopRule(100, tolerance)) for made in (processor, device))
-    assert found.stopped == "tolerance"
-    assert exact.iterations <= found.iterations < exact.iterations + EVERY
-    assert found.iterations % EVERY == 0
+    assert found.termination_reason == "tolerance"
+    assert exact.num_iterations <= found.num_iterations < exact.num_iterations + ITERATIONS_PER_RESIDUAL
+    assert found.num_iterations % ITERATIONS_PER_RESIDUAL == 0
     assert found.residual == pytest.approx(device.residual_at(problem, found.positions))
-    assert found.residual <= tolerance * processor.residual_at(problem, problem.current)
+    assert found.residual <= tolerance * processor.residual_at(problem, problem.current_positions)
 
 
 def test_what_it_cannot_take_is_named() -> None:
     with pytest.raises(Unsupported, match=r"StrainLimits.*without `device: cuda`"):
-        on_device(first_problem(cloth_with(LIMITS)))
+        on_device(build_first_problem(cloth_with(STRAIN_LIMIT_EFFECT)))

@@ -10,27 +10,32 @@ from typing import Any
 import numpy as np
 import pytest
 
-from solvers.cuda.run import DeviceIterative
+from solvers.cuda.run import DeviceSolver
 from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
 from solvers.problem import StepProblem, StopRule, Unsupported
 from tests.cuda.near import iterates, same_iterates
-from tests.effects import BEND
-from tests.effects import cloth as cloth_with
-from tests.scenes import SCENES, cloth, first_problem, random_problem
+from tests.effects import BENDING_EFFECT
+from tests.effects import build_effect_cloth as cloth_with
+from tests.scenes import SCENE_BUILDERS, build_cloth, build_first_problem, build_random_problem
 
 
 def one_point() -> StepProblem:
     """Springs that begin without length, and so do inertia's predictions."""
-    problem = first_problem(SCENES["chain"]("exact"))
-    at = np.zeros_like(problem.target)
-    return replace(problem, target=at, force=at, start=replace(problem.start, positions=at, velocity=at))
+    problem = build_first_problem(SCENE_BUILDERS["chain"]("exact"))
+    at = np.zeros_like(problem.inertial_target)
+    return replace(
+        problem,
+        inertial_target=at,
+        external_force=at,
+        step_start=replace(problem.step_start, positions=at, velocity=at),
+    )
 
 
 PROBLEMS: dict[str, Callable[[], StepProblem]] = {
-    "chain": lambda: first_problem(SCENES["chain"](1e10)),
-    "cloth, exact pins": lambda: first_problem(cloth(4, "exact")),
-    "random": lambda: random_problem(0, weights=(1e4, np.inf, 1e2)),
-    "random, not pinned": lambda: random_problem(1, weights=()),
+    "chain": lambda: build_first_problem(SCENE_BUILDERS["chain"](1e10)),
+    "cloth, exact pins": lambda: build_first_problem(build_cloth(4, "exact")),
+    "random": lambda: build_random_problem(0, weights=(1e4, np.inf, 1e2)),
+    "random, not pinned": lambda: build_random_problem(1, weights=()),
     "one point": one_point,
 }
 METHODS: dict[str, Callable[..., Any]] = {"xpbd": Xpbd, "xpbd-small-steps": XpbdSmallSteps}
@@ -45,11 +50,11 @@ def test_iterates_are_those_of_the_processor(make: Callable[[], StepProblem], me
 
 @methods
 def test_bits_and_velocities_do_not_depend_on_who_looks(method: Callable[..., Any]) -> None:
-    problem, rule = first_problem(SCENES["chain"](1e10)), StopRule(4)
+    problem, rule = build_first_problem(SCENE_BUILDERS["chain"](1e10)), StopRule(4)
     prepared = method(device="cuda").prepare(problem.system)
-    assert isinstance(prepared, DeviceIterative)
+    assert isinstance(prepared, DeviceSolver)
     looked_at = [p.copy() for p in islice(prepared.iterates(problem), 4)][-1]
-    replayed, solved = prepared.replay(problem, 4)[0], prepared.solve(problem, rule)
+    replayed, solved = prepared.replay_iterations(problem, 4)[0], prepared.solve(problem, rule)
     np.testing.assert_array_equal(replayed.positions, looked_at)
     np.testing.assert_array_equal(solved.positions, looked_at)
     wanted = method().prepare(problem.system).solve(problem, rule).velocity
@@ -63,8 +68,8 @@ def test_bits_and_velocities_do_not_depend_on_who_looks(method: Callable[..., An
 
 
 def test_solves_of_one_system_take_turns() -> None:
-    one, other = random_problem(0), random_problem(0)
-    other = replace(other, target=-other.target)
+    one, other = build_random_problem(0), build_random_problem(0)
+    other = replace(other, inertial_target=-other.inertial_target)
     prepared = Xpbd(device="cuda").prepare(one.system)
     alone = iterates(Xpbd(device="cuda"), one, 4)
     turns = prepared.iterates(one)
@@ -77,4 +82,4 @@ def test_solves_of_one_system_take_turns() -> None:
 @methods
 def test_what_it_does_not_know_it_refuses_by_name(method: Callable[..., Any]) -> None:
     with pytest.raises(Unsupported, match="knows springs only; the scene has Bending"):
-        method(device="cuda").prepare(cloth_with(BEND).system)
+        method(device="cuda").prepare(cloth_with(BENDING_EFFECT).system)

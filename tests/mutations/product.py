@@ -9,9 +9,9 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from harness.config.load import load_any
-from harness.experiments.plan import Files
-from harness.experiments.run import execute
+from harness.config.load import load_config
+from harness.experiments.plan import RunFiles
+from harness.experiments.run import execute_run
 
 SCENE = """
 mesh: {kind: grid}
@@ -29,10 +29,10 @@ def main(solver: str) -> None:
     with TemporaryDirectory() as home:
         folder = Path(home)
         (folder / "scene.yaml").write_text(SCENE)
-        (run,) = load_any(folder / "scene.yaml", solvers=[solver], iterations=60, rounds=1, threads=1).runs()
-        files = Files.of(run, folder)
-        files.rows.parent.mkdir()
-        first = execute(run, files, lambda phase: None)[0]
+        (run,) = load_config(folder / "scene.yaml", solvers=[solver], iterations=60, rounds=1, threads=1).list_runs()
+        files = RunFiles.for_run(run, folder)
+        files.rows_path.parent.mkdir()
+        first = execute_run(run, files, lambda phase: None)[0]
     print(f"{first['status']}: {first.get('reason', '')}")
 
 

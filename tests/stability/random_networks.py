@@ -10,14 +10,14 @@ from hypothesis import settings
 from hypothesis import strategies as st
 
 from harness.scenes.bind import Scene
-from harness.scenes.mesh.network import Network
-from harness.simulation.step import State
+from harness.scenes.mesh.network import NetworkMesh
+from harness.simulation.step import MotionState
 from solvers.energies.springs import Springs
 from solvers.integrators import INTEGRATORS, Motion
-from solvers.problem import Pins, Positions, Start, StepProblem, System
-from solvers.registry import SOLVERS, load
+from solvers.problem import DirichletPins, Positions, StepProblem, StepStart, System
+from solvers.registry import SOLVERS, load_target
 
-ALL = {name: load(target)() for name, target in SOLVERS.items()}
+ALL = {name: load_target(target)() for name, target in SOLVERS.items()}
 MINIMISERS = {name: solver for name, solver in ALL.items() if solver.minimises}
 
 EPS = float(np.finfo(float).eps)
@@ -48,29 +48,31 @@ class Case:
         p, v = rest + 0.3 * rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
         current = p.copy()
         current[:q] = rest[:q]
-        start = Start(p, v, 0.0, p, 1.0 / DT, DT)
+        start = StepStart(p, v, 0.0, p, 1.0 / DT, DT)
         force = rng.normal(size=(n, 3))
         return StepProblem(system, p + DT * v, force, rest[:q], current, current, start)
 
     def flying(self) -> tuple[StepProblem, Positions]:
         """A step of the network at its rest lengths, as a whole in flight, without pins and forces; where it ends."""
         problem = replace(self, pinned=0).problem()
-        springs, p = springs_of(problem), problem.start.positions
-        system = replace(problem.system, energies=(replace(springs, rest_length=springs.lengths(p)),))
-        v = np.tile(problem.start.velocity[0], (self.n, 1))
-        start, on = replace(problem.start, velocity=v), p + DT * v
-        return replace(problem, system=system, target=on, force=np.zeros_like(p), start=start), on
+        springs, p = springs_of(problem), problem.step_start.positions
+        system = replace(problem.system, energies=(replace(springs, rest_length=springs.edge_lengths(p)),))
+        v = np.tile(problem.step_start.velocity[0], (self.n, 1))
+        start, on = replace(problem.step_start, velocity=v), p + DT * v
+        return replace(
+            problem, system=system, inertial_target=on, external_force=np.zeros_like(p), step_start=start
+        ), on
 
-    def thrown(self, integrator: str) -> tuple[Scene, State]:
+    def thrown(self, integrator: str) -> tuple[Scene, MotionState]:
         """The network without pins and forces, as a scene to be stepped, and a start that moves and is stretched."""
         rng, rest, system = replace(self, pinned=0)._drawn()
-        mesh = Network(positions=tuple(map(tuple, rest.tolist()))).build()
+        mesh = NetworkMesh(positions=tuple(map(tuple, rest.tolist()))).build_mesh()
         by = INTEGRATORS[integrator]
         none = np.empty((0, 3))
-        system = replace(system, factor=by.factor, speed=by.speed)
+        system = replace(system, inertia_factor=by.inertia_factor, velocity_factor=by.velocity_factor)
         scene = Scene(mesh, system, np.zeros_like(rest), (), (), none, (0.0, 0.0, 0.0), integrator=by)
         p, v = rest + 0.3 * rng.normal(size=rest.shape), rng.normal(size=rest.shape)
-        return scene, State(Motion(p, v), None, 0)
+        return scene, MotionState(Motion(p, v), None, 0)
 
     def _drawn(self) -> tuple[np.random.Generator, Positions, System]:
         """The generator, the rest shape (n, 3) [m], and the system: springs and pins."""
@@ -79,8 +81,8 @@ class Case:
         second = (first + rng.integers(1, n, self.m)) % n  # never itself; twins are welcome
         mass = rng.uniform(0.5, 1.5, n)
         k = 10.0 ** (self.number + self.spread * rng.uniform(-0.5, 0.5, self.m)) / DT**2
-        springs = Springs.at_rest(rest, np.stack([first, second], axis=1), k)
-        pins = Pins(np.arange(self.pinned), np.where(np.arange(self.pinned) % 2, 1e8, np.inf))
+        springs = Springs.from_rest_shape(rest, np.stack([first, second], axis=1), k)
+        pins = DirichletPins(np.arange(self.pinned), np.where(np.arange(self.pinned) % 2, 1e8, np.inf))
         return rng, rest, System(mass, DT, (springs,), pins)
 
 
@@ -103,27 +105,30 @@ def renumbered(problem: StepProblem, seed: int) -> tuple[StepProblem, Map]:
     """The problem with its vertices and springs in another order, some springs' ends exchanged, and what that does to
     positions."""
     rng, springs, pins = np.random.default_rng(seed), springs_of(problem), problem.system.pins
-    place = rng.permutation(problem.system.vertices)  # where vertex i goes
+    place = rng.permutation(problem.system.num_vertices)  # where vertex i goes
     back = np.argsort(place)
     rows, flip = rng.permutation(len(springs.edges)), rng.random((len(springs.edges), 1)) < 0.5
     edges = np.where(flip, place[springs.edges][:, ::-1], place[springs.edges])[rows]
     direction = np.where(flip, -springs.rest_direction, springs.rest_direction)[rows]
     renamed = Springs(edges, springs.stiffness[rows], springs.rest_length[rows], direction)
     where = np.argsort(place[pins.vertices])
-    moved = Pins(place[pins.vertices][where], pins.weight[where])
+    moved = DirichletPins(place[pins.vertices][where], pins.weight[where])
     system = System(problem.system.mass[back], problem.system.time_step, (renamed,), moved)
-    other = changed(replace(problem, pin_targets=problem.target), lambda p: p[back], lambda v: v[back])
+    other = changed(replace(problem, pin_targets=problem.inertial_target), lambda p: p[back], lambda v: v[back])
     return replace(other, system=system, pin_targets=problem.pin_targets[where]), lambda p: p[back]
 
 
 def changed(problem: StepProblem, places: Map, vectors: Map) -> StepProblem:
     """The problem with `places` applied to its positions [m] and `vectors` to its forces and velocities."""
-    start = problem.start
+    start = problem.step_start
     begun = replace(
-        start, positions=places(start.positions), velocity=vectors(start.velocity), origin=places(start.origin)
+        start,
+        positions=places(start.positions),
+        velocity=vectors(start.velocity),
+        velocity_origin=places(start.velocity_origin),
     )
     moved = {key: places(getattr(problem, key)) for key in ("target", "pin_targets", "current", "first_guess")}
-    return replace(problem, force=vectors(problem.force), start=begun, **moved)
+    return replace(problem, external_force=vectors(problem.external_force), step_start=begun, **moved)
 
 
 def springs_of(problem: StepProblem) -> Springs:

@@ -9,20 +9,20 @@ import pytest
 from typer.testing import CliRunner
 
 from harness.cli import app
-from harness.config.load import load_any, load_scene
-from harness.experiments.plan import Files
-from harness.experiments.run import execute
-from harness.record.reader import read_replay, summary
-from harness.reference.judge import Judge
-from harness.scenes.bind import Scene, build
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.mesh.chain import Chain
+from harness.config.load import load_config, load_scene
+from harness.experiments.plan import RunFiles
+from harness.experiments.run import execute_run
+from harness.record.reader import read_replay, summarise_recording
+from harness.reference.judge import StepVerifier
+from harness.scenes.bind import Scene, build_scene
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.mesh.chain import ChainMesh
 from harness.scenes.spec import SceneSpec
-from harness.simulation.step import prepare, simulate, start
-from solvers.methods.newton import Newton
+from harness.simulation.step import build_initial_state, prepare, simulate_scene
+from solvers.methods.newton import NewtonSolver
 from solvers.methods.symplectic_euler import PreparedSymplecticEuler, SymplecticEuler
 from solvers.problem import StopRule, Unsupported
-from solvers.registry import SOLVERS, load
+from solvers.registry import SOLVERS, load_target
 
 FILE = Path(__file__).resolve().parents[2] / "configs" / "hard" / "motion-alternating-steps.yaml"
 LENGTHS = (1 / 3, 1 / 300)
@@ -30,72 +30,85 @@ FRAMES, STOP = 6, StopRule(30, 1e-6)
 
 
 def made(integrator: str = "implicit-euler") -> Scene:
-    return build(load_scene(FILE), 6, integrator)
+    return build_scene(load_scene(FILE), 6, integrator)
 
 
 @pytest.mark.parametrize("name", SOLVERS)
 def test_each_step_is_one_of_its_length_from_where_the_last_one_ended(name: str):
-    scene, solver = made(), load(SOLVERS[name])()
-    assert scene.alternate is not None
-    alone = [solver.prepare(part.system) for part in (scene, scene.alternate)]
-    state, time = start(scene), 0.0  # added up here, multiplied there: some eps apart
-    for step in simulate(scene, prepare(scene, solver), STOP, first_guess="current", frames=FRAMES):
-        dt, begun = LENGTHS[state.index % 2], step.problem.start
+    scene, solver = made(), load_target(SOLVERS[name])()
+    assert scene.alternate_scene is not None
+    alone = [solver.prepare(part.system) for part in (scene, scene.alternate_scene)]
+    state, time = build_initial_state(scene), 0.0  # added up here, multiplied there: some eps apart
+    for step in simulate_scene(scene, prepare(scene, solver), STOP, initial_guess="current", frames=FRAMES):
+        dt, begun = LENGTHS[state.index % 2], step.problem.step_start
         assert (step.problem.system.time_step, begun.time) == (dt, pytest.approx(time, rel=1e-15))
-        np.testing.assert_array_equal(step.problem.target, state.now.positions + dt * state.now.velocity)
-        np.testing.assert_allclose(step.problem.pin_targets, scene.pins_at(time + dt), rtol=0, atol=1e-15)
+        np.testing.assert_array_equal(step.problem.inertial_target, state.motion.positions + dt * state.motion.velocity)
+        np.testing.assert_allclose(step.problem.pin_targets, scene.pin_targets_at(time + dt), rtol=0, atol=1e-15)
         solution = alone[state.index % 2].solve(step.problem, STOP)
         np.testing.assert_array_equal(step.solution.positions, solution.positions)
         state, time = step.state, time + dt
-    assert scene.time(FRAMES) == pytest.approx(time, rel=1e-15)
+    assert scene.compute_time(FRAMES) == pytest.approx(time, rel=1e-15)
 
 
 def test_midpoint_falls_exactly_as_a_stone_does_whatever_the_steps():
-    given = {"mesh": Chain(), "effects": (Gravity(),), "time_step": 0.1, "alternate_time_step": 0.003}
-    scene = build(SceneSpec(mass=1.0, frames=9, path=Path("scene.yaml"), **given), 3, "midpoint")
-    *_, last = simulate(scene, prepare(scene, Newton()), STOP, first_guess="inertial", frames=9)
-    assert scene.time(9) == pytest.approx(0.512, rel=1e-15)
+    given = {"mesh": ChainMesh(), "effects": (GravityEffect(),), "time_step": 0.1, "alternate_time_step": 0.003}
+    scene = build_scene(SceneSpec(mass=1.0, frames=9, path=Path("scene.yaml"), **given), 3, "midpoint")
+    *_, last = simulate_scene(scene, prepare(scene, NewtonSolver()), STOP, initial_guess="inertial", frames=9)
+    assert scene.compute_time(9) == pytest.approx(0.512, rel=1e-15)
     # Nine roundings of a fall of 1.3 m.
     np.testing.assert_allclose(last.positions[:, 1], -0.5 * 9.81 * 0.512**2, rtol=1e-14)
 
 
 def test_an_integrator_of_two_steps_of_one_length_is_refused():
     with pytest.raises(Unsupported, match="steps of one length"):
-        prepare(made("bdf2"), Newton())
+        prepare(made("bdf2"), NewtonSolver())
 
 
 def test_each_step_is_judged_by_the_matrix_of_its_length():
     scene = made("midpoint")
-    judge = Judge(scene, None, minimises=True)
-    for step in simulate(scene, prepare(scene, Newton()), StopRule(100), first_guess="current", frames=FRAMES):
+    judge = StepVerifier(scene, None, is_minimiser=True)
+    for step in simulate_scene(
+        scene, prepare(scene, NewtonSolver()), StopRule(100), initial_guess="current", frames=FRAMES
+    ):
         found = judge(step)
         assert found["beyond"] == 0.0
 
 
 def test_a_run_is_recorded_by_its_own_clock(tmp_path: Path):
-    (run,) = load_any(FILE, solvers=["sparse"], frames=4, rounds=1).runs()
-    files = Files.of(run, tmp_path)
-    files.rows.parent.mkdir()
-    rows = execute(run, files, lambda phase: None)
+    (run,) = load_config(FILE, solvers=["sparse"], frames=4, rounds=1).list_runs()
+    files = RunFiles.for_run(run, tmp_path)
+    files.rows_path.parent.mkdir()
+    rows = execute_run(run, files, lambda phase: None)
     assert {row["status"] for row in rows} == {"ok"}
     ends = np.array([0.0, LENGTHS[0], sum(LENGTHS), 2 * LENGTHS[0] + LENGTHS[1], 2 * sum(LENGTHS)])
-    np.testing.assert_allclose(read_replay(files.recording).times, ends, rtol=0, atol=1e-9)  # nanoseconds
-    with_time = [row for row in summary(files.recording).scalars.to_pylist() if row["time"] is not None]
+    np.testing.assert_allclose(read_replay(files.recording_path).times, ends, rtol=0, atol=1e-9)  # nanoseconds
+    with_time = [
+        row for row in summarise_recording(files.recording_path).scalars.to_pylist() if row["time"] is not None
+    ]
     assert {row["frame"] for row in with_time} == set(range(5))
     for row in with_time:
         assert row["time"] == pytest.approx(ends[row["frame"]], abs=1e-9)
 
 
 def test_a_sweeps_own_time_step_is_that_of_all_steps():
-    (run,) = load_any(FILE, solvers=["sparse"], time_step=0.1).runs()
-    scene = build(run.scene, run.size)
-    assert scene.alternate is None
-    assert scene.time(7) == 7 * 0.1
+    (run,) = load_config(FILE, solvers=["sparse"], time_step=0.1).list_runs()
+    scene = build_scene(run.scene, run.size)
+    assert scene.alternate_scene is None
+    assert scene.compute_time(7) == 7 * 0.1
 
 
 def test_runs_of_other_steps_have_another_name():
     spec = load_scene(FILE)
-    assert len({spec.digest, spec.stepped(1 / 300).digest, spec.stepped(1 / 300).stepped(1 / 3).digest}) == 3
+    assert (
+        len(
+            {
+                spec.scene_digest,
+                spec.with_time_step(1 / 300).scene_digest,
+                spec.with_time_step(1 / 300).with_time_step(1 / 3).scene_digest,
+            }
+        )
+        == 3
+    )
 
 
 @pytest.mark.parametrize("command", ["ablate", "recommend", "accuracy"])
@@ -111,9 +124,9 @@ def test_what_measures_at_one_time_step_refuses_two_by_the_key(command: str, tmp
 
 def test_symplectic_euler_takes_the_substeps_that_each_length_asks_for():
     scene = made()
-    assert scene.alternate is not None
-    prepared = [SymplecticEuler().prepare(part.system) for part in (scene, scene.alternate)]
-    counts = [one.substeps for one in prepared if isinstance(one, PreparedSymplecticEuler)]
+    assert scene.alternate_scene is not None
+    prepared = [SymplecticEuler().prepare(part.system) for part in (scene, scene.alternate_scene)]
+    counts = [one.num_substeps for one in prepared if isinstance(one, PreparedSymplecticEuler)]
     assert len(counts) == 2
     assert counts[0] == pytest.approx(100 * counts[1], rel=0.5)
     assert counts[1] >= 1

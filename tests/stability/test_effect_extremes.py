@@ -6,67 +6,76 @@ import numpy as np
 import pytest
 
 from harness.scenes.bind import Scene
-from harness.scenes.effects.air_drag import AirDrag
-from harness.scenes.effects.attachments import Attachments
-from harness.scenes.effects.base import Effect
-from harness.scenes.effects.bending import Bending
-from harness.scenes.effects.dashpots import Dashpots
-from harness.scenes.effects.gas import Gas
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.rayleigh import Rayleigh
-from harness.scenes.effects.springs import Springs
-from harness.scenes.effects.strain_limits import StrainLimits
-from harness.scenes.effects.wind import Wind
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.mesh.surfaces import Balloon
-from harness.scenes.motion import Key, KeyedMotion
-from harness.simulation.step import prepare, simulate
-from solvers.matrices import assemble
+from harness.scenes.effects.air_drag import AirDragEffect
+from harness.scenes.effects.attachments import AttachmentsEffect
+from harness.scenes.effects.base import SceneEffect
+from harness.scenes.effects.bending import BendingEffect
+from harness.scenes.effects.dashpots import DashpotsEffect
+from harness.scenes.effects.gas import GasEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.rayleigh import RayleighEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.effects.strain_limits import StrainLimitsEffect
+from harness.scenes.effects.wind import WindEffect
+from harness.scenes.mesh.grid import GridMesh
+from harness.scenes.mesh.surfaces import BalloonMesh
+from harness.scenes.motion import KeyFrame, KeyFrameMotion
+from harness.simulation.step import prepare, simulate_scene
+from solvers.matrices import assemble_system_matrix
 from solvers.methods.lbfgs import Lbfgs
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import ProjectiveEnergy, Solver, StopRule
-from tests.scenes import scene
+from tests.scenes import build_test_scene
 
 TINY, HUGE = 1e-9, 1e9
-LEAP = KeyedMotion(keys=(Key(time=0.0), Key(time=1e-6, offset=(0.3, 0.0, 0.0), turn=3e4)))
+LEAP = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=1e-6, offset=(0.3, 0.0, 0.0), turn=3e4)))
 
-EFFECTS: dict[str, Effect] = {
-    "bending of 1e9 N m": Bending(stiffness=HUGE),
-    "bending of 1e-9 N m": Bending(stiffness=TINY),
-    "limits of 1e9 N/m about the rest length": StrainLimits(longest=1.0, shortest=0.999, stiffness=HUGE),
-    "limits of 1e-9 N/m": StrainLimits(longest=1.0, stiffness=TINY),
-    "dashpots of 1e9 N s/m": Dashpots(stretch=HUGE),
-    "Rayleigh damping of 1e9": Rayleigh(mass=HUGE, stiffness=HUGE),
-    "linear drag of 1e9 N s/m": AirDrag(coefficient=HUGE),
-    "quadratic drag of 1e9 kg/m": AirDrag(law="quadratic", coefficient=HUGE),
-    "attachments of 1e9 N/m": Attachments(at=("bottom",), stiffness=HUGE),
-    "attachments that leap": Attachments(at=("bottom",), stiffness=100.0, motion=LEAP),
-    "pins that leap": Pins(at=("bottom",), motion=LEAP),
-    "a storm of 300 m/s": Wind(per="triangle", velocity=(0.0, 300.0, 0.0), lift=2.0),
-    "air as dense as 1e9 kg/m^3": Wind(per="triangle", velocity=(0.0, 1.0, 0.0), density=HUGE),
+EFFECTS: dict[str, SceneEffect] = {
+    "bending of 1e9 N m": BendingEffect(stiffness=HUGE),
+    "bending of 1e-9 N m": BendingEffect(stiffness=TINY),
+    "limits of 1e9 N/m about the rest length": StrainLimitsEffect(longest=1.0, shortest=0.999, stiffness=HUGE),
+    "limits of 1e-9 N/m": StrainLimitsEffect(longest=1.0, stiffness=TINY),
+    "dashpots of 1e9 N s/m": DashpotsEffect(stretch=HUGE),
+    "Rayleigh damping of 1e9": RayleighEffect(mass=HUGE, stiffness=HUGE),
+    "linear drag of 1e9 N s/m": AirDragEffect(coefficient=HUGE),
+    "quadratic drag of 1e9 kg/m": AirDragEffect(law="quadratic", coefficient=HUGE),
+    "attachments of 1e9 N/m": AttachmentsEffect(at=("bottom",), stiffness=HUGE),
+    "attachments that leap": AttachmentsEffect(at=("bottom",), stiffness=100.0, motion=LEAP),
+    "pins that leap": PinsEffect(at=("bottom",), motion=LEAP),
+    "a storm of 300 m/s": WindEffect(per="triangle", velocity=(0.0, 300.0, 0.0), lift=2.0),
+    "air as dense as 1e9 kg/m^3": WindEffect(per="triangle", velocity=(0.0, 1.0, 0.0), density=HUGE),
 }
 TIME_STEPS = (1e-5, 1 / 30, 1.0)
 
 
 def runs_well(made: Scene, solver: Solver, reach: float) -> None:
-    Q = assemble(made.system, [energy for energy in made.system.energies if isinstance(energy, ProjectiveEnergy)])
+    Q = assemble_system_matrix(
+        made.system, [energy for energy in made.system.energies if isinstance(energy, ProjectiveEnergy)]
+    )
     # What objectives of sums of some hundred terms, and positions of order one that a solve knows to 1e-12, leave.
     round_off, displaced = 1e-12, Q.trace() * 1e-12**2
-    for step in simulate(made, prepare(made, solver), StopRule(30), first_guess="current", frames=8):
+    for step in simulate_scene(made, prepare(made, solver), StopRule(30), initial_guess="current", frames=8):
         assert np.isfinite(step.positions).all()
         assert np.abs(step.positions).max() <= reach
-        begin, end = (step.problem.value(p) for p in (step.problem.first_guess, step.solution.positions))
-        assert end <= begin + round_off * step.problem.magnitude(step.solution.positions) + displaced
+        begin, end = (step.problem.value(p) for p in (step.problem.initial_guess, step.solution.positions))
+        assert end <= begin + round_off * step.problem.value_scale(step.solution.positions) + displaced
 
 
 @pytest.mark.parametrize("time_step", TIME_STEPS)
 @pytest.mark.parametrize("solver", [SparseLocalGlobal(), Lbfgs()], ids=["sparse", "lbfgs"])
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_a_cloth_with_an_effect_at_its_extreme_stays_in_the_room(effect, solver, time_step):
-    pins = Pins(at=("top",))
-    made = scene(
-        Grid(), Springs(stretch=300.0), Gravity(), pins, EFFECTS[effect], size=6, mass=0.1, time_step=time_step
+    pins = PinsEffect(at=("top",))
+    made = build_test_scene(
+        GridMesh(),
+        SpringsEffect(stretch=300.0),
+        GravityEffect(),
+        pins,
+        EFFECTS[effect],
+        size=6,
+        mass=0.1,
+        time_step=time_step,
     )
     # A cloth of a metre that hangs by its top; a step of a second can throw a corner some lengths before springs catch
     # it, and the storm's first step blows what is loose as far as the air goes in a second.
@@ -76,12 +85,12 @@ def test_a_cloth_with_an_effect_at_its_extreme_stays_in_the_room(effect, solver,
 @pytest.mark.parametrize("time_step", TIME_STEPS)
 @pytest.mark.parametrize("pressure", [1e-9, 1.0, 1e4, 1e7])
 def test_a_balloon_at_any_pressure_keeps_its_volume_positive(pressure, time_step):
-    made = scene(
-        Balloon(),
-        Springs(stretch=100.0),
-        Gravity(),
-        Gas(pressure=pressure),
-        Pins(at=("pole_top",)),
+    made = build_test_scene(
+        BalloonMesh(),
+        SpringsEffect(stretch=100.0),
+        GravityEffect(),
+        GasEffect(pressure=pressure),
+        PinsEffect(at=("pole_top",)),
         size=3,
         mass=0.1,
         time_step=time_step,

@@ -20,7 +20,7 @@ from harness.record.reader import read_replay
 from solvers.linear.factors import DenseCholesky
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.methods.symplectic_euler import PreparedSymplecticEuler, SymplecticEuler
-from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, System
+from solvers.problem import Positions, PreparedSolver, Solution, StepProblem, StopRule, System
 from solvers.registry import SOLVERS
 
 FRAMES, BROKEN = 20, 4
@@ -45,47 +45,47 @@ options: {pictures: false, rounds: 1, iterations: 5}
 class _Breaking:
     """Local-global, until a frame in which something else happens instead."""
 
-    sound: Prepared
+    sound: PreparedSolver
     happens: Callable[[], object]
 
     @property
-    def choice(self) -> str:
+    def description(self) -> str:
         return ""
 
     @property
-    def facts(self) -> dict[str, float]:
-        return self.sound.facts
+    def stats(self) -> dict[str, float]:
+        return self.sound.stats
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         return self.sound.iterates(problem)
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        if round(problem.start.time / problem.system.time_step) == BROKEN - 1:
+        if round(problem.step_start.time / problem.system.time_step) == BROKEN - 1:
             self.happens()
         return self.sound.solve(problem, stop)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         return self.sound.residual_at(problem, p)
 
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         return {}
 
 
 @dataclass(frozen=True)
 class Indefinite:
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         return _Breaking(SparseLocalGlobal().prepare(system), lambda: DenseCholesky(-np.eye(3)))
 
 
 @dataclass(frozen=True)
 class OutOfMemory:
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedSolver:
         return _Breaking(SparseLocalGlobal().prepare(system), lambda: np.empty(2**55))
 
 
@@ -93,13 +93,13 @@ class OutOfMemory:
 class PastItsLimit:
     """Symplectic Euler in one substep, where stability asks for a million: each step multiplies what it begins with."""
 
-    minimises: ClassVar[bool] = False
-    descends: ClassVar[bool] = False
+    is_minimiser: ClassVar[bool] = False
+    is_monotone: ClassVar[bool] = False
 
     def prepare(self, system: System) -> PreparedSymplecticEuler:
         slow = SymplecticEuler().prepare(replace(system, time_step=1e-9))
         assert isinstance(slow, PreparedSymplecticEuler)
-        return replace(slow, system=system, substeps=1)
+        return replace(slow, system=system, num_substeps=1)
 
 
 FAILURES = {

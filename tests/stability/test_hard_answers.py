@@ -8,12 +8,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.reference.oracle import Oracle
-from harness.simulation.step import prepare, problem, start
+from harness.reference.oracle import ReferenceEvaluator
+from harness.simulation.step import build_initial_state, build_problem, prepare
 from solvers.problem import Solution, StepProblem, StopRule, Unsupported
 from tests.stability.test_hard_scenes import METHODS, cases, scene, spacing
 
-MINIMISERS = {name: solver for name, solver in METHODS.items() if solver.minimises}
+MINIMISERS = {name: solver for name, solver in METHODS.items() if solver.is_minimiser}
 TOLERANCE = 1e-6
 STOP = StopRule(100, TOLERANCE)
 SAID = ("tolerance", "floor")
@@ -39,7 +39,7 @@ UNIQUE = (
 def answers(case: str, stop: StopRule) -> tuple[StepProblem, dict[str, Solution]]:
     """The first step of a case, and the answers of the minimisers that take it."""
     made, found = scene(case), {}
-    stated = problem(made, start(made), "current")
+    stated = build_problem(made, build_initial_state(made), "current")
     for name, solver in MINIMISERS.items():
         try:
             found[name] = prepare(made, solver).solve(stated, stop)
@@ -51,17 +51,17 @@ def answers(case: str, stop: StopRule) -> tuple[StepProblem, dict[str, Solution]
 @cases
 def test_an_answer_is_as_stationary_as_it_is_said_to_be(case: str):
     stated, found = answers(case, STOP)
-    oracle = Oracle(stated.system)
+    oracle = ReferenceEvaluator(stated.system)
     for name, solution in found.items():
-        reading, said = oracle.stationarity(stated, solution.positions), solution.stopped in SAID
-        assert not said or reading.beyond <= SLACK * TOLERANCE, (name, solution.stopped, reading)
-        assert solution.stopped != "iterations" or solution.iterations == STOP.iterations, name
+        reading, said = oracle.measure_stationarity(stated, solution.positions), solution.termination_reason in SAID
+        assert not said or reading.above_roundoff <= SLACK * TOLERANCE, (name, solution.termination_reason, reading)
+        assert solution.termination_reason != "iterations" or solution.num_iterations == STOP.max_iterations, name
 
 
 @pytest.mark.parametrize("case", UNIQUE)
 def test_all_minimisers_agree_where_there_is_one_minimum(case: str):
     _, found = answers(case, StopRule(1000, 1e-9))
-    assert {name for name, solution in found.items() if solution.stopped != "iterations"} == set(MINIMISERS)
+    assert {name for name, solution in found.items() if solution.termination_reason != "iterations"} == set(MINIMISERS)
     # The tolerance of what the step moves, at most some metres, a hundredfold for what is softer than Q.
     atol = 1e-7 * spacing(scene(case))
     for name, solution in found.items():

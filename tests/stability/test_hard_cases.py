@@ -11,12 +11,20 @@ import numpy as np
 import pytest
 
 from harness.scenes.bind import Scene
-from harness.simulation.step import State, problem
+from harness.simulation.step import MotionState, build_problem
 from solvers.integrators import Motion
-from solvers.problem import Pins, Positions, Solver, StopRule, System
-from tests.scenes import BACKENDS, SCENES, cloth, first_problem, of_one_unknown, static_shape, trajectory
+from solvers.problem import DirichletPins, Positions, Solver, StopRule, System
+from tests.scenes import (
+    LOCAL_GLOBAL_BACKENDS,
+    SCENE_BUILDERS,
+    build_cloth,
+    build_first_problem,
+    compute_static_shape,
+    simulate_trajectory,
+    single_stage_integrator,
+)
 
-backends = pytest.mark.parametrize("backend", BACKENDS, ids=lambda b: type(b).__name__)
+backends = pytest.mark.parametrize("backend", LOCAL_GLOBAL_BACKENDS, ids=lambda b: type(b).__name__)
 
 STEPS, STOP = 20, StopRule(10)
 VALUE = 1e-12
@@ -41,30 +49,30 @@ def at_rest(rest: Positions) -> Positions:
 
 
 def changed(**system) -> Scene:
-    made = cloth(8)
+    made = build_cloth(8)
     return replace(made, system=replace(made.system, **system))
 
 
 def heavy_and_light() -> Scene:
-    mass = cloth(8).system.mass
+    mass = build_cloth(8).system.mass
     return changed(mass=mass * np.where(np.arange(len(mass)) % 2, 1e4, 1e-4))
 
 
 def mostly_massless() -> Scene:
-    mass = cloth(8).system.mass
+    mass = build_cloth(8).system.mass
     return changed(mass=np.where(np.arange(len(mass)) % 3, 0.0, mass))
 
 
 def weights(w: float) -> Scene:
-    made = cloth(8)
+    made = build_cloth(8)
     vertices = made.system.pins.vertices
-    return replace(made, system=replace(made.system, pins=Pins(vertices, np.full(len(vertices), w))))
+    return replace(made, system=replace(made.system, pins=DirichletPins(vertices, np.full(len(vertices), w))))
 
 
 def far_away(distance: float) -> Scene:
-    made = cloth(8)
-    rest = made.mesh.rest + distance
-    return replace(made, mesh=replace(made.mesh, rest=rest), pin_targets=made.pin_targets + distance)
+    made = build_cloth(8)
+    rest = made.mesh.rest_positions + distance
+    return replace(made, mesh=replace(made.mesh, rest_positions=rest), pin_targets=made.pin_targets + distance)
 
 
 def tangled(rest: Positions) -> Positions:
@@ -75,27 +83,27 @@ def tangled(rest: Positions) -> Positions:
 CASES = {
     "a time step of a hundred seconds": Case(lambda: changed(time_step=100.0), at_rest, 1.5),
     "a time step of a microsecond": Case(lambda: changed(time_step=1e-6), at_rest, 0.51),
-    "springs of 1e9 N/m": Case(lambda: cloth(8, stretch=1e9), at_rest, 1.1),
-    "springs of 1e-6 N/m fall freely": Case(lambda: cloth(8, stretch=1e-6), at_rest, 2.3),
+    "springs of 1e9 N/m": Case(lambda: build_cloth(8, stretch=1e9), at_rest, 1.1),
+    "springs of 1e-6 N/m fall freely": Case(lambda: build_cloth(8, stretch=1e-6), at_rest, 2.3),
     "masses eight orders apart": Case(heavy_and_light, at_rest, 1.5),
     "two thirds of the vertices without mass": Case(mostly_massless, at_rest, 1.5),
     "pins of 1e16 N/m": Case(lambda: weights(1e16), at_rest, 1.5),
     "pins of 1e-3 N/m fall freely": Case(lambda: weights(1e-3), at_rest, 2.4),
     "far from the origin": Case(lambda: far_away(1e6), at_rest, 1e6 + 1.5),
-    "collapsed into a point": Case(lambda: cloth(8), np.zeros_like, 1.5),
-    "flattened to a line": Case(lambda: cloth(8), lambda rest: rest * [1.0, 0.0, 0.0], 1.5),
-    "turned inside out": Case(lambda: cloth(8), np.negative, 2.0),
-    "tangled": Case(lambda: cloth(8), tangled, 4.0),
-    "tangled, exact pins": Case(lambda: cloth(8, "exact"), tangled, 4.0),
-    "a tangle of a stiff block": Case(lambda: SCENES["block"](1e10), tangled, 4.0),
-    "stretched a thousandfold": Case(lambda: cloth(8), lambda rest: 1e3 * rest, 500.0),
-    "a stiff tower of 3 m": Case(lambda: SCENES["tower"](1e10), at_rest, 3.1),
+    "collapsed into a point": Case(lambda: build_cloth(8), np.zeros_like, 1.5),
+    "flattened to a line": Case(lambda: build_cloth(8), lambda rest: rest * [1.0, 0.0, 0.0], 1.5),
+    "turned inside out": Case(lambda: build_cloth(8), np.negative, 2.0),
+    "tangled": Case(lambda: build_cloth(8), tangled, 4.0),
+    "tangled, exact pins": Case(lambda: build_cloth(8, "exact"), tangled, 4.0),
+    "a tangle of a stiff block": Case(lambda: SCENE_BUILDERS["block"](1e10), tangled, 4.0),
+    "stretched a thousandfold": Case(lambda: build_cloth(8), lambda rest: 1e3 * rest, 500.0),
+    "a stiff tower of 3 m": Case(lambda: SCENE_BUILDERS["tower"](1e10), at_rest, 3.1),
 }
 cases = pytest.mark.parametrize("case", CASES.values(), ids=list(CASES))
 
 
-def resting(positions: Positions) -> State:
-    return State(Motion(positions, np.zeros_like(positions)), None, 0)
+def resting(positions: Positions) -> MotionState:
+    return MotionState(Motion(positions, np.zeros_like(positions)), None, 0)
 
 
 @backends
@@ -103,35 +111,37 @@ def resting(positions: Positions) -> State:
 def test_a_hard_case_descends_stays_finite_and_near(case: Case, backend: Solver):
     made = case.scene()
     prepared = backend.prepare(made.system)
-    positions = case.start(made.mesh.rest)
+    positions = case.start(made.mesh.rest_positions)
     state = resting(positions)
     for index in range(1, STEPS + 1):
-        stated = problem(made, state, "current")
+        stated = build_problem(made, state, "current")
         solution = prepared.solve(stated, STOP)
         p = solution.positions
         assert np.isfinite(p).all()
         assert np.abs(p).max() <= case.reach
-        slack = VALUE * stated.magnitude(stated.first_guess)
-        assert stated.value(p) <= stated.value(stated.first_guess) + slack
-        state = State(of_one_unknown(made).advance(stated.start, solution), state.now, index)
+        slack = VALUE * stated.value_scale(stated.initial_guess)
+        assert stated.value(p) <= stated.value(stated.initial_guess) + slack
+        state = MotionState(
+            single_stage_integrator(made).complete_step(stated.step_start, solution), state.motion, index
+        )
 
 
 @cases
 def test_backends_agree_on_a_hard_case(case: Case):
     made = case.scene()
-    positions = case.start(made.mesh.rest)
-    stated = problem(made, resting(positions), "current")
-    found = [list(islice(backend.prepare(made.system).iterates(stated), 10))[-1] for backend in BACKENDS]
+    positions = case.start(made.mesh.rest_positions)
+    stated = build_problem(made, resting(positions), "current")
+    found = [list(islice(backend.prepare(made.system).iterates(stated), 10))[-1] for backend in LOCAL_GLOBAL_BACKENDS]
     assert np.ptp(found, axis=0).max() <= AGREEMENT * case.reach
 
 
 @backends
 def test_a_long_run_comes_to_rest_where_the_statics_say(backend):
-    made = SCENES["chain"](1e10)
-    p = trajectory(made, backend, 1500, iterations=30)
+    made = SCENE_BUILDERS["chain"](1e10)
+    p = simulate_trajectory(made, backend, 1500, iterations=30)
     assert np.isfinite(p).all()
     # Implicit Euler damps the slowest swing, of some hertz, to e^-15; ends are then equal to the solves' accuracy.
-    np.testing.assert_allclose(p[-1], static_shape(made), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(p[-1], compute_static_shape(made), rtol=0, atol=1e-6)
 
 
 @backends
@@ -139,18 +149,18 @@ def test_a_long_run_comes_to_rest_where_the_statics_say(backend):
 def test_the_scale_of_time_and_length_is_free(backend, time_step):
     """In units of another length and time the same motion has the same digits (powers of two change no bit)."""
     length, time = 2.0**20, 2.0**-12
-    made = cloth(6)
+    made = build_cloth(6)
     made = replace(made, system=replace(made.system, time_step=time_step))
-    stated = first_problem(made)
+    stated = build_first_problem(made)
     scaled = replace(
         stated,
         system=System(
             made.system.mass * time**2,
             time_step * time,
-            tuple(replace(s, rest_length=s.rest_length * length) for s in (made.springs,)),
+            tuple(replace(s, rest_length=s.rest_length * length) for s in (made.all_springs,)),
             made.system.pins,
         ),
-        force=stated.force * length,
+        external_force=stated.external_force * length,
         **{name: getattr(stated, name) * length for name in ("target", "pin_targets", "current", "first_guess")},
     )
     found, other = (list(islice(backend.prepare(one.system).iterates(one), 5))[-1] for one in (stated, scaled))

@@ -15,14 +15,21 @@ import numpy as np
 import pytest
 
 from harness.config.load import load_scene, load_sweep
-from harness.reference.oracle import Oracle
-from harness.scenes.bind import Scene, build
-from harness.simulation.step import State, Step, prepare, problem, simulate, start
+from harness.reference.oracle import ReferenceEvaluator
+from harness.scenes.bind import Scene, build_scene
+from harness.simulation.step import (
+    MotionState,
+    SimulationStep,
+    build_initial_state,
+    build_problem,
+    prepare,
+    simulate_scene,
+)
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.problem import Positions, Prepared, Solver, StepProblem, StopRule, Unsupported
-from solvers.registry import EVERY, SOLVERS, load
-from solvers.round_off import gradient_round_off
-from tests.scenes import THREADS, far, of_one_unknown
+from solvers.problem import Positions, PreparedSolver, Solver, StepProblem, StopRule, Unsupported
+from solvers.registry import SOLVER_TABLE, SOLVERS, load_target
+from solvers.round_off import gradient_roundoff
+from tests.scenes import THREAD_COUNT, rounding_scale, single_stage_integrator
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 CASES = {path.stem: path for path in sorted((CONFIGS / "hard").glob("*.yaml"))}
@@ -30,7 +37,7 @@ ALIKE = {"blanes-moan-4", "blanes-moan-6", "runge-kutta-4", "tsitouras-5", "dorm
 """Methods of the same code as velocity-verlet, and those that give up by themselves where no step keeps to an error:
 `tests/unit/test_explicit.py`; and what is vbd where no length is exact: `tests/unit/test_avbd.py`."""
 METHODS: dict[str, Solver] = {
-    **{name: load(target)() for name, target in SOLVERS.items() if name not in ALIKE},
+    **{name: load_target(target)() for name, target in SOLVERS.items() if name not in ALIKE},
     "numba float32": CompiledLocalGlobal(precision="float32"),
 }
 TAKE_ALL = {"lbfgs", "hybrid", "newton"}
@@ -39,7 +46,7 @@ REFUSED = {
     (case, method): "mass"
     for case in ("numbers-massless-vertices", "numbers-mostly-massless")
     for method in SOLVERS
-    if method in ("xpbd", "mgpbd") or load(SOLVERS[method]).about.own_steps
+    if method in ("xpbd", "mgpbd") or load_target(SOLVERS[method]).about.own_steps
 }
 REFUSED |= {(case, "velocity-verlet"): "substeps" for case in ("effects-air-drag-1e9", "effects-bending-1e12")}
 """Methods that move each vertex by its own mass cannot move one that has none; explicit ones would take all day."""
@@ -58,22 +65,22 @@ methods = pytest.mark.parametrize("method", METHODS)
 @lru_cache(maxsize=1)
 def scene(case: str, size: int | None = None) -> Scene:
     spec = load_scene(CASES[case])
-    return build(spec, size or spec.default_size or 0)
+    return build_scene(spec, size or spec.default_size or 0)
 
 
 def spacing(made: Scene) -> float:
     """The median rest length [m], or a metre where there are no springs."""
-    lengths = made.springs.rest_length
+    lengths = made.all_springs.rest_length
     return float(np.median(lengths[lengths > 0.0])) if lengths.any() else 1.0
 
 
 def rounded(stated: StepProblem, p: Positions) -> Positions:
     """What a gradient may be off by (n, 3) [N], vertex by vertex: along an error d a step Q^-1 (g + d) rises by at most
     |Q^-1 d|_Q^2 / 2, because Q majorises."""
-    return np.repeat(gradient_round_off(stated, p)[:, None] / 3**0.5, 3, axis=1)
+    return np.repeat(gradient_roundoff(stated, p)[:, None] / 3**0.5, 3, axis=1)
 
 
-def prepared_or_refused(made: Scene, solver: Solver) -> Prepared | None:
+def prepared_or_refused(made: Scene, solver: Solver) -> PreparedSolver | None:
     """None where the solver refuses the scene, and names one of its energies."""
     energies = {type(energy).__name__ for energy in made.system.energies}
     with suppress(Unsupported):
@@ -84,14 +91,14 @@ def prepared_or_refused(made: Scene, solver: Solver) -> Prepared | None:
 
 
 @lru_cache(maxsize=1)
-def oracle(case: str) -> Oracle:
-    return Oracle(scene(case).system)
+def oracle(case: str) -> ReferenceEvaluator:
+    return ReferenceEvaluator(scene(case).system)
 
 
 def slack(case: str, stated: StepProblem, iterates: list[Positions]) -> float:
     """What round-off may raise the objective by [J]."""
-    of_values = VALUE * max(map(stated.magnitude, iterates)) + 0.5 * (ROUNDED * far(stated)) ** 2
-    return of_values + 0.5 * max(oracle(case).length(rounded(stated, p)) for p in iterates) ** 2
+    of_values = VALUE * max(map(stated.value_scale, iterates)) + 0.5 * (ROUNDED * rounding_scale(stated)) ** 2
+    return of_values + 0.5 * max(oracle(case).compute_energy_norm(rounded(stated, p)) for p in iterates) ** 2
 
 
 @methods  # which vary faster than the cases, so that each scene is built once
@@ -106,28 +113,30 @@ def test_a_hard_scene_is_refused_by_name_or_stays_finite_descends_and_repeats_it
     prepared = prepared_or_refused(made, solver) if may_refuse else prepare(made, solver)
     if prepared is None:
         return
-    again, state = prepare(made, solver), start(made)
+    again, state = prepare(made, solver), build_initial_state(made)
     for frame in range(1, FRAMES + 1):
-        stated = problem(made, state, "current")
-        if solver.descends:
-            iterates = [stated.first_guess, *(p.copy() for p in islice(prepared.iterates(stated), ITERATIONS))]
+        stated = build_problem(made, state, "current")
+        if solver.is_monotone:
+            iterates = [stated.initial_guess, *(p.copy() for p in islice(prepared.iterates(stated), ITERATIONS))]
             values = [stated.value(p) for p in iterates]
             rises = [b - a for a, b in pairwise(values) if not b <= a]
             if rises:
                 bound = slack(case, stated, iterates)
                 said = f"frame {frame}: the objective rose by {rises} J, {bound:.1e} J being round-off"
                 assert all(rise <= bound for rise in rises), said
-        for phase in prepared.phases(stated).values():
+        for phase in prepared.iteration_phases(stated).values():
             phase()
         solution = prepared.solve(stated, StopRule(ITERATIONS))
         assert np.isfinite(solution.positions).all()
         if frame == 1:
             np.testing.assert_array_equal(again.solve(stated, StopRule(ITERATIONS)).positions, solution.positions)
-        state = State(of_one_unknown(made).advance(stated.start, solution), state.now, frame)
+        state = MotionState(
+            single_stage_integrator(made).complete_step(stated.step_start, solution), state.motion, frame
+        )
 
 
-def steps(made: Scene, solver: Solver, iterations: int) -> list[Step]:
-    run = simulate(made, prepare(made, solver), StopRule(iterations), first_guess="current", frames=FRAMES)
+def steps(made: Scene, solver: Solver, iterations: int) -> list[SimulationStep]:
+    run = simulate_scene(made, prepare(made, solver), StopRule(iterations), initial_guess="current", frames=FRAMES)
     return list(run)
 
 
@@ -137,7 +146,7 @@ LARGE = {"geometry-collapsed": 48, "geometry-random": 48, "motion-pins-shake": 4
 """Cases at sizes that have work for two threads."""
 
 
-@pytest.mark.skipif(THREADS < 2, reason="Numba was started with one thread")
+@pytest.mark.skipif(THREAD_COUNT < 2, reason="Numba was started with one thread")
 @pytest.mark.parametrize("solver", SPLIT.values(), ids=list(SPLIT))
 @pytest.mark.parametrize(
     ("case", "size"),
@@ -148,7 +157,7 @@ def test_any_number_of_threads_gives_the_same_bits(case: str, size: int | None, 
     try:
         for threads in (1, 2):
             numba.set_num_threads(threads)
-            assert threads == 1 or size is None or "of 2 threads" not in solver.prepare(made.system).choice
+            assert threads == 1 or size is None or "of 2 threads" not in solver.prepare(made.system).description
             found.append(steps(made, solver, ITERATIONS)[-1].positions)
     finally:
         numba.set_num_threads(before)
@@ -177,15 +186,15 @@ def test_a_factor_in_single_precision_leaves_the_motion_where_it_was(case: str):
 
 def test_the_sweep_runs_every_case_by_every_solver():
     sweep = load_sweep(CONFIGS / "hard.yaml")
-    asked = {(run.scene_name, run.solver.name) for run in sweep.runs()}
-    assert asked == {(case, name) for case in CASES for name in EVERY.keys() - ALIKE}
+    asked = {(run.scene_name, run.solver.name) for run in sweep.list_runs()}
+    assert asked == {(case, name) for case in CASES for name in SOLVER_TABLE.keys() - ALIKE}
     assert len(CASES) >= 60
-    assert {run.solver.parameters["precision"] for run in sweep.runs() if run.solver.name == "numba"} == {
+    assert {run.solver.parameters["precision"] for run in sweep.list_runs() if run.solver.name == "numba"} == {
         "float32",
         "float64",
     }
-    assert min(run.time_step for run in sweep.runs()) <= 1e-4
-    assert max(run.time_step for run in sweep.runs()) >= 1.0
+    assert min(run.time_step for run in sweep.list_runs()) <= 1e-4
+    assert max(run.time_step for run in sweep.list_runs()) >= 1.0
 
 
 @cases

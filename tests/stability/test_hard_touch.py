@@ -7,18 +7,18 @@ from pathlib import Path
 import pytest
 
 from harness.config.load import load_scene
-from harness.scenes.bind import build
-from harness.simulation.observe import intersections
-from harness.simulation.step import prepare, simulate
-from solvers.contact.self_contact import PairContact
-from solvers.core.clearing import Blocked
+from harness.scenes.bind import build_scene
+from harness.simulation.observe import count_intersections
+from harness.simulation.step import prepare, simulate_scene
+from solvers.contact.self_contact import BarrierContact
+from solvers.core.clearing import NoClearance
 from solvers.problem import StopRule
-from tests.self_contacts import TAKE_SURFACES
+from tests.self_contacts import SURFACE_CONTACT_SOLVERS
 
 CASES = {
     path.stem: path for path in sorted((Path(__file__).resolve().parents[2] / "configs/hard-touch").glob("*.yaml"))
 }
-SOLVE = TAKE_SURFACES
+SOLVE = SURFACE_CONTACT_SOLVERS
 QUICK = {"edges-parallel", "vertex-on-face", "needles"}
 QUICKLY = {"newton", "newton-cg", "pncg", "lbfgs", "lbfgs float32", "hybrid"}
 IMPOSSIBLE = {"slit-closes": "obstacles leave no room"}
@@ -37,16 +37,16 @@ FEW = 4
 )
 def test_nothing_passes_through_anything(case: str, name: str):
     spec = load_scene(CASES[case])
-    made, touched = build(spec, spec.default_size or 6), 0
+    made, touched = build_scene(spec, spec.default_size or 6), 0
     rule, frames = StopRule(60, 1e-4), spec.frames if name in MANY or case in IMPOSSIBLE else FEW
-    run = simulate(made, prepare(made, SOLVE[name]), rule, first_guess="current", frames=frames)
+    run = simulate_scene(made, prepare(made, SOLVE[name]), rule, initial_guess="current", frames=frames)
     if case in IMPOSSIBLE:
-        with pytest.raises(Blocked, match=IMPOSSIBLE[case]):
+        with pytest.raises(NoClearance, match=IMPOSSIBLE[case]):
             list(run)
         return
     for step in run:
-        assert intersections(made, step.positions, made.time(step.index)) == 0
-        energies = [energy for energy in step.problem.energies if isinstance(energy, PairContact)]
-        assert not any(energy.closed(step.positions) for energy in energies)
-        touched += sum(len(energy.blocks(step.positions).vertices) for energy in energies)
+        assert count_intersections(made, step.positions, made.compute_time(step.index)) == 0
+        energies = [energy for energy in step.problem.energies if isinstance(energy, BarrierContact)]
+        assert not any(energy.find_violated_pairs(step.positions) for energy in energies)
+        touched += sum(len(energy.hessian_blocks(step.positions).vertices) for energy in energies)
     assert touched or frames < 10

@@ -21,10 +21,10 @@ import pytest
 from scipy.optimize import root
 
 from solvers.energies.springs import Springs
-from solvers.methods.hybrid import Hybrid
-from solvers.methods.newton import Newton
-from solvers.problem import Pins, Positions, Solver, StepProblem, StopRule, System
-from tests.scenes import begun
+from solvers.methods.hybrid import HybridNewton
+from solvers.methods.newton import NewtonSolver
+from solvers.problem import DirichletPins, Positions, Solver, StepProblem, StopRule, System
+from tests.scenes import build_step_start
 
 LENGTH, WEIGHT = 2.0, 10.0
 """Of the whole cable [m], [N]."""
@@ -33,7 +33,7 @@ TO_THE_END = StopRule(2000)
 SUPPORTS = {"level": (1.2, 0.0), "on a slope": (1.0, 0.7)}
 """Where the right support is from the left one [m]."""
 
-solvers = pytest.mark.parametrize("solver", [Newton(), Hybrid()], ids=lambda s: type(s).__name__)
+solvers = pytest.mark.parametrize("solver", [NewtonSolver(), HybridNewton()], ids=lambda s: type(s).__name__)
 supports = pytest.mark.parametrize("support", SUPPORTS.values(), ids=list(SUPPORTS))
 
 Shape = Callable[[np.ndarray], np.ndarray]
@@ -79,20 +79,20 @@ def equilibrium(n: int, EA: float, support: tuple[float, float], solver: Solver)
     along = np.linspace(0.0, 1.0, n)[:, None]
     rest: Positions = np.zeros((n, 3))
     rest[:, :1] = LENGTH * along
-    springs = Springs.at_rest(rest, np.stack([np.arange(n - 1), np.arange(1, n)], axis=1), np.full(n - 1, EA))
+    springs = Springs.from_rest_shape(rest, np.stack([np.arange(n - 1), np.arange(1, n)], axis=1), np.full(n - 1, EA))
     springs = Springs(
         springs.edges, springs.stiffness / springs.rest_length, springs.rest_length, springs.rest_direction
     )
     mass = np.full(n, WEIGHT / G / (n - 1))
     mass[[0, -1]] *= 0.5
-    system = System(mass, STEP, (springs,), Pins(np.array([0, n - 1]), np.full(2, np.inf)))
+    system = System(mass, STEP, (springs,), DirichletPins(np.array([0, n - 1]), np.full(2, np.inf)))
     end = np.array([*support, 0.0])
     bow = along * end - [0.0, 0.5 * LENGTH, 0.0] * np.sin(np.pi * along)
     bow[-1] = end
     force = mass[:, None] * [0.0, -G, 0.0]
-    problem = StepProblem(system, bow, force, bow[[0, -1]], bow, bow, begun(system, bow, bow))
+    problem = StepProblem(system, bow, force, bow[[0, -1]], bow, bow, build_step_start(system, bow, bow))
     solution = solver.prepare(system).solve(problem, TO_THE_END)
-    assert solution.stopped == "stalled"
+    assert solution.termination_reason == "stalled"
     # Nothing pulls it out of its plane but round-off, where Newton's method looks for a way down.
     np.testing.assert_allclose(solution.positions[:, 2], 0.0, rtol=0, atol=1e-12 * LENGTH)
     return solution.positions[:, :2]

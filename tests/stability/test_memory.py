@@ -11,23 +11,23 @@ from typer.testing import CliRunner
 
 from harness.base.errors import InputError
 from harness.cli import app
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.generator import Generator
-from harness.scenes.mesh.grid import Grid, Net
-from harness.scenes.mesh.solids import Block, Tower
-from harness.scenes.mesh.star import Star
-from harness.scenes.mesh.surfaces import Balloon, Skirt
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.generator import MeshGenerator
+from harness.scenes.mesh.grid import GridMesh, NetMesh
+from harness.scenes.mesh.solids import BlockMesh, TowerMesh
+from harness.scenes.mesh.star import StarMesh
+from harness.scenes.mesh.surfaces import BalloonMesh, SkirtMesh
 from solvers import memory
-from solvers.linear.choice import factorise
-from solvers.matrices import assemble
-from solvers.methods.hybrid import Hybrid
+from solvers.linear.choice import build_linear_solver
+from solvers.matrices import assemble_system_matrix
+from solvers.methods.hybrid import HybridNewton
 from solvers.methods.local_global import DenseLocalGlobal
-from solvers.methods.newton import Newton
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import Solver, Unsupported
-from tests.networks import grid
-from tests.scenes import scene
+from tests.networks import grid_matrix
+from tests.scenes import build_test_scene
 
 GIB = 2.0**30
 SCENE = """
@@ -50,10 +50,10 @@ LARGE = {
 
 @pytest.fixture
 def none_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
-    def generate(self: Generator, size: int) -> None:
+    def generate(self: MeshGenerator, size: int) -> None:
         raise AssertionError("the mesh is built")
 
-    for kind in (Grid, Net, Block):
+    for kind in (GridMesh, NetMesh, BlockMesh):
         monkeypatch.setattr(kind, "generate", generate)
 
 
@@ -87,32 +87,37 @@ def test_a_size_within_the_limit_is_refused_by_a_machine_that_is_too_small_for_i
     for needle in ("4,999,696 vertices of at most 3,869,339", "5.17 GiB", "4 GiB may be taken"):
         assert needle in said
     monkeypatch.setattr(memory, "of_machine", lambda: 6.0 * GIB)
-    Grid().check(2_236)
+    GridMesh().check_size(2_236)
     with pytest.raises(InputError, match="allowed for grid: 2 to 2236 "):
-        Grid().check(2_237)
+        GridMesh().check_size(2_237)
 
 
 @pytest.mark.parametrize(
     ("mesh", "size"),
     [
-        (Chain(), 5_000),
-        (Star(), 5_000),
-        (Net(), 50),
-        (Grid(), 70),
-        (Skirt(), 110),
-        (Balloon(), 20),
-        (Tower(), 300),
-        (Block(), 16),
+        (ChainMesh(), 5_000),
+        (StarMesh(), 5_000),
+        (NetMesh(), 50),
+        (GridMesh(), 70),
+        (SkirtMesh(), 110),
+        (BalloonMesh(), 20),
+        (TowerMesh(), 300),
+        (BlockMesh(), 16),
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_a_mesh_takes_what_was_estimated(mesh: Generator, size: int):
+def test_a_mesh_takes_what_was_estimated(mesh: MeshGenerator, size: int):
     """With its springs and Q, counted as they are made. Small meshes have fewer springs a vertex than large ones."""
-    estimate = mesh.count(size) * mesh._bytes
+    estimate = mesh.count_vertices(size) * mesh._vertex_bytes
     tracemalloc.start()
     try:
-        made = scene(mesh, Springs(stretch=10.0, shear=0.0 if mesh.SPRINGS < 3 else 5.0), Gravity(), size=size)
-        assemble(made.system, [made.springs])
+        made = build_test_scene(
+            mesh,
+            SpringsEffect(stretch=10.0, shear=0.0 if mesh.SPRINGS_PER_VERTEX < 3 else 5.0),
+            GravityEffect(),
+            size=size,
+        )
+        assemble_system_matrix(made.system, [made.all_springs])
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -121,16 +126,16 @@ def test_a_mesh_takes_what_was_estimated(mesh: Generator, size: int):
 
 @pytest.mark.parametrize("solver", [DenseLocalGlobal()], ids=repr)
 def test_dense_matrices_are_refused_at_200_vertices_a_side(solver: Solver, monkeypatch: pytest.MonkeyPatch):
-    system = scene(Grid(), Springs(stretch=10.0, shear=2.0), size=200).system
+    system = build_test_scene(GridMesh(), SpringsEffect(stretch=10.0, shear=2.0), size=200).system
     monkeypatch.setattr(memory, "of_machine", lambda: 64.0 * GIB)
     with pytest.raises(Unsupported, match=r"40,000 vertices and 158,802 springs take 178 GiB .* 64 GiB may be taken"):
         solver.prepare(system)
 
 
-@pytest.mark.parametrize("solver", [Newton(), Hybrid()], ids=repr)
+@pytest.mark.parametrize("solver", [NewtonSolver(), HybridNewton()], ids=repr)
 def test_a_hessians_factor_that_does_not_fit_is_refused(solver: Solver, monkeypatch: pytest.MonkeyPatch):
     """Nine times the entries of Q's, which fits."""
-    system = scene(Grid(), Springs(stretch=10.0, shear=2.0), size=40).system
+    system = build_test_scene(GridMesh(), SpringsEffect(stretch=10.0, shear=2.0), size=40).system
     monkeypatch.setattr(memory, "of_machine", lambda: 4.0 * 2**20)
     with pytest.raises(Unsupported, match=r"factor of the Hessian has [\d,]+ entries and takes [\d.]+ MiB .* 4 MiB"):
         solver.prepare(system)
@@ -140,11 +145,11 @@ def test_what_no_linear_solver_holds_is_refused_with_what_each_needs():
     with pytest.raises(
         Unsupported, match=r"does not fit in 100 KiB of memory: supernodal needs [\d.]+ KiB .* cg needs"
     ):
-        factorise(grid(40, 40), memory=100.0 * 2**10)
+        build_linear_solver(grid_matrix(40, 40), memory_limit=100.0 * 2**10)
 
 
 def test_bytes_are_told_in_words():
-    assert [memory.in_words(n) for n in (0, 1023, 1024, 3.5 * 2**20, 2.0**30, 3.0 * 2**50)] == [
+    assert [memory.format_bytes(n) for n in (0, 1023, 1024, 3.5 * 2**20, 2.0**30, 3.0 * 2**50)] == [
         "0 bytes",
         "1,023 bytes",
         "1 KiB",
@@ -152,4 +157,4 @@ def test_bytes_are_told_in_words():
         "1 GiB",
         "3,145,728 GiB",
     ]
-    assert np.isfinite(memory.of_machine())
+    assert np.isfinite(memory.compute_memory_limit())

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from solvers.problem import Positions, StepProblem, StopRule, System
-from tests.scenes import far
+from tests.scenes import rounding_scale
 from tests.stability.random_networks import (
     ALL,
     EPS,
@@ -63,10 +63,10 @@ def tolerance(case: Case) -> float:
 def test_iterates_are_finite_and_descend(name: str, case: Case):
     problem = case.problem()
     iterates = ALL[name].prepare(problem.system).iterates(problem)
-    found = [problem.first_guess, *(p.copy() for p in islice(iterates, 8))]
+    found = [problem.initial_guess, *(p.copy() for p in islice(iterates, 8))]
     assert np.isfinite(found).all()
-    floor = far(problem)
-    slack = VALUE * max(map(problem.magnitude, found)) + 0.5 * (ROUNDED * floor) ** 2
+    floor = rounding_scale(problem)
+    slack = VALUE * max(map(problem.value_scale, found)) + 0.5 * (ROUNDED * floor) ** 2
     assert all(problem.value(q) <= problem.value(p) + slack for p, q in pairwise(found))
 
 
@@ -100,8 +100,15 @@ def test_units_of_length_time_and_mass_mean_nothing(name: str, case: Case):
     pins = replace(problem.system.pins, weight=problem.system.pins.weight * k)
     system = System(problem.system.mass * mass, problem.system.time_step * time, (scaled,), pins)
     other = changed(problem, lambda p: p * length, lambda v: v * length / time)
-    other = replace(other, system=system, force=problem.force * (k * length))
-    other = replace(other, start=replace(other.start, rate=other.start.rate / time, until=other.start.until * time))
+    other = replace(other, system=system, external_force=problem.external_force * (k * length))
+    other = replace(
+        other,
+        step_start=replace(
+            other.step_start,
+            velocity_rate=other.step_start.velocity_rate / time,
+            stage_time=other.step_start.stage_time * time,
+        ),
+    )
     np.testing.assert_array_equal(ends(name, other), ends(name, problem) * length)
 
 
@@ -119,10 +126,10 @@ def test_the_same_step_twice_has_the_same_bits(name: str, case: Case):
 def test_what_nothing_holds_keeps_its_momentum(name: str, case: Case):
     problem = replace(case, pinned=0).problem()
     mass, dt = problem.system.mass[:, None], problem.system.time_step
-    free = replace(problem, force=np.zeros_like(problem.force))
-    moved = (mass * (ends(name, free) - free.start.positions)).sum(axis=0) / dt
-    before = (mass * free.start.velocity).sum(axis=0)
-    scale = (mass * np.abs(free.start.positions)).sum() / dt  # what the differences above are taken of
+    free = replace(problem, external_force=np.zeros_like(problem.external_force))
+    moved = (mass * (ends(name, free) - free.step_start.positions)).sum(axis=0) / dt
+    before = (mass * free.step_start.velocity).sum(axis=0)
+    scale = (mass * np.abs(free.step_start.positions)).sum() / dt  # what the differences above are taken of
     np.testing.assert_allclose(moved, before, rtol=0, atol=100 * EPS * case.worst * scale)
 
 
@@ -140,5 +147,5 @@ def test_what_flies_freely_at_rest_length_goes_on(name: str, case: Case):
 @given(case=networks())
 def test_springs_of_no_strength_leave_free_fall(name: str, case: Case):
     problem = replace(case, number=-40.0, spread=0.0, pinned=0).problem()
-    fall = problem.target + problem.force / problem.system.inertia[:, None]
+    fall = problem.inertial_target + problem.external_force / problem.system.inertia_diagonal[:, None]
     np.testing.assert_allclose(ends(name, problem), fall, rtol=0, atol=1e-13)  # a thousand eps of coordinates of some m

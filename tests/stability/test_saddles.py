@@ -11,45 +11,45 @@ import numpy as np
 import pytest
 
 from harness.config.load import load_scene
-from harness.reference.curvature import curvature
-from harness.reference.judge import Judge
+from harness.reference.curvature import compute_curvature
+from harness.reference.judge import StepVerifier
 from harness.reference.judge import is_minimum as minimum
-from harness.report.robustness import SLACK
-from harness.scenes.bind import Scene, build
-from harness.scenes.effects.pins import Pins as PinsEffect
-from harness.scenes.effects.springs import Springs as SpringsEffect
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.mesh.solids import Tower
-from harness.simulation.step import State, prepare, problem, simulate
+from harness.report.robustness import TOLERANCE_SLACK
+from harness.scenes.bind import Scene, build_scene
+from harness.scenes.effects.pins import PinsEffect as PinsEffect
+from harness.scenes.effects.springs import SpringsEffect as SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
+from harness.scenes.mesh.solids import TowerMesh
+from harness.simulation.step import MotionState, build_problem, prepare, simulate_scene
 from solvers.integrators import INTEGRATORS, Motion
-from solvers.methods.hybrid import Hybrid
-from solvers.methods.newton import Newton
+from solvers.methods.hybrid import HybridNewton
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import Positions, Solver, StepProblem, StopRule
-from tests.scenes import scene
+from tests.scenes import build_test_scene
 
-solvers = pytest.mark.parametrize("solver", [Newton(), Hybrid()], ids=lambda s: type(s).__name__)
+solvers = pytest.mark.parametrize("solver", [NewtonSolver(), HybridNewton()], ids=lambda s: type(s).__name__)
 
 STOP = StopRule(300, 1e-6)
 
 
 def squeezed(mesh, size: int, pins: str, factors: tuple[float, float, float]) -> tuple[Scene, Positions]:
     """A scene whose time step leaves the springs to themselves, and its shape squeezed evenly about its mean."""
-    made = scene(
+    made = build_test_scene(
         mesh,
         SpringsEffect(stretch=1e3),
         PinsEffect.model_validate({"at": [pins], "weight": "exact"}),
         size=size,
         time_step=1.0,
     )
-    c = made.mesh.rest.mean(axis=0)
-    return made, c + np.array(factors) * (made.mesh.rest - c)
+    c = made.mesh.rest_positions.mean(axis=0)
+    return made, c + np.array(factors) * (made.mesh.rest_positions - c)
 
 
 SADDLES = {
-    "a chain pressed along its line": lambda: squeezed(Chain(), 9, "ends", (0.5, 1, 1)),
-    "a sheet pressed evenly in its plane": lambda: squeezed(Grid(), 5, "corners", (0.5, 1, 0.5)),
-    "a tower pressed to half its height": lambda: squeezed(Tower(), 4, "base", (1, 0.5, 1)),
+    "a chain pressed along its line": lambda: squeezed(ChainMesh(), 9, "ends", (0.5, 1, 1)),
+    "a sheet pressed evenly in its plane": lambda: squeezed(GridMesh(), 5, "corners", (0.5, 1, 0.5)),
+    "a tower pressed to half its height": lambda: squeezed(TowerMesh(), 4, "base", (1, 0.5, 1)),
 }
 saddles = pytest.mark.parametrize("saddle", SADDLES)
 
@@ -59,17 +59,17 @@ def at_a_saddle(saddle: str, integrator: str) -> tuple[Scene, StepProblem]:
     """A step that starts where the gradient vanishes and the Hessian is not positive definite: the forces are such."""
     made, p = SADDLES[saddle]()
     method = INTEGRATORS[integrator]
-    made = replace(made, integrator=method, system=replace(made.system, factor=method.factor))
+    made = replace(made, integrator=method, system=replace(made.system, inertia_factor=method.inertia_factor))
     made = replace(made, pin_targets=p[made.system.pins.vertices])
     still = Motion(p, np.zeros_like(p))
-    stated = problem(made, State(still, still, 1), "current")
-    return made, replace(stated, force=stated.force + stated.gradient(p))
+    stated = build_problem(made, MotionState(still, still, 1), "current")
+    return made, replace(stated, external_force=stated.external_force + stated.gradient(p))
 
 
 def at_the_bottom(given: StepProblem, p: Positions, saddle: str) -> bool:
     """Whether p is a minimum; of a chain whose ends stay on its line also one of those that turn about it, a valley."""
-    found = curvature(given, p)
-    return found.convex or (found.flat and saddle == "a chain pressed along its line")
+    found = compute_curvature(given, p)
+    return found.is_convex or (found.is_degenerate and saddle == "a chain pressed along its line")
 
 
 @saddles
@@ -77,16 +77,18 @@ def at_the_bottom(given: StepProblem, p: Positions, saddle: str) -> bool:
 @solvers
 def test_a_step_that_starts_at_a_saddle_ends_at_a_minimum_below_it(solver: Solver, saddle: str, integrator: str):
     made, given = at_a_saddle(saddle, integrator)
-    start = given.first_guess
-    judge = Judge(made, None, minimises=True)
-    assert np.abs(given.gradient(start)).max() <= 1e-12 * made.system.inertia.max()
+    start = given.initial_guess
+    judge = StepVerifier(made, None, is_minimiser=True)
+    assert np.abs(given.gradient(start)).max() <= 1e-12 * made.system.inertia_diagonal.max()
     assert not minimum(given, start)
     solution = solver.prepare(given.system).solve(given, STOP)
     p = solution.positions
     assert at_the_bottom(given, p, saddle)
-    assert solution.stopped != "iterations"
-    assert judge.stationarity(given, p).beyond == 0.0, "the yardstick is round-off, and so is all that may be left"
-    assert given.value(p) < given.value(start) - 1e-6 * given.magnitude(start)
+    assert solution.termination_reason != "iterations"
+    assert judge.measure_stationarity(given, p).above_roundoff == 0.0, (
+        "the yardstick is round-off, and so is all that may be left"
+    )
+    assert given.value(p) < given.value(start) - 1e-6 * given.value_scale(start)
 
 
 @saddles
@@ -94,24 +96,26 @@ def test_a_step_that_starts_at_a_saddle_ends_at_a_minimum_below_it(solver: Solve
 def test_a_saddle_is_left_the_same_way_twice_and_downwards(solver: Solver, saddle: str):
     _, given = at_a_saddle(saddle, "implicit-euler")
     one, two = (
-        [given.first_guess, *(p.copy() for p in islice(solver.prepare(given.system).iterates(given), 60))]
+        [given.initial_guess, *(p.copy() for p in islice(solver.prepare(given.system).iterates(given), 60))]
         for _ in range(2)
     )
     np.testing.assert_array_equal(one, two)
-    slack = 1e-12 * max(map(given.magnitude, one))  # round-off of sums of a thousand terms
+    slack = 1e-12 * max(map(given.value_scale, one))  # round-off of sums of a thousand terms
     assert all(b <= a + slack for a, b in pairwise(map(given.value, one)))
 
 
 def test_only_a_close_tolerance_asks_for_a_minimum():
     """Far from stationary points the Hessian tells nothing."""
     _, given = at_a_saddle("a chain pressed along its line", "implicit-euler")
-    guess = given.first_guess.copy()
-    guess[given.system.free, 0] += 1e-3 * np.cos(np.arange(len(given.system.free)))  # keeps to the saddle's plane
-    given, prepared = replace(given, current=guess, first_guess=guess), Newton().prepare(given.system)
+    guess = given.initial_guess.copy()
+    guess[given.system.free_vertices, 0] += 1e-3 * np.cos(
+        np.arange(len(given.system.free_vertices))
+    )  # keeps to the saddle's plane
+    given, prepared = replace(given, current_positions=guess, initial_guess=guess), NewtonSolver().prepare(given.system)
     coarse, close = (prepared.solve(given, StopRule(300, tolerance)) for tolerance in (1e-2, 1e-6))
-    assert coarse.stopped == "tolerance"
+    assert coarse.termination_reason == "tolerance"
     assert at_the_bottom(given, close.positions, "a chain pressed along its line")
-    assert coarse.iterations < close.iterations
+    assert coarse.num_iterations < close.num_iterations
 
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "hard"
@@ -134,14 +138,16 @@ sphere and circles, along which the curvature is zero, and round-off gives it a 
 def ends(case: str, solver: Solver, frames: int) -> list[str]:
     """The steps of a hard scene that end at no certified minimum."""
     spec = load_scene(CASES[case])
-    made = build(spec, spec.default_size or 0)
-    judge, wrong = Judge(made, None, minimises=True), []
+    made = build_scene(spec, spec.default_size or 0)
+    judge, wrong = StepVerifier(made, None, is_minimiser=True), []
     stop = StopRule(20_000, 1e-6) if case in VALLEY else STOP
-    for step in simulate(made, prepare(made, solver), stop, first_guess="current", frames=frames):
+    for step in simulate_scene(made, prepare(made, solver), stop, initial_guess="current", frames=frames):
         assert np.isfinite(step.positions).all()
         found = judge(step)
-        if not (found["minimum"] and found["beyond"] <= SLACK * 1e-6):
-            wrong.append(f"step {step.index}: {found}, {step.solution.stopped} after {step.solution.iterations}")
+        if not (found["minimum"] and found["beyond"] <= TOLERANCE_SLACK * 1e-6):
+            wrong.append(
+                f"step {step.index}: {found}, {step.solution.termination_reason} after {step.solution.num_iterations}"
+            )
     return wrong
 
 

@@ -5,24 +5,28 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.scenes.effects.bending import Bending
-from solvers.core.descent import Metric
-from solvers.core.prefactored import prepared, projective
-from solvers.methods.a_jacobi import Aggregated, AggregatedJacobi
-from solvers.methods.newton import Newton
+from harness.scenes.effects.bending import BendingEffect
+from solvers.core.descent import ResidualMetric
+from solvers.core.prefactored import prepare_local_global, require_projective
+from solvers.methods.a_jacobi import AggregatedJacobi, AggregatedSweeps
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import StopRule, Unsupported
-from tests.effects import SCENES, stepped
-from tests.effects import cloth as cloth_with
-from tests.scenes import cloth, first_problem
+from tests.effects import EFFECT_SCENES, build_moving_problem
+from tests.effects import build_effect_cloth as cloth_with
+from tests.scenes import build_cloth, build_first_problem
 
-HANGING = first_problem(cloth(8, "exact", stretch=100.0))
+HANGING = build_first_problem(build_cloth(8, "exact", stretch=100.0))
 
 
 def made(sweeps: int):
     """Q over the free vertices, dense, and the matrix that stands for so many sweeps."""
     found = []
-    prepared(HANGING.system, projective(HANGING.system, ""), lambda Q: (found.append(Q) or Aggregated(Q, sweeps), ""))
-    return found[0].toarray(), Aggregated(found[0], sweeps).matrix.toarray()
+    prepare_local_global(
+        HANGING.system,
+        require_projective(HANGING.system, ""),
+        lambda Q: (found.append(Q) or AggregatedSweeps(Q, sweeps), ""),
+    )
+    return found[0].toarray(), AggregatedSweeps(found[0], sweeps).matrix.toarray()
 
 
 @pytest.mark.parametrize("sweeps", [2, 4])
@@ -47,22 +51,23 @@ def test_its_inverse_majorises_the_hessian_as_q_does(sweeps):
 @pytest.mark.parametrize("sweeps", [1, 2, 3, 4])
 def test_stiff_bending_leaves_its_matrix_positive_definite(sweeps):
     """Eigenvalues of D^-1 Q reach 2.8 there; with D itself two sweeps would have a negative one."""
-    Q = Metric(cloth_with(Bending(stiffness=50.0)).system).inner
-    products = np.linalg.eigvals(Aggregated(Q, sweeps).matrix @ Q.toarray()).real
+    Q = ResidualMetric(cloth_with(BendingEffect(stiffness=50.0)).system).free_block
+    products = np.linalg.eigvals(AggregatedSweeps(Q, sweeps).matrix @ Q.toarray()).real
     assert 0.0 < products.min() <= products.max() <= 1.0 + 1e-12
 
 
 @pytest.mark.parametrize("sweeps", [1, 2, 5])
 def test_it_ends_at_the_minimum_whatever_the_sweeps(sweeps):
-    wanted = Newton().prepare(HANGING.system).solve(HANGING, StopRule(100, 1e-12)).positions
+    wanted = NewtonSolver().prepare(HANGING.system).solve(HANGING, StopRule(100, 1e-12)).positions
     found = AggregatedJacobi(sweeps).prepare(HANGING.system).solve(HANGING, StopRule(5000, 1e-8))
-    assert found.stopped == "tolerance"
+    assert found.termination_reason == "tolerance"
     np.testing.assert_allclose(found.positions, wanted, rtol=0, atol=1e-6)
 
 
 def test_more_sweeps_take_fewer_iterations():
     one, two, four = (
-        AggregatedJacobi(l).prepare(HANGING.system).solve(HANGING, StopRule(5000, 1e-3)).iterations for l in (1, 2, 4)
+        AggregatedJacobi(l).prepare(HANGING.system).solve(HANGING, StopRule(5000, 1e-3)).num_iterations
+        for l in (1, 2, 4)
     )
     assert one > two > four
 
@@ -70,7 +75,7 @@ def test_more_sweeps_take_fewer_iterations():
 @pytest.mark.parametrize(("scene", "name"), [("contact", "Contact"), ("gas", "Gas")], ids=lambda x: x)
 def test_what_has_no_rows_in_q_is_refused_by_name(scene, name):
     with pytest.raises(Unsupported, match=f"a-jacobi: .*{name}"):
-        AggregatedJacobi().prepare(stepped(SCENES[scene]()).system)
+        AggregatedJacobi().prepare(build_moving_problem(EFFECT_SCENES[scene]()).system)
 
 
 @pytest.mark.parametrize("sweeps", [0, -1, 9])

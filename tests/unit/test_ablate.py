@@ -12,18 +12,18 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from harness.base.claim import claimed
-from harness.base.columns import COLUMNS as RUN_COLUMNS
-from harness.base.columns import Column
+from harness.base.claim import claim_folder
+from harness.base.columns import RUN_COLUMNS as RUN_COLUMNS
+from harness.base.columns import ColumnSpec
 from harness.cli import app
-from harness.config.load import load_any, load_scene
-from harness.experiments.ablation.ablation_rows import COLUMNS
-from harness.experiments.ablation.command import SOLVER
-from harness.experiments.ablation.side_by_side import Contender, cost
+from harness.config.load import load_config, load_scene
+from harness.experiments.ablation.ablation_rows import ABLATION_COLUMNS
+from harness.experiments.ablation.command import DEFAULT_ABLATION_SOLVER
+from harness.experiments.ablation.side_by_side import VariantRun, compute_cost
 from harness.experiments.ablation.unit import run_ablation
-from harness.experiments.ablation.variants import Variant, variants
-from harness.report.ablation import read, sentences, verdict
-from tests.displays import Quiet
+from harness.experiments.ablation.variants import SceneVariant, build_variants
+from harness.report.ablation import describe_effect, read_ablation, summarise_ablation
+from tests.displays import SilentDisplay
 
 ROOT = Path(__file__).resolve().parents[2]
 CLOTH = """
@@ -54,8 +54,10 @@ def rows_of(scene: str, tmp_path: Path, *, pairs: bool = False, **options: Any) 
     """The rows of an ablation by local-global."""
     path = tmp_path / "scene.yaml"
     path.write_text(scene)
-    sweep = load_any(path, solvers=["sparse"], threads=1, rounds=2, **options)
-    return read(run_ablation(sweep, tmp_path, Quiet(), lambda line: None, pairs=pairs, isolated=False))
+    sweep = load_config(path, solvers=["sparse"], threads=1, rounds=2, **options)
+    return read_ablation(
+        run_ablation(sweep, tmp_path, SilentDisplay(), lambda line: None, with_pairs=pairs, isolated=False)
+    )
 
 
 def by_name(rows: Sequence[dict[str, Any]], kind: str = "without") -> dict[str, dict[str, Any]]:
@@ -71,7 +73,7 @@ def test_every_effect_is_left_out_once_and_every_pair_on_request(tmp_path: Path)
     path = tmp_path / "scene.yaml"
     path.write_text(CLOTH + "  - {kind: pins, at: [bottom]}\n")
     scene = load_scene(path)
-    alone, both = variants(scene, pairs=False), variants(scene, pairs=True)
+    alone, both = build_variants(scene, with_pairs=False), build_variants(scene, with_pairs=True)
     assert [one.name for one in alone] == [
         "",
         "springs",
@@ -90,7 +92,7 @@ def test_an_effect_that_does_nothing_costs_no_entry_and_moves_nothing(told):
     (whole,), row = by_name(told, "whole").values(), by_name(told)["air-drag"]
     assert (row["largest"], row["rms"], row["energy"], row["centre"]) == (0.0, 0.0, 0.0, 0.0)
     assert row["nnz_factor"] == whole["nnz_factor"]
-    assert "changes nothing at all" in verdict(row, told)
+    assert "changes nothing at all" in describe_effect(row, told)
 
 
 def test_fill_in_and_memory_are_those_that_bending_brings(told):
@@ -120,7 +122,7 @@ def test_pairs_are_told_of_under_both_names(told):
 def test_a_scene_that_cannot_be_without_an_effect_says_so(tmp_path: Path):
     told = rows_of(HELD, tmp_path, iterations=5)
     assert by_name(told)["springs"]["status"] == "impossible"
-    assert "impossible without it (" in verdict(by_name(told)["springs"], told)
+    assert "impossible without it (" in describe_effect(by_name(told)["springs"], told)
     assert by_name(told)["gravity"]["status"] == "ok"
 
 
@@ -136,10 +138,10 @@ def test_the_cost_is_the_difference_of_frames_that_were_timed_together():
     scene: Any = None
     rng = np.random.default_rng(1)
     drift = rng.uniform(1.0, 5.0, (5, 40))
-    whole, without = (Contender(Variant((), scene), seconds=(drift + more).tolist()) for more in (0.3, 0.0))
-    assert cost(whole, without) == pytest.approx((0.3, 0.3, 0.3))
-    noisy = Contender(Variant((), scene), seconds=(drift + 0.3 + 0.05 * rng.standard_normal((5, 40))).tolist())
-    middle, low, high = cost(noisy, without)
+    whole, without = (VariantRun(SceneVariant((), scene), seconds=(drift + more).tolist()) for more in (0.3, 0.0))
+    assert compute_cost(whole, without) == pytest.approx((0.3, 0.3, 0.3))
+    noisy = VariantRun(SceneVariant((), scene), seconds=(drift + 0.3 + 0.05 * rng.standard_normal((5, 40))).tolist())
+    middle, low, high = compute_cost(noisy, without)
     assert low < middle < high
     # 40 frames, the median of 5 rounds each: the mean is known to 0.05 / sqrt(40 * 3), 0.005; six of these.
     assert middle == pytest.approx(0.3, abs=0.03)
@@ -181,13 +183,13 @@ ROW |= {"cost": 0.11, "cost_low": 0.1, "cost_high": 0.12}
     ],
 )
 def test_the_verdict_follows_from_the_numbers(change: dict, said: str):
-    assert verdict(ROW | change, [WHOLE, *ERRORS]) == said
+    assert describe_effect(ROW | change, [WHOLE, *ERRORS]) == said
 
 
 def test_where_no_error_is_known_the_verdict_does_not_judge():
     unknown = [row | {"status": "unknown", "reason": "lost", "largest": None} for row in ERRORS]
-    assert verdict(ROW, [WHOLE, *unknown]).endswith("by how much the scene is wrong anyway is not known")
-    assert "error of the solver: unknown (lost)" in sentences([WHOLE, *unknown])
+    assert describe_effect(ROW, [WHOLE, *unknown]).endswith("by how much the scene is wrong anyway is not known")
+    assert "error of the solver: unknown (lost)" in summarise_ablation([WHOLE, *unknown])
 
 
 def test_the_command_says_what_it_found_and_leaves_rows_and_a_picture(tmp_path: Path):
@@ -201,14 +203,16 @@ def test_the_command_says_what_it_found_and_leaves_rows_and_a_picture(tmp_path: 
     assert "effects[3] (air-drag) does nothing with these parameters and is left out" in " ".join(told.stderr.split())
     (rows,) = tmp_path.glob("cloth/ablation/*.parquet")
     (picture,) = tmp_path.glob("cloth/pictures/*.png")
-    assert len(read(rows)) >= 1 + 5 + 2
-    assert {row["solver"] for row in read(rows)} == {SOLVER}
+    assert len(read_ablation(rows)) >= 1 + 5 + 2
+    assert {row["solver"] for row in read_ablation(rows)} == {DEFAULT_ABLATION_SOLVER}
     assert Image.open(picture).size == (1600, 900)
 
 
-@pytest.mark.parametrize("column", [c for c in COLUMNS if c not in RUN_COLUMNS], ids=lambda column: column.name)
-def test_every_column_of_its_own_is_documented(column: Column):
-    line = f"| `{column.name}` | {column.unit} | {column.meaning} |"
+@pytest.mark.parametrize(
+    "column", [c for c in ABLATION_COLUMNS if c not in RUN_COLUMNS], ids=lambda column: column.name
+)
+def test_every_column_of_its_own_is_documented(column: ColumnSpec):
+    line = f"| `{column.name}` | {column.unit} | {column.description} |"
     assert line in (ROOT / "results" / "README.md").read_text().splitlines()
 
 
@@ -222,7 +226,7 @@ def test_the_command_leaves_the_results_of_another_scene_of_this_name_alone(tmp_
     for folder in ("one", "other"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "cloth.yaml").write_text(CLOTH)
-    claimed(tmp_path / "results" / "cloth", tmp_path / "one" / "cloth.yaml")
+    claim_folder(tmp_path / "results" / "cloth", tmp_path / "one" / "cloth.yaml")
     asked = ["ablate", str(tmp_path / "other" / "cloth.yaml"), "--results", str(tmp_path / "results"), "--frames", "2"]
     told = CliRunner().invoke(app, asked)
     assert told.exit_code == 2

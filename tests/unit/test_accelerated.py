@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array, diags_array
 
-from solvers.core.driver import largest
-from solvers.kernels.loop import at_most
+from solvers.core.driver import compute_max_coordinate
+from solvers.kernels.loop import iteration_limit
 from solvers.methods.anderson import Anderson
 from solvers.methods.chebyshev import Chebyshev
 from solvers.methods.lbfgs import Lbfgs
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.methods.quasi_newton import PreparedAccelerated
 from solvers.problem import Positions, Solver, StepProblem, StopRule
-from tests.scenes import cloth, first_problem, random_problem
+from tests.scenes import build_cloth, build_first_problem, build_random_problem
 
 METHODS: tuple[type[Anderson | Chebyshev | Lbfgs], ...] = (Anderson, Chebyshev, Lbfgs)
 methods = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.__name__)
@@ -25,18 +25,18 @@ methods = pytest.mark.parametrize("method", METHODS, ids=lambda method: method._
 
 def massless(seed: int) -> StepProblem:
     """A random network in which one vertex has no mass: springs alone hold it."""
-    problem = random_problem(seed)
+    problem = build_random_problem(seed)
     mass = problem.system.mass.copy()
     mass[5] = 0.0
     return replace(problem, system=replace(problem.system, mass=mass))
 
 
 PROBLEMS = {
-    "cloth": lambda: first_problem(cloth(8)),
-    "cloth, exact pins": lambda: first_problem(cloth(8, "exact")),
-    "stiff cloth": lambda: first_problem(cloth(8, "exact", stretch=1e4)),
-    "random": lambda: random_problem(0, weights=(1e4, np.inf, 1e2)),
-    "random, not pinned": lambda: random_problem(1, weights=()),
+    "cloth": lambda: build_first_problem(build_cloth(8)),
+    "cloth, exact pins": lambda: build_first_problem(build_cloth(8, "exact")),
+    "stiff cloth": lambda: build_first_problem(build_cloth(8, "exact", stretch=1e4)),
+    "random": lambda: build_random_problem(0, weights=(1e4, np.inf, 1e2)),
+    "random, not pinned": lambda: build_random_problem(1, weights=()),
     "random, massless": lambda: massless(0),
 }
 problems = pytest.mark.parametrize("name", PROBLEMS)
@@ -51,12 +51,12 @@ def iterates(solver: Solver, problem: StepProblem, count: int) -> list[Positions
 @pytest.mark.parametrize("start", ["guess", "one point", "far away"])
 def test_the_objective_never_rises(method, name, start):
     problem = PROBLEMS[name]()
-    far = 1e3 * np.random.default_rng(0).normal(size=problem.target.shape)
-    guess = {"guess": problem.first_guess, "one point": 0.0 * far, "far away": far}[start]
-    path = iterates(method(), replace(problem, first_guess=guess), 300)
+    far = 1e3 * np.random.default_rng(0).normal(size=problem.inertial_target.shape)
+    guess = {"guess": problem.initial_guess, "one point": 0.0 * far, "far away": far}[start]
+    path = iterates(method(), replace(problem, initial_guess=guess), 300)
     for before, after in pairwise(path):
         # Four units in the last place of the terms: what the oracle itself loses in adding them.
-        assert problem.value(after) <= problem.value(before) + 4 * np.finfo(float).eps * problem.magnitude(before)
+        assert problem.value(after) <= problem.value(before) + 4 * np.finfo(float).eps * problem.value_scale(before)
 
 
 @methods
@@ -67,9 +67,9 @@ def test_the_objective_never_rises(method, name, start):
 def test_the_solution_is_a_stationary_point(method, name, linear, precision):
     problem = PROBLEMS[name]()
     solution = method(linear=linear, precision=precision).prepare(problem.system).solve(problem, StopRule(4000, 1e-9))
-    assert solution.stopped in ("tolerance", "floor")
-    free = problem.system.unpinned
-    begun = np.abs(problem.gradient(problem.current)[free]).max()
+    assert solution.termination_reason in ("tolerance", "floor")
+    free = problem.system.unpinned_mask
+    begun = np.abs(problem.gradient(problem.current_positions)[free]).max()
     # The residual fell to 1e-9; the gradient is Q times the correction, and may be larger by Q's condition.
     assert np.abs(problem.gradient(solution.positions)[free]).max() <= 1e-6 * begun
 
@@ -90,28 +90,28 @@ def test_a_step_compiled_as_a_whole_is_the_step_with_calls_in_between(method, na
 def test_a_run_tells_its_gradient_and_by_how_much_the_objective_fell(method, name, linear):
     problem = PROBLEMS[name]()
     prepared = method(linear=linear).prepare(problem.system)
-    run = prepared.begin(problem, problem.first_guess)
-    run.iterate(at_most(0))
+    run = prepared.begin(problem, problem.initial_guess)
+    run.run_iterations(iteration_limit(0))
     # Of a gradient some units in the last place of stiffness times position: at a pin of its weight times that.
-    pins, exact = problem.system.pins, problem.system.pins.exact
-    stiffness = np.full(len(problem.target), prepared.base.trace)
+    pins, exact = problem.system.pins, problem.system.pins.exact_mask
+    stiffness = np.full(len(problem.inertial_target), prepared.base.trace)
     stiffness[pins.vertices[~exact]] += pins.weight[~exact]
-    start, size = problem.value(run.positions), problem.magnitude(run.positions)
+    start, size = problem.value(run.positions), problem.value_scale(run.positions)
     for _ in range(2):
-        run.iterate(at_most(6))
+        run.run_iterations(iteration_limit(6))
         # A dozen differences, each of which may be round-off of the terms, here or where the run started.
-        size = max(size, problem.magnitude(run.positions))
-        assert abs(start - problem.value(run.positions) - run.fallen) <= 12 * 4 * np.finfo(float).eps * size
+        size = max(size, problem.value_scale(run.positions))
+        assert abs(start - problem.value(run.positions) - run.objective_decrease) <= 12 * 4 * np.finfo(float).eps * size
         wanted = problem.gradient(run.positions)
         wanted[pins.vertices[exact]] = 0.0
-        assert (np.abs(run.gradient() - wanted) <= 1e-15 * stiffness[:, None] * largest(problem)).all()
+        assert (np.abs(run.gradient() - wanted) <= 1e-15 * stiffness[:, None] * compute_max_coordinate(problem)).all()
 
 
 @methods
 def test_fewer_iterations_reach_an_accuracy_than_of_local_global(method):
-    problem = first_problem(cloth(12, "exact"))
+    problem = build_first_problem(build_cloth(12, "exact"))
     lowest = problem.value(iterates(Lbfgs(), problem, 1500)[-1])
-    begun = problem.value(problem.current)
+    begun = problem.value(problem.current_positions)
 
     def needed(solver: Solver) -> int:
         for count, p in enumerate(solver.prepare(problem.system).iterates(problem), 1):
@@ -125,10 +125,10 @@ def test_fewer_iterations_reach_an_accuracy_than_of_local_global(method):
 @methods
 @pytest.mark.parametrize("linear", ["supernodal", "cholespy"])
 def test_at_a_minimum_iterates_stay_where_they_are(method, linear):
-    problem = random_problem(2)
+    problem = build_random_problem(2)
     prepared = method(linear=linear).prepare(problem.system)
     end = prepared.solve(problem, StopRule(4000, 1e-13)).positions
-    again = replace(problem, first_guess=end, current=end)
+    again = replace(problem, initial_guess=end, current_positions=end)
     solution = prepared.solve(again, StopRule(50))
     assert np.abs(solution.positions - end).max() <= 1e-9  # what round-off in the gradient moves, by the condition of Q
     assert np.isfinite(solution.residual)
@@ -136,9 +136,9 @@ def test_at_a_minimum_iterates_stay_where_they_are(method, linear):
 
 @methods
 def test_a_scene_at_rest_stays_so(method):
-    problem = random_problem(3, weights=())
-    rest = problem.current
-    resting = replace(problem, target=rest, force=0.0 * rest, first_guess=rest)
+    problem = build_random_problem(3, weights=())
+    rest = problem.current_positions
+    resting = replace(problem, inertial_target=rest, external_force=0.0 * rest, initial_guess=rest)
     solution = method().prepare(problem.system).solve(resting, StopRule(20, 1e-3))
     np.testing.assert_allclose(solution.positions, rest, atol=1e-12)  # of a network of size one
 
@@ -146,42 +146,45 @@ def test_a_scene_at_rest_stays_so(method):
 @methods
 @pytest.mark.parametrize("linear", ["supernodal", "cholespy"])
 def test_a_guess_that_is_no_number_ends_as_stalled(method, linear):
-    problem = random_problem(0)
-    guess = problem.first_guess.copy()
+    problem = build_random_problem(0)
+    guess = problem.initial_guess.copy()
     guess[4] = np.nan
     solution = (
-        method(linear=linear).prepare(problem.system).solve(replace(problem, first_guess=guess), StopRule(20, 1e-3))
+        method(linear=linear).prepare(problem.system).solve(replace(problem, initial_guess=guess), StopRule(20, 1e-3))
     )
-    assert solution.stopped == "stalled"
-    assert solution.iterations == 0
+    assert solution.termination_reason == "stalled"
+    assert solution.num_iterations == 0
 
 
 @methods
 def test_no_iteration_is_the_first_guess(method):
-    problem = random_problem(2)
+    problem = build_random_problem(2)
     solution = method().prepare(problem.system).solve(problem, StopRule(0))
-    free = problem.system.free
-    np.testing.assert_array_equal(solution.positions[free], problem.first_guess[free])
+    free = problem.system.free_vertices
+    np.testing.assert_array_equal(solution.positions[free], problem.initial_guess[free])
     assert solution.iterations == 0
 
 
 @methods
 def test_all_vertices_may_be_pinned_exactly(method):
-    problem = random_problem(3, n=4, m=8, weights=(np.inf,) * 4)
+    problem = build_random_problem(3, n=4, m=8, weights=(np.inf,) * 4)
     found = method().prepare(problem.system).solve(problem, StopRule(3)).positions
     np.testing.assert_array_equal(found, problem.pin_targets)
 
 
 @methods
 def test_memory_that_is_used_again_changes_nothing(method):
-    problem = first_problem(cloth(8))
+    problem = build_first_problem(build_cloth(8))
     prepared = method().prepare(problem.system)
     assert isinstance(prepared, PreparedAccelerated)
     first = prepared.solve(problem, StopRule(40, 1e-9))
-    prepared.solve(replace(problem, first_guess=10.0 * problem.first_guess, force=-problem.force), StopRule(33))
+    prepared.solve(
+        replace(problem, initial_guess=10.0 * problem.initial_guess, external_force=-problem.external_force),
+        StopRule(33),
+    )
     again = prepared.solve(problem, StopRule(40, 1e-9))
     np.testing.assert_array_equal(first.positions, again.positions)
-    assert (first.iterations, first.residual) == (again.iterations, again.residual)
+    assert (first.num_iterations, first.residual) == (again.num_iterations, again.residual)
 
 
 @dataclass(frozen=True)
@@ -204,16 +207,16 @@ class Barrier:
 
 
 def test_lbfgs_minimises_energies_that_are_not_projective_and_never_steps_over_a_barrier():
-    problem = first_problem(cloth(6, "exact"))
+    problem = build_first_problem(build_cloth(6, "exact"))
     system = replace(problem.system, energies=(*problem.system.energies, Barrier(10.0)))
-    pushed = replace(problem, system=system, force=300.0 * problem.force)
+    pushed = replace(problem, system=system, external_force=300.0 * problem.external_force)
     path = iterates(Lbfgs(), pushed, 200)
     values = [pushed.value(p) for p in path]
     assert np.isfinite(values).all()
     assert all(
-        b <= a + 4 * np.finfo(float).eps * pushed.magnitude(p)
+        b <= a + 4 * np.finfo(float).eps * pushed.value_scale(p)
         for a, b, p in zip(values, values[1:], path, strict=False)
     )
     assert path[-1][:, 1].min() < -1.5  # the barrier is what holds the cloth, which without it would fall to -2.8
-    begun = np.abs(pushed.gradient(pushed.current)).max()
+    begun = np.abs(pushed.gradient(pushed.current_positions)).max()
     assert np.abs(pushed.gradient(path[-1])).max() <= 1e-6 * begun

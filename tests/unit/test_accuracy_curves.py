@@ -14,29 +14,29 @@ import pytest
 
 from harness.base.errors import RunFailed
 from harness.experiments.accuracy import curves
-from harness.experiments.accuracy.curves import GradedCurve, kept, measure
-from harness.experiments.accuracy.scales import distances
-from harness.reference.minimiser import polish
-from harness.reference.oracle import Oracle, Reading
+from harness.experiments.accuracy.curves import ScoredCurve, is_scored_iteration, measure_convergence
+from harness.experiments.accuracy.scales import compute_vertex_distances
+from harness.reference.minimiser import refine_minimum
+from harness.reference.oracle import ReferenceEvaluator, StationarityReading
 from harness.simulation.trace import EnergyNorm
 from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.newton import Newton
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import Positions, StepProblem
-from tests.scenes import cloth, first_problem
-from tests.undisturbed import undisturbed
+from tests.scenes import build_cloth, build_first_problem
+from tests.undisturbed import retry_if_preempted
 from tests.unit.test_minimiser import FLAT
 
-PROBLEM = first_problem(cloth(6, "exact"))
+PROBLEM = build_first_problem(build_cloth(6, "exact"))
 
 
 @cache
 def minimum() -> Positions:
     """Found when it is first asked for: whoever only collects tests compiles nothing."""
-    return polish(PROBLEM, PROBLEM.current, Newton()).positions
+    return refine_minimum(PROBLEM, PROBLEM.current_positions, NewtonSolver()).positions
 
 
 def test_each_early_iterate_is_graded_and_then_twelve_a_decade() -> None:
-    graded = [number for number in range(100_001) if kept(number)]
+    graded = [number for number in range(100_001) if is_scored_iteration(number)]
     assert graded[:51] == list(range(51))
     for decade in (100, 1000, 10_000):
         assert sum(decade <= number < 10 * decade for number in graded) == 12
@@ -44,22 +44,24 @@ def test_each_early_iterate_is_graded_and_then_twelve_a_decade() -> None:
 
 
 def test_stationarity_is_the_step_of_local_global_relative_to_that_at_the_current_positions() -> None:
-    oracle, norm = Oracle(PROBLEM.system), EnergyNorm(PROBLEM.system)
+    oracle, norm = ReferenceEvaluator(PROBLEM.system), EnergyNorm(PROBLEM.system)
     prepared = SparseLocalGlobal().prepare(PROBLEM.system)
-    points = [PROBLEM.current, *(p.copy() for p in islice(prepared.iterates(PROBLEM), 4))]
+    points = [PROBLEM.current_positions, *(p.copy() for p in islice(prepared.iterates(PROBLEM), 4))]
     steps = [norm(after - before) for before, after in pairwise(points)]
     for p, step in zip(points, steps, strict=False):
         # Two factorisations of one matrix solve it, each to round-off in a condition number of 1e3.
-        assert oracle.stationarity(PROBLEM, p).reached == pytest.approx(step / steps[0], rel=1e-9)
-    assert oracle.stationarity(PROBLEM, minimum()).reached < 1e-12  # round-off of a gradient beside 1 at the start
+        assert oracle.measure_stationarity(PROBLEM, p).stationarity == pytest.approx(step / steps[0], rel=1e-9)
+    assert (
+        oracle.measure_stationarity(PROBLEM, minimum()).stationarity < 1e-12
+    )  # round-off of a gradient beside 1 at the start
 
 
 def test_distances_leave_out_what_is_pinned() -> None:
-    moved = PROBLEM.current.copy()
+    moved = PROBLEM.current_positions.copy()
     moved[PROBLEM.system.pins.vertices] += 5.0
-    free = PROBLEM.system.free
+    free = PROBLEM.system.free_vertices
     moved[free[0], 1] += 0.3
-    largest, rms = distances(PROBLEM.system, moved, PROBLEM.current)
+    largest, rms = compute_vertex_distances(PROBLEM.system, moved, PROBLEM.current_positions)
     assert (largest, rms) == pytest.approx((0.3, 0.3 / len(free) ** 0.5), rel=1e-12)  # round-off of a difference
 
 
@@ -77,19 +79,21 @@ class Scripted:
 
 def towards(share: Callable[[int], float]) -> Callable[[int], Positions]:
     """Iterates on the line from the minimum (share 0) to the current positions (1) and beyond."""
-    return lambda number: minimum() + share(number) * (PROBLEM.current - minimum())
+    return lambda number: minimum() + share(number) * (PROBLEM.current_positions - minimum())
 
 
-def curve(prepared: Any, **more: Any) -> GradedCurve:
+def curve(prepared: Any, **more: Any) -> ScoredCurve:
     limits: dict[str, Any] = {"iterations": 200, "time_limit": 60.0, "rounds": 2} | more
-    return measure(prepared, PROBLEM, Oracle(PROBLEM.system), PROBLEM.value(minimum()), **limits)
+    return measure_convergence(
+        prepared, PROBLEM, ReferenceEvaluator(PROBLEM.system), PROBLEM.value(minimum()), **limits
+    )
 
 
 ENDS = {
     "it converges": (towards(lambda n: 0.5**n), "ok", ""),
     "it converges too slowly": (towards(lambda n: 1 / (1 + n)), "ok", "limit of iterations"),
     "it stands still far off": (towards(lambda n: max(0.5**n, 0.01)), "no-progress", "do not change"),
-    "it pauses": (towards(lambda n: 0.5 ** (n // curves.STILL)), "ok", ""),
+    "it pauses": (towards(lambda n: 0.5 ** (n // curves.MAX_UNCHANGED_ITERATES)), "ok", ""),
     "it goes to and fro": (towards(lambda n: 0.5 + 0.1 * (n % 2)), "no-progress", "limit of iterations"),
     "it explodes": (towards(lambda n: 10.0**n), "diverged", "exploded"),
     "it is not a number": (towards(lambda n: np.nan if n == 3 else 0.5 / n), "diverged", "after 3 iterations"),
@@ -101,27 +105,33 @@ def test_a_curve_says_how_it_ended(iterate: Callable[[int], Positions], status: 
     found = curve(Scripted(iterate))
     assert found.status == status
     assert reason in found.reason
-    assert found.numbers[0] == 0
-    assert len(found.numbers) == len(found.g) == len(found.stationarity) == len(found.positions) == len(found.seconds)
+    assert found.iterate_indices[0] == 0
+    assert (
+        len(found.iterate_indices)
+        == len(found.g)
+        == len(found.stationarity)
+        == len(found.positions)
+        == len(found.seconds)
+    )
 
 
 def test_a_curve_ends_at_its_time_limit_without_the_iterates_that_compile() -> None:
     found = curve(Scripted(towards(lambda n: 1 / (1 + n)), pause=0.02), time_limit=0.05, rounds=1)
     assert found.status == "time-limit"
     # Sleeping takes at least as long as asked: three iterates after the warm-up are over the limit, perhaps fewer.
-    assert curves.WARM_UP < found.numbers[-1] <= curves.WARM_UP + 3
-    assert found.seconds[-1, 0] >= 0.02 * found.numbers[-1]
+    assert curves.NUM_WARMUP_ITERATES < found.iterate_indices[-1] <= curves.NUM_WARMUP_ITERATES + 3
+    assert found.seconds[-1, 0] >= 0.02 * found.iterate_indices[-1]
 
 
 def test_grades_are_the_oracles_and_stamps_ascend_in_each_round() -> None:
     prepared = SparseLocalGlobal().prepare(PROBLEM.system)
     found = curve(prepared, iterations=120, rounds=3)
-    assert found.numbers == [number for number in range(121) if kept(number)]
-    for number, p, g in zip(found.numbers[1:], found.positions[1:], found.g[1:], strict=True):
+    assert found.iterate_indices == [number for number in range(121) if is_scored_iteration(number)]
+    for number, p, g in zip(found.iterate_indices[1:], found.positions[1:], found.g[1:], strict=True):
         expected = next(islice(prepared.iterates(PROBLEM), number - 1, None))
         assert np.array_equal(p, expected)
         assert g == PROBLEM.value(expected)
-    assert found.seconds.shape == (len(found.numbers), 3)
+    assert found.seconds.shape == (len(found.iterate_indices), 3)
     assert (found.seconds[0] == 0.0).all()
     assert (np.diff(found.seconds, axis=0) > 0.0).all()
 
@@ -133,7 +143,7 @@ def test_stamps_that_another_clock_does_not_bear_out_are_a_failure(
     monkeypatch.setattr(curves, "perf_counter", lambda: scale * perf_counter())
     prepared = SparseLocalGlobal().prepare(PROBLEM.system)
     with pytest.raises(RunFailed, match="the times of iterates add up to"):
-        undisturbed(lambda: ([{"interrupted": curve(prepared, iterations=120).interrupted}], None))
+        retry_if_preempted(lambda: ([{"interrupted": curve(prepared, iterations=120).preempted}], None))
 
 
 def test_passes_that_differ_in_the_last_bit_are_a_failure() -> None:
@@ -148,30 +158,32 @@ def test_passes_that_differ_in_the_last_bit_are_a_failure() -> None:
         curve(Scripted(iterate))
 
 
-def at_a_saddle(iterate: Callable[[int], Positions]) -> GradedCurve:
-    above = polish(FLAT, FLAT.current, Newton())
+def at_a_saddle(iterate: Callable[[int], Positions]) -> ScoredCurve:
+    above = refine_minimum(FLAT, FLAT.current_positions, NewtonSolver())
     limits: dict[str, Any] = {"iterations": 40, "time_limit": 60.0, "rounds": 1}
-    return measure(cast("Any", Scripted(iterate)), STARTED, Oracle(FLAT.system), above.g, **limits)
+    return measure_convergence(
+        cast("Any", Scripted(iterate)), STARTED, ReferenceEvaluator(FLAT.system), above.objective, **limits
+    )
 
 
-STARTED = replace(FLAT, current=FLAT.current + np.array([[0.0], [0.0], [0.0], [0.0], [1e-3]]))
+STARTED = replace(FLAT, current_positions=FLAT.current_positions + np.array([[0.0], [0.0], [0.0], [0.0], [1e-3]]))
 """A step whose current positions are beside the saddle at which FLAT's are."""
 
 
 def test_a_solver_that_sits_on_a_saddle_is_named_so_and_has_not_converged() -> None:
-    found = at_a_saddle(lambda number: FLAT.current)
-    assert found.stationarity[-1] <= curves.STATIONARY
+    found = at_a_saddle(lambda number: FLAT.current_positions)
+    assert found.stationarity[-1] <= curves.STATIONARITY_TOLERANCE
     assert found.status == "saddle"
     assert "saddle, where the curvature is -" in found.reason
 
 
 def test_a_solver_that_leaves_a_saddle_goes_on_to_its_minimum() -> None:
-    above = polish(FLAT, FLAT.current, Newton()).positions
-    found = at_a_saddle(lambda number: FLAT.current if number < 3 else above)
-    assert (found.status, found.numbers[-1]) == ("ok", 3)
+    above = refine_minimum(FLAT, FLAT.current_positions, NewtonSolver()).positions
+    found = at_a_saddle(lambda number: FLAT.current_positions if number < 3 else above)
+    assert (found.status, found.iterate_indices[-1]) == ("ok", 3)
 
 
 def test_a_stationarity_that_is_no_number_is_a_divergence(monkeypatch: pytest.MonkeyPatch) -> None:
-    reading = Reading(np.inf, 0.0, np.inf)
-    monkeypatch.setattr(Oracle, "stationarity", lambda self, problem, p: reading)
+    reading = StationarityReading(np.inf, 0.0, np.inf)
+    monkeypatch.setattr(ReferenceEvaluator, "stationarity", lambda self, problem, p: reading)
     assert curve(Scripted(towards(lambda n: 0.5**n))).status == "diverged"

@@ -9,12 +9,12 @@ from typing import get_args
 import pytest
 
 from harness.base.errors import InputError
-from harness.config.accuracy_load import Accuracy, load_accuracy
-from harness.config.load import load_any
-from harness.report.accuracy.convergence import GUESSES
-from harness.scenes.bind import build
-from harness.scenes.spec import FirstGuess
-from harness.simulation.step import COARSE, FIRST_GUESSES
+from harness.config.accuracy_load import AccuracyPlan, load_accuracy
+from harness.config.load import load_config
+from harness.report.accuracy.convergence import INITIAL_GUESS_LABELS
+from harness.scenes.bind import build_scene
+from harness.scenes.spec import InitialGuess
+from harness.simulation.step import COARSE_TO_FINE, INITIAL_GUESSES
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SHIPPED = [path for path in sorted(CONFIGS.glob("*.yaml")) if {"curves:", "work:"} & {*path.read_text().splitlines()}]
@@ -43,7 +43,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def loaded(folder: Path, text: str) -> Accuracy:
+def loaded(folder: Path, text: str) -> AccuracyPlan:
     (folder / "config.yaml").write_text(text)
     return load_accuracy(folder / "config.yaml")
 
@@ -56,17 +56,17 @@ def test_a_study_of_curves_asks_for_each_moment_and_solver_that_minimises(folder
         (3, "numba"),
         (3, "newton"),
     ]
-    assert {(u.case.scene_name, u.case.size, u.first_guesses, u.how.rounds) for u in units} == {
+    assert {(u.case.scene_name, u.case.size, u.initial_guesses, u.measurement.rounds) for u in units} == {
         ("cloth", 4, ("current", "inertial"), 7)
     }
 
 
 def test_studies_take_every_first_guess_that_is_no_solve_and_reports_have_words_for_each(folder: Path) -> None:
-    *guesses, coarse = get_args(FirstGuess)
-    assert coarse == COARSE
+    *guesses, coarse = get_args(InitialGuess)
+    assert coarse == COARSE_TO_FINE
     asked = CONFIG.replace("rounds: 7", f"rounds: 7, first_guess: [{', '.join(guesses)}]")
-    assert {unit.first_guesses for unit in loaded(folder, asked).curves} == {tuple(guesses)}
-    assert set(GUESSES) == set(FIRST_GUESSES) == set(guesses)
+    assert {unit.initial_guesses for unit in loaded(folder, asked).curves} == {tuple(guesses)}
+    assert set(INITIAL_GUESS_LABELS) == set(INITIAL_GUESSES) == set(guesses)
 
 
 def test_a_study_of_work_asks_for_all_combinations(folder: Path) -> None:
@@ -86,21 +86,23 @@ def test_a_study_of_work_asks_for_all_combinations(folder: Path) -> None:
 def test_what_two_studies_ask_for_is_measured_as_the_first_says(folder: Path) -> None:
     twice = CONFIG.replace("work:", "  - {scene: cloth, size: 4, moment: early, solver: newton, rounds: 2}\nwork:")
     once, both = loaded(folder, CONFIG), loaded(folder, twice)
-    assert [(u.label(), u.how) for u in both.curves] == [(u.label(), u.how) for u in once.curves]
+    assert [(u.build_file_stem(), u.measurement) for u in both.curves] == [
+        (u.build_file_stem(), u.measurement) for u in once.curves
+    ]
 
 
 def test_a_unit_keeps_its_file_and_changes_its_id_where_it_is_measured_otherwise(folder: Path) -> None:
     accuracy = loaded(folder, CONFIG)
     for unit in (accuracy.curves[0], accuracy.work[0]):
-        other = replace(unit, how=replace(unit.how, rounds=9))
-        assert other.label() == unit.label()
-        assert len({unit.unit_id("here"), other.unit_id("here"), unit.unit_id("there")}) == 3
+        other = replace(unit, measurement=replace(unit.measurement, rounds=9))
+        assert other.build_file_stem() == unit.build_file_stem()
+        assert len({unit.compute_unit_id("here"), other.compute_unit_id("here"), unit.compute_unit_id("there")}) == 3
 
 
 def test_a_changed_scene_is_another_point(folder: Path) -> None:
-    before = {unit.label() for unit in loaded(folder, CONFIG).curves}
+    before = {unit.build_file_stem() for unit in loaded(folder, CONFIG).curves}
     (folder / "cloth.yaml").write_text(CLOTH.replace("stretch: 100", "stretch: 101"))
-    assert not before & {unit.label() for unit in loaded(folder, CONFIG).curves}
+    assert not before & {unit.build_file_stem() for unit in loaded(folder, CONFIG).curves}
 
 
 MISTAKES = [
@@ -133,7 +135,7 @@ def test_a_sweep_and_an_accuracy_config_are_not_taken_for_each_other(folder: Pat
         load_accuracy(folder / "sweep.yaml")
     loaded(folder, CONFIG)
     with pytest.raises(InputError, match="springbench accuracy"):
-        load_any(folder / "config.yaml")
+        load_config(folder / "config.yaml")
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -158,10 +160,10 @@ def test_the_paper_is_reproduced_with_its_curtains() -> None:
     assert all(found == set(range(1, 51)) for found in frames.values())
     cases = {(unit.case.scene_name, unit.case.size): unit.case for unit in units}
     for key, k in PAPER.items():
-        scene = build(cases[key].scene, key[1])
+        scene = build_scene(cases[key].scene, key[1])
         # The rule multiplies by a ratio of sizes: round-off of one product.
-        assert abs(scene.springs.stiffness / k - 1).max() < 1e-14
+        assert abs(scene.all_springs.stiffness / k - 1).max() < 1e-14
         assert abs(scene.system.mass.sum() - 1.0) < 1e-12  # kg; round-off of the sum over 6,561 vertices
         assert cases[key].scene.time_step == 1 / 30
         if key[1] == 81:
-            assert len(scene.springs.edges) == 32_158
+            assert len(scene.all_springs.edges) == 32_158

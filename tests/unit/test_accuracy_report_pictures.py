@@ -14,15 +14,15 @@ from PIL import Image
 
 from harness.record.blueprint import BACKGROUND
 from harness.report import page
-from harness.report.accuracy import draw, sheet
+from harness.report.accuracy import draw_accuracy_report, sheet
 from harness.report.accuracy.convergence import draw_convergence
-from harness.report.accuracy.growth import draw_growth
+from harness.report.accuracy.growth import draw_scalings
 from harness.report.accuracy.profiles import draw_profiles
-from harness.report.accuracy.reading import read
-from harness.report.accuracy.time_plot import draw_times
-from harness.report.accuracy.work_plot import draw_work
-from harness.report.style import HEIGHT, OLDER, PAGE, WIDTH, marks
-from solvers.registry import EVERY, load
+from harness.report.accuracy.reading import read_accuracy
+from harness.report.accuracy.time_plot import draw_times_to_accuracy
+from harness.report.accuracy.work_plot import draw_work_precision
+from harness.report.style import BACKGROUND_COLOUR, PAGE_HEIGHT, PAGE_WIDTH, STALE_NOTE, assign_solver_styles
+from solvers.registry import SOLVER_TABLE, load_target
 from tests import accuracy_rows as made
 
 
@@ -30,28 +30,32 @@ def small() -> list[dict]:
     """Two sizes of a scene, two solvers that converge, one in another minimum, failures, a doubt, simulations."""
     rows = []
     for size in (6, 12, 24):
-        rows += made.problem("net", size, "early", branches=2)
+        rows += made.build_snapshot_rows("net", size, "early", minima_count=2)
         for guess in ("current", "inertial"):
-            rows += made.curve("net", size, "early", "numba", guess=guess)
-            rows += made.curve("net", size, "early", "newton", guess=guess, branch=int(size == 12))
-    rows += made.problem("net", 6, "violent", certified=False)
-    rows += made.curve("net", 6, "violent", "lbfgs", status="time-limit", reason="the limit of 5 s was reached")
-    rows.append(made.failure("net", 6, "violent", "dense", "unsupported", "knows springs </script> alone"))
-    return rows + list(made.work("net", 6))
+            rows += made.build_curve_rows("net", size, "early", "numba", initial_guess=guess)
+            rows += made.build_curve_rows(
+                "net", size, "early", "newton", initial_guess=guess, minimum_index=int(size == 12)
+            )
+    rows += made.build_snapshot_rows("net", 6, "violent", certified=False)
+    rows += made.build_curve_rows(
+        "net", 6, "violent", "lbfgs", status="time-limit", reason="the limit of 5 s was reached"
+    )
+    rows.append(made.build_failure_row("net", 6, "violent", "dense", "unsupported", "knows springs </script> alone"))
+    return rows + list(made.build_work_rows("net", 6))
 
 
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], dict[str, Figure]]:
     """The files of a report, and its pages by the names of their pictures."""
-    folder, pages = made.write(tmp_path_factory.mktemp("mini"), small()), {}
+    folder, pages = made.write_accuracy_rows(tmp_path_factory.mktemp("mini"), small()), {}
 
     def save(sheet: Figure, path: Path) -> None:
         pages[f"{path.parent.name}/{path.stem}"] = sheet
-        page.save(sheet, path)
+        page.save_page(sheet, path)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sheet, "save", save)
-        return draw(folder), pages
+        return draw_accuracy_report(folder), pages
 
 
 def written(drawn: Figure) -> str:
@@ -68,15 +72,15 @@ def test_every_picture_is_there_in_both_formats_and_nothing_half_written(drawn) 
     assert not list(files[0].parents[1].rglob(".*")), "no partial file is left"
     for path in pictures:
         with Image.open(path) as image:
-            assert image.size == (WIDTH, HEIGHT)
+            assert image.size == (PAGE_WIDTH, PAGE_HEIGHT)
             assert np.asarray(image.convert("L")).std() > 3, "an empty page has no variance"
         assert "<svg" in path.with_suffix(".svg").read_text()[:1000]
 
 
 def test_the_same_rows_give_the_same_vectors(tmp_path: Path) -> None:
-    rows = [*made.problem("net", 6, "early"), *made.curve("net", 6, "early", "numba")]
-    table = read(made.write(tmp_path, rows))
-    once, again = (draw_times(table, tmp_path / name)[1].read_text() for name in ("once", "again"))
+    rows = [*made.build_snapshot_rows("net", 6, "early"), *made.build_curve_rows("net", 6, "early", "numba")]
+    table = read_accuracy(made.write_accuracy_rows(tmp_path, rows))
+    once, again = (draw_times_to_accuracy(table, tmp_path / name)[1].read_text() for name in ("once", "again"))
     assert once == again
 
 
@@ -88,7 +92,7 @@ def test_doubtful_references_and_failures_are_told_on_the_picture(drawn) -> None
     assert "× ended early (time-limit): lbfgs" in said
     assert "unsupported" in said
     crosses = [line for ax in doubtful.axes for line in ax.lines if line.get_marker() == "x"]
-    assert {line.get_color() for line in crosses} == {marks([])["lbfgs"].color}
+    assert {line.get_color() for line in crosses} == {assign_solver_styles([])["lbfgs"].color}
     (sure,) = (page for name, page in pages.items() if "net-24-early" in name)
     assert "not certified" not in written(sure)
 
@@ -115,23 +119,31 @@ def test_what_other_code_measured_is_hollow_in_every_picture_and_told(
 ) -> None:
     rows: list[dict] = []
     for size in (6, 12, 24):
-        rows += made.problem("net", size, "early")
+        rows += made.build_snapshot_rows("net", size, "early")
         for solver in ("numba", "newton"):
-            rows += made.curve("net", size, "early", solver, code="before" if solver == "newton" else None)
-    rows += [row | {"code": "before" if row["solver"] == "hybrid" else None} for row in made.work("net", 6)]
+            rows += made.build_curve_rows("net", size, "early", solver, code="before" if solver == "newton" else None)
+    rows += [row | {"code": "before" if row["solver"] == "hybrid" else None} for row in made.build_work_rows("net", 6)]
     pages: dict[str, Figure] = {}
     monkeypatch.setattr(sheet, "save", lambda drawn, path: pages.setdefault(path.parent.name, drawn))
-    table = read(made.write(tmp_path, rows))
-    for draw_all, name in ((draw_convergence, "convergence"), (draw_times, "times"), (draw_work, "work")):
+    table = read_accuracy(made.write_accuracy_rows(tmp_path, rows))
+    for draw_all, name in (
+        (draw_convergence, "convergence"),
+        (draw_times_to_accuracy, "times"),
+        (draw_work_precision, "work"),
+    ):
         draw_all(table, tmp_path / name)
-    for draw_one, name in ((draw_growth, "growth"), (draw_profiles, "profiles")):
+    for draw_one, name in ((draw_scalings, "growth"), (draw_profiles, "profiles")):
         draw_one(table, tmp_path / name / name)
     told = {"profiles": "Measured by other code than today's, in whole or in part: newton."}
     for name, solver in {"convergence": "newton", "times": "newton", "work": "hybrid", "growth": "newton"}.items():
         lines = [one for ax in pages[name].axes for one in ax.lines if len(np.asarray(one.get_xdata())) > 1]
-        hollow = {one.get_color() for one in lines if one.get_marker() != "None" and one.get_markerfacecolor() == PAGE}
-        assert hollow == {marks([])[solver].color}, name
-        told[name] = OLDER
+        hollow = {
+            one.get_color()
+            for one in lines
+            if one.get_marker() != "None" and one.get_markerfacecolor() == BACKGROUND_COLOUR
+        }
+        assert hollow == {assign_solver_styles([])[solver].color}, name
+        told[name] = STALE_NOTE
     for name, words in told.items():
         assert words in written(pages[name]), name
 
@@ -147,7 +159,7 @@ BLINDNESS = {
 
 @pytest.mark.parametrize("matrix", BLINDNESS.values(), ids=[*BLINDNESS])
 def test_solvers_differ_in_colour_or_line_to_the_colour_blind_too(matrix: list[list[float]]) -> None:
-    looks = marks([])
+    looks = assign_solver_styles([])
 
     def seen(color: str) -> np.ndarray:
         rgb = np.array(to_rgb(color))
@@ -169,25 +181,27 @@ def luminance(color: Sequence[float]) -> float:
     return float(np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4) @ [0.2126, 0.7152, 0.0722])
 
 
-@pytest.mark.parametrize("name", [*EVERY, *(f"a stranger {k}" for k in range(12))])
+@pytest.mark.parametrize("name", [*SOLVER_TABLE, *(f"a stranger {k}" for k in range(12))])
 def test_one_look_is_seen_on_the_light_page_and_on_the_dark_ground_of_the_viewer(name: str) -> None:
-    color = luminance(to_rgb(marks([name])[name].color))
-    page, ground = luminance(to_rgb(PAGE)), luminance([part / 255 for part in BACKGROUND])
+    color = luminance(to_rgb(assign_solver_styles([name])[name].color))
+    page, ground = luminance(to_rgb(BACKGROUND_COLOUR)), luminance([part / 255 for part in BACKGROUND])
     # Contrast as the W3C defines it; 1.5 is that of a hairline, and lines are thick.
     assert (page + 0.05) / (color + 0.05) > 1.5
     assert (color + 0.05) / (ground + 0.05) > 1.5
 
 
 def test_every_solver_has_a_look_and_a_marker_of_its_own() -> None:
-    looks = marks([])
-    assert set(looks) == set(EVERY)
+    looks = assign_solver_styles([])
+    assert set(looks) == set(SOLVER_TABLE)
     assert len({look.marker for look in looks.values()}) == len(looks)
 
 
 def test_solvers_of_a_family_have_one_hue() -> None:
     hues: dict[str, set[int]] = {}
-    for name, look in marks([]).items():
+    for name, look in assign_solver_styles([]).items():
         hue, saturation, _ = rgb_to_hsv(to_rgb(look.color))
-        hues.setdefault(load(EVERY[name]).about.family, set()).add(round(360 * hue) if saturation > 0.1 else -1)
+        hues.setdefault(load_target(SOLVER_TABLE[name]).about.family, set()).add(
+            round(360 * hue) if saturation > 0.1 else -1
+        )
     # Two hexadecimal digits round a hue by a degree or two.
     assert all(max(found) - min(found) <= 3 for found in hues.values())

@@ -7,29 +7,31 @@ from pathlib import Path
 import pytest
 
 from harness.base import columns, rows
-from harness.base.columns import COLUMNS as RUN_COLUMNS
-from harness.experiments.accuracy.accuracy_rows import COLUMNS, SCHEMA
-from harness.report.query import answer
+from harness.base.columns import RUN_COLUMNS as RUN_COLUMNS
+from harness.experiments.accuracy.accuracy_rows import ACCURACY_COLUMNS, ACCURACY_SCHEMA
+from harness.report.query import run_query
 
 README = Path(__file__).resolve().parents[2] / "results" / "README.md"
 SHARED = {column.name for column in RUN_COLUMNS} - {"status", "seconds"}
 
 
-@pytest.mark.parametrize("column", [c for c in COLUMNS if c.name not in SHARED], ids=lambda column: column.name)
-def test_every_column_of_its_own_is_documented(column: columns.Column) -> None:
-    line = f"| `{column.name}` | {column.unit} | {column.meaning.replace('|', chr(92) + '|')} |"
+@pytest.mark.parametrize(
+    "column", [c for c in ACCURACY_COLUMNS if c.name not in SHARED], ids=lambda column: column.name
+)
+def test_every_column_of_its_own_is_documented(column: columns.ColumnSpec) -> None:
+    line = f"| `{column.name}` | {column.unit} | {column.description.replace('|', chr(92) + '|')} |"
     assert line in README.read_text().splitlines()
 
 
 def test_columns_are_named_once() -> None:
-    assert len(set(SCHEMA.names)) == len(COLUMNS)
+    assert len(set(ACCURACY_SCHEMA.names)) == len(ACCURACY_COLUMNS)
 
 
 def test_a_query_sees_the_accuracy_rows_of_all_configs(tmp_path: Path) -> None:
     for name, error in (("first", 0.5), ("second", 0.25)):
         (tmp_path / name / "accuracy").mkdir(parents=True)
         row = {"kind": "work", "sweep": name, "error": error, "seconds": [0.1, 0.2]}
-        rows.write(tmp_path / name / "accuracy" / "a.parquet", [row], SCHEMA)
-    found = answer("SELECT sweep, list_min(seconds) FROM accuracy ORDER BY error", tmp_path)
+        rows.write_rows(tmp_path / name / "accuracy" / "a.parquet", [row], ACCURACY_SCHEMA)
+    found = run_query("SELECT sweep, list_min(seconds) FROM accuracy ORDER BY error", tmp_path)
     assert found.values == [("second", 0.1), ("first", 0.1)]
-    assert answer("SELECT count(*) FROM rows", tmp_path).values == [(0,)]
+    assert run_query("SELECT count(*) FROM rows", tmp_path).values == [(0,)]

@@ -10,68 +10,68 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.config.accuracy import Case, How, WorkSpec
+from harness.config.accuracy import BenchmarkCase, MeasurementSettings, WorkSpec
 from harness.config.sweep import SolverSpec
-from harness.experiments.accuracy.units import trajectory_of
-from harness.experiments.accuracy.work import work_rows
-from harness.reference.frozen import bind
-from harness.reference.store import Store
-from harness.reference.trajectory import Trajectory, Unpredictable
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
+from harness.experiments.accuracy.units import load_reference_trajectory
+from harness.experiments.accuracy.work import build_work_rows
+from harness.reference.frozen import build_exact_scene
+from harness.reference.store import ReferenceStore
+from harness.reference.trajectory import ReferenceTrajectory, UnpredictableMotion
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
 from harness.scenes.spec import SceneSpec
 from harness.simulation import clock as clock_module
-from harness.simulation.step import prepare, simulate
+from harness.simulation.step import prepare, simulate_scene
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import StopRule
-from tests.undisturbed import undisturbed
+from tests.undisturbed import retry_if_preempted
 
 CHAIN = SceneSpec(
-    mesh=Chain(length=2.0),
+    mesh=ChainMesh(length=2.0),
     mass=1.0,
     time_step=1 / 30,
     frames=1,
-    effects=(Springs(stretch=500.0), Gravity(), Pins.model_validate({"at": ["ends"]})),
+    effects=(SpringsEffect(stretch=500.0), GravityEffect(), PinsEffect.model_validate({"at": ["ends"]})),
     path=Path("chain.yaml"),
 )
 HORIZON = 0.2
 UNIT = WorkSpec(
-    Case("chain", CHAIN, 5, "implicit-euler"),
+    BenchmarkCase("chain", CHAIN, 5, "implicit-euler"),
     HORIZON,
     SolverSpec("sparse", {}),
     {"first_guess": "current", "iterations": 20, "tolerance": None},
-    how=How(threads=1, rounds=2, time_limit=60.0),
+    measurement=MeasurementSettings(threads=1, rounds=2, time_limit=60.0),
 )
 
 
 @pytest.fixture(scope="module")
-def trajectory(tmp_path_factory: pytest.TempPathFactory) -> Trajectory:
-    found = trajectory_of(UNIT, Store(tmp_path_factory.mktemp("references")))
-    assert isinstance(found, Trajectory)
+def trajectory(tmp_path_factory: pytest.TempPathFactory) -> ReferenceTrajectory:
+    found = load_reference_trajectory(UNIT, ReferenceStore(tmp_path_factory.mktemp("references")))
+    assert isinstance(found, ReferenceTrajectory)
     return found
 
 
-def row(unit: WorkSpec, trajectory: Trajectory | Exception) -> dict[str, Any]:
-    (found,) = work_rows(unit, trajectory, lambda: None)
+def row(unit: WorkSpec, trajectory: ReferenceTrajectory | Exception) -> dict[str, Any]:
+    (found,) = build_work_rows(unit, trajectory, lambda: None)
     return found
 
 
-def test_the_error_is_that_of_the_last_positions(trajectory: Trajectory) -> None:
+def test_the_error_is_that_of_the_last_positions(trajectory: ReferenceTrajectory) -> None:
     found = row(UNIT, trajectory)
-    scene = bind(CHAIN, 5)
-    run = simulate(scene, prepare(scene, SparseLocalGlobal()), StopRule(20), first_guess="current", frames=6)
+    scene = build_exact_scene(CHAIN, 5)
+    run = simulate_scene(scene, prepare(scene, SparseLocalGlobal()), StopRule(20), initial_guess="current", frames=6)
     p = [step.positions.copy() for step in run][-1]
-    away, moved = p - trajectory.positions[-1], trajectory.positions[-1] - scene.mesh.rest
+    away, moved = p - trajectory.positions[-1], trajectory.positions[-1] - scene.mesh.rest_positions
     # The pinned vertices are in place in all three; what is left is round-off of sums.
     assert found["error"] == pytest.approx(np.linalg.norm(away) / np.linalg.norm(moved), rel=1e-12)
     assert found["error_rms_m"] == pytest.approx(np.linalg.norm(away) / 3**0.5, rel=1e-12)
     assert found["iterations_done"] == 6 * 20
 
 
-def test_a_smaller_step_and_a_better_integrator_err_less(trajectory: Trajectory) -> None:
-    smaller = replace(UNIT, case=replace(UNIT.case, scene=CHAIN.stepped(1 / 120)))
+def test_a_smaller_step_and_a_better_integrator_err_less(trajectory: ReferenceTrajectory) -> None:
+    smaller = replace(UNIT, case=replace(UNIT.case, scene=CHAIN.with_time_step(1 / 120)))
     better = replace(UNIT, case=replace(UNIT.case, integrator="midpoint"))
     error = row(UNIT, trajectory)["error"]
     # First order: a quarter of the step leaves about a quarter; second order is better still at this step.
@@ -79,31 +79,31 @@ def test_a_smaller_step_and_a_better_integrator_err_less(trajectory: Trajectory)
     assert row(better, trajectory)["error"] < 0.4 * error
 
 
-def test_each_round_has_a_time_and_their_median_is_the_cost(trajectory: Trajectory) -> None:
-    found = row(replace(UNIT, how=replace(UNIT.how, rounds=3)), trajectory)
+def test_each_round_has_a_time_and_their_median_is_the_cost(trajectory: ReferenceTrajectory) -> None:
+    found = row(replace(UNIT, measurement=replace(UNIT.measurement, rounds=3)), trajectory)
     assert len(found["seconds"]) == 3
     assert isinstance(found["interrupted"], bool)
     assert found["seconds_per_simulated"] == np.median(found["seconds"]) / HORIZON
 
 
 def test_seconds_that_another_clock_does_not_bear_out_are_a_failure(
-    trajectory: Trajectory, monkeypatch: pytest.MonkeyPatch
+    trajectory: ReferenceTrajectory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(clock_module, "perf_counter", lambda: perf_counter() / 1000)
-    (found,), _ = undisturbed(lambda: ([row(UNIT, trajectory)], None))
+    (found,), _ = retry_if_preempted(lambda: ([row(UNIT, trajectory)], None))
     assert (found["status"], "seconds" in found) == ("failed", False)
     assert "the times of step add up to" in found["reason"]
 
 
 LOST = [
-    ({"how": replace(UNIT.how, time_limit=1e-9)}, "time-limit", "was reached in frame"),
+    ({"how": replace(UNIT.measurement, time_limit=1e-9)}, "time-limit", "was reached in frame"),
     ({"solver": SolverSpec("symplectic-euler", {}), "case": replace(UNIT.case, integrator="bdf2")}, "unsupported", ""),
 ]
 
 
 @pytest.mark.parametrize(("change", "status", "reason"), LOST, ids=[status for _, status, _ in LOST])
 def test_what_goes_wrong_is_a_status_with_a_reason(
-    trajectory: Trajectory, change: dict[str, Any], status: str, reason: str
+    trajectory: ReferenceTrajectory, change: dict[str, Any], status: str, reason: str
 ) -> None:
     found = row(replace(UNIT, **change), trajectory)
     assert (found["status"], "error" in found) == (status, False)
@@ -111,13 +111,13 @@ def test_what_goes_wrong_is_a_status_with_a_reason(
     assert reason in found["reason"]
 
 
-def test_an_error_below_the_reference_s_own_is_no_error(trajectory: Trajectory) -> None:
+def test_an_error_below_the_reference_s_own_is_no_error(trajectory: ReferenceTrajectory) -> None:
     doubtful = replace(trajectory, growth=np.array([10.0]))
     found = row(UNIT, doubtful)
     assert (found["status"], "error" in found) == ("uncertified", False)
 
 
 def test_without_a_reference_nothing_is_simulated() -> None:
-    found = row(UNIT, Unpredictable("after 9 s a perturbation has grown"))
+    found = row(UNIT, UnpredictableMotion("after 9 s a perturbation has grown"))
     assert (found["status"], found["reason"]) == ("uncertified", "after 9 s a perturbation has grown")
     assert "seconds" not in found

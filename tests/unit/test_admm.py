@@ -11,12 +11,12 @@ import pytest
 from solvers.energies.springs import Springs
 from solvers.methods.admm import Admm
 from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.newton import Newton
-from solvers.problem import Pins, StepProblem, StopRule, Unsupported
-from tests.effects import SCENES, stepped
-from tests.scenes import cloth, first_problem
+from solvers.methods.newton import NewtonSolver
+from solvers.problem import DirichletPins, StepProblem, StopRule, Unsupported
+from tests.effects import EFFECT_SCENES, build_moving_problem
+from tests.scenes import build_cloth, build_first_problem
 
-HANGING = first_problem(cloth(8, "exact", stretch=100.0))
+HANGING = build_first_problem(build_cloth(8, "exact", stretch=100.0))
 
 
 def after(solver, problem: StepProblem, count: int):
@@ -32,15 +32,16 @@ def test_the_first_iteration_with_the_weight_one_is_local_global():
 
 @pytest.mark.parametrize("weight", [0.1, 1.0, 3.0])
 def test_it_ends_at_the_minimum_whatever_the_weight(weight):
-    wanted = Newton().prepare(HANGING.system).solve(HANGING, StopRule(100, 1e-12)).positions
+    wanted = NewtonSolver().prepare(HANGING.system).solve(HANGING, StopRule(100, 1e-12)).positions
     found = Admm(weight).prepare(HANGING.system).solve(HANGING, StopRule(5000, 1e-8))
-    assert found.stopped == "tolerance"
+    assert found.termination_reason == "tolerance"
     np.testing.assert_allclose(found.positions, wanted, rtol=0, atol=1e-6)
 
 
 def test_a_small_weight_takes_fewer_iterations_where_springs_hang():
     small, one, great = (
-        Admm(weight).prepare(HANGING.system).solve(HANGING, StopRule(5000, 1e-3)).iterations for weight in (0.1, 1.0, 3)
+        Admm(weight).prepare(HANGING.system).solve(HANGING, StopRule(5000, 1e-3)).num_iterations
+        for weight in (0.1, 1.0, 3)
     )
     assert 2 * small <= one
     assert 2 * one <= great
@@ -49,14 +50,22 @@ def test_a_small_weight_takes_fewer_iterations_where_springs_hang():
 @pytest.mark.parametrize(("weight", "stays"), [(0.5, False), (1.0, False), (3.0, True)])
 def test_a_spring_shorter_than_the_weight_allows_has_no_fixed_point(weight, stays):
     """A spring pressed to 2/5 of its rest length, at a minimum since inertia holds it: 1/(1 + 3) < 2/5 < 1/(1 + 1)."""
-    given = first_problem(cloth(2, "exact"))
+    given = build_first_problem(build_cloth(2, "exact"))
     springs = Springs(np.array([[0, 1]]), np.ones(1), np.ones(1), np.array([[1.0, 0.0, 0.0]]))
     p = np.zeros((2, 3))
     p[1, 0] = 0.4
-    pins = Pins(np.array([0]), np.array([np.inf]))
+    pins = DirichletPins(np.array([0]), np.array([np.inf]))
     system = replace(given.system, mass=np.full(2, 10.0), time_step=1.0, energies=(springs,), pins=pins)
     force = np.array([[0.0, 0.0, 0.0], [-0.6, 0.0, 0.0]])
-    given = replace(given, system=system, target=p, force=force, current=p, first_guess=p, pin_targets=p[:1])
+    given = replace(
+        given,
+        system=system,
+        inertial_target=p,
+        external_force=force,
+        current_positions=p,
+        initial_guess=p,
+        pin_targets=p[:1],
+    )
     assert np.abs(given.gradient(p)[1]).max() <= 1e-15
     last = [q.copy() for q in islice(Admm(weight).prepare(system).iterates(given), 300)][-8:]
     moved = np.abs(np.array(last) - p).max()
@@ -68,7 +77,7 @@ def test_a_spring_shorter_than_the_weight_allows_has_no_fixed_point(weight, stay
 )
 def test_what_has_no_projection_along_edges_is_refused_by_name(scene, name):
     with pytest.raises(Unsupported, match=f"admm: .*the scene has .*{name}"):
-        Admm().prepare(stepped(SCENES[scene]()).system)
+        Admm().prepare(build_moving_problem(EFFECT_SCENES[scene]()).system)
 
 
 @pytest.mark.parametrize("weight", [0.0, -1.0, np.inf, np.nan])

@@ -8,74 +8,79 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.reference.trajectory import Trajectory, integrate
-from harness.scenes.bind import Scene, build
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
+from harness.reference.trajectory import ReferenceTrajectory, integrate_motion
+from harness.scenes.bind import Scene, build_scene
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
 from harness.scenes.spec import SceneSpec
-from harness.simulation.algebraic import Auto, Stop, stop_rule
-from harness.simulation.step import Step, prepare, simulate
+from harness.simulation.algebraic import AutoTolerance, StopCriterion, build_stop_rule
+from harness.simulation.step import SimulationStep, prepare, simulate_scene
 from solvers.integrators import INTEGRATORS
 from solvers.methods.lbfgs import Lbfgs
 from solvers.problem import StopRule, Unsupported
 
 END = 0.3
-EFFECTS = (Springs(stretch=20.0), Gravity(), Pins(at=("first",), weight="exact"))
+EFFECTS = (SpringsEffect(stretch=20.0), GravityEffect(), PinsEffect(at=("first",), weight="exact"))
 
 
 def scene(integrator: str, steps: int) -> Scene:
     """A chain that is thrown."""
-    given = {"mesh": Chain(), "effects": EFFECTS, "velocity": (0.5, 1.0, 2.0), "time_step": END / steps}
-    return build(SceneSpec(mass=1.0, frames=1, path=Path("scene.yaml"), **given), 6, integrator)
+    given = {"mesh": ChainMesh(), "effects": EFFECTS, "velocity": (0.5, 1.0, 2.0), "time_step": END / steps}
+    return build_scene(SceneSpec(mass=1.0, frames=1, path=Path("scene.yaml"), **given), 6, integrator)
 
 
-def run(integrator: str, steps: int, stop: Stop) -> list[Step]:
+def run(integrator: str, steps: int, stop: StopCriterion) -> list[SimulationStep]:
     made = scene(integrator, steps)
-    return list(simulate(made, prepare(made, Lbfgs()), stop, first_guess="inertial", frames=steps))
+    return list(simulate_scene(made, prepare(made, Lbfgs()), stop, initial_guess="inertial", frames=steps))
 
 
 @pytest.fixture(scope="module")
-def truth() -> Trajectory:
-    return integrate(scene("esdirk-4", 4), [END])
+def truth() -> ReferenceTrajectory:
+    return integrate_motion(scene("esdirk-4", 4), [END])
 
 
 @pytest.mark.parametrize("steps", [24, 96])
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "midpoint", "newmark", "sdirk-3", "esdirk-4"])
 def test_solves_add_little_to_the_steps_own_error_and_do_little_besides(integrator, steps, truth):
-    auto, converged = run(integrator, steps, Auto(200)), run(integrator, steps, StopRule(200, 1e-12))
-    own = truth.error(0, converged[-1].positions)
-    away = np.linalg.norm(auto[-1].positions - converged[-1].positions) / truth.moved[0]
+    auto, converged = run(integrator, steps, AutoTolerance(200)), run(integrator, steps, StopRule(200, 1e-12))
+    own = truth.measure_error(0, converged[-1].positions)
+    away = np.linalg.norm(auto[-1].positions - converged[-1].positions) / truth.displacement[0]
     assert away <= 0.5 * own  # a tenth a step, whose signs may agree where those of the steps' own errors do not
     past = slice(6, None)
     most = 0.8 if INTEGRATORS[integrator].order < 4 else 1.0  # an error of 7e-9 asks for all but the last digits
-    assert sum(step.iterations for step in auto[past]) <= most * sum(step.iterations for step in converged[past])
-    assert all(solution.residual <= step.stop.within for step in auto[past] for _, solution in step.stages)
+    assert sum(step.num_iterations for step in auto[past]) <= most * sum(
+        step.num_iterations for step in converged[past]
+    )
+    assert all(solution.residual <= step.stop_rule.atol for step in auto[past] for _, solution in step.stages)
 
 
 def test_the_bound_falls_with_the_integrators_order():
     for integrator, order in (("implicit-euler", 1), ("midpoint", 2), ("sdirk-3", 3)):
-        bounds = [np.median([step.stop.within for step in run(integrator, steps, Auto(200))[6:]]) for steps in (48, 96)]
+        bounds = [
+            np.median([step.stop_rule.atol for step in run(integrator, steps, AutoTolerance(200))[6:]])
+            for steps in (48, 96)
+        ]
         # |e_v| falls by the order and one; that of order 3 is not yet asymptotic
         np.testing.assert_allclose(np.log2(bounds[0] / bounds[1]), order + 1, atol=0.6)
 
 
 def test_a_scene_at_rest_is_solved_at_once():
-    given = {"mesh": Chain(), "effects": EFFECTS[::2], "time_step": 0.1}
-    still = build(SceneSpec(mass=1.0, frames=1, path=Path("scene.yaml"), **given), 6, "implicit-euler")
-    steps = list(simulate(still, prepare(still, Lbfgs()), Auto(50), first_guess="current", frames=6))
-    assert max(step.iterations for step in steps) <= 1
+    given = {"mesh": ChainMesh(), "effects": EFFECTS[::2], "time_step": 0.1}
+    still = build_scene(SceneSpec(mass=1.0, frames=1, path=Path("scene.yaml"), **given), 6, "implicit-euler")
+    steps = list(simulate_scene(still, prepare(still, Lbfgs()), AutoTolerance(50), initial_guess="current", frames=6))
+    assert max(step.num_iterations for step in steps) <= 1
 
 
 def test_steps_of_two_lengths_are_refused():
     made = scene("implicit-euler", 24)
-    uneven = replace(made, alternate=scene("implicit-euler", 48))
+    uneven = replace(made, alternate_scene=scene("implicit-euler", 48))
     with pytest.raises(Unsupported, match="alternates two"):
-        next(simulate(uneven, prepare(made, Lbfgs()), Auto(50), first_guess="current", frames=2))
+        next(simulate_scene(uneven, prepare(made, Lbfgs()), AutoTolerance(50), initial_guess="current", frames=2))
 
 
 def test_a_stated_tolerance_is_the_rule_of_every_step():
-    assert stop_rule(7, 1e-3) == StopRule(7, 1e-3)
-    assert stop_rule(7, None) == StopRule(7)
-    assert stop_rule(7, "auto") == Auto(7)
+    assert build_stop_rule(7, 1e-3) == StopRule(7, 1e-3)
+    assert build_stop_rule(7, None) == StopRule(7)
+    assert build_stop_rule(7, "auto") == AutoTolerance(7)

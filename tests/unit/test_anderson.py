@@ -9,22 +9,24 @@ import numpy as np
 import pytest
 from scipy.linalg import cholesky
 
-from solvers.matrices import assemble
+from solvers.matrices import assemble_system_matrix
 from solvers.methods.anderson import Anderson
 from solvers.problem import Positions, ProjectiveEnergy, StepProblem, StopRule, Unsupported
-from tests.scenes import cloth, first_problem, random_problem
+from tests.scenes import build_cloth, build_first_problem, build_random_problem
 from tests.unit.test_accelerated import Barrier
 
-PROBLEMS = {"cloth": lambda: first_problem(cloth(7, "exact")), "random": lambda: random_problem(4)}
+PROBLEMS = {"cloth": lambda: build_first_problem(build_cloth(7, "exact")), "random": lambda: build_random_problem(4)}
 
 
 def by_least_squares(problem: StepProblem, pairs: int, count: int) -> list[Positions]:
     """Peng et al. 2018, algorithm 1, in NumPy: residuals in the norm of Q, by LAPACK's least squares."""
-    system, free = problem.system, problem.system.free
-    Q = assemble(system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)]).toarray()[np.ix_(free, free)]
+    system, free = problem.system, problem.system.free_vertices
+    Q = assemble_system_matrix(system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)]).toarray()[
+        np.ix_(free, free)
+    ]
     root = cholesky(Q)
-    p = problem.first_guess.copy()
-    p[system.pins.vertices[system.pins.exact]] = problem.pin_targets[system.pins.exact]
+    p = problem.initial_guess.copy()
+    p[system.pins.vertices[system.pins.exact_mask]] = problem.pin_targets[system.pins.exact_mask]
     visited: list[tuple[Positions, Positions]] = []
     path = []
     for _ in range(count):
@@ -58,15 +60,15 @@ def test_iterates_are_those_of_the_least_squares_problem(name, pairs, linear):
 
 
 def test_energies_that_are_not_projective_are_refused_by_name():
-    system = first_problem(cloth(4)).system
+    system = build_first_problem(build_cloth(4)).system
     with pytest.raises(Unsupported, match=r"anderson.*Barrier"):
         Anderson().prepare(replace(system, energies=(*system.energies, Barrier(1.0))))
 
 
 def test_differences_that_depend_on_each_other_do_no_harm():
     """One free vertex has three coordinates: five differences are never independent."""
-    problem = random_problem(6, n=3, m=6, weights=(np.inf, np.inf))
+    problem = build_random_problem(6, n=3, m=6, weights=(np.inf, np.inf))
     solution = Anderson(8).prepare(problem.system).solve(problem, StopRule(500, 1e-12))
-    assert solution.stopped in ("tolerance", "floor")
-    begun = np.abs(problem.gradient(problem.current)).max()
+    assert solution.termination_reason in ("tolerance", "floor")
+    begun = np.abs(problem.gradient(problem.current_positions)).max()
     assert np.abs(problem.gradient(solution.positions)).max() <= 1e-10 * begun  # as asked, by the condition of one row

@@ -11,7 +11,7 @@ import harness
 from harness import api
 from harness.base import rows
 from harness.base.errors import InputError
-from tests.recordings import info, record, waving
+from tests.recordings import build_recording_info, generate_waves, write_recording
 
 
 @pytest.fixture
@@ -31,26 +31,28 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[object]:
 def test_rows_of_a_folder_are_a_table_in_the_order_of_their_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "rows").mkdir()
     for name in ("b", "a"):
-        rows.write(tmp_path / "rows" / f"{name}.parquet", [{"solver": name, "frame": k} for k in (1, 2)])
+        rows.write_rows(tmp_path / "rows" / f"{name}.parquet", [{"solver": name, "frame": k} for k in (1, 2)])
     monkeypatch.setattr(api, "find_spec", lambda name: None)  # neither polars nor pandas
-    found = harness.rows(tmp_path)
-    assert found.select(["solver", "frame"]).to_pylist() == [{"solver": s, "frame": k} for s in "ab" for k in (1, 2)]
+    found = harness.load_rows(tmp_path)
+    assert found.build_query(["solver", "frame"]).to_pylist() == [
+        {"solver": s, "frame": k} for s in "ab" for k in (1, 2)
+    ]
 
 
 def test_an_opened_recording_has_every_frame(tmp_path: Path):
-    of = info("chain")
-    replay = harness.open_recording(record(tmp_path / "a.rrd", of, count=3))
-    np.testing.assert_array_equal(replay.positions, [f.positions.astype(np.float32) for f in waving(of, 3)])
+    of = build_recording_info("chain")
+    replay = harness.open_recording(write_recording(tmp_path / "a.rrd", of, frame_count=3))
+    np.testing.assert_array_equal(replay.positions, [f.positions.astype(np.float32) for f in generate_waves(of, 3)])
     np.testing.assert_array_equal(replay.springs, of.springs)
     with pytest.raises(InputError, match="nowhere"):
         harness.open_recording(tmp_path / "nowhere.rrd")
 
 
 def test_a_recording_is_drawn_alone_and_several_side_by_side(tmp_path: Path, drawn: list[object]):
-    path = record(tmp_path / "a.rrd", info("chain"), count=2)
+    path = write_recording(tmp_path / "a.rrd", build_recording_info("chain"), frame_count=2)
     replay = harness.open_recording(path)
-    picture = harness.draw(replay)
-    harness.draw({"one": path, "other": replay})
+    picture = harness.draw_picture(replay)
+    harness.draw_picture({"one": path, "other": replay})
     alone, beside = drawn
     assert alone is replay
     assert isinstance(beside, dict)

@@ -13,10 +13,10 @@ import pytest
 import harness
 from harness.base.errors import InputError
 from harness.config.keys import IntegratorName, OptionKeys, ReportName, SceneKeys, SolverName, SweepKeys
-from harness.config.sweep import REPORTS, Options, SweepFields
+from harness.config.sweep import SHIPPED_REPORTS, SweepConfig, SweepOptions
 from harness.scenes.spec import SceneFields
 from solvers.integrators import INTEGRATORS
-from solvers.registry import OPTIONAL, SOLVERS
+from solvers.registry import OPTIONAL_SOLVERS, SOLVERS
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -37,13 +37,13 @@ harness.run({"scenes": ["a.yaml"], "solvers": ["sparse"], "reports": ["timings"]
 
 
 def test_types_name_what_is_shipped():
-    assert set(get_args(SolverName)) == {*SOLVERS, *OPTIONAL}
+    assert set(get_args(SolverName)) == {*SOLVERS, *OPTIONAL_SOLVERS}
     assert set(get_args(IntegratorName)) == {*INTEGRATORS}
-    assert set(get_args(ReportName)) == {*REPORTS}
+    assert set(get_args(ReportName)) == {*SHIPPED_REPORTS}
 
 
 def test_types_have_the_keys_of_the_models():
-    for keys, model in ((SceneKeys, SceneFields), (OptionKeys, Options), (SweepKeys, SweepFields)):
+    for keys, model in ((SceneKeys, SceneFields), (OptionKeys, SweepOptions), (SweepKeys, SweepConfig)):
         assert keys.__annotations__.keys() == model.model_fields.keys()
 
 
@@ -70,4 +70,4 @@ class Mine:
 
 def test_a_class_in_a_sweep_is_answered_by_how_to_name_it():
     with pytest.raises(InputError, match=r'solvers\[1\]: came the class Mine; wanted .* "./test_api_types.py:Mine"'):
-        harness.run({"scenes": ["a.yaml"], "solvers": ["sparse", Mine]}, name="a")  # type: ignore[list-item]
+        harness.run_config({"scenes": ["a.yaml"], "solvers": ["sparse", Mine]}, name="a")  # type: ignore[list-item]

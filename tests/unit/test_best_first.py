@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from harness.config.accuracy import Case, How, WorkSpec
+from harness.config.accuracy import BenchmarkCase, MeasurementSettings, WorkSpec
 from harness.config.sweep import SolverSpec
 from harness.experiments.accuracy.best_first import LEAST_LIMIT, OVER_BUDGET, SLOWER, search
 
@@ -19,11 +19,11 @@ STEPS, TOLERANCES, SOLVERS = (0.4, 0.2, 0.1, 0.05, 0.025), (1e-1, 1e-2, 1e-3), (
 def specs() -> list[WorkSpec]:
     return [
         WorkSpec(
-            Case("scene", SimpleNamespace(time_step=dt), 4, "implicit-euler"),  # type: ignore[arg-type]
+            BenchmarkCase("scene", SimpleNamespace(time_step=dt), 4, "implicit-euler"),  # type: ignore[arg-type]
             1.0,
             SolverSpec(solver, {}),
             {"first_guess": "current", "iterations": 9, "tolerance": tolerance},
-            How(1, rounds=1, time_limit=1e3),
+            MeasurementSettings(1, rounds=1, time_limit=1e3),
         )
         for solver in SOLVERS
         for tolerance in reversed(TOLERANCES)
@@ -58,7 +58,7 @@ class Measured:
 
     def __call__(self, spec: WorkSpec) -> dict[str, Any]:
         row = self.rows[key(spec)]
-        if row["status"] == "ok" and row["seconds_per_simulated"] > spec.how.time_limit:
+        if row["status"] == "ok" and row["seconds_per_simulated"] > spec.measurement.time_limit:
             row = {"status": "time-limit"}
         self.found[key(spec)] = row
         return row
@@ -101,7 +101,7 @@ def test_a_simulation_may_take_little_more_than_the_best(best: float, limit: flo
     given = list[float]()
 
     def measure(spec: WorkSpec) -> dict[str, Any]:
-        given.append(spec.how.time_limit)
+        given.append(spec.measurement.time_limit)
         return {"status": "unsupported"}
 
     omitted = search(specs(), 1e-2, best, measure, 60.0)

@@ -62,7 +62,7 @@ def test_a_solve_agrees_with_scipy(A):
     assert factor.factorise(entries(A))
     wanted = np.asarray(spsolve(A.tocsc(), b.ravel())).reshape(-1, 3)
     np.testing.assert_allclose(factor.solve(b), wanted, rtol=0, atol=ROUND_OFF * np.abs(wanted).max())
-    np.testing.assert_array_equal(BlockCholesky(graph_of(A)).solve_anew(entries(A), b), factor.solve(b))
+    np.testing.assert_array_equal(BlockCholesky(graph_of(A)).factorise_and_solve(entries(A), b), factor.solve(b))
 
 
 @matrices
@@ -73,7 +73,7 @@ def test_an_indefinite_matrix_is_told_wherever_it_is_indefinite(A):
         values = entries(A)
         values[(rows == vertex) & (A.indices == vertex), 1, 1] *= -1.0
         assert not factor.factorise(values)
-        assert factor.solve_anew(values, np.ones((n, 3))) is None
+        assert factor.factorise_and_solve(values, np.ones((n, 3))) is None
     assert factor.factorise(entries(A)), "a failure leaves nothing behind"
 
 

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from solvers.contact import ways
-from solvers.contact.barrier import distances
-from solvers.contact.contacts import Pairs, padded
-from solvers.contact.known import WIDE
+from solvers.contact.barrier import compute_distances
+from solvers.contact.contacts import Candidates, pad_positions
+from solvers.contact.known import CACHE_INFLATION
 from solvers.contact.self_contact import SelfContact
-from solvers.contact.surface import Surface
+from solvers.contact.surface import CollisionMesh
 
 THICKNESS = 1 / 64
 LEFT = Fraction(1, 20)
@@ -59,9 +59,9 @@ FASTER = (0.5, 0.86, 0.95, 1.05, 1.12, 1.3, 4.0, 1000.0)
 """Units that a pair would close by in a whole step. Without a look pairs are free up to 0.9 of their gap."""
 
 
-def pairs_of(edges: bool) -> Pairs:
+def pairs_of(edges: bool) -> Candidates:
     one = np.ones(1)
-    return Pairs(np.arange(4)[None], 0 if edges else 1, one, one, 0 * one, THICKNESS, 0.5)
+    return Candidates(np.arange(4)[None], 0 if edges else 1, one, one, 0 * one, THICKNESS, 0.5)
 
 
 @pytest.mark.parametrize("name", CLOSING)
@@ -75,7 +75,11 @@ def test_no_pair_that_closes_at_its_bound_loses_more_than_nineteen_twentieths_of
             p = np.array(closing.positions, float)[:, axes]
             d = speed * np.array(closing.displacements, float)[:, axes]
             d += [4.0, -2.0, 0.5]  # a common motion bounds nothing
-            step = Fraction(ways.largest(pairs_of(closing.edges), padded(p), padded(d), 1.0, *ways.scratch()))
+            step = Fraction(
+                ways.collision_free_step_size(
+                    pairs_of(closing.edges), pad_positions(p), pad_positions(d), 1.0, *ways.allocate_ccd_scratch()
+                )
+            )
             assert step * Fraction(speed) <= (1 - LEFT) * gap  # exactly: the distance is linear in the step
             # And it is of use: of a step that has to end, it ends in the last tenth of the gap.
             assert step == 1 or step * Fraction(speed) >= Fraction(89, 100) * gap
@@ -125,10 +129,14 @@ def test_no_random_pair_comes_nearer_than_it_may_on_the_way(edges):
     for _ in range(24):
         p, d = (np.round(64 * rng.normal(size=(4, 3))) / 64 for _ in range(2))
         d[0] += 8.0 * (p[2] - p[0])
-        gap = distances(pairs_of(edges), p)[0] - THICKNESS
+        gap = compute_distances(pairs_of(edges), p)[0] - THICKNESS
         if gap <= 0.0:
             continue
-        step = Fraction(ways.largest(pairs_of(edges), padded(p), padded(d), 1.0, *ways.scratch()))
+        step = Fraction(
+            ways.collision_free_step_size(
+                pairs_of(edges), pad_positions(p), pad_positions(d), 1.0, *ways.allocate_ccd_scratch()
+            )
+        )
         ended += step < 1
         least = (Fraction(THICKNESS) + Fraction(gap) * Fraction(49, 1000)) ** 2  # round-off of the gap aside
         for k in range(1, 9):
@@ -151,11 +159,11 @@ def test_what_is_kept_between_steps_bounds_them_as_well():
     for speed in FASTER:
         d = np.zeros_like(rest)
         d[:3, 2], d[3:, 2] = 0.5 * speed, -0.5 * speed
-        contact = SelfContact(Surface.of(rest, edges, triangles, np.ones(6), THICKNESS, 1 / 16))
+        contact = SelfContact(CollisionMesh.from_rest_shape(rest, edges, triangles, np.ones(6), THICKNESS, 1 / 16))
         for kept in (0.0, 0.125 / speed):  # what the last look found is kept for the next one
             contact.value(rest)
-            contact.largest_step(rest, kept * d)
-            step = Fraction(contact.largest_step(rest, d))
+            contact.collision_free_step_size(rest, kept * d)
+            step = Fraction(contact.collision_free_step_size(rest, d))
             assert step * Fraction(speed) <= (1 - LEFT) * gap
 
 
@@ -170,11 +178,11 @@ def test_candidates_that_are_kept_bound_no_step_that_leads_beyond_their_reach(wa
 
     triangles = np.arange(9).reshape(3, 3)
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [0, 2]]])
-    contact = SelfContact(Surface.of(at(0, 1, 2), edges, triangles, np.ones(9), THICKNESS, reach))
-    apart = 1.02 * WIDE * limit
+    contact = SelfContact(CollisionMesh.from_rest_shape(at(0, 1, 2), edges, triangles, np.ones(9), THICKNESS, reach))
+    apart = 1.02 * CACHE_INFLATION * limit
     p = at(0.0, 0.5 * limit, 0.5 * limit + apart)
     d = at(0.0, 0.0, -way * limit) - at(0.0, 0.0, 0.0)
     contact.value(p)
-    assert contact.kept[0].pairs.vertices.max() < 6
-    step = contact.largest_step(p, d)
+    assert contact.candidate_caches[0].candidates.vertices.max() < 6
+    step = contact.collision_free_step_size(p, d)
     assert step == 1.0 if way < 1.0 else step * way * limit <= 0.95 * (apart - THICKNESS)

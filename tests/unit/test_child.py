@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from harness.base import child
-from harness.base.errors import InputError, Mistake
-from harness.base.files import CannotWrite, replacing, told
+from harness.base.errors import InputError, InputMistake
+from harness.base.files import WriteError, atomic_write, describe_os_error
 
-LIMITS, SHORT = child.Allowance(20.0, 2**27), child.Allowance(0.5, 2**27)
+LIMITS, SHORT = child.CallLimits(20.0, 2**27), child.CallLimits(0.5, 2**27)
 """What ends by itself has time on a slow machine as well; what does not is ended soon."""
 
 
@@ -52,11 +52,11 @@ def panic() -> None:
 
 
 def refuse(path: Path) -> None:
-    raise InputError(Mistake("is odd", path, 3, "key"))
+    raise InputError(InputMistake("is odd", path, 3, "key"))
 
 
 def half(path: Path) -> None:
-    with replacing(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text("new")
         raise OSError(errno.ENOSPC, "the disk is full")
 
@@ -66,8 +66,8 @@ def here() -> str:
 
 
 def test_it_answers_and_prints_nothing(capfd: pytest.CaptureFixture[str]):
-    assert child.call(double, 21, limits=LIMITS) == 42
-    child.call(print, "noise", limits=LIMITS)
+    assert child.call_in_sandbox(double, 21, limits=LIMITS) == 42
+    child.call_in_sandbox(print, "noise", limits=LIMITS)
     assert capfd.readouterr() == ("", "")
 
 
@@ -84,32 +84,32 @@ def test_it_answers_and_prints_nothing(capfd: pytest.CaptureFixture[str]):
     ],
 )
 def test_what_it_does_not_answer_is_said_in_words_and_the_next_call_is_answered(function, why):
-    with pytest.raises(child.NoAnswer) as caught:
-        child.call(function, limits=SHORT if function is loop else LIMITS)
+    with pytest.raises(child.SandboxError) as caught:
+        child.call_in_sandbox(function, limits=SHORT if function is loop else LIMITS)
     assert why in str(caught.value)
-    assert child.call(double, 21, limits=LIMITS) == 42
+    assert child.call_in_sandbox(double, 21, limits=LIMITS) == 42
 
 
 def test_a_mistake_comes_with_its_place(tmp_path: Path):
     with pytest.raises(InputError) as caught:
-        child.call(refuse, tmp_path, limits=LIMITS)
-    assert caught.value.mistakes == (Mistake("is odd", tmp_path, 3, "key"),)
+        child.call_in_sandbox(refuse, tmp_path, limits=LIMITS)
+    assert caught.value.mistakes == (InputMistake("is odd", tmp_path, 3, "key"),)
 
 
 def test_relative_paths_mean_what_they_mean_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
-    assert child.call(here, limits=LIMITS) == os.getcwd()
+    assert child.call_in_sandbox(here, limits=LIMITS) == os.getcwd()
 
 
 def test_a_file_takes_its_place_whole_or_not_at_all(tmp_path: Path):
     path = tmp_path / "a.txt"
-    with replacing(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text("old")
-    with pytest.raises(CannotWrite, match=r"a\.txt: cannot be written: No space left on device"):
+    with pytest.raises(WriteError, match=r"a\.txt: cannot be written: No space left on device"):
         half(path)
     assert path.read_text() == "old"
     assert [file.name for file in tmp_path.iterdir()] == ["a.txt"]
 
 
 def test_an_error_of_the_system_names_its_files():
-    assert told(OSError(20, "Not a directory", "a", None, "b")) == "a and b: Not a directory"
+    assert describe_os_error(OSError(20, "Not a directory", "a", None, "b")) == "a and b: Not a directory"

@@ -14,16 +14,24 @@ import numpy as np
 import pytest
 
 from harness.base.errors import RunFailed
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.mesh.chain import Chain
-from harness.simulation.clock import CALL, LEAST, SHARE, ClocksDisagree, Watch, measured_again, working
-from tests.scenes import first_problem, scene
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.simulation.clock import (
+    CALL_OVERHEAD_SECONDS,
+    CLOCK_ATOL_SECONDS,
+    CLOCK_RTOL,
+    ClockMismatch,
+    PhaseWatch,
+    check_phases,
+    retry_on_mismatch,
+)
+from tests.scenes import build_first_problem, build_test_scene
 
-SECOND = Watch(wall=1.0, entered=100, process=1.0, thread=1.0)
+SECOND = PhaseWatch(wall_seconds=1.0, num_entries=100, process_seconds=1.0, thread_seconds=1.0)
 """A second in which one thread computed all the time."""
 
-HALF_LOST = Watch(wall=1.0, entered=100, process=0.5, thread=0.5)
+HALF_LOST = PhaseWatch(wall_seconds=1.0, num_entries=100, process_seconds=0.5, thread_seconds=0.5)
 
 LIES = {
     "the solve is left out": (SECOND, 0.05),
@@ -37,21 +45,21 @@ LIES = {
 
 
 @pytest.mark.parametrize(("watch", "told"), LIES.values(), ids=LIES)
-def test_times_that_another_clock_did_not_see_are_refused(watch: Watch, told: float) -> None:
+def test_times_that_another_clock_did_not_see_are_refused(watch: PhaseWatch, told: float) -> None:
     with pytest.raises(RunFailed, match="the times of step add up to"):
-        watch.columns("step", [told / 4] * 4)
+        watch.build_columns("step", [told / 4] * 4)
 
 
 @pytest.mark.parametrize("lies", [0, 1, 2])
 def test_what_is_told_falsely_once_is_measured_again_and_twice_is_a_failure(lies: int) -> None:
     times = iter([1e-3] * lies + [1.0] * 3)
 
-    @measured_again
+    @retry_on_mismatch
     def measure(what: str) -> float:
-        return SECOND.columns(what, [next(times)])["summed_seconds"]
+        return SECOND.build_columns(what, [next(times)])["summed_seconds"]
 
     if lies == 2:
-        with pytest.raises(ClocksDisagree, match="the times of step"):
+        with pytest.raises(ClockMismatch, match="the times of step"):
             measure("step")
     else:
         assert measure("step") == 1.0
@@ -60,40 +68,51 @@ def test_what_is_told_falsely_once_is_measured_again_and_twice_is_a_failure(lies
 
 HONEST = {
     "to the last bit": (SECOND, 1.0),
-    "within three hundredths": (SECOND, 1.0 - 0.9 * SHARE),
-    "within a millisecond": (Watch(wall=2e-3, entered=1, process=2e-3, thread=2e-3), 2e-3 - 0.9 * LEAST),
-    "within what reading a clock takes": (Watch(wall=0.03, entered=1000, process=0.03, thread=0.03), 0.03 - 900 * CALL),
+    "within three hundredths": (SECOND, 1.0 - 0.9 * CLOCK_RTOL),
+    "within a millisecond": (
+        PhaseWatch(wall_seconds=2e-3, num_entries=1, process_seconds=2e-3, thread_seconds=2e-3),
+        2e-3 - 0.9 * CLOCK_ATOL_SECONDS,
+    ),
+    "within what reading a clock takes": (
+        PhaseWatch(wall_seconds=0.03, num_entries=1000, process_seconds=0.03, thread_seconds=0.03),
+        0.03 - 900 * CALL_OVERHEAD_SECONDS,
+    ),
     "a delay between two steps": (HALF_LOST, 0.6),
-    "two threads that take turns": (Watch(threads=2, wall=1.0, entered=1, process=1.1, thread=0.99), 1.0),
+    "two threads that take turns": (
+        PhaseWatch(num_threads=2, wall_seconds=1.0, num_entries=1, process_seconds=1.1, thread_seconds=0.99),
+        1.0,
+    ),
 }
 
 
 @pytest.mark.parametrize(("watch", "told"), HONEST.values(), ids=HONEST)
-def test_times_that_another_clock_saw_are_believed_and_both_are_told(watch: Watch, told: float) -> None:
-    columns = watch.columns("step", [told / 2] * 2)
+def test_times_that_another_clock_saw_are_believed_and_both_are_told(watch: PhaseWatch, told: float) -> None:
+    columns = watch.build_columns("step", [told / 2] * 2)
     assert columns == {
-        "pass_seconds": watch.wall,
+        "pass_seconds": watch.wall_seconds,
         "summed_seconds": told,
-        "cpu_seconds": watch.process,
+        "cpu_seconds": watch.process_seconds,
         "interrupted": watch is HALF_LOST,
     }
 
 
 def test_both_of_two_threads_that_were_stopped_for_half_the_time_are_found_out() -> None:
-    assert Watch(threads=2, wall=1.0, process=1.0, thread=0.5).columns("step", [1.0])["interrupted"]
+    assert PhaseWatch(num_threads=2, wall_seconds=1.0, process_seconds=1.0, thread_seconds=0.5).build_columns(
+        "step", [1.0]
+    )["interrupted"]
 
 
 def test_a_watch_adds_up_what_is_done_within_it_and_nothing_in_between() -> None:
-    watch = Watch()
+    watch = PhaseWatch()
     for _ in range(2):
         with watch:
             sleep(0.01)
         sleep(0.2)
-    assert watch.entered == 2
-    assert watch.wall >= 0.02
+    assert watch.num_entries == 2
+    assert watch.wall_seconds >= 0.02
     # A thread that sleeps takes no CPU time, but for waking up; others of this process may.
-    assert watch.thread <= 0.001
-    assert watch.lost == max(0.0, watch.wall - max(watch.thread, watch.process))
+    assert watch.thread_seconds <= 0.001
+    assert watch.preempted_seconds == max(0.0, watch.wall_seconds - max(watch.thread_seconds, watch.process_seconds))
 
 
 STOPPED = """
@@ -118,7 +137,9 @@ def test_a_process_that_was_stopped_says_so() -> None:
     assert float(lost) >= 0.09  # of 0.1: CPU time is known to some milliseconds, where a host counts it
 
 
-PROBLEM = first_problem(scene(Chain(), Gravity(), Pins(at=("first",), weight=1e4), size=4))
+PROBLEM = build_first_problem(
+    build_test_scene(ChainMesh(), GravityEffect(), PinsEffect(at=("first",), weight=1e4), size=4)
+)
 KEPT, UNTOUCHED = np.ones((2, 4, 3))
 
 
@@ -142,10 +163,10 @@ def prepared(call: Any) -> Any:
 
 @pytest.mark.parametrize("call", DOES.values(), ids=DOES)
 def test_a_phase_that_computes_is_timed(call: Any) -> None:
-    assert working(prepared(call), PROBLEM) == {"local": filled, "global": call}
+    assert check_phases(prepared(call), PROBLEM) == {"local": filled, "global": call}
 
 
 @pytest.mark.parametrize("call", DOES_NOT.values(), ids=DOES_NOT)
 def test_a_phase_that_computes_nothing_is_found_out(call: Any) -> None:
     with pytest.raises(RunFailed, match="the phase global does nothing"):
-        working(prepared(call), PROBLEM)
+        check_phases(prepared(call), PROBLEM)

@@ -14,8 +14,8 @@ import pytest
 from harness.base.errors import InputError
 from harness.config.sweep import RunSpec
 from harness.experiments import cluster
-from harness.experiments.cluster import WorkerFacts
-from solvers.plugins import Plugin
+from harness.experiments.cluster import WorkerInfo
+from solvers.plugins import PluginName
 
 
 class Workers:
@@ -31,34 +31,34 @@ class Workers:
 class Own(NamedTuple):
     """A run with somebody's own code."""
 
-    plugins: tuple[Plugin, ...]
+    plugins: tuple[PluginName, ...]
 
-    def own(self) -> list[Plugin]:
+    def own(self) -> list[PluginName]:
         return list(self.plugins)
 
 
-def machines(client: Workers, *plugins: Plugin, say: Callable[[str], None] = print) -> list[str]:
+def machines(client: Workers, *plugins: PluginName, say: Callable[[str], None] = print) -> list[str]:
     runs: Any = [Own(plugins)]
     asked: Any = client
-    return cluster.machines(asked, list[RunSpec](runs), say)
+    return cluster.check_workers(asked, list[RunSpec](runs), say)
 
 
 def test_workers_like_this_one_can_do_runs():
-    assert machines(Workers(None, None)) == [WorkerFacts.this().machine]
+    assert machines(Workers(None, None)) == [WorkerInfo.from_this_process().machine_id]
 
 
 @pytest.mark.parametrize("what", ["code", "python", "distributed"])
 def test_a_worker_of_another_version_is_refused_with_both(what: str):
-    other = WorkerFacts.this()._replace(**{what: "0.0.1"})
+    other = WorkerInfo.from_this_process()._replace(**{what: "0.0.1"})
     with pytest.raises(InputError) as refused:
         machines(Workers(None, (other, {})))
-    for part in ("tcp://worker-1:1", f"{what} 0.0.1", str(getattr(WorkerFacts.this(), what))):
+    for part in ("tcp://worker-1:1", f"{what} 0.0.1", str(getattr(WorkerInfo.from_this_process(), what))):
         assert part in str(refused.value)
     assert "worker-0" not in str(refused.value)
 
 
 def test_a_worker_without_a_plug_in_is_named_with_it(tmp_path: Path):
-    mine = Plugin("./mine.py:Mine", f"{tmp_path}/mine.py:Mine", "mine", "1", "")
+    mine = PluginName("./mine.py:Mine", f"{tmp_path}/mine.py:Mine", "mine", "1", "")
     with pytest.raises(InputError) as refused:
         machines(Workers(None), mine)
     assert "worker-0" in str(refused.value)
@@ -72,7 +72,9 @@ def test_a_worker_that_cannot_be_asked_is_told():
 
 def test_a_worker_that_is_lost_meanwhile_is_no_mistake():
     told: list[str] = []
-    assert machines(Workers(None, OSError("Stream is closed")), say=told.append) == [WorkerFacts.this().machine]
+    assert machines(Workers(None, OSError("Stream is closed")), say=told.append) == [
+        WorkerInfo.from_this_process().machine_id
+    ]
     assert "worker-1" in told[0]
     with pytest.raises(InputError, match="all workers were lost"):
         machines(Workers(OSError("Stream is closed")))
@@ -81,7 +83,7 @@ def test_a_worker_that_is_lost_meanwhile_is_no_mistake():
 @pytest.mark.parametrize(("off", "words"), [(3600.0, "ahead"), (-3600.0, "behind"), (1.0, "")])
 def test_clocks_that_differ_are_said(off: float, words: str):
     told: list[str] = []
-    machines(Workers((WorkerFacts.this()._replace(clock=time() + off), {})), say=told.append)
+    machines(Workers((WorkerInfo.from_this_process()._replace(clock_seconds=time() + off), {})), say=told.append)
     assert [words in line for line in told] == [True] * bool(words)
 
 
@@ -97,7 +99,7 @@ def test_clocks_that_differ_are_said(off: float, words: str):
 def test_where_there_is_no_cluster_that_is_said(on: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr(cluster, "PATIENCE", 0.3)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=said), cluster.cluster(on, [], print):
+    with pytest.raises(InputError, match=said), cluster.connect_cluster(on, [], print):
         pass
 
 
@@ -115,5 +117,5 @@ def test_a_batch_system_that_is_not_there_is_said(
     hand = SimpleNamespace(job_cls=SimpleNamespace(submit_command="submit-by-hand --now"))
     monkeypatch.setitem(sys.modules, "dask_jobqueue", SimpleNamespace(HANDCluster=hand))
     (tmp_path / "batch.yaml").write_text(described)
-    with pytest.raises(InputError, match=said), cluster.cluster(str(tmp_path / "batch.yaml"), [], print):
+    with pytest.raises(InputError, match=said), cluster.connect_cluster(str(tmp_path / "batch.yaml"), [], print):
         pass

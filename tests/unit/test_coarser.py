@@ -7,60 +7,60 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness.config.load import load_any
-from harness.scenes.bind import build
-from harness.simulation.coarser import interpolation
-from harness.simulation.step import prepare, problem, simulate, start
+from harness.config.load import load_config
+from harness.scenes.bind import build_scene
+from harness.simulation.coarser import build_interpolation
+from harness.simulation.step import build_initial_state, build_problem, prepare, simulate_scene
 from solvers.methods.lbfgs import Lbfgs
 from solvers.problem import StopRule, Unsupported
-from tests.scenes import CLOTH_FILE
+from tests.scenes import CLOTH_SCENE_YAML
 
 
 def made(folder, mesh="{kind: grid}", pins="at: [top_corners]", size=21, integrator="implicit-euler"):
     path = folder / "cloth.yaml"
-    text = CLOTH_FILE.replace("{kind: grid}", mesh).replace("at: [top_corners]", pins).replace("300", "3000")
+    text = CLOTH_SCENE_YAML.replace("{kind: grid}", mesh).replace("at: [top_corners]", pins).replace("300", "3000")
     path.write_text(text, encoding="utf-8")
-    (run,) = load_any(path, solvers=["lbfgs"], sizes=[size]).runs()
-    return build(run.scene, size, integrator)
+    (run,) = load_config(path, solvers=["lbfgs"], sizes=[size]).list_runs()
+    return build_scene(run.scene, size, integrator)
 
 
 @pytest.mark.parametrize("mesh", ["{kind: chain}", "{kind: grid}", "{kind: net}", "{kind: block}"])
 def test_affine_motions_pass_between_meshes_without_change(tmp_path, mesh):
     pins = "every: 1000"
-    fine, coarse = (made(tmp_path, mesh, pins, size).mesh.rest for size in (12, 5))
+    fine, coarse = (made(tmp_path, mesh, pins, size).mesh.rest_positions for size in (12, 5))
     rng = np.random.default_rng(0)
     turn, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
     for known, wanted in ((fine, coarse), (coarse, fine)):
-        weights = interpolation(known, wanted)
+        weights = build_interpolation(known, wanted)
         np.testing.assert_allclose(weights @ (known @ turn + shift), wanted @ turn + shift, rtol=0, atol=1e-9)
 
 
 def test_vertices_that_both_meshes_have_keep_their_values(tmp_path):
-    fine, coarse = (made(tmp_path, size=size).mesh.rest for size in (9, 5))
+    fine, coarse = (made(tmp_path, size=size).mesh.rest_positions for size in (9, 5))
     value = np.random.default_rng(0).normal(size=len(fine))
     where = [int(np.linalg.norm(fine - x, axis=1).argmin()) for x in coarse]
-    np.testing.assert_allclose(interpolation(fine, coarse) @ value, value[where], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(build_interpolation(fine, coarse) @ value, value[where], rtol=0, atol=1e-6)
 
 
 def test_the_guess_is_nearer_to_the_minimum_and_saves_iterations(tmp_path):
     scene = made(tmp_path)
-    state, ready = start(scene), prepare(scene, Lbfgs())
-    current, coarse = (problem(scene, state, guess) for guess in ("current", "coarse"))
-    np.testing.assert_array_equal(coarse.first_guess[scene.system.pins.vertices], coarse.pin_targets)
+    state, ready = build_initial_state(scene), prepare(scene, Lbfgs())
+    current, coarse = (build_problem(scene, state, guess) for guess in ("current", "coarse"))
+    np.testing.assert_array_equal(coarse.initial_guess[scene.system.pins.vertices], coarse.pin_targets)
     wanted = ready.solve(current, StopRule(2000, 1e-8)).positions
-    away = [np.abs(stated.first_guess - wanted).max() for stated in (current, coarse)]
+    away = [np.abs(stated.initial_guess - wanted).max() for stated in (current, coarse)]
     assert away[1] <= 0.3 * away[0]
     first, second = (ready.solve(stated, StopRule(2000, 1e-3)) for stated in (current, coarse))
-    assert first.stopped == second.stopped == "tolerance"
-    assert second.iterations < first.iterations
-    np.testing.assert_array_equal(coarse.first_guess, problem(scene, state, "coarse").first_guess)
+    assert first.termination_reason == second.termination_reason == "tolerance"
+    assert second.num_iterations < first.num_iterations
+    np.testing.assert_array_equal(coarse.initial_guess, build_problem(scene, state, "coarse").initial_guess)
 
 
 def test_it_goes_on_from_step_to_step(tmp_path):
     scene = made(tmp_path, integrator="bdf2")
     rule, ready = StopRule(2000, 1e-4), prepare(scene, Lbfgs())
-    runs = [list(simulate(scene, ready, rule, first_guess=guess, frames=3)) for guess in ("current", "coarse")]
-    assert {step.solution.stopped for steps in runs for step in steps} == {"tolerance"}
+    runs = [list(simulate_scene(scene, ready, rule, initial_guess=guess, frames=3)) for guess in ("current", "coarse")]
+    assert {step.solution.termination_reason for steps in runs for step in steps} == {"tolerance"}
     # It falls by 15 cm, and wrinkles of some millimetres choose their side by the guess.
     np.testing.assert_allclose(*(steps[-1].positions for steps in runs), rtol=0, atol=5e-3)
 
@@ -79,10 +79,10 @@ def test_it_goes_on_from_step_to_step(tmp_path):
 def test_where_there_is_no_coarser_mesh_it_is_refused(tmp_path, given, why):
     scene = made(tmp_path, **given)
     with pytest.raises(Unsupported, match=why):
-        problem(scene, start(scene), "coarse")
+        build_problem(scene, build_initial_state(scene), "coarse")
 
 
 def test_a_scene_of_one_size_has_none(tmp_path):
-    scene = replace(made(tmp_path), halved=None)
+    scene = replace(made(tmp_path), build_coarser=None)
     with pytest.raises(Unsupported, match="the mesh is from a file"):
-        problem(scene, start(scene), "coarse")
+        build_problem(scene, build_initial_state(scene), "coarse")

@@ -7,7 +7,7 @@ import pytest
 
 from solvers.core import colouring
 from tests.networks import grid_springs
-from tests.scenes import SCENES, random_network
+from tests.scenes import SCENE_BUILDERS, build_random_network
 
 
 def star(n: int) -> np.ndarray:
@@ -23,19 +23,21 @@ NETWORKS = {
     "twins and loops": (np.array([[0, 1], [1, 0], [2, 2], [1, 2], [0, 1]]), 4),
     "grid with diagonals": (grid_springs(9, 7), 63),
     "solid": (grid_springs(5, 4, 3), 60),
-    "random": (random_network(np.random.default_rng(0), 40, 200)[1].edges, 40),
-    "cloth with shear and bending": (SCENES["cloth"](1e10).springs.edges, 64),
+    "random": (build_random_network(np.random.default_rng(0), 40, 200)[1].edges, 40),
+    "cloth with shear and bending": (SCENE_BUILDERS["cloth"](1e10).all_springs.edges, 64),
 }
 networks = pytest.mark.parametrize(("edges", "n"), NETWORKS.values(), ids=list(NETWORKS))
 
 
 def parts(coloured: colouring.Colouring) -> list[np.ndarray]:
-    return [coloured.order[a:b] for a, b in zip(coloured.start[:-1], coloured.start[1:], strict=True)]
+    return [
+        coloured.item_order[a:b] for a, b in zip(coloured.colour_starts[:-1], coloured.colour_starts[1:], strict=True)
+    ]
 
 
 @networks
 def test_no_two_springs_of_a_colour_share_a_vertex(edges, n):
-    for part in parts(colouring.of_springs(edges, n)):
+    for part in parts(colouring.colour_springs(edges, n)):
         ends = edges[part]
         ends = ends[ends[:, 0] != ends[:, 1]]  # a loop moves nothing
         assert len(np.unique(ends)) == ends.size
@@ -43,15 +45,15 @@ def test_no_two_springs_of_a_colour_share_a_vertex(edges, n):
 
 @networks
 def test_no_two_vertices_of_a_colour_share_a_spring(edges, n):
-    for part in parts(colouring.of_vertices(edges, n)):
+    for part in parts(colouring.colour_vertices(edges, n)):
         both = np.isin(edges, part).all(axis=1)
         assert (edges[both, 0] == edges[both, 1]).all()
 
 
 @networks
 def test_every_one_has_one_colour_and_no_colour_is_empty(edges, n):
-    for coloured, count in ((colouring.of_springs(edges, n), len(edges)), (colouring.of_vertices(edges, n), n)):
-        assert sorted(coloured.order) == list(range(count))
+    for coloured, count in ((colouring.colour_springs(edges, n), len(edges)), (colouring.colour_vertices(edges, n), n)):
+        assert sorted(coloured.item_order) == list(range(count))
         assert all(len(part) and (np.diff(part) > 0).all() for part in parts(coloured))
 
 
@@ -61,20 +63,20 @@ def test_there_are_no_more_colours_than_greedy_may_need(edges, n):
     degree = np.bincount(proper.ravel(), minlength=n).max(initial=0)
     neighbours = np.unique(np.concatenate([proper, proper[:, ::-1]]), axis=0)
     most = np.bincount(neighbours[:, 0], minlength=n).max(initial=0)
-    assert colouring.of_springs(edges, n).colours <= max(1, 2 * degree - 1)
-    assert colouring.of_vertices(edges, n).colours <= most + 1
+    assert colouring.colour_springs(edges, n).num_colours <= max(1, 2 * degree - 1)
+    assert colouring.colour_vertices(edges, n).num_colours <= most + 1
 
 
 @pytest.mark.parametrize(("name", "springs", "vertices"), [("chain", 2, 2), ("star", 499, 2)])
 def test_what_has_few_colours_gets_no_more(name, springs, vertices):
     edges, n = NETWORKS[name]
-    assert colouring.of_springs(edges, n).colours == springs
-    assert colouring.of_vertices(edges, n).colours == vertices
+    assert colouring.colour_springs(edges, n).num_colours == springs
+    assert colouring.colour_vertices(edges, n).num_colours == vertices
 
 
 def test_equal_networks_get_equal_colours():
     edges, n = NETWORKS["random"]
-    for colours in (colouring.of_springs, colouring.of_vertices):
+    for colours in (colouring.colour_springs, colouring.colour_vertices):
         one, two = colours(edges, n), colours(edges.copy(), n)
-        np.testing.assert_array_equal(one.order, two.order)
-        np.testing.assert_array_equal(one.start, two.start)
+        np.testing.assert_array_equal(one.item_order, two.item_order)
+        np.testing.assert_array_equal(one.colour_starts, two.colour_starts)

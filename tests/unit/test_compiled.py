@@ -15,19 +15,19 @@ from numba import types
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 
-from solvers.core.compiled import PreparedCompiled
+from solvers.core.compiled import PreparedCompiledLocalGlobal
 from solvers.energies.springs import Springs
 from solvers.kernels import plan
-from solvers.kernels.springs import Bundles, aligned, project
-from solvers.linear.choice import Linear, Precision
-from solvers.matrices import assemble, energy_norm
+from solvers.kernels.springs import SpringPackets, allocate_aligned, run_local_step
+from solvers.linear.choice import LinearSolverName, Precision
+from solvers.matrices import assemble_system_matrix, energy_norm
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, StepProblem, StopRule
-from solvers.vectors.springs import WIDE, Eights
-from tests.scenes import THREADS, cloth, first_problem, random_network, random_problem
+from solvers.vectors.springs import PACKET_TYPE, PacketBuilder
+from tests.scenes import THREAD_COUNT, build_cloth, build_first_problem, build_random_network, build_random_problem
 
-LINEAR: tuple[Linear, ...] = ("inverse", "supernodal")
+LINEAR: tuple[LinearSolverName, ...] = ("inverse", "supernodal")
 PRECISIONS: tuple[Precision, ...] = ("float64", "float32", "float16")
 DIRECT = [CompiledLocalGlobal(linear, precision) for linear in LINEAR for precision in PRECISIONS]
 """The linear solvers whose panels the step goes through, in every precision."""
@@ -51,12 +51,12 @@ def iterates(prepared, problem: StepProblem, count: int) -> list[Positions]:
 def local(springs: Springs, p: Positions, y: Positions) -> Positions:
     """The local step by the kernel, over all vertices."""
     n = len(p)
-    bundles, _ = Bundles.of(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
-    x, b = (aligned(4 * (n + 2)) for _ in range(2))
+    bundles, _ = SpringPackets.from_springs(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
+    x, b = (allocate_aligned(4 * (n + 2)) for _ in range(2))
     x[4 * (n + 1)] = 1e100
-    zero = bundles.right(np.zeros(n + 2))
+    zero = bundles.build_right_hand_side(np.zeros(n + 2))
     out = np.empty_like(p)
-    project(bundles, p, y, x, b, zero, out)
+    run_local_step(bundles, p, y, x, b, zero, out)
     return out
 
 
@@ -64,7 +64,7 @@ def local(springs: Springs, p: Positions, y: Positions) -> Positions:
 def test_the_local_step_is_that_of_the_energy(seed, scale):
     rng = np.random.default_rng(seed)
     n, m = int(rng.integers(1, 40)), int(rng.integers(0, 200))
-    _, springs = random_network(rng, n, m)
+    _, springs = build_random_network(rng, n, m)
     p, y = scale * rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
     p[rng.random(n) < 0.2] = p[0]  # springs of no length beside others
     wanted = y.copy()
@@ -75,12 +75,12 @@ def test_the_local_step_is_that_of_the_energy(seed, scale):
 
 def test_springs_keep_their_weights_and_equal_ones_share_them():
     rng = np.random.default_rng(0)
-    for springs in (random_network(rng, 30, 90)[1], cloth(40).springs):
+    for springs in (build_random_network(rng, 30, 90)[1], build_cloth(40).all_springs):
         n = int(springs.edges.max()) + 1
-        bundles, _ = Bundles.of(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
-        pull, k = bundles.each()
-        used = bundles.neighbour != 4 * (n + 1)
-        name = np.maximum(bundles.spring, ~bundles.spring)[used]
+        bundles, _ = SpringPackets.from_springs(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
+        pull, k = bundles.entry_weights()
+        used = bundles.neighbour_offset != 4 * (n + 1)
+        name = np.maximum(bundles.spring_index, ~bundles.spring_index)[used]
         np.testing.assert_array_equal(k[used], springs.stiffness[name])
         np.testing.assert_array_equal(pull[used], springs.stiffness[name] * springs.rest_length[name])
     assert len(bundles.weights) < 0.2 * len(pull)  # a cloth's springs are of two kinds, in a few orders
@@ -88,7 +88,7 @@ def test_springs_keep_their_weights_and_equal_ones_share_them():
 
 def test_positions_that_are_not_numbers_stay_so_where_they_are_and_at_their_neighbours():
     rest = np.arange(12.0).reshape(4, 3)
-    springs = Springs.at_rest(rest, np.array([[0, 1], [1, 2], [2, 3]]), np.ones(3))
+    springs = Springs.from_rest_shape(rest, np.array([[0, 1], [1, 2], [2, 3]]), np.ones(3))
     rest[0] = np.nan
     assert np.isnan(local(springs, rest, np.zeros((4, 3)))).any(axis=1).tolist() == [True, True, False, False]
 
@@ -98,12 +98,14 @@ def inverse_roots(estimates: bool):
 
     def declare(typingctx, s, out):
         def generate(context, builder, signature, args):
-            v = Eights(context, builder)
-            v.wide = estimates
+            v = PacketBuilder(context, builder)
+            v.has_avx512 = estimates
             s, out = (
                 context.make_array(kind)(context, builder, x).data for kind, x in zip(signature.args, args, strict=True)
             )
-            v.builder.store(v.inverse_root(v.load(s, WIDE)), builder.bitcast(out, WIDE.as_pointer()), align=8)
+            v.builder.store(
+                v.inverse_sqrt(v.load(s, PACKET_TYPE)), builder.bitcast(out, PACKET_TYPE.as_pointer()), align=8
+            )
             return context.get_dummy_value()
 
         return types.void(s, out), generate
@@ -112,7 +114,7 @@ def inverse_roots(estimates: bool):
     return numba.njit(lambda s, out: root(s, out))  # noqa: TID251
 
 
-ESTIMATES = Eights(cpu_target.target_context, None).wide
+ESTIMATES = PacketBuilder(cpu_target.target_context, None).has_avx512
 
 
 @pytest.mark.parametrize("estimates", [False, True] if ESTIMATES else [False])
@@ -124,10 +126,10 @@ def test_inverse_roots_are_right_to_the_last_digit(estimates):
 
 
 PROBLEMS = {
-    "cloth": lambda: first_problem(cloth(8)),
-    "cloth, exact pins": lambda: first_problem(cloth(8, "exact")),
-    "random": lambda: random_problem(0, weights=(1e4, np.inf, 1e2)),
-    "random, not pinned": lambda: random_problem(1, weights=()),
+    "cloth": lambda: build_first_problem(build_cloth(8)),
+    "cloth, exact pins": lambda: build_first_problem(build_cloth(8, "exact")),
+    "random": lambda: build_random_problem(0, weights=(1e4, np.inf, 1e2)),
+    "random, not pinned": lambda: build_random_problem(1, weights=()),
 }
 problems = pytest.mark.parametrize("name", PROBLEMS)
 
@@ -147,11 +149,11 @@ def test_every_precision_ends_where_float64_ends(solver, name):
 @pytest.mark.parametrize("start", [1.0, 0.0], ids=["from the guess", "from one point"])
 def test_the_energy_never_rises_with_a_rounded_factor(solver, name, start):
     problem = PROBLEMS[name]()
-    problem = replace(problem, first_guess=start * problem.first_guess)
+    problem = replace(problem, initial_guess=start * problem.initial_guess)
     iterated = iterates(solver.prepare(problem.system), problem, 60)
     for before, after in pairwise(iterated):
         # A hundred terms' round-off. The rounded factor still majorises: nothing is added for it.
-        assert problem.value(after) <= problem.value(before) + 1e-13 * problem.magnitude(before)
+        assert problem.value(after) <= problem.value(before) + 1e-13 * problem.value_scale(before)
     assert problem.value(iterated[-1]) < problem.value(iterated[0])
 
 
@@ -159,7 +161,7 @@ def test_the_energy_never_rises_with_a_rounded_factor(solver, name, start):
 @problems
 def test_collapsed_positions_come_apart_as_in_the_sparse_backend(solver, name):
     problem = PROBLEMS[name]()
-    problem = replace(problem, first_guess=np.zeros_like(problem.target))
+    problem = replace(problem, initial_guess=np.zeros_like(problem.inertial_target))
     wanted = iterates(SparseLocalGlobal().prepare(problem.system), problem, 1)[0]
     found = iterates(solver.prepare(problem.system), problem, 1)[0]
     assert np.abs(found - wanted).max() <= 1e-10 * np.abs(wanted).max()  # a solve, by the condition of Q
@@ -169,14 +171,17 @@ def test_collapsed_positions_come_apart_as_in_the_sparse_backend(solver, name):
 @pytest.mark.parametrize("size", [3000, 30_000], ids="blocks of {} bytes".format)
 def test_blocks_change_nothing_but_the_order_of_work(solver, size, monkeypatch):
     """A sheet large enough for groups, in one block each and in many, with one thread and two."""
-    problem = first_problem(cloth(60))
+    problem = build_first_problem(build_cloth(60))
     whole = solver.prepare(problem.system)
     monkeypatch.setattr(plan, "BLOCK_BYTES", size)
     cut = solver.prepare(problem.system)
-    assert isinstance(cut, PreparedCompiled)
-    assert isinstance(whole, PreparedCompiled)
-    assert len(cut.plan.blocks) > 10 > len(whole.plan.blocks)
-    downs, ups = (cut.plan.visits[cut.plan.visits & 1 == side] >> 1 for side in (plan.DOWN, plan.UP))
+    assert isinstance(cut, PreparedCompiledLocalGlobal)
+    assert isinstance(whole, PreparedCompiledLocalGlobal)
+    assert len(cut.iteration_plan.block_table) > 10 > len(whole.iteration_plan.block_table)
+    downs, ups = (
+        cut.iteration_plan.visit_schedule[cut.iteration_plan.visit_schedule & 1 == side] >> 1
+        for side in (plan.VISIT_DOWN, plan.VISIT_UP)
+    )
     assert sorted(downs) == list(ups)  # the blocks of all groups, once each way
     assert (np.diff(downs) < 0).any()  # some lie above others
     expected = whole.solve(problem, StopRule(12)).positions
@@ -186,11 +191,11 @@ def test_blocks_change_nothing_but_the_order_of_work(solver, size, monkeypatch):
     np.testing.assert_array_equal(found, iterates(cut, problem, 12)[-1])
 
 
-@pytest.mark.skipif(THREADS < 2, reason="Numba was started with one thread")
+@pytest.mark.skipif(THREAD_COUNT < 2, reason="Numba was started with one thread")
 @pytest.mark.parametrize("solver", DIRECT[3:], ids=named)
 @pytest.mark.parametrize("stop", [StopRule(10), StopRule(200, 0.3)], ids=["count", "tolerance"])
 def test_the_bits_do_not_depend_on_the_number_of_threads(solver, stop):
-    problem = first_problem(cloth(60))
+    problem = build_first_problem(build_cloth(60))
     before, found = numba.get_num_threads(), []
     try:
         for threads in (1, 2):
@@ -204,7 +209,7 @@ def test_the_bits_do_not_depend_on_the_number_of_threads(solver, stop):
 
 def test_a_small_system_keeps_to_one_thread_and_says_so(monkeypatch):
     monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
-    small, large = (CompiledLocalGlobal().prepare(cloth(size).system).choice for size in (12, 60))
+    small, large = (CompiledLocalGlobal().prepare(build_cloth(size).system).description for size in (12, 60))
     assert small.endswith("; 1 of 2 threads: the system is too small for a second thread to pay")
     assert "threads" not in large
 
@@ -216,33 +221,33 @@ def test_the_residual_is_measured_over_the_vertices_that_no_pin_holds(solver, na
     system = problem.system
     prepared = solver.prepare(system)
     before, after = iterates(prepared, problem, 5)[-2:]
-    Q = assemble(system, [e for e in system.energies if isinstance(e, Springs)])
-    e = np.where(system.unpinned[:, None], after - before, 0.0)
+    Q = assemble_system_matrix(system, [e for e in system.energies if isinstance(e, Springs)])
+    e = np.where(system.unpinned_mask[:, None], after - before, 0.0)
     solution = prepared.solve(problem, StopRule(5))
     assert solution.residual == pytest.approx(energy_norm(Q, e), rel=1e-6)  # half the digits, or those of a correction
 
 
 def test_no_iteration_is_the_first_guess():
-    problem = random_problem(2)
+    problem = build_random_problem(2)
     for solver in DIRECT:
         solution = solver.prepare(problem.system).solve(problem, StopRule(0))
-        soft = problem.system.free
-        np.testing.assert_array_equal(solution.positions[soft], problem.first_guess[soft])
-        assert solution.iterations == 0
+        soft = problem.system.free_vertices
+        np.testing.assert_array_equal(solution.positions[soft], problem.initial_guess[soft])
+        assert solution.num_iterations == 0
         assert np.isnan(solution.residual)
 
 
 def test_all_vertices_may_be_pinned_exactly():
-    problem = random_problem(3, n=4, m=8, weights=(np.inf,) * 4)
+    problem = build_random_problem(3, n=4, m=8, weights=(np.inf,) * 4)
     for solver in DIRECT:
         found = solver.prepare(problem.system).solve(problem, StopRule(3)).positions
         np.testing.assert_array_equal(found, problem.pin_targets)
 
 
 def test_a_prepared_solver_says_what_it_chose_and_counts_it():
-    system = first_problem(cloth(8)).system
+    system = build_first_problem(build_cloth(8)).system
     for solver in DIRECT:
         prepared = solver.prepare(system)
-        assert prepared.choice.startswith(solver.linear)
-        assert prepared.facts["panel_bytes"] > 0
-        assert prepared.facts["flops_per_solve"] > 0
+        assert prepared.description.startswith(solver.linear)
+        assert prepared.stats["panel_bytes"] > 0
+        assert prepared.stats["flops_per_solve"] > 0

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import Field
 
-from harness.base.document import Document, Key, key_text, quote
+from harness.base.document import ConfigDocument, ConfigKey, format_key, quote_value
 from harness.base.errors import InputError
-from harness.base.model import Model, Vector
+from harness.base.model import ConfigModel, Vector3
 from harness.base.yaml import read_yaml
 
 VALUES = {
@@ -39,7 +39,7 @@ VALUES = {
 }
 
 
-def read(folder: Path, text: str) -> Document:
+def read(folder: Path, text: str) -> ConfigDocument:
     path = folder / "config.yaml"
     path.write_text(text, encoding="utf-8")
     return read_yaml(path)
@@ -61,7 +61,7 @@ def test_a_number_that_is_not_finite_is_read_and_left_to_the_model_to_refuse(tmp
 
 def test_every_key_and_item_knows_its_line(tmp_path: Path) -> None:
     lines = read(tmp_path, "a: 1\n\nb:\n  - c: 2\n    d: 3\n  -\n    5\n").lines
-    assert {key_text(key): line for key, line in lines.items() if key} == {
+    assert {format_key(key): line for key, line in lines.items() if key} == {
         "a": 1,
         "b": 3,
         "b[0]": 4,
@@ -79,24 +79,24 @@ def test_a_byte_order_mark_is_passed_over(tmp_path: Path) -> None:
     assert read(tmp_path, "\ufeffa: 1\n").data == {"a": 1}
 
 
-class Inner(Model):
+class Inner(ConfigModel):
     width: float = 1.0
 
 
-class Ball(Model):
+class Ball(ConfigModel):
     kind: Literal["ball"] = "ball"
     radius: float = 1.0
 
 
-class Brick(Model):
+class Brick(ConfigModel):
     kind: Literal["brick"] = "brick"
-    sides: Vector = (1.0, 1.0, 1.0)
+    sides: Vector3 = (1.0, 1.0, 1.0)
 
 
-class Outer(Model):
+class Outer(ConfigModel):
     count: int
     toy: tuple[Annotated[Ball | Brick, Field(discriminator="kind")], ...] = ()
-    place: Vector = (0.0, 0.0, 0.0)
+    place: Vector3 = (0.0, 0.0, 0.0)
     weight: float | Literal["exact"] = 1.0
     inner: Inner | None = None
 
@@ -140,21 +140,21 @@ CHECKS: dict[str, tuple[dict[str, Any], list[str]]] = {
 @pytest.mark.parametrize("case", CHECKS)
 def test_each_mistake_names_its_key_and_the_nearest_line(case: str) -> None:
     data, expected = CHECKS[case]
-    lines: dict[Key, int] = {("part", "count"): 5} if "count" in data else {}
-    document = Document(Path("c.yaml"), {"part": data}, {(): 1, ("part",): 4, **lines})
-    assert document.check(Outer, data, ("part",)) is None
-    assert list(map(str, document.error().mistakes)) == expected
+    lines: dict[ConfigKey, int] = {("part", "count"): 5} if "count" in data else {}
+    document = ConfigDocument(Path("c.yaml"), {"part": data}, {(): 1, ("part",): 4, **lines})
+    assert document.validate_data(Outer, data, ("part",)) is None
+    assert list(map(str, document.build_error().mistakes)) == expected
 
 
 def test_a_sound_mapping_becomes_its_model() -> None:
-    document = Document(Path("c.yaml"), {})
-    outer = document.check(Outer, {"count": 3, "place": [0, 1, 2], "weight": "exact", "inner": {"width": 2}})
+    document = ConfigDocument(Path("c.yaml"), {})
+    outer = document.validate_data(Outer, {"count": 3, "place": [0, 1, 2], "weight": "exact", "inner": {"width": 2}})
     assert outer == Outer(count=3, place=(0.0, 1.0, 2.0), weight="exact", inner=Inner(width=2.0))
     assert not document.mistakes
 
 
 def test_a_long_value_is_quoted_short() -> None:
-    assert quote("x" * 1000) == '"' + "x" * 56 + "..."
+    assert quote_value("x" * 1000) == '"' + "x" * 56 + "..."
 
 
 def test_aliases_that_multiply_are_refused_before_they_fill_the_memory(tmp_path: Path) -> None:

@@ -7,22 +7,22 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from harness.scenes.effects.ether_drag import EtherDrag
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.self_contact import SelfContact
-from harness.scenes.effects.springs import Springs
-from harness.scenes.effects.surface_contact import SurfaceContact
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.mesh.stack import Stack
-from harness.scenes.obstacles import Plane
-from harness.simulation.step import State, prepare, simulate, start
+from harness.scenes.effects.ether_drag import EtherDragEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.self_contact import SelfContactEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.effects.surface_contact import SurfaceContactEffect
+from harness.scenes.mesh.grid import GridMesh
+from harness.scenes.mesh.stack import StackMesh
+from harness.scenes.obstacles import PlaneObstacle
+from harness.simulation.step import MotionState, build_initial_state, prepare, simulate_scene
 from solvers.contact.self_contact import SelfContact as Energy
 from solvers.integrators import Motion
-from solvers.methods.newton import Newton
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import StopRule
-from tests.contact_refinement import apart, fallen
-from tests.scenes import scene
+from tests.contact_refinement import simulate_fall, successive_distances
+from tests.scenes import build_test_scene
 
 MU, DT, G = 0.4, 0.01, 9.81
 
@@ -31,13 +31,15 @@ def slide(tangent: float, frames: int) -> tuple[np.ndarray, float]:
     """How fast a sheet slides down a sheet that lies on a slope, at the end of each step [m/s], and how it should
     accelerate."""
     angle = np.arctan(tangent)
-    down = Gravity(acceleration=(G * np.sin(angle), -G * np.cos(angle), 0.0))
-    two, rough = Stack(width=0.2, height=0.2, apart=0.0202), SelfContact(thickness=0.01, friction=MU)
-    lies = Pins(at=("lowest",))
-    made = scene(two, Springs(stretch=100.0, shear=20.0), down, lies, rough, size=3, time_step=DT)
+    down = GravityEffect(acceleration=(G * np.sin(angle), -G * np.cos(angle), 0.0))
+    two, rough = StackMesh(width=0.2, height=0.2, apart=0.0202), SelfContactEffect(thickness=0.01, friction=MU)
+    lies = PinsEffect(at=("lowest",))
+    made = build_test_scene(two, SpringsEffect(stretch=100.0, shear=20.0), down, lies, rough, size=3, time_step=DT)
     upper = made.mesh.parts["highest"]
-    steps = simulate(made, prepare(made, Newton()), StopRule(100, 1e-6), first_guess="motion", frames=frames)
-    speeds = np.array([step.state.now.velocity[upper, 0].mean() for step in steps])
+    steps = simulate_scene(
+        made, prepare(made, NewtonSolver()), StopRule(100, 1e-6), initial_guess="motion", frames=frames
+    )
+    speeds = np.array([step.state.motion.velocity[upper, 0].mean() for step in steps])
     return speeds, G * float(np.sin(angle) - MU * np.cos(angle))
 
 
@@ -53,28 +55,36 @@ def test_a_sheet_on_a_sheet_slides_above_the_angle_of_friction_and_rests_below_w
 
 @pytest.mark.long
 def test_it_converges_as_its_thickness_shrinks_and_as_its_barrier_stiffens():
-    thinner = apart([fallen(t, 100.0) for t in (0.02, 0.01, 0.005, 0.0025)])
+    thinner = successive_distances([simulate_fall(t, 100.0) for t in (0.02, 0.01, 0.005, 0.0025)])
     for one, next_ in pairwise(thinner):
         assert one / next_ == pytest.approx(2.0, rel=0.1)  # order 1
-    stiffer = apart([fallen(0.02, k) for k in (1e2, 1.6e3, 2.56e4, 4.096e5)])
+    stiffer = successive_distances([simulate_fall(0.02, k) for k in (1e2, 1.6e3, 2.56e4, 4.096e5)])
     assert stiffer[0] > 1.5 * stiffer[1] > 3.0 * stiffer[2]
 
 
 @pytest.mark.long
 def test_a_cloth_that_is_dropped_onto_itself_loses_energy_and_comes_to_rest():
-    floor = SurfaceContact(thickness=0.01, obstacles=(Plane(point=(0.0, -0.45, 0.0)),))
-    acts = Springs(stretch=100.0, shear=20.0), Gravity(), EtherDrag(rate=3.0), SelfContact(thickness=0.01), floor
-    made = scene(Grid(plane="vertical", width=0.2, height=0.4), *acts, size=4)
-    p, mass = start(made).now.positions, made.system.mass
-    shaken = State(Motion(p, 0.3 * np.random.default_rng(0).normal(size=p.shape)), None, 0)
+    floor = SurfaceContactEffect(thickness=0.01, obstacles=(PlaneObstacle(point=(0.0, -0.45, 0.0)),))
+    acts = (
+        SpringsEffect(stretch=100.0, shear=20.0),
+        GravityEffect(),
+        EtherDragEffect(rate=3.0),
+        SelfContactEffect(thickness=0.01),
+        floor,
+    )
+    made = build_test_scene(GridMesh(plane="vertical", width=0.2, height=0.4), *acts, size=4)
+    p, mass = build_initial_state(made).motion.positions, made.system.mass
+    shaken = MotionState(Motion(p, 0.3 * np.random.default_rng(0).normal(size=p.shape)), None, 0)
     energy, pressed, far, before = list[float](), list[int](), np.inf, p
     rule = StopRule(300, 1e-10)
-    for step in simulate(made, prepare(made, Newton()), rule, first_guess="current", frames=300, state=shaken):
-        p, v = step.positions, step.state.now.velocity
+    for step in simulate_scene(
+        made, prepare(made, NewtonSolver()), rule, initial_guess="current", frames=300, initial_state=shaken
+    ):
+        p, v = step.positions, step.state.motion.velocity
         parts = [one.value(p) for one in step.problem.energies]
         energy.append(sum(parts) + 0.5 * float(mass @ (v * v).sum(axis=1)) + G * float(mass @ p[:, 1]))
         (own,) = (e for e in step.problem.energies if isinstance(e, Energy))
-        pressed.append(len(own.blocks(p).vertices))
+        pressed.append(len(own.hessian_blocks(p).vertices))
         far, before = float(np.abs(p - before).max()), p.copy()
     # The last impact: when the number of pairs in range grew last.
     last = max(k for k in range(1, len(pressed)) if pressed[k] > pressed[k - 1])

@@ -7,109 +7,109 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness.scenes.effects.contact import Contact
-from solvers.contact.energy import Contact as Energy
-from solvers.contact.energy import Obstacle
-from solvers.problem import Positions, Start
-from tests.contacts import OBSTACLES, THICKNESS, contact
+from harness.scenes.effects.contact import ContactEffect
+from solvers.contact.energy import ConvexObstacle
+from solvers.contact.energy import HalfSpaceContact as Energy
+from solvers.problem import Positions, StepStart
+from tests.contacts import CONTACT_THICKNESS, OBSTACLE_SPECS, build_contact
 
 REACH = 1e-6
 """Relative: so near Newton's method comes to the first contact."""
 
 
-def bound(effect: Contact, n: int, stiffness: float = 100.0) -> Energy:
-    obstacles = tuple(one.obstacle() for one in effect.obstacles)
-    return Energy(obstacles, THICKNESS, effect.friction, np.full(n, stiffness), 1e-6, 0.1, 1.0)
+def bound(effect: ContactEffect, n: int, stiffness: float = 100.0) -> Energy:
+    obstacles = tuple(one.build_obstacle() for one in effect.obstacles)
+    return Energy(obstacles, CONTACT_THICKNESS, effect.friction, np.full(n, stiffness), 1e-6, 0.1, 1.0)
 
 
 def begun(energy: Energy, p: Positions, v: Positions, time: float = 0.0) -> Energy:
-    return energy.begin_step(Start(p, v, time, p, 1.0, time + 1.0))
+    return energy.begin_step(StepStart(p, v, time, p, 1.0, time + 1.0))
 
 
-def ways(obstacle: Obstacle, count: int = 400) -> tuple[Positions, Positions]:
+def ways(obstacle: ConvexObstacle, count: int = 400) -> tuple[Positions, Positions]:
     """Starts outside of an obstacle and velocities towards it and past it."""
     rng = np.random.default_rng(0)
     p = rng.uniform(-1.2, 1.2, (4 * count, 3))
-    p = np.ascontiguousarray(p[obstacle.distance(p, 0.0) > THICKNESS][:count])
+    p = np.ascontiguousarray(p[obstacle.signed_distance(p, 0.0) > CONTACT_THICKNESS][:count])
     aim = rng.uniform((-0.6, -0.8, -0.5), (0.6, -0.2, 0.5), p.shape)
     return p, rng.uniform(0.3, 2.0, (len(p), 1)) * (aim - p)
 
 
-def nearest_on_way(obstacle: Obstacle, p: Positions, v: Positions) -> np.ndarray:
+def nearest_on_way(obstacle: ConvexObstacle, p: Positions, v: Positions) -> np.ndarray:
     """The least distance on the way, by many points."""
-    return np.min([obstacle.distance(p + s * v, 0.0) for s in np.linspace(0.0, 1.0, 2001)], axis=0)
+    return np.min([obstacle.signed_distance(p + s * v, 0.0) for s in np.linspace(0.0, 1.0, 2001)], axis=0)
 
 
-@pytest.mark.parametrize("name", OBSTACLES)
+@pytest.mark.parametrize("name", OBSTACLE_SPECS)
 def test_a_half_space_has_the_start_on_its_outer_side_and_the_obstacle_on_the_other(name):
-    energy = bound(contact(OBSTACLES[name]), 400)
+    energy = bound(build_contact(OBSTACLE_SPECS[name]), 400)
     (obstacle,) = energy.obstacles
     p, v = ways(obstacle)
-    planes = begun(energy, p, v).planes
+    planes = begun(energy, p, v).active_planes
     assert len(planes.vertices) > 50
     outside = np.einsum("ij,ij->i", planes.normal, p[planes.vertices]) - planes.offset
     assert outside.min() >= -1e-12
     cloud = np.random.default_rng(1).uniform((-1, -1, -1), (1, 0, 1), (20_000, 3))
-    inside = cloud[obstacle.distance(cloud, 0.0) <= 0.0]
+    inside = cloud[obstacle.signed_distance(cloud, 0.0) <= 0.0]
     assert len(inside) > 100
     beyond = planes.normal @ inside.T - planes.offset[:, None]
-    assert beyond.max() <= -THICKNESS + 1e-12
+    assert beyond.max() <= -CONTACT_THICKNESS + 1e-12
 
 
-@pytest.mark.parametrize("name", OBSTACLES)
+@pytest.mark.parametrize("name", OBSTACLE_SPECS)
 def test_what_passes_by_is_let_pass_and_what_hits_is_stopped(name):
-    energy = bound(contact(OBSTACLES[name]), 400)
+    energy = bound(build_contact(OBSTACLE_SPECS[name]), 400)
     (obstacle,) = energy.obstacles
     p, v = ways(obstacle)
-    planes = begun(energy, p, v).planes
+    planes = begun(energy, p, v).active_planes
     gap = np.full(len(p), np.inf)
     gap[planes.vertices] = np.einsum("ij,ij->i", planes.normal, (p + v)[planes.vertices]) - planes.offset
     least = nearest_on_way(obstacle, p, v)
-    misses, hits = least > THICKNESS * (1 + 1e-3), least < THICKNESS * (1 - 1e-2)
+    misses, hits = least > CONTACT_THICKNESS * (1 + 1e-3), least < CONTACT_THICKNESS * (1 - 1e-2)
     assert misses.sum() > 20
     assert hits.sum() > 20
-    assert gap[misses].min() >= -1e-3 * THICKNESS  # Newton's method ends so near to the nearest point of a way
+    assert gap[misses].min() >= -1e-3 * CONTACT_THICKNESS  # Newton's method ends so near to the nearest point of a way
     assert gap[hits].max() < 0.0
 
 
 @pytest.mark.parametrize("name", ["plane", "sphere", "capsule", "plate"])
 def test_a_half_space_touches_the_first_contact_of_a_way(name):
-    energy = bound(contact(OBSTACLES[name]), 400)
+    energy = bound(build_contact(OBSTACLE_SPECS[name]), 400)
     (obstacle,) = energy.obstacles
     p, v = ways(obstacle)
-    planes = begun(energy, p, v).planes
+    planes = begun(energy, p, v).active_planes
     a, d = p[planes.vertices], v[planes.vertices]
     rate = np.einsum("ij,ij->i", planes.normal, d)
     hit = rate < -1e-3
     s = ((planes.offset - np.einsum("ij,ij->i", planes.normal, a)) / np.where(hit, rate, 1.0))[hit]
-    crossed = (s <= 1.0) & (nearest_on_way(obstacle, a[hit], d[hit]) < 0.99 * THICKNESS)
-    there = obstacle.distance((a[hit] + s[:, None] * d[hit])[crossed], 0.0)
+    crossed = (s <= 1.0) & (nearest_on_way(obstacle, a[hit], d[hit]) < 0.99 * CONTACT_THICKNESS)
+    there = obstacle.signed_distance((a[hit] + s[:, None] * d[hit])[crossed], 0.0)
     assert crossed.sum() > 20
     # The stop's REACH is relative to the radius with the thickness, 0.31 m at most.
-    np.testing.assert_allclose(there, THICKNESS, rtol=0, atol=2 * REACH * 0.31)
+    np.testing.assert_allclose(there, CONTACT_THICKNESS, rtol=0, atol=2 * REACH * 0.31)
 
 
 def test_nothing_near_is_idle_and_costs_no_half_space():
-    energy = bound(contact(OBSTACLES["sphere"], OBSTACLES["capsule"]), 3)
+    energy = bound(build_contact(OBSTACLE_SPECS["sphere"], OBSTACLE_SPECS["capsule"]), 3)
     p = np.array([[5.0, 5.0, 5.0], [5.1, 5.0, 5.0], [5.0, 5.3, 5.0]])
     step = begun(energy, p, np.zeros_like(p))
     out = np.zeros_like(p)
     step.add_gradient(p, out)
-    assert step.idle()
+    assert step.has_no_active_collisions()
     assert (step.value(p), float(np.abs(out).max()), step.hessian(p).nnz) == (0.0, 0.0, 0)
-    assert not begun(energy, p, np.full_like(p, -5.0)).idle()
+    assert not begun(energy, p, np.full_like(p, -5.0)).has_no_active_collisions()
 
 
-@pytest.mark.parametrize("name", OBSTACLES)
+@pytest.mark.parametrize("name", OBSTACLE_SPECS)
 def test_gradient_and_hessian_are_differences_of_the_value(name):
     """At points that press, slip and stick; the energy is smooth but where one of them begins."""
-    energy = bound(contact(OBSTACLES[name], friction=0.5), 200)
+    energy = bound(build_contact(OBSTACLE_SPECS[name], friction=0.5), 200)
     (obstacle,) = energy.obstacles
     p, _ = ways(obstacle, 200)
     rng = np.random.default_rng(2)
     step = begun(energy, p, rng.normal(size=p.shape))
-    grip = np.where(np.arange(len(step.planes.vertices)) % 2, 3.0, 0.0)
-    step = replace(step, planes=step.planes._replace(grip=grip), slip=0.3)
+    grip = np.where(np.arange(len(step.active_planes.vertices)) % 2, 3.0, 0.0)
+    step = replace(step, active_planes=step.active_planes._replace(friction_limit=grip), smoothing_length=0.3)
     x, u, h = p + 0.5 * rng.normal(size=p.shape), rng.normal(size=p.shape), 1e-7
     step.add_gradient(x, gradient := np.zeros_like(x))
     found = (step.value(x + h * u) - step.value(x - h * u)) / (2 * h)
@@ -123,19 +123,23 @@ def test_gradient_and_hessian_are_differences_of_the_value(name):
     np.testing.assert_allclose(difference, change, rtol=0, atol=1e-5 * np.abs(change).max())
 
 
-@pytest.mark.parametrize("name", OBSTACLES)
+@pytest.mark.parametrize("name", OBSTACLE_SPECS)
 def test_cautious_rows_majorise_the_energy(name):
-    energy = bound(contact(OBSTACLES[name], friction=0.5), 200)
+    energy = bound(build_contact(OBSTACLE_SPECS[name], friction=0.5), 200)
     (obstacle,) = energy.obstacles
     p, _ = ways(obstacle, 200)
     rng = np.random.default_rng(3)
     step = begun(energy, p, rng.normal(size=p.shape))
-    step = replace(step, planes=step.planes._replace(grip=np.full(len(step.planes.vertices), 3.0)), slip=0.3)
+    step = replace(
+        step,
+        active_planes=step.active_planes._replace(friction_limit=np.full(len(step.active_planes.vertices), 3.0)),
+        smoothing_length=0.3,
+    )
     for size in (0.01, 0.1, 1.0):
         x, d = p + 0.5 * rng.normal(size=p.shape), size * rng.normal(size=p.shape)
-        rows = step.rows(x, x + d, cautious=True)
+        rows = step.build_penalty_rows(x, x + d, majorise=True)
         step.add_gradient(x, gradient := np.zeros_like(x))
         along = np.einsum("ij,ij->i", rows.direction, d[rows.vertices])
-        model = float(np.sum(gradient * d)) + 0.5 * float(rows.weight @ (along + rows.gap) ** 2)
+        model = float(np.sum(gradient * d)) + 0.5 * float(rows.stiffness @ (along + rows.gap) ** 2)
         rise = step.value(x + d) - step.value(x)
         assert rise <= model + 1e-12 * abs(step.value(x))

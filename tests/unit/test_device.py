@@ -13,16 +13,16 @@ from typer.testing import CliRunner
 
 from harness.base import rows
 from harness.cli import app
-from harness.config.load import load_any
-from harness.experiments.plan import Files
-from harness.simulation.on_device import seconds
+from harness.config.load import load_config
+from harness.experiments.plan import RunFiles
+from harness.simulation.on_device import compute_event_seconds
 from solvers.cuda import device
-from solvers.device import Marks
+from solvers.device import SolveEvents
 from solvers.methods.newton_cg import NewtonCG
 from solvers.methods.vbd import VertexBlockDescent
 from solvers.methods.xpbd import Xpbd
 from solvers.problem import Solver, Unsupported
-from tests.scenes import CLOTH_FILE, cloth
+from tests.scenes import CLOTH_SCENE_YAML, build_cloth
 
 SWEEP = """
 scenes: [cloth.yaml]
@@ -35,7 +35,7 @@ options: {iterations: 2, rounds: 1, frames: 1, threads: 1, pictures: false}
 @pytest.fixture
 def sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # where there is one it is not seen
-    (tmp_path / "cloth.yaml").write_text(CLOTH_FILE)
+    (tmp_path / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     made = tmp_path / "sweep.yaml"
     made.write_text(SWEEP)
     return made
@@ -45,8 +45,8 @@ def test_without_a_device_a_run_is_refused_and_the_others_are_done(sweep: Path) 
     told = CliRunner().invoke(app, ["run", str(sweep), "--results", str(sweep.parent / "r")])
     assert told.exit_code == 1, told.output
     found: list[dict[str, Any]] = []
-    for run in load_any(sweep).runs():
-        row = rows.first(Files.of(run, sweep.parent / "r" / "sweep").rows)
+    for run in load_config(sweep).list_runs():
+        row = rows.read_first_row(RunFiles.for_run(run, sweep.parent / "r" / "sweep").rows_path)
         assert isinstance(row, dict)
         found.append(row)
     here, there = found
@@ -67,11 +67,11 @@ def test_the_command_installs_all_that_a_method_needs(solver: Solver, monkeypatc
 
     monkeypatch.setattr(device, "version", missing)
     with pytest.raises(Unsupported, match=re.escape("`.venv/bin/pip install -e '.[cuda]'`")):
-        solver.prepare(cloth(3).system)
+        solver.prepare(build_cloth(3).system)
 
 
 def test_runs_on_the_processor_are_named_as_before_there_were_devices(sweep: Path) -> None:
-    given = [run.solver.parameters for run in load_any(sweep).runs()]
+    given = [run.solver.parameters for run in load_config(sweep).list_runs()]
     assert given == [{"device": "cuda", "spectral_radius": 0.999}, {"spectral_radius": 0.999}]
 
 
@@ -102,9 +102,9 @@ class At:
 
 
 def test_events_tell_kernels_and_transfers_apart() -> None:
-    told = seconds(Marks(At(1.0), At(3.0), At(10.0), At(10.5)))
+    told = compute_event_seconds(SolveEvents(At(1.0), At(3.0), At(10.0), At(10.5)))
     assert told == pytest.approx({"kernel_seconds": 7e-3, "transfer_seconds": 2.5e-3})
-    assert seconds(None) == {}, "of a device without a clock nothing is told"
+    assert compute_event_seconds(None) == {}, "of a device without a clock nothing is told"
 
 
 class Refused(Exception):
@@ -139,9 +139,9 @@ def nvml(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 def test_a_row_has_what_the_device_tells_of_its_state_and_null_for_what_it_does_not(nvml: SimpleNamespace) -> None:
     told = {"sm_clock_mhz": 1980.0, "memory_clock_mhz": 2619.0, "power_w": None, "power_limit_w": 700.0}
-    assert device.state() == told | {"performance_state": 0.0, "temperature_c": 41.0}
+    assert device.read_device_state() == told | {"performance_state": 0.0, "temperature_c": 41.0}
 
 
 def test_where_the_library_cannot_begin_all_is_null(nvml: SimpleNamespace) -> None:
     nvml.nvmlInit = nvml.nvmlDeviceGetPowerUsage
-    assert set(device.state().values()) == {None}
+    assert set(device.read_device_state().values()) == {None}

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from harness.base import rows
 from harness.cli import app
-from harness.report.devices import pairs, pays_from, runs, words
-from solvers.device import SIMULATED
+from harness.report.devices import find_break_even, pair_fastest_runs, read_device_runs, summarise_runs
+from solvers.device import SIMULATOR_NAME
 from tests.unit.test_machines import table_of
 
 ON = '{"device": "cuda", "spectral_radius": 0.999}'
@@ -50,7 +50,7 @@ MEASURED = [
 
 
 def told(some: list[dict[str, Any]], config: str = "configs/gpu.yaml") -> str:
-    return " ".join(words(runs(table_of(some)), config)).replace("\u2009", ",")
+    return " ".join(summarise_runs(read_device_runs(table_of(some)), config)).replace("\u2009", ",")
 
 
 def test_a_device_pays_from_where_it_is_faster_on_all_larger_meshes() -> None:
@@ -74,8 +74,8 @@ def test_a_mesh_in_between_that_is_slower_moves_the_size(ratios: list[float], fi
         for k, (n, ratio) in enumerate(zip(sizes, ratios, strict=False))
         for row in made(2 * k, "vbd", n, 1.0, on=True) + made(2 * k + 1, "hybrid", n, ratio)
     ]
-    mine = pairs(runs(table_of(some))).get(("cloth", 1e-3), [])
-    found = pays_from(mine)
+    mine = pair_fastest_runs(read_device_runs(table_of(some))).get(("cloth", 1e-3), [])
+    found = find_break_even(mine)
     assert (found.vertices if found else None) == (None if first is None else sizes[first])
 
 
@@ -88,11 +88,11 @@ def test_without_a_device_nothing_is_claimed_and_the_command_is_told() -> None:
 
 
 def test_times_of_the_simulator_are_no_devices() -> None:
-    some = made(0, "vbd", 10_000, 0.1, on=True, device=SIMULATED) + made(1, "hybrid", 10_000, 0.2)
+    some = made(0, "vbd", 10_000, 0.1, on=True, device=SIMULATOR_NAME) + made(1, "hybrid", 10_000, 0.2)
     said = told(some)
-    assert f"nothing is said of what one saves ({SIMULATED})" in said
+    assert f"nothing is said of what one saves ({SIMULATOR_NAME})" in said
     assert "pays" not in said
-    assert pairs(runs(table_of(some))) == {}
+    assert pair_fastest_runs(read_device_runs(table_of(some))) == {}
 
 
 def test_what_has_no_time_is_told() -> None:
@@ -108,7 +108,7 @@ def test_the_report_draws_it_and_the_page_says_it(there: bool, tmp_path: Path) -
     folder = tmp_path / "r" / "gpu" / "rows"
     folder.mkdir(parents=True)
     for unit in {row["run_id"] for row in kept}:
-        rows.write(folder / f"{unit}.parquet", [row for row in kept if row["run_id"] == unit])
+        rows.write_rows(folder / f"{unit}.parquet", [row for row in kept if row["run_id"] == unit])
     done = CliRunner().invoke(app, ["report", str(tmp_path / "r"), "--without-viewer"])
     assert done.exit_code == 0, done.output
     said = " ".join(done.output.split())
@@ -119,4 +119,4 @@ def test_the_report_draws_it_and_the_page_says_it(there: bool, tmp_path: Path) -
     assert wanted in (tmp_path / "r" / "site" / "data" / "index.js").read_text()
     if there:
         with Image.open(picture) as image:
-            assert np.asarray(image.convert("L")).min() < 100, "something is drawn"
+            assert np.asarray(image.convert_node("L")).min() < 100, "something is drawn"

@@ -9,67 +9,81 @@ import numpy as np
 import pytest
 
 from solvers.core import driver
-from solvers.core.driver import Iterating, Iterative
-from solvers.core.prefactored import only_springs
-from solvers.kernels.loop import EACH, FLOOR, ITERATIONS, LAST, NEVER, STALLED, TOLERANCE, Limits, over
+from solvers.core.driver import IterativeSolver, SolverState
+from solvers.core.prefactored import require_only_springs
+from solvers.kernels.loop import (
+    REASON_FLOOR,
+    REASON_ITERATIONS,
+    REASON_STALLED,
+    REASON_TOLERANCE,
+    RESIDUAL_EACH,
+    RESIDUAL_LAST,
+    RESIDUAL_NEVER,
+    LoopLimits,
+    build_loop,
+)
 from solvers.problem import Positions, StepProblem, StopRule, System
-from tests.scenes import cloth, first_problem
+from tests.scenes import build_cloth, build_first_problem
 
 
 # A whole method, of the formula p <- p - D^-1 grad g(p), where D holds each vertex by twice its springs: it majorises.
 @dataclass(frozen=True)
 class DiagonalDescent:
     def prepare(self, system: System) -> PreparedDiagonal:
-        springs, (_, soft, weight) = only_springs(system, "diagonal"), system.penalty
-        held = system.inertia + np.bincount(soft, weight, minlength=system.vertices)
+        springs, (_, soft, weight) = require_only_springs(system, "diagonal"), system.penalty_pins
+        held = system.inertia_diagonal + np.bincount(soft, weight, minlength=system.num_vertices)
         stiffness = np.repeat(springs.stiffness, 2)
-        return PreparedDiagonal(held + 2.0 * np.bincount(springs.edges.ravel(), stiffness, minlength=system.vertices))
+        return PreparedDiagonal(
+            held + 2.0 * np.bincount(springs.edges.ravel(), stiffness, minlength=system.num_vertices)
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedDiagonal(Iterative):
+class PreparedDiagonal(IterativeSolver):
     diagonal: np.ndarray
-    choice: str = ""
-    facts: dict[str, float] = field(default_factory=dict)
+    description: str = ""
+    stats: dict[str, float] = field(default_factory=dict)
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, guess: Positions) -> SolverState:
         return Diagonal(self.diagonal[:, None], problem, guess.copy())
 
 
-class Diagonal(Iterating):
+class Diagonal(SolverState):
     def __init__(self, diagonal: np.ndarray, problem: StepProblem, p: Positions) -> None:
         self.diagonal, self.problem, self.positions = diagonal, problem, p
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         self.positions = self.positions - self.problem.gradient(self.positions) / self.diagonal
         return True
 
     def residual(self) -> float:  # |D^-1 g|_D over the unpinned vertices
-        g = self.problem.gradient(self.positions)[self.problem.system.unpinned]
-        return float(np.sqrt((g**2 / self.diagonal[self.problem.system.unpinned]).sum()))
+        g = self.problem.gradient(self.positions)[self.problem.system.unpinned_mask]
+        return float(np.sqrt((g**2 / self.diagonal[self.problem.system.unpinned_mask]).sum()))
 
 
 def test_a_method_of_thirty_lines_is_a_solver():
-    problem = first_problem(cloth(5))
+    problem = build_first_problem(build_cloth(5))
     prepared = DiagonalDescent().prepare(problem.system)
     solution = prepared.solve(problem, StopRule(5000, 1e-3))
-    assert (solution.stopped, solution.residual_of) == ("tolerance", "returned")
-    assert 10 < solution.iterations < 5000
-    assert solution.residual <= 1e-3 * solution.yardstick
+    assert (solution.termination_reason, solution.residual_iterate) == ("tolerance", "returned")
+    assert 10 < solution.num_iterations < 5000
+    assert solution.residual <= 1e-3 * solution.initial_residual
     assert solution.residual == prepared.residual_at(problem, solution.positions)
-    assert solution.yardstick == prepared.residual_at(problem, problem.current)
-    before, last = (p.copy() for p in islice(prepared.iterates(problem), solution.iterations - 2, solution.iterations))
+    assert solution.initial_residual == prepared.residual_at(problem, problem.current_positions)
+    before, last = (
+        p.copy() for p in islice(prepared.iterates(problem), solution.num_iterations - 2, solution.num_iterations)
+    )
     np.testing.assert_array_equal(last, solution.positions)
-    assert prepared.residual_at(problem, before) > 1e-3 * solution.yardstick
-    assert problem.value(last) < problem.value(before) < problem.value(problem.current)
+    assert prepared.residual_at(problem, before) > 1e-3 * solution.initial_residual
+    assert problem.value(last) < problem.value(before) < problem.value(problem.current_positions)
 
 
 def test_without_a_tolerance_only_the_last_residual_is_asked_for(monkeypatch):
-    problem, asked = first_problem(cloth(3)), []
+    problem, asked = build_first_problem(build_cloth(3)), []
     measured = Diagonal.residual
     monkeypatch.setattr(Diagonal, "residual", lambda self: asked.append(0) or measured(self))
     solution = DiagonalDescent().prepare(problem.system).solve(problem, StopRule(6))
-    assert (solution.iterations, solution.stopped, len(asked)) == (6, "iterations", 1)
+    assert (solution.num_iterations, solution.termination_reason, len(asked)) == (6, "iterations", 1)
 
 
 class Table:
@@ -78,7 +92,7 @@ class Table:
     def __init__(self, *residuals: float | None) -> None:
         self.residuals, self.at, self.now, self.asked = residuals, 0, np.nan, 0
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         following, self.at = self.residuals[self.at], self.at + 1
         self.now = self.now if following is None else following
         return following is not None
@@ -89,16 +103,31 @@ class Table:
 
 
 LOOPS = {
-    "the limit of iterations": ((4.0, 3.0, 2.0, 1.0), Limits(3, 0.5, 0.0, EACH), (3, 2.0, ITERATIONS), 3),
-    "a tolerance": ((4.0, 3.0, 2.0, 1.0), Limits(9, 2.5, 0.0, EACH), (3, 2.0, TOLERANCE), 3),
-    "the floor": ((4.0, 3.0, 2.0), Limits(9, 1.0, 3.5, EACH), (2, 3.0, FLOOR), 2),
-    "a tolerance above the floor": ((1.0,), Limits(9, 2.0, 2.0, EACH), (1, 1.0, TOLERANCE), 1),
-    "nothing that descends": ((4.0, None), Limits(9, 0.5, 0.0, EACH), (1, 4.0, STALLED), 2),
-    "nothing that descends, unwatched": ((4.0, None), Limits(9, 0.0, 0.0, LAST), (1, 4.0, STALLED), 1),
-    "a residual of zero, unwatched": ((0.0, 0.0), Limits(2, 0.0, 0.0, LAST), (2, 0.0, ITERATIONS), 1),
-    "no residual": ((4.0, 3.0), Limits(2, 0.0, 0.0, NEVER), (2, np.nan, ITERATIONS), 0),
-    "no number": ((np.nan, np.nan), Limits(2, 1.0, 1.0, EACH), (2, np.nan, ITERATIONS), 2),
-    "no iteration": ((), Limits(0, 1.0, 1.0, LAST), (0, np.nan, ITERATIONS), 1),
+    "the limit of iterations": (
+        (4.0, 3.0, 2.0, 1.0),
+        LoopLimits(3, 0.5, 0.0, RESIDUAL_EACH),
+        (3, 2.0, REASON_ITERATIONS),
+        3,
+    ),
+    "a tolerance": ((4.0, 3.0, 2.0, 1.0), LoopLimits(9, 2.5, 0.0, RESIDUAL_EACH), (3, 2.0, REASON_TOLERANCE), 3),
+    "the floor": ((4.0, 3.0, 2.0), LoopLimits(9, 1.0, 3.5, RESIDUAL_EACH), (2, 3.0, REASON_FLOOR), 2),
+    "a tolerance above the floor": ((1.0,), LoopLimits(9, 2.0, 2.0, RESIDUAL_EACH), (1, 1.0, REASON_TOLERANCE), 1),
+    "nothing that descends": ((4.0, None), LoopLimits(9, 0.5, 0.0, RESIDUAL_EACH), (1, 4.0, REASON_STALLED), 2),
+    "nothing that descends, unwatched": (
+        (4.0, None),
+        LoopLimits(9, 0.0, 0.0, RESIDUAL_LAST),
+        (1, 4.0, REASON_STALLED),
+        1,
+    ),
+    "a residual of zero, unwatched": (
+        (0.0, 0.0),
+        LoopLimits(2, 0.0, 0.0, RESIDUAL_LAST),
+        (2, 0.0, REASON_ITERATIONS),
+        1,
+    ),
+    "no residual": ((4.0, 3.0), LoopLimits(2, 0.0, 0.0, RESIDUAL_NEVER), (2, np.nan, REASON_ITERATIONS), 0),
+    "no number": ((np.nan, np.nan), LoopLimits(2, 1.0, 1.0, RESIDUAL_EACH), (2, np.nan, REASON_ITERATIONS), 2),
+    "no iteration": ((), LoopLimits(0, 1.0, 1.0, RESIDUAL_LAST), (0, np.nan, REASON_ITERATIONS), 1),
 }
 
 
@@ -106,18 +135,18 @@ LOOPS = {
 def test_a_loop_ends_by(what):
     residuals, limits, wanted, asked = LOOPS[what]
     state = Table(*residuals)
-    np.testing.assert_equal(over(Table.advance, Table.residual)(state, limits), wanted)
+    np.testing.assert_equal(build_loop(Table.step_state, Table.residual)(state, limits), wanted)
     assert state.asked == asked
 
 
-class Stepping(Iterating):
+class Stepping(SolverState):
     """Halves its residual, and is certain of a minimum only from `certain` iterations on."""
 
     def __init__(self, certain: int, most: int) -> None:
         self.count, self.certain, self.most = 0, certain, most
         self.positions = np.zeros((1, 3))
 
-    def advance(self) -> bool:
+    def step_state(self) -> bool:
         moved = self.count < self.most
         self.count += moved
         return moved
@@ -125,16 +154,16 @@ class Stepping(Iterating):
     def residual(self) -> float:
         return 0.5**self.count
 
-    def certifies(self) -> bool:
+    def can_terminate(self) -> bool:
         return self.count >= self.certain
 
 
 @dataclass(frozen=True)
-class PreparedStepping(Iterative):
+class PreparedStepping(IterativeSolver):
     certain: int
     most: int = 1000
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def init_state(self, problem: StepProblem, guess: Positions) -> SolverState:
         return Stepping(self.certain, self.most)
 
 
@@ -149,15 +178,15 @@ class PreparedStepping(Iterative):
     ],
 )
 def test_a_close_tolerance_ends_a_solve_at_a_minimum_only(prepared, stop, wanted):
-    solution = prepared.solve(first_problem(cloth(3)), stop)
-    assert (solution.iterations, solution.stopped) == wanted
+    solution = prepared.solve(build_first_problem(build_cloth(3)), stop)
+    assert (solution.num_iterations, solution.termination_reason) == wanted
 
 
 @dataclass(frozen=True)
 class PreparedNear(PreparedStepping):
     """Near to round-off by its residual from the fortieth iteration on."""
 
-    def scale(self, problem: StepProblem) -> float:
+    def residual_scale(self, problem: StepProblem) -> float:
         return 1e12 * 0.5**40
 
 
@@ -175,5 +204,5 @@ def test_a_small_residual_is_the_floor_where_the_gradient_is_round_off(monkeypat
     monkeypatch.setattr(PreparedNear, "begin", lambda *_: run)
     monkeypatch.setattr(driver, "at_rest", lambda *_: looked.append(run.count) or run.count >= rests)
     monkeypatch.setattr(PreparedNear, "residual_at", lambda *_: 1.0)
-    solution = PreparedNear(0).solve(first_problem(cloth(3)), StopRule(most, 1e-300))
-    assert ((solution.iterations, solution.stopped), looked) == (wanted, looks)
+    solution = PreparedNear(0).solve(build_first_problem(build_cloth(3)), StopRule(most, 1e-300))
+    assert ((solution.num_iterations, solution.termination_reason), looked) == (wanted, looks)

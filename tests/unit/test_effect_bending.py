@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from harness.base.errors import InputError
-from harness.scenes.effects.bending import Bending
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.mesh.surfaces import Balloon
-from harness.scenes.selection import Box
+from harness.scenes.effects.bending import BendingEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
+from harness.scenes.mesh.surfaces import BalloonMesh
+from harness.scenes.selection import BoxRegion
 from solvers.energies.bending import Bending as Energy
-from solvers.energies.bending import flaps
-from tests.effects import at_rest
-from tests.scenes import scene
+from solvers.energies.bending import find_flaps
+from tests.effects import compute_rest_shape
+from tests.scenes import build_test_scene
 
 B, G = 0.01, 9.81
 LOAD = 1e-3 * 8 * B
@@ -29,17 +29,17 @@ LOAD = 1e-3 * 8 * B
 def tip(segments: int, width: float, plane: str = "horizontal") -> float:
     """How far the end of a strip of one metre sinks [m] whose first two columns of vertices are held."""
     h = 1.0 / segments
-    pins = Pins(box=Box(low=(-0.5, -1, -1), high=(-0.5 + 1.01 * h, 1, 1)), weight="exact")
-    made = scene(
-        Grid(width=1.0, height=width),
-        Springs(stretch=1e4),
-        Gravity(),
-        Bending(stiffness=B),
+    pins = PinsEffect(box=BoxRegion(low=(-0.5, -1, -1), high=(-0.5 + 1.01 * h, 1, 1)), weight="exact")
+    made = build_test_scene(
+        GridMesh(width=1.0, height=width),
+        SpringsEffect(stretch=1e4),
+        GravityEffect(),
+        BendingEffect(stiffness=B),
         pins,
         size=segments + 1,
         mass=LOAD / G * width,
     )
-    return -at_rest(made)[made.mesh.parts["right"], 1].mean()
+    return -compute_rest_shape(made)[made.mesh.parts["right"], 1].mean()
 
 
 @pytest.mark.parametrize("width", [None, 0.125, 0.25], ids=["one cell", "an eighth", "a quarter"])
@@ -59,49 +59,51 @@ def test_a_cantilever_clamped_half_way_between_its_pins_is_a_beam_to_a_thousandt
 
 @pytest.mark.parametrize("angle", [0, 30, 45, 60, 90, 135])
 def test_a_cylinder_stores_what_its_curvature_asks_along_the_lines_and_twice_that_along_the_diagonals(angle):
-    mesh = Grid().build(41)
+    mesh = GridMesh().build_mesh(41)
     e = np.array([np.cos(np.deg2rad(angle)), 0.0, np.sin(np.deg2rad(angle))])
-    p, curvature = mesh.rest.copy(), 1e-2
-    p[:, 1] = 0.5 * curvature * (mesh.rest @ e) ** 2
-    found = Energy.of(mesh.rest, mesh.triangles, B).value(p) / (0.5 * B * curvature**2)
+    p, curvature = mesh.rest_positions.copy(), 1e-2
+    p[:, 1] = 0.5 * curvature * (mesh.rest_positions @ e) ** 2
+    found = Energy.from_rest_shape(mesh.rest_positions, mesh.triangles, B).value(p) / (0.5 * B * curvature**2)
     # k_xx^2 + k_zz^2 + 6 k_xz^2; the outermost of 40 cells count half, along which nothing is hinged.
     assert found == pytest.approx(1 + np.sin(np.deg2rad(2 * angle)) ** 2, rel=1.5 / 40)
 
 
 def test_bending_does_not_mind_where_a_surface_is_nor_how_it_stretches():
-    mesh = Grid(plane="vertical").build(9)
-    energy = Energy.of(mesh.rest, mesh.triangles, B)
+    mesh = GridMesh(plane="vertical").build_mesh(9)
+    energy = Energy.from_rest_shape(mesh.rest_positions, mesh.triangles, B)
     affine = np.random.default_rng(0).normal(size=(3, 3))
     # Cotangents of order one, times positions of order ten, leave round-off of 1e-15, squared, at 352 flaps.
-    assert energy.value(mesh.rest @ affine + 5.0) <= 352 * 1e-29
+    assert energy.value(mesh.rest_positions @ affine + 5.0) <= 352 * 1e-29
 
 
 def test_either_diagonal_of_the_cells_makes_the_same_energy():
-    mesh = Grid().build(7)
-    mirrored = mesh.rest * [-1.0, 1.0, 1.0]
-    p = mesh.rest + 0.1 * np.random.default_rng(0).normal(size=mesh.rest.shape)
-    one, two = (Energy.of(rest, mesh.triangles, B).value(p) for rest in (mesh.rest, mirrored))
+    mesh = GridMesh().build_mesh(7)
+    mirrored = mesh.rest_positions * [-1.0, 1.0, 1.0]
+    p = mesh.rest_positions + 0.1 * np.random.default_rng(0).normal(size=mesh.rest_positions.shape)
+    one, two = (Energy.from_rest_shape(rest, mesh.triangles, B).value(p) for rest in (mesh.rest_positions, mirrored))
     assert one == pytest.approx(two, rel=1e-12)  # the order of sums
     index = np.arange(49).reshape(7, 7)[:, ::-1]  # the cells cut the other way
-    assert Energy.of(mesh.rest, index.ravel()[mesh.triangles], B).value(p) == pytest.approx(one, rel=1e-12)
+    assert Energy.from_rest_shape(mesh.rest_positions, index.ravel()[mesh.triangles], B).value(p) == pytest.approx(
+        one, rel=1e-12
+    )
 
 
 def test_each_inner_edge_has_one_flap():
-    triangles = Balloon().build(3).triangles
-    flap = flaps(triangles)
+    triangles = BalloonMesh().build_mesh(3).triangles
+    flap = find_flaps(triangles)
     assert len(flap) == 3 * len(triangles) // 2
     assert {tuple(sorted(f[[0, 1, 2]])) for f in flap} <= {tuple(sorted(t)) for t in triangles}
-    assert len(flaps(np.array([[0, 1, 2]]))) == 0
+    assert len(find_flaps(np.array([[0, 1, 2]]))) == 0
 
 
 BAD = {
-    "a chain": (Chain().build(4), "needs triangles"),
+    "a chain": (ChainMesh().build_mesh(4), "needs triangles"),
     "a triangle of no area": (
-        replace(Grid().build(3), triangles=np.array([[0, 1, 2]])),
+        replace(GridMesh().build_mesh(3), triangles=np.array([[0, 1, 2]])),
         r"\[0, 1, 2\] has no area",
     ),
     "three triangles at an edge": (
-        replace(Grid().build(3), triangles=np.array([[0, 1, 3], [0, 1, 4], [0, 1, 6]])),
+        replace(GridMesh().build_mesh(3), triangles=np.array([[0, 1, 3], [0, 1, 4], [0, 1, 6]])),
         r"more than two triangles meet at the edge \[0, 1\]",
     ),
 }
@@ -111,4 +113,4 @@ BAD = {
 def test_a_mesh_that_is_no_surface_is_refused(case):
     mesh, told = BAD[case]
     with pytest.raises(InputError, match=told):
-        Bending(stiffness=1.0).bind(mesh, np.ones(len(mesh.rest)), 0.1)
+        BendingEffect(stiffness=1.0).build_contribution(mesh, np.ones(len(mesh.rest_positions)), 0.1)

@@ -9,31 +9,40 @@ import numpy as np
 import pytest
 
 from harness.base.errors import InputError
-from harness.scenes.effects.contact import Contact
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.motion import Key, KeyedMotion
+from harness.scenes.effects.contact import ContactEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.grid import GridMesh
+from harness.scenes.motion import KeyFrame, KeyFrameMotion
 from solvers.problem import StopRule
-from tests.contacts import DT, OBSTACLES, THICKNESS, contact, depth, on_slope, sheet, steps
-from tests.effects import integrated
-from tests.scenes import scene
+from tests.contacts import (
+    CONTACT_THICKNESS,
+    OBSTACLE_SPECS,
+    TIME_STEP,
+    build_contact,
+    build_sheet,
+    build_sliding_block,
+    collect_steps,
+    penetration_depth,
+)
+from tests.effects import with_integrator
+from tests.scenes import build_test_scene
 
-TOLERANCE = THICKNESS / 10.0
+TOLERANCE = CONTACT_THICKNESS / 10.0
 """What the effect states where a scene does not say."""
 
 
 @pytest.mark.parametrize("speed", [0.0, 1.0, 10.0], ids="{:g} m/s".format)
-@pytest.mark.parametrize("name", OBSTACLES)
+@pytest.mark.parametrize("name", OBSTACLE_SPECS)
 def test_nothing_ends_a_step_deeper_than_the_tolerance_nor_passes_through(name, speed):
-    made = sheet(contact(OBSTACLES[name], friction=0.3), velocity=(0.0, -speed, 0.0))
-    p, deepest = made.mesh.rest, []
-    for step in steps(made, 12):
-        deepest.append(depth(made, step.positions, step.index * DT))
+    made = build_sheet(build_contact(OBSTACLE_SPECS[name], friction=0.3), velocity=(0.0, -speed, 0.0))
+    p, deepest = made.mesh.rest_positions, []
+    for step in collect_steps(made, 12):
+        deepest.append(penetration_depth(made, step.positions, step.index * TIME_STEP))
         # The plate's 1 cm are a thirtieth of the fastest way: 150 points on it cannot all miss the plate.
         for s in np.linspace(0.0, 1.0, 150):
-            assert depth(made, p + s * (step.positions - p), step.index * DT) <= THICKNESS
+            assert penetration_depth(made, p + s * (step.positions - p), step.index * TIME_STEP) <= CONTACT_THICKNESS
         p = step.positions
     assert max(deepest) <= TOLERANCE
     # It has arrived: on round obstacles what slides leaves the tangent plane of a step by a fraction of a millimetre.
@@ -44,23 +53,28 @@ def test_nothing_ends_a_step_deeper_than_the_tolerance_nor_passes_through(name, 
 @pytest.mark.parametrize("name", ["sphere", "capsule", "plate"])
 def test_a_moving_obstacle_takes_a_resting_sheet_along(name, speed):
     up = {"keys": [{"time": 0}, {"time": 0.2, "offset": (0, 0.2 * speed, 0)}]}
-    made = sheet(contact(OBSTACLES[name] | {"motion": up}))
-    deepest = [depth(made, step.positions, step.index * DT) for step in steps(made, 8)]
+    made = build_sheet(build_contact(OBSTACLE_SPECS[name] | {"motion": up}))
+    deepest = [penetration_depth(made, step.positions, step.index * TIME_STEP) for step in collect_steps(made, 8)]
     assert max(deepest) <= TOLERANCE
     assert speed < 10.0 or max(deepest) > -TOLERANCE  # it has arrived
 
 
 @pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
 def test_the_depth_is_that_of_the_steps_end_with_other_integrators(integrator):
-    made = integrated(sheet(contact(OBSTACLES["plate"], friction=0.3), velocity=(0.0, -10.0, 0.0)), integrator)
-    assert max(depth(made, step.positions, step.index * DT) for step in steps(made, 8)) <= TOLERANCE
+    made = with_integrator(
+        build_sheet(build_contact(OBSTACLE_SPECS["plate"], friction=0.3), velocity=(0.0, -10.0, 0.0)), integrator
+    )
+    assert (
+        max(penetration_depth(made, step.positions, step.index * TIME_STEP) for step in collect_steps(made, 8))
+        <= TOLERANCE
+    )
 
 
 @pytest.mark.parametrize("friction", [0.2, 0.5])
 def test_a_block_slides_where_the_slope_is_steeper_than_friction_holds(friction):
-    made = on_slope(1.05 * friction, friction)
+    made = build_sliding_block(1.05 * friction, friction)
     weight = made.system.mass / made.system.mass.sum()
-    x = np.array([weight @ step.positions[:, 0] for step in steps(made, 120)])
+    x = np.array([weight @ step.positions[:, 0] for step in collect_steps(made, 120)])
     angle = np.arctan(1.05 * friction)
     wanted = 9.81 * (np.sin(angle) - friction * np.cos(angle))
     found = np.diff(x, 2)[60:].mean() * 60**2
@@ -69,24 +83,26 @@ def test_a_block_slides_where_the_slope_is_steeper_than_friction_holds(friction)
 
 @pytest.mark.parametrize("friction", [0.2, 0.5])
 def test_a_block_rests_where_friction_holds(friction):
-    made = on_slope(0.95 * friction, friction)
-    p = [step.positions for step in steps(made, 120)]
+    made = build_sliding_block(0.95 * friction, friction)
+    p = [step.positions for step in collect_steps(made, 120)]
     assert np.abs(p[-1] - p[-11]).max() <= 1.1 * 1e-5 * 10 / 60  # the creep, and what still rings
 
 
 def test_a_resting_sheet_does_not_creep():
-    ground = contact({"kind": "plane", "point": (0, -THICKNESS, 0)}, friction=0.5)
-    made = scene(Grid(), Springs(stretch=300.0), Gravity(acceleration=(0.5, -9.8, 0)), ground, size=4)
-    p = [step.positions for step in steps(made, 1000, stop=StopRule(20, 1e-8))]
+    ground = build_contact({"kind": "plane", "point": (0, -CONTACT_THICKNESS, 0)}, friction=0.5)
+    made = build_test_scene(
+        GridMesh(), SpringsEffect(stretch=300.0), GravityEffect(acceleration=(0.5, -9.8, 0)), ground, size=4
+    )
+    p = [step.positions for step in collect_steps(made, 1000, stop=StopRule(20, 1e-8))]
     # What is pulled at a part of friction's limit, 0.5 of 0.5 times 9.8 m/s^2, creeps at that part of 1e-5 m/s.
     np.testing.assert_allclose((p[-1] - p[20])[:, 0], 0.5 / 4.9 * 1e-5 * 979 / 30, rtol=0.05)
 
 
 def test_energy_does_not_grow_without_friction():
-    made = sheet(contact(OBSTACLES["plane"]), velocity=(0.5, -5.0, 0.0))
+    made = build_sheet(build_contact(OBSTACLE_SPECS["plane"]), velocity=(0.5, -5.0, 0.0))
     mass, total = made.system.mass, []
-    for step in steps(made, 20, stop=StopRule(60, 1e-12)):
-        v = step.state.now.velocity
+    for step in collect_steps(made, 20, stop=StopRule(60, 1e-12)):
+        v = step.state.motion.velocity
         p, problem = step.positions, step.problem
         kinetic = 0.5 * float(mass @ np.einsum("ij,ij->i", v, v))
         stored = sum(energy.value(p) for energy in problem.energies)
@@ -97,45 +113,48 @@ def test_energy_does_not_grow_without_friction():
 
 
 def test_the_momentum_that_a_sheet_loses_is_what_the_obstacle_took():
-    made = sheet(contact(OBSTACLES["capsule"], friction=0.4), velocity=(1.0, -4.0, 0.0))
+    made = build_sheet(build_contact(OBSTACLE_SPECS["capsule"], friction=0.4), velocity=(1.0, -4.0, 0.0))
     mass, before = made.system.mass, np.array([1.0, -4.0, 0.0])
-    for step in steps(made, 8, stop=StopRule(60, 1e-12)):
-        after = mass @ step.state.now.velocity / mass.sum()
-        force = made.load.copy()
+    for step in collect_steps(made, 8, stop=StopRule(60, 1e-12)):
+        after = mass @ step.state.motion.velocity / mass.sum()
+        force = made.constant_force.copy()
         energy = step.problem.energies[-1]
         pushed = np.zeros_like(force)
         energy.add_gradient(step.solution.positions, pushed)
         # Springs exchange momentum among vertices alone; the solve's tolerance of 1e-12 leaves nine digits.
-        np.testing.assert_allclose(after - before, DT * (force - pushed).sum(axis=0) / mass.sum(), atol=1e-8)
+        np.testing.assert_allclose(after - before, TIME_STEP * (force - pushed).sum(axis=0) / mass.sum(), atol=1e-8)
         before = after
 
 
 def test_friction_is_what_a_moving_belt_carries_things_by():
-    belt = {"kind": "plane", "point": (0, -THICKNESS, 0)}
+    belt = {"kind": "plane", "point": (0, -CONTACT_THICKNESS, 0)}
     belt |= {"motion": {"keys": [{"time": 0}, {"time": 10, "offset": (5, 0, 0)}]}}
-    made = sheet(contact(belt, friction=0.5), size=4)
-    last = steps(made, 30)[-1]
-    np.testing.assert_allclose(last.state.now.velocity[:, 0], 0.5, rtol=1e-3)  # the springs still ring
+    made = build_sheet(build_contact(belt, friction=0.5), size=4)
+    last = collect_steps(made, 30)[-1]
+    np.testing.assert_allclose(last.state.motion.velocity[:, 0], 0.5, rtol=1e-3)  # the springs still ring
 
 
-def net(**pins: Any) -> Pins:
-    return Pins.model_validate({"at": ["corners"]} | pins)
+def net(**pins: Any) -> PinsEffect:
+    return PinsEffect.model_validate({"at": ["corners"]} | pins)
 
 
 REFUSED = {
-    "thickness": ([contact(OBSTACLES["plane"], thickness=0.3)], ["contact", "thickness", "springs"]),
+    "thickness": ([build_contact(OBSTACLE_SPECS["plane"], thickness=0.3)], ["contact", "thickness", "springs"]),
     "pin": (
-        [contact({"kind": "sphere", "center": (0.5, 0, 0.5), "radius": 0.1}), net()],
+        [build_contact({"kind": "sphere", "center": (0.5, 0, 0.5), "radius": 0.1}), net()],
         ["contact", "pins", "sphere"],
     ),
     "pin that moves inside": (
         [
-            contact(OBSTACLES["plane"]),
-            net(motion=KeyedMotion(keys=(Key(time=0), Key(time=2, offset=(0, -3, 0))))),
+            build_contact(OBSTACLE_SPECS["plane"]),
+            net(motion=KeyFrameMotion(keys=(KeyFrame(time=0), KeyFrame(time=2, offset=(0, -3, 0))))),
         ],
         ["contact", "pins", " s", "plane"],
     ),
-    "start": ([contact({"kind": "box", "low": (-1, -1, -1), "high": (0.1, 0.1, 0.1)})], ["contact", "starts", "box"]),
+    "start": (
+        [build_contact({"kind": "box", "low": (-1, -1, -1), "high": (0.1, 0.1, 0.1)})],
+        ["contact", "starts", "box"],
+    ),
 }
 
 
@@ -143,7 +162,7 @@ REFUSED = {
 def test_conflicts_are_refused_with_both_names(case):
     effects, named = REFUSED[case]
     with pytest.raises(InputError) as refusal:
-        scene(Grid(), Springs(stretch=300.0), *effects, size=6)
+        build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), *effects, size=6)
     assert all(name in str(refusal.value) for name in named)
 
 
@@ -162,4 +181,4 @@ def test_conflicts_are_refused_with_both_names(case):
 )
 def test_parameters_without_a_meaning_are_refused(given):
     with pytest.raises(ValueError):
-        Contact.model_validate(given)
+        ContactEffect.model_validate(given)

@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 
 from harness.scenes.bind import Scene
-from harness.scenes.effects.air_drag import AirDrag
-from harness.scenes.effects.base import Effect
-from harness.scenes.effects.bending import Bending
-from harness.scenes.effects.dashpots import Dashpots
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.rayleigh import Rayleigh
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
-from harness.simulation.step import State, prepare, simulate
+from harness.scenes.effects.air_drag import AirDragEffect
+from harness.scenes.effects.base import SceneEffect
+from harness.scenes.effects.bending import BendingEffect
+from harness.scenes.effects.dashpots import DashpotsEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.rayleigh import RayleighEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
+from harness.simulation.step import MotionState, prepare, simulate_scene
 from solvers.energies.quadratic import RayleighDamping
 from solvers.integrators import Motion
 from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.newton import Newton
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import Positions, StopRule
-from tests.effects import integrated
-from tests.scenes import scene
+from tests.effects import with_integrator
+from tests.scenes import build_test_scene
 
 INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
 G = 9.81
@@ -31,27 +31,32 @@ G = 9.81
 
 def moving(made: Scene, velocity: Positions, steps: int, at: Positions | None = None) -> list[Motion]:
     """The motion at the start and after each converged step."""
-    state = State(Motion(made.mesh.rest if at is None else at, velocity), None, 0)
-    run = simulate(
-        made, prepare(made, Newton()), StopRule(20, 1e-10), first_guess="inertial", frames=steps, state=state
+    state = MotionState(Motion(made.mesh.rest_positions if at is None else at, velocity), None, 0)
+    run = simulate_scene(
+        made,
+        prepare(made, NewtonSolver()),
+        StopRule(20, 1e-10),
+        initial_guess="inertial",
+        frames=steps,
+        initial_state=state,
     )
-    return [state.now, *(step.state.now for step in run)]
+    return [state.motion, *(step.state.motion for step in run)]
 
 
-def pendulum(drag: AirDrag, dt: float) -> Scene:
+def pendulum(drag: AirDragEffect, dt: float) -> Scene:
     """1 kg at the end of a stiff rod of 1 m; the other kilogramme is at the pivot, and so is half of the drag."""
-    pins = Pins(at=("first",), weight="exact")
-    made = scene(
-        Chain(direction=(0.0, -1.0, 0.0)),
-        Springs(stretch=1e5),
-        Gravity(),
+    pins = PinsEffect(at=("first",), weight="exact")
+    made = build_test_scene(
+        ChainMesh(direction=(0.0, -1.0, 0.0)),
+        SpringsEffect(stretch=1e5),
+        GravityEffect(),
         pins,
         drag,
         size=2,
         mass=2.0,
         time_step=dt,
     )
-    return integrated(made, "midpoint")
+    return with_integrator(made, "midpoint")
 
 
 def amplitudes(made: Scene, seconds: float, first: float) -> np.ndarray:
@@ -70,7 +75,7 @@ PERIOD = 2 * np.pi / G**0.5
 def test_a_pendulum_in_linear_drag_decays_at_its_rate():
     """m x'' = -c x' - m g x / l: the amplitude decays by exp(-c t / 2 m)."""
     c, dt = 0.2, PERIOD / 100
-    found = amplitudes(pendulum(AirDrag(coefficient=2 * c), dt), 5 * PERIOD, 0.05)
+    found = amplitudes(pendulum(AirDragEffect(coefficient=2 * c), dt), 5 * PERIOD, 0.05)
     rate = -np.log(found[-1] / found[0]) / (5 * PERIOD)
     assert rate == pytest.approx(c / 2, rel=0.01)  # midpoint and the rod's stretch err by some (dt w)^2 = 0.4 %
 
@@ -78,7 +83,7 @@ def test_a_pendulum_in_linear_drag_decays_at_its_rate():
 def test_a_pendulum_in_quadratic_drag_decays_as_one_over_time():
     """m x'' = -k |x'| x' - m g x / l: 1/A grows by 4 k w l / (3 pi m) a second, by the work done in a period."""
     k, dt = 2.0, PERIOD / 200
-    found = amplitudes(pendulum(AirDrag(law="quadratic", coefficient=2 * k), dt), 5 * PERIOD, 0.01)
+    found = amplitudes(pendulum(AirDragEffect(law="quadratic", coefficient=2 * k), dt), 5 * PERIOD, 0.01)
     wanted = 4 * k * G**0.5 / (3 * np.pi)
     growth = (1 / found[-1] - 1 / found[0]) / (5 * PERIOD)
     assert growth == pytest.approx(wanted, rel=0.01)  # averaging over a period errs by some k A/4
@@ -88,8 +93,8 @@ def test_a_pendulum_in_quadratic_drag_decays_as_one_over_time():
 def test_linear_drag_slows_a_free_body_by_each_integrators_own_formula(integrator):
     """v' = v / (1 + c dt/m) for implicit Euler; the others are closer to exp(-c dt/m) by an order."""
     velocity = np.tile([1.0, -2.0, 0.5], (4, 1))
-    made = scene(Chain(), AirDrag(coefficient=3.0), size=4, mass=2.0, time_step=0.02)
-    v = moving(integrated(made, integrator), velocity, 20)[-1].velocity
+    made = build_test_scene(ChainMesh(), AirDragEffect(coefficient=3.0), size=4, mass=2.0, time_step=0.02)
+    v = moving(with_integrator(made, integrator), velocity, 20)[-1].velocity
     factor = {"implicit-euler": (1 + 0.03) ** -20.0}.get(integrator, np.exp(-0.6))
     # Euler's is exact; BDF2's first step is Euler's, whose error is (0.03)^2 / 2.
     np.testing.assert_allclose(v, factor * velocity, rtol=1e-11 if integrator == "implicit-euler" else 2e-3)
@@ -97,24 +102,26 @@ def test_linear_drag_slows_a_free_body_by_each_integrators_own_formula(integrato
 
 @pytest.mark.parametrize("coefficient", [0.01, 1.0, 1e6])
 def test_quadratic_drag_is_exact_at_any_time_step(coefficient):
-    made = scene(Chain(), AirDrag(law="quadratic", coefficient=coefficient), size=3, mass=2.0, time_step=5.0)
+    made = build_test_scene(
+        ChainMesh(), AirDragEffect(law="quadratic", coefficient=coefficient), size=3, mass=2.0, time_step=5.0
+    )
     v = moving(made, np.tile([3.0, 0.0, 4.0], (3, 1)), 4)[-1].velocity
     # 1/|v| grows by c/m a second,
     # with a velocity of 1e-7 m/s as the difference of positions of order one over 5 s, at worst.
     np.testing.assert_allclose(1 / np.linalg.norm(v, axis=1), 0.2 + coefficient / 2.0 * 20.0, rtol=1e-9)
 
 
-def oscillator(*damping: Effect) -> Scene:
+def oscillator(*damping: SceneEffect) -> Scene:
     """Two masses of 1 kg on a spring of 100 N/m and 1 m: the angular frequency is sqrt(200)."""
-    made = scene(Chain(), Springs(stretch=100.0), *damping, size=2, mass=2.0, time_step=0.002)
-    return integrated(made, "midpoint")
+    made = build_test_scene(ChainMesh(), SpringsEffect(stretch=100.0), *damping, size=2, mass=2.0, time_step=0.002)
+    return with_integrator(made, "midpoint")
 
 
 DAMPED = {
-    "dashpots": (Dashpots(stretch=1.5), 1.5),
-    "Rayleigh, stiffness": (Rayleigh(stiffness=0.015), 1.5),
-    "Rayleigh, masses": (Rayleigh(mass=3.0), 1.5),
-    "Rayleigh, both": (Rayleigh(mass=1.0, stiffness=0.01), 1.5),
+    "dashpots": (DashpotsEffect(stretch=1.5), 1.5),
+    "Rayleigh, stiffness": (RayleighEffect(stiffness=0.015), 1.5),
+    "Rayleigh, masses": (RayleighEffect(mass=3.0), 1.5),
+    "Rayleigh, both": (RayleighEffect(mass=1.0, stiffness=0.01), 1.5),
 }
 
 
@@ -135,9 +142,9 @@ def test_an_oscillator_decays_at_its_rate(case):
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_dashpots_conserve_linear_momentum(integrator):
     rng = np.random.default_rng(0)
-    made = scene(Grid(), Springs(stretch=100.0), Dashpots(stretch=5.0), size=5)
-    velocity = rng.normal(size=made.mesh.rest.shape)
-    path = moving(integrated(made, integrator), velocity, 10)
+    made = build_test_scene(GridMesh(), SpringsEffect(stretch=100.0), DashpotsEffect(stretch=5.0), size=5)
+    velocity = rng.normal(size=made.mesh.rest_positions.shape)
+    path = moving(with_integrator(made, integrator), velocity, 10)
     momentum = np.array([made.system.mass @ now.velocity for now in path])
     # Newton's residual, 1e-10 of the first forces of some newtons, times dt.
     np.testing.assert_allclose(momentum, momentum[[0]].repeat(11, 0), rtol=0, atol=1e-10)
@@ -146,8 +153,8 @@ def test_dashpots_conserve_linear_momentum(integrator):
 def test_dashpots_conserve_angular_momentum_by_implicit_euler():
     """Their forces are along p^t, so sum p^t x f = 0, and p' x m v' = p^t x m v' for p' = p^t + dt v'."""
     rng = np.random.default_rng(1)
-    made = scene(Grid(), Dashpots(stretch=5.0), size=5)
-    path = moving(made, rng.normal(size=made.mesh.rest.shape), 10)
+    made = build_test_scene(GridMesh(), DashpotsEffect(stretch=5.0), size=5)
+    path = moving(made, rng.normal(size=made.mesh.rest_positions.shape), 10)
     spin = [np.cross(now.positions, made.system.mass[:, None] * now.velocity).sum(axis=0) for now in path]
     np.testing.assert_allclose(spin, [spin[0]] * 11, rtol=0, atol=1e-10)
     energy = [made.system.mass @ np.sum(now.velocity**2, axis=1) for now in path]
@@ -155,40 +162,53 @@ def test_dashpots_conserve_angular_momentum_by_implicit_euler():
 
 
 def test_dashpots_let_a_rigid_motion_alone():
-    made = scene(Grid(), Dashpots(stretch=1e4), size=5, time_step=1e-3)
-    velocity = np.array([1.0, 2.0, 0.0]) + np.cross([0.0, 3.0, 0.0], made.mesh.rest)
+    made = build_test_scene(GridMesh(), DashpotsEffect(stretch=1e4), size=5, time_step=1e-3)
+    velocity = np.array([1.0, 2.0, 0.0]) + np.cross([0.0, 3.0, 0.0], made.mesh.rest_positions)
     now = moving(made, velocity, 1)[-1]
     # A turn by w dt stretches springs to second order: that speed, w^2 dt l = 0.009 l, is all that can be taken.
     np.testing.assert_allclose(now.velocity, velocity, rtol=0, atol=0.02)
 
 
 @pytest.mark.parametrize(
-    "damping", [Dashpots(stretch=1e9), Rayleigh(mass=1e9, stiffness=1e9), AirDrag(coefficient=1e9)]
+    "damping", [DashpotsEffect(stretch=1e9), RayleighEffect(mass=1e9, stiffness=1e9), AirDragEffect(coefficient=1e9)]
 )
 def test_damping_beyond_all_measure_stops_motion_and_nothing_else(damping):
-    made = scene(Grid(), Springs(stretch=100.0), Gravity(), damping, Pins(at=("top",)), size=5)
-    velocity = np.random.default_rng(2).normal(size=made.mesh.rest.shape)
-    prepared, state = prepare(made, SparseLocalGlobal()), State(Motion(made.mesh.rest, velocity), None, 0)
-    for step in simulate(made, prepared, StopRule(50), first_guess="current", frames=10, state=state):
+    made = build_test_scene(
+        GridMesh(), SpringsEffect(stretch=100.0), GravityEffect(), damping, PinsEffect(at=("top",)), size=5
+    )
+    velocity = np.random.default_rng(2).normal(size=made.mesh.rest_positions.shape)
+    prepared, state = (
+        prepare(made, SparseLocalGlobal()),
+        MotionState(Motion(made.mesh.rest_positions, velocity), None, 0),
+    )
+    for step in simulate_scene(made, prepared, StopRule(50), initial_guess="current", frames=10, initial_state=state):
         assert np.isfinite(step.positions).all()
-        assert np.abs(step.positions - made.mesh.rest).max() < 1.0
+        assert np.abs(step.positions - made.mesh.rest_positions).max() < 1.0
 
 
 def test_rayleigh_damping_takes_the_matrix_of_bending():
-    made = scene(Grid(), Bending(stiffness=2.0), Rayleigh(stiffness=0.5), size=4)
+    made = build_test_scene(GridMesh(), BendingEffect(stiffness=2.0), RayleighEffect(stiffness=0.5), size=4)
     bending, damping = made.system.energies
     assert isinstance(damping, RayleighDamping)
-    n = len(made.mesh.rest)
+    n = len(made.mesh.rest_positions)
     found, wanted = damping.stiffness_matrix(n), bending.stiffness_matrix(n)  # pyright: ignore[reportAttributeAccessIssue]
     assert np.abs(found - 0.5 * wanted).max() <= 1e-14 * np.abs(wanted).max()  # at the rate of 1/s
 
 
 def test_damping_is_the_same_in_the_first_step_of_an_integrator_that_needs_a_history():
     """The first step is implicit Euler's, whose Q has the rate 1/dt and not 3/(2 dt)."""
-    made = scene(Grid(), Springs(stretch=100.0), Dashpots(stretch=1.0), Gravity(), Pins(at=("top",)), size=4)
-    euler, bdf2 = (integrated(made, name) for name in ("implicit-euler", "bdf2"))
+    made = build_test_scene(
+        GridMesh(),
+        SpringsEffect(stretch=100.0),
+        DashpotsEffect(stretch=1.0),
+        GravityEffect(),
+        PinsEffect(at=("top",)),
+        size=4,
+    )
+    euler, bdf2 = (with_integrator(made, name) for name in ("implicit-euler", "bdf2"))
     stop = StopRule(7)
     one, two = (
-        next(simulate(s, prepare(s, SparseLocalGlobal()), stop, first_guess="current", frames=1)) for s in (euler, bdf2)
+        next(simulate_scene(s, prepare(s, SparseLocalGlobal()), stop, initial_guess="current", frames=1))
+        for s in (euler, bdf2)
     )
     np.testing.assert_array_equal(one.positions, two.positions)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from solvers.matrices import assemble
+from solvers.matrices import assemble_system_matrix
 from solvers.problem import Energy, Positions, ProjectiveEnergy, StepProblem, is_lagged
-from tests.effects import SCENES, cloth, stepped
+from tests.effects import EFFECT_SCENES, build_effect_cloth, build_moving_problem
 
 INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
 PROBLEMS = {
-    f"{name}, {integrator}": (name, integrator) for name in SCENES for integrator in INTEGRATORS if "all" in name
-} | {name: (name, "implicit-euler") for name in SCENES if "all" not in name}
+    f"{name}, {integrator}": (name, integrator) for name in EFFECT_SCENES for integrator in INTEGRATORS if "all" in name
+} | {name: (name, "implicit-euler") for name in EFFECT_SCENES if "all" not in name}
 problems = pytest.mark.parametrize("case", PROBLEMS)
 
 STEP = 1e-7
@@ -22,7 +22,7 @@ positions of order one, 1e-16, leaves seven digits or more."""
 
 def of(case: str) -> StepProblem:
     name, integrator = PROBLEMS[case]
-    return stepped(SCENES[name](), integrator)
+    return build_moving_problem(EFFECT_SCENES[name](), integrator)
 
 
 def gradient(energy: Energy, p: Positions) -> Positions:
@@ -33,7 +33,9 @@ def gradient(energy: Energy, p: Positions) -> Positions:
 
 def places(problem: StepProblem) -> tuple[Positions, Positions]:
     rng = np.random.default_rng(1)
-    return problem.current + 0.02 * rng.normal(size=problem.current.shape), rng.normal(size=problem.current.shape)
+    return problem.current_positions + 0.02 * rng.normal(size=problem.current_positions.shape), rng.normal(
+        size=problem.current_positions.shape
+    )
 
 
 @problems
@@ -93,11 +95,11 @@ def test_a_projective_energys_stiffness_is_nowhere_less_than_its_hessian(case):
 @problems
 def test_the_system_matrix_has_the_stiffness_of_the_step(case):
     problem = of(case)
-    n = problem.system.vertices
+    n = problem.system.num_vertices
     projective = [energy for energy in problem.system.energies if isinstance(energy, ProjectiveEnergy)]
-    Q = assemble(problem.system, projective).toarray()
+    Q = assemble_system_matrix(problem.system, projective).toarray()
     s = problem.system
-    held = s.inertia + np.bincount(*s.penalty[1:], minlength=n)
+    held = s.inertia_diagonal + np.bincount(*s.penalty_pins[1:], minlength=n)
     wanted = np.diag(held)
     for energy in problem.energies:
         wanted = wanted + (energy.stiffness_matrix(n).toarray() if isinstance(energy, ProjectiveEnergy) else 0.0)
@@ -105,12 +107,12 @@ def test_the_system_matrix_has_the_stiffness_of_the_step(case):
 
 
 def test_a_lagged_energy_does_not_keep_what_a_step_told_it():
-    problem = stepped(cloth())
-    one, two = (stepped(SCENES["all that are projective"]()) for _ in range(2))
-    assert problem.value(problem.current) < one.value(one.current)
+    problem = build_moving_problem(build_effect_cloth())
+    one, two = (build_moving_problem(EFFECT_SCENES["all that are projective"]()) for _ in range(2))
+    assert problem.value(problem.current_positions) < one.value(one.current_positions)
     lagged = [energy for energy in one.system.energies if is_lagged(energy)]
     assert len(lagged) == 6  # dashpots, Rayleigh damping of masses, springs and bending, air drag, attachments
     for energy in lagged:
-        once, again = (energy.begin_step(one.start).value(one.current) for _ in range(2))
+        once, again = (energy.begin_step(one.step_start).value(one.current_positions) for _ in range(2))
         assert once == again
-    assert one.value(one.current) == two.value(two.current)
+    assert one.value(one.current_positions) == two.value(two.current_positions)

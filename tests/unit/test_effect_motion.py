@@ -10,23 +10,25 @@ import pytest
 from pydantic import ValidationError
 
 from harness.base.errors import InputError
-from harness.scenes.effects.attachments import Attachments
-from harness.scenes.effects.ether_drag import EtherDrag
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.effects.wind import Wind
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.motion import Key, KeyedMotion
-from harness.simulation.step import prepare, simulate
+from harness.scenes.effects.attachments import AttachmentsEffect
+from harness.scenes.effects.ether_drag import EtherDragEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.effects.wind import WindEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
+from harness.scenes.motion import KeyFrame, KeyFrameMotion
+from harness.simulation.step import prepare, simulate_scene
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import StopRule
-from tests.effects import at_rest, integrated
-from tests.scenes import scene
+from tests.effects import compute_rest_shape, with_integrator
+from tests.scenes import build_test_scene
 
 POINTS = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 1.0]])
-LIFT = KeyedMotion(keys=(Key(time=1.0), Key(time=2.0, offset=(0.0, 3.0, 0.0)), Key(time=4.0, offset=(0.0, 1.0, 0.0))))
+LIFT = KeyFrameMotion(
+    keys=(KeyFrame(time=1.0), KeyFrame(time=2.0, offset=(0.0, 3.0, 0.0)), KeyFrame(time=4.0, offset=(0.0, 1.0, 0.0)))
+)
 INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
 
 
@@ -34,33 +36,39 @@ INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
     ("time", "height"), [(0.0, 0.0), (1.0, 0.0), (1.5, 1.5), (2.0, 3.0), (3.0, 2.0), (4.0, 1.0), (9.0, 1.0)]
 )
 def test_points_go_straight_from_key_to_key_and_rest_before_and_after(time, height):
-    np.testing.assert_allclose(LIFT.moved(POINTS, time), POINTS + np.array([0.0, height, 0.0]), rtol=1e-15)
+    np.testing.assert_allclose(LIFT.transform_points(POINTS, time), POINTS + np.array([0.0, height, 0.0]), rtol=1e-15)
 
 
 def test_a_smooth_motion_goes_through_its_keys_and_never_beyond():
     smooth = LIFT.model_copy(update={"between": "smooth"})
     times = np.linspace(0.0, 5.0, 501)
-    heights = np.array([smooth.moved(POINTS, t)[0, 1] for t in times])
+    heights = np.array([smooth.transform_points(POINTS, t)[0, 1] for t in times])
     assert heights.min() == 0.0
     assert heights.max() == 3.0
     for key in LIFT.keys:
-        np.testing.assert_allclose(smooth.moved(POINTS, key.time), LIFT.moved(POINTS, key.time), rtol=1e-15)
+        np.testing.assert_allclose(
+            smooth.transform_points(POINTS, key.time), LIFT.transform_points(POINTS, key.time), rtol=1e-15
+        )
     speed = np.diff(heights[100:401]) / 0.01
     assert np.abs(np.diff(speed)).max() < 0.3  # no corner: straight ones turn by 4 m/s at two seconds
 
 
 def test_a_turn_is_about_its_axis():
-    motion = KeyedMotion(keys=(Key(time=0.0), Key(time=1.0, turn=180.0)), axis=(0.0, 0.0, 2.0), about=(1.0, 1.0, 5.0))
-    np.testing.assert_allclose(motion.moved(np.array([[3.0, 1.0, 0.0]]), 0.5), [[1.0, 3.0, 0.0]], atol=1e-15)
-    np.testing.assert_allclose(motion.moved(np.array([[3.0, 1.0, 0.0]]), 1.0), [[-1.0, 1.0, 0.0]], atol=1e-15)
+    motion = KeyFrameMotion(
+        keys=(KeyFrame(time=0.0), KeyFrame(time=1.0, turn=180.0)), axis=(0.0, 0.0, 2.0), about=(1.0, 1.0, 5.0)
+    )
+    np.testing.assert_allclose(motion.transform_points(np.array([[3.0, 1.0, 0.0]]), 0.5), [[1.0, 3.0, 0.0]], atol=1e-15)
+    np.testing.assert_allclose(
+        motion.transform_points(np.array([[3.0, 1.0, 0.0]]), 1.0), [[-1.0, 1.0, 0.0]], atol=1e-15
+    )
 
 
 def test_a_turn_of_many_rounds_keeps_distances():
-    motion = KeyedMotion(keys=(Key(time=0.0), Key(time=1.0, turn=3600.0)), axis=(1.0, 2.0, 3.0))
+    motion = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=1.0, turn=3600.0)), axis=(1.0, 2.0, 3.0))
     for t in (0.013, 0.4, 0.77):
-        a, b = motion.moved(POINTS, t)
+        a, b = motion.transform_points(POINTS, t)
         assert np.linalg.norm(a - b) == pytest.approx(6**0.5, rel=1e-14)
-    np.testing.assert_allclose(motion.moved(POINTS, 1.0), POINTS, atol=1e-13)  # ten rounds, of 63 radians
+    np.testing.assert_allclose(motion.transform_points(POINTS, 1.0), POINTS, atol=1e-13)  # ten rounds, of 63 radians
 
 
 @pytest.mark.parametrize(
@@ -76,85 +84,102 @@ def test_a_turn_of_many_rounds_keeps_distances():
 )
 def test_key_frames_that_mean_nothing_are_refused(data):
     with pytest.raises(ValidationError):
-        KeyedMotion.model_validate(data)
+        KeyFrameMotion.model_validate(data)
 
 
-SWING = KeyedMotion(keys=(Key(time=0.0), Key(time=0.3, offset=(0.2, 0.1, 0.0), turn=60.0)))
+SWING = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=0.3, offset=(0.2, 0.1, 0.0), turn=60.0)))
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("weight", [1e10, "exact"])
 def test_pins_are_on_their_path_at_the_end_of_each_step(integrator, weight):
-    pins = Pins.model_validate({"at": ["top"], "weight": weight, "motion": SWING.model_dump()})
-    made = integrated(scene(Grid(), Springs(stretch=100.0), Gravity(), pins, size=4), integrator)
+    pins = PinsEffect.model_validate({"at": ["top"], "weight": weight, "motion": SWING.model_dump()})
+    made = with_integrator(
+        build_test_scene(GridMesh(), SpringsEffect(stretch=100.0), GravityEffect(), pins, size=4), integrator
+    )
     held = made.system.pins.vertices
-    for step in simulate(made, prepare(made, SparseLocalGlobal()), StopRule(60), first_guess="current", frames=12):
-        wanted = SWING.moved(made.mesh.rest[held], step.index / 30)
+    for step in simulate_scene(
+        made, prepare(made, SparseLocalGlobal()), StopRule(60), initial_guess="current", frames=12
+    ):
+        wanted = SWING.transform_points(made.mesh.rest_positions[held], step.index / 30)
         # A penalty gives way by some newtons over 1e10 N/m, which midpoint carries on from step to step.
         np.testing.assert_allclose(step.positions[held], wanted, rtol=0, atol=1e-8 if weight == 1e10 else 1e-14)
 
 
 def test_a_chain_pulled_at_both_ends_gets_there():
     """Both ends go 1 m along; what hangs between them follows and comes to rest a metre further, through drag."""
-    along = KeyedMotion(keys=(Key(time=0.0), Key(time=0.5, offset=(1.0, 0.0, 0.0))))
-    pins = Pins(at=("ends",), weight="exact", motion=along)
-    made = scene(Chain(), Springs(stretch=100.0), pins, EtherDrag(rate=10.0), size=6)
-    *_, last = simulate(made, prepare(made, SparseLocalGlobal()), StopRule(50), first_guess="current", frames=90)
-    np.testing.assert_allclose(last.positions, made.mesh.rest + np.array([1.0, 0.0, 0.0]), rtol=0, atol=1e-3)
+    along = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=0.5, offset=(1.0, 0.0, 0.0))))
+    pins = PinsEffect(at=("ends",), weight="exact", motion=along)
+    made = build_test_scene(ChainMesh(), SpringsEffect(stretch=100.0), pins, EtherDragEffect(rate=10.0), size=6)
+    *_, last = simulate_scene(
+        made, prepare(made, SparseLocalGlobal()), StopRule(50), initial_guess="current", frames=90
+    )
+    np.testing.assert_allclose(last.positions, made.mesh.rest_positions + np.array([1.0, 0.0, 0.0]), rtol=0, atol=1e-3)
 
 
 def test_pins_that_rest_and_pins_that_move_live_in_one_scene():
-    made = scene(Grid(), Pins(at=("bottom",)), Pins(at=("top",), weight="exact", motion=SWING), size=3)
-    targets = made.pins_at(0.15)
+    made = build_test_scene(
+        GridMesh(), PinsEffect(at=("bottom",)), PinsEffect(at=("top",), weight="exact", motion=SWING), size=3
+    )
+    targets = made.pin_targets_at(0.15)
     np.testing.assert_array_equal(made.system.pins.vertices, [0, 1, 2, 6, 7, 8])
-    np.testing.assert_array_equal(targets[3:], made.mesh.rest[6:])
-    np.testing.assert_array_equal(targets[:3], SWING.moved(made.mesh.rest[:3], 0.15))
-    assert made.pins_at(0.15) is not made.pin_targets
-    np.testing.assert_array_equal(made.pin_targets, made.mesh.rest[made.system.pins.vertices])
+    np.testing.assert_array_equal(targets[3:], made.mesh.rest_positions[6:])
+    np.testing.assert_array_equal(targets[:3], SWING.transform_points(made.mesh.rest_positions[:3], 0.15))
+    assert made.pin_targets_at(0.15) is not made.pin_targets
+    np.testing.assert_array_equal(made.pin_targets, made.mesh.rest_positions[made.system.pins.vertices])
 
 
 def test_a_vertex_pinned_to_rest_and_to_move_is_refused_with_both_names():
     with pytest.raises(InputError, match=r"vertex 0 is pinned twice, by effects\[0\] and effects\[1\]"):
-        scene(Grid(), Pins(at=("left",)), Pins(at=("top",), motion=SWING), size=3)
-    both = scene(Grid(), Pins(at=("left",), motion=SWING), Pins(at=("top",), motion=SWING), size=3)
+        build_test_scene(GridMesh(), PinsEffect(at=("left",)), PinsEffect(at=("top",), motion=SWING), size=3)
+    both = build_test_scene(
+        GridMesh(), PinsEffect(at=("left",), motion=SWING), PinsEffect(at=("top",), motion=SWING), size=3
+    )
     assert len(both.system.pins.vertices) == 5
 
 
-def hanging(*attachments: Attachments):
-    return scene(Chain(direction=(0.0, -1.0, 0.0)), Springs(stretch=1e4), Gravity(), *attachments, size=4, mass=2.0)
+def hanging(*attachments: AttachmentsEffect):
+    return build_test_scene(
+        ChainMesh(direction=(0.0, -1.0, 0.0)),
+        SpringsEffect(stretch=1e4),
+        GravityEffect(),
+        *attachments,
+        size=4,
+        mass=2.0,
+    )
 
 
 def test_an_attachment_gives_way_by_the_weight_over_its_stiffness():
-    p = at_rest(hanging(Attachments(at=("first",), stiffness=50.0)))
+    p = compute_rest_shape(hanging(AttachmentsEffect(at=("first",), stiffness=50.0)))
     assert p[0, 1] == pytest.approx(-2.0 * 9.81 / 50.0, rel=1e-7)  # inertia holds with 2e-6 N/m
 
 
 def test_attachments_share_their_stiffness():
-    p = at_rest(hanging(Attachments(every=1, indices=(0, 1, 2, 3), stiffness=50.0)))
+    p = compute_rest_shape(hanging(AttachmentsEffect(every=1, indices=(0, 1, 2, 3), stiffness=50.0)))
     assert p.mean(axis=0)[1] - (-0.5) == pytest.approx(-2.0 * 9.81 / 50.0, rel=1e-3)  # masses are 1 2 2 1
 
 
 def test_attachments_pull_to_the_points_that_they_name():
     one, each = ((2.0, 0.0, 0.0),), ((0.0, 1.0, 0.0), (1.0, 1.0, 0.0))
-    mesh = scene(Chain(), Attachments(at=("ends",), stiffness=3.0, to=each), size=3)
-    np.testing.assert_allclose(at_rest(mesh)[[0, 2]], each, rtol=0, atol=1e-6)  # as above
-    mesh = scene(Chain(), Attachments(at=("ends",), stiffness=3.0, to=one), size=3)
-    np.testing.assert_allclose(at_rest(mesh)[[0, 2]], one * 2, rtol=0, atol=1e-6)
+    mesh = build_test_scene(ChainMesh(), AttachmentsEffect(at=("ends",), stiffness=3.0, to=each), size=3)
+    np.testing.assert_allclose(compute_rest_shape(mesh)[[0, 2]], each, rtol=0, atol=1e-6)  # as above
+    mesh = build_test_scene(ChainMesh(), AttachmentsEffect(at=("ends",), stiffness=3.0, to=one), size=3)
+    np.testing.assert_allclose(compute_rest_shape(mesh)[[0, 2]], one * 2, rtol=0, atol=1e-6)
     with pytest.raises(InputError, match="came 2 points for 1 vertices"):
-        scene(Chain(), Attachments(at=("first",), stiffness=3.0, to=each), size=3)
+        build_test_scene(ChainMesh(), AttachmentsEffect(at=("first",), stiffness=3.0, to=each), size=3)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_an_attachment_pulls_a_free_mass_behind_its_point_as_the_equation_of_motion_says(integrator):
     """m x'' = -k (x - v t): x = v (t - sin(w t) / w)."""
     speed, w, seconds = 2.0, 5.0, 1.0
-    motion = KeyedMotion(keys=(Key(time=0.0), Key(time=10.0, offset=(10 * speed, 0.0, 0.0))))
+    motion = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=10.0, offset=(10 * speed, 0.0, 0.0))))
     wanted, errors = speed * (seconds - np.sin(w * seconds) / w), []
     for dt in (0.01, 0.005, 0.0025):
-        ends = Attachments(at=("ends",), stiffness=2 * w**2, motion=motion)
-        made = integrated(scene(Chain(), ends, size=2, mass=2.0, time_step=dt), integrator)
-        run = simulate(
-            made, prepare(made, SparseLocalGlobal()), StopRule(1), first_guess="current", frames=round(1 / dt)
+        ends = AttachmentsEffect(at=("ends",), stiffness=2 * w**2, motion=motion)
+        made = with_integrator(build_test_scene(ChainMesh(), ends, size=2, mass=2.0, time_step=dt), integrator)
+        run = simulate_scene(
+            made, prepare(made, SparseLocalGlobal()), StopRule(1), initial_guess="current", frames=round(1 / dt)
         )
         *_, last = run
         errors.append(last.positions[0, 0] - wanted)
@@ -165,8 +190,12 @@ def test_an_attachment_pulls_a_free_mass_behind_its_point_as_the_equation_of_mot
 
 def test_what_does_nothing_is_left_out_and_the_log_says_so(caplog):
     with caplog.at_level(logging.INFO, "springbench"):
-        made = scene(
-            Chain(), Springs(stretch=1.0), Wind(strength=0.0), Attachments(at=("first",), stiffness=0.0), size=3
+        made = build_test_scene(
+            ChainMesh(),
+            SpringsEffect(stretch=1.0),
+            WindEffect(strength=0.0),
+            AttachmentsEffect(at=("first",), stiffness=0.0),
+            size=3,
         )
     assert len(made.system.energies) == 1
     assert [record.getMessage() for record in caplog.records] == [

@@ -10,27 +10,27 @@ import pytest
 from pydantic import ValidationError
 
 from harness.base.errors import InputError
-from harness.scenes.bind import build
-from harness.scenes.effects.self_contact import SelfContact
-from harness.scenes.effects.sewing import Sewing
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.stack import Stack
-from harness.scenes.selection import Selection
+from harness.scenes.bind import build_scene
+from harness.scenes.effects.self_contact import SelfContactEffect
+from harness.scenes.effects.sewing import SewingEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.stack import StackMesh
+from harness.scenes.selection import VertexSelection
 from harness.scenes.spec import SceneSpec
-from harness.simulation.observe import intersections
-from harness.simulation.opinion.second import second_opinion
-from harness.simulation.step import prepare, simulate
+from harness.simulation.observe import count_intersections
+from harness.simulation.opinion.second import verify_terms
+from harness.simulation.step import prepare, simulate_scene
 from solvers.energies.sewing import Sewing as Energy
 from solvers.problem import StopRule
-from solvers.registry import SOLVERS, load
+from solvers.registry import SOLVERS, load_target
 
-ROWS = tuple(Selection(indices=tuple(range(first, first + 5))) for first in (0, 25))
-SEWN = Sewing(first=ROWS[0], second=ROWS[1], stiffness=2e4, begin=0.02, end=0.2, gap=0.05)
+ROWS = tuple(VertexSelection(indices=tuple(range(first, first + 5))) for first in (0, 25))
+SEWN = SewingEffect(first=ROWS[0], second=ROWS[1], stiffness=2e4, begin=0.02, end=0.2, gap=0.05)
 
 
 def spec(*effects) -> SceneSpec:
     given: dict[str, Any] = {"mass": 0.2, "time_step": 0.02, "frames": 20, "path": Path("scene.yaml")}
-    return SceneSpec(mesh=Stack(apart=0.2), effects=(Springs(stretch=100.0), *effects), **given)
+    return SceneSpec(mesh=StackMesh(apart=0.2), effects=(SpringsEffect(stretch=100.0), *effects), **given)
 
 
 def gaps(p: np.ndarray) -> np.ndarray:
@@ -39,8 +39,10 @@ def gaps(p: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("solver", ["newton", "numba", "admm"])
 def test_a_seam_closes_when_it_should_and_stays_closed(solver):
-    made = build(spec(SEWN), 5)
-    steps = simulate(made, prepare(made, load(SOLVERS[solver])()), StopRule(300, 1e-6), first_guess="motion", frames=14)
+    made = build_scene(spec(SEWN), 5)
+    steps = simulate_scene(
+        made, prepare(made, load_target(SOLVERS[solver])()), StopRule(300, 1e-6), initial_guess="motion", frames=14
+    )
     open_ = [float(gaps(step.positions).max()) for step in steps]
     assert open_[0] == pytest.approx(0.2, abs=1e-12)  # they begin at the end of this step
     # At most as long as they may be, but for what inertia and springs, some N, stretch threads of 4e3 N/m by.
@@ -50,28 +52,28 @@ def test_a_seam_closes_when_it_should_and_stays_closed(solver):
 
 
 def test_with_self_contact_the_panels_meet_and_pass_nowhere():
-    made = build(spec(SEWN, SelfContact(thickness=0.01)), 5)
-    last = made.mesh.rest
-    for step in simulate(
-        made, prepare(made, load(SOLVERS["newton"])()), StopRule(50, 1e-4), first_guess="motion", frames=14
+    made = build_scene(spec(SEWN, SelfContactEffect(thickness=0.01)), 5)
+    last = made.mesh.rest_positions
+    for step in simulate_scene(
+        made, prepare(made, load_target(SOLVERS["newton"])()), StopRule(50, 1e-4), initial_guess="motion", frames=14
     ):
-        assert intersections(made, step.positions, 0.0) == 0
+        assert count_intersections(made, step.positions, 0.0) == 0
         last = step.positions
     assert gaps(last).max() < 0.052
 
 
 def test_each_vertex_is_sewn_to_what_is_nearest():
-    made = build(spec(SEWN.model_copy(update={"second": Selection(indices=(25, 29))})), 5)
+    made = build_scene(spec(SEWN.model_copy(update={"second": VertexSelection(indices=(25, 29))})), 5)
     (energy,) = (e for e in made.system.energies if isinstance(e, Energy))
     assert energy.edges.tolist() == [[0, 25], [1, 25], [2, 25], [3, 29], [4, 29]]
 
 
 def test_the_second_opinion_agrees():
-    assert second_opinion(spec(SEWN), build(spec(SEWN), 5), "implicit-euler") == "agrees"
+    assert verify_terms(spec(SEWN), build_scene(spec(SEWN), 5), "implicit-euler") == "agrees"
 
 
 def test_rows_that_share_a_vertex_and_ends_before_the_beginning_are_refused():
     with pytest.raises(InputError, match="sewing: vertex 0 is in both rows"):
-        build(spec(SEWN.model_copy(update={"second": Selection(indices=(0,))})), 3)
+        build_scene(spec(SEWN.model_copy(update={"second": VertexSelection(indices=(0,))})), 3)
     with pytest.raises(ValidationError, match="end at 0 s, before they begin at 1 s"):
-        Sewing(first=ROWS[0], second=ROWS[1], stiffness=1.0, begin=1.0, end=0.0)
+        SewingEffect(first=ROWS[0], second=ROWS[1], stiffness=1.0, begin=1.0, end=0.0)

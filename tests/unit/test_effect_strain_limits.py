@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.effects.strain_limits import StrainLimits
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.effects.strain_limits import StrainLimitsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
 from solvers.energies import strain_limits
-from tests.effects import at_rest
-from tests.scenes import scene
+from tests.effects import compute_rest_shape
+from tests.scenes import build_test_scene
 
 
 def ratios(made, p) -> np.ndarray:
@@ -23,11 +23,19 @@ def ratios(made, p) -> np.ndarray:
 
 def test_no_spring_is_beyond_the_limit_when_converged():
     free, limited = (
-        scene(Grid(plane="vertical"), Springs(stretch=10.0), Gravity(), Pins(at=("top",)), *limits, size=9, mass=0.5)
-        for limits in ((), (StrainLimits(longest=1.1, stiffness=2e4),))
+        build_test_scene(
+            GridMesh(plane="vertical"),
+            SpringsEffect(stretch=10.0),
+            GravityEffect(),
+            PinsEffect(at=("top",)),
+            *limits,
+            size=9,
+            mass=0.5,
+        )
+        for limits in ((), (StrainLimitsEffect(longest=1.1, stiffness=2e4),))
     )
-    assert ratios(free, at_rest(free)).max() > 1.15
-    stretched = ratios(limited, at_rest(limited))
+    assert ratios(free, compute_rest_shape(free)).max() > 1.15
+    stretched = ratios(limited, compute_rest_shape(limited))
     # The weight of 4.9 N hangs on a metre of width: a strain of 2.5e-4 over 2e4 N/m, and twice that at the corners.
     assert 1.1 < stretched.max() <= 1.1 + 1e-3
 
@@ -35,38 +43,38 @@ def test_no_spring_is_beyond_the_limit_when_converged():
 def test_a_chain_at_its_limit_gives_way_by_what_the_stiffness_says():
     """The springs hold EA (l - 1), the limits EA' (l - 1.1), and both together the weight that hangs below."""
     ea, stiff, mass, size = 50.0, 5e4, 2.0, 6
-    made = scene(
-        Chain(direction=(0.0, -1.0, 0.0)),
-        Springs(stretch=ea),
-        Gravity(),
-        StrainLimits(longest=1.1, stiffness=stiff),
-        Pins(at=("first",), weight="exact"),
+    made = build_test_scene(
+        ChainMesh(direction=(0.0, -1.0, 0.0)),
+        SpringsEffect(stretch=ea),
+        GravityEffect(),
+        StrainLimitsEffect(longest=1.1, stiffness=stiff),
+        PinsEffect(at=("first",), weight="exact"),
         size=size,
         mass=mass,
     )
     tension = 9.81 * np.cumsum(made.system.mass[::-1])[:-1][::-1]
     wanted = 1 + np.where(tension > 0.1 * ea, (tension + 0.1 * stiff) / (ea + stiff), tension / ea)
-    np.testing.assert_allclose(ratios(made, at_rest(made)), wanted, rtol=1e-8)  # of convergence
+    np.testing.assert_allclose(ratios(made, compute_rest_shape(made)), wanted, rtol=1e-8)  # of convergence
 
 
 def test_springs_within_their_limits_feel_nothing():
-    mesh = Grid().build(5)
-    limits = StrainLimits(longest=1.2, shortest=0.8, stiffness=100.0)
-    (energy,) = limits.bind(mesh, np.ones(len(mesh.rest)), 0.1).energies
+    mesh = GridMesh().build_mesh(5)
+    limits = StrainLimitsEffect(longest=1.2, shortest=0.8, stiffness=100.0)
+    (energy,) = limits.build_contribution(mesh, np.ones(len(mesh.rest_positions)), 0.1).energies
     for scale in (0.81, 1.0, 1.19):
-        p, out = scale * mesh.rest, np.zeros_like(mesh.rest)
+        p, out = scale * mesh.rest_positions, np.zeros_like(mesh.rest_positions)
         energy.add_gradient(p, out)
         # Lengths of a fifth of a metre have 1e-17; what is within the limits is left as it is.
         assert energy.value(p) == 0.0
         assert not out.any()
         assert energy.hessian(p).nnz == 0
     for scale in (0.79, 1.21):
-        assert energy.value(scale * mesh.rest) > 0.0
+        assert energy.value(scale * mesh.rest_positions) > 0.0
 
 
 def test_a_spring_pressed_to_a_point_is_pushed_to_its_shortest_length():
-    mesh = Chain().build(2)
-    (energy,) = StrainLimits(shortest=0.5, stiffness=10.0).bind(mesh, np.ones(2), 0.1).energies
+    mesh = ChainMesh().build_mesh(2)
+    (energy,) = StrainLimitsEffect(shortest=0.5, stiffness=10.0).build_contribution(mesh, np.ones(2), 0.1).energies
     assert isinstance(energy, strain_limits.StrainLimits)
     p, out = np.zeros((2, 3)), np.zeros((2, 3))
     energy.add_gradient(p, out)
@@ -78,4 +86,4 @@ def test_a_spring_pressed_to_a_point_is_pushed_to_its_shortest_length():
 @pytest.mark.parametrize("data", [{"longest": 0.9}, {"shortest": 1.1}, {"longest": 1.0, "shortest": 1.0}], ids=str)
 def test_limits_that_mean_nothing_are_refused(data):
     with pytest.raises(ValidationError):
-        StrainLimits.model_validate({"stiffness": 1.0, **data})
+        StrainLimitsEffect.model_validate({"stiffness": 1.0, **data})

@@ -7,28 +7,30 @@ import pytest
 from pydantic import ValidationError
 
 from harness.base.errors import InputError
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.effects.wind import Wind
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.mesh.surfaces import Balloon
-from harness.simulation.step import prepare, simulate
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.effects.wind import WindEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
+from harness.scenes.mesh.surfaces import BalloonMesh
+from harness.simulation.step import prepare, simulate_scene
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import Positions, StopRule
-from tests.scenes import scene
+from tests.scenes import build_test_scene
 
-PLATE = Grid(width=2.0, height=1.5, plane="vertical").build(5)
+PLATE = GridMesh(width=2.0, height=1.5, plane="vertical").build_mesh(5)
 """In the plane z = 0, 3 square metres."""
-HEAVY = np.full(len(PLATE.rest), 1e6)
+HEAVY = np.full(len(PLATE.rest_positions), 1e6)
 """Masses so large that no force is limited."""
-STILL = np.zeros_like(PLATE.rest)
+STILL = np.zeros_like(PLATE.rest_positions)
 RHO, AREA = 1.2, 3.0
 
 
-def force(p: Positions = PLATE.rest, v: Positions = STILL, t: float = 0.0, *, mass=HEAVY, dt=0.01, **wind) -> Positions:
-    (blow,) = Wind.model_validate({"per": "triangle", **wind}).bind(PLATE, mass, dt).forces
+def force(
+    p: Positions = PLATE.rest_positions, v: Positions = STILL, t: float = 0.0, *, mass=HEAVY, dt=0.01, **wind
+) -> Positions:
+    (blow,) = WindEffect.model_validate({"per": "triangle", **wind}).build_contribution(PLATE, mass, dt).forces
     return blow(p, v, t)
 
 
@@ -47,7 +49,7 @@ def test_a_plate_feels_drag_along_the_wind_and_lift_across_it(angle):
 
 
 def test_only_the_velocity_of_the_air_relative_to_the_triangle_counts():
-    v = np.tile([1.0, -2.0, 3.0], (len(PLATE.rest), 1))
+    v = np.tile([1.0, -2.0, 3.0], (len(PLATE.rest_positions), 1))
     one = force(velocity=(4.0, 1.0, 5.0), lift=0.3)
     two = force(velocity=(5.0, -1.0, 8.0), v=v, lift=0.3)
     np.testing.assert_allclose(one, two, rtol=1e-13)
@@ -55,59 +57,63 @@ def test_only_the_velocity_of_the_air_relative_to_the_triangle_counts():
 
 
 def test_the_force_does_not_depend_on_which_way_triangles_face():
-    mirrored = PLATE.rest * [-1.0, 1.0, 1.0]  # their normals now point the other way
-    found, wanted = (force(p, velocity=(0.0, 0.0, 5.0), lift=0.4) for p in (mirrored, PLATE.rest))
+    mirrored = PLATE.rest_positions * [-1.0, 1.0, 1.0]  # their normals now point the other way
+    found, wanted = (force(p, velocity=(0.0, 0.0, 5.0), lift=0.4) for p in (mirrored, PLATE.rest_positions))
     np.testing.assert_allclose(found, wanted, rtol=1e-13)
 
 
 def test_a_sheet_falls_at_the_speed_at_which_drag_carries_it():
     """Air at rest: m g = rho/2 A C_D v^2."""
-    wind = Wind(per="triangle", velocity=(0.0, 0.0, 0.0), drag=1.3)
-    made = scene(Grid(), Springs(stretch=100.0), Gravity(), wind, size=5, mass=0.4, time_step=0.01)
-    *_, last = simulate(made, prepare(made, SparseLocalGlobal()), StopRule(10), first_guess="inertial", frames=600)
+    wind = WindEffect(per="triangle", velocity=(0.0, 0.0, 0.0), drag=1.3)
+    made = build_test_scene(
+        GridMesh(), SpringsEffect(stretch=100.0), GravityEffect(), wind, size=5, mass=0.4, time_step=0.01
+    )
+    *_, last = simulate_scene(
+        made, prepare(made, SparseLocalGlobal()), StopRule(10), initial_guess="inertial", frames=600
+    )
     wanted = (2 * 0.4 * 9.81 / (RHO * 1.3)) ** 0.5
-    fall = -made.system.mass @ last.state.now.velocity[:, 1] / 0.4
+    fall = -made.system.mass @ last.state.motion.velocity[:, 1] / 0.4
     assert fall == pytest.approx(wanted, rel=1e-3)  # the sheet is a little bent, since its rim is lighter
 
 
 def test_no_triangle_is_blown_faster_than_the_air():
     """A sheet of a gram in a storm of 100 m/s, with steps in which drag alone would throw it back and forth."""
-    made = scene(
-        Grid(),
-        Springs(stretch=50.0),
-        Wind(per="triangle", velocity=(0.0, 100.0, 0.0)),
-        Pins(at=("top",)),
+    made = build_test_scene(
+        GridMesh(),
+        SpringsEffect(stretch=50.0),
+        WindEffect(per="triangle", velocity=(0.0, 100.0, 0.0)),
+        PinsEffect(at=("top",)),
         size=6,
         mass=1e-3,
     )
-    run = simulate(made, prepare(made, SparseLocalGlobal()), StopRule(50), first_guess="current", frames=60)
+    run = simulate_scene(made, prepare(made, SparseLocalGlobal()), StopRule(50), initial_guess="current", frames=60)
     for step in run:
-        assert np.abs(step.state.now.velocity).max() <= 200.0  # of the air, and of springs let loose
-    free = scene(Grid(), Wind(per="triangle", velocity=(0.0, 100.0, 0.0)), size=6, mass=1e-3)
-    run = simulate(free, prepare(free, SparseLocalGlobal()), StopRule(1), first_guess="current", frames=5)
+        assert np.abs(step.state.motion.velocity).max() <= 200.0  # of the air, and of springs let loose
+    free = build_test_scene(GridMesh(), WindEffect(per="triangle", velocity=(0.0, 100.0, 0.0)), size=6, mass=1e-3)
+    run = simulate_scene(free, prepare(free, SparseLocalGlobal()), StopRule(1), initial_guess="current", frames=5)
     for step in run:
-        speed = step.state.now.velocity[:, 1]
+        speed = step.state.motion.velocity[:, 1]
         assert np.all((speed > 0.0) & (speed <= 100.0 * (1 + 1e-9)))
 
 
 def test_a_closed_surface_in_a_wind_is_pushed_along_it():
-    mesh = Balloon().build(6)
-    wind = Wind(per="triangle", velocity=(10.0, 0.0, 0.0))
-    (blow,) = wind.bind(mesh, np.full(len(mesh.rest), 1e6), 0.01).forces
-    total = blow(mesh.rest, np.zeros_like(mesh.rest), 0.0).sum(axis=0)
+    mesh = BalloonMesh().build_mesh(6)
+    wind = WindEffect(per="triangle", velocity=(10.0, 0.0, 0.0))
+    (blow,) = wind.build_contribution(mesh, np.full(len(mesh.rest_positions), 1e6), 0.01).forces
+    total = blow(mesh.rest_positions, np.zeros_like(mesh.rest_positions), 0.0).sum(axis=0)
     # Front and back face the air with pi r^2 each; the mesh is inside the sphere by less than 2 %.
     assert total[0] == pytest.approx(2 * RHO / 2 * np.pi * 0.25 * 100.0, rel=0.02)
     assert np.abs(total[1:]).max() <= 1e-10 * total[0]
 
 
-def gusts(**changed) -> Wind:
-    return Wind.model_validate({"field": "gusts", "per": "triangle", "velocity": (6.0, 0.0, 8.0), **changed})
+def gusts(**changed) -> WindEffect:
+    return WindEffect.model_validate({"field": "gusts", "per": "triangle", "velocity": (6.0, 0.0, 8.0), **changed})
 
 
-def speeds(wind: Wind, times: np.ndarray) -> np.ndarray:
+def speeds(wind: WindEffect, times: np.ndarray) -> np.ndarray:
     """The air's velocity in the middle of the plate, by the drag of a plate that faces it (k, 3)."""
-    (blow,) = wind.bind(PLATE, HEAVY, 0.01).forces
-    total = np.array([blow(PLATE.rest, STILL, t).sum(axis=0) for t in times])
+    (blow,) = wind.build_contribution(PLATE, HEAVY, 0.01).forces
+    total = np.array([blow(PLATE.rest_positions, STILL, t).sum(axis=0) for t in times])
     # f = rho/2 A u_z u
     uz = np.sqrt(total[:, 2] / (RHO / 2 * AREA))
     return total / (RHO / 2 * AREA * uz)[:, None]
@@ -137,8 +143,10 @@ def test_gusts_of_nothing_are_the_constant_wind():
 
 
 def test_gusts_on_vertices_have_the_force_as_their_mean():
-    (blow,) = Wind(field="gusts", force=(2.0, 0.0, 0.0), gustiness=0.2).bind(PLATE, HEAVY, 0.01).forces
-    total = np.array([blow(PLATE.rest, STILL, t).sum(axis=0) for t in np.linspace(0.0, 200.0, 2000)])
+    (blow,) = (
+        WindEffect(field="gusts", force=(2.0, 0.0, 0.0), gustiness=0.2).build_contribution(PLATE, HEAVY, 0.01).forces
+    )
+    total = np.array([blow(PLATE.rest_positions, STILL, t).sum(axis=0) for t in np.linspace(0.0, 200.0, 2000)])
     # As above; the plate is as long as a fortieth to a half of the waves, which averages their height down.
     np.testing.assert_allclose(total.mean(axis=0), [2.0, 0.0, 0.0], rtol=0, atol=0.03)
     assert np.all((total.std(axis=0) > 0.2) & (total.std(axis=0) <= 0.45))
@@ -146,7 +154,7 @@ def test_gusts_on_vertices_have_the_force_as_their_mean():
 
 def test_the_assignments_field_on_triangles_is_a_velocity():
     found = force(field="assignment", t=1.7).sum(axis=0)
-    phi = PLATE.rest[PLATE.triangles].mean(axis=1)[:, 0] / 2.5 + 1.7
+    phi = PLATE.rest_positions[PLATE.triangles].mean(axis=1)[:, 0] / 2.5 + 1.7
     u = np.stack([3 + 1.5 * (1 + np.cos(5 * phi)), 1 + np.cos(0.3 + phi), np.sin(phi)], axis=1)
     wanted = (RHO / 2 * AREA / len(phi) * np.abs(u[:, [2]]) * u).sum(axis=0)
     np.testing.assert_allclose(found, wanted, rtol=1e-12)
@@ -164,7 +172,7 @@ def test_the_assignments_field_on_triangles_is_a_velocity():
     ids=str,
 )
 def test_wind_of_nothing_leaves_nothing(wind):
-    assert Wind.model_validate(wind).bind(PLATE, HEAVY, 0.01).empty
+    assert WindEffect.model_validate(wind).build_contribution(PLATE, HEAVY, 0.01).is_empty
 
 
 @pytest.mark.parametrize(
@@ -180,9 +188,9 @@ def test_wind_of_nothing_leaves_nothing(wind):
 )
 def test_keys_that_mean_nothing_are_refused(wind, key):
     with pytest.raises(ValidationError, match=f"`{key}` has no meaning"):
-        Wind.model_validate(wind)
+        WindEffect.model_validate(wind)
 
 
 def test_wind_on_triangles_needs_triangles():
     with pytest.raises(InputError, match="needs triangles"):
-        Wind(per="triangle").bind(Chain().build(3), np.ones(3), 0.1)
+        WindEffect(per="triangle").build_contribution(ChainMesh().build_mesh(3), np.ones(3), 0.1)

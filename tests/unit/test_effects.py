@@ -9,25 +9,25 @@ import pytest
 from pydantic import ValidationError
 
 from harness.base.errors import InputError
-from harness.scenes.effects.base import Contribution
-from harness.scenes.effects.constant_force import ConstantForce
-from harness.scenes.effects.effect_names import EFFECTS
-from harness.scenes.effects.ether_drag import EtherDrag
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.effects.wind import Wind
-from harness.scenes.material import spring_stiffness
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
-from harness.simulation.opinion.declared import Declared
-from harness.simulation.opinion.selected import chosen as opinion_of
+from harness.scenes.effects.base import EffectContribution
+from harness.scenes.effects.constant_force import ConstantForceEffect
+from harness.scenes.effects.effect_names import EFFECT_CLASSES
+from harness.scenes.effects.ether_drag import EtherDragEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.effects.wind import WindEffect
+from harness.scenes.material import compute_spring_stiffness
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
+from harness.simulation.opinion.declared import SceneDeclaration
+from harness.simulation.opinion.selected import select_vertices as opinion_of
 from solvers.energies.springs import Springs as SpringsEnergy
-from solvers.registry import load
-from tests.scenes import scene
+from solvers.registry import load_target
+from tests.scenes import build_test_scene
 
-MESH = Grid(width=2.0, height=1.0, skip_one=True).build(5)
-N = len(MESH.rest)
+MESH = GridMesh(width=2.0, height=1.0, skip_one=True).build_mesh(5)
+N = len(MESH.rest_positions)
 MASS = np.linspace(1.0, 2.0, N)
 DT = 0.1
 
@@ -35,13 +35,13 @@ RNG = np.random.default_rng(0)
 P, V, T = RNG.normal(size=(N, 3)), RNG.normal(size=(N, 3)), 1.7
 
 ABSENT = [
-    Gravity(acceleration=(0.0, 0.0, 0.0)),
-    ConstantForce(force=(0.0, 0.0, 0.0)),
-    Wind(strength=0.0),
-    Wind(field="assignment", strength=0.0),
-    Wind(force=(0.0, 0.0, 0.0)),
-    EtherDrag(rate=0.0),
-    Springs(stretch=0.0),
+    GravityEffect(acceleration=(0.0, 0.0, 0.0)),
+    ConstantForceEffect(force=(0.0, 0.0, 0.0)),
+    WindEffect(strength=0.0),
+    WindEffect(field="assignment", strength=0.0),
+    WindEffect(force=(0.0, 0.0, 0.0)),
+    EtherDragEffect(rate=0.0),
+    SpringsEffect(stretch=0.0),
 ]
 
 
@@ -50,13 +50,13 @@ def force_of(effect) -> np.ndarray:
     return force(P, V, T)
 
 
-def bound(effect) -> Contribution:
+def bound(effect) -> EffectContribution:
     return effect.bind(MESH, MASS, DT)
 
 
 def chosen(**selectors) -> list[int]:
-    (pin,) = bound(Pins(**selectors)).pins
-    np.testing.assert_array_equal(pin.targets, MESH.rest[pin.vertices])
+    (pin,) = bound(PinsEffect(**selectors)).pins
+    np.testing.assert_array_equal(pin.targets, MESH.rest_positions[pin.vertices])
     return pin.vertices.tolist()
 
 
@@ -67,71 +67,75 @@ def test_an_effect_of_nothing_leaves_nothing(effect):
 
 
 def test_a_scene_without_effects_has_nothing_in_any_place():
-    made = scene(Chain(), size=3)
-    assert (made.system.energies, made.forces, made.filters) == ((), (), ())
+    made = build_test_scene(ChainMesh(), size=3)
+    assert (made.system.energies, made.varying_forces, made.velocity_filters) == ((), (), ())
     assert len(made.system.pins.vertices) == len(made.pin_targets) == 0
-    assert not made.load.any()
+    assert not made.constant_force.any()
 
 
 def test_forces_that_never_change_are_added_up_once():
-    effects = Gravity(), ConstantForce(force=(1.0, 2.0, 3.0)), Wind(force=(0.0, 0.0, 6.0))
-    made = scene(Chain(), *effects, size=4, mass=3.0)
-    wanted = np.outer(made.system.mass, [0, -9.81, 0]) + np.outer(made.mesh.shares, [0, 0, 6]) + np.array([1, 2, 3])
-    np.testing.assert_allclose(made.load, wanted, rtol=1e-15)
-    assert made.forces == ()
+    effects = GravityEffect(), ConstantForceEffect(force=(1.0, 2.0, 3.0)), WindEffect(force=(0.0, 0.0, 6.0))
+    made = build_test_scene(ChainMesh(), *effects, size=4, mass=3.0)
+    wanted = (
+        np.outer(made.system.mass, [0, -9.81, 0]) + np.outer(made.mesh.mass_fractions, [0, 0, 6]) + np.array([1, 2, 3])
+    )
+    np.testing.assert_allclose(made.constant_force, wanted, rtol=1e-15)
+    assert made.varying_forces == ()
 
 
-@pytest.mark.parametrize("kind", EFFECTS)
+@pytest.mark.parametrize("kind", EFFECT_CLASSES)
 def test_the_name_of_an_effect_is_its_kind(kind):
-    assert load(EFFECTS[kind]).model_fields["kind"].default == kind
+    assert load_target(EFFECT_CLASSES[kind]).model_fields["kind"].default == kind
 
 
 def test_gravity_is_mass_times_acceleration():
     wanted = np.outer(MASS, [1.0, -9.81, 0.5])
-    np.testing.assert_array_equal(force_of(Gravity(acceleration=(1.0, -9.81, 0.5))), wanted)
+    np.testing.assert_array_equal(force_of(GravityEffect(acceleration=(1.0, -9.81, 0.5))), wanted)
 
 
 def test_a_constant_force_is_the_same_on_every_vertex_whatever_its_mass():
-    np.testing.assert_array_equal(force_of(ConstantForce(force=(1, -2, 3))), np.tile([1.0, -2.0, 3.0], (N, 1)))
+    np.testing.assert_array_equal(force_of(ConstantForceEffect(force=(1, -2, 3))), np.tile([1.0, -2.0, 3.0], (N, 1)))
 
 
 def test_a_force_that_never_changes_cannot_be_written_to():
     with pytest.raises(ValueError, match="read-only"):
-        force_of(Gravity())[:] = 0.0
+        force_of(GravityEffect())[:] = 0.0
 
 
 def test_a_constant_wind_is_spread_as_the_mass_is():
-    force = force_of(Wind(force=(2.0, 0.0, 4.0), strength=3.0))
-    np.testing.assert_allclose(force, 3.0 * np.outer(MESH.shares, [2.0, 0.0, 4.0]), rtol=1e-15)
+    force = force_of(WindEffect(force=(2.0, 0.0, 4.0), strength=3.0))
+    np.testing.assert_allclose(force, 3.0 * np.outer(MESH.mass_fractions, [2.0, 0.0, 4.0]), rtol=1e-15)
     np.testing.assert_allclose(force.sum(axis=0), [6.0, 0.0, 12.0], rtol=1e-14)  # a sum of N terms
 
 
 def test_wind_per_vertex_is_the_same_on_every_vertex():
-    force = force_of(Wind(force=(2.0, 0.0, 4.0), per="vertex", strength=0.5))
+    force = force_of(WindEffect(force=(2.0, 0.0, 4.0), per="vertex", strength=0.5))
     np.testing.assert_array_equal(force, np.tile([1.0, 0.0, 2.0], (N, 1)))
 
 
 def test_the_assignments_wind_is_its_formula():
     diagonal = np.sqrt(2.0**2 + 1.0**2)
-    for i, force in enumerate(force_of(Wind(field="assignment", per="vertex"))):
+    for i, force in enumerate(force_of(WindEffect(field="assignment", per="vertex"))):
         phi = P[i, 0] / diagonal + T
         wanted = [3 + 1.5 * (1 + np.cos(5 * phi)), 1 + np.cos(0.3 + phi), np.sin(phi)]
         np.testing.assert_allclose(force, wanted, rtol=1e-14)  # the phase of a cosine has 1e-15
 
 
 def test_the_assignments_wind_and_force_make_its_external_force():
-    total = force_of(Wind(field="assignment", per="vertex")) + force_of(ConstantForce(force=(0.0, -9.8, 0.0)))
-    phi = P[:, 0] / MESH.size + T
+    total = force_of(WindEffect(field="assignment", per="vertex")) + force_of(
+        ConstantForceEffect(force=(0.0, -9.8, 0.0))
+    )
+    phi = P[:, 0] / MESH.bounding_box_diagonal + T
     np.testing.assert_allclose(total[:, 1], -9.8 + 1 + np.cos(0.3 + phi), rtol=1e-14)
 
 
 def test_the_assignments_wind_per_share_is_the_mean_over_the_mass():
-    each, shared = (force_of(Wind(field="assignment", per=per)) for per in ("vertex", "share"))
-    np.testing.assert_allclose(shared, MESH.shares[:, None] * each, rtol=1e-15)
+    each, shared = (force_of(WindEffect(field="assignment", per=per)) for per in ("vertex", "share"))
+    np.testing.assert_allclose(shared, MESH.mass_fractions[:, None] * each, rtol=1e-15)
 
 
 def test_ether_drag_scales_the_velocity_once_a_step():
-    (decay,) = bound(EtherDrag(rate=3.0)).filters
+    (decay,) = bound(EtherDragEffect(rate=3.0)).velocity_filters
     np.testing.assert_allclose(decay(V), np.exp(-3.0 * DT) * V, rtol=1e-15)
 
 
@@ -163,16 +167,16 @@ def test_pins_hold_what_their_selectors_name(case):
 
 @pytest.mark.parametrize(("weight", "wanted"), [(5.0, 5.0), ("exact", np.inf)])
 def test_pins_have_their_weight(weight, wanted):
-    (pin,) = bound(Pins(at=("top",), weight=weight)).pins
+    (pin,) = bound(PinsEffect(at=("top",), weight=weight)).pins
     assert pin.weight == wanted
 
 
 def test_pins_weigh_what_the_assignments_do_unless_told():
-    (pin,) = bound(Pins(at=("top",))).pins
+    (pin,) = bound(PinsEffect(at=("top",))).pins
     assert pin.weight == 1e10
 
 
-SHEET = Grid().build(5)
+SHEET = GridMesh().build_mesh(5)
 HOLED = replace(
     SHEET,
     triangles=SHEET.triangles[~(SHEET.triangles == 12).any(axis=1)],
@@ -192,8 +196,12 @@ HOLED = replace(
     ],
 )
 def test_holes_and_numbers_of_a_file_choose_vertices_as_the_second_opinion_has_it(selectors, wanted):
-    pins = Pins.model_validate(selectors)
-    assert pins.chosen(HOLED, "pins").tolist() == wanted == opinion_of(Declared(HOLED, np.ones(25), DT, ()), pins)
+    pins = PinsEffect.model_validate(selectors)
+    assert (
+        pins.select_vertices(HOLED, "pins").tolist()
+        == wanted
+        == opinion_of(SceneDeclaration(HOLED, np.ones(25), DT, ()), pins)
+    )
 
 
 def test_a_holeless_sheet_and_unknown_numbers_are_refused():
@@ -204,11 +212,11 @@ def test_a_holeless_sheet_and_unknown_numbers_are_refused():
         ({"sphere": {"center": (9.0, 0.0, 0.0), "radius": 0.1}}, "no vertex of the mesh lies in the sphere"),
     ):
         with pytest.raises(InputError, match=told):
-            bound(Pins.model_validate(selectors))
+            bound(PinsEffect.model_validate(selectors))
 
 
 def test_selectors_that_are_not_used_are_not_written_down():
-    assert set(Pins(at=("top",)).model_dump()) == {"at", "indices", "box", "every", "kind", "weight", "motion"}
+    assert set(PinsEffect(at=("top",)).model_dump()) == {"at", "indices", "box", "every", "kind", "weight", "motion"}
 
 
 REFUSED = {
@@ -222,7 +230,7 @@ REFUSED = {
 def test_pins_that_do_not_fit_the_mesh_are_refused(case):
     selectors, told = REFUSED[case]
     with pytest.raises(InputError, match=told):
-        bound(Pins(**selectors))
+        bound(PinsEffect(**selectors))
 
 
 @pytest.mark.parametrize(
@@ -232,31 +240,31 @@ def test_pins_that_do_not_fit_the_mesh_are_refused(case):
 )
 def test_pins_that_mean_nothing_are_refused(data):
     with pytest.raises(ValidationError):
-        Pins.model_validate(data)
+        PinsEffect.model_validate(data)
 
 
 def test_springs_take_the_stiffness_of_their_rule():
-    (energy,) = bound(Springs(stretch=100.0, shear=20.0, bend=0.01)).energies
+    (energy,) = bound(SpringsEffect(stretch=100.0, shear=20.0, bend=0.01)).energies
     assert isinstance(energy, SpringsEnergy)
-    wanted = spring_stiffness(MESH, rule="continuum", stretch=100.0, shear=20.0, bend=0.01)
+    wanted = compute_spring_stiffness(MESH, scaling_rule="continuum", stretch=100.0, shear=20.0, bend=0.01)
     np.testing.assert_array_equal(energy.stiffness, wanted)
     np.testing.assert_array_equal(energy.edges, MESH.springs)
     np.testing.assert_allclose(energy.rest_length, MESH.rest_lengths, rtol=1e-15)
 
 
 def test_springs_shear_as_they_stretch_unless_told():
-    (energy,) = bound(Springs(stretch=100.0, rule="fixed")).energies
+    (energy,) = bound(SpringsEffect(stretch=100.0, rule="fixed")).energies
     assert isinstance(energy, SpringsEnergy)
     assert set(energy.stiffness) == {100.0}
 
 
 def test_springs_of_no_stiffness_are_left_out():
-    (energy,) = bound(Springs(stretch=100.0, shear=0.0)).energies
+    (energy,) = bound(SpringsEffect(stretch=100.0, shear=0.0)).energies
     assert isinstance(energy, SpringsEnergy)
-    np.testing.assert_array_equal(energy.edges, MESH.springs[MESH.families["stretch"]])
+    np.testing.assert_array_equal(energy.edges, MESH.springs[MESH.spring_families["stretch"]])
 
 
 def test_the_reference_size_sets_the_stiffness_of_liu2013():
-    (energy,) = bound(Springs(stretch=100.0, rule="liu2013", reference=9)).energies
+    (energy,) = bound(SpringsEffect(stretch=100.0, rule="liu2013", reference=9)).energies
     assert isinstance(energy, SpringsEnergy)
     assert energy.stiffness[0] == 100.0 * (5 - 1) / (9 - 1)

@@ -6,17 +6,24 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from harness.scenes.effects.contact import Contact
-from solvers.core.fixed_objective import Objective
+from harness.scenes.effects.contact import ContactEffect
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
-from solvers.energies.elements import Joined, add_blocks
-from tests.effects import DASHPOTS, FLOOR, LIMITS, RAYLEIGH, cloth, stepped
+from solvers.energies.elements import JoinedElements, add_blocks
+from tests.effects import (
+    DASHPOT_EFFECT,
+    FLOOR_CONTACT,
+    RAYLEIGH_EFFECT,
+    STRAIN_LIMIT_EFFECT,
+    build_effect_cloth,
+    build_moving_problem,
+)
 
 ENERGIES = {
-    "strain limits": (LIMITS, "StrainLimits"),
-    "dashpots": (DASHPOTS, "Dashpots"),
-    "rayleigh": (RAYLEIGH, "RayleighDashpots"),
-    "contact": (FLOOR, "Contact"),
+    "strain limits": (STRAIN_LIMIT_EFFECT, "StrainLimits"),
+    "dashpots": (DASHPOT_EFFECT, "Dashpots"),
+    "rayleigh": (RAYLEIGH_EFFECT, "RayleighDashpots"),
+    "contact": (FLOOR_CONTACT, "Contact"),
 }
 SUMS = 1e-13
 """Sums of some dozen terms in another order, relative to the largest."""
@@ -26,10 +33,12 @@ SUMS = 1e-13
 def begun(request):
     """An energy of a step that has begun, and two points that it acts at."""
     effect, name = ENERGIES[request.param]
-    problem = stepped(cloth(effect))
+    problem = build_moving_problem(build_effect_cloth(effect))
     (energy,) = (e for e in problem.energies if type(e).__name__ == name)
     rng = np.random.default_rng(1)
-    p, q = (problem.first_guess - [0, 0.03, 0] + 0.02 * rng.normal(size=problem.target.shape) for _ in range(2))
+    p, q = (
+        problem.initial_guess - [0, 0.03, 0] + 0.02 * rng.normal(size=problem.inertial_target.shape) for _ in range(2)
+    )
     assert energy.value(p) > 0.0
     return energy, p, q
 
@@ -38,7 +47,7 @@ def hessian(energy, p) -> np.ndarray:
     """(3n, 3n), from the second derivatives of the elements."""
     elements, n = energy.elements, len(p)
     curvature = np.empty((len(elements.vertices), 6))
-    energy.law.curve(elements, p, curvature)
+    energy.element_law.curve(elements, p, curvature)
     k = elements.vertices.shape[1]
     places = np.repeat(elements.vertices, k, axis=1) * n + np.tile(elements.vertices, k)
     blocks = np.zeros((n * n, 3, 3))
@@ -48,13 +57,13 @@ def hessian(energy, p) -> np.ndarray:
 
 def test_the_value_is_the_energys(begun):
     energy, p, _ = begun
-    assert energy.law.value(energy.elements, p) == pytest.approx(energy.value(p), rel=SUMS)
+    assert energy.element_law.value(energy.elements, p) == pytest.approx(energy.value(p), rel=SUMS)
 
 
 def test_the_gradient_is_the_energys(begun):
     energy, p, _ = begun
     found, wanted = np.zeros_like(p), np.zeros_like(p)
-    energy.law.add_gradient(energy.elements, p, found)
+    energy.element_law.add_gradient(energy.elements, p, found)
     energy.add_gradient(p, wanted)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=SUMS * np.abs(wanted).max())
 
@@ -68,7 +77,7 @@ def test_the_hessian_is_the_energys(begun):
 def test_the_rise_is_the_difference_of_the_values(begun):
     energy, p, q = begun
     wanted, size = energy.value(q) - energy.value(p), energy.value(q) + energy.value(p)
-    assert energy.law.rise(energy.elements, p, q) == pytest.approx(wanted, rel=0, abs=SUMS * size)
+    assert energy.element_law.rise(energy.elements, p, q) == pytest.approx(wanted, rel=0, abs=SUMS * size)
 
 
 def test_the_rise_keeps_its_digits_where_values_have_none_left(begun):
@@ -78,7 +87,7 @@ def test_the_rise_keeps_its_digits_where_values_have_none_left(begun):
     q = p + 1e-13 * (q - p)
     wanted = float((slope * (q - p)).sum())  # to first order; what follows is less by the length of the step
     # A difference of values is off by 1e-16 of an energy of 1e13 times the rise.
-    assert energy.law.rise(energy.elements, p, q) == pytest.approx(wanted, rel=1e-5)
+    assert energy.element_law.rise(energy.elements, p, q) == pytest.approx(wanted, rel=1e-5)
 
 
 def test_one_that_says_that_its_second_derivatives_are_constant_is_right(begun):
@@ -87,22 +96,22 @@ def test_one_that_says_that_its_second_derivatives_are_constant_is_right(begun):
 
 
 def test_a_product_is_that_of_all_energies_together():
-    problem = stepped(cloth(LIMITS, DASHPOTS, FLOOR))
-    step = StepObjective(Objective(problem.system), problem)
-    assert isinstance(step.joined, Joined)
-    p = step.placed(problem.first_guess - [0, 0.03, 0])
+    problem = build_moving_problem(build_effect_cloth(STRAIN_LIMIT_EFFECT, DASHPOT_EFFECT, FLOOR_CONTACT))
+    step = StepObjective(FixedObjective(problem.system), problem)
+    assert isinstance(step.joined_elements, JoinedElements)
+    p = step.apply_exact_pins(problem.initial_guess - [0, 0.03, 0])
     x = np.random.default_rng(2).normal(size=p.shape)
     x[problem.system.pins.vertices] = 0.0
-    wanted = problem.system.inertia[:, None] * x
+    wanted = problem.system.inertia_diagonal[:, None] * x
     for energy in problem.energies:
         wanted += (csr_array(energy.hessian(p)) @ x.ravel()).reshape(-1, 3)
-    wanted[problem.system.pins.vertices[problem.system.pins.exact]] = 0.0
-    _, vertices, weight = problem.system.penalty
+    wanted[problem.system.pins.vertices[problem.system.pins.exact_mask]] = 0.0
+    _, vertices, weight = problem.system.penalty_pins
     wanted[vertices] += weight[:, None] * x[vertices]
-    np.testing.assert_allclose(step.hessian(p).multiply(x), wanted, rtol=0, atol=SUMS * np.abs(wanted).max())
+    np.testing.assert_allclose(step.hessian(p).matvec(x), wanted, rtol=0, atol=SUMS * np.abs(wanted).max())
 
 
 def test_energies_that_have_no_elements_in_a_step_are_left_out_of_it():
-    far = Contact.model_validate({"obstacles": [{"kind": "plane", "point": (0, -50, 0)}]})
-    problem = stepped(cloth(far))
-    assert not StepObjective(Objective(problem.system), problem).stated
+    far = ContactEffect.model_validate({"obstacles": [{"kind": "plane", "point": (0, -50, 0)}]})
+    problem = build_moving_problem(build_effect_cloth(far))
+    assert not StepObjective(FixedObjective(problem.system), problem).element_energies

@@ -10,27 +10,34 @@ import numpy as np
 import pytest
 
 from harness.base import rows
-from harness.config.load import load_any
+from harness.config.load import load_config
 from harness.config.sweep import RunSpec, SolverSpec
-from harness.experiments.failure import grown
-from harness.experiments.plan import Files
-from harness.experiments.run import execute
-from harness.experiments.sweep import failures
+from harness.experiments.failure import build_energy_growth_columns
+from harness.experiments.plan import RunFiles
+from harness.experiments.run import execute_run
+from harness.experiments.sweep import list_failed_runs
 from harness.record.reader import read_replay
-from harness.report.robustness import DIVERGED, GROWN, judged
+from harness.report.robustness import DIVERGED, ENERGY_GROWTH, classify_run
 from harness.scenes.bind import Scene
-from harness.scenes.effects.attachments import Attachments
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
+from harness.scenes.effects.attachments import AttachmentsEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
 from harness.scenes.spec import SceneSpec
-from harness.simulation.energy_balance import BLOW_UP, GROWTH, UNCERTAINTY, Balance, EnergyBalance, Growth
-from harness.simulation.step import Step, prepare, simulate
+from harness.simulation.energy_balance import (
+    BLOW_UP_FACTOR,
+    GROWTH_LIMIT,
+    ROUNDOFF_SAFETY,
+    EnergyBalance,
+    EnergyGain,
+    EnergyGrowth,
+)
+from harness.simulation.step import SimulationStep, prepare, simulate_scene
 from solvers import integrators
-from solvers.methods.newton import Newton
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import Positions, StopRule
-from tests.scenes import scene
+from tests.scenes import build_test_scene
 
 G, DT, CLOSE = 9.81, 0.1, 1e-9
 """Of gravity [m/s^2], a time step [s], and what sums and solves lose of a joule."""
@@ -40,127 +47,133 @@ PULL = {"keys": [{"time": 0}, {"time": DT, "offset": [-0.2, 0, 0]}]}
 
 def chain(*effects: Any, time_step: float = DT, **settings: Any) -> Scene:
     """Two masses of 1 kg, one metre apart along x."""
-    return scene(Chain(length=1.0), *effects, size=2, mass=2.0, time_step=time_step, **settings)
+    return build_test_scene(ChainMesh(length=1.0), *effects, size=2, mass=2.0, time_step=time_step, **settings)
 
 
-def held(weight: str | float = "exact", **settings: Any) -> Pins:
-    return Pins.model_validate({"at": ["first"], "weight": weight, **settings})
+def held(weight: str | float = "exact", **settings: Any) -> PinsEffect:
+    return PinsEffect.model_validate({"at": ["first"], "weight": weight, **settings})
 
 
-def taken(bound: Scene, frames: int) -> list[Step]:
-    run = simulate(bound, prepare(bound, Newton()), StopRule(100, 1e-12), first_guess="current", frames=frames)
+def taken(bound: Scene, frames: int) -> list[SimulationStep]:
+    run = simulate_scene(
+        bound, prepare(bound, NewtonSolver()), StopRule(100, 1e-12), initial_guess="current", frames=frames
+    )
     return list(run)
 
 
-def balances(bound: Scene, frames: int) -> list[Balance]:
+def balances(bound: Scene, frames: int) -> list[EnergyGain]:
     balance = EnergyBalance(bound)
-    return [balance.after(step) for step in taken(bound, frames)]
+    return [balance.add_step(step) for step in taken(bound, frames)]
 
 
 def by_midpoint(bound: Scene) -> Scene:
-    method = integrators.find("midpoint")
-    return replace(bound, integrator=method, system=replace(bound.system, factor=method.factor, speed=method.speed))
+    method = integrators.find_integrator("midpoint")
+    return replace(
+        bound,
+        integrator=method,
+        system=replace(bound.system, inertia_factor=method.inertia_factor, velocity_factor=method.velocity_factor),
+    )
 
 
-def led(step: Step, positions: Positions, velocity: Positions) -> Step:
+def led(step: SimulationStep, positions: Positions, velocity: Positions) -> SimulationStep:
     """The same step with another end."""
     now = integrators.Motion(positions, velocity)
-    return replace(step, solution=replace(step.solution, positions=positions), state=replace(step.state, now=now))
+    return replace(step, solution=replace(step.solution, positions=positions), state=replace(step.state, motion=now))
 
 
 def test_free_fall_by_implicit_euler_loses_what_its_formula_says():
     """v = g n dt and a fall of g dt^2 n (n + 1)/2: half of m g^2 dt^2 is lost a step."""
-    for n, found in enumerate(balances(chain(Gravity()), 5), start=1):
-        assert found.gained == pytest.approx(-0.5 * 2.0 * G**2 * DT**2 * n, rel=1e-9)
-        assert found.available == pytest.approx(2.0 * G**2 * DT**2 * (0.5 + 0.5 * n * (n + 1)), rel=1e-9)
+    for n, found in enumerate(balances(chain(GravityEffect()), 5), start=1):
+        assert found.gain == pytest.approx(-0.5 * 2.0 * G**2 * DT**2 * n, rel=1e-9)
+        assert found.available_energy == pytest.approx(2.0 * G**2 * DT**2 * (0.5 + 0.5 * n * (n + 1)), rel=1e-9)
 
 
 def test_a_vibration_by_midpoint_has_the_energy_that_it_began_with():
-    bound = by_midpoint(chain(Springs(stretch=50.0, rule="fixed"), held(), velocity=(0.5, 0.0, 0.0)))
+    bound = by_midpoint(chain(SpringsEffect(stretch=50.0, rule="fixed"), held(), velocity=(0.5, 0.0, 0.0)))
     before = 1.0
     for step, found in zip(taken(bound, 6), balances(bound, 6), strict=True):
         now = step.positions[1, 0]
         left, mean = 0.5 * 0.5**2 - 0.5 * 50.0 * (now - 1.0) ** 2, 0.5 * ((now - before) / DT) ** 2
-        assert found.gained == pytest.approx(max(left, mean) - 0.5 * 0.5**2, abs=CLOSE)
+        assert found.gain == pytest.approx(max(left, mean) - 0.5 * 0.5**2, abs=CLOSE)
         before = now
-        assert found.available == pytest.approx(0.5 * 0.5**2, abs=CLOSE)
+        assert found.available_energy == pytest.approx(0.5 * 0.5**2, abs=CLOSE)
 
 
 @pytest.mark.parametrize(("weight", "inertia"), [("exact", 0.0), (1e10, 0.2 / DT**2)])
 def test_a_pin_that_moves_gives_its_force_times_its_way(weight: str | float, inertia: float):
     """The free end follows by u = k d/(m/dt^2 + k), so that the spring pulls with k (d - u); what a penalty holds has
     its inertia as well, m d/dt^2."""
-    (found,) = balances(chain(Springs(stretch=50.0, rule="fixed"), held(weight, motion=PULL)), 1)
+    (found,) = balances(chain(SpringsEffect(stretch=50.0, rule="fixed"), held(weight, motion=PULL)), 1)
     pull = 50.0 * 0.2 * (1.0 - 50.0 / (1.0 / DT**2 + 50.0))
-    assert found.available == pytest.approx(UNCERTAINTY * 0.2 * (pull + inertia), rel=1e-6)
-    assert found.gained < 0.0
+    assert found.available_energy == pytest.approx(ROUNDOFF_SAFETY * 0.2 * (pull + inertia), rel=1e-6)
+    assert found.gain < 0.0
 
 
 def test_points_that_move_give_the_energy_of_their_springs():
-    tied = Attachments.model_validate({"at": ["first"], "stiffness": 50.0, "motion": PULL})
+    tied = AttachmentsEffect.model_validate({"at": ["first"], "stiffness": 50.0, "motion": PULL})
     first, second = balances(chain(tied), 2)
-    assert first.available == pytest.approx(0.5 * 50.0 * 0.2**2, rel=1e-9)
-    assert second.available == pytest.approx(first.available, rel=1e-9)
-    assert not second.exceeds(0.0)
+    assert first.available_energy == pytest.approx(0.5 * 50.0 * 0.2**2, rel=1e-9)
+    assert second.available_energy == pytest.approx(first.available_energy, rel=1e-9)
+    assert not second.is_above(0.0)
 
 
 def drag(times: float) -> Scene:
     """A drag c (u - v) with u = 2 m/s and c = times m/dt, taken where a step starts."""
-    return replace(chain(), forces=(lambda p, v, t: times / DT * (np.array([2.0, 0.0, 0.0]) - v),))
+    return replace(chain(), varying_forces=(lambda p, v, t: times / DT * (np.array([2.0, 0.0, 0.0]) - v),))
 
 
 def test_a_force_gives_its_work_at_the_mean_velocity():
     """From rest v' = u/2, so that two masses move by u dt/2, against 3/4 of the force that they start with."""
     (found,) = balances(drag(0.5), 1)
     work = 2.0 * (0.75 * 0.5 / DT * 2.0) * (0.5 * 2.0 * DT)
-    assert found.available == pytest.approx(UNCERTAINTY * work, rel=1e-9)
-    assert found.gained == pytest.approx(0.5 * 2.0 * 1.0**2 - work, rel=1e-9)
+    assert found.available_energy == pytest.approx(ROUNDOFF_SAFETY * work, rel=1e-9)
+    assert found.gain == pytest.approx(0.5 * 2.0 * 1.0**2 - work, rel=1e-9)
 
 
 def test_a_drag_that_turns_the_motion_around_is_no_source():
     """v - u is multiplied by -2 a step."""
-    assert balances(drag(3.0), 12)[-1].exceeds(GROWTH)
-    assert not any(one.exceeds(GROWTH) for one in balances(drag(1.5), 12))
+    assert balances(drag(3.0), 12)[-1].is_above(GROWTH_LIMIT)
+    assert not any(one.is_above(GROWTH_LIMIT) for one in balances(drag(1.5), 12))
 
 
 def test_a_filter_that_speeds_up_is_a_source():
-    (found,) = balances(replace(chain(velocity=(1.0, 0.0, 0.0)), filters=(lambda v: 2.0 * v,)), 1)
-    assert found.gained == pytest.approx(0.0, abs=CLOSE)
-    assert found.available == pytest.approx(1.0 + UNCERTAINTY * 3.0, rel=1e-9)
+    (found,) = balances(replace(chain(velocity=(1.0, 0.0, 0.0)), velocity_filters=(lambda v: 2.0 * v,)), 1)
+    assert found.gain == pytest.approx(0.0, abs=CLOSE)
+    assert found.available_energy == pytest.approx(1.0 + ROUNDOFF_SAFETY * 3.0, rel=1e-9)
 
 
 def test_stored_energy_counts_where_a_spring_is_longer_than_twice_its_length():
     """A stiff spring that a solve leaves too long stores much, and moves nothing: 10 s are for a slow way there."""
-    bound = chain(Springs(stretch=1e9, rule="fixed"), Gravity(), held(), time_step=10.0)
+    bound = chain(SpringsEffect(stretch=1e9, rule="fixed"), GravityEffect(), held(), time_step=10.0)
     (step,) = taken(bound, 1)
     for length, grows in ((1.5, False), (2.5, True)):
         p = np.array([[0.0, 0.0, 0.0], [length, 0.0, 0.0]])
-        found = EnergyBalance(bound).after(led(step, p, np.zeros_like(p)))
-        assert found.exceeds(GROWTH) == grows
-    assert found.gained == pytest.approx(0.5 * 1e9 * 1.5**2, rel=1e-6)
+        found = EnergyBalance(bound).add_step(led(step, p, np.zeros_like(p)))
+        assert found.is_above(GROWTH_LIMIT) == grows
+    assert found.gain == pytest.approx(0.5 * 1e9 * 1.5**2, rel=1e-6)
 
 
 def test_a_motion_counts_whatever_velocity_a_solver_claims():
-    bound = chain(Gravity())
+    bound = chain(GravityEffect())
     (step,) = taken(bound, 1)
-    moved = step.problem.current + np.array([1e5, 0.0, 0.0])
-    assert EnergyBalance(bound).after(led(step, moved, np.zeros_like(moved))).exceeds(BLOW_UP)
+    moved = step.problem.current_positions + np.array([1e5, 0.0, 0.0])
+    assert EnergyBalance(bound).add_step(led(step, moved, np.zeros_like(moved))).is_above(BLOW_UP_FACTOR)
 
 
 def test_round_off_is_no_gain():
-    bound = chain(Springs(stretch=50.0, rule="fixed"))
+    bound = chain(SpringsEffect(stretch=50.0, rule="fixed"))
     (step,) = taken(bound, 1)
-    p = step.problem.current * (1.0 + 4.0 * np.finfo(float).eps)
-    v = (p - step.problem.current) / DT
+    p = step.problem.current_positions * (1.0 + 4.0 * np.finfo(float).eps)
+    v = (p - step.problem.current_positions) / DT
     assert v.any()
-    assert not EnergyBalance(bound).after(led(step, p, v)).exceeds(GROWTH)
-    assert EnergyBalance(bound).after(led(step, p, 1e6 * v)).exceeds(GROWTH)
+    assert not EnergyBalance(bound).add_step(led(step, p, v)).is_above(GROWTH_LIMIT)
+    assert EnergyBalance(bound).add_step(led(step, p, 1e6 * v)).is_above(GROWTH_LIMIT)
 
 
 def test_growth_names_its_first_frame_and_its_largest_ratio():
     rows = {n: {"energy_gained": float(gain), "energy_available": 2.0} for n, gain in enumerate((1, 2, 3, 9, 4), 1)}
-    assert Growth.of(rows) == Growth(first=3, times=4.5)
-    assert Growth.of({1: rows[1], 2: rows[2]}) is None
+    assert EnergyGrowth.from_rows(rows) == EnergyGrowth(first_frame=3, max_ratio=4.5)
+    assert EnergyGrowth.from_rows({1: rows[1], 2: rows[2]}) is None
 
 
 LIMIT = """
@@ -214,15 +227,15 @@ class Prepared:
 '''
 
 
-def done(folder: Path, solver: str, record: str, timing: str, integrator: str) -> tuple[list[dict[str, Any]], Files]:
+def done(folder: Path, solver: str, record: str, timing: str, integrator: str) -> tuple[list[dict[str, Any]], RunFiles]:
     (folder / "limit.yaml").write_text(LIMIT)
     (folder / "wrong.py").write_text(WRONG)
     options = OPTIONS % (record, timing, integrator)
     (folder / "sweep.yaml").write_text(f"scenes: [limit.yaml]\nsolvers: [{solver}]\n{options}")
-    (spec,) = load_any(folder / "sweep.yaml").runs()
-    files = Files.of(spec, folder)
-    files.rows.parent.mkdir()
-    return execute(spec, files, lambda phase: None), files
+    (spec,) = load_config(folder / "sweep.yaml").list_runs()
+    files = RunFiles.for_run(spec, folder)
+    files.rows_path.parent.mkdir()
+    return execute_run(spec, files, lambda phase: None), files
 
 
 @pytest.mark.parametrize(
@@ -231,13 +244,13 @@ def done(folder: Path, solver: str, record: str, timing: str, integrator: str) -
 def test_a_run_whose_energy_grows_says_so_in_all_rows(tmp_path: Path, record: str, timing: str):
     found, files = done(tmp_path, "newton", record, timing, "midpoint")
     assert {row["status"] for row in found} == {"energy-growth"}
-    assert len(failures(rows.read([files.rows]))) == 1
+    assert len(list_failed_runs(rows.read_rows([files.rows_path]))) == 1
     assert "without a source, from frame " in found[0]["reason"]
     assert found[0]["reason"].endswith("a step of 0.1 s is too long for midpoint")
     steps = [row | {"distance": None, "stationarity": None} for row in found if row["phase"] == "step"]
-    assert judged(steps)[0] is GROWN
+    assert classify_run(steps)[0] is ENERGY_GROWTH
     if record == "true":
-        facts = read_replay(files.recording).properties
+        facts = read_replay(files.recording_path).properties
         assert (facts["status"], facts["solver"]) == ("energy-growth", "newton")
 
 
@@ -255,7 +268,7 @@ def test_the_reason_of_growth_is_the_step_or_its_iterations(integrator: str, sol
     scene = SceneSpec.model_construct(time_step=0.1)
     run = RunSpec.model_construct(integrator=integrator, solver=SolverSpec(solver, {}), iterations=60, scene=scene)
     by_frame = {7: {"stopped": "iterations", "iterations": iterations}}
-    assert words in grown(run, Growth(7, 2.0), by_frame)["reason"]
+    assert words in build_energy_growth_columns(run, EnergyGrowth(7, 2.0), by_frame)["reason"]
 
 
 def test_the_same_steps_by_implicit_euler_are_ok(tmp_path: Path):
@@ -269,6 +282,6 @@ def test_a_blow_up_ends_a_run_at_its_first_frame(tmp_path: Path):
     assert (row["status"], row["phase"]) == ("diverged", "run")
     assert f"from frame {row['frame']} on the motion has " in row["reason"]
     assert 1 < row["frame"] < 20
-    assert judged([row])[0] is DIVERGED
-    (line,) = failures(rows.read([files.rows]))  # for which the command exits with 1
+    assert classify_run([row])[0] is DIVERGED
+    (line,) = list_failed_runs(rows.read_rows([files.rows_path]))  # for which the command exits with 1
     assert line == f"limit 2 ./wrong.py:Wrong: diverged: {row['reason']}"

@@ -15,26 +15,28 @@ from typer.testing import CliRunner
 
 from harness.cli import app
 from harness.config.sweep import SolverSpec
-from harness.experiments.provenance import provenance
-from harness.scenes.bind import Scene, build
-from harness.scenes.effects.bending import Bending
-from harness.scenes.effects.dashpots import Dashpots
-from harness.scenes.effects.ether_drag import EtherDrag
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
+from harness.experiments.provenance import build_provenance_columns
+from harness.scenes.bind import Scene, build_scene
+from harness.scenes.effects.bending import BendingEffect
+from harness.scenes.effects.dashpots import DashpotsEffect
+from harness.scenes.effects.ether_drag import EtherDragEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
 from harness.scenes.spec import SceneSpec
-from harness.simulation.step import problem, start
+from harness.simulation.step import build_initial_state, build_problem
 from solvers.engines import base
-from solvers.engines.base import Engine, PreparedEngine
+from solvers.engines.base import ExternalEngine, PreparedEngine
 from solvers.methods.xpbd import XpbdSmallSteps
 from solvers.problem import Positions, StepProblem, StopRule, System, Unsupported
-from solvers.registry import OPTIONAL, SOLVERS, about, load, minimises
-from tests.scenes import random_problem
+from solvers.registry import OPTIONAL_SOLVERS, SOLVERS, find_solver_info, is_minimiser, load_target
+from tests.scenes import build_random_problem
 
-ENGINES = [name for name, target in OPTIONAL.items() if about(load(target), name).package]
+ENGINES = [
+    name for name, target in OPTIONAL_SOLVERS.items() if find_solver_info(load_target(target), name).package_name
+]
 engines = pytest.mark.parametrize("name", ENGINES)
 
 CONFIG = """
@@ -53,18 +55,18 @@ effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [corn
 
 def made(*effects: Any, mesh: Any = None, size: int = 4, integrator: str = "own", **given: Any) -> Scene:
     path = Path("scene.yaml")
-    spec = SceneSpec(mesh=mesh or Grid(), mass=1.0, time_step=1 / 30, frames=1, effects=effects, path=path, **given)
-    return build(spec, size, integrator)
+    spec = SceneSpec(mesh=mesh or GridMesh(), mass=1.0, time_step=1 / 30, frames=1, effects=effects, path=path, **given)
+    return build_scene(spec, size, integrator)
 
 
-HANGING = Springs(stretch=300.0, shear=60.0), Gravity(), Pins.model_validate({"at": ["top_corners"]})
+HANGING = SpringsEffect(stretch=300.0, shear=60.0), GravityEffect(), PinsEffect.model_validate({"at": ["top_corners"]})
 
 
 def ready(name: str, system: System, **parameters: Any) -> PreparedEngine:
     """The engine; where it is not installed it says which command does so, and there is nothing to try."""
-    engine: Engine = load(OPTIONAL[name])(**parameters)
+    engine: ExternalEngine = load_target(OPTIONAL_SOLVERS[name])(**parameters)
     try:
-        engine.package.load(name)
+        engine.engine_package.import_library(name)
     except Unsupported as error:
         pytest.skip(str(error))
     return engine.prepare(system)
@@ -73,8 +75,10 @@ def ready(name: str, system: System, **parameters: Any) -> PreparedEngine:
 def falling(problem: StepProblem) -> StepProblem:
     """The same with the weight of gravity for a load, and at rest."""
     s = problem.system
-    begun = replace(problem.start, positions=problem.current, velocity=np.zeros_like(problem.current))
-    return replace(problem, force=s.mass[:, None] * np.array([0.0, -9.81, 0.0]), start=begun)
+    begun = replace(
+        problem.step_start, positions=problem.current_positions, velocity=np.zeros_like(problem.current_positions)
+    )
+    return replace(problem, external_force=s.mass[:, None] * np.array([0.0, -9.81, 0.0]), step_start=begun)
 
 
 @engines
@@ -83,34 +87,36 @@ def test_where_it_is_not_installed_the_reason_is_the_command_that_does_so(name: 
         raise ModuleNotFoundError(f"No module named {module!r}")
 
     monkeypatch.setattr(base, "import_module", none)
-    engine = load(OPTIONAL[name])()
-    wanted = rf"^{name}: .*pip install -e '\.\[{engine.package.extra}\]'` in the checkout"
+    engine = load_target(OPTIONAL_SOLVERS[name])()
+    wanted = rf"^{name}: .*pip install -e '\.\[{engine.engine_package.extra}\]'` in the checkout"
     with pytest.raises(Unsupported, match=wanted):
         engine.prepare(made(*HANGING).system)
 
 
 @engines
 def test_what_an_engine_cannot_express_it_refuses_by_name(name: str):
-    engine = load(OPTIONAL[name])()
-    assert not minimises(engine)
+    engine = load_target(OPTIONAL_SOLVERS[name])()
+    assert not is_minimiser(engine)
     with pytest.raises(Unsupported, match=rf"^{name}: expresses springs.* the scene has \w*Bending\w* as well"):
-        engine.prepare(made(*HANGING, Bending(stiffness=1e-3)).system)
+        engine.prepare(made(*HANGING, BendingEffect(stiffness=1e-3)).system)
     with pytest.raises(Unsupported, match=f"{name}: divides the step by itself"):
         engine.prepare(made(*HANGING, integrator="bdf2").system)
 
 
 def test_drag_that_an_engine_does_not_have_is_refused():
     with pytest.raises(Unsupported, match="pypbd: expresses springs; the scene has EtherDrag as well"):
-        load(OPTIONAL["pypbd"])().prepare(made(*HANGING, EtherDrag(rate=1.0)).system)
+        load_target(OPTIONAL_SOLVERS["pypbd"])().prepare(made(*HANGING, EtherDragEffect(rate=1.0)).system)
 
 
 def semi_implicit(scene: Scene, stated: StepProblem, substeps: int, damping: float) -> tuple[Positions, Positions]:
     """v <- v + h M^-1 (f - grad E) on what is not pinned, p <- p + h v."""
     s, h = scene.system, scene.system.time_step / substeps
-    p, v = stated.start.positions.copy(), np.where(s.unpinned[:, None], stated.start.velocity, 0.0)
+    p, v = stated.step_start.positions.copy(), np.where(s.unpinned_mask[:, None], stated.step_start.velocity, 0.0)
     for _ in range(substeps):
-        force = stated.force.copy()
-        for edge, r, k in zip(scene.springs.edges, scene.springs.rest_length, scene.springs.stiffness, strict=True):
+        force = stated.external_force.copy()
+        for edge, r, k in zip(
+            scene.all_springs.edges, scene.all_springs.rest_length, scene.all_springs.stiffness, strict=True
+        ):
             i, j = edge
             away = p[i] - p[j]
             length = float(np.linalg.norm(away))
@@ -118,22 +124,29 @@ def semi_implicit(scene: Scene, stated: StepProblem, substeps: int, damping: flo
             pull = (k * (length - r) + damping * n @ (v[i] - v[j])) * n
             force[i] -= pull
             force[j] += pull
-        v[s.unpinned] += h * force[s.unpinned] / s.mass[s.unpinned, None]
-        p[s.unpinned] += h * v[s.unpinned]
+        v[s.unpinned_mask] += h * force[s.unpinned_mask] / s.mass[s.unpinned_mask, None]
+        p[s.unpinned_mask] += h * v[s.unpinned_mask]
     return p, v
 
 
 @pytest.mark.parametrize(("integrator", "damping"), [("Euler", 0.5), ("implicitfast", 0.0), ("implicit", 0.0)])
 def test_mujoco_steps_a_network_as_its_documentation_says(integrator: str, damping: float):
-    parts = Springs(rule="fixed", stretch=300.0), Dashpots(rule="fixed", stretch=damping), Gravity(), HANGING[2]
+    parts = (
+        SpringsEffect(rule="fixed", stretch=300.0),
+        DashpotsEffect(rule="fixed", stretch=damping),
+        GravityEffect(),
+        HANGING[2],
+    )
     scene = made(*parts, size=3, velocity=(0.3, 0.0, -0.2))
-    stated = problem(scene, start(scene), "current")
-    wind = replace(stated, force=stated.force + np.random.default_rng(0).normal(size=stated.force.shape))
+    stated = build_problem(scene, build_initial_state(scene), "current")
+    wind = replace(
+        stated, external_force=stated.external_force + np.random.default_rng(0).normal(size=stated.external_force.shape)
+    )
     prepared = ready("mujoco", scene.system, integrator=integrator)
     for one in stated, wind:
         found = prepared.solve(one, StopRule(20))
         p, v = semi_implicit(scene, one, 20, damping)
-        free = scene.system.unpinned
+        free = scene.system.unpinned_mask
         # Two ways to add the same terms, twenty times.
         np.testing.assert_allclose(found.positions[free], p[free], rtol=0, atol=1e-12)
         assert found.velocity is not None
@@ -141,9 +154,11 @@ def test_mujoco_steps_a_network_as_its_documentation_says(integrator: str, dampi
 
 
 def test_the_drag_that_mujoco_takes_is_that_of_the_scene():
-    scene = made(Gravity(), EtherDrag(rate=2.0), HANGING[2], size=3, velocity=(1.0, 0.0, 0.0))
-    found = ready("mujoco", scene.system).solve(problem(scene, start(scene), "current"), StopRule(400))
-    free = scene.system.unpinned
+    scene = made(GravityEffect(), EtherDragEffect(rate=2.0), HANGING[2], size=3, velocity=(1.0, 0.0, 0.0))
+    found = ready("mujoco", scene.system).solve(
+        build_problem(scene, build_initial_state(scene), "current"), StopRule(400)
+    )
+    free = scene.system.unpinned_mask
     assert found.velocity is not None
     # v' = g - c v; steps of 1/400 of a frame are of order 1.
     np.testing.assert_allclose(found.velocity[free, 0], np.exp(-2.0 / 30), rtol=1e-4)
@@ -151,9 +166,9 @@ def test_the_drag_that_mujoco_takes_is_that_of_the_scene():
 
 @pytest.mark.parametrize("substeps", [1, 7])
 def test_pypbd_moves_one_spring_as_xpbd_in_small_steps_does(substeps: int):
-    pins = Pins.model_validate({"at": ["first"], "weight": "exact"})
-    scene = made(Springs(stretch=500.0), Gravity(), pins, mesh=Chain(), size=2)
-    stated = problem(scene, start(scene), "current")
+    pins = PinsEffect.model_validate({"at": ["first"], "weight": "exact"})
+    scene = made(SpringsEffect(stretch=500.0), GravityEffect(), pins, mesh=ChainMesh(), size=2)
+    stated = build_problem(scene, build_initial_state(scene), "current")
     found = ready("pypbd", scene.system).solve(stated, StopRule(substeps))
     wanted = XpbdSmallSteps().prepare(scene.system).solve(stated, StopRule(substeps))
     # It may compute in single precision.
@@ -169,45 +184,47 @@ def test_pypbd_moves_one_spring_as_xpbd_in_small_steps_does(substeps: int):
     ],
 )
 def test_newton_physics_steps_springs_as_its_methods_say(parameters: dict[str, Any], substeps: int, wanted: str):
-    pins = Pins.model_validate({"at": ["first"], "weight": "exact"})
+    pins = PinsEffect.model_validate({"at": ["first"], "weight": "exact"})
     size, velocity = (2 if wanted == "xpbd" else 4), (0.3, 0.1, -0.2)  # its XPBD moves along all springs at once
-    effects = Springs(stretch=500.0), Gravity(), pins
-    scene = made(*effects, mesh=Chain(), size=size, velocity=velocity)
-    stated = problem(scene, start(scene), "current")
+    effects = SpringsEffect(stretch=500.0), GravityEffect(), pins
+    scene = made(*effects, mesh=ChainMesh(), size=size, velocity=velocity)
+    stated = build_problem(scene, build_initial_state(scene), "current")
     found = ready("newton-physics", scene.system, **parameters).solve(stated, StopRule(substeps)).positions
     if wanted == "semi-implicit":
         should = semi_implicit(scene, stated, substeps, damping=0.0)[0]
     elif wanted == "xpbd":
         should = XpbdSmallSteps().prepare(scene.system).solve(stated, StopRule(substeps)).positions
     else:
-        same = made(*effects, mesh=Chain(), size=size, velocity=velocity, integrator="implicit-euler")
-        step = problem(same, start(same), "current")
-        should = load(SOLVERS["newton"])().prepare(same.system).solve(step, StopRule(100, 1e-12)).positions
-    assert np.abs(found - stated.current).max() > 100 * 2e-6
+        same = made(*effects, mesh=ChainMesh(), size=size, velocity=velocity, integrator="implicit-euler")
+        step = build_problem(same, build_initial_state(same), "current")
+        should = load_target(SOLVERS["newton"])().prepare(same.system).solve(step, StopRule(100, 1e-12)).positions
+    assert np.abs(found - stated.current_positions).max() > 100 * 2e-6
     np.testing.assert_allclose(found, should, rtol=0, atol=2e-6)  # float32
 
 
 def test_the_program_in_taichi_minimises_the_step_and_one_iteration_is_the_linearised_step():
-    effects = HANGING[:2], Pins.model_validate({"at": ["top_corners"], "weight": "exact"})
+    effects = HANGING[:2], PinsEffect.model_validate({"at": ["top_corners"], "weight": "exact"})
     scene = made(*effects[0], effects[1], velocity=(0.3, 0.1, -0.2))
-    stated = problem(scene, start(scene), "current")
+    stated = build_problem(scene, build_initial_state(scene), "current")
     found = ready("taichi", scene.system, iterations=30, tolerance=1e-9).solve(stated, StopRule(1)).positions
     same = made(*effects[0], effects[1], velocity=(0.3, 0.1, -0.2), integrator="implicit-euler")
     should = (
-        load(SOLVERS["newton"])()
+        load_target(SOLVERS["newton"])()
         .prepare(same.system)
-        .solve(problem(same, start(same), "current"), StopRule(100, 1e-12))
+        .solve(build_problem(same, build_initial_state(same), "current"), StopRule(100, 1e-12))
     )
     np.testing.assert_allclose(found, should.positions, rtol=0, atol=1e-9)
     once = ready("taichi", scene.system, iterations=1).solve(stated, StopRule(1)).positions
-    assert 1e-6 < np.abs(once - should.positions).max() < 0.3 * np.abs(should.positions - stated.current).max()
+    assert (
+        1e-6 < np.abs(once - should.positions).max() < 0.3 * np.abs(should.positions - stated.current_positions).max()
+    )
 
 
 def test_all_of_a_net_is_one_colour_to_newton_physics_which_sees_no_springs():
     ready("newton-physics", made(*HANGING).system)
     for colours, told in (("newton", "1 colours"), ("springs", "4 colours")):
         prepared = ready("newton-physics", made(*HANGING).system, colours=colours)
-        assert told in prepared.choice
+        assert told in prepared.description
 
 
 def test_newton_physics_says_where_there_is_no_device():
@@ -220,20 +237,20 @@ def test_newton_physics_says_where_there_is_no_device():
 @engines
 @pytest.mark.parametrize("weight", [1e10, "exact"])
 def test_a_solve_depends_on_the_problem_alone_and_ends_at_the_iterate_of_its_number(name: str, weight: float | str):
-    pins = Pins.model_validate({"at": ["top_corners"], "weight": weight})
+    pins = PinsEffect.model_validate({"at": ["top_corners"], "weight": weight})
     scene = made(*HANGING[:2], pins)
-    stated = problem(scene, start(scene), "current")
+    stated = build_problem(scene, build_initial_state(scene), "current")
     prepared = ready(name, scene.system)
-    kept = stated.start.positions.copy()
-    other = falling(random_problem(0))
+    kept = stated.step_start.positions.copy()
+    other = falling(build_random_problem(0))
     elsewhere = ready(name, other.system)
     alone = prepared.solve(stated, StopRule(5))
     together = zip(prepared.iterates(stated), elsewhere.iterates(other), strict=False)
     iterates = [p.copy() for p, _ in islice(together, 5)]
     np.testing.assert_array_equal(alone.positions, iterates[-1])
-    np.testing.assert_array_equal(stated.start.positions, kept)
-    assert (alone.residual_of, alone.stopped, alone.iterations) == ("none", "iterations", 5)
-    assert np.isnan([alone.residual, alone.yardstick, prepared.residual_at(stated, kept)]).all()
+    np.testing.assert_array_equal(stated.step_start.positions, kept)
+    assert (alone.residual_iterate, alone.termination_reason, alone.num_iterations) == ("none", "iterations", 5)
+    assert np.isnan([alone.residual, alone.initial_residual, prepared.residual_at(stated, kept)]).all()
     # Pins that move are at their ends, whatever came before.
     moved = replace(stated, pin_targets=stated.pin_targets + 0.01)
     found = prepared.solve(moved, StopRule(4))
@@ -244,10 +261,10 @@ def test_a_solve_depends_on_the_problem_alone_and_ends_at_the_iterate_of_its_num
 @engines
 def test_rows_tell_the_version_of_the_engine(name: str):
     prepared = ready(name, made(*HANGING).system)
-    package = load(OPTIONAL[name]).about.package
-    version = json.loads(provenance(SolverSpec(name, {}))["versions"])[package]
-    assert f"{package} {version}," in prepared.choice
-    assert package not in json.loads(provenance(SolverSpec("newton", {}))["versions"])
+    package = load_target(OPTIONAL_SOLVERS[name]).about.package
+    version = json.loads(build_provenance_columns(SolverSpec(name, {}))["versions"])[package]
+    assert f"{package} {version}," in prepared.description
+    assert package not in json.loads(build_provenance_columns(SolverSpec("newton", {}))["versions"])
 
 
 @engines

@@ -11,30 +11,30 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.reference.trajectory import Trajectory, integrate
-from harness.scenes.bind import Scene, build
-from harness.scenes.effects.air_drag import AirDrag
-from harness.scenes.effects.bending import Bending
-from harness.scenes.effects.dashpots import Dashpots
-from harness.scenes.effects.ether_drag import EtherDrag
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.rayleigh import Rayleigh
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
+from harness.reference.trajectory import ReferenceTrajectory, integrate_motion
+from harness.scenes.bind import Scene, build_scene
+from harness.scenes.effects.air_drag import AirDragEffect
+from harness.scenes.effects.bending import BendingEffect
+from harness.scenes.effects.dashpots import DashpotsEffect
+from harness.scenes.effects.ether_drag import EtherDragEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.rayleigh import RayleighEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
 from harness.scenes.spec import SceneSpec
-from harness.simulation.step import State, prepare, simulate, start
-from solvers.core.explicit_tables import BLANES_MOAN_4, RUNGE_KUTTA_4, TSITOURAS_5, VERLET
-from solvers.core.forces import frequency
+from harness.simulation.step import MotionState, build_initial_state, prepare, simulate_scene
+from solvers.core.explicit_tables import BLANES_MOAN_4, RUNGE_KUTTA_4, TSITOURAS_5, VELOCITY_VERLET
+from solvers.core.forces import estimate_max_frequency
 from solvers.integrators import Motion
 from solvers.methods.explicit import PreparedExplicit
-from solvers.methods.newton import Newton
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import StopRule, Unsupported
-from solvers.registry import SOLVERS, load
+from solvers.registry import SOLVERS, load_target
 
 END, ONCE = 0.3, StopRule(1)
-HELD, SOFT = Pins(at=("first",), weight="exact"), Springs(stretch=20.0)
+HELD, SOFT = PinsEffect(at=("first",), weight="exact"), SpringsEffect(stretch=20.0)
 METHODS = {
     "velocity-verlet": (2, 16),
     "blanes-moan-4": (4, 8),
@@ -46,46 +46,51 @@ METHODS = {
 """Order, and substeps to begin with."""
 EFFECTS: dict[str, tuple[Any, ...]] = {
     "none": (),
-    "ether drag": (EtherDrag(rate=3.0),),
-    "air": (AirDrag(coefficient=2.0),),
-    "Rayleigh's damping of masses": (Rayleigh(mass=1.5),),
+    "ether drag": (EtherDragEffect(rate=3.0),),
+    "air": (AirDragEffect(coefficient=2.0),),
+    "Rayleigh's damping of masses": (RayleighEffect(mass=1.5),),
 }
 
 
 def made(*effects: Any, time_step: float = END, mesh: Any = None, size: int = 4) -> Scene:
     """A scene of 1 kg, which solvers integrate by themselves."""
-    given = {"mesh": mesh or Chain(), "effects": effects, "velocity": (0.5, 1.0, 2.0), "time_step": time_step}
-    return build(SceneSpec(mass=1.0, frames=1, path=Path("scene.yaml"), **given), size, "own")
+    given = {"mesh": mesh or ChainMesh(), "effects": effects, "velocity": (0.5, 1.0, 2.0), "time_step": time_step}
+    return build_scene(SceneSpec(mass=1.0, frames=1, path=Path("scene.yaml"), **given), size, "own")
 
 
 def prepared(name: str, scene: Scene, **parameters: Any) -> PreparedExplicit:
-    return load(SOLVERS[name])(**parameters).prepare(scene.system)
+    return load_target(SOLVERS[name])(**parameters).prepare(scene.system)
 
 
 def fixed(name: str, scene: Scene, substeps: int) -> PreparedExplicit:
     """With substeps of one length."""
     one: Any = prepared(name, scene)
-    taken = replace(one.substeps, count=substeps, tolerance=0.0)
-    method = replace(one.method, power=0.0) if hasattr(one.method, "power") and one.substeps.tolerance else one.method
-    return replace(one, substeps=taken, method=method)
+    taken = replace(one.substep_choice, num_substeps=substeps, tolerance=0.0)
+    method = (
+        replace(one.method, power=0.0) if hasattr(one.method, "power") and one.substep_choice.tolerance else one.method
+    )
+    return replace(one, substep_choice=taken, method=method)
 
 
-def run(scene: Scene, ready: Any, frames: int = 1, state: State | None = None) -> list[Motion]:
-    state = state or start(scene)
-    return [s.state.now for s in simulate(scene, ready, ONCE, first_guess="current", frames=frames, state=state)]
+def run(scene: Scene, ready: Any, frames: int = 1, state: MotionState | None = None) -> list[Motion]:
+    state = state or build_initial_state(scene)
+    return [
+        s.state.motion
+        for s in simulate_scene(scene, ready, ONCE, initial_guess="current", frames=frames, initial_state=state)
+    ]
 
 
 @cache
-def truth(effects: str) -> Trajectory:
-    return integrate(made(SOFT, Gravity(), HELD, *EFFECTS[effects]), [END])
+def truth(effects: str) -> ReferenceTrajectory:
+    return integrate_motion(made(SOFT, GravityEffect(), HELD, *EFFECTS[effects]), [END])
 
 
 @pytest.mark.parametrize("effects", EFFECTS)
 @pytest.mark.parametrize("name", METHODS)
 def test_the_error_falls_with_the_methods_order(name, effects):
-    scene, (order, first) = made(SOFT, Gravity(), HELD, *EFFECTS[effects]), METHODS[name]
+    scene, (order, first) = made(SOFT, GravityEffect(), HELD, *EFFECTS[effects]), METHODS[name]
     paths = (run(scene, fixed(name, scene, k * first)) for k in (1, 2))
-    coarse, fine = (truth(effects).error(0, path[-1].positions) for path in paths)
+    coarse, fine = (truth(effects).measure_error(0, path[-1].positions) for path in paths)
     # The next terms of the error are smaller by a substep times the fastest frequency, up to a half, of the highest
     # orders; they have the sign that makes it fall faster.
     assert order - 0.25 < np.log2(coarse / fine) < order + 1.3
@@ -93,9 +98,9 @@ def test_the_error_falls_with_the_methods_order(name, effects):
 
 @pytest.mark.parametrize("name", ["tsitouras-5", "dormand-prince-8"])
 def test_the_error_that_is_asked_for_steers_the_one_that_is_found(name):
-    scene = made(SOFT, Gravity(), HELD, time_step=END / 3)
+    scene = made(SOFT, GravityEffect(), HELD, time_step=END / 3)
     errors = [
-        truth("none").error(0, run(scene, prepared(name, scene, error=asked), 3)[-1].positions)
+        truth("none").measure_error(0, run(scene, prepared(name, scene, error=asked), 3)[-1].positions)
         for asked in (1e-4, 1e-6, 1e-8, 1e-10)
     ]
     assert errors[0] < 1e-3
@@ -105,29 +110,29 @@ def test_the_error_that_is_asked_for_steers_the_one_that_is_found(name):
 
 def test_it_agrees_with_an_implicit_integrator():
     """Bending is a force as well; SDIRK of order 4 has it as an energy."""
-    pins = Pins(at=("top_corners",), weight="exact")
-    effects = (Springs(stretch=5.0), Bending(stiffness=1e-3), Gravity(), pins)
-    scene = made(*effects, mesh=Grid(), time_step=0.02)
-    other = build(SceneSpec(mesh=Grid(), mass=1.0, frames=1, path=Path("scene.yaml"), effects=effects,
+    pins = PinsEffect(at=("top_corners",), weight="exact")
+    effects = (SpringsEffect(stretch=5.0), BendingEffect(stiffness=1e-3), GravityEffect(), pins)
+    scene = made(*effects, mesh=GridMesh(), time_step=0.02)
+    other = build_scene(SceneSpec(mesh=GridMesh(), mass=1.0, frames=1, path=Path("scene.yaml"), effects=effects,
                             velocity=(0.5, 1.0, 2.0), time_step=0.02), 4, "sdirk-4")  # fmt: skip
-    path = simulate(other, prepare(other, Newton()), StopRule(100, 1e-12), first_guess="motion", frames=5)
+    path = simulate_scene(other, prepare(other, NewtonSolver()), StopRule(100, 1e-12), initial_guess="motion", frames=5)
     wanted = [step.positions for step in path][-1]
     found = run(scene, prepared("dormand-prince-8", scene, error=1e-9), 5)[-1].positions
-    moved = np.abs(wanted - scene.mesh.rest).max()
+    moved = np.abs(wanted - scene.mesh.rest_positions).max()
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-4 * moved)  # the error of order 4 at these steps
 
 
 @pytest.mark.parametrize("name", ["velocity-verlet", "blanes-moan-4", "blanes-moan-6"])
 def test_the_energy_of_symplectic_methods_stays_near_over_a_hundred_thousand_steps(name):
-    scene = made(Springs(rule="fixed", stretch=25.0), size=3, time_step=1.0)
+    scene = made(SpringsEffect(rule="fixed", stretch=25.0), size=3, time_step=1.0)
     ready, substeps = prepared(name, scene), 2000
-    h = 0.25 / ready.substeps.count  # of the longest that is stable
+    h = 0.25 / ready.substep_choice.num_substeps  # of the longest that is stable
     system = replace(scene.system, time_step=substeps * h)
-    taken = replace(ready.substeps, count=substeps)
-    scene, ready = replace(scene, system=system), replace(ready, system=system, substeps=taken)
-    begun = State(Motion(1.1 * scene.mesh.rest, np.random.default_rng(0).normal(size=(3, 3))), None, 0)
-    path = [begun.now, *run(scene, ready, 50, begun)]
-    energy = np.array([0.5 * system.mass @ (v**2).sum(axis=1) + scene.springs.value(p) for p, v in path])
+    taken = replace(ready.substep_choice, num_substeps=substeps)
+    scene, ready = replace(scene, system=system), replace(ready, system=system, substep_choice=taken)
+    begun = MotionState(Motion(1.1 * scene.mesh.rest_positions, np.random.default_rng(0).normal(size=(3, 3))), None, 0)
+    path = [begun.motion, *run(scene, ready, 50, begun)]
+    energy = np.array([0.5 * system.mass @ (v**2).sum(axis=1) + scene.all_springs.value(p) for p, v in path])
     # It swings by (omega h)^2 at most, and does not drift.
     assert np.ptp(energy) < 0.1 * energy[0]
     assert abs(energy[-10:].mean() - energy[:10].mean()) < 0.05 * energy[0]
@@ -135,9 +140,9 @@ def test_the_energy_of_symplectic_methods_stays_near_over_a_hundred_thousand_ste
 
 @pytest.mark.parametrize("name", METHODS)
 def test_momentum_is_kept(name):
-    scene = made(Springs(stretch=30.0), mesh=Grid(), time_step=0.1)
-    v = np.random.default_rng(1).normal(size=scene.mesh.rest.shape)
-    path = run(scene, prepared(name, scene), 10, State(Motion(scene.mesh.rest, v), None, 0))
+    scene = made(SpringsEffect(stretch=30.0), mesh=GridMesh(), time_step=0.1)
+    v = np.random.default_rng(1).normal(size=scene.mesh.rest_positions.shape)
+    path = run(scene, prepared(name, scene), 10, MotionState(Motion(scene.mesh.rest_positions, v), None, 0))
     m = scene.system.mass
     np.testing.assert_allclose([m @ w for _, w in path], np.tile(m @ v, (10, 1)), rtol=0, atol=1e-12)  # round-off
     if name in ("velocity-verlet", "blanes-moan-4", "blanes-moan-6"):
@@ -147,27 +152,27 @@ def test_momentum_is_kept(name):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_the_same_steps_give_the_same_bits(name):
-    scene = made(SOFT, Gravity(), HELD)
+    scene = made(SOFT, GravityEffect(), HELD)
     one, two = (run(scene, prepared(name, scene), 4) for _ in "ab")
     np.testing.assert_array_equal(np.array(one), np.array(two))
 
 
 def test_the_largest_frequency_is_bounded_closely():
-    scene = made(Springs(stretch=300.0, shear=100.0), Gravity(), mesh=Grid(), size=9)
-    K = scene.springs.stiffness_matrix(81).toarray()
+    scene = made(SpringsEffect(stretch=300.0, shear=100.0), GravityEffect(), mesh=GridMesh(), size=9)
+    K = scene.all_springs.stiffness_matrix(81).toarray()
     most = np.sqrt(np.linalg.eigvals(K / scene.system.mass[:, None]).real.max())
-    assert most <= frequency(scene.system) <= 1.05 * most
+    assert most <= estimate_max_frequency(scene.system) <= 1.05 * most
 
 
 def test_limits_of_stability_are_those_of_textbooks():
-    assert VERLET.limit == pytest.approx(2.0, abs=0.02)
-    assert RUNGE_KUTTA_4.limit == pytest.approx(2.0 * 2.0**0.5, abs=0.02)  # Hairer and Wanner, section IV.2
-    assert BLANES_MOAN_4.limit > 3.0
-    np.testing.assert_allclose(TSITOURAS_5.times[-1], 1.0, rtol=1e-14)
+    assert VELOCITY_VERLET.stability_limit == pytest.approx(2.0, abs=0.02)
+    assert RUNGE_KUTTA_4.stability_limit == pytest.approx(2.0 * 2.0**0.5, abs=0.02)  # Hairer and Wanner, section IV.2
+    assert BLANES_MOAN_4.stability_limit > 3.0
+    np.testing.assert_allclose(TSITOURAS_5.stage_times[-1], 1.0, rtol=1e-14)
 
 
 def test_what_it_does_not_know_is_refused_by_name():
-    scene = made(SOFT, Dashpots(stretch=0.4), HELD)
+    scene = made(SOFT, DashpotsEffect(stretch=0.4), HELD)
     with pytest.raises(Unsupported, match=r"dormand-prince-8.*Dashpots"):
         prepared("dormand-prince-8", scene)
     with pytest.raises(Unsupported, match="1e-14 to 1"):
@@ -175,14 +180,14 @@ def test_what_it_does_not_know_is_refused_by_name():
 
 
 def test_an_error_that_no_step_keeps_ends_with_the_part_of_the_frame_that_was_reached():
-    scene = made(SOFT, Gravity(), HELD)
-    broken = replace(scene, load=np.full_like(scene.load, np.nan))
+    scene = made(SOFT, GravityEffect(), HELD)
+    broken = replace(scene, constant_force=np.full_like(scene.constant_force, np.nan))
     ready = prepared("tsitouras-5", broken)
     with pytest.raises(RuntimeError, match="was not kept within"):
         run(broken, ready)
 
 
 def test_a_minimiser_has_nothing_to_do_where_the_solver_should_integrate():
-    scene = made(SOFT, Gravity(), HELD)
+    scene = made(SOFT, GravityEffect(), HELD)
     with pytest.raises(Unsupported, match="own"):
-        run(scene, prepare(scene, Newton()))
+        run(scene, prepare(scene, NewtonSolver()))

@@ -8,15 +8,15 @@ import pytest
 from typer.testing import CliRunner
 
 from harness.cli import app
-from harness.report.figures.entry import chosen, ready
-from harness.report.figures.panel import Plot, Scale
+from harness.report.figures.entry import entries_from_panels, select_entries
+from harness.report.figures.panel import AxisScale, CurvePlot
 from tests import figure_results as made
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of a sweep."""
-    return made.sweep(tmp_path_factory.mktemp("sweep"))
+    return made.write_sweep_results(tmp_path_factory.mktemp("sweep"))
 
 
 BAD = {
@@ -55,15 +55,17 @@ def test_a_mistake_is_answered_with_what_was_wanted(results: Path, name: str, tm
 
 
 def test_panels_are_named_by_parts() -> None:
-    def plot(*parts: str) -> Plot:
-        return Plot(parts[:1], parts[1:], "", "", Scale(""), Scale(""), [])
+    def plot(*parts: str) -> CurvePlot:
+        return CurvePlot(parts[:1], parts[1:], "", "", AxisScale(""), AxisScale(""), [])
 
-    entries = ready(
+    entries = entries_from_panels(
         [plot(a, b, c) for a in ("net", "block") for b in ("gap", "largest") for c in ("time", "iterations")]
     )
 
     def picked(*selectors: str) -> list[str]:
-        return [":".join(one.parts) for one in chosen(entries, [tuple(one.split(":")) for one in selectors])]
+        return [
+            ":".join(one.name_parts) for one in select_entries(entries, [tuple(one.split(":")) for one in selectors])
+        ]
 
     assert picked("gap:time") == ["net:gap:time"], "of the first, where it is not said of what"
     assert picked("block:gap:time", "net:time") == ["block:gap:time", "net:gap:time", "net:largest:time"]

@@ -20,69 +20,80 @@ from typer.testing import CliRunner
 
 from harness.cli import app
 from harness.report.figures import kinds
-from harness.report.figures.asked import LEAST, Asked
-from harness.report.figures.canvas import INCH, compose, ordered, texts
-from harness.report.figures.drawing import mark
-from harness.report.figures.faults import faults
-from harness.report.figures.panel import Plot, Scale, Series
-from harness.report.style import Mark
+from harness.report.figures.asked import MIN_FONT_SIZE, FigureOptions
+from harness.report.figures.canvas import MILLIMETRES_PER_INCH, compose_figure, sort_by_end_value, visible_texts
+from harness.report.figures.drawing import marker_style
+from harness.report.figures.faults import find_layout_faults
+from harness.report.figures.panel import AxisScale, CurvePlot, CurveSeries
+from harness.report.style import SeriesStyle
 from tests import figure_results as made
-from tests.drawn_figures import ALIKE, FOLDER, MESHES, RESULTS, composed, pixels, sheet, similarity
+from tests.drawn_figures import (
+    EXPECTED_FOLDER,
+    FIGURE_SOURCES,
+    MESH_FIGURE_KINDS,
+    MIN_SIMILARITY,
+    compose_kind,
+    least_similarity,
+    render_figure,
+    tile_figures,
+)
 
-LOOKS = FOLDER / "figures.png"
+LOOKS = EXPECTED_FOLDER / "figures.png"
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A folder of results for each kind."""
     folder = tmp_path_factory.mktemp("results")
-    written = {make: make(folder / make.__name__) for make in dict.fromkeys(make for _, make in RESULTS.values())}
-    return {kind: written[make] for kind, (_, make) in RESULTS.items()}
+    written = {
+        make: make(folder / make.__name__) for make in dict.fromkeys(make for _, make in FIGURE_SOURCES.values())
+    }
+    return {kind: written[make] for kind, (_, make) in FIGURE_SOURCES.items()}
 
 
 @pytest.fixture(scope="module")
 def figures(results: dict[str, Path]) -> dict[str, Figure]:
     """One figure of each kind, 85 mm wide."""
-    return {kind: composed(kind, results[kind], Asked())[0] for kind in RESULTS}
+    return {kind: compose_kind(kind, results[kind], FigureOptions())[0] for kind in FIGURE_SOURCES}
 
 
 def test_all_kinds_are_on_a_sheet() -> None:
-    assert {*RESULTS, *MESHES} == {*kinds.KINDS}
+    assert {*FIGURE_SOURCES, *MESH_FIGURE_KINDS} == {*kinds.FIGURE_KINDS}
 
 
 def test_the_sheet_of_all_figures_looks_as_it_did(figures: dict[str, Figure], tmp_path: Path) -> None:
-    now = sheet(list(figures.values()), (2100, 1080))
+    now = tile_figures(list(figures.values()), (2100, 1080))
     now.save(tmp_path / "figures.png")
     then = Image.open(LOOKS)
     told = f"look at {tmp_path / 'figures.png'} beside {LOOKS}, and where it is better, put it there"
     assert now.size == then.size, told
-    assert similarity(now, then) > ALIKE, told
+    assert least_similarity(now, then) > MIN_SIMILARITY, told
 
 
 def test_a_curve_of_another_look_is_found_out(figures: dict[str, Figure]) -> None:
     line = figures["timing"].axes[0].lines[0]
-    look, now = (line.get_linestyle(), line.get_color()), pixels(figures["timing"])
+    look, now = (line.get_linestyle(), line.get_color()), render_figure(figures["timing"])
     line.set(linestyle=":", color="#d55e00")
-    other = pixels(figures["timing"])
+    other = render_figure(figures["timing"])
     line.set(linestyle=look[0], color=look[1])
-    assert similarity(now, other) < ALIKE
+    assert least_similarity(now, other) < MIN_SIMILARITY
 
 
-@pytest.mark.parametrize("kind", RESULTS)
+@pytest.mark.parametrize("kind", FIGURE_SOURCES)
 def test_no_type_of_a_figure_is_small_cut_or_covered(figures: dict[str, Figure], kind: str) -> None:
     figure = figures[kind]
-    assert faults(figure) == []
-    assert len(texts(figure)) > 5
-    assert figure.get_size_inches()[0] * INCH == pytest.approx(85.0)
+    assert find_layout_faults(figure) == []
+    assert len(visible_texts(figure)) > 5
+    assert figure.get_size_inches()[0] * MILLIMETRES_PER_INCH == pytest.approx(85.0)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(("width", "size"), [(60.0, 6.0), (180.0, 10.0)])
 def test_nor_at_other_widths(results: dict[str, Path], width: float, size: float) -> None:
     for kind in ("timing", "ablation"):
-        figure, _ = composed(kind, results[kind], Asked(width=width, size=size))
-        assert faults(figure) == []
-        assert min(float(text.get_fontsize()) for text in texts(figure)) >= LEAST
+        figure, _ = compose_kind(kind, results[kind], FigureOptions(width_mm=width, font_size=size))
+        assert find_layout_faults(figure) == []
+        assert min(float(text.get_fontsize()) for text in visible_texts(figure)) >= MIN_FONT_SIZE
 
 
 def test_faults_are_found() -> None:
@@ -95,14 +106,14 @@ def test_faults_are_found() -> None:
     figure.text(0.1, 0.5, "one name")
     figure.text(0.12, 0.5, "another")
     figure.legend(loc="center")
-    told = "\n".join(faults(figure))
+    told = "\n".join(find_layout_faults(figure))
     for said in ("'beyond the edge' is cut", "'tiny' is of 5.0 points", "'one name' meets 'another'", "lies over data"):
         assert said in told
 
 
 def test_the_legend_has_the_order_of_the_curves(results: dict[str, Path]) -> None:
-    asked = Asked(selectors=(("net", "10", "gap", "time"), ("net", "10", "current", "gap", "iterations")))
-    figure, _ = composed("convergence", results["convergence"], asked)
+    asked = FigureOptions(selectors=(("net", "10", "gap", "time"), ("net", "10", "current", "gap", "iterations")))
+    figure, _ = compose_kind("convergence", results["convergence"], asked)
     (legend,) = figure.legends
     lines = {str(line.get_label()): line for line in figure.axes[0].lines}
     names = [text.get_text() for text in legend.get_texts() if text.get_text() in lines]
@@ -115,26 +126,29 @@ def test_names_at_the_ends_of_curves_have_their_order_and_need_no_legend(figures
     figure = figures["timing"]
     assert not figure.legends
     names = sorted(figure.axes[0].texts, key=lambda text: -text.get_position()[1])
-    series = [one.label for one in ordered(composed_timing(figure))]
+    series = [one.label for one in sort_by_end_value(composed_timing(figure))]
     assert [name.get_text() for name in names] == series
 
 
-def composed_timing(figure: Figure) -> list[Series]:
+def composed_timing(figure: Figure) -> list[CurveSeries]:
     lines = [line for line in figure.axes[0].lines if not str(line.get_label()).startswith("_")]
     return [
-        Series(
-            str(one.get_label()), Mark("k", "o"), np.asarray(one.get_xdata(), float), np.asarray(one.get_ydata(), float)
+        CurveSeries(
+            str(one.get_label()),
+            SeriesStyle("k", "o"),
+            np.asarray(one.get_xdata(), float),
+            np.asarray(one.get_ydata(), float),
         )
         for one in lines
     ]
 
 
 def test_one_size_has_a_row_for_each_solver_the_fastest_first(tmp_path: Path) -> None:
-    folder = made.sweep(tmp_path, sizes=(8,))
-    figure, _ = composed("timing", folder, Asked(selectors=(("geometry-flat", "step"),)))
+    folder = made.write_sweep_results(tmp_path, sizes=(8,))
+    figure, _ = compose_kind("timing", folder, FigureOptions(selectors=(("geometry-flat", "step"),)))
     ax = figure.axes[0]
-    assert [label.get_text() for label in ax.get_yticklabels()] == list(made.SOLVERS)
-    assert faults(figure) == []
+    assert [label.get_text() for label in ax.get_yticklabels()] == list(made.SOLVER_NAMES)
+    assert find_layout_faults(figure) == []
 
 
 def test_the_command_writes_each_format_the_data_and_a_script_that_draws_them(
@@ -147,14 +161,16 @@ def test_the_command_writes_each_format_the_data_and_a_script_that_draws_them(
     pdf, svg = stem.with_suffix(".pdf").read_bytes(), stem.with_suffix(".svg").read_text()
     box = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+)", pdf)
     assert box
-    assert float(box[1]) == pytest.approx(85.0 / INCH * 72.0, abs=0.1)
+    assert float(box[1]) == pytest.approx(85.0 / MILLIMETRES_PER_INCH * 72.0, abs=0.1)
     assert b"/FontFile2" in pdf or b"/FontFile" in pdf
     assert "<text" not in svg.partition("</metadata>")[2], "letters are paths, which need no font"
     with Image.open(stem.with_suffix(".png")) as image:
-        assert image.width == round(85.0 / INCH * 300.0) or image.width == int(85.0 / INCH * 300.0)
+        assert image.width == round(85.0 / MILLIMETRES_PER_INCH * 300.0) or image.width == int(
+            85.0 / MILLIMETRES_PER_INCH * 300.0
+        )
     assert "A processor" in svg, "whose data it is stays in the file"
     rows = list(csv.DictReader(line for line in stem.with_suffix(".csv").read_text().splitlines() if line[0] != "#"))
-    assert {row["series"] for row in rows} == set(made.SOLVERS)
+    assert {row["series"] for row in rows} == set(made.SOLVER_NAMES)
     with matplotlib.rc_context():
         done = subprocess.run([sys.executable, stem.with_suffix(".py")], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -163,24 +179,24 @@ def test_the_command_writes_each_format_the_data_and_a_script_that_draws_them(
 
 
 def test_without_a_title_its_words_and_the_origin_are_left_to_the_caption(results: dict[str, Path]) -> None:
-    figure, _ = composed("timing", results["timing"], Asked(titled=False, transparent=True))
-    said = "\n".join(text.get_text() for text in texts(figure))
+    figure, _ = compose_kind("timing", results["timing"], FigureOptions(has_title=False, is_transparent=True))
+    said = "\n".join(text.get_text() for text in visible_texts(figure))
     assert "Time a step" not in said
     assert "A processor" not in said
     assert np.asarray(FigureCanvasAgg(figure).figure.get_facecolor())[3] == 0.0
 
 
 def test_a_gate_s_level_has_a_gap_where_it_changed(results: dict[str, Path]) -> None:
-    figure, (panel,) = composed("history", results["history"], Asked())
+    figure, (panel,) = compose_kind("history", results["history"], FigureOptions())
     assert panel.subject == "test_step[cloth]", "the one that changed most"
     stored, level = panel.series
     assert len(stored.x) == 30
     known = np.isfinite(level.y)
     assert known.tolist() == [True, True, False] * 2
     assert level.y[3] / level.y[0] == pytest.approx(1.05, rel=0.01)
-    said = " ".join(text.get_text() for text in texts(figure))
+    said = " ".join(text.get_text() for text in visible_texts(figure))
     assert re.search(r"Changed by \+[456]\.\d % at 00000", said)
-    assert not kinds.kind("history").panels(results["timing"], lambda _: ())
+    assert not kinds.find_figure_kind("history").list_panels(results["timing"], lambda _: ())
 
 
 def test_a_report_from_outside_is_a_kind_if_it_has_panels(
@@ -189,25 +205,25 @@ def test_a_report_from_outside_is_a_kind_if_it_has_panels(
     def report(rows: Any, folder: Path) -> list[Path]:
         return []
 
-    def panels(rows: Any) -> list[Plot]:
+    def panels(rows: Any) -> list[CurvePlot]:
         x = np.arange(3.0)
-        series = [Series("mine", Mark("#123456", "o"), x, x + 1.0)]
-        scales = Scale("frame", "linear"), Scale("rows of " + str(len(rows)), "linear")
-        return [Plot(("mine",), ("rows",), "all", "", *scales, series)]
+        series = [CurveSeries("mine", SeriesStyle("#123456", "o"), x, x + 1.0)]
+        scales = AxisScale("frame", "linear"), AxisScale("rows of " + str(len(rows)), "linear")
+        return [CurvePlot(("mine",), ("rows",), "all", "", *scales, series)]
 
     monkeypatch.setattr(report, "panels", panels, raising=False)
-    monkeypatch.setattr(type(kinds.EVERY_REPORT), "_installed", lambda _: {"mine": None})
-    monkeypatch.setattr(type(kinds.EVERY_REPORT), "__getitem__", lambda self, name: "tests:mine")
+    monkeypatch.setattr(type(kinds.REPORT_TABLE), "_installed", lambda _: {"mine": None})
+    monkeypatch.setattr(type(kinds.REPORT_TABLE), "__getitem__", lambda self, name: "tests:mine")
     monkeypatch.setattr(kinds, "load", lambda _: report)
-    found = kinds.kind("mine")
-    (entry,) = found.panels(results["timing"], lambda _: ())
-    assert entry.parts == ("mine", "rows")
-    assert isinstance(compose([entry.make()], found.title, Asked()).axes[0].lines[0], Line2D)
+    found = kinds.find_figure_kind("mine")
+    (entry,) = found.list_panels(results["timing"], lambda _: ())
+    assert entry.name_parts == ("mine", "rows")
+    assert isinstance(compose_figure([entry.build_panel()], found.title, FigureOptions()).axes[0].lines[0], Line2D)
     monkeypatch.setattr(report, "panels", lambda rows: 1 / 0)
     with pytest.raises(kinds.RunFailed, match="the report mine failed: ZeroDivisionError"):
-        found.panels(results["timing"], lambda _: ())
+        found.list_panels(results["timing"], lambda _: ())
 
 
 def test_a_hollow_mark_keeps_its_colour() -> None:
-    filled, hollow = mark(Mark("#0072b2", "o")), mark(Mark("#0072b2", "o"), hollow=True)
+    filled, hollow = marker_style(SeriesStyle("#0072b2", "o")), marker_style(SeriesStyle("#0072b2", "o"), is_stale=True)
     assert (filled["mfc"], hollow["mfc"], hollow["mec"]) == ("#0072b2", "white", "#0072b2")

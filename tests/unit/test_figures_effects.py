@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
-from harness.experiments.ablation.ablation_rows import SCHEMA
-from harness.report.ablation import read
-from harness.report.figures.asked import Asked
-from harness.report.figures.canvas import INCH, texts
-from harness.report.figures.faults import faults
+from harness.experiments.ablation.ablation_rows import ABLATION_SCHEMA
+from harness.report.ablation import read_ablation
+from harness.report.figures.asked import FigureOptions
+from harness.report.figures.canvas import MILLIMETRES_PER_INCH, visible_texts
+from harness.report.figures.faults import find_layout_faults
 from solvers.registry import SOLVERS
 from tests import figure_results as made
-from tests.drawn_figures import composed
+from tests.drawn_figures import compose_kind
 
 PRICES = {"bending": (1.7, 1.6, 1.9), "wind": (1.05, 0.98, 1.1), "gas": (2.4, 2.3, 2.5), "all": (1.2, 1.1, 1.3)}
 """Of each effect, with the interval."""
@@ -24,32 +24,34 @@ def priced(folder: Path, solvers: list[str], refused: str, codes: dict[str, str]
     """Each effect's price by each solver; one refuses bending; codes: of solvers of other code."""
     rows: list[dict[str, Any]] = []
     for solver in solvers:
-        same = made.HERE | {"scene": "cloth", "size": 33, "vertices": 1089, "kind": "price", "solver": solver}
+        same = made.SHARED_COLUMNS | {"scene": "cloth", "size": 33, "vertices": 1089, "kind": "price", "solver": solver}
         for name, (price, low, high) in PRICES.items():
             told: dict[str, Any] = {"name": name, "price": price, "price_low": low, "price_high": high}
             if (solver, name) == (refused, "bending"):
                 told = {"name": name, "status": "unsupported"}
             rows.append(same | told | {"code": codes.get(solver)})
-    made.write(folder / "ablation" / "cloth.parquet", rows, SCHEMA)
+    made.write_result_rows(folder / "ablation" / "cloth.parquet", rows, ABLATION_SCHEMA)
     return folder
 
 
 def test_the_dearest_effect_stands_first_all_last_and_round_off_of_one_is_no_price(tmp_path: Path) -> None:
-    figure, (grid,) = composed("prices", priced(tmp_path, ["numba", "dense"], "dense", {"dense": "before"}), Asked())
-    told = {(cell.row, cell.column): (cell.outcome, cell.figure, cell.older) for cell in grid.cells}
+    figure, (grid,) = compose_kind(
+        "prices", priced(tmp_path, ["numba", "dense"], "dense", {"dense": "before"}), FigureOptions()
+    )
+    told = {(cell.row, cell.column): (cell.outcome, cell.value_text, cell.is_stale) for cell in grid.cells}
     assert list(dict.fromkeys(cell.row for cell in grid.cells)) == ["gas", "bending", "wind", "all"]
     assert told["gas", "numba"] == ("2 to 3", "2.40", False)
     assert told["wind", "numba"] == ("cannot be told from 1", "1.05", False)
     assert told["bending", "dense"] == ("unsupported", "–", True)
-    said = " ".join(text.get_text() for text in texts(figure))
+    said = " ".join(text.get_text() for text in visible_texts(figure))
     assert "Dot: measured by other code than today's." in said
     assert sum(line.get_marker() == "o" for line in figure.axes[0].lines) == 4
 
 
 def test_where_all_is_of_other_code_words_say_so_and_no_dots(tmp_path: Path) -> None:
     codes: dict[str, str] = {"numba": "before", "dense": "before"}
-    figure, _ = composed("prices", priced(tmp_path, list(codes), "", codes), Asked())
-    said = " ".join(text.get_text() for text in texts(figure))
+    figure, _ = compose_kind("prices", priced(tmp_path, list(codes), "", codes), FigureOptions())
+    said = " ".join(text.get_text() for text in visible_texts(figure))
     assert "Dot" not in said
     assert "Measured by other code than today's." in said
     assert not figure.axes[0].lines
@@ -57,19 +59,21 @@ def test_where_all_is_of_other_code_words_say_so_and_no_dots(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("width", [85.0, 220.0])
 def test_all_solvers_fit_a_page(tmp_path: Path, width: float) -> None:
-    figure, (grid,) = composed("prices", priced(tmp_path, list(SOLVERS), "dense", {}), Asked(width=width))
-    across, up = figure.get_size_inches() * INCH
+    figure, (grid,) = compose_kind(
+        "prices", priced(tmp_path, list(SOLVERS), "dense", {}), FigureOptions(width_mm=width)
+    )
+    across, up = figure.get_size_inches() * MILLIMETRES_PER_INCH
     assert up < 1.2 * across
-    assert faults(figure) == []
+    assert find_layout_faults(figure) == []
     assert {cell.column for cell in grid.cells} == set(SOLVERS)
     assert len(figure.axes[0].texts) == (len(grid.cells) if width > 100 else 0), "figures, where they fit"
 
 
 def test_a_solver_of_two_settings_has_a_column_for_each(tmp_path: Path) -> None:
     folder = priced(tmp_path, ["newton", "numba"], "", {})
-    table = read(folder / "ablation" / "cloth.parquet")
+    table = read_ablation(folder / "ablation" / "cloth.parquet")
     graded = [row | {"parameters": '{"indefinite": "graded"}', "price": 9.0} for row in table[:4]]
-    made.write(folder / "ablation" / "other.parquet", graded, SCHEMA)
-    figure, (grid,) = composed("prices", folder, Asked())
+    made.write_result_rows(folder / "ablation" / "other.parquet", graded, ABLATION_SCHEMA)
+    figure, (grid,) = compose_kind("prices", folder, FigureOptions())
     assert {cell.column for cell in grid.cells} == {"newton", "newton, indefinite graded", "numba"}
-    assert faults(figure) == []
+    assert find_layout_faults(figure) == []

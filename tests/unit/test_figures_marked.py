@@ -12,77 +12,83 @@ from rich.console import Console
 
 from harness.base import rows as base_rows
 from harness.base import shelf
-from harness.report.figures.asked import Asked
-from harness.report.figures.canvas import texts
+from harness.report.figures.asked import FigureOptions
+from harness.report.figures.canvas import visible_texts
 from harness.report.speed import size_plot
-from harness.report.speed.figures import figures as speed_figures
-from harness.report.speed.pictures import draw
-from harness.report.speed.speed_table import speed_table
-from harness.report.style import OLDER, PAGE, marks
+from harness.report.speed.figures import compute_speed_figures as speed_figures
+from harness.report.speed.pictures import draw_speed_plots
+from harness.report.speed.speed_table import build_speed_table
+from harness.report.style import BACKGROUND_COLOUR, STALE_NOTE, assign_solver_styles
 from tests import accuracy_rows
 from tests import figure_results as made
-from tests.drawn_figures import RESULTS, composed
+from tests.drawn_figures import FIGURE_SOURCES, compose_kind
 
 
 def test_what_other_code_measured_is_hollow_and_told(tmp_path: Path) -> None:
-    swept = made.sweep(tmp_path)
+    swept = made.write_sweep_results(tmp_path)
     older = {f"geometry-flat-newton-{size}" for size in (8, 16, 32)}
-    figure, (panel,) = composed("timing", swept, Asked(), older)
-    faces = {one.get_markerfacecolor() for one in figure.axes[0].lines if one.get_marker() == marks()["newton"].marker}
+    figure, (panel,) = compose_kind("timing", swept, FigureOptions(), older)
+    faces = {
+        one.get_markerfacecolor()
+        for one in figure.axes[0].lines
+        if one.get_marker() == assign_solver_styles()["newton"].marker
+    }
     assert "white" in faces
-    assert OLDER in "\n".join(text.get_text() for text in texts(figure))
+    assert STALE_NOTE in "\n".join(text.get_text() for text in visible_texts(figure))
     assert {row["series"] for row in panel.rows() if row["other_code"]} == {"newton"}
-    _, (grid,) = composed("hard", swept, Asked(), older)
-    assert {cell.column for cell in grid.cells if cell.older} == {"newton"}
+    _, (grid,) = compose_kind("hard", swept, FigureOptions(), older)
+    assert {cell.column for cell in grid.cells if cell.is_stale} == {"newton"}
     assert "other code" in grid.notes[0]
 
 
 @pytest.mark.parametrize("kind", ["timing", "hard", "ablation", "prices", "speed", "convergence", "winners", "engines"])
 def test_and_what_code_that_is_in_no_commit_did(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
-    monkeypatch.setitem(made.HERE, "commit", f"{'0' * 40}-dirty")
-    monkeypatch.setitem(accuracy_rows.MACHINE, "commit", f"{'0' * 40}-dirty")
-    figure, _ = composed(kind, RESULTS[kind][1](tmp_path), Asked())
-    assert "commit 0000000-dirty" in "\n".join(text.get_text() for text in texts(figure))
+    monkeypatch.setitem(made.SHARED_COLUMNS, "commit", f"{'0' * 40}-dirty")
+    monkeypatch.setitem(accuracy_rows.MACHINE_COLUMNS, "commit", f"{'0' * 40}-dirty")
+    figure, _ = compose_kind(kind, FIGURE_SOURCES[kind][1](tmp_path), FigureOptions())
+    assert "commit 0000000-dirty" in "\n".join(text.get_text() for text in visible_texts(figure))
 
 
 @pytest.mark.parametrize("kind", ["convergence", "times", "work", "growth", "profiles", "liu2013"])
 def test_in_figures_of_accuracy_too(tmp_path: Path, kind: str) -> None:
     rows: list[dict[str, Any]] = []
     for size in (10, 24):
-        rows += accuracy_rows.problem("net", size, "early")
+        rows += accuracy_rows.build_snapshot_rows("net", size, "early")
         for solver in ("numba", "newton"):
-            rows += accuracy_rows.curve("net", size, "early", solver)
-    rows += [*accuracy_rows.work("net", 10, ("numba", "newton")), *accuracy_rows.paper()]
+            rows += accuracy_rows.build_curve_rows("net", size, "early", solver)
+    rows += [*accuracy_rows.build_work_rows("net", 10, ("numba", "newton")), *accuracy_rows.build_liu2013_rows()]
     # The reproduction of the paper is by one solver alone.
     before = "numba" if kind == "liu2013" else "newton"
     rows = [row | {"code": "before" if row.get("solver") == before else None} for row in rows]
-    asked = Asked(selectors=(("net", "10", "gap"),)) if kind == "convergence" else Asked()
-    figure, panels = composed(kind, accuracy_rows.write(tmp_path, rows), asked)
-    said = " ".join(text.get_text() for text in texts(figure)).replace("\n", " ")
+    asked = FigureOptions(selectors=(("net", "10", "gap"),)) if kind == "convergence" else FigureOptions()
+    figure, panels = compose_kind(kind, accuracy_rows.write_accuracy_rows(tmp_path, rows), asked)
+    said = " ".join(text.get_text() for text in visible_texts(figure)).replace("\n", " ")
     if kind in ("profiles", "liu2013"):
         assert f"Measured by other code than today's, in whole or in part: {before}." in said
     else:
-        assert OLDER in said
+        assert STALE_NOTE in said
         older = {row["series"].split()[0] for panel in panels for row in panel.rows() if row["other_code"]}
         assert older == {"newton"}
 
 
 def test_and_in_those_of_speed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told = made.speed(tmp_path / "told")
-    _, (panel,) = composed("speed", told, Asked())
+    told = made.write_speed_results(tmp_path / "told")
+    _, (panel,) = compose_kind("speed", told, FigureOptions())
     assert {row["series"] for row in panel.rows() if row["other_code"]} == {"numba supernodal"}
-    found = speed_figures(base_rows.read(shelf.units(told / "rows")))
+    found = speed_figures(base_rows.read_rows(shelf.list_units(told / "rows")))
     pages: list[Figure] = []
     monkeypatch.setattr(size_plot, "save", lambda page, path: pages.append(page))
-    draw(found, tmp_path)
+    draw_speed_plots(found, tmp_path)
     drawn = [page for page in pages if page.axes[0].lines]
     assert len(drawn) == 4, "the part of the limit is not known"
     for page in drawn:
-        hollow = {line.get_linestyle() for line in page.axes[0].lines if line.get_markerfacecolor() == PAGE}
+        hollow = {
+            line.get_linestyle() for line in page.axes[0].lines if line.get_markerfacecolor() == BACKGROUND_COLOUR
+        }
         assert hollow == {"None"}, "marks on top of their line"
-        assert OLDER in "\n".join(text.get_text() for text in page.texts)
+        assert STALE_NOTE in "\n".join(text.get_text() for text in page.texts)
     table = Console(width=400, record=True, file=io.StringIO())
-    table.print(speed_table(found))
+    table.print(build_speed_table(found))
     marked = [line for line in table.export_text().splitlines() if "by other code" in line]
     assert len(marked) == 3
     assert all("numba supernodal (10 of 50, by other code)" in line for line in marked)

@@ -11,7 +11,7 @@ import pytest
 from harness.base.errors import InputError
 from harness.base.yaml import read_yaml
 from harness.scenes.mesh import ply
-from harness.scenes.mesh.files import File
+from harness.scenes.mesh.files import FileMesh
 
 XYZ = "property float x\nproperty float y\nproperty float z\n"
 CORNERS = "property list uchar int vertex_indices\n"
@@ -42,10 +42,10 @@ def text(face: str, other: str, rows: str, others: str) -> bytes:
 
 @pytest.mark.parametrize("case", TEXTS)
 def test_other_properties_and_elements_of_a_ply_are_skipped(case):
-    found = ply.read(text(*TEXTS[case]))
+    found = ply.read_ply(text(*TEXTS[case]))
     assert found.points.tolist() == [list(point) for point in POINTS]
     assert {k: rows.tolist() for k, (rows, _) in found.faces.items()} == {4: [[0, 1, 2, 3]]}
-    assert not found.numbers
+    assert not found.vertex_attributes
 
 
 @pytest.mark.parametrize("order", ["<", ">"], ids=["little", "big"])
@@ -65,9 +65,9 @@ def test_a_binary_ply_of_any_properties_is_read(order, mixed):
         coordinates = (0.5,) * (2 * i if mixed else 2)
         body += struct.pack(f"{order}bH{len(face)}I", -1, len(face), *face)
         body += struct.pack(f"{order}B{len(coordinates)}d", len(coordinates), *coordinates)
-    found = ply.read(head.encode() + body + struct.pack(order + "2i", 0, 2))
+    found = ply.read_ply(head.encode() + body + struct.pack(order + "2i", 0, 2))
     assert found.points.tolist() == [list(point) for point in POINTS]
-    assert found.numbers["red"].tolist() == [200, 201, 202, 203]
+    assert found.vertex_attributes["red"].tolist() == [200, 201, 202, 203]
     rows = {k: (rows.tolist(), which.tolist()) for k, (rows, which) in found.faces.items()}
     wanted = {3: ([[1, 2, 3]], [1]), 4: ([[0, 1, 2, 3]], [0])}
     assert rows == (wanted if mixed else {3: ([[0, 1, 2], [0, 2, 3]], [0, 1])})
@@ -79,7 +79,7 @@ def test_a_ply_gives_a_mesh_with_its_numbers_in_double_precision(tmp_path):
     for i, (x, y, z) in enumerate(POINTS):
         content = content.replace(f"\n{x} {y} {z}\n".encode(), f"\n{x} {y} {z} {i}.1\n".encode())
     path.write_bytes(content)
-    mesh = File(path=path).build()
+    mesh = FileMesh(path=path).build_mesh()
     assert mesh.springs.tolist() == [[0, 1], [0, 3], [1, 2], [2, 3]]
     assert mesh.attributes["heat"].tolist() == [0.1, 1.1, 2.1, 3.1]
 
@@ -102,7 +102,7 @@ def test_a_ply_gives_a_mesh_with_its_numbers_in_double_precision(tmp_path):
 def test_a_broken_ply_is_refused_with_the_reason(before, after, words):
     content = text(CORNERS, "", "4 0 1 2 3\n", "")
     with pytest.raises(ValueError, match=words.replace(".", r"\.")):
-        ply.read(content.replace(before, after))
+        ply.read_ply(content.replace(before, after))
 
 
 MSH = """$MeshFormat
@@ -166,21 +166,21 @@ def gmsh(folder: Path, **changes: str) -> Path:
     ids=["some", "one", "two of one surface"],
 )
 def test_gmshs_entities_without_a_group_are_read_and_stray_points_left_out(tmp_path, caplog, sheet, groups):
-    mesh = File(path=gmsh(tmp_path, sheet=sheet)).build()
-    assert (len(mesh.rest), len(mesh.springs), len(mesh.triangles)) == (4, 5, 2)
+    mesh = FileMesh(path=gmsh(tmp_path, sheet=sheet)).build_mesh()
+    assert (len(mesh.rest_positions), len(mesh.springs), len(mesh.triangles)) == (4, 5, 2)
     sides = ("left", "right", "bottom", "top", "back", "front")
     assert {name: part.tolist() for name, part in mesh.parts.items() if name not in sides} == groups
-    assert "1 points belong to no cell and are left out: at (9, 9, 9) m" in caplog.messages[0]
+    assert "1 points belong to no cell and are left out: at (9, 9, 9) m" in caplog.message_counts[0]
 
 
 def test_gmshs_parametric_nodes_are_refused_by_name(tmp_path):
     path = gmsh(tmp_path, parametric="1")
     with pytest.raises(InputError, match="parametric nodes"):
-        File(path=path).build()
+        FileMesh(path=path).build_mesh()
     nodes = "$ParametricNodes\n3\n1 0 0 0 0 1\n2 1 0 0 0 2\n3 1 1 0 0 3\n$EndParametricNodes\n"
     path.write_text(f"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n{nodes}$Elements\n1\n1 2 2 1 1 1 2 3\n$EndElements\n")
     with pytest.raises(InputError, match="parametric nodes; save it without them"):
-        File(path=path).build()
+        FileMesh(path=path).build_mesh()
 
 
 STAND_INS = {
@@ -204,7 +204,7 @@ def test_what_stands_in_place_of_a_file_is_named(tmp_path, name, case):
     path = tmp_path / name
     path.write_bytes(content)
     with pytest.raises(InputError, match=words):
-        read_yaml(path) if name == "x.yaml" else File(path=path).build()
+        read_yaml(path) if name == "x.yaml" else FileMesh(path=path).build_mesh()
 
 
 @pytest.mark.parametrize(
@@ -219,7 +219,7 @@ def test_the_reason_that_a_reader_prints_is_in_the_message(tmp_path, name, conte
     path = tmp_path / name
     path.write_bytes(content)
     with pytest.raises(InputError, match=f"cannot be read as a mesh: .*({words})"):
-        File(path=path).build()
+        FileMesh(path=path).build_mesh()
 
 
 @pytest.mark.parametrize(
@@ -246,5 +246,5 @@ def test_a_colon_without_quotes_is_named_with_what_to_quote(tmp_path, config, li
 
 
 def test_text_is_read_as_float64_and_not_as_the_declared_type():
-    found = ply.read(text(CORNERS, "", "4 0 1 2 3\n", "").replace(b"1 1 0\n", b"1 0.1 0\n"))
+    found = ply.read_ply(text(CORNERS, "", "4 0 1 2 3\n", "").replace(b"1 1 0\n", b"1 0.1 0\n"))
     assert np.array_equal(found.points[2], [1, 0.1, 0])

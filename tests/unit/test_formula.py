@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from solvers.core.formula import Formula
-from solvers.problem import StopRule, WrongAnswer
-from tests.scenes import cloth, first_problem
+from solvers.core.formula import FixedPointSolver
+from solvers.problem import PluginContractError, StopRule
+from tests.scenes import build_cloth, build_first_problem
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -28,15 +28,15 @@ WRONG: dict[str, tuple[Callable[..., Any], str]] = {
 
 
 def solver_with(**methods: Any) -> Any:
-    return make_dataclass("Wrong", [], bases=(Formula,), namespace=methods, frozen=True)
+    return make_dataclass("Wrong", [], bases=(FixedPointSolver,), namespace=methods, frozen=True)
 
 
 @pytest.mark.parametrize("name", WRONG)
 def test_a_formula_that_answers_wrongly_is_named_with_its_line(name: str):
     wrong, words = WRONG[name]
     line = inspect.getsourcelines(wrong)[1]
-    stated = first_problem(cloth(4))
-    with pytest.raises(WrongAnswer, match=rf"test_formula\.py:{line}: `formula` {words}"):
+    stated = build_first_problem(build_cloth(4))
+    with pytest.raises(PluginContractError, match=rf"test_formula\.py:{line}: `formula` {words}"):
         solver_with(formula=wrong)().prepare(stated.system).solve(stated, StopRule(3))
 
 

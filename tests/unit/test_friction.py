@@ -9,31 +9,38 @@ import numpy as np
 import pytest
 
 from harness.scenes.bind import Scene
-from harness.scenes.effects.contact import Contact
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.self_contact import SelfContact
-from harness.scenes.effects.springs import Springs
-from harness.scenes.effects.surface_contact import SurfaceContact
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.mesh.network import Network
-from harness.scenes.mesh.stack import Stack
-from harness.scenes.motion import Key, KeyedMotion
-from harness.scenes.obstacles import Plane
-from harness.scenes.shapes import Solid, Triangles
-from harness.simulation.observe import columns
-from harness.simulation.step import State, Step, prepare, problem, simulate, start
+from harness.scenes.effects.contact import ContactEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.self_contact import SelfContactEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.effects.surface_contact import SurfaceContactEffect
+from harness.scenes.mesh.grid import GridMesh
+from harness.scenes.mesh.network import NetworkMesh
+from harness.scenes.mesh.stack import StackMesh
+from harness.scenes.motion import KeyFrame, KeyFrameMotion
+from harness.scenes.obstacles import PlaneObstacle
+from harness.scenes.shapes import MeshObstacle, TriangleSurface
+from harness.simulation.observe import build_solution_columns
+from harness.simulation.step import (
+    MotionState,
+    SimulationStep,
+    build_initial_state,
+    build_problem,
+    prepare,
+    simulate_scene,
+)
 from solvers.contact.friction_rounds import solve_with_friction
 from solvers.integrators import Motion
-from solvers.methods.newton import Newton
-from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule
-from solvers.registry import SOLVERS, load
-from tests.effects import integrated
-from tests.scenes import scene
-from tests.self_contacts import TAKE_SURFACES
+from solvers.methods.newton import NewtonSolver
+from solvers.problem import Positions, PreparedSolver, Solution, Solver, StepProblem, StopRule
+from solvers.registry import SOLVERS, load_target
+from tests.effects import with_integrator
+from tests.scenes import build_test_scene
+from tests.self_contacts import SURFACE_CONTACT_SOLVERS
 
 G, SLOPE = 9.81, 0.5
 SIN, COS = SLOPE / np.hypot(1.0, SLOPE), 1.0 / np.hypot(1.0, SLOPE)
-DOWN = Gravity(acceleration=(G * SIN, -G * COS, 0.0))
+DOWN = GravityEffect(acceleration=(G * SIN, -G * COS, 0.0))
 """The frame is the slope's: gravity leans instead."""
 
 STICKS, SLIPS = 0.6, 0.4
@@ -47,14 +54,16 @@ TAKE = ("sparse", "numba", "anderson", "chebyshev", "lbfgs", "vbd", "avbd", "hyb
 def pebble(friction: float, dt: float = 1 / 60, integrator: str = "implicit-euler", **more: Any) -> Scene:
     """A vertex of 1 kg at rest on a slope, just not pressed."""
     ground = {"obstacles": [{"kind": "plane", "point": (0.0, -THICKNESS, 0.0)}], "thickness": THICKNESS}
-    rough = Contact.model_validate(ground | {"friction": friction} | more)
-    return integrated(scene(Network(positions=((0.0, 0.0, 0.0),)), DOWN, rough, size=0, time_step=dt), integrator)
+    rough = ContactEffect.model_validate(ground | {"friction": friction} | more)
+    return with_integrator(
+        build_test_scene(NetworkMesh(positions=((0.0, 0.0, 0.0),)), DOWN, rough, size=0, time_step=dt), integrator
+    )
 
 
 SURFACES: dict[str, Any] = {
-    "plane": Plane(point=(0.0, -0.0186, 0.0)),
-    "mesh": Solid(
-        mesh=Triangles(points=((-4.0, 0.0, -4.0), (-4.0, 0.0, 8.0), (8.0, 0.0, -4.0)), triangles=((0, 1, 2),)),
+    "plane": PlaneObstacle(point=(0.0, -0.0186, 0.0)),
+    "mesh": MeshObstacle(
+        mesh=TriangleSurface(points=((-4.0, 0.0, -4.0), (-4.0, 0.0, 8.0), (8.0, 0.0, -4.0)), triangles=((0, 1, 2),)),
         offset=(0.0, -0.0186, 0.0),
     ),
 }
@@ -62,45 +71,45 @@ SURFACES: dict[str, Any] = {
 
 
 def patch(
-    friction: float, surface: Any = SURFACES["mesh"], down: Gravity = DOWN, integrator: str = "implicit-euler"
+    friction: float, surface: Any = SURFACES["mesh"], down: GravityEffect = DOWN, integrator: str = "implicit-euler"
 ) -> Scene:
     """A small sheet in the range of a slope's barrier."""
-    rough = SurfaceContact(thickness=0.01, friction=friction, stiffness=1000.0, obstacles=(surface,))
-    springs = Springs(stretch=100.0, shear=20.0)
-    made = scene(Grid(width=0.2, height=0.2), springs, down, rough, size=2, time_step=1 / 60)
-    return integrated(made, integrator)
+    rough = SurfaceContactEffect(thickness=0.01, friction=friction, stiffness=1000.0, obstacles=(surface,))
+    springs = SpringsEffect(stretch=100.0, shear=20.0)
+    made = build_test_scene(GridMesh(width=0.2, height=0.2), springs, down, rough, size=2, time_step=1 / 60)
+    return with_integrator(made, integrator)
 
 
 @cache
-def pressed() -> State:
+def pressed() -> MotionState:
     """The sheet at rest where the slope carries it."""
-    made = patch(0.0, down=Gravity(acceleration=(0.0, -G * COS, 0.0)))
-    last = steps(made, 60)[-1].state.now
+    made = patch(0.0, down=GravityEffect(acceleration=(0.0, -G * COS, 0.0)))
+    last = steps(made, 60)[-1].state.motion
     assert np.abs(last.velocity).max() < 1e-4
-    return State(Motion(last.positions, np.zeros_like(last.positions)), None, 0)
+    return MotionState(Motion(last.positions, np.zeros_like(last.positions)), None, 0)
 
 
 def steps(
-    made: Scene, frames: int, solver: Solver | None = None, stop: StopRule = EXACTLY, state: State | None = None
-) -> list[Step]:
-    prepared = prepare(made, solver or Newton())
-    return list(simulate(made, prepared, stop, first_guess="current", frames=frames, state=state))
+    made: Scene, frames: int, solver: Solver | None = None, stop: StopRule = EXACTLY, state: MotionState | None = None
+) -> list[SimulationStep]:
+    prepared = prepare(made, solver or NewtonSolver())
+    return list(simulate_scene(made, prepared, stop, initial_guess="current", frames=frames, initial_state=state))
 
 
-def motion(made: Scene, run: list[Step]) -> np.ndarray:
+def motion(made: Scene, run: list[SimulationStep]) -> np.ndarray:
     """The mean velocity at the end of each step (frames, 3) [m/s]."""
     weight = made.system.mass / made.system.mass.sum()
-    return np.array([weight @ step.state.now.velocity for step in run])
+    return np.array([weight @ step.state.motion.velocity for step in run])
 
 
-def slid(run: list[Step]) -> float:
+def slid(run: list[SimulationStep]) -> float:
     """How far the first vertex went down the slope [m]."""
-    return float(run[-1].positions[0, 0] - run[0].problem.start.positions[0, 0])
+    return float(run[-1].positions[0, 0] - run[0].problem.step_start.positions[0, 0])
 
 
 @cache
 def of_name(solver: str) -> Solver:
-    return TAKE_SURFACES[solver] if solver in TAKE_SURFACES else load(SOLVERS[solver])()
+    return SURFACE_CONTACT_SOLVERS[solver] if solver in SURFACE_CONTACT_SOLVERS else load_target(SOLVERS[solver])()
 
 
 @pytest.mark.parametrize("solver", TAKE)
@@ -112,7 +121,7 @@ def test_a_vertex_sticks_and_slides_from_the_first_step_on(solver):
     assert found == pytest.approx(78 / 60**2 * G * (SIN - SLIPS * COS), rel=1e-3)
 
 
-@pytest.mark.parametrize("solver", sorted(TAKE_SURFACES))
+@pytest.mark.parametrize("solver", sorted(SURFACE_CONTACT_SOLVERS))
 def test_surfaces_exert_coulombs_force_of_the_steps_own_pressure(solver):
     """What slips has m v_x = m g sin t - mu m (g cos t + v_y) at the end of each step, however its pressure changes."""
     made = patch(SLIPS)
@@ -148,32 +157,36 @@ def test_a_slide_converges_with_order_1_by_implicit_euler():
 def test_what_sticks_creeps_at_a_speed_whatever_the_step(dt):
     """A vertex at y times `creep` is pulled back by y times the limit of friction."""
     last = steps(pebble(STICKS, dt, creep=2e-4), 16)[-1]
-    assert last.state.now.velocity[0, 0] == pytest.approx(SLOPE / STICKS * 2e-4, rel=1e-3)
+    assert last.state.motion.velocity[0, 0] == pytest.approx(SLOPE / STICKS * 2e-4, rel=1e-3)
 
 
 def test_a_sheet_on_a_sheet_has_the_steps_own_pressure_too():
     """Momentum law of the upper sheet, from its first step in range on."""
-    rough = SelfContact(thickness=0.01, friction=SLIPS)
-    two = Stack(width=0.2, height=0.2, apart=0.0186)
-    made = scene(two, Springs(stretch=100.0, shear=20.0), rough, size=2, time_step=1 / 60)
+    rough = SelfContactEffect(thickness=0.01, friction=SLIPS)
+    two = StackMesh(width=0.2, height=0.2, apart=0.0186)
+    made = build_test_scene(two, SpringsEffect(stretch=100.0, shear=20.0), rough, size=2, time_step=1 / 60)
     upper = made.mesh.parts["highest"]
-    velocity = np.zeros_like(made.mesh.rest)
+    velocity = np.zeros_like(made.mesh.rest_positions)
     velocity[upper] = (1.0, -0.5, 0.0)
-    begun = State(start(made).now._replace(velocity=velocity), None, 0)
-    run = list(simulate(made, prepare(made, Newton()), EXACTLY, first_guess="current", frames=3, state=begun))
+    begun = MotionState(build_initial_state(made).motion._replace(velocity=velocity), None, 0)
+    run = list(
+        simulate_scene(
+            made, prepare(made, NewtonSolver()), EXACTLY, initial_guess="current", frames=3, initial_state=begun
+        )
+    )
     for step in run:
-        v = step.state.now.velocity[upper].mean(axis=0)
+        v = step.state.motion.velocity[upper].mean(axis=0)
         assert 1.0 - v[0] == pytest.approx(SLIPS * (v[1] + 0.5), rel=0.02)  # some normals lean a little
 
 
 def test_a_floor_that_slides_and_rises_takes_a_sheet_along_from_the_first_step_on():
     """At 0.5 m/s and 0.1 m/s: friction accelerates the sheet by mu times the normal force where the floor then is."""
-    belt = KeyedMotion(keys=(Key(time=0.0), Key(time=10.0, offset=(5.0, 1.0, 0.0))))
-    floor = SurfaceContact(
+    belt = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=10.0, offset=(5.0, 1.0, 0.0))))
+    floor = SurfaceContactEffect(
         thickness=0.01, friction=0.2, obstacles=(SURFACES["mesh"].model_copy(update={"motion": belt}),)
     )
-    springs, down = Springs(stretch=100.0, shear=20.0), Gravity()
-    made = scene(Grid(width=0.2, height=0.2), springs, down, floor, size=2, time_step=1 / 60)
+    springs, down = SpringsEffect(stretch=100.0, shear=20.0), GravityEffect()
+    made = build_test_scene(GridMesh(width=0.2, height=0.2), springs, down, floor, size=2, time_step=1 / 60)
     v, t = motion(made, steps(made, 4)), np.arange(1, 5) / 60
     np.testing.assert_allclose(v[:, 0], 0.2 * (9.81 * t + v[:, 1]), rtol=1e-3)
 
@@ -181,7 +194,7 @@ def test_a_floor_that_slides_and_rises_takes_a_sheet_along_from_the_first_step_o
 class Counted:
     """A prepared solver that counts its solves."""
 
-    def __init__(self, prepared: Prepared) -> None:
+    def __init__(self, prepared: PreparedSolver) -> None:
         self.prepared, self.problems = prepared, list[StepProblem]()
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
@@ -189,27 +202,27 @@ class Counted:
         return self.prepared.solve(problem, stop)
 
 
-def solves(made: Scene, frames: int) -> tuple[list[StepProblem], list[Step]]:
-    counted: Any = Counted(prepare(made, Newton()))
-    return counted.problems, list(simulate(made, counted, EXACTLY, first_guess="current", frames=frames))
+def solves(made: Scene, frames: int) -> tuple[list[StepProblem], list[SimulationStep]]:
+    counted: Any = Counted(prepare(made, NewtonSolver()))
+    return counted.problems, list(simulate_scene(made, counted, EXACTLY, initial_guess="current", frames=frames))
 
 
 def test_rounds_are_done_where_friction_acts_and_nowhere_else():
     for made, rounds in ((pebble(0.0), 0), (pebble(SLIPS, friction_rounds=1), 1)):
         problems, run = solves(made, 3)
         assert len(problems) == 3
-        assert all(problem.start.pressed is None for problem in problems)
-        assert [step.friction.rounds if step.friction else 0 for step in run] == 3 * [rounds]
+        assert all(problem.step_start.normal_force_positions is None for problem in problems)
+        assert [step.friction_rounds.num_iterations if step.friction_rounds else 0 for step in run] == 3 * [rounds]
     # With the pressure of the step's start the first step is without friction, and the row says what was left.
     assert float(run[0].positions[0, 0]) == pytest.approx(G * SIN / 60**2, rel=1e-9)
-    assert run[0].friction is not None
-    assert run[0].friction.change == 1.0
+    assert run[0].friction_rounds is not None
+    assert run[0].friction_rounds.relative_change == 1.0
     problems, run = solves(pebble(SLIPS), 8)
-    assert [step.friction.rounds for step in run if step.friction][:2] == [2, 2]
-    assert run[-1].friction is not None
-    assert run[-1].friction.rounds == 1
-    assert all(step.friction.change < 1e-4 for step in run if step.friction)
-    last: Positions | None = run[1].problem.start.pressed
+    assert [step.friction_rounds.num_iterations for step in run if step.friction_rounds][:2] == [2, 2]
+    assert run[-1].friction_rounds is not None
+    assert run[-1].friction_rounds.num_iterations == 1
+    assert all(step.friction_rounds.relative_change < 1e-4 for step in run if step.friction_rounds)
+    last: Positions | None = run[1].problem.step_start.normal_force_positions
     assert last is not None
     assert np.abs(last - run[1].positions).max() < 1e-3
 
@@ -217,12 +230,16 @@ def test_rounds_are_done_where_friction_acts_and_nowhere_else():
 def test_rows_tell_the_rounds_and_what_they_left():
     made = pebble(SLIPS)
     (step,) = steps(made, 1)
-    row = columns(made, step, step.problem.terms(step.solution.positions), step.solution.residual)
-    assert row["friction_rounds"] == len(step.counts) == 2
+    row = build_solution_columns(
+        made, step, step.problem.evaluate_terms(step.solution.positions), step.solution.residual
+    )
+    assert row["friction_rounds"] == len(step.iteration_counts) == 2
     assert row["friction_change"] < 1e-4
     made = pebble(0.0)
     (step,) = steps(made, 1)
-    row = columns(made, step, step.problem.terms(step.solution.positions), step.solution.residual)
+    row = build_solution_columns(
+        made, step, step.problem.evaluate_terms(step.solution.positions), step.solution.residual
+    )
     assert row["friction_rounds"] is None
     assert row["friction_change"] is None
 
@@ -249,30 +266,32 @@ SLID, STUCK, BETWEEN = (2e-3, -2e-3), (1e-7, 1e-4), (1e-3, -1e-3)
 def test_rounds_that_repeat_end_where_most_friction_acts_and_say_what_is_left(cycle, rounds, end, change):
     made = pebble(1e3)
     recited: Any = Recited(*cycle)
-    solved = solve_with_friction(recited, problem(made, start(made), "current"), EXACTLY)
-    assert recited.solves == len(solved.counts) == rounds
+    solved = solve_with_friction(recited, build_problem(made, build_initial_state(made), "current"), EXACTLY)
+    assert recited.solves == len(solved.iteration_counts) == rounds
     assert tuple(solved.solution.positions[0, :2]) == end
-    assert solved.friction is not None
-    assert solved.friction.rounds == rounds
-    assert solved.friction.change == pytest.approx(change)
+    assert solved.convergence is not None
+    assert solved.convergence.num_iterations == rounds
+    assert solved.convergence.relative_change == pytest.approx(change)
 
 
 @pytest.mark.parametrize("factor", [-0.5, 0.5, -0.9])
 def test_rounds_that_converge_however_slowly_are_not_cut_short(factor):
     made = pebble(SLIPS, friction_rounds=20)
     recited: Any = Recited(*((2e-3, -2e-3 * (1.0 + 0.5 * factor**k)) for k in range(20)))
-    solved = solve_with_friction(recited, problem(made, start(made), "current"), EXACTLY)
-    assert solved.friction is not None
-    assert solved.friction.rounds == 20 or solved.friction.change <= 1e-4
-    assert solved.friction.rounds > 8
+    solved = solve_with_friction(recited, build_problem(made, build_initial_state(made), "current"), EXACTLY)
+    assert solved.convergence is not None
+    assert solved.convergence.num_iterations == 20 or solved.convergence.relative_change <= 1e-4
+    assert solved.convergence.num_iterations > 8
 
 
 def test_a_sheet_on_a_slope_with_very_large_friction_takes_few_rounds():
     """A corner that touches first alternates between sticking out of range and sliding in range."""
-    slope = Plane(point=(0.0, -0.32, 0.0), normal=(0.5, 1.0, 0.0))
-    rough = SurfaceContact(thickness=0.01, friction=1e3, obstacles=(slope,))
-    made = scene(Grid(), Springs(stretch=300.0, shear=60.0), Gravity(), rough, size=6, time_step=1 / 30)
+    slope = PlaneObstacle(point=(0.0, -0.32, 0.0), normal=(0.5, 1.0, 0.0))
+    rough = SurfaceContactEffect(thickness=0.01, friction=1e3, obstacles=(slope,))
+    made = build_test_scene(
+        GridMesh(), SpringsEffect(stretch=300.0, shear=60.0), GravityEffect(), rough, size=6, time_step=1 / 30
+    )
     last = steps(made, 3, stop=StopRule(400, 1e-6))[-1]
-    assert last.friction is not None
-    assert 2 < last.friction.rounds <= 8
-    assert last.friction.change > 0.5
+    assert last.friction_rounds is not None
+    assert 2 < last.friction_rounds.num_iterations <= 8
+    assert last.friction_rounds.relative_change > 0.5

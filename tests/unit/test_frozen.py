@@ -9,30 +9,30 @@ import numpy as np
 import pytest
 
 from harness.base.errors import RunFailed
-from harness.reference.frozen import Frozen, bind, moment_frames, reference_run
-from harness.reference.store import Store
-from harness.scenes.effects.ether_drag import EtherDrag
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.effects.surface_contact import SurfaceContact
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.obstacles import Plane
+from harness.reference.frozen import StepSnapshot, build_exact_scene, run_reference, select_snapshot_frames
+from harness.reference.store import ReferenceStore
+from harness.scenes.effects.ether_drag import EtherDragEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.effects.surface_contact import SurfaceContactEffect
+from harness.scenes.mesh.grid import GridMesh
+from harness.scenes.obstacles import PlaneObstacle
 from harness.scenes.spec import IntegratorName, SceneSpec
-from harness.simulation.step import prepare, problem, simulate, start
+from harness.simulation.step import build_initial_state, build_problem, prepare, simulate_scene
 from solvers.integrators import INTEGRATORS
 from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.newton import Newton
-from solvers.problem import Start, StepProblem, StopRule, System
+from solvers.methods.newton import NewtonSolver
+from solvers.problem import StepProblem, StepStart, StopRule, System
 
 FRAMES = 12
 SPEC = SceneSpec(
-    mesh=Grid(),
+    mesh=GridMesh(),
     mass=1.0,
     time_step=1 / 30,
     frames=FRAMES,
     velocity=(0.0, 0.0, 0.5),
-    effects=(Springs(stretch=100.0), Gravity(), EtherDrag(rate=0.5), Pins(at=("top_corners",))),
+    effects=(SpringsEffect(stretch=100.0), GravityEffect(), EtherDragEffect(rate=0.5), PinsEffect(at=("top_corners",))),
     path=Path("scene.yaml"),
 )
 SIZE = 4
@@ -45,35 +45,35 @@ def changed(**values) -> SceneSpec:
     return SceneSpec.model_construct(None, **{k: getattr(SPEC, k) for k in SceneSpec.model_fields} | values)
 
 
-class Refuses(Newton):
+class Refuses(NewtonSolver):
     """A solver that must not be asked."""
 
     def prepare(self, system: System):
         raise AssertionError("what was found once is found again")
 
 
-def arrays(frozen: Frozen) -> dict[str, np.ndarray]:
+def arrays(frozen: StepSnapshot) -> dict[str, np.ndarray]:
     """All that a problem is made of, its system's energies apart."""
     named = {f.name: getattr(frozen.problem, f.name) for f in fields(StepProblem) if f.name not in ("system", "start")}
-    named |= {f"start {f.name}": np.asarray(getattr(frozen.problem.start, f.name)) for f in fields(Start)}
-    return named | {"after p": frozen.after.positions, "after v": frozen.after.velocity}
+    named |= {f"start {f.name}": np.asarray(getattr(frozen.problem.step_start, f.name)) for f in fields(StepStart)}
+    return named | {"after p": frozen.end_motion.positions, "after v": frozen.end_motion.velocity}
 
 
-def same(one: Frozen, other: Frozen) -> bool:
+def same(one: StepSnapshot, other: StepSnapshot) -> bool:
     """Whether two frozen problems are the same to the last bit."""
     pairs = zip(arrays(one).values(), arrays(other).values(), strict=True)
     systems = one.problem.system, other.problem.system
     return (
         all(np.array_equal(a, b) for a, b in pairs)
         and (one.frame, one.digest) == (other.frame, other.digest)
-        and len({(s.factor, s.time_step, s.mass.tobytes()) for s in systems}) == 1
+        and len({(s.inertia_factor, s.time_step, s.mass.tobytes()) for s in systems}) == 1
     )
 
 
 @integrators
 def test_a_frozen_problem_comes_back_from_disk_to_the_last_bit(tmp_path, integrator: IntegratorName):
-    taken = Store(tmp_path).moments(SPEC, SIZE, integrator)
-    found = Store(tmp_path, Refuses()).moments(SPEC, SIZE, integrator)
+    taken = ReferenceStore(tmp_path).load_snapshots(SPEC, SIZE, integrator)
+    found = ReferenceStore(tmp_path, Refuses()).load_snapshots(SPEC, SIZE, integrator)
     assert list(taken) == list(found) == ["early", "middle", "violent"]
     assert all(same(taken[moment], found[moment]) for moment in taken)
     assert not any(array.flags.writeable for one in found.values() for array in arrays(one).values() if array.ndim)
@@ -85,13 +85,13 @@ def test_a_frozen_problem_comes_back_from_disk_to_the_last_bit(tmp_path, integra
 
 @integrators
 def test_a_frozen_problem_is_the_step_of_a_converged_run_with_exact_pins(tmp_path, integrator: IntegratorName):
-    frozen = Store(tmp_path).frames(SPEC, SIZE, [1, 5], integrator)
-    scene = bind(SPEC, SIZE, integrator)
-    run = simulate(scene, prepare(scene, Newton()), StopRule(100, 1e-12), first_guess="current", frames=5)
+    frozen = ReferenceStore(tmp_path).load_frames(SPEC, SIZE, [1, 5], integrator)
+    scene = build_exact_scene(SPEC, SIZE, integrator)
+    run = simulate_scene(scene, prepare(scene, NewtonSolver()), StopRule(100, 1e-12), initial_guess="current", frames=5)
     steps = {step.index: step.problem for step in run}
     for frame, one in frozen.items():
-        assert one.problem.system.pins.exact.all()
-        assert one.problem.system.factor == steps[frame].system.factor
+        assert one.problem.system.pins.exact_mask.all()
+        assert one.problem.system.inertia_factor == steps[frame].system.inertia_factor
         for name in ("target", "force", "pin_targets", "current"):
             np.testing.assert_array_equal(getattr(one.problem, name), getattr(steps[frame], name))
 
@@ -99,39 +99,45 @@ def test_a_frozen_problem_is_the_step_of_a_converged_run_with_exact_pins(tmp_pat
 @integrators
 def test_a_run_goes_on_from_a_frozen_step_as_if_it_had_never_stopped(tmp_path, integrator: IntegratorName):
     """BDF2 needs the motion one step before as well, as the velocity filter left it."""
-    at_once = Store(tmp_path / "once").frames(SPEC, SIZE, [3, 4, 9], integrator)
-    store = Store(tmp_path / "bits")
-    bit_by_bit = {frame: store.frames(SPEC, SIZE, [frame], integrator)[frame] for frame in (3, 4, 9)}
+    at_once = ReferenceStore(tmp_path / "once").load_frames(SPEC, SIZE, [3, 4, 9], integrator)
+    store = ReferenceStore(tmp_path / "bits")
+    bit_by_bit = {frame: store.load_frames(SPEC, SIZE, [frame], integrator)[frame] for frame in (3, 4, 9)}
     assert all(same(at_once[frame], bit_by_bit[frame]) for frame in at_once)
-    backwards = store.frames(SPEC, SIZE, [2, 3], integrator)
+    backwards = store.load_frames(SPEC, SIZE, [2, 3], integrator)
     assert same(backwards[3], at_once[3])
 
 
 def test_the_first_guess_is_chosen_at_use(tmp_path):
-    (one,) = Store(tmp_path).frames(SPEC, SIZE, [3]).values()
+    (one,) = ReferenceStore(tmp_path).load_frames(SPEC, SIZE, [3]).values()
     held = one.problem.system.pins.vertices
-    guess = one.problem.target.copy()
+    guess = one.problem.inertial_target.copy()
     guess[held] = one.problem.pin_targets
-    np.testing.assert_array_equal(one.stated("inertial").first_guess, guess)
-    np.testing.assert_array_equal(one.stated("current").first_guess, one.problem.current)
-    assert np.abs(guess - one.problem.current).max() > 1e-4
+    np.testing.assert_array_equal(one.build_problem("inertial").initial_guess, guess)
+    np.testing.assert_array_equal(one.build_problem("current").initial_guess, one.problem.current_positions)
+    assert np.abs(guess - one.problem.current_positions).max() > 1e-4
 
 
 def test_a_first_guess_beyond_an_obstacle_is_where_the_step_starts(tmp_path):
-    below = SurfaceContact(thickness=0.01, obstacles=(Plane(point=(0.0, -0.05, 0.0)),))
-    spec = changed(effects=(Springs(stretch=50.0), Gravity(), below), velocity=(0.0, -8.0, 0.0))
-    made = bind(spec, 3)
-    state = start(made)
-    stated = Frozen(1, problem(made, state, "current"), state.now, "").stated("inertial")
-    assert stated.target[:, 1].max() < -0.06, "by inertia alone it would be beyond"
-    np.testing.assert_array_equal(stated.first_guess, state.now.positions)
+    below = SurfaceContactEffect(thickness=0.01, obstacles=(PlaneObstacle(point=(0.0, -0.05, 0.0)),))
+    spec = changed(effects=(SpringsEffect(stretch=50.0), GravityEffect(), below), velocity=(0.0, -8.0, 0.0))
+    made = build_exact_scene(spec, 3)
+    state = build_initial_state(made)
+    stated = StepSnapshot(1, build_problem(made, state, "current"), state.motion, "").build_problem("inertial")
+    assert stated.inertial_target[:, 1].max() < -0.06, "by inertia alone it would be beyond"
+    np.testing.assert_array_equal(stated.initial_guess, state.motion.positions)
 
 
 def test_the_violent_moment_is_the_step_that_has_farthest_to_go():
-    scene, length = bind(SPEC, SIZE), 30  # it swings through its lowest point after half a second
-    kept, violence = reference_run(scene, Newton(), length)
-    run = list(simulate(scene, prepare(scene, Newton()), StopRule(100, 1e-12), first_guess="current", frames=length))
-    gap = [step.problem.value(step.problem.current) - step.problem.value(step.solution.positions) for step in run]
+    scene, length = build_exact_scene(SPEC, SIZE), 30  # it swings through its lowest point after half a second
+    kept, violence = run_reference(scene, NewtonSolver(), length)
+    run = list(
+        simulate_scene(
+            scene, prepare(scene, NewtonSolver()), StopRule(100, 1e-12), initial_guess="current", frames=length
+        )
+    )
+    gap = [
+        step.problem.value(step.problem.current_positions) - step.problem.value(step.solution.positions) for step in run
+    ]
     np.testing.assert_allclose(violence, gap, rtol=1e-9)  # differences of sums that are some hundred times as large
     violent = 2 + int(np.argmax(gap[1:]))
     assert 2 < violent < length
@@ -148,11 +154,11 @@ def test_the_violent_moment_is_the_step_that_has_farthest_to_go():
     ],
 )
 def test_moments_are_a_tenth_and_a_half_of_the_run_and_its_peak(violence, wanted):
-    assert tuple(moment_frames(np.array(violence), len(violence)).values()) == wanted
+    assert tuple(select_snapshot_frames(np.array(violence), len(violence)).values()) == wanted
 
 
 CHANGES = {
-    "stiffness": {"effects": (Springs(stretch=101.0), *SPEC.effects[1:])},
+    "stiffness": {"effects": (SpringsEffect(stretch=101.0), *SPEC.effects[1:])},
     "mass": {"mass": 1.1},
     "time step": {"time_step": 1 / 60},
     "speed": {"velocity": (0.0, 0.1, 0.5)},
@@ -161,33 +167,35 @@ CHANGES = {
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_another_scene_is_another_problem(tmp_path, change):
-    store = Store(tmp_path)
-    one, other = (store.frames(spec, SIZE, [4])[4] for spec in (SPEC, changed(**CHANGES[change])))
+    store = ReferenceStore(tmp_path)
+    one, other = (store.load_frames(spec, SIZE, [4])[4] for spec in (SPEC, changed(**CHANGES[change])))
     assert one.digest != other.digest
-    assert same(Store(tmp_path, Refuses()).frames(SPEC, SIZE, [4])[4], one)
+    assert same(ReferenceStore(tmp_path, Refuses()).load_frames(SPEC, SIZE, [4])[4], one)
 
 
 def test_a_problem_that_the_same_scene_states_otherwise_by_now_is_taken_anew(tmp_path, monkeypatch):
     """As after a change of the code: the scene's digest is the same, its springs are not."""
-    store = Store(tmp_path)
-    before = store.frames(SPEC, SIZE, [4])[4]
-    monkeypatch.setitem(SPEC.__dict__, "effects", (Springs(stretch=120.0), *SPEC.effects[1:]))  # the digest is kept
-    after = store.frames(SPEC, SIZE, [4])[4]
+    store = ReferenceStore(tmp_path)
+    before = store.load_frames(SPEC, SIZE, [4])[4]
+    monkeypatch.setitem(
+        SPEC.__dict__, "effects", (SpringsEffect(stretch=120.0), *SPEC.effects[1:])
+    )  # the digest is kept
+    after = store.load_frames(SPEC, SIZE, [4])[4]
     assert after.digest != before.digest
-    fresh = Store(tmp_path / "fresh").frames(SPEC, SIZE, [4])[4]
+    fresh = ReferenceStore(tmp_path / "fresh").load_frames(SPEC, SIZE, [4])[4]
     assert same(after, fresh)
 
 
 def test_a_reference_run_that_does_not_converge_is_no_reference(tmp_path):
-    stiff = changed(effects=(Springs(stretch=1e9), *SPEC.effects[1:]))
+    stiff = changed(effects=(SpringsEffect(stretch=1e9), *SPEC.effects[1:]))
     with pytest.raises(RunFailed, match="step 1 of the reference run does not converge"):
-        Store(tmp_path, SparseLocalGlobal()).moments(stiff, SIZE)
+        ReferenceStore(tmp_path, SparseLocalGlobal()).load_snapshots(stiff, SIZE)
 
 
 def test_complete_files_alone_are_left(tmp_path):
-    store = Store(tmp_path)
-    for one in store.moments(SPEC, SIZE).values():
-        store.reference(one)
+    store = ReferenceStore(tmp_path)
+    for one in store.load_snapshots(SPEC, SIZE).values():
+        store.find_minima(one)
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
     assert {path.name.split("-")[0] for path in tmp_path.iterdir()} == {"run", "problem", "minima"}
     for path in tmp_path.iterdir():

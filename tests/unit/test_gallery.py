@@ -13,13 +13,13 @@ from typer.testing import CliRunner
 from harness.base import machine
 from harness.cli import app
 from harness.report import contact_sheet, opengl
-from harness.report.contact_sheet import abreast
-from harness.report.origin import machine_and_commit
-from harness.report.solids import solid
-from harness.scenes.motion import Key, KeyedMotion
-from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
+from harness.report.contact_sheet import choose_column_count
+from harness.report.origin import describe_machine_and_commit
+from harness.report.solids import build_obstacle_mesh
+from harness.scenes.motion import KeyFrame, KeyFrameMotion
+from harness.scenes.obstacles import BoxObstacle, CapsuleObstacle, PlaneObstacle, SphereObstacle
 
-needs_opengl = pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
+needs_opengl = pytest.mark.skipif(opengl.find_opengl_problem() is not None, reason=opengl.find_opengl_problem() or "")
 SEEN = np.random.default_rng(0).normal(size=(20, 3))
 
 FACTS = ("at the last frame, by hybrid to 1e-4", "strain: blue −10 % or more, orange as much stretched")
@@ -38,15 +38,15 @@ effects:
 @pytest.mark.parametrize(
     "obstacle",
     [
-        Sphere(center=(1.0, 2.0, 3.0), radius=0.5),
-        Capsule(ends=((0.0, 0.0, 0.0), (1.0, 1.0, 0.0)), radius=0.2),
-        Box(low=(-1.0, 0.0, 0.0), high=(1.0, 0.5, 2.0)),
-        Plane(point=(0.0, 1.0, 0.0), normal=(1.0, 1.0, 0.0)),
+        SphereObstacle(center=(1.0, 2.0, 3.0), radius=0.5),
+        CapsuleObstacle(ends=((0.0, 0.0, 0.0), (1.0, 1.0, 0.0)), radius=0.2),
+        BoxObstacle(low=(-1.0, 0.0, 0.0), high=(1.0, 0.5, 2.0)),
+        PlaneObstacle(point=(0.0, 1.0, 0.0), normal=(1.0, 1.0, 0.0)),
     ],
     ids=lambda one: one.kind,
 )
 def test_what_is_drawn_of_an_obstacle_is_its_surface(obstacle):
-    made = solid(obstacle, 0.0, SEEN)
+    made = build_obstacle_mesh(obstacle, 0.0, SEEN)
     assert made is not None
     points = np.asarray(made.points, np.float64)
     distance = obstacle.obstacle().distance(points, 0.0)
@@ -56,14 +56,14 @@ def test_what_is_drawn_of_an_obstacle_is_its_surface(obstacle):
 
 
 def test_an_obstacle_is_drawn_where_it_has_moved_to():
-    moves = KeyedMotion(keys=(Key(time=0.0), Key(time=2.0, offset=(0.0, 4.0, 0.0))))
-    made = solid(Sphere(radius=1.0, motion=moves), 1.0, SEEN)
+    moves = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=2.0, offset=(0.0, 4.0, 0.0))))
+    made = build_obstacle_mesh(SphereObstacle(radius=1.0, motion=moves), 1.0, SEEN)
     assert made is not None
     assert np.asarray(made.points).mean(axis=0) == pytest.approx([0.0, 2.0, 0.0], abs=1e-5)  # single precision
 
 
 def test_the_level_ground_is_not_drawn():
-    assert solid(Plane(), 0.0, SEEN) is None
+    assert build_obstacle_mesh(PlaneObstacle(), 0.0, SEEN) is None
 
 
 @needs_opengl
@@ -89,11 +89,11 @@ def test_the_sheet_has_a_tile_for_each_scene_and_says_what_drew_it(tmp_path: Pat
     assert sizes[0][0] == sizes[1][0] == 1600
     assert sizes[1][1] > sizes[0][1] + 300  # another row
     assert blank == [False, True]  # the last of which is one tile short
-    here = {"cpu": machine.describe().cpu, "commit": machine.commit()}
+    here = {"cpu": machine.describe_machine().cpu, "commit": machine.read_commit()}
     for page in said:
-        assert page[-1] == "   ·   ".join([*FACTS, *machine_and_commit([here])])
+        assert page[-1] == "   ·   ".join([*FACTS, *describe_machine_and_commit([here])])
 
 
 def test_a_sheet_leaves_as_few_places_blank_as_it_can():
-    assert [abreast(count) for count in (1, 4, 5, 6, 7, 9, 15, 16)] == [1, 4, 5, 3, 4, 3, 3, 4]
-    assert all(-count % abreast(count) <= 2 for count in range(1, 60))
+    assert [choose_column_count(count) for count in (1, 4, 5, 6, 7, 9, 15, 16)] == [1, 4, 5, 3, 4, 3, 3, 4]
+    assert all(-count % choose_column_count(count) <= 2 for count in range(1, 60))

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from harness.base.errors import InputError
 from harness.cli import app
-from harness.report.gate import compare
+from harness.report.gate import compare_benchmarks
 
 ROOT = Path(__file__).resolve().parents[2]
 HERE = {"cpu": {"brand_raw": "Fast 9000", "count": 2}, "affinity": 2}
@@ -38,7 +38,7 @@ def stored(path: Path, *benchmarks: dict[str, Any], machine: dict[str, Any] = HE
 
 def judged(base: Path, new: Path) -> tuple[int, str]:
     console = Console(file=io.StringIO(), width=200)
-    code = compare(base, new, console)
+    code = compare_benchmarks(base, new, console)
     assert isinstance(console.file, io.StringIO)
     return code, console.file.getvalue()
 

@@ -8,10 +8,19 @@ from random import Random
 
 import pytest
 
-from harness.experiments.gates.abba import ORDERS, Racers, Renewing, Result, Turn, confirmed, orders, race
-from harness.experiments.gates.sequential import RatioInterval, Rule, Verdict
+from harness.experiments.gates.abba import (
+    BLOCK_ORDERS,
+    BenchmarkResult,
+    LayoutRandomiser,
+    ProgramPair,
+    TimedBlock,
+    draw_block_orders,
+    run_confirmed_benchmark,
+    run_paired_benchmark,
+)
+from harness.experiments.gates.sequential import RatioInterval, SequentialTest, SequentialVerdict
 
-RULE = Rule(1.03)
+RULE = SequentialTest(1.03)
 
 
 def clock(seconds: float) -> Callable[[], float]:
@@ -20,26 +29,30 @@ def clock(seconds: float) -> Callable[[], float]:
 
 @pytest.mark.parametrize(
     ("ratio", "answer"),
-    [(1.0, Verdict.HOLDS), (1.05, Verdict.FAILS), (1.03, Verdict.UNDECIDED)],
+    [(1.0, SequentialVerdict.PASS), (1.05, SequentialVerdict.FAIL), (1.03, SequentialVerdict.INCONCLUSIVE)],
 )
-def test_a_race_ends_when_it_knows(ratio: float, answer: Verdict):
+def test_a_race_ends_when_it_knows(ratio: float, answer: SequentialVerdict):
     # The third ratio is the limit itself: neither above nor below, so that only the budget ends it.
-    found = race(Racers(clock(ratio), clock(1.0)), RULE, budget=60.0 if answer is not Verdict.UNDECIDED else 0.05)
-    assert found.answer is answer
-    if answer is not Verdict.UNDECIDED:
-        assert len(found.turns) == 16  # the fewest that can decide at an error of 0.1 %
+    found = run_paired_benchmark(
+        ProgramPair(clock(ratio), clock(1.0)),
+        RULE,
+        time_budget=60.0 if answer is not SequentialVerdict.INCONCLUSIVE else 0.05,
+    )
+    assert found.verdict is answer
+    if answer is not SequentialVerdict.INCONCLUSIVE:
+        assert len(found.blocks) == 16  # the fewest that can decide at an error of 0.1 %
         assert (found.interval.low, found.interval.high) == pytest.approx((ratio, ratio))
 
 
 def test_both_orders_come_equally_often():
-    drawn = list(islice(orders(Random(1)), 1000))
-    assert set(drawn) == set(ORDERS)
+    drawn = list(islice(draw_block_orders(Random(1)), 1000))
+    assert set(drawn) == set(BLOCK_ORDERS)
     assert abs(drawn.count("ABBA") - 500) < 50  # three standard deviations
 
 
 def test_a_steady_drift_cancels_in_each_turn():
-    for order in ORDERS:
-        assert Turn(order, (1.0, 1.1, 1.2, 1.3)).log_ratio == pytest.approx(0.0, abs=1e-15)
+    for order in BLOCK_ORDERS:
+        assert TimedBlock(order, (1.0, 1.1, 1.2, 1.3)).log_ratio == pytest.approx(0.0, abs=1e-15)
 
 
 def test_work_is_made_anew_between_turns_in_its_share_of_the_time(monkeypatch: pytest.MonkeyPatch):
@@ -51,18 +64,20 @@ def test_work_is_made_anew_between_turns_in_its_share_of_the_time(monkeypatch: p
 
     monkeypatch.setattr("harness.experiments.gates.abba.perf_counter", lambda: now[0])
     monkeypatch.setattr("harness.experiments.gates.abba.SHARE", 0.2)
-    renewing = Renewing(renew)
+    renewing = LayoutRandomiser(renew)
     for _ in range(12):
         turns.append(None)
         now[0] += 1.0
-        renewing.after(1.0)
+        renewing.rebuild_after(1.0)
     assert renewed == [1, 4, 8, 12]  # after the first turn, and then after every fourth: a fifth of the time
 
 
 def test_a_race_makes_the_work_of_both_anew_until_it_knows():
     renewed = list[None]()
-    found = race(Racers(clock(1.0), clock(1.0), lambda: renewed.append(None)), RULE, budget=60.0)
-    assert (found.answer, len(found.turns)) == (Verdict.HOLDS, 16)
+    found = run_paired_benchmark(
+        ProgramPair(clock(1.0), clock(1.0), lambda: renewed.append(None)), RULE, time_budget=60.0
+    )
+    assert (found.verdict, len(found.blocks)) == (SequentialVerdict.PASS, 16)
     assert 1 <= len(renewed) <= 15
 
 
@@ -71,9 +86,9 @@ def pairs(*ratios: float) -> tuple[Callable[..., object], list[float]]:
     left, started = iter(ratios), []
 
     @contextmanager
-    def start() -> Iterator[Racers]:
+    def start() -> Iterator[ProgramPair]:
         started.append(next(left))
-        yield Racers(clock(started[-1]), clock(1.0))
+        yield ProgramPair(clock(started[-1]), clock(1.0))
 
     return start, started
 
@@ -81,67 +96,77 @@ def pairs(*ratios: float) -> tuple[Callable[..., object], list[float]]:
 @pytest.mark.parametrize(
     ("ratios", "answer"),
     [
-        ((1.0,), Verdict.HOLDS),
-        ((1.06, 1.05), Verdict.FAILS),
-        ((1.06, 1.0), Verdict.UNDECIDED),  # two processes of the same code may differ by where their memory lies
+        ((1.0,), SequentialVerdict.PASS),
+        ((1.06, 1.05), SequentialVerdict.FAIL),
+        (
+            (1.06, 1.0),
+            SequentialVerdict.INCONCLUSIVE,
+        ),  # two processes of the same code may differ by where their memory lies
     ],
 )
-def test_a_slowdown_is_believed_when_a_second_start_has_it_too(ratios: tuple[float, ...], answer: Verdict):
+def test_a_slowdown_is_believed_when_a_second_start_has_it_too(ratios: tuple[float, ...], answer: SequentialVerdict):
     start, started = pairs(*ratios)
-    found = confirmed(start, RULE, budget=60.0)  # type: ignore[arg-type]
-    assert found.answer is answer
-    assert (tuple(started), found.starts) == (ratios, len(ratios))
+    found = run_confirmed_benchmark(start, RULE, time_budget=60.0)  # type: ignore[arg-type]
+    assert found.verdict is answer
+    assert (tuple(started), found.num_process_pairs) == (ratios, len(ratios))
     assert (found.interval.low, found.interval.high) == (pytest.approx(min(ratios)), pytest.approx(max(ratios)))
 
 
 def test_the_budget_is_that_of_both_races(monkeypatch: pytest.MonkeyPatch):
-    slow = confirmed(pairs(1.06, 1.05)[0], RULE, budget=60.0)  # type: ignore[arg-type]
+    slow = run_confirmed_benchmark(pairs(1.06, 1.05)[0], RULE, time_budget=60.0)  # type: ignore[arg-type]
     budgets: list[float] = []
 
-    def raced(start: object, rule: Rule, budget: float) -> Result:
+    def raced(start: object, rule: SequentialTest, budget: float) -> BenchmarkResult:
         budgets.append(budget)
-        return replace(slow, rule=rule, elapsed=45.0)
+        return replace(slow, sequential_test=rule, elapsed_seconds=45.0)
 
     monkeypatch.setattr("harness.experiments.gates.abba._raced", raced)
     for budget in (60.0, 30.0):
-        confirmed(pairs(1.0)[0], RULE, budget=budget)  # type: ignore[arg-type]
+        run_confirmed_benchmark(pairs(1.0)[0], RULE, time_budget=budget)  # type: ignore[arg-type]
     assert budgets == [60.0, 15.0, 30.0, 0.0]
 
 
 def test_programs_are_started_anew_as_long_as_a_race_lasts(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("harness.experiments.gates.abba.PAIR", 0.0)  # a start for each turn
     start, started = pairs(*[1.0] * 16)
-    found = confirmed(start, RULE, budget=60.0)  # type: ignore[arg-type]
-    assert (found.answer, found.starts, len(found.turns), len(started)) == (Verdict.HOLDS, 16, 16, 16)
+    found = run_confirmed_benchmark(start, RULE, time_budget=60.0)  # type: ignore[arg-type]
+    assert (found.verdict, found.num_process_pairs, len(found.blocks), len(started)) == (
+        SequentialVerdict.PASS,
+        16,
+        16,
+        16,
+    )
 
 
 def test_pairs_that_differ_all_their_lives_decide_nothing_together(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("harness.experiments.gates.abba.PAIR", 0.0)
     start, _ = pairs(*[1.05, 1.0] * 10_000)
-    found = confirmed(start, RULE, budget=0.05)  # type: ignore[arg-type]
-    assert found.answer is Verdict.UNDECIDED
-    assert found.starts == len(found.turns) > 16
-    assert found.elapsed == pytest.approx(0.05, abs=0.05)
+    found = run_confirmed_benchmark(start, RULE, time_budget=0.05)  # type: ignore[arg-type]
+    assert found.verdict is SequentialVerdict.INCONCLUSIVE
+    assert found.num_process_pairs == len(found.blocks) > 16
+    assert found.elapsed_seconds == pytest.approx(0.05, abs=0.05)
 
 
 @pytest.mark.parametrize(
     ("answer", "limit", "interval", "said"),
     [
-        (Verdict.FAILS, 1.03, (1.061, 1.052, 1.07), "slower by 6.1 % [5.2, 7.0]: fails (limit 3.0 %)"),
-        (Verdict.HOLDS, 1.03, (1.003, 0.99, 1.012), "no slower than 1.2 %: holds (limit 3.0 %)"),
-        (Verdict.HOLDS, 1.03, (0.9, 0.89, 0.91), "ratio 0.9 [0.89, 0.91]: holds (limit 1.03)"),
-        (Verdict.FAILS, 0.45, (0.5, 0.48, 0.52), "ratio 0.5 [0.48, 0.52]: fails (limit 0.45)"),
-        (Verdict.FAILS, 1.03, (3.0, 2.9, 3.1), "ratio 3 [2.9, 3.1]: fails (limit 1.03)"),
+        (SequentialVerdict.FAIL, 1.03, (1.061, 1.052, 1.07), "slower by 6.1 % [5.2, 7.0]: fails (limit 3.0 %)"),
+        (SequentialVerdict.PASS, 1.03, (1.003, 0.99, 1.012), "no slower than 1.2 %: holds (limit 3.0 %)"),
+        (SequentialVerdict.PASS, 1.03, (0.9, 0.89, 0.91), "ratio 0.9 [0.89, 0.91]: holds (limit 1.03)"),
+        (SequentialVerdict.FAIL, 0.45, (0.5, 0.48, 0.52), "ratio 0.5 [0.48, 0.52]: fails (limit 0.45)"),
+        (SequentialVerdict.FAIL, 1.03, (3.0, 2.9, 3.1), "ratio 3 [2.9, 3.1]: fails (limit 1.03)"),
         (
-            *(Verdict.UNDECIDED, 1.03, (1.01, 0.96, 1.07)),
+            *(SequentialVerdict.INCONCLUSIVE, 1.03, (1.01, 0.96, 1.07)),
             "cannot tell within 120 s: 0.96 to 1.07 (limit 1.03), on a machine with load 7",
         ),
         (
-            *(Verdict.UNDECIDED, 1.03, (1.01, 0.0, float("inf"))),
+            *(SequentialVerdict.INCONCLUSIVE, 1.03, (1.01, 0.0, float("inf"))),
             "cannot tell within 120 s: 1 turns are too few (limit 1.03), on a machine with load 7",
         ),
     ],
 )
-def test_a_result_says_what_was_found(answer: Verdict, limit: float, interval: tuple[float, float, float], said: str):
-    turn = Turn("ABBA", (1.0, 1.0, 1.0, 1.0))
-    assert str(Result(answer, Rule(limit), RatioInterval(*interval), (turn,), 120.0, 7.2)) == said
+def test_a_result_says_what_was_found(
+    answer: SequentialVerdict, limit: float, interval: tuple[float, float, float], said: str
+):
+    turn = TimedBlock("ABBA", (1.0, 1.0, 1.0, 1.0))
+    assert str(BenchmarkResult(answer, SequentialTest(limit), RatioInterval(*interval), (turn,), 120.0, 7.2)) == said

@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 
 from harness.cli import app
 from harness.experiments.gates import revisions, worker
-from harness.experiments.gates.against import Request, exit_code, started
-from harness.experiments.gates.pair import Side, changes, workers
-from harness.experiments.gates.sequential import Verdict
-from tests.scenes import CLOTH_FILE
+from harness.experiments.gates.against import WorkRequest, choose_exit_code, start_revisions
+from harness.experiments.gates.pair import GitRevision, describe_changes, start_workers
+from harness.experiments.gates.sequential import SequentialVerdict
+from tests.scenes import CLOTH_SCENE_YAML
 
 GATES = """
 from types import SimpleNamespace
@@ -120,7 +120,7 @@ def test_a_revision_whose_libraries_cannot_be_had_does_not_build(repository: Pat
     assert code == 2
     assert "does not build:" in said
     # One that was killed while it was built is not taken for whole.
-    (tree,) = (path for path in revisions.cache().iterdir() if path.is_dir())
+    (tree,) = (path for path in revisions.worktree_cache().iterdir() if path.is_dir())
     (tree / ".venv" / "bin").mkdir(parents=True)
     (tree / ".venv" / "bin" / "python").touch()
     code, said = gate("--against", "HEAD", "-k", "adding")
@@ -163,22 +163,28 @@ def test_a_folder_outside_git_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_run_of_a_scene_is_held_with_its_exact_facts_and_each_revision_has_its_own_file(repository: Path):
-    (repository / "cloth.yaml").write_text(CLOTH_FILE)
+    (repository / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     other = repository / "elsewhere"
     other.mkdir()
-    (other / "cloth.yaml").write_text(CLOTH_FILE.replace("300", "600"))
-    sides = Side("this", repository), Side("that", other, checkout=repository, extra=0.1)
+    (other / "cloth.yaml").write_text(CLOTH_SCENE_YAML.replace("300", "600"))
+    sides = GitRevision("this", repository), GitRevision("that", other, checkout=repository, injected_slowdown=0.1)
     asked = {"solvers": ["sparse"], "sizes": [], "iterations": 20}
-    with workers(*sides) as alive:
+    with start_workers(*sides) as alive:
         held = []
         for worker in alive:
-            config = str(worker.side.own(repository / "cloth.yaml"))
-            (title,) = worker.ask("runs", config=config, asked=asked)["runs"]
+            config = str(worker.revision.resolve_file(repository / "cloth.yaml"))
+            (title,) = worker.send_request("runs", config=config, asked=asked)["runs"]
             assert title == "cloth, size 4, sparse, 20 iterations, implicit-euler, dt 0.03333"
-            given = {"config": config, "asked": asked, "index": 0, "frames": 9, "extra": worker.side.extra}
-            held.append(worker.hold("run", **given))
-            assert worker.seconds(2, "cpu") > 0
-    assert [(h.frames, h.clock, h.answer.shape) for h in held] == [(2, "cpu", (16, 3))] * 2
+            given = {
+                "config": config,
+                "asked": asked,
+                "index": 0,
+                "frames": 9,
+                "extra": worker.revision.injected_slowdown,
+            }
+            held.append(worker.prepare_work("run", **given))
+            assert worker.time_calls(2, "cpu") > 0
+    assert [(h.num_frames, h.clock, h.answer.shape) for h in held] == [(2, "cpu", (16, 3))] * 2
     assert held[0].facts == held[1].facts  # what is planted is beside the run's own work
     assert held[0].facts["iterations"] == 40
     assert held[0].facts["nnz_factor"] > 16
@@ -193,23 +199,25 @@ def test_work_that_is_renewed_is_made_again_before_it_is_timed(tmp_path: Path, m
         return lambda: done.append(number) or 0.0
 
     monkeypatch.setattr(worker, "_gates", lambda: {"mine": SimpleNamespace(candidate=candidate, clock="cpu")})
-    held = worker.Worker()
+    held = worker.RevisionWorker()
     monkeypatch.setattr(held, "_pin", lambda threads: None)
-    held.gate("mine", str(tmp_path / "answer.npy"))
-    held.renew()
-    held.time(2, "cpu")
+    held.prepare_test("mine", str(tmp_path / "answer.npy"))
+    held.rebuild_work()
+    held.time_calls(2, "cpu")
     assert (made, done) == ([0, 1], [0, 1, 1])
 
 
 def test_a_worker_that_dies_is_told_with_its_last_words(tmp_path: Path):
     (tmp_path / "json.py").write_text("raise SystemExit('there is no more json')")
-    request = Request("a gate", "gate", {"name": "a gate"})
+    request = WorkRequest("a gate", "gate", {"name": "a gate"})
     from harness.base.errors import InputError
-    from harness.experiments.gates.against import Options
+    from harness.experiments.gates.against import ComparisonOptions
 
     with (
         pytest.raises(InputError, match="that: does not run: there is no more json"),
-        started((Side("that", tmp_path), Side("this", tmp_path)), request, Options(1.0), print),
+        start_revisions(
+            (GitRevision("that", tmp_path), GitRevision("this", tmp_path)), request, ComparisonOptions(1.0), print
+        ),
     ):
         pass
 
@@ -217,17 +225,17 @@ def test_a_worker_that_dies_is_told_with_its_last_words(tmp_path: Path):
 def test_changes_of_exact_facts_are_told():
     old = {"iterations": 200, "nnz_factor": 1000, "instructions": 1_000_000, "gone": 1}
     new = {"iterations": 210, "nnz_factor": 1000, "instructions": 1_000_900, "come": 2}
-    assert changes(new, old) == ["iterations 200 -> 210 (+5.0%)"]
-    assert changes(new | {"instructions": 990_000}, old)[1] == "instructions 1,000,000 -> 990,000 (-1.0%)"
+    assert describe_changes(new, old) == ["iterations 200 -> 210 (+5.0%)"]
+    assert describe_changes(new | {"instructions": 990_000}, old)[1] == "instructions 1,000,000 -> 990,000 (-1.0%)"
 
 
 @pytest.mark.parametrize(
     ("answers", "code"),
     [
-        ([Verdict.HOLDS], 0),
-        ([Verdict.HOLDS, Verdict.UNDECIDED], 3),
-        ([Verdict.UNDECIDED, Verdict.FAILS, Verdict.HOLDS], 1),
+        ([SequentialVerdict.PASS], 0),
+        ([SequentialVerdict.PASS, SequentialVerdict.INCONCLUSIVE], 3),
+        ([SequentialVerdict.INCONCLUSIVE, SequentialVerdict.FAIL, SequentialVerdict.PASS], 1),
     ],
 )
-def test_one_failure_outweighs_what_is_undecided_and_that_what_holds(answers: list[Verdict], code: int):
-    assert exit_code(answers) == code
+def test_one_failure_outweighs_what_is_undecided_and_that_what_holds(answers: list[SequentialVerdict], code: int):
+    assert choose_exit_code(answers) == code

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from harness.experiments.gates import listed
-from harness.experiments.gates.sequential import Rule
+from harness.experiments.gates.sequential import SequentialTest
 from tests.contracts.hostile import scene
 
 TABLE = """
@@ -21,12 +21,12 @@ def test_the_gates_of_a_table_share_its_error_and_each_may_have_a_budget_of_its_
 ):
     (tmp_path / "cloth.yaml").write_text(scene())
     (tmp_path / "gates.yaml").write_text(TABLE)
-    asked: list[tuple[Rule, float]] = []
+    asked: list[tuple[SequentialTest, float]] = []
 
-    def confirmed(start: Any, rule: Rule, *, budget: float) -> str:
+    def confirmed(start: Any, rule: SequentialTest, *, budget: float) -> str:
         asked.append((rule, budget))
         return "holds"
 
     monkeypatch.setattr(listed, "confirmed", confirmed)
-    listed.run_table(tmp_path / "gates.yaml", 60.0, lambda line: None, alpha=0.01)
-    assert asked == [(Rule(1.5, 0.005), 60.0), (Rule(2.0, 0.005), 7.0)]
+    listed.run_regression_table(tmp_path / "gates.yaml", 60.0, lambda line: None, alpha=0.01)
+    assert asked == [(SequentialTest(1.5, 0.005), 60.0), (SequentialTest(2.0, 0.005), 7.0)]

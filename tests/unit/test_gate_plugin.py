@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from harness.cli import app
-from harness.experiments.gates.agreement import difference
+from harness.experiments.gates.agreement import describe_difference
 
 SCENE = """
 mesh: {kind: grid}
@@ -187,4 +187,4 @@ def test_options_that_a_table_states_itself_are_refused(tmp_path: Path):
     ],
 )  # fmt: skip
 def test_answers_are_compared_in_their_own_size(new: Any, old: Any, tolerance: float, said: str):
-    assert difference(new, old, tolerance) == said
+    assert describe_difference(new, old, tolerance) == said

@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from harness.experiments.gates.sequential import Rule, Verdict, critical, interval
+from harness.experiments.gates.sequential import (
+    SequentialTest,
+    SequentialVerdict,
+    compute_critical_count,
+    compute_interval,
+)
 
 TURNS, SAMPLES = 400, 1000
 
@@ -41,19 +46,22 @@ def test_the_fewest_turns_that_refuse_are_those_of_the_martingale():
         return 6 * 2**n * factorial(k + 1) * factorial(n - k + 1) / factorial(n + 3)
 
     for n in (1, 5, 15, 16, 17, 40, 101):
-        k = critical(n, 0.001)
+        k = compute_critical_count(n, 0.001)
         assert k == n + 1 or martingale(n, k) >= 1000
         assert martingale(n, min(k, n + 1) - 1) < 1000
-    assert critical(15, 0.001) == 16
-    assert critical(16, 0.001) == 16
+    assert compute_critical_count(15, 0.001) == 16
+    assert compute_critical_count(16, 0.001) == 16
 
 
 @pytest.mark.parametrize("bursts", [False, True], ids=["calm", "bursty"])
 def test_looking_after_every_turn_is_wrong_as_rarely_as_stated(bursts: bool):
     # The limit is the true ratio, so every answer is wrong. At an error of 5 % more than 71 of 1000 would come about
     # once in a thousand repetitions of this test (binomial); the seeds are fixed.
-    rule = Rule(1.0, alpha=0.05)
-    wrong = [rule.first(sample(seed, bursts=bursts))[0] is not Verdict.UNDECIDED for seed in range(SAMPLES)]
+    rule = SequentialTest(1.0, alpha=0.05)
+    wrong = [
+        rule.decide_first_verdict(sample(seed, bursts=bursts))[0] is not SequentialVerdict.INCONCLUSIVE
+        for seed in range(SAMPLES)
+    ]
     assert 0 < sum(wrong) <= 71
 
 
@@ -62,7 +70,7 @@ def test_the_interval_covers_the_truth_at_every_number_of_turns(bursts: bool):
     missed = 0
     for seed in range(200):
         x = sample(seed, 1.05, bursts=bursts)
-        found = [interval(x[:n], alpha=0.05) for n in (1, 10, 20, 50, 100, 200, 400)]
+        found = [compute_interval(x[:n], alpha=0.05) for n in (1, 10, 20, 50, 100, 200, 400)]
         missed += not all(f.low <= 1.05 <= f.high for f in found)
         assert all(f.low <= f.ratio <= f.high for f in found)
     assert missed <= 20  # 5 % of 200, and twice that would come once in a thousand
@@ -71,47 +79,54 @@ def test_the_interval_covers_the_truth_at_every_number_of_turns(bursts: bool):
 @pytest.mark.parametrize("bursts", [False, True], ids=["calm", "bursty"])
 @pytest.mark.parametrize(("slower", "limit", "within"), [(1.05, 1.03, 200), (1.1, 1.03, 60), (1.02, 1.01, 400)])
 def test_a_slowdown_is_found(slower: float, limit: float, within: int, bursts: bool):
-    found = [Rule(limit).first(sample(seed, slower, bursts=bursts)) for seed in range(200)]
-    assert sum(answer is Verdict.FAILS and turns <= within for answer, turns in found) >= 190
-    assert not any(answer is Verdict.HOLDS for answer, _ in found)
+    found = [SequentialTest(limit).decide_first_verdict(sample(seed, slower, bursts=bursts)) for seed in range(200)]
+    assert sum(answer is SequentialVerdict.FAIL and turns <= within for answer, turns in found) >= 190
+    assert not any(answer is SequentialVerdict.PASS for answer, _ in found)
 
 
 def test_equal_programs_hold_and_none_fails():
-    found = [Rule(1.03).first(sample(seed, bursts=seed % 2 == 0)) for seed in range(SAMPLES)]
-    assert {answer for answer, _ in found} == {Verdict.HOLDS}
+    found = [SequentialTest(1.03).decide_first_verdict(sample(seed, bursts=seed % 2 == 0)) for seed in range(SAMPLES)]
+    assert {answer for answer, _ in found} == {SequentialVerdict.PASS}
 
 
 def test_noise_too_large_for_the_limit_is_undecided_and_not_passed():
-    found = [Rule(1.03).first(sample(seed, 1.05, noise=0.5))[0] for seed in range(200)]
-    assert found.count(Verdict.UNDECIDED) >= 190  # the interval of 400 such turns is .3 wide
-    assert Verdict.HOLDS not in found
+    found = [SequentialTest(1.03).decide_first_verdict(sample(seed, 1.05, noise=0.5))[0] for seed in range(200)]
+    assert found.count(SequentialVerdict.INCONCLUSIVE) >= 190  # the interval of 400 such turns is .3 wide
+    assert SequentialVerdict.PASS not in found
 
 
 def test_the_first_answer_is_that_of_looking_turn_by_turn():
-    rule = Rule(1.03)
+    rule = SequentialTest(1.03)
     for seed in range(20):
         x = sample(seed, 1.0 + 0.01 * seed)
-        looked = next(((a, n) for n in range(1, TURNS + 1) if (a := rule.judge(x[:n])) is not Verdict.UNDECIDED), None)
-        assert rule.first(x) == (looked or (Verdict.UNDECIDED, TURNS))
+        looked = next(
+            (
+                (a, n)
+                for n in range(1, TURNS + 1)
+                if (a := rule.decide_verdict(x[:n])) is not SequentialVerdict.INCONCLUSIVE
+            ),
+            None,
+        )
+        assert rule.decide_first_verdict(x) == (looked or (SequentialVerdict.INCONCLUSIVE, TURNS))
 
 
 def test_an_answer_is_what_the_interval_says():
     for seed in range(20):
         x = sample(seed, 1.0 + 0.005 * seed)
         for n in (10, 20, 50, 400):
-            found, answer = interval(x[:n]), Rule(1.03).judge(x[:n])
-            assert (found.low > 1.03) == (answer is Verdict.FAILS)
-            assert (found.high < 1.03) == (answer is Verdict.HOLDS)
+            found, answer = compute_interval(x[:n]), SequentialTest(1.03).decide_verdict(x[:n])
+            assert (found.low > 1.03) == (answer is SequentialVerdict.FAIL)
+            assert (found.high < 1.03) == (answer is SequentialVerdict.PASS)
 
 
 def test_one_turn_that_was_disturbed_without_end_changes_nothing():
     x = sample(1)
     x[7] = 1e300
-    assert interval(x).high < 1.01
+    assert compute_interval(x).high < 1.01
 
 
 def test_a_smaller_error_takes_more_turns():
-    needed = [critical(100, alpha) for alpha in (0.05, 0.01, 0.001, 1e-6)]
+    needed = [compute_critical_count(100, alpha) for alpha in (0.05, 0.01, 0.001, 1e-6)]
     assert all(a < b for a, b in pairwise(needed))
 
 
@@ -127,4 +142,4 @@ def test_a_smaller_error_takes_more_turns():
 )
 def test_a_rule_that_cannot_be_is_refused(given: dict[str, float], named: str):
     with pytest.raises(ValueError, match=named):
-        Rule(**given)
+        SequentialTest(**given)

@@ -28,7 +28,7 @@ def results(folder: Path, *runs: dict[str, Any]) -> Path:
         ]
         if given.get("status", "ok") != "ok":
             steps = [{"phase": "run"}]
-        rows.write(folder / "rows" / f"{number}.parquet", [shared | given | step for step in steps])
+        rows.write_rows(folder / "rows" / f"{number}.parquet", [shared | given | step for step in steps])
     return folder
 
 

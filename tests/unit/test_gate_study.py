@@ -8,13 +8,20 @@ from typer.testing import CliRunner
 
 from harness.base import rows
 from harness.cli import app
-from harness.experiments.gates.live import summary
-from harness.experiments.gates.sequential import Rule
-from harness.experiments.gates.study import OTHERS, SCHEMA, PairTurns, read, replay, replay_other
-from tests.scenes import CLOTH_FILE
+from harness.experiments.gates.live import summarise_live_study
+from harness.experiments.gates.sequential import SequentialTest
+from harness.experiments.gates.study import (
+    OTHER_COMPARISONS,
+    RECORD_SCHEMA,
+    RecordedBlocks,
+    read_recorded_blocks,
+    replay_comparison,
+    replay_tests,
+)
+from tests.scenes import CLOTH_SCENE_YAML
 
 
-def starts(biases: tuple[float, ...] = (1.0, 1.0, 1.0), noise: float = 0.02, turns: int = 500) -> list[PairTurns]:
+def starts(biases: tuple[float, ...] = (1.0, 1.0, 1.0), noise: float = 0.02, turns: int = 500) -> list[RecordedBlocks]:
     """Recorded starts of the same code, whose second process is so many times as slow, on a machine with bursts."""
     found = []
     for seed, bias in enumerate(biases):
@@ -23,7 +30,11 @@ def starts(biases: tuple[float, ...] = (1.0, 1.0, 1.0), noise: float = 0.02, tur
         burst = np.repeat(rng.random(turns // 10) < 0.2, 10)
         a[burst] *= rng.uniform(1, 2, (burst.sum(), 2))
         b[burst] *= rng.uniform(1, 2, (burst.sum(), 2))
-        found.append(PairTurns(np.log(bias * a.sum(axis=1) / b.sum(axis=1)), bias * a, b, wall=0.1, load=1.0))
+        found.append(
+            RecordedBlocks(
+                np.log(bias * a.sum(axis=1) / b.sum(axis=1)), bias * a, b, wall_seconds=0.1, load_average=1.0
+            )
+        )
     return found
 
 
@@ -38,40 +49,40 @@ def starts(biases: tuple[float, ...] = (1.0, 1.0, 1.0), noise: float = 0.02, tur
 def test_a_replay_finds_slowdowns_and_raises_no_alarm(
     slower: float, limit: float, fails: tuple[float, float], holds: tuple[float, float]
 ):
-    found = replay(starts(), slower, Rule(limit), budget=120.0, replays=1000)
-    assert fails[0] <= found.fails <= fails[1]
-    assert holds[0] <= found.holds <= holds[1]
-    assert found.fails + found.holds + found.undecided == pytest.approx(1.0)
-    assert 1.6 <= found.seconds <= 120  # 16 turns of .1 s, the fewest that decide
+    found = replay_tests(starts(), slower, SequentialTest(limit), budget=120.0, num_replays=1000)
+    assert fails[0] <= found.fail_rate <= fails[1]
+    assert holds[0] <= found.pass_rate <= holds[1]
+    assert found.fail_rate + found.pass_rate + found.inconclusive_rate == pytest.approx(1.0)
+    assert 1.6 <= found.median_seconds <= 120  # 16 turns of .1 s, the fewest that decide
 
 
 def test_a_start_that_lies_badly_alone_hardly_makes_an_alarm():
     # One of ten pairs of processes is 5 % apart: a tenth of first races fails, a tenth of those a second time.
-    found = replay(starts((1.05, *([1.0] * 9))), 1.0, Rule(1.03), budget=120.0, replays=2000)
-    assert 0.0 < found.fails < 0.02
-    assert found.undecided > 0.05
+    found = replay_tests(starts((1.05, *([1.0] * 9))), 1.0, SequentialTest(1.03), budget=120.0, num_replays=2000)
+    assert 0.0 < found.fail_rate < 0.02
+    assert found.inconclusive_rate > 0.05
 
 
 def test_pairs_that_differ_all_their_lives_are_drawn_again_in_a_long_race(monkeypatch: pytest.MonkeyPatch):
     # A third of the pairs is .8 % apart: alone it does not show that the code is 2 % slower and not 1 %.
     recorded = starts((1.0, 1.0, 0.992), noise=0.04)
-    several = replay(recorded, 1.02, Rule(1.01), budget=300.0, replays=300)
+    several = replay_tests(recorded, 1.02, SequentialTest(1.01), budget=300.0, num_replays=300)
     monkeypatch.setattr("harness.experiments.gates.study.PAIR", 300.0)
-    alone = replay(recorded, 1.02, Rule(1.01), budget=300.0, replays=300)
-    assert several.holds == 0.0
-    assert several.fails > alone.fails + 0.2  # .90 and .54
+    alone = replay_tests(recorded, 1.02, SequentialTest(1.01), budget=300.0, num_replays=300)
+    assert several.pass_rate == 0.0
+    assert several.fail_rate > alone.fail_rate + 0.2  # .90 and .54
 
 
 def test_others_compare_one_session_with_the_next():
     same = starts()
-    for rule in OTHERS.values():
-        assert replay_other(rule, same, 1.5, seconds=20.0, replays=100) > 0.9
-        assert replay_other(rule, same, 0.7, seconds=20.0, replays=100) == 0.0
+    for rule in OTHER_COMPARISONS.values():
+        assert replay_comparison(rule, same, 1.5, duration=20.0, num_replays=100) > 0.9
+        assert replay_comparison(rule, same, 0.7, duration=20.0, num_replays=100) == 0.0
 
 
 @pytest.mark.long
 def test_turns_are_recorded_and_replayed_by_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / "cloth.yaml").write_text(CLOTH_FILE)
+    (tmp_path / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     (tmp_path / ".git").mkdir()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("harness.experiments.gates.revisions.root", lambda folder: folder)
@@ -80,10 +91,10 @@ def test_turns_are_recorded_and_replayed_by_the_command(tmp_path: Path, monkeypa
     for starts in ("2", "1"):  # what is stored already is kept
         done = CliRunner().invoke(app, ["gate-study", *given, "--starts", starts])
         assert done.exit_code == 0, done.output
-    recorded = rows.read([samples], SCHEMA).to_pylist()
+    recorded = rows.read_rows([samples], RECORD_SCHEMA).to_pylist()
     assert {row["start"] for row in recorded} == {0, 1, 2}
     assert {row["planted"] for row in recorded} == {0.1}
-    ((key, found),) = read([samples]).items()
+    ((key, found),) = read_recorded_blocks([samples]).items()
     assert key == ("cloth, size 4, sparse, 50 iterations, implicit-euler, dt 0.03333", "nothing")
     assert sum(len(start.log_ratios) for start in found) == len(recorded)
     done = CliRunner().invoke(app, ["gate-study", "replay", str(samples), "--replays", "20"])
@@ -93,14 +104,14 @@ def test_turns_are_recorded_and_replayed_by_the_command(tmp_path: Path, monkeypa
 
 @pytest.mark.long
 def test_real_gates_are_held_and_counted_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / "cloth.yaml").write_text(CLOTH_FILE)
+    (tmp_path / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("harness.experiments.gates.revisions.root", lambda folder: folder)
     given = ["gate-study", "live", "held.parquet", "cloth.yaml", "--solver", "sparse", "--budget", "20", "--limit", "2"]
     assert CliRunner().invoke(app, [*given, "--gates", "2"]).exit_code == 0
     done = CliRunner().invoke(app, [*given, "--gates", "1", "--planted", "4"])
     assert done.exit_code == 0, done.output
-    (same, slower) = summary(tmp_path / "held.parquet")
+    (same, slower) = summarise_live_study(tmp_path / "held.parquet")
     # A machine that is too busy lets a gate say that it cannot tell, and nothing else.
     assert same[3:7] == ("0%", "100%", "2", "0")
     assert int(same[7]) + int(same[8]) == 2
@@ -121,7 +132,7 @@ def test_real_gates_are_held_and_counted_and_kept(tmp_path: Path, monkeypatch: p
 def test_a_mistake_is_one_message(
     arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    (tmp_path / "cloth.yaml").write_text(CLOTH_FILE)
+    (tmp_path / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("harness.experiments.gates.revisions.root", lambda folder: folder)
     done = CliRunner().invoke(app, ["gate-study", *arguments])

@@ -10,13 +10,13 @@ from typer.testing import CliRunner
 from harness.base import rows
 from harness.base.errors import InputError
 from harness.cli import app
-from harness.config.goals import load_goals
-from harness.config.load import load_any
-from harness.experiments.accuracy.accuracy_rows import SCHEMA
+from harness.config.goals import load_targets
+from harness.config.load import load_config
+from harness.experiments.accuracy.accuracy_rows import ACCURACY_SCHEMA
 from harness.experiments.asked import held
-from harness.experiments.asked.goals import Met
-from harness.experiments.asked.libraries import LIBRARIES
-from solvers.registry import EVERY
+from harness.experiments.asked.goals import TargetResult
+from harness.experiments.asked.libraries import THIRD_PARTY_INTEGRATORS
+from solvers.registry import SOLVER_TABLE
 
 SPRING = """
 mesh: {kind: chain}
@@ -39,17 +39,17 @@ def config(folder: Path, goals: str) -> Path:
 
 
 def test_the_shipped_goals_are_sound_and_name_their_schema() -> None:
-    goals = load_goals(CONFIGS / "goals.yaml", list(LIBRARIES), list(EVERY)).goals
+    goals = load_targets(CONFIGS / "goals.yaml", list(THIRD_PARTY_INTEGRATORS), list(SOLVER_TABLE)).goals
     assert [(one.scene, one.size) for one in goals][:4] == [
         ("chain", 9),
         ("net", 9),
         ("hanging-cloth", 9),
         ("hanging-cloth", 17),
     ]
-    controlled = load_goals(CONFIGS / "controlled.yaml", list(LIBRARIES), list(EVERY)).goals
+    controlled = load_targets(CONFIGS / "controlled.yaml", list(THIRD_PARTY_INTEGRATORS), list(SOLVER_TABLE)).goals
     assert len({one.scene for one in controlled}) == 11
     assert len(controlled) == 3 * 11
-    assert all(one.goal.graded for one in controlled)
+    assert all(one.target.graded for one in controlled)
     for name in ("goals", "controlled"):
         first = (CONFIGS / f"{name}.yaml").read_text().splitlines()[0]
         assert first == "# yaml-language-server: $schema=schema.json"
@@ -68,14 +68,18 @@ def test_the_shipped_goals_are_sound_and_name_their_schema() -> None:
 )
 def test_what_cannot_be_a_goal_is_refused(tmp_path: Path, goal: str, said: str) -> None:
     with pytest.raises(InputError) as refused:
-        load_goals(config(tmp_path, f"[{{{goal}, horizon: 0.2, wanted: 0.5}}]"), list(LIBRARIES), list(EVERY))
+        load_targets(
+            config(tmp_path, f"[{{{goal}, horizon: 0.2, wanted: 0.5}}]"),
+            list(THIRD_PARTY_INTEGRATORS),
+            list(SOLVER_TABLE),
+        )
     assert said in str(refused.value)
 
 
 def test_other_commands_name_the_one_for_goals(tmp_path: Path) -> None:
     path = config(tmp_path, "[{scene: spring, horizon: 0.2, error: 1e-3, peer: scipy-rk45, wanted: 1}]")
     with pytest.raises(InputError, match="springbench goals"):
-        load_any(path)
+        load_config(path)
 
 
 def test_goals_are_timed_beside_a_peer_and_steps_of_one_length(tmp_path: Path) -> None:
@@ -89,7 +93,7 @@ def test_goals_are_timed_beside_a_peer_and_steps_of_one_length(tmp_path: Path) -
     done = CliRunner().invoke(app, ["goals", str(path), "--results", str(tmp_path / "results")])
     assert done.exit_code == 1, done.output
     assert "does not hold" in done.output
-    found = rows.read([tmp_path / "results" / "mine" / "accuracy" / "goals.parquet"], SCHEMA).to_pylist()
+    found = rows.read_rows([tmp_path / "results" / "mine" / "accuracy" / "goals.parquet"], ACCURACY_SCHEMA).to_pylist()
     assert [row["against"].split(",")[0] for row in found] == ["scipy-dop853-numpy", "midpoint with newton"]
     for row in found:
         assert row["kind"] == "goal"
@@ -109,15 +113,17 @@ def test_what_takes_too_long_is_a_bound_of_the_goal(tmp_path: Path, monkeypatch:
     assert done.exit_code == 1, done.output
     assert "an error of" in done.output
     assert "at most" in done.output
-    (row,) = rows.read([tmp_path / "results" / "mine" / "accuracy" / "goals.parquet"], SCHEMA).to_pylist()
+    (row,) = rows.read_rows([tmp_path / "results" / "mine" / "accuracy" / "goals.parquet"], ACCURACY_SCHEMA).to_pylist()
     assert "given up after" in row["against"]
     assert row["against_error"] is None
     assert row["against_seconds"] > 0.0
 
 
 def test_a_graded_error_is_near_the_one_asked_or_it_is_said_why_not() -> None:
-    (one, *_) = load_goals(CONFIGS / "controlled.yaml", list(LIBRARIES), list(EVERY)).goals
+    (one, *_) = load_targets(CONFIGS / "controlled.yaml", list(THIRD_PARTY_INTEGRATORS), list(SOLVER_TABLE)).goals
     cases = {(2.1, ""): False, (2.0, ""): True, (0.3, ""): False, (0.3, "unstable"): True}
     for (part, note), holds in cases.items():
-        assert Met(one, 9, error=part * one.error, seconds=1.0, other_seconds=1.0, note=note).holds == holds
-    assert not Met(one, 9, error=one.error, seconds=1.6, other_seconds=1.0).holds
+        assert (
+            TargetResult(one, 9, error=part * one.error, seconds=1.0, baseline_seconds=1.0, note=note).is_met == holds
+        )
+    assert not TargetResult(one, 9, error=one.error, seconds=1.6, baseline_seconds=1.0).is_met

@@ -9,43 +9,45 @@ from matplotlib.image import imread
 from typer.testing import CliRunner
 
 from harness.cli import app
-from harness.report.history import StoredResult, changes, history, stored_files
-from tests.gate_results import series, write
+from harness.report.history import BenchmarkPoint, detect_changes, find_stored_files, read_histories
+from tests.gate_results import build_ratio_series, write_benchmark_files
 
 
-def points(values: Any) -> list[StoredResult]:
-    return [StoredResult(f"{k:07x}", float(v), float(v) * 0.985, float(v) * 1.015) for k, v in enumerate(values)]
+def points(values: Any) -> list[BenchmarkPoint]:
+    return [BenchmarkPoint(f"{k:07x}", float(v), float(v) * 0.985, float(v) * 1.015) for k, v in enumerate(values)]
 
 
 def test_a_step_of_five_percent_in_noise_of_one_is_found_within_a_commit_of_where_it_is():
-    found = [changes(points(series(seed, 30, (18, 1.05)))) for seed in range(100)]
+    found = [detect_changes(points(build_ratio_series(seed, 30, (18, 1.05)))) for seed in range(100)]
     hits = [starts for starts in found if len(starts) == 2 and abs(starts[1] - 18) <= 1]
     assert len(hits) >= 95
 
 
 def test_noise_alone_seldom_looks_like_a_change_and_an_outlier_never_does_where_there_is_none():
-    alarms = sum(len(changes(points(series(seed, 30)))) > 1 for seed in range(200))
+    alarms = sum(len(detect_changes(points(build_ratio_series(seed, 30)))) > 1 for seed in range(200))
     assert alarms <= 4
     lone = np.ones(30)
     lone[12] = 1.03
-    assert changes(points(lone)) == (0,)
+    assert detect_changes(points(lone)) == (0,)
 
 
 def test_changes_are_told_by_commit_with_their_size_the_largest_first(tmp_path: Path):
-    gates = {"test_same": series(1, 24), "test_slower": series(2, 24, (8, 1.1), (16, 0.8))}
-    found = history(stored_files([write(tmp_path / "bench", gates)]))
-    assert [one.gate for one in found] == ["test_slower", "test_same"]
+    gates = {"test_same": build_ratio_series(1, 24), "test_slower": build_ratio_series(2, 24, (8, 1.1), (16, 0.8))}
+    found = read_histories(find_stored_files([write_benchmark_files(tmp_path / "bench", gates)]))
+    assert [one.benchmark_name for one in found] == ["test_slower", "test_same"]
     assert [point.commit for point in found[0].points] == [f"{k:07x}" for k in range(24)]
-    (first, up), (second, down) = found[0].changes
+    (first, up), (second, down) = found[0].level_changes
     assert (first, second) == (8, 16)
     assert (up, down) == pytest.approx((1.1, 0.8), abs=0.02)  # the means of eight results each, with noise of 1 %
-    assert found[1].changes == []
+    assert found[1].level_changes == []
 
 
 @pytest.mark.parametrize("ratio", [True, False], ids=["ratios", "least times"])
 def test_the_command_tells_them_and_draws_a_picture(tmp_path: Path, ratio: bool):
-    folder = write(
-        tmp_path / "bench", {"test_slower": series(2, 12, (6, 1.2)), "test_same": series(3, 12)}, ratio=ratio
+    folder = write_benchmark_files(
+        tmp_path / "bench",
+        {"test_slower": build_ratio_series(2, 12, (6, 1.2)), "test_same": build_ratio_series(3, 12)},
+        is_ratio=ratio,
     )
     told = CliRunner().invoke(app, ["history", str(folder), "-o", str(tmp_path / "history.png")])
     assert told.exit_code == 0, told.output
@@ -54,7 +56,7 @@ def test_the_command_tells_them_and_draws_a_picture(tmp_path: Path, ratio: bool)
 
 
 def test_too_little_is_said_to_be_so_and_is_no_answer(tmp_path: Path):
-    folder = write(tmp_path / "bench", {"test_slower": series(2, 5, (3, 2.0))})
+    folder = write_benchmark_files(tmp_path / "bench", {"test_slower": build_ratio_series(2, 5, (3, 2.0))})
     told = CliRunner().invoke(app, ["history", str(folder), "-o", str(tmp_path / "history.png")])
     assert told.exit_code == 3
     assert "at most 5 results of a gate, wanted 6; `pytest tests/bench" in " ".join(told.output.split())

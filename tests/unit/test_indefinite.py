@@ -9,19 +9,26 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from solvers.core.definite import RULES, Clamped, Close, Indefinite, Progressive, Trusted
-from solvers.core.descent import Metric, Point
-from solvers.core.eigenvalues import Filtering
-from solvers.core.fixed_objective import Objective
+from solvers.core.definite import (
+    REGULARISATION_RULES,
+    ClampRule,
+    ContactScheduleRule,
+    IndefiniteStrategy,
+    ProgressiveRule,
+    TrustRegionRule,
+)
+from solvers.core.descent import DescentPoint, ResidualMetric
+from solvers.core.eigenvalues import PsdProjection
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
 from solvers.energies.springs import Springs
-from solvers.methods.newton import Newton
-from solvers.problem import Pins, StepProblem, StopRule, Unsupported
-from tests.effects import SCENES, stepped
-from tests.scenes import cloth, first_problem
-from tests.self_contacts import touching
+from solvers.methods.newton import NewtonSolver
+from solvers.problem import DirichletPins, StepProblem, StopRule, Unsupported
+from tests.effects import EFFECT_SCENES, build_moving_problem
+from tests.scenes import build_cloth, build_first_problem
+from tests.self_contacts import build_touching_sheets
 
-OTHERS = [name for name in get_args(Indefinite) if name != "graded"]
+OTHERS = [name for name in get_args(IndefiniteStrategy) if name != "graded"]
 others = pytest.mark.parametrize("rule", OTHERS)
 
 FILTERS = {"clamp": lambda x: np.maximum(x, 0.0), "absolute": np.abs}
@@ -33,15 +40,21 @@ FIRST, SECOND = 0.4, 0.1
 
 def compressed() -> StepProblem:
     """Two springs of 1 N/m along x, each from a vertex that is held to one that is free, k dt^2/m = 1/10."""
-    given = first_problem(cloth(2, "exact"))
+    given = build_first_problem(build_cloth(2, "exact"))
     edges = np.array([[0, 1], [2, 3]])
     springs = Springs(edges, np.ones(2), np.ones(2), np.tile([1.0, 0.0, 0.0], (2, 1)))
     p = np.zeros((4, 3))
     p[:, 0] = [0.0, FIRST, 5.0, 5.0 + SECOND]
-    pins = Pins(np.array([0, 2]), np.full(2, np.inf))
+    pins = DirichletPins(np.array([0, 2]), np.full(2, np.inf))
     system = replace(given.system, mass=np.full(4, 10.0), time_step=1.0, energies=(springs,), pins=pins)
     return replace(
-        given, system=system, target=p, force=np.zeros_like(p), current=p, first_guess=p, pin_targets=p[[0, 2]]
+        given,
+        system=system,
+        inertial_target=p,
+        external_force=np.zeros_like(p),
+        current_positions=p,
+        initial_guess=p,
+        pin_targets=p[[0, 2]],
     )
 
 
@@ -49,10 +62,10 @@ def lateral(length: float) -> float:
     return 1.0 - 1.0 / length
 
 
-def begun(given: StepProblem) -> tuple[StepObjective, Point, np.ndarray]:
-    step = StepObjective(Objective(given.system), given)
-    p = step.placed(given.first_guess)
-    return step, Point(p, step.gradient(p)), np.repeat(Metric(given.system).diagonal, 3)
+def begun(given: StepProblem) -> tuple[StepObjective, DescentPoint, np.ndarray]:
+    step = StepObjective(FixedObjective(given.system), given)
+    p = step.apply_exact_pins(given.initial_guess)
+    return step, DescentPoint(p, step.gradient(p)), np.repeat(ResidualMetric(given.system).free_diagonal, 3)
 
 
 def curvatures(hessian) -> list[float]:
@@ -66,7 +79,7 @@ def curvatures(hessian) -> list[float]:
 def test_a_spring_keeps_its_stiffness_and_its_lateral_part_is_filtered(name):
     step, at, diagonal = begun(compressed())
     hessian = step.hessian(at.positions)
-    assert RULES[name]().factorised(hessian, at, diagonal) == 1
+    assert REGULARISATION_RULES[name]().factorise_hessian(hessian, at, diagonal) == 1
     wanted = [10.0 + FILTERS[name](lateral(length)) for length in (FIRST, SECOND)]
     np.testing.assert_allclose(curvatures(hessian), wanted, rtol=1e-12)
     along = np.zeros((4, 3))
@@ -80,21 +93,21 @@ def test_a_block_is_filtered_in_its_own_axes(name):
     known = np.array([[3.0, -2.0, 0.5], [1.0, 2.0, 3.0]])
     whole = np.einsum("ij,mj,kj->mik", axes, known, axes)
     packed = whole[:, *np.triu_indices(3)]
-    by = Filtering(absolute=name == "absolute")
-    out = by.packed(np.array([[0], [1]]), packed)
+    by = PsdProjection(use_absolute=name == "absolute")
+    out = by.project_packed(np.array([[0], [1]]), packed)
     wanted = np.einsum("ij,mj,kj->mik", axes, FILTERS[name](known), axes)
     np.testing.assert_allclose(out[0], wanted[0][np.triu_indices(3)], atol=1e-14)
     np.testing.assert_array_equal(out[1], packed[1])
-    assert (by.looked, by.changed) == (2, 1)
+    assert (by.num_examined, by.num_projected) == (2, 1)
 
 
 @filters
 def test_pairs_of_surfaces_are_filtered_so_too(name):
-    energy, p, _ = touching()
-    exact = energy.blocks(p)
+    energy, p, _ = build_touching_sheets()
+    exact = energy.hessian_blocks(p)
     size = np.linalg.eigvalsh(exact.values)
     assert size.min() < -1e-3 * size.max()
-    found = Filtering(absolute=name == "absolute").pairs(exact)
+    found = PsdProjection(use_absolute=name == "absolute").project_pairs(exact)
     wanted = np.sort(FILTERS[name](size), axis=1)
     np.testing.assert_allclose(np.linalg.eigvalsh(found.values), wanted, atol=1e-12 * size.max())
 
@@ -103,24 +116,24 @@ def test_the_trust_region_takes_absolute_values_until_the_model_is_right():
     """Absolute values first; clamped after a step that the quadratic model foretold within 1 %, and only then."""
     given = compressed()
     step, at, _ = begun(given)
-    hessian, rule = step.hessian(at.positions), Trusted()
-    assert rule.absolute
+    hessian, rule = step.hessian(at.positions), TrustRegionRule()
+    assert rule.use_absolute
     for by, absolute in ((1e-6, False), (0.5, True), (1e-6, False)):
         q = at.positions.copy()
         q[3, 1] += by
-        along = replace(given, force=np.where(q > at.positions, 1.0, 0.0))
-        stated = StepObjective(Objective(given.system), along)
-        here = Point(at.positions, stated.gradient(at.positions))
-        rule.took(stated, hessian, here, Point(q, here.gradient))
-        assert rule.absolute is absolute
+        along = replace(given, external_force=np.where(q > at.positions, 1.0, 0.0))
+        stated = StepObjective(FixedObjective(given.system), along)
+        here = DescentPoint(at.positions, stated.gradient(at.positions))
+        rule.record_step(stated, hessian, here, DescentPoint(q, here.gradient))
+        assert rule.use_absolute is absolute
 
 
 def test_progressive_projection_leaves_a_definite_hessian_as_it_is():
     step, at, diagonal = begun(compressed())
-    rule = Progressive()
+    rule = ProgressiveRule()
     hessian = step.hessian(at.positions)
-    assert rule.factorised(hessian, at, diagonal) == 0
-    assert (rule.looked, rule.changed) == (0, 0)
+    assert rule.factorise_hessian(hessian, at, diagonal) == 0
+    assert (rule.num_examined, rule.num_projected) == (0, 0)
     np.testing.assert_allclose(curvatures(hessian), [10.0 + lateral(x) for x in (FIRST, SECOND)], rtol=1e-12)
 
 
@@ -130,29 +143,33 @@ def test_progressive_projection_takes_the_elements_where_the_gradient_is_largest
     given = compressed()
     system = replace(given.system, mass=np.full(4, 2.0))
     step, at, diagonal = begun(replace(given, system=system))
-    hessian, rule = step.hessian(at.positions), Progressive()
+    hessian, rule = step.hessian(at.positions), ProgressiveRule()
     force = at.gradient.copy()
     force[1] *= 0.1
-    assert rule.factorised(hessian, at._replace(gradient=force), diagonal) == 1
+    assert rule.factorise_hessian(hessian, at._replace(gradient=force), diagonal) == 1
     np.testing.assert_allclose(curvatures(hessian), [2.0 + lateral(FIRST), 2.0], rtol=1e-12)
-    assert (rule.looked, rule.changed) == (1, 1)
-    everywhere = Clamped()
-    everywhere.factorised(hessian, at, diagonal)
-    assert everywhere.changed == 2
+    assert (rule.num_examined, rule.num_projected) == (1, 1)
+    everywhere = ClampRule()
+    everywhere.factorise_hessian(hessian, at, diagonal)
+    assert everywhere.num_projected == 2
 
 
 @others
 @pytest.mark.parametrize("name", ["springs", "all that are projective", "contact"])
 def test_all_rules_descend_to_the_same_certified_minimum(rule, name):
-    given = first_problem(cloth(8, "exact", stretch=1e4)) if name == "springs" else stepped(SCENES[name]())
-    wanted = Newton().prepare(given.system).solve(given, StopRule(300, 1e-11))
-    prepared = Newton(rule).prepare(given.system)
+    given = (
+        build_first_problem(build_cloth(8, "exact", stretch=1e4))
+        if name == "springs"
+        else build_moving_problem(EFFECT_SCENES[name]())
+    )
+    wanted = NewtonSolver().prepare(given.system).solve(given, StopRule(300, 1e-11))
+    prepared = NewtonSolver(rule).prepare(given.system)
     found = prepared.solve(given, StopRule(300, 1e-11))
-    assert found.stopped in ("tolerance", "floor", "stalled")
+    assert found.termination_reason in ("tolerance", "floor", "stalled")
     size = np.ptp(wanted.positions, axis=0).max()
     np.testing.assert_allclose(found.positions, wanted.positions, atol=1e-9 * size)
-    _, at, _ = begun(replace(given, first_guess=found.positions))
-    assert prepared.method.certifies(StepObjective(Objective(given.system), given), at)
+    _, at, _ = begun(replace(given, initial_guess=found.positions))
+    assert prepared.method.can_terminate(StepObjective(FixedObjective(given.system), given), at)
 
 
 @others
@@ -161,11 +178,11 @@ def test_all_rules_leave_a_saddle(rule):
     given = compressed()
     system = replace(given.system, mass=np.full(4, 0.1))
     _, at, _ = begun(replace(given, system=system))
-    given = replace(given, system=system, force=at.gradient)
-    start = StepObjective(Objective(system), given)
+    given = replace(given, system=system, external_force=at.gradient)
+    start = StepObjective(FixedObjective(system), given)
     assert not start.gradient(at.positions).any()
-    found = Newton(rule).prepare(system).solve(given, StopRule(300, 1e-10))
-    p, free = found.positions, system.free
+    found = NewtonSolver(rule).prepare(system).solve(given, StopRule(300, 1e-10))
+    p, free = found.positions, system.free_vertices
     assert given.value(p) < given.value(at.positions)
     (springs,) = system.energies
     hessian = springs.hessian(p).toarray()
@@ -175,17 +192,17 @@ def test_all_rules_leave_a_saddle(rule):
 
 @others
 def test_energies_without_elements_are_refused_by_name(rule):
-    made = SCENES["gas"]()
+    made = EFFECT_SCENES["gas"]()
     with pytest.raises(Unsupported, match=f"newton, indefinite: {rule}: .*none of Gas; take indefinite: graded"):
-        Newton(rule).prepare(made.system)
+        NewtonSolver(rule).prepare(made.system)
 
 
 def test_where_pairs_touch_a_hessian_becomes_exact_by_and_by():
     step, at, diagonal = begun(compressed())
-    rule, levels = Close(), list[int | None]()
+    rule, levels = ContactScheduleRule(), list[int | None]()
     for length in (0.05, 0.06, *[FIRST] * 4):
         p = at.positions.copy()
         p[3, 0] = p[2, 0] + length
-        levels.append(rule.factorised(step.hessian(p), at._replace(positions=p), diagonal))
+        levels.append(rule.factorise_hessian(step.hessian(p), at._replace(positions=p), diagonal))
     # Inertia of 10 N/m holds a half of -19 N/m, six tenths of -15.7, and all of -1.5.
     assert levels == [5, 4, 3, 2, 1, 0]

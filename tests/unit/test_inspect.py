@@ -16,30 +16,30 @@ import pyvista as pv
 from rich.console import Console
 
 from harness.base.errors import InputError, RunFailed
-from harness.record.cells import cell
-from harness.record.compare import Look, side_by_side
+from harness.record.cells import read_cell
+from harness.record.compare import LineStyle, write_side_by_side
 from harness.record.reader import open_recording, read_replay
 from harness.report import inspect as module
-from harness.report.inspect import find_recordings, inspect, view
-from harness.scenes.mesh.files import File
-from tests.recordings import MESHES, info, record, waving
+from harness.report.inspect import find_recordings, inspect_recordings, view_recordings
+from harness.scenes.mesh.files import FileMesh
+from tests.recordings import MESHES_BY_KIND, build_recording_info, generate_waves, write_recording
 
 
 @pytest.fixture
 def cloth(tmp_path: Path) -> Path:
-    return record(tmp_path / "cloth.rrd")
+    return write_recording(tmp_path / "cloth.rrd")
 
 
 @pytest.fixture
 def chain(tmp_path: Path) -> Path:
-    return record(tmp_path / "chain.rrd", info("chain"))
+    return write_recording(tmp_path / "chain.rrd", build_recording_info("chain"))
 
 
 def printed(*paths: Path, **options: Any) -> str:
     """What an inspection prints, white space made one blank."""
     out = io.StringIO()
     asked = {"frame": None, "export": None, "csv": None, **options}
-    inspect(list(paths), **asked, console=Console(file=out, width=200))
+    inspect_recordings(list(paths), **asked, console=Console(file=out, width=200))
     return " ".join(out.getvalue().split())
 
 
@@ -84,24 +84,26 @@ def test_a_frame_is_exported_as_a_surface(suffix: str, cloth: Path, tmp_path: Pa
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".stl", ".vtk", ".vtp"])
 def test_a_frame_far_from_zero_is_exported_in_double_precision_or_not_at_all(suffix: str, tmp_path: Path):
-    mesh = MESHES["cloth"]
-    of = replace(info(), mesh=replace(mesh, rest=mesh.rest + np.array([32e6, 0.0, 0.0])))
-    path, target = record(tmp_path / "a.rrd", of, count=3), tmp_path / f"mesh{suffix}"
+    mesh = MESHES_BY_KIND["cloth"]
+    of = replace(
+        build_recording_info(), mesh=replace(mesh, rest_positions=mesh.rest_positions + np.array([32e6, 0.0, 0.0]))
+    )
+    path, target = write_recording(tmp_path / "a.rrd", of, frame_count=3), tmp_path / f"mesh{suffix}"
     if suffix in (".ply", ".stl"):
         with pytest.raises(InputError, match=r"moves vertices by up to 1 m this far .* export to \.vtp"):
             printed(path, export=target)
         assert not target.exists()
     else:
         printed(path, export=target)
-        expected = [*waving(of, 3)][-1].positions
+        expected = [*generate_waves(of, 3)][-1].positions
         np.testing.assert_allclose(pv.read(target).points, expected, rtol=0, atol=1e-5)  # .obj: text
 
 
 def test_what_is_exported_is_read_as_a_mesh(cloth: Path, chain: Path, tmp_path: Path):
     for recording in (cloth, chain):
         printed(recording, export=tmp_path / "mesh.vtp")
-        mesh, replay = File(path=tmp_path / "mesh.vtp").build(), read_replay(recording, [-1])
-        np.testing.assert_array_equal(mesh.rest, replay.positions[0])
+        mesh, replay = FileMesh(path=tmp_path / "mesh.vtp").build_mesh(), read_replay(recording, [-1])
+        np.testing.assert_array_equal(mesh.rest_positions, replay.positions[0])
         np.testing.assert_array_equal(mesh.triangles, replay.triangles)
         if not len(replay.triangles):
             np.testing.assert_array_equal(mesh.springs, replay.springs)
@@ -124,9 +126,9 @@ def test_scalars_are_written_in_long_form(cloth: Path, tmp_path: Path):
 
 
 def test_two_recordings_are_compared_in_metres_and_rest_lengths(cloth: Path, tmp_path: Path):
-    of = info()
-    moved = replace(of.mesh, rest=of.mesh.rest + np.array([0.0, 0.25, 0.0]))
-    other = record(tmp_path / "other.rrd", replace(of, mesh=moved), count=9)
+    of = build_recording_info()
+    moved = replace(of.mesh, rest_positions=of.mesh.rest_positions + np.array([0.0, 0.25, 0.0]))
+    other = write_recording(tmp_path / "other.rrd", replace(of, mesh=moved), frame_count=9)
     text = printed(cloth, other)
     assert "positions in frame 8" in text  # the last that both have
     shift = np.linalg.norm(
@@ -139,19 +141,19 @@ def test_two_recordings_are_compared_in_metres_and_rest_lengths(cloth: Path, tmp
 
 
 def test_two_equal_recordings_do_not_differ(cloth: Path, tmp_path: Path):
-    assert "max 0 0 rms 0 0" in printed(cloth, record(tmp_path / "same.rrd"))
+    assert "max 0 0 rms 0 0" in printed(cloth, write_recording(tmp_path / "same.rrd"))
 
 
 def test_recordings_side_by_side_have_the_longest_scale(tmp_path: Path):
-    short, long = info("chain", strain_range=0.02), info("chain", strain_range=0.4)
-    paths = {"a": record(tmp_path / "a.rrd", short), "b": record(tmp_path / "b.rrd", long)}
-    side_by_side(tmp_path / "both.rrd", paths, "chain 9", dict.fromkeys(paths, Look("#0072b2")))
+    short, long = build_recording_info("chain", strain_range=0.02), build_recording_info("chain", strain_range=0.4)
+    paths = {"a": write_recording(tmp_path / "a.rrd", short), "b": write_recording(tmp_path / "b.rrd", long)}
+    write_side_by_side(tmp_path / "both.rrd", paths, "chain 9", dict.fromkeys(paths, LineStyle("#0072b2")))
     seen: dict[str, list[Any]] = {}
     with open_recording(tmp_path / "both.rrd") as source:
-        for chunk in source.chunks(content="/**", components=["Points3D:colors", "LineStrips3D:colors"]):
+        for chunk in source.iterate_chunks(content="/**", components=["Points3D:colors", "LineStrips3D:colors"]):
             batch = chunk.to_record_batch()
             for name in {"Points3D:colors", "LineStrips3D:colors"} & set(batch.schema.names):
-                rows = [cell(batch, name, k).tolist() for k in range(batch.num_rows)]
+                rows = [read_cell(batch, name, k).tolist() for k in range(batch.num_rows)]
                 seen.setdefault(chunk.entity_path, []).extend(rows)
     for part in ("mesh", "springs"):
         assert seen[f"/1-a/scene/{part}"] == seen[f"/2-b/scene/{part}"], "the same positions have the same colours"
@@ -160,7 +162,7 @@ def test_recordings_side_by_side_have_the_longest_scale(tmp_path: Path):
 def test_recordings_side_by_side_can_be_inspected(cloth: Path, tmp_path: Path):
     both = tmp_path / "both.rrd"
     paths = {"dense": cloth, "sparse": cloth}
-    side_by_side(both, paths, "cloth 6", dict.fromkeys(paths, Look("#0072b2")))
+    write_side_by_side(both, paths, "cloth 6", dict.fromkeys(paths, LineStyle("#0072b2")))
     assert "/1-dense/milliseconds/step 1 6 10.5" in printed(both)
     with pytest.raises(InputError, match="not of one run"):
         printed(both, cloth)
@@ -207,7 +209,7 @@ def test_the_viewer_opens_the_recordings(cloth: Path, monkeypatch: pytest.Monkey
 
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr(module.subprocess, "run", run)
-    view([cloth])
+    view_recordings([cloth])
     ((binary, *files),) = opened
     assert Path(binary).is_file()
     assert files == [str(cloth)]
@@ -218,13 +220,13 @@ def test_the_viewer_says_that_it_needs_a_display(cloth: Path, monkeypatch: pytes
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr(module.sys, "platform", "linux")
     with pytest.raises(RunFailed, match="no display"):
-        view([cloth])
+        view_recordings([cloth])
 
 
 def test_the_viewer_refuses_what_is_no_recording(tmp_path: Path):
     (tmp_path / "a.rrd").write_text("no")
     with pytest.raises(InputError, match="is not a Rerun recording"):
-        view([tmp_path / "a.rrd"])
+        view_recordings([tmp_path / "a.rrd"])
 
 
 def test_a_folder_stands_for_the_recordings_below_it(cloth: Path, chain: Path):

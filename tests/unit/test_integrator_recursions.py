@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from harness.scenes.bind import Scene
-from harness.scenes.effects.constant_force import ConstantForce
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
-from harness.simulation.step import State, prepare, simulate, start
-from solvers.integrators import INTEGRATORS, GeneralisedAlpha, Motion, RungeKutta, Solved
-from solvers.methods.newton import Newton
+from harness.scenes.effects.constant_force import ConstantForceEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.simulation.step import MotionState, build_initial_state, prepare, simulate_scene
+from solvers.integrators import INTEGRATORS, GeneralisedAlpha, Motion, RungeKutta, StageSolution
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import StopRule
-from tests.scenes import scene
+from tests.scenes import build_test_scene
 
 DT, STEPS = 1 / 30, 25
 CONVERGED = StopRule(100, 1e-14)
@@ -33,14 +33,20 @@ TABLEAUX = [name for name, method in INTEGRATORS.items() if isinstance(method, R
 def by(made: Scene, name: str) -> Scene:
     """The scene by another integrator."""
     method = INTEGRATORS[name]
-    return replace(made, integrator=method, system=replace(made.system, factor=method.factor, speed=method.speed))
+    return replace(
+        made,
+        integrator=method,
+        system=replace(made.system, inertia_factor=method.inertia_factor, velocity_factor=method.velocity_factor),
+    )
 
 
-def motions(made: Scene, state: State | None = None) -> list[Motion]:
+def motions(made: Scene, state: MotionState | None = None) -> list[Motion]:
     """The motions at the start and after each step."""
-    state = state or start(made)
-    steps = simulate(made, prepare(made, Newton()), CONVERGED, first_guess="current", frames=STEPS, state=state)
-    return [state.now, *(step.state.now for step in steps)]
+    state = state or build_initial_state(made)
+    steps = simulate_scene(
+        made, prepare(made, NewtonSolver()), CONVERGED, initial_guess="current", frames=STEPS, initial_state=state
+    )
+    return [state.motion, *(step.state.motion for step in steps)]
 
 
 # What a method's recursion adds to a t^2/2 after n steps, in units of a dt^2/2: implicit Euler takes each velocity from
@@ -51,15 +57,15 @@ LATE = {"implicit-euler": lambda n: n, "bdf2": lambda n: 1.5 * (1.0 - 3.0**-n)}
 @integrators
 def test_free_flight_follows_the_methods_own_parabola(name):
     push, mass, velocity = np.array([3.0, -1.0, 0.5]), 2.0, (1.0, 2.0, -0.5)
-    force = ConstantForce.model_validate({"force": tuple(push)})
-    made = by(scene(Chain(), force, size=2, mass=mass, velocity=velocity), name)
+    force = ConstantForceEffect.model_validate({"force": tuple(push)})
+    made = by(build_test_scene(ChainMesh(), force, size=2, mass=mass, velocity=velocity), name)
     n = np.arange(STEPS + 1.0)[:, None]
     a = 2.0 * push / mass  # on each of the two vertices
     positions = np.array([p[0] for p, _ in motions(made)])
     wanted = n * DT * np.array(velocity) + 0.5 * a * DT**2 * (n**2 + LATE.get(name, lambda n: 0.0 * n)(n))
     # A few roundings of positions of one metre in each step; weights of tableaux, of up to 8, add up some tens of them.
     more = 100.0 if name in TABLEAUX else 1.0
-    np.testing.assert_allclose(positions, made.mesh.rest[0] + wanted, rtol=0, atol=more * 1e-13)
+    np.testing.assert_allclose(positions, made.mesh.rest_positions[0] + wanted, rtol=0, atol=more * 1e-13)
     speeds = np.array([v[0] for _, v in motions(made)])
     np.testing.assert_allclose(speeds, np.array(velocity) + n * DT * a, rtol=0, atol=more * 1e-11)  # the same over dt
 
@@ -88,8 +94,8 @@ def powers(name: str, z: complex) -> np.ndarray:
 def test_a_mass_on_a_spring_turns_by_the_methods_own_powers(name, stiffness):
     """Along its axis the spring is linear, and w = v + i omega u turns as w' = i omega w."""
     speed, omega = 0.3, np.sqrt(stiffness)
-    springs, pins = Springs(rule="fixed", stretch=stiffness), Pins(at=("first",), weight="exact")
-    made = by(scene(Chain(), springs, pins, size=2, mass=2.0, velocity=(speed, 0.0, 0.0)), name)
+    springs, pins = SpringsEffect(rule="fixed", stretch=stiffness), PinsEffect(at=("first",), weight="exact")
+    made = by(build_test_scene(ChainMesh(), springs, pins, size=2, mass=2.0, velocity=(speed, 0.0, 0.0)), name)
     found = motions(made)
     w = speed * powers(name, 1j * omega * DT)
     # Round-off of positions of one metre, which the spring makes a speed by its frequency; more as above.
@@ -101,9 +107,12 @@ def test_a_mass_on_a_spring_turns_by_the_methods_own_powers(name, stiffness):
 def orbit(name: str, time_step: float) -> np.ndarray:
     """The angular momenta of a mass that circles a pin on a spring of no rest length, which is linear."""
     omega = 4.0
-    pins, springs = Pins(at=("first",), weight="exact"), Springs(rule="fixed", stretch=omega**2)
-    made = by(scene(Chain(), springs, pins, size=2, mass=2.0, time_step=time_step, velocity=(0.0, omega, 0.0)), name)
-    linear = replace(made.springs, rest_length=np.zeros(1))
+    pins, springs = PinsEffect(at=("first",), weight="exact"), SpringsEffect(rule="fixed", stretch=omega**2)
+    made = by(
+        build_test_scene(ChainMesh(), springs, pins, size=2, mass=2.0, time_step=time_step, velocity=(0.0, omega, 0.0)),
+        name,
+    )
+    linear = replace(made.all_springs, rest_length=np.zeros(1))
     made = replace(made, system=replace(made.system, energies=(linear,)))
     return np.array([np.cross(p[1], v[1])[2] for p, v in motions(made)])
 
@@ -127,13 +136,13 @@ def test_an_orbit_decays_by_the_methods_damping(name, power):
 
 
 def test_bdf2_starts_with_a_step_of_implicit_euler():
-    made = scene(Chain(), Springs(stretch=10.0), size=4, velocity=(0.0, 1.0, 0.0))
+    made = build_test_scene(ChainMesh(), SpringsEffect(stretch=10.0), size=4, velocity=(0.0, 1.0, 0.0))
     first, second = (
-        list(islice(simulate(m, prepare(m, Newton()), CONVERGED, first_guess="current", frames=2), 2))
+        list(islice(simulate_scene(m, prepare(m, NewtonSolver()), CONVERGED, initial_guess="current", frames=2), 2))
         for m in (made, by(made, "bdf2"))
     )
     np.testing.assert_array_equal(first[0].positions, second[0].positions)
-    assert [step.problem.system.factor for step in second] == [1.0, 2.25]
+    assert [step.problem.system.inertia_factor for step in second] == [1.0, 2.25]
 
 
 @pytest.mark.parametrize("name", ["implicit-euler", "bdf2", "midpoint"])
@@ -142,17 +151,17 @@ def test_the_unknown_moves_with_the_velocity_of_the_start(name):
     method: Any = INTEGRATORS[name]
     v = np.array([[1.0, -2.0, 0.5]])
     now, before = Motion(DT * v, v), Motion(0.0 * v, v)
-    target, origin = method.predict(now, before, DT)
-    np.testing.assert_allclose(target, (1.0 + method.when) * DT * v, rtol=1e-14)
-    np.testing.assert_allclose(method.factor**0.5 / DT * (target - origin), v, rtol=1e-13)
+    target, origin = method.predict_target(now, before, DT)
+    np.testing.assert_allclose(target, (1.0 + method.stage_fraction) * DT * v, rtol=1e-14)
+    np.testing.assert_allclose(method.inertia_factor**0.5 / DT * (target - origin), v, rtol=1e-13)
 
 
 @pytest.mark.parametrize("name", TABLEAUX)
 def test_a_spring_far_too_stiff_for_the_step_is_at_rest_after_one(name):
     """L-stability: R(z) falls as 1/z, here with |z| = 1e4, on a spring of no rest length, which is linear."""
-    springs, pins = Springs(rule="fixed", stretch=(1e4 / DT) ** 2), Pins(at=("first",), weight="exact")
-    made = by(scene(Chain(), springs, pins, size=2, mass=2.0), name)
-    linear = replace(made.springs, rest_length=np.zeros(1))
+    springs, pins = SpringsEffect(rule="fixed", stretch=(1e4 / DT) ** 2), PinsEffect(at=("first",), weight="exact")
+    made = by(build_test_scene(ChainMesh(), springs, pins, size=2, mass=2.0), name)
+    linear = replace(made.all_springs, rest_length=np.zeros(1))
     made = replace(made, system=replace(made.system, energies=(linear,)))
     assert max(abs(p[1, 0]) for p, _ in motions(made)[1:]) < 0.01  # of the one metre at the start
 
@@ -165,11 +174,11 @@ def test_generalised_alpha_damps_the_highest_frequencies_by_its_spectral_radius(
     columns = []
     for d, v, a in np.eye(3):
         one = [np.full((1, 3), x) for x in (d, v, a)]
-        step = method.step(Motion(one[0], one[1]), one[2], 1.0)
+        step = method.iterate_stages(Motion(one[0], one[1]), one[2], 1.0)
         unknown = next(step)
-        x = unknown.target * method.factor / (method.factor + size)  # c (x - target) = -z^2 x
+        x = unknown.target * method.inertia_factor / (method.inertia_factor + size)  # c (x - target) = -z^2 x
         with pytest.raises(StopIteration) as ended:
-            step.send(Solved(x, x, method.factor * (x - unknown.target)))
+            step.send(StageSolution(x, x, method.inertia_factor * (x - unknown.target)))
         (p, w), b, _ = ended.value.value
         columns.append([p[0, 0], w[0, 0], b[0, 0]])
     powers = np.abs(np.linalg.eigvals(np.transpose(columns)))
@@ -189,7 +198,7 @@ def test_a_tableau_meets_the_conditions_of_its_order(name):
         [(c**2, 3), (A @ c, 6)],
         [(c**3, 4), (c * (A @ c), 8), (A @ c**2, 12), (A @ A @ c, 24)],
     ]
-    for weights, order in [(A[-1], method.order), (np.array(method.lower), method.embedded)]:
+    for weights, order in [(A[-1], method.order), (np.array(method.embedded_weights), method.embedded_order)]:
         missed = [max(abs(weights @ tree - 1 / gamma) for tree, gamma in level) for level in trees] if order else []
         assert all(error < 1e-14 for error in missed[:order])
         assert all(error > 1e-4 for error in missed[order : order + 1])
@@ -197,6 +206,6 @@ def test_a_tableau_meets_the_conditions_of_its_order(name):
 
 @integrators
 def test_the_same_steps_give_the_same_bits(name):
-    made = by(scene(Chain(), Springs(stretch=10.0), size=4, velocity=(0.0, 1.0, 0.0)), name)
+    made = by(build_test_scene(ChainMesh(), SpringsEffect(stretch=10.0), size=4, velocity=(0.0, 1.0, 0.0)), name)
     one, two = motions(made), motions(made)
     np.testing.assert_array_equal(np.array(one), np.array(two))

@@ -9,23 +9,25 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs as SpringsEffect
-from harness.scenes.mesh.solids import Block
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect as SpringsEffect
+from harness.scenes.mesh.solids import BlockMesh
 from solvers import memory
 from solvers.energies.springs import Springs
-from solvers.kernels.jgs2 import PatchScratch, directions
-from solvers.methods.jgs2 import Jgs2, answering
-from solvers.methods.newton import Newton
+from solvers.kernels.jgs2 import PatchScratch, compute_directions
+from solvers.methods.jgs2 import Jgs2, compute_responses
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import Positions, StepProblem, StopRule, Unsupported
-from tests.effects import SCENES, stepped
-from tests.scenes import cloth, first_problem, scene
+from tests.effects import EFFECT_SCENES, build_moving_problem
+from tests.scenes import build_cloth, build_first_problem, build_test_scene
 
-HANGING = first_problem(cloth(8, "exact", stretch=1000.0))
-PINS = Pins.model_validate({"at": ["left"], "weight": "exact"})
-BEAM = first_problem(
-    scene(Block(height=0.4, depth=0.4), SpringsEffect(stretch=1e5), Gravity(), PINS, size=5, mass=50.0)
+HANGING = build_first_problem(build_cloth(8, "exact", stretch=1000.0))
+PINS = PinsEffect.model_validate({"at": ["left"], "weight": "exact"})
+BEAM = build_first_problem(
+    build_test_scene(
+        BlockMesh(height=0.4, depth=0.4), SpringsEffect(stretch=1e5), GravityEffect(), PINS, size=5, mass=50.0
+    )
 )
 
 
@@ -50,10 +52,14 @@ def rotations(count: int) -> np.ndarray:
 def test_a_vertex_takes_the_best_step_along_its_turned_response(rings):
     graph, f = chain(6), 6
     H, now, R = positive_definite(graph, 3), positive_definite(graph, 4), rotations(f)
-    patches, g, out = answering(csr_array(H), graph, rings), np.random.default_rng(2).normal(size=18), np.empty((f, 3))
+    patches, g, out = (
+        compute_responses(csr_array(H), graph, rings),
+        np.random.default_rng(2).normal(size=18),
+        np.empty((f, 3)),
+    )
     blocks = now.reshape(f, 3, f, 3).transpose(0, 2, 1, 3)[graph.toarray() > 0.0]
     pointers, columns = graph.indptr.astype(np.int64), graph.indices.astype(np.int64)
-    directions(patches, R, pointers, columns, blocks, g.reshape(f, 3), PatchScratch.of(patches), out)
+    compute_directions(patches, R, pointers, columns, blocks, g.reshape(f, 3), PatchScratch.from_patches(patches), out)
     turn = np.zeros((18, 18))
     for i in range(f):
         turn[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = R[i]
@@ -67,10 +73,10 @@ def test_a_vertex_takes_the_best_step_along_its_turned_response(rings):
 
 
 def test_what_answers_from_the_whole_mesh_to_a_quadratic_objective_is_newtons_step():
-    springs = Springs.joined([e for e in HANGING.system.energies if isinstance(e, Springs)])
+    springs = Springs.from_parts([e for e in HANGING.system.energies if isinstance(e, Springs)])
     soft = replace(springs, rest_length=np.zeros(len(springs.edges)))
     problem = replace(HANGING, system=replace(HANGING.system, energies=(soft,)))
-    wanted = Newton().prepare(problem.system).solve(problem, StopRule(5, 1e-12)).positions
+    wanted = NewtonSolver().prepare(problem.system).solve(problem, StopRule(5, 1e-12)).positions
     np.testing.assert_allclose(first(Jgs2(rings=8), problem), wanted, rtol=0, atol=1e-10)
 
 
@@ -88,9 +94,9 @@ def test_responses_turn_with_the_mesh():
 
 def test_on_a_solid_at_small_displacements_it_converges_as_newtons_method_does():
     none, two, whole = (
-        Jgs2(rings, 0.001).prepare(BEAM.system).solve(BEAM, StopRule(5000, 1e-3)).iterations for rings in (0, 2, 8)
+        Jgs2(rings, 0.001).prepare(BEAM.system).solve(BEAM, StopRule(5000, 1e-3)).num_iterations for rings in (0, 2, 8)
     )
-    newton = Newton().prepare(BEAM.system).solve(BEAM, StopRule(50, 1e-3)).iterations
+    newton = NewtonSolver().prepare(BEAM.system).solve(BEAM, StopRule(50, 1e-3)).num_iterations
     assert none > 10 * two
     assert whole <= newton + 2
 
@@ -98,13 +104,13 @@ def test_on_a_solid_at_small_displacements_it_converges_as_newtons_method_does()
 @pytest.mark.parametrize(("scene", "name"), [("contact", "Contact"), ("gas", "Gas")], ids=lambda x: x)
 def test_what_the_rest_shape_does_not_tell_is_refused_by_name(scene, name):
     with pytest.raises(Unsupported, match=f"jgs2: .*{name}"):
-        Jgs2().prepare(stepped(SCENES[scene]()).system)
+        Jgs2().prepare(build_moving_problem(EFFECT_SCENES[scene]()).system)
 
 
 def test_responses_that_do_not_fit_in_memory_are_refused_beforehand(monkeypatch):
     monkeypatch.setattr(memory, "of_machine", lambda: 5e4)
     with pytest.raises(Unsupported, match=r"within 4 rings .* KiB of memory.*take fewer rings"):
-        answering(csr_array(np.eye(300)), chain(100), 4)
+        compute_responses(csr_array(np.eye(300)), chain(100), 4)
 
 
 @pytest.mark.parametrize(("given", "words"), [({"rings": -1}, "rings"), ({"lateral": 1.5}, "lateral")], ids=str)

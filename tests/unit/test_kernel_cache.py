@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from solvers import caching, sources
-from solvers.compiling import kept
+from solvers.compiling import cached_njit
 
 YEAR_2001 = 1e9
 """Seconds since 1970."""
@@ -148,15 +148,15 @@ def imported(path: Path) -> set[str]:
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             found |= {node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)}
-    return {name for name in found if name.split(".")[0] in sources.PACKAGES}
+    return {name for name in found if name.split(".")[0] in sources.PACKAGE_NAMES}
 
 
 def test_every_import_of_the_project_is_followed():
-    for package in sources.PACKAGES:
-        for path in (sources.ROOT / package).rglob("*.py"):
-            reached = sources.reached(str(path))
+    for package in sources.PACKAGE_NAMES:
+        for path in (sources.PROJECT_ROOT / package).rglob("*.py"):
+            reached = sources.find_dependencies(str(path))
             for name in imported(path):
-                place = sources.ROOT.joinpath(*name.split("."))
+                place = sources.PROJECT_ROOT.joinpath(*name.split("."))
                 module = {str(place.with_suffix(".py")), str(place / "__init__.py")}
                 exists = any(os.path.exists(file) for file in module)
                 assert not exists or module & reached, f"{path} imports {name}"
@@ -180,11 +180,11 @@ def test_a_source_from_outside_depends_on_what_lies_beside_it_and_on_the_solvers
     for name, text in OUTSIDE.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
-    found = {Path(path) for path in sources.reached(str(tmp_path / "own.py"))}
+    found = {Path(path) for path in sources.find_dependencies(str(tmp_path / "own.py"))}
     assert {path.relative_to(tmp_path).as_posix() for path in found if tmp_path in path.parents} == (
         OUTSIDE.keys() - {"alien.py"}
     )
-    assert sources.ROOT / "solvers" / "memory.py" in found
+    assert sources.PROJECT_ROOT / "solvers" / "memory.py" in found
 
 
 def twice(x: float) -> float:
@@ -202,11 +202,11 @@ DAMAGES: dict[str, Damage] = {
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
 def test_what_cannot_be_read_is_compiled_and_kept_anew(home: Path, damage: Damage):
-    assert kept()(twice)(1.0) == 2.0
+    assert cached_njit()(twice)(1.0) == 2.0
     (path,) = home.glob("*/*.nbc")
     damage(path)
     for hits in (0, 1):
-        again = kept()(twice)
+        again = cached_njit()(twice)
         assert again(1.0) == 2.0
         assert sum(again.stats.cache_hits.values()) == hits
 
@@ -223,7 +223,7 @@ def test_a_disk_without_room_costs_the_kept_code_alone(home: Path, monkeypatch: 
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(caching, "_write", full)
-    assert kept()(twice)(1.0) == 2.0
+    assert cached_njit()(twice)(1.0) == 2.0
     assert not [*home.glob("*/*")]
 
 
@@ -233,7 +233,7 @@ def test_code_of_other_sources_goes_when_new_comes_and_nobody_has_used_it(home: 
     (home / "another-unused").mkdir()
     for name in (f"{__name__}-unused", "another-unused"):
         os.utime(home / name, (YEAR_2001, YEAR_2001))
-    kept()(twice)(1.0)
+    cached_njit()(twice)(1.0)
     assert {path.name for path in home.iterdir()} >= {f"{__name__}-used", "another-unused"}
     assert not (home / f"{__name__}-unused").exists()
 
@@ -241,8 +241,8 @@ def test_code_of_other_sources_goes_when_new_comes_and_nobody_has_used_it(home: 
 def test_sources_that_cannot_be_written_beside_are_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "__pycache__").write_text("a file, where a folder would have to be")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "users"))
-    monkeypatch.setattr(caching._CONFIG, "CACHE_DIR", "")
-    assert caching._home(str(tmp_path)).is_relative_to(tmp_path / "users")
+    monkeypatch.setattr(caching._NUMBA_CONFIG, "CACHE_DIR", "")
+    assert caching._writable_root(str(tmp_path)).is_relative_to(tmp_path / "users")
 
 
 DIGESTS = """

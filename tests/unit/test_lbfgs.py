@@ -9,22 +9,22 @@ import pytest
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from solvers.core.descent import Metric
-from solvers.matrices import assemble
-from solvers.methods.a_jacobi import Aggregated
+from solvers.core.descent import ResidualMetric
+from solvers.matrices import assemble_system_matrix
+from solvers.methods.a_jacobi import AggregatedSweeps
 from solvers.methods.lbfgs import Lbfgs
 from solvers.problem import Positions, ProjectiveEnergy, StepProblem, StopRule, Unsupported
-from tests.effects import SCENES as EFFECTS
-from tests.scenes import random_problem
+from tests.effects import EFFECT_SCENES as EFFECTS
+from tests.scenes import build_random_problem
 
-PROBLEMS = {"random": lambda: random_problem(4), "larger": lambda: random_problem(8, n=30, m=80)}
+PROBLEMS = {"random": lambda: build_random_problem(4), "larger": lambda: build_random_problem(8, n=30, m=80)}
 
 
 def free_matrix(problem: StepProblem) -> csr_array:
     """Q of the free vertices."""
     system = problem.system
-    Q = assemble(system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)])
-    return csr_array(Q[system.free][:, system.free])
+    Q = assemble_system_matrix(system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)])
+    return csr_array(Q[system.free_vertices][:, system.free_vertices])
 
 
 def two_loops(
@@ -33,10 +33,10 @@ def two_loops(
     """Nocedal and Wright 2006, algorithms 7.4 and 7.5, in NumPy, with steps of full length. inverse: in the place of
     Q^-1, which it is if left out."""
     system = problem.system
-    free = system.free
+    free = system.free_vertices
     inverse = np.linalg.inv(free_matrix(problem).toarray()) if inverse is None else inverse
-    p = problem.first_guess.copy()
-    p[system.pins.vertices[system.pins.exact]] = problem.pin_targets[system.pins.exact]
+    p = problem.initial_guess.copy()
+    p[system.pins.vertices[system.pins.exact_mask]] = problem.pin_targets[system.pins.exact_mask]
     window: list[tuple[Positions, Positions]] = []
     path = []
     gradient = problem.gradient(p)[free]
@@ -74,18 +74,18 @@ def test_iterates_are_those_of_the_two_loop_recursion(name, pairs, linear):
 
 def test_pairs_of_negative_curvature_are_left_out():
     """From one point all springs are compressed, and the Hessian is indefinite for many iterations."""
-    problem = random_problem(5, n=30, m=120)
-    guess = 1e-3 * problem.first_guess
+    problem = build_random_problem(5, n=30, m=120)
+    guess = 1e-3 * problem.initial_guess
     path = [p.copy() for p in islice(Lbfgs().prepare(problem.system).iterates(problem), 400)]
     assert problem.value(path[-1]) < problem.value(guess)
-    begun = np.abs(problem.gradient(problem.current)).max()
+    begun = np.abs(problem.gradient(problem.current_positions)).max()
     assert np.abs(problem.gradient(path[-1])).max() <= 1e-7 * begun  # half of the digits, by the condition of Q
 
 
 @pytest.mark.parametrize("sweeps", [1, 2])
 def test_with_a_sparse_matrix_iterates_are_those_of_the_recursion_with_it(sweeps: int) -> None:
-    problem = random_problem(8, n=30, m=80)
-    S = Aggregated(free_matrix(problem), sweeps).matrix.toarray()
+    problem = build_random_problem(8, n=30, m=80)
+    S = AggregatedSweeps(free_matrix(problem), sweeps).matrix.toarray()
     solver = Lbfgs(3, preconditioner="a-jacobi", sweeps=sweeps)
     wanted = two_loops(problem, 3, 6, S)
     values = [problem.value(p) for p in wanted]
@@ -95,11 +95,11 @@ def test_with_a_sparse_matrix_iterates_are_those_of_the_recursion_with_it(sweeps
 
 
 def test_with_a_sparse_matrix_residuals_are_those_of_q() -> None:
-    problem = random_problem(4)
+    problem = build_random_problem(4)
     solved = Lbfgs(preconditioner="a-jacobi").prepare(problem.system).solve(problem, StopRule(500, 1e-8))
-    assert solved.stopped == "tolerance"
-    assert solved.residual == pytest.approx(Metric(problem.system).residual(problem.gradient(solved.positions)))
-    assert solved.residual <= 1e-8 * solved.yardstick
+    assert solved.termination_reason == "tolerance"
+    assert solved.residual == pytest.approx(ResidualMetric(problem.system).residual(problem.gradient(solved.positions)))
+    assert solved.residual <= 1e-8 * solved.initial_residual
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from harness.cli import app
-from harness.scenes.effects.effect_names import EFFECTS
-from harness.scenes.mesh.mesh_names import MESHES
+from harness.scenes.effects.effect_names import EFFECT_CLASSES
+from harness.scenes.mesh.mesh_names import MESH_CLASSES
 from solvers.integrators import INTEGRATORS
 from solvers.registry import SOLVERS
 
@@ -34,7 +34,7 @@ def test_runs_are_listed_with_the_settings_in_which_they_differ(tmp_path: Path):
 
 def test_everything_that_ships_is_listed_with_a_sentence():
     lines = CliRunner().invoke(app, ["list"]).stdout.splitlines()
-    for table in (SOLVERS, INTEGRATORS, EFFECTS, MESHES):
+    for table in (SOLVERS, INTEGRATORS, EFFECT_CLASSES, MESH_CLASSES):
         for name in table:
             (line,) = [line for line in lines if line.startswith(f"  {name} ")]
             assert line.removeprefix(f"  {name}").strip()

@@ -9,21 +9,29 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from solvers.core.prefactored import only_springs
-from solvers.energies.springs import TINY, Springs
-from solvers.matrices import assemble
+from solvers.core.prefactored import require_only_springs
+from solvers.energies.springs import ZERO_LENGTH, Springs
+from solvers.matrices import assemble_system_matrix
 from solvers.methods import local_global
 from solvers.methods.local_global import DenseLocalGlobal, SparseLocalGlobal
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.problem import NotPositiveDefinite, Pins, Positions, StepProblem, StopRule, System, Unsupported
-from tests.scenes import BACKENDS, SCENES, begun, cloth, first_problem, random_network, random_problem
+from solvers.problem import DirichletPins, NotPositiveDefinite, Positions, StepProblem, StopRule, System, Unsupported
+from tests.scenes import (
+    LOCAL_GLOBAL_BACKENDS,
+    SCENE_BUILDERS,
+    build_cloth,
+    build_first_problem,
+    build_random_network,
+    build_random_problem,
+    build_step_start,
+)
 
 VALUE = 1e-13
 """Round-off of the objective relative to its magnitude: sums of some hundred terms."""
 SOLVE = 1e-9
 """A solve with Q whose condition number, with weights of 1e4 beside stiffnesses of 1, is below 1e6."""
 
-backends = pytest.mark.parametrize("backend", BACKENDS, ids=lambda b: type(b).__name__)
+backends = pytest.mark.parametrize("backend", LOCAL_GLOBAL_BACKENDS, ids=lambda b: type(b).__name__)
 
 
 def iterates(backend, problem: StepProblem, count: int) -> list[Positions]:
@@ -32,21 +40,21 @@ def iterates(backend, problem: StepProblem, count: int) -> list[Positions]:
 
 def collapsed(problem: StepProblem) -> StepProblem:
     """All vertices in one point: no spring has a direction."""
-    return replace(problem, first_guess=np.zeros_like(problem.target))
+    return replace(problem, initial_guess=np.zeros_like(problem.inertial_target))
 
 
 def scattered(problem: StepProblem) -> StepProblem:
-    return replace(problem, first_guess=np.random.default_rng(1).normal(size=problem.target.shape))
+    return replace(problem, initial_guess=np.random.default_rng(1).normal(size=problem.inertial_target.shape))
 
 
 STARTS = {"hanging": lambda problem: problem, "collapsed": collapsed, "scattered": scattered}
 NETWORKS = {
-    "cloth": lambda: first_problem(cloth(12)),
-    "cloth, exact pins": lambda: first_problem(cloth(12, "exact")),
-    "stiff cloth": lambda: first_problem(cloth(12, stretch=1e6)),
-    "block": lambda: first_problem(SCENES["block"](1e10)),
-    "random": lambda: random_problem(0),
-    "random, not pinned": lambda: random_problem(1, weights=()),
+    "cloth": lambda: build_first_problem(build_cloth(12)),
+    "cloth, exact pins": lambda: build_first_problem(build_cloth(12, "exact")),
+    "stiff cloth": lambda: build_first_problem(build_cloth(12, stretch=1e6)),
+    "block": lambda: build_first_problem(SCENE_BUILDERS["block"](1e10)),
+    "random": lambda: build_random_problem(0),
+    "random, not pinned": lambda: build_random_problem(1, weights=()),
 }
 
 
@@ -57,7 +65,7 @@ def test_energy_never_rises(backend, network, start):
     problem = STARTS[start](NETWORKS[network]())
     iterated = iterates(backend, problem, 40)
     for before, after in pairwise(iterated):
-        assert problem.value(after) <= problem.value(before) + VALUE * problem.magnitude(before)
+        assert problem.value(after) <= problem.value(before) + VALUE * problem.value_scale(before)
     assert np.isfinite(iterated[-1]).all()
 
 
@@ -66,48 +74,48 @@ def test_energy_never_rises(backend, network, start):
 @pytest.mark.parametrize("weights", [(), (1e4,), (np.inf,), (1e4, np.inf, 1e2, np.inf)], ids=str)
 def test_an_iteration_is_a_preconditioned_gradient_step_of_length_one(backend, weights, scale):
     """Q^-1 grad g(p) = p - LG(p) over the free vertices, also where springs have no length."""
-    problem = random_problem(2, weights=weights)
+    problem = build_random_problem(2, weights=weights)
     s = problem.system
-    guess = scale * problem.first_guess
-    exact = s.pins.exact
+    guess = scale * problem.initial_guess
+    exact = s.pins.exact_mask
     guess[s.pins.vertices[exact]] = problem.pin_targets[exact]
-    problem = replace(problem, first_guess=guess)
+    problem = replace(problem, initial_guess=guess)
     (after,) = iterates(backend, problem, 1)
-    Q = assemble(s, [only_springs(s, "the test")]).toarray()
-    step = np.linalg.solve(Q[np.ix_(s.free, s.free)], problem.gradient(guess)[s.free])
-    np.testing.assert_allclose((guess - after)[s.free], step, rtol=0, atol=SOLVE * np.abs(step).max())
+    Q = assemble_system_matrix(s, [require_only_springs(s, "the test")]).toarray()
+    step = np.linalg.solve(Q[np.ix_(s.free_vertices, s.free_vertices)], problem.gradient(guess)[s.free_vertices])
+    np.testing.assert_allclose((guess - after)[s.free_vertices], step, rtol=0, atol=SOLVE * np.abs(step).max())
 
 
 @backends
 def test_iterations_end_where_the_gradient_vanishes(backend):
-    problem = random_problem(3)
+    problem = build_random_problem(3)
     p = iterates(backend, problem, 3000)[-1]
-    forces = np.abs(problem.system.mass[:, None] / problem.system.time_step**2 * (p - problem.target)).max()
+    forces = np.abs(problem.system.mass[:, None] / problem.system.time_step**2 * (p - problem.inertial_target)).max()
     assert np.abs(problem.gradient(p)).max() <= 1e-9 * forces  # the first gradient is of the order of `forces`
 
 
 @backends
 def test_every_iterate_moves_the_centre_of_mass_as_the_forces_say(backend):
     """1'A' = 0, so that springs drop out of the sum of all rows of Q p = A'K d + y, converged or not."""
-    problem = random_problem(4, weights=())
+    problem = build_random_problem(4, weights=())
     mass, dt = problem.system.mass, problem.system.time_step
-    wanted = mass @ problem.target + dt**2 * problem.force.sum(axis=0)
+    wanted = mass @ problem.inertial_target + dt**2 * problem.external_force.sum(axis=0)
     for p in iterates(backend, problem, 5):
         np.testing.assert_allclose(mass @ p, wanted, rtol=0, atol=SOLVE * mass.sum())
 
 
 @backends
-@pytest.mark.parametrize("length", [0.0, 1e-170, 0.5 * TINY, 2 * TINY, 1e-100], ids="{:.0e}".format)
+@pytest.mark.parametrize("length", [0.0, 1e-170, 0.5 * ZERO_LENGTH, 2 * ZERO_LENGTH, 1e-100], ids="{:.0e}".format)
 def test_springs_of_almost_no_length_have_the_same_direction_in_every_backend(backend, length):
     rest = np.array([[0.0, 0, 0], [0.0, 2, 0]])
-    springs = Springs.at_rest(rest, np.array([[1, 0]]), np.array([100.0]))
+    springs = Springs.from_rest_shape(rest, np.array([[1, 0]]), np.array([100.0]))
     system = System(np.ones(2), 0.1, (springs,))
     guess = np.array([[0.0, 0, 0], [0.0, 0, length]])
     zero, none = np.zeros((2, 3)), np.empty((0, 3))
-    problem = StepProblem(system, zero, zero, none, zero, guess, begun(system, zero, zero))
+    problem = StepProblem(system, zero, zero, none, zero, guess, build_step_start(system, zero, zero))
     (p,) = iterates(backend, problem, 1)
     # Q^-1 A'K r e, with e the eigenvector (1, -1) of A'A: k r / (m/dt^2 + 2k).
-    wanted = 100 * 2 / (100 + 200) * (np.array([0.0, 1, 0]) if length <= TINY else np.array([0.0, 0, 1]))
+    wanted = 100 * 2 / (100 + 200) * (np.array([0.0, 1, 0]) if length <= ZERO_LENGTH else np.array([0.0, 0, 1]))
     np.testing.assert_allclose(p, [-wanted, wanted], rtol=0, atol=1e-14)  # a solve with two unknowns
 
 
@@ -115,9 +123,9 @@ def test_springs_of_almost_no_length_have_the_same_direction_in_every_backend(ba
 def test_loops_twins_and_springs_of_no_rest_length_are_harmless(backend):
     rest = np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0]])
     edges = np.array([[0, 0], [0, 1], [1, 0], [1, 2]])
-    springs = Springs.at_rest(rest, edges, np.array([5.0, 1.0, 2.0, 4.0]))
-    twinless = Springs.at_rest(rest, edges[[1, 3]], np.array([3.0, 4.0]))
-    shared = random_problem(5, n=3, m=1, weights=())
+    springs = Springs.from_rest_shape(rest, edges, np.array([5.0, 1.0, 2.0, 4.0]))
+    twinless = Springs.from_rest_shape(rest, edges[[1, 3]], np.array([3.0, 4.0]))
+    shared = build_random_problem(5, n=3, m=1, weights=())
     found = [
         iterates(backend, replace(shared, system=replace(shared.system, energies=(energy,))), 10)[-1]
         for energy in (springs, twinless)
@@ -127,8 +135,8 @@ def test_loops_twins_and_springs_of_no_rest_length_are_harmless(backend):
 
 @backends
 def test_springs_in_two_energies_are_as_good_as_in_one(backend):
-    problem = random_problem(6)
-    one = only_springs(problem.system, "the test")
+    problem = build_random_problem(6)
+    one = require_only_springs(problem.system, "the test")
     parts = tuple(
         Springs(one.edges[k], one.stiffness[k], one.rest_length[k], one.rest_direction[k])
         for k in (slice(0, 11), slice(11, None))
@@ -141,27 +149,32 @@ def test_springs_in_two_energies_are_as_good_as_in_one(backend):
 @backends
 @pytest.mark.parametrize("count", [1, 3], ids="{} vertices".format)
 def test_vertices_without_springs_go_where_forces_send_them(backend, count):
-    problem = random_problem(7, n=count, m=0, weights=())
+    problem = build_random_problem(7, n=count, m=0, weights=())
     mass, dt = problem.system.mass[:, None], problem.system.time_step
     (p,) = iterates(backend, problem, 1)
-    np.testing.assert_allclose(p, problem.target + dt**2 / mass * problem.force, rtol=1e-14)
+    np.testing.assert_allclose(p, problem.inertial_target + dt**2 / mass * problem.external_force, rtol=1e-14)
 
 
 @backends
 def test_a_system_without_any_energy_falls(backend):
-    problem = random_problem(8, weights=())
+    problem = build_random_problem(8, weights=())
     bare = replace(problem, system=replace(problem.system, energies=()))
     mass, dt = bare.system.mass[:, None], bare.system.time_step
-    np.testing.assert_allclose(iterates(backend, bare, 1)[0], bare.target + dt**2 / mass * bare.force, rtol=1e-14)
+    np.testing.assert_allclose(
+        iterates(backend, bare, 1)[0], bare.inertial_target + dt**2 / mass * bare.external_force, rtol=1e-14
+    )
 
 
 def test_the_facts_count_what_is_stored():
-    problem = random_problem(9, n=10, m=0, weights=())
+    problem = build_random_problem(9, n=10, m=0, weights=())
     edges = np.array([[i, i + 1] for i in range(9)])
-    chain = Springs.at_rest(np.zeros((10, 3)), edges, np.ones(9))
+    chain = Springs.from_rest_shape(np.zeros((10, 3)), edges, np.ones(9))
     system = replace(problem.system, energies=(chain,))
-    backends = (*BACKENDS[:2], *(CompiledLocalGlobal(linear) for linear in ("inverse", "supernodal", "cholespy")))
-    facts = [backend.prepare(system).facts for backend in backends]
+    backends = (
+        *LOCAL_GLOBAL_BACKENDS[:2],
+        *(CompiledLocalGlobal(linear) for linear in ("inverse", "supernodal", "cholespy")),
+    )
+    facts = [backend.prepare(system).stats for backend in backends]
     assert [fact["nnz_system"] for fact in facts] == [10 + 2 * 9] * 5
     # A tree's factor has no fill-in; a dense one has the whole triangle; cholespy does not tell.
     assert [fact.get("nnz_factor") for fact in facts] == [10 * 11 / 2, 10 + 9, 10 * 11 / 2, 10 + 9, None]
@@ -194,17 +207,17 @@ class ProjectiveWell(Well):
 
 @backends
 def test_an_energy_that_a_backend_does_not_know_is_refused_by_name(backend):
-    system = replace(random_problem(0).system, energies=(Well(),))
+    system = replace(build_random_problem(0).system, energies=(Well(),))
     with pytest.raises(Unsupported, match="Well"):
         backend.prepare(system)
 
 
 def test_backends_with_sparse_factors_take_any_projective_energy_and_the_dense_one_refuses_it():
-    problem = random_problem(10)
+    problem = build_random_problem(10)
     problem = replace(problem, system=replace(problem.system, energies=(*problem.system.energies, ProjectiveWell())))
     for backend in (SparseLocalGlobal(), CompiledLocalGlobal(), CompiledLocalGlobal("supernodal", "float32")):
         p = iterates(backend, problem, 3000)[-1]
-        assert np.abs(problem.gradient(p)).max() <= 1e-9 * np.abs(problem.gradient(problem.first_guess)).max()
+        assert np.abs(problem.gradient(p)).max() <= 1e-9 * np.abs(problem.gradient(problem.initial_guess)).max()
     with pytest.raises(Unsupported, match="ProjectiveWell"):
         DenseLocalGlobal().prepare(problem.system)
 
@@ -214,13 +227,13 @@ INDEFINITE = {
     "a stiffness that is not a number": lambda system: replace(system, energies=(_stiffness(system, np.nan),)),
     "an infinite stiffness": lambda system: replace(system, energies=(_stiffness(system, np.inf),)),
     "a mass that is not a number": lambda system: replace(system, mass=np.full(system.vertices, np.nan)),
-    "a negative pin weight": lambda system: replace(system, pins=Pins(np.array([0]), np.array([-1e9]))),
-    "no mass and no pin": lambda system: replace(system, mass=np.zeros(system.vertices), pins=Pins()),
+    "a negative pin weight": lambda system: replace(system, pins=DirichletPins(np.array([0]), np.array([-1e9]))),
+    "no mass and no pin": lambda system: replace(system, mass=np.zeros(system.vertices), pins=DirichletPins()),
 }
 
 
 def _stiffness(system: System, k: float) -> Springs:
-    springs = only_springs(system, "the test")
+    springs = require_only_springs(system, "the test")
     return replace(springs, stiffness=np.full(len(springs.edges), k))
 
 
@@ -230,24 +243,24 @@ def _stiffness(system: System, k: float) -> Springs:
 @pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")
 def test_a_matrix_that_is_not_positive_definite_is_refused(backend, fault):
     with pytest.raises(NotPositiveDefinite):
-        backend.prepare(INDEFINITE[fault](random_problem(0).system))
+        backend.prepare(INDEFINITE[fault](build_random_problem(0).system))
 
 
 @backends
 def test_stiffness_beyond_the_digits_of_inertia_leaves_numbers(backend):
     """1e15 times the inertia: float64 has no digits left to place the whole, but nothing becomes NaN."""
-    rest, springs = random_network(np.random.default_rng(11), 10, 30)
+    rest, springs = build_random_network(np.random.default_rng(11), 10, 30)
     stiff = replace(springs, stiffness=np.full(30, 1e12))
     system = System(np.full(10, 1e-3), 1.0, (stiff,))
     zero, none = np.zeros((10, 3)), np.empty((0, 3))
-    problem = StepProblem(system, rest, zero, none, rest, rest + 1.0, begun(system, rest, rest))
+    problem = StepProblem(system, rest, zero, none, rest, rest + 1.0, build_step_start(system, rest, rest))
     solution = backend.prepare(system).solve(problem, StopRule(5, 1e-6))
     assert np.isfinite(solution.positions).all()
     assert np.isfinite(solution.residual)
 
 
 def test_the_product_with_a_large_dense_matrix_is_the_same(monkeypatch):
-    problem = first_problem(cloth(12))
+    problem = build_first_problem(build_cloth(12))
     usual = iterates(DenseLocalGlobal(), problem, 10)
     monkeypatch.setattr(local_global, "_LARGE", 0)
     for one, other in zip(usual, iterates(DenseLocalGlobal(), problem, 10), strict=True):

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_info
 from harness.base import machine
 from harness.base.errors import InputError
 
-CORES = machine.describe().cores
+CORES = machine.describe_machine().cores
 
 
 def git(folder: Path, *arguments: str) -> str:
@@ -38,26 +38,28 @@ def checkout(tmp_path: Path) -> Path:
 
 
 def test_the_machine_is_described():
-    here = machine.describe()
+    here = machine.describe_machine()
     assert here.cpu.strip() == here.cpu != ""
     assert 1 <= here.cores <= (os.cpu_count() or 1)
     assert 0.1 < here.memory_gib < 1e5
-    assert platform.system() in here.system
-    assert here == machine.describe()
+    assert platform.system() in here.operating_system
+    assert here == machine.describe_machine()
 
 
 def test_the_machine_does_not_tell_its_host_name():
     name = re.compile(rf"\b{re.escape(socket.gethostname())}\b")
-    assert not [value for value in astuple(machine.describe()) if name.search(str(value))]
+    assert not [value for value in astuple(machine.describe_machine()) if name.search(str(value))]
 
 
 def test_the_id_depends_on_processor_cores_and_memory_alone():
-    here = machine.Machine(cpu="a processor", cores=2, memory_gib=23.5, system="a system")
-    assert re.fullmatch(r"[0-9a-f]{12}", here.id)
-    assert replace(here, system="another").id == here.id
-    assert replace(here, memory_gib=23.6).id == here.id  # firmware updates change the memory by less than 1 GiB
+    here = machine.MachineInfo(cpu="a processor", cores=2, memory_gib=23.5, operating_system="a system")
+    assert re.fullmatch(r"[0-9a-f]{12}", here.machine_id)
+    assert replace(here, operating_system="another").machine_id == here.machine_id
+    assert (
+        replace(here, memory_gib=23.6).machine_id == here.machine_id
+    )  # firmware updates change the memory by less than 1 GiB
     others = [replace(here, cpu="another"), replace(here, cores=4), replace(here, memory_gib=64.0)]
-    assert len({here.id, *(other.id for other in others)}) == 4
+    assert len({here.machine_id, *(other.machine_id for other in others)}) == 4
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system has no affinity of processes")
@@ -68,41 +70,41 @@ def test_the_cores_are_those_that_the_process_may_use():
 
 
 def test_the_versions_name_python_and_the_numeric_libraries():
-    found = machine.versions()
+    found = machine.collect_versions()
     assert found["python"] == platform.python_version()
     assert {"numpy", "scipy", "numba"} <= found.keys()
     assert all(re.match(r"\d+\.\d+", version) for version in found.values())
 
 
 def test_a_clean_checkout_gives_its_commit(checkout: Path):
-    assert machine.commit(checkout) == git(checkout, "rev-parse", "HEAD")
+    assert machine.read_commit(checkout) == git(checkout, "rev-parse", "HEAD")
 
 
 def test_a_tag_does_not_hide_the_commit(checkout: Path):
     git(checkout, "tag", "-a", "v1", "-m", "one")
-    assert machine.commit(checkout) == git(checkout, "rev-parse", "HEAD")
+    assert machine.read_commit(checkout) == git(checkout, "rev-parse", "HEAD")
 
 
 def test_a_changed_file_makes_the_commit_dirty(checkout: Path):
     (checkout / "harness" / "one.py").write_text("x = 2\n")
-    assert machine.commit(checkout) == git(checkout, "rev-parse", "HEAD") + "-dirty"
+    assert machine.read_commit(checkout) == git(checkout, "rev-parse", "HEAD") + "-dirty"
 
 
 def test_a_folder_inside_a_foreign_checkout_has_an_unknown_commit(checkout: Path):
-    assert machine.commit(checkout / "harness") == "unknown"
+    assert machine.read_commit(checkout / "harness") == "unknown"
 
 
 def test_without_git_the_commit_is_unknown(checkout: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("PATH", str(checkout))
-    assert machine.commit(checkout) == "unknown"
+    assert machine.read_commit(checkout) == "unknown"
 
 
 def test_the_commit_is_the_projects_wherever_the_process_was_started(checkout: Path, monkeypatch: pytest.MonkeyPatch):
     foreign = git(checkout, "rev-parse", "HEAD")
     monkeypatch.chdir(checkout)
     monkeypatch.setenv("GIT_DIR", str(checkout / ".git"))
-    machine.commit.cache_clear()
-    assert foreign not in machine.commit()
+    machine.read_commit.cache_clear()
+    assert foreign not in machine.read_commit()
 
 
 def test_the_code_hash_follows_names_and_contents_of_the_sources(tmp_path: Path):
@@ -112,10 +114,10 @@ def test_the_code_hash_follows_names_and_contents_of_the_sources(tmp_path: Path)
         for package in ("harness", "solvers"):
             (root / package).mkdir(parents=True)
         (root / "solvers" / f"{name}.py").write_text(text)
-        seen.append(machine.code_hash(root))
+        seen.append(machine.hash_sources(root))
         (root / "solvers" / "notes.txt").write_text("not a source")
-        machine.code_hash.cache_clear()
-        assert machine.code_hash(root) == seen[-1]
+        machine.hash_sources.cache_clear()
+        assert machine.hash_sources(root) == seen[-1]
     assert len(set(seen)) == 4
     assert all(re.fullmatch(r"[0-9a-f]{12}", each) for each in seen)
 
@@ -148,7 +150,7 @@ def test_pinned_threads_are_restored_even_after_a_failure():
         return [numba.get_num_threads(), *(pool["num_threads"] for pool in threadpool_info())]
 
     def fail() -> None:
-        with machine.pinned_threads(1):
+        with machine.limit_threads(1):
             assert numba.get_num_threads() == 1
             raise ZeroDivisionError
 
@@ -160,7 +162,7 @@ def test_pinned_threads_are_restored_even_after_a_failure():
 
 @pytest.mark.parametrize("threads", [0, -1, CORES + 1])
 def test_more_threads_than_usable_cores_are_the_users_mistake(threads: int):
-    with pytest.raises(InputError, match=rf"from 1 to {CORES}, .* not {threads}"), machine.pinned_threads(threads):
+    with pytest.raises(InputError, match=rf"from 1 to {CORES}, .* not {threads}"), machine.limit_threads(threads):
         pass
 
 
@@ -173,9 +175,9 @@ def looked(monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr(machine.os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
         monkeypatch.setattr(psutil, "cpu_percent", lambda _, percpu: list(busy))
 
-    machine._idle.cache_clear()
+    machine._count_idle_cores.cache_clear()
     yield pretend
-    machine._idle.cache_clear()
+    machine._count_idle_cores.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -184,18 +186,18 @@ def looked(monkeypatch: pytest.MonkeyPatch):
 )
 def test_threads_are_as_many_as_there_are_idle_cores(looked, busy: tuple[float, ...], number: int):
     looked(*busy)
-    found = machine.threads("auto")
-    assert found.number == number
-    assert f"{number} of 4" in found.why
+    found = machine.choose_threads("auto")
+    assert found.count == number
+    assert f"{number} of 4" in found.reason
 
 
 def test_a_number_that_was_given_stays(looked):
     looked(100, 100, 100, 100)
-    assert machine.threads(3) == machine.Threads(3)
+    assert machine.choose_threads(3) == machine.ThreadChoice(3)
 
 
 def test_the_choice_stays_the_same_all_the_process_long(looked):
     looked(0, 0, 0, 0)
-    first = machine.threads("auto")
+    first = machine.choose_threads("auto")
     looked(100, 100, 100, 100)
-    assert machine.threads("auto") is first
+    assert machine.choose_threads("auto") is first

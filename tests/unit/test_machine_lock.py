@@ -14,13 +14,13 @@ from time import monotonic
 
 import pytest
 
-from harness.base.asides import WAITING, begun, ended
-from harness.base.crew import Task, done_by
+from harness.base.asides import WAITING, parse_activity_end, parse_activity_start
+from harness.base.crew import PoolTask, run_tasks
 from harness.base.errors import InputError
-from harness.base.files import open_lock
-from harness.base.holding import Claims, together
-from harness.base.machine_lock import Turn, alone, beside, own_cores
-from harness.base.workers import Limits, Tick
+from harness.base.files import open_lock_file
+from harness.base.holding import UnitClaims, lock_folder_shared
+from harness.base.machine_lock import TimingSession, lock_timing_exclusive, lock_timing_shared, reserve_cores
+from harness.base.workers import ProgressCallback, TaskLimits
 
 SOON, PATIENCE = 0.1, 60.0
 
@@ -33,7 +33,7 @@ def _locks_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 class Other(threading.Thread):
     """Somebody else who would compute, and has begun once it is in."""
 
-    def __init__(self, how: Callable[[Tick], AbstractContextManager[object]]) -> None:
+    def __init__(self, how: Callable[[ProgressCallback], AbstractContextManager[object]]) -> None:
         super().__init__(daemon=True)
         self.how, self.waits, self.inside, self.leave = how, threading.Event(), threading.Event(), threading.Event()
         self.heard: list[str] = []
@@ -53,7 +53,14 @@ def quiet(said: str) -> None:
     pass
 
 
-@pytest.mark.parametrize(("mine", "others"), [(alone, alone), (alone, beside), (beside, alone)])
+@pytest.mark.parametrize(
+    ("mine", "others"),
+    [
+        (lock_timing_exclusive, lock_timing_exclusive),
+        (lock_timing_exclusive, lock_timing_shared),
+        (lock_timing_shared, lock_timing_exclusive),
+    ],
+)
 def test_who_is_timed_is_alone(mine: Callable[..., AbstractContextManager[None]], others: Callable[..., object]):
     with mine(quiet):
         other = Other(others)  # type: ignore[arg-type]
@@ -62,21 +69,21 @@ def test_who_is_timed_is_alone(mine: Callable[..., AbstractContextManager[None]]
     assert other.inside.wait(PATIENCE)
     other.leave.set()
     other.join(PATIENCE)
-    assert begun(other.heard[0]) == ended(other.heard[-1]) == WAITING
+    assert parse_activity_start(other.heard[0]) == parse_activity_end(other.heard[-1]) == WAITING
 
 
 def test_what_is_not_timed_is_done_side_by_side():
-    with beside(quiet):
-        other = Other(beside)
+    with lock_timing_shared(quiet):
+        other = Other(lock_timing_shared)
         assert other.inside.wait(PATIENCE)
         other.leave.set()
 
 
 def test_who_would_be_timed_goes_before_who_would_not():
-    with beside(quiet):
-        timed = Other(alone)
+    with lock_timing_shared(quiet):
+        timed = Other(lock_timing_exclusive)
         assert timed.waits.wait(PATIENCE)
-        untimed = Other(beside)
+        untimed = Other(lock_timing_shared)
         assert untimed.waits.wait(PATIENCE)
         assert not untimed.inside.wait(SOON)
     assert timed.inside.wait(PATIENCE)
@@ -87,23 +94,23 @@ def test_who_would_be_timed_goes_before_who_would_not():
 
 
 def test_who_gets_ready_goes_before_who_was_timed_and_two_get_ready_side_by_side():
-    with Turn(quiet, exclusive=True) as mine, Turn(quiet, exclusive=True) as another:
-        looks = Other(beside)
+    with TimingSession(quiet, exclusive=True) as mine, TimingSession(quiet, exclusive=True) as another:
+        looks = Other(lock_timing_shared)
         assert looks.waits.wait(PATIENCE)
-        with mine.ready(), another.ready():
+        with mine.lock_for_preparation(), another.lock_for_preparation():
             assert not looks.inside.wait(SOON)
-        with alone(quiet):
+        with lock_timing_exclusive(quiet):
             assert not looks.inside.is_set()
     assert looks.inside.wait(PATIENCE)
     looks.leave.set()
 
 
 def test_who_was_timed_looks_beside_others():
-    with Turn(quiet, exclusive=True) as mine:
-        mine.look()
-        mine.look()
-        with Turn(quiet, exclusive=False) as shared, shared.ready():
-            timed = Other(alone)
+    with TimingSession(quiet, exclusive=True) as mine:
+        mine.finish_timing()
+        mine.finish_timing()
+        with TimingSession(quiet, exclusive=False) as shared, shared.lock_for_preparation():
+            timed = Other(lock_timing_exclusive)
             assert timed.waits.wait(PATIENCE)
         assert not timed.inside.wait(SOON)
     assert timed.inside.wait(PATIENCE)
@@ -124,11 +131,11 @@ def test_what_is_in_the_way_of_a_lock_is_named_at_once(what: str, tmp_path: Path
     monkeypatch.setenv("SPRINGBENCH_LOCKS", "locks")
     Path("locks").mkdir()
     places: dict[str, Callable[[], AbstractContextManager[object]]] = {
-        "locks/springbench-wanted.lock": lambda: alone(quiet),
-        "locks/springbench-used.lock": lambda: beside(quiet),
-        f"locks/springbench-core-{min(os.sched_getaffinity(0))}.lock": lambda: own_cores(1, quiet),
-        ".lock": lambda: together(Path()),
-        ".claims": lambda: closing(Claims(Path(), [])),
+        "locks/springbench-wanted.lock": lambda: lock_timing_exclusive(quiet),
+        "locks/springbench-used.lock": lambda: lock_timing_shared(quiet),
+        f"locks/springbench-core-{min(os.sched_getaffinity(0))}.lock": lambda: reserve_cores(1, quiet),
+        ".lock": lambda: lock_folder_shared(Path()),
+        ".claims": lambda: closing(UnitClaims(Path(), [])),
     }
     for name, lock in places.items():
         IN_THE_WAY[what](Path(name))
@@ -144,12 +151,12 @@ def test_a_lock_that_may_not_be_opened_is_named(tmp_path: Path, monkeypatch: pyt
     (tmp_path / "lock").touch()
     monkeypatch.setattr(os, "open", refused)
     with pytest.raises(InputError, match=r"cannot be opened \(Permission denied\).*, or do so"):
-        open_lock(tmp_path / "lock", otherwise=", or do so")
+        open_lock_file(tmp_path / "lock", hint=", or do so")
 
 
-def at_core(tick: Tick) -> tuple[list[int], set[int], float, float]:
+def at_core(tick: ProgressCallback) -> tuple[list[int], set[int], float, float]:
     """The cores that this is kept to, as told and as it is, and from when to when."""
-    with own_cores(1, tick) as cores:
+    with reserve_cores(1, tick) as cores:
         began, end = monotonic(), monotonic() + SOON
         while monotonic() < end:
             pass
@@ -157,8 +164,8 @@ def at_core(tick: Tick) -> tuple[list[int], set[int], float, float]:
 
 
 def test_each_has_cores_of_its_own():
-    task = Task(partial(at_core), quiet, Limits(PATIENCE))
-    found = [value for _, value in done_by(3, int, [None] * 3, lambda number: task)]
+    task = PoolTask(partial(at_core), quiet, TaskLimits(PATIENCE))
+    found = [value for _, value in run_tasks(3, int, [None] * 3, lambda number: task)]
     for cores, kept_to, began, end in found:
         assert set(cores) == kept_to
         assert len(kept_to) == 1
@@ -169,5 +176,8 @@ def test_each_has_cores_of_its_own():
 @pytest.mark.parametrize("value", ["/proc", "/dev/null"])
 def test_a_folder_for_locks_in_which_no_file_can_be_made_is_refused(value: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("SPRINGBENCH_LOCKS", value)
-    with pytest.raises(InputError, match=f"SPRINGBENCH_LOCKS: {value}: expected a folder"), alone(quiet):
+    with (
+        pytest.raises(InputError, match=f"SPRINGBENCH_LOCKS: {value}: expected a folder"),
+        lock_timing_exclusive(quiet),
+    ):
         pass

@@ -12,18 +12,18 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from harness.base import rows
-from harness.base.columns import SCHEMA
-from harness.base.files import users_cache
-from harness.base.machine import describe, node
+from harness.base.columns import RUN_SCHEMA
+from harness.base.files import user_cache_dir
+from harness.base.machine import compute_node_id, describe_machine
 from harness.cli import app
 from harness.experiments import ability
-from harness.report.learned import sentences
-from harness.report.machines import COMPARE
-from harness.report.medians import medians
-from harness.report.robustness import summary
-from harness.report.timing_table import labels, runs, summary_table
+from harness.report.learned import summarise_sweep
+from harness.report.machines import COMPARISON_NOTE
+from harness.report.medians import write_medians
+from harness.report.robustness import build_score_table
+from harness.report.timing_table import build_summary_table, label_runs, read_run_times
 from tests.contracts.hostile import scene
-from tests.dummies import dummy_rows
+from tests.dummies import build_dummy_rows
 
 ABLE = {"machine_bandwidth": 12.0e9, "machine_flops": 40.0e9, "machine_step": 3.1e-3}
 
@@ -34,12 +34,12 @@ def two_machines(solvers: tuple[str, ...] = ("sparse", "dense")) -> list[dict[st
     for number, solver in enumerate(solvers):
         own = {"run_id": f"{number:012x}", "solver": solver, "scene": "cloth", "size": 8, "residual": 1e-3}
         own |= {"machine": f"{number}" * 12, "node": "e" * 12, "seconds": 1e-3 * (1 + number), **ABLE}
-        told += [row | own for row in dummy_rows(number)]
+        told += [row | own for row in build_dummy_rows(number)]
     return told
 
 
 def table_of(told: list[dict[str, Any]]) -> pa.Table:
-    return pa.Table.from_pylist(told, schema=SCHEMA)
+    return pa.Table.from_pylist(told, schema=RUN_SCHEMA)
 
 
 def printed(table: Any) -> str:
@@ -50,16 +50,16 @@ def printed(table: Any) -> str:
 
 def test_a_sweeps_table_names_the_machine_of_each_run_and_what_it_can_do():
     table = table_of(two_machines())
-    assert list(labels(runs(table)).values()) == ["sparse, machine 000000", "dense, machine 111111"]
-    text = printed(summary_table(table))
+    assert list(label_runs(read_run_times(table)).values()) == ["sparse, machine 000000", "dense, machine 111111"]
+    text = printed(build_summary_table(table))
     assert "8 sparse, machine – – 1 1 – – 50 ok 1.0e-03 – – 000000" in text
     assert "machine 111111: a processor, 2 cores, by one thread 12 GB/s, 40 GFLOP/s, a fixed step 3.1 ms" in text
-    assert COMPARE in text
+    assert COMPARISON_NOTE in text
 
 
 def test_two_computers_of_one_kind_are_told_apart():
     told = [row | {"machine": "a" * 12, "node": str(row["seconds"] > 1e-3) * 3} for row in two_machines()]
-    assert sorted(labels(runs(table_of(told))).values()) == [
+    assert sorted(label_runs(read_run_times(table_of(told))).values()) == [
         "dense, machine aaaaaa-True",
         "sparse, machine aaaaaa-Fals",
     ]
@@ -67,19 +67,19 @@ def test_two_computers_of_one_kind_are_told_apart():
 
 def test_a_table_of_one_machine_says_so_once_and_names_it_in_no_row():
     one = [row | {"machine": "a" * 12} for row in two_machines()]
-    text = printed(summary_table(table_of(one)))
+    text = printed(build_summary_table(table_of(one)))
     assert len(re.findall("machine aaaaaa", text)) == 1
-    assert COMPARE in text
+    assert COMPARISON_NOTE in text
 
 
 def test_no_solver_is_called_faster_than_one_on_another_machine():
-    assert not [line for line in sentences(runs(table_of(two_machines()))) if "fastest" in line]
+    assert not [line for line in summarise_sweep(read_run_times(table_of(two_machines()))) if "fastest" in line]
     one = [row | {"machine": "a" * 12} for row in two_machines()]
-    assert [line for line in sentences(runs(table_of(one))) if "fastest" in line]
+    assert [line for line in summarise_sweep(read_run_times(table_of(one))) if "fastest" in line]
 
 
 def test_medians_are_those_of_one_machine(tmp_path: Path):
-    (path,) = medians(table_of(two_machines(("sparse", "sparse"))), tmp_path)
+    (path,) = write_medians(table_of(two_machines(("sparse", "sparse"))), tmp_path)
     with path.open() as file:
         found = [(row["machine"], float(row["median_seconds"])) for row in csv.DictReader(file)]
     assert found == [("0" * 12, 1e-3), ("1" * 12, 2e-3)]
@@ -93,48 +93,50 @@ def command(*arguments: object) -> str:
 
 def test_list_query_and_merge_say_it(tmp_path: Path):
     (tmp_path / "cloth.yaml").write_text(scene())
-    assert f"states are those on this machine, {describe().id:.6}" in command(
+    assert f"states are those on this machine, {describe_machine().machine_id:.6}" in command(
         "list", tmp_path / "cloth.yaml", "--results", tmp_path / "none"
     )
     for name, told in zip("ab", (two_machines()[:2], two_machines()[2:]), strict=True):
         (tmp_path / name / "sweep" / "rows").mkdir(parents=True)
-        rows.write(tmp_path / name / "sweep" / "rows" / f"{name}.parquet", told)
+        rows.write_rows(tmp_path / name / "sweep" / "rows" / f"{name}.parquet", told)
     question = "SELECT machine, median(seconds) FROM rows GROUP BY ALL"
-    assert COMPARE in command("query", question, "--results", tmp_path / "a")
-    assert COMPARE not in command("query", question, "--results", tmp_path / "a", "--csv"), "it is read by programs"
+    assert COMPARISON_NOTE in command("query", question, "--results", tmp_path / "a")
+    assert COMPARISON_NOTE not in command("query", question, "--results", tmp_path / "a", "--csv"), (
+        "it is read by programs"
+    )
     said = command("merge", tmp_path / "a", tmp_path / "b", "-o", tmp_path / "all")
     assert "machine 000000: " in said
     assert "machine 111111: " in said
-    assert COMPARE in said
+    assert COMPARISON_NOTE in said
 
 
 def test_a_report_says_that_its_counts_may_be_compared():
-    assert "may be compared across machines" in printed(summary([]))
+    assert "may be compared across machines" in printed(build_score_table([]))
 
 
 def test_what_a_machine_can_do_is_found_once_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(ability, "_KNOWN", {})
     monkeypatch.setattr(ability, "_OWN", 0.0)  # whatever else runs here
-    found = ability.of_this_machine(lambda said: None)
-    assert set(found) == set(ability.NAMES)
+    found = ability.calibrate_machine(lambda said: None)
+    assert set(found) == set(ability.CALIBRATION_COLUMNS)
     assert 1e7 < found["machine_bandwidth"] < 1e13
     assert 1e7 < found["machine_flops"] < 1e13
     assert 1e-6 < found["machine_step"] < 10.0
-    (kept,) = users_cache("machine").iterdir()
-    assert kept.stem == node()
+    (kept,) = user_cache_dir("machine").iterdir()
+    assert kept.stem == compute_node_id()
     for name in ("bandwidth", "flops", "step"):
         monkeypatch.delattr(ability, name)  # what is kept is not found again
     monkeypatch.setattr(ability, "_KNOWN", {})
-    assert ability.of_this_machine(lambda said: None) == found
+    assert ability.calibrate_machine(lambda said: None) == found
 
 
 def test_what_a_busy_machine_can_do_is_told_and_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(ability, "_KNOWN", {})
     monkeypatch.setattr(ability, "_OWN", 2.0)  # more than any thread can have
-    assert set(ability.of_this_machine(lambda said: None)) == set(ability.NAMES)
-    assert not users_cache("machine").exists()
+    assert set(ability.calibrate_machine(lambda said: None)) == set(ability.CALIBRATION_COLUMNS)
+    assert not user_cache_dir("machine").exists()
 
 
 def test_a_run_without_the_memory_for_it_is_done_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -144,4 +146,4 @@ def test_a_run_without_the_memory_for_it_is_done_all_the_same(tmp_path: Path, mo
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(ability, "_KNOWN", {})
     monkeypatch.setattr(ability, "bandwidth", full)
-    assert ability.of_this_machine(lambda said: None) == {}
+    assert ability.calibrate_machine(lambda said: None) == {}

@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 
 from solvers import matrices
 from solvers.energies.springs import Springs
-from solvers.problem import NotPositiveDefinite, Pins, System
+from solvers.problem import DirichletPins, NotPositiveDefinite, System
 
 EXACT = 0.0
 """Both sides do the same few additions of the same numbers."""
@@ -133,11 +133,11 @@ def test_the_matrix_of_a_system_is_the_assignments_without_exact_pins(network):
     springs, stiffness, mass, time_step, pinned, weight = network
     mass = mass + 1.0  # every vertex is determined
     mixed = np.where(np.arange(len(pinned)) % 2, np.inf, weight)
-    energy = Springs.at_rest(np.zeros((len(mass), 3)), springs, stiffness)
-    system = System(mass, time_step, (energy,), Pins(pinned, mixed))
+    energy = Springs.from_rest_shape(np.zeros((len(mass), 3)), springs, stiffness)
+    system = System(mass, time_step, (energy,), DirichletPins(pinned, mixed))
     soft = np.isfinite(mixed)
     wanted = dense_matrices(springs, stiffness, mass, time_step, pinned[soft], weight[soft])["Q"]
-    made = matrices.assemble(system, [energy])
+    made = matrices.assemble_system_matrix(system, [energy])
     np.testing.assert_allclose(made.toarray(), wanted, rtol=0, atol=ROUND_OFF * np.abs(wanted).max())
     assert made.nnz == len(mass) + 2 * len(springs)
 
@@ -170,8 +170,8 @@ HELD = {
 
 def bare_system(springs, stiffness, mass, pinned, weight=1.0):
     edges = np.array(springs, np.int64).reshape(-1, 2)
-    energy = Springs.at_rest(np.zeros((len(mass), 3)), edges, np.array(stiffness, float))
-    pins = Pins(np.array(pinned, np.int64), np.full(len(pinned), weight))
+    energy = Springs.from_rest_shape(np.zeros((len(mass), 3)), edges, np.array(stiffness, float))
+    pins = DirichletPins(np.array(pinned, np.int64), np.full(len(pinned), weight))
     return System(np.array(mass, float), 1.0, (energy,), pins), energy
 
 
@@ -180,7 +180,7 @@ def test_vertices_that_nothing_determines_are_named(case):
     springs, stiffness, mass, pinned, named = LOOSE[case]
     system, energy = bare_system(springs, stiffness, mass, pinned)
     with pytest.raises(NotPositiveDefinite) as raised:
-        matrices.assemble(system, [energy])
+        matrices.assemble_system_matrix(system, [energy])
     assert named in str(raised.value)
 
 
@@ -189,4 +189,4 @@ def test_vertices_that_nothing_determines_are_named(case):
 def test_a_mass_or_a_pin_determines_all_that_springs_tie_to_it(case, weight):
     springs, stiffness, mass, pinned = HELD[case]
     system, energy = bare_system(springs, stiffness, mass, pinned, weight)
-    assert matrices.assemble(system, [energy]).shape == (system.vertices, system.vertices)
+    assert matrices.assemble_system_matrix(system, [energy]).shape == (system.num_vertices, system.num_vertices)

@@ -16,17 +16,24 @@ import numpy as np
 import pytest
 
 from harness.base.errors import RunFailed
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.mesh.chain import Chain
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.mesh.chain import ChainMesh
 from harness.simulation import times
-from harness.simulation.clock import Watch
-from harness.simulation.measure import ITERATION, PHASE_REPEATS, Measured, Settings, Timing, measure
+from harness.simulation.clock import PhaseWatch
+from harness.simulation.measure import (
+    ITERATION_PHASE,
+    PHASE_REPEATS,
+    RunMeasurement,
+    SteppingSettings,
+    TimingSample,
+    measure_run,
+)
 from solvers.problem import Positions, Solution, StepProblem, StopRule, System
-from tests.scenes import scene
+from tests.scenes import build_test_scene
 
 FRAMES, ROUNDS, ITERATIONS = 3, 2, 4
-MADE = scene(Chain(), Gravity(), size=4)
-SETTINGS = Settings(StopRule(ITERATIONS), "current", FRAMES, ROUNDS)
+MADE = build_test_scene(ChainMesh(), GravityEffect(), size=4)
+SETTINGS = SteppingSettings(StopRule(ITERATIONS), "current", FRAMES, ROUNDS)
 TAKES = {"prepare": 0.004, "solve": 0.008, "local": 0.001, "global": 0.002}
 """Seconds that each part sleeps at least."""
 
@@ -35,12 +42,12 @@ TAKES = {"prepare": 0.004, "solve": 0.008, "local": 0.001, "global": 0.002}
 class Sleeper:
     """A solver that is prepared with itself; slept: by part, how long each call of it slept, by its own stamps."""
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
 
     slept: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-    choice: str = ""
-    facts: dict[str, float] = field(default_factory=dict)
+    description: str = ""
+    stats: dict[str, float] = field(default_factory=dict)
 
     def rest(self, part: str) -> Positions:
         began = perf_counter()
@@ -53,37 +60,43 @@ class Sleeper:
         return self
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        yield problem.first_guess
+        yield problem.initial_guess
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         self.rest("solve")
-        return Solution(problem.first_guess + 1.0, stop.iterations, 0.0, 0.0, "iterations")
+        return Solution(problem.initial_guess + 1.0, stop.max_iterations, 0.0, 0.0, "iterations")
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         return 0.0
 
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         return {part: lambda part=part: self.rest(part) for part in ("local", "global")}
 
 
 @pytest.fixture(scope="module")
-def seen() -> tuple[Sleeper, Measured, float]:
+def seen() -> tuple[Sleeper, RunMeasurement, float]:
     """The solver, what was measured of it, and the seconds of all."""
     solver, began = Sleeper(), perf_counter()
-    measured = measure(MADE, solver, SETTINGS, lambda phase: sleep(0.02))
+    measured = measure_run(MADE, solver, SETTINGS, lambda phase: sleep(0.02))
     return solver, measured, perf_counter() - began
 
 
-def of(measured: Measured, phase: str) -> list[Timing]:
+def of(measured: RunMeasurement, phase: str) -> list[TimingSample]:
     return [t for t in measured.timings if t.phase == phase]
 
 
 def test_each_phase_is_timed_as_often_as_it_says(seen):
     _, measured, _ = seen
-    counts = {phase: len(of(measured, phase)) for phase in ("prepare", "local", "global", ITERATION, "step")}
+    counts = {phase: len(of(measured, phase)) for phase in ("prepare", "local", "global", ITERATION_PHASE, "step")}
     repeated = FRAMES * PHASE_REPEATS
     steps = FRAMES * ROUNDS
-    assert counts == {"prepare": ROUNDS + 1, "local": repeated, "global": repeated, ITERATION: FRAMES, "step": steps}
+    assert counts == {
+        "prepare": ROUNDS + 1,
+        "local": repeated,
+        "global": repeated,
+        ITERATION_PHASE: FRAMES,
+        "step": steps,
+    }
     assert len(measured.timings) == sum(counts.values())
     assert [(t.frame, t.round) for t in of(measured, "step")] == [(f, r) for r in range(ROUNDS) for f in (1, 2, 3)]
 
@@ -96,57 +109,60 @@ def test_times_hold_what_was_done_in_them(seen):
     assert all(t.seconds >= slept for t, slept in zip(of(measured, "global"), repeats, strict=True))
     assert all(t.seconds >= slept for t, slept in zip(of(measured, "prepare"), solver.slept["prepare"], strict=True))
     beside, timed = solver.slept["solve"][1 : 2 * FRAMES : 2], solver.slept["solve"][2 * FRAMES :]
-    assert all(t.seconds * t.calls >= slept for t, slept in zip(of(measured, ITERATION), beside, strict=True))
+    assert all(t.seconds * t.num_calls >= slept for t, slept in zip(of(measured, ITERATION_PHASE), beside, strict=True))
     assert all(t.seconds >= slept for t, slept in zip(of(measured, "step"), timed, strict=True))
-    assert sum(t.seconds * t.calls for t in measured.timings) <= whole
+    assert sum(t.seconds * t.num_calls for t in measured.timings) <= whole
 
 
 def test_what_is_shown_between_steps_is_in_no_time(seen):
     _, measured, whole = seen
     shown = 0.02 * FRAMES * (1 + ROUNDS)
-    assert sum(t.seconds * t.calls for t in measured.timings) <= whole - shown
+    assert sum(t.seconds * t.num_calls for t in measured.timings) <= whole - shown
     assert sum(watch.wall for watch in measured.watches.values()) <= whole - shown
 
 
 def test_every_time_lies_within_what_its_watch_saw(seen):
     _, measured, _ = seen
-    assert set(measured.watches) == {("prepare", None), ("local", None), ("global", None), (ITERATION, None)} | {
+    assert set(measured.watches) == {("prepare", None), ("local", None), ("global", None), (ITERATION_PHASE, None)} | {
         ("step", round) for round in range(ROUNDS)
     }
     for (phase, round), watch in measured.watches.items():
-        told = sum(t.seconds * t.calls for t in of(measured, phase) if round in (None, t.round))
+        told = sum(t.seconds * t.num_calls for t in of(measured, phase) if round in (None, t.round))
         # The raw clock and the one that is adjusted differ by 500 parts in a million at most.
         assert told <= watch.wall * (1 + 5e-4)
 
 
 def test_rows_tell_both_clocks_and_that_a_solver_which_sleeps_was_interrupted(seen):
     _, measured, _ = seen
-    for row in times.rows(measured):
+    for row in times.build_timing_rows(measured):
         assert row["summed_seconds"] <= row["pass_seconds"] * (1 + 5e-4)
         assert row["cpu_seconds"] < row["pass_seconds"]
         assert row["interrupted"]
     by_round = [
-        {r["summed_seconds"] for r in times.rows(measured) if r["round"] == k and r["phase"] == "step"} for k in (0, 1)
+        {r["summed_seconds"] for r in times.build_timing_rows(measured) if r["round"] == k and r["phase"] == "step"}
+        for k in (0, 1)
     ]
     for round, told in enumerate(by_round):
         assert told == {sum(t.seconds for t in of(measured, "step") if t.round == round)}
 
 
-@pytest.mark.parametrize("phase", ["prepare", "local", "global", ITERATION, "step"])
+@pytest.mark.parametrize("phase", ["prepare", "local", "global", ITERATION_PHASE, "step"])
 def test_no_row_is_made_of_times_that_are_scaled(seen, phase: str):
     _, measured, _ = seen
     scaled = [
-        Timing(t.phase, t.frame, t.round, t.seconds / (1000 if t.phase == phase else 1), t.calls)
+        TimingSample(t.phase, t.frame, t.round, t.seconds / (1000 if t.phase == phase else 1), t.num_calls)
         for t in measured.timings
     ]
     # The other clock saw what the true times add up to, whatever else the machine did then.
     walls = {
-        (name, round): sum(t.seconds * t.calls for t in of(measured, name) if round in (None, t.round))
+        (name, round): sum(t.seconds * t.num_calls for t in of(measured, name) if round in (None, t.round))
         for name, round in measured.watches
     }
-    busy = {key: Watch(1, walls[key], watch.entered, walls[key], walls[key]) for key, watch in measured.watches.items()}
+    busy = {
+        key: PhaseWatch(1, walls[key], watch.entered, walls[key], walls[key]) for key, watch in measured.watches.items()
+    }
     with pytest.raises(RunFailed, match=f"the times of {phase} add up to"):
-        times.rows(Measured(measured.prepared, scaled, busy, measured.final))
+        times.build_timing_rows(RunMeasurement(measured.prepared, scaled, busy, measured.final_positions))
 
 
 PARTS = {
@@ -161,16 +177,19 @@ PARTS = {
 
 @pytest.mark.parametrize(("phases", "iteration", "expected"), PARTS.values(), ids=PARTS)
 def test_rows_say_whether_phases_add_up_to_an_iteration(phases: dict[str, float], iteration: float, expected: bool):
-    timings = [Timing("step", 1, 0, 40.0)]
+    timings = [TimingSample("step", 1, 0, 40.0)]
     for frame in (1, 2, 3):
         slow = 50.0 if frame == 2 else 1.0  # one frame that was disturbed does not decide
-        timings += [Timing(phase, frame, k, t * slow) for phase, t in phases.items() for k in range(PHASE_REPEATS)]
-        timings.append(Timing(ITERATION, frame, 0, iteration, 4))
+        timings += [
+            TimingSample(phase, frame, k, t * slow) for phase, t in phases.items() for k in range(PHASE_REPEATS)
+        ]
+        timings.append(TimingSample(ITERATION_PHASE, frame, 0, iteration, 4))
     watches = {}
     for t in timings:
-        watch = watches.setdefault((t.phase, Measured.pass_of(t)), Watch(1))
-        watch.wall = watch.process = watch.thread = watch.wall + t.seconds * t.calls
+        watch = watches.setdefault((t.phase, RunMeasurement.get_round(t)), PhaseWatch(1))
+        watch.wall_seconds = watch.process_seconds = watch.thread_seconds = watch.wall_seconds + t.seconds * t.num_calls
     found = {
-        row["phase"]: row["adds_up"] for row in times.rows(Measured(Sleeper(), timings, watches, np.zeros((4, 3))))
+        row["phase"]: row["adds_up"]
+        for row in times.build_timing_rows(RunMeasurement(Sleeper(), timings, watches, np.zeros((4, 3))))
     }
-    assert found == {"step": None, ITERATION: expected} | dict.fromkeys(phases, expected)
+    assert found == {"step": None, ITERATION_PHASE: expected} | dict.fromkeys(phases, expected)

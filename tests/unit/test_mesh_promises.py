@@ -10,66 +10,66 @@ import pytest
 
 from harness.base.errors import InputError
 from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
-from harness.scenes.mesh.chain import Chain, Rope
-from harness.scenes.mesh.generator import MAX_VERTICES, Generator
-from harness.scenes.mesh.grid import Grid, Net
-from harness.scenes.mesh.mesh_names import MESHES
-from harness.scenes.mesh.solids import Block, Tower
-from harness.scenes.mesh.surfaces import Balloon, Skirt
+from harness.scenes.mesh.chain import ChainMesh, RopeMesh
+from harness.scenes.mesh.generator import MAX_VERTICES, MeshGenerator
+from harness.scenes.mesh.grid import GridMesh, NetMesh
+from harness.scenes.mesh.mesh_names import MESH_CLASSES
+from harness.scenes.mesh.solids import BlockMesh, TowerMesh
+from harness.scenes.mesh.surfaces import BalloonMesh, SkirtMesh
 from solvers import memory
 
 ROUND_OFF = 1e-12
 """A few thousand additions of numbers of order one in float64."""
 
-GENERATORS: list[Generator] = [
-    Chain(length=2.0, direction=(1.0, -1.0, 0.5)),
-    Rope(),
-    Grid(diagonals="none"),
-    Grid(width=1.5, height=0.7, diagonals="one", skip_one=True),
-    Grid(plane="vertical", skip_one=True),
-    Net(width=1.2, height=2.0),
-    Net(plane="vertical"),
-    Skirt(),
-    Balloon(radius=0.3),
-    Tower(),
-    Block(length=1.0, height=0.4, depth=0.6),
-    Block(length=1.0, height=0.6, depth=0.4, diagonals="one"),
+GENERATORS: list[MeshGenerator] = [
+    ChainMesh(length=2.0, direction=(1.0, -1.0, 0.5)),
+    RopeMesh(),
+    GridMesh(diagonals="none"),
+    GridMesh(width=1.5, height=0.7, diagonals="one", skip_one=True),
+    GridMesh(plane="vertical", skip_one=True),
+    NetMesh(width=1.2, height=2.0),
+    NetMesh(plane="vertical"),
+    SkirtMesh(),
+    BalloonMesh(radius=0.3),
+    TowerMesh(),
+    BlockMesh(length=1.0, height=0.4, depth=0.6),
+    BlockMesh(length=1.0, height=0.6, depth=0.4, diagonals="one"),
 ]
 MESH_CASES = [
-    pytest.param(generator, generator.SMALLEST + extra, id=f"{type(generator).__name__}{k}-{extra}")
+    pytest.param(generator, generator.MIN_SIZE + extra, id=f"{type(generator).__name__}{k}-{extra}")
     for k, generator in enumerate(GENERATORS)
     for extra in (0, 1, 5)
 ]
 
 
-@pytest.mark.parametrize("kind", MESHES)
+@pytest.mark.parametrize("kind", MESH_CLASSES)
 def test_the_table_names_a_model_of_that_kind(kind):
-    module, name = MESHES[kind].split(":")
+    module, name = MESH_CLASSES[kind].split(":")
     model = getattr(import_module(module), name)
     assert model.model_fields["kind"].default == kind
 
 
 @pytest.mark.parametrize(("generator", "size"), MESH_CASES)
 def test_springs_join_two_vertices_once(generator, size):
-    mesh = generator.build(size)
+    mesh = generator.build_mesh(size)
     pairs = Counter(frozenset(pair) for pair in mesh.springs.tolist())
     assert set(pairs.values()) == {1}
     assert all(len(pair) == 2 for pair in pairs)
     assert mesh.springs.min() == 0
-    assert mesh.springs.max() == len(mesh.rest) - 1
+    assert mesh.springs.max() == len(mesh.rest_positions) - 1
 
 
 @pytest.mark.parametrize(("generator", "size"), MESH_CASES)
 def test_families_are_a_partition_of_the_springs(generator, size):
-    mesh = generator.build(size)
-    assert set(mesh.families) == {STRETCH, SHEAR, BEND}
-    assert sorted(np.concatenate(list(mesh.families.values()))) == list(range(len(mesh.springs)))
+    mesh = generator.build_mesh(size)
+    assert set(mesh.spring_families) == {STRETCH, SHEAR, BEND}
+    assert sorted(np.concatenate(list(mesh.spring_families.values()))) == list(range(len(mesh.springs)))
 
 
 @pytest.mark.parametrize(("generator", "size"), MESH_CASES)
 def test_the_vertices_are_as_many_as_announced_and_joined_in_one_piece(generator, size):
-    mesh = generator.build(size)
-    assert len(mesh.rest) == generator.count(size)
+    mesh = generator.build_mesh(size)
+    assert len(mesh.rest_positions) == generator.count(size)
     reached, frontier = {0}, {0}
     neighbours: dict[int, set[int]] = {}
     for i, j in mesh.springs.tolist():
@@ -78,20 +78,20 @@ def test_the_vertices_are_as_many_as_announced_and_joined_in_one_piece(generator
     while frontier:
         frontier = set().union(*(neighbours[v] for v in frontier)) - reached
         reached |= frontier
-    assert len(reached) == len(mesh.rest)
+    assert len(reached) == len(mesh.rest_positions)
 
 
 @pytest.mark.parametrize(("generator", "size"), MESH_CASES)
 def test_every_vertex_has_a_share_and_the_shares_sum_to_one(generator, size):
-    mesh = generator.build(size)
-    assert mesh.shares.shape == (len(mesh.rest),)
-    assert mesh.shares.min() > 0
-    assert mesh.shares.sum() == pytest.approx(1, abs=ROUND_OFF)
+    mesh = generator.build_mesh(size)
+    assert mesh.mass_fractions.shape == (len(mesh.rest_positions),)
+    assert mesh.mass_fractions.min() > 0
+    assert mesh.mass_fractions.sum() == pytest.approx(1, abs=ROUND_OFF)
 
 
 @pytest.mark.parametrize(("generator", "size"), MESH_CASES)
 def test_parts_are_sorted_vertices(generator, size):
-    mesh = generator.build(size)
+    mesh = generator.build_mesh(size)
     assert mesh.parts
     for part in mesh.parts.values():
         assert len(part)
@@ -102,53 +102,60 @@ def test_parts_are_sorted_vertices(generator, size):
 
 @pytest.mark.parametrize(("generator", "size"), MESH_CASES)
 def test_arrays_have_the_promised_types_and_cannot_be_written_to(generator, size):
-    mesh = generator.build(size)
-    assert mesh.rest.dtype == np.float64
-    assert mesh.rest.flags.c_contiguous
+    mesh = generator.build_mesh(size)
+    assert mesh.rest_positions.dtype == np.float64
+    assert mesh.rest_positions.flags.c_contiguous
     assert mesh.springs.dtype == mesh.triangles.dtype == np.int64
-    for array in (mesh.rest, mesh.springs, mesh.triangles, mesh.shares, *mesh.families.values(), *mesh.parts.values()):
+    for array in (
+        mesh.rest_positions,
+        mesh.springs,
+        mesh.triangles,
+        mesh.mass_fractions,
+        *mesh.spring_families.values(),
+        *mesh.parts.values(),
+    ):
         assert not array.flags.writeable
 
 
 @pytest.mark.parametrize(("generator", "size"), MESH_CASES)
 def test_neighbouring_triangles_agree_on_their_orientation(generator, size):
-    directed = Counter(directed_edges(generator.build(size)))
+    directed = Counter(directed_edges(generator.build_mesh(size)))
     assert set(directed.values()) <= {1}  # two triangles that agree pass their common side in opposite directions
 
 
 @pytest.mark.parametrize(("generator", "size"), MESH_CASES)
 def test_building_again_gives_the_same_mesh(generator, size):
-    first, second = generator.build(size), generator.build(size)
-    assert np.array_equal(first.rest, second.rest)
+    first, second = generator.build_mesh(size), generator.build_mesh(size)
+    assert np.array_equal(first.rest_positions, second.rest_positions)
     assert np.array_equal(first.springs, second.springs)
     assert np.array_equal(first.triangles, second.triangles)
 
 
 @pytest.mark.parametrize("generator", GENERATORS, ids=lambda g: type(g).__name__)
 def test_the_extent_does_not_depend_on_the_size(generator):
-    coarse, fine = generator.build(12), generator.build(24)
+    coarse, fine = generator.build_mesh(12), generator.build_mesh(24)
     # rings and spheres of 12 vertices miss the extreme points of a circle by at most 1 - cos(pi/12) = 3.4 %
     assert np.ptp(fine.rest, axis=0) == pytest.approx(np.ptp(coarse.rest, axis=0), rel=0.035, abs=ROUND_OFF)
 
 
 @pytest.mark.parametrize("generator", GENERATORS, ids=lambda g: type(g).__name__)
 def test_the_spacing_is_a_typical_rest_length_and_halves_with_twice_the_size(generator):
-    coarse, fine = generator.build(8), generator.build(16)
+    coarse, fine = generator.build_mesh(8), generator.build_mesh(16)
     assert fine.rest_lengths.min() <= fine.spacing <= fine.rest_lengths.max()
-    if not isinstance(generator, Tower):  # its storeys get lower, its width stays
+    if not isinstance(generator, TowerMesh):  # its storeys get lower, its width stays
         assert 0.4 < fine.spacing / coarse.spacing < 0.6  # (8 - 1)/(16 - 1) = 0.47 and rounded row counts
 
 
 @pytest.mark.parametrize(
     ("generator", "size", "volume", "tolerance"),
     [
-        (Balloon(radius=0.5), 16, np.pi / 6, 0.01),  # an inscribed polyhedron of 5120 facets lacks half a percent
-        (Block(length=1.0, height=0.5, depth=0.4), 11, 0.2, ROUND_OFF),
+        (BalloonMesh(radius=0.5), 16, np.pi / 6, 0.01),  # an inscribed polyhedron of 5120 facets lacks half a percent
+        (BlockMesh(length=1.0, height=0.5, depth=0.4), 11, 0.2, ROUND_OFF),
     ],
     ids=repr,
 )
 def test_closed_surfaces_enclose_their_volume(generator, size, volume, tolerance):
-    mesh = generator.build(size)
+    mesh = generator.build_mesh(size)
     edges = set(directed_edges(mesh))
     assert all((j, i) in edges for i, j in edges)
     a, b, c = (mesh.rest[mesh.triangles[:, k]] for k in range(3))
@@ -159,7 +166,7 @@ def test_closed_surfaces_enclose_their_volume(generator, size, volume, tolerance
 @pytest.mark.parametrize("size", [-3, 0, 10**9, 10**400], ids=["-3", "0", "1e9", "1e400"])
 def test_senseless_sizes_are_refused_with_what_is_allowed(generator, size):
     with pytest.raises(InputError) as caught:
-        generator.build(size)
+        generator.build_mesh(size)
     (mistake,) = caught.value.mistakes
     assert mistake.key == "size"
     assert mistake.problem.startswith(f"{size} ")
@@ -170,7 +177,7 @@ def test_senseless_sizes_are_refused_with_what_is_allowed(generator, size):
 def test_the_largest_size_named_is_the_largest_that_fits(generator, monkeypatch):
     monkeypatch.setattr(memory, "of_machine", lambda: 2.0**40)  # so that memory is not what limits
     with pytest.raises(InputError) as caught:
-        generator.build(generator.SMALLEST - 1)
+        generator.build_mesh(generator.SMALLEST - 1)
     largest = int(str(caught.value).split(" to ")[1].split()[0])
     assert generator.count(largest) <= MAX_VERTICES < generator.count(largest + 1)
 

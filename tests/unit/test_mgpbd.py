@@ -8,24 +8,30 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins as PinsEffect
-from harness.scenes.effects.springs import Springs as SpringsEffect
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
-from harness.simulation.step import prepare, simulate
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect as PinsEffect
+from harness.scenes.effects.springs import SpringsEffect as SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
+from harness.simulation.step import prepare, simulate_scene
 from solvers.energies.springs import Springs
-from solvers.linear.near_kernel import Cycle, Prolongation, Solving, near_kernel, norm
+from solvers.linear.near_kernel import (
+    PreconditionedSolve,
+    ProlongationHierarchy,
+    VCycle,
+    compute_near_nullspace,
+    ordered_norm,
+)
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.methods.mgpbd import MultigridXpbd
-from solvers.methods.newton import Newton
+from solvers.methods.newton import NewtonSolver
 from solvers.methods.xpbd import Xpbd
-from solvers.problem import Pins, StepProblem, StopRule, System, Unsupported
+from solvers.problem import DirichletPins, StepProblem, StopRule, System, Unsupported
 from tests.bench.duals import course, mgpbd, xpbd
-from tests.scenes import begun, cloth, first_problem, random_problem, scene
+from tests.scenes import build_cloth, build_first_problem, build_random_problem, build_step_start, build_test_scene
 from tests.unit.test_xpbd import Other, without_mass
 
-STIFF = first_problem(cloth(16, "exact", stretch=1e4))
+STIFF = build_first_problem(build_cloth(16, "exact", stretch=1e4))
 """Nine hundred springs, which multigrid takes two levels for."""
 
 
@@ -35,27 +41,29 @@ def solved(problem: StepProblem, iterations: int, solver: MultigridXpbd | Xpbd |
 
 def hanging(stretch: float, factor: float = 1.0) -> StepProblem:
     pins = PinsEffect.model_validate({"at": ["first"], "weight": "exact"})
-    mesh = Chain(length=2.0, direction=(0.0, -1.0, 0.0))
-    problem = first_problem(scene(mesh, SpringsEffect(stretch=stretch), Gravity(), pins, size=10))
-    return replace(problem, system=replace(problem.system, factor=factor))
+    mesh = ChainMesh(length=2.0, direction=(0.0, -1.0, 0.0))
+    problem = build_first_problem(
+        build_test_scene(mesh, SpringsEffect(stretch=stretch), GravityEffect(), pins, size=10)
+    )
+    return replace(problem, system=replace(problem.system, inertia_factor=factor))
 
 
 def dual(problem: StepProblem, solver: MultigridXpbd | None = None):
     """The matrix of the first iteration, its right-hand side, and how it is prolonged."""
     made = (solver or MultigridXpbd()).prepare(problem.system)
-    run = made.begin(problem, problem.first_guess)
-    A = made.matrix(made.stretched(run.positions)[1])
-    return A, run.misfit, made.prolongation(A)
+    run = made.init_state(problem, problem.initial_guess)
+    A = made.dual_matrix(made.scaled_constraints(run.positions)[1])
+    return A, run.dual_residual, made.build_prolongation(A)
 
 
 def test_one_spring_ends_where_its_force_is_that_of_inertia():
     """k (l - r) = m/dt^2 (y - l), for a mass that inertia leads to y below where its spring is held."""
     k, r, m, dt, y = 500.0, 0.7, 0.3, 0.1, 1.2
     rest = np.array([[0.0, 0.0, 0.0], [0.0, -r, 0.0]])
-    springs = Springs.at_rest(rest, np.array([[0, 1]]), np.array([k]))
-    system = System(np.full(2, m), dt, (springs,), Pins(np.array([0]), np.array([np.inf])))
+    springs = Springs.from_rest_shape(rest, np.array([[0, 1]]), np.array([k]))
+    system = System(np.full(2, m), dt, (springs,), DirichletPins(np.array([0]), np.array([np.inf])))
     target = np.array([[0.0, 0.0, 0.0], [0.0, -y, 0.0]])
-    start = begun(system, target, rest)
+    start = build_step_start(system, target, rest)
     problem = StepProblem(system, target, np.zeros((2, 3)), rest[:1], rest, rest, start)
     held = m / dt**2
     wanted = (k * r + held * y) / (k + held)
@@ -75,9 +83,11 @@ def test_springs_that_turn_in_a_step_leave_an_error_of_fourth_order_in_the_time_
     apart = []
     pins = PinsEffect.model_validate({"at": ["ends"], "weight": "exact"})
     for frames in (24, 48, 96):
-        made = scene(Chain(length=2.0), SpringsEffect(stretch=20.0), Gravity(), pins, size=10, time_step=0.2 / frames)
-        prepared = prepare(made, Newton())
-        *_, last = simulate(made, prepared, StopRule(100, 1e-12), first_guess="current", frames=frames)
+        made = build_test_scene(
+            ChainMesh(length=2.0), SpringsEffect(stretch=20.0), GravityEffect(), pins, size=10, time_step=0.2 / frames
+        )
+        prepared = prepare(made, NewtonSolver())
+        *_, last = simulate_scene(made, prepared, StopRule(100, 1e-12), initial_guess="current", frames=frames)
         apart.append(np.abs(solved(last.problem, 20) - last.solution.positions).max())
     np.testing.assert_allclose([a / b for a, b in pairwise(apart)], 16.0, rtol=0.1)  # the next order
 
@@ -91,18 +101,22 @@ def test_tensions_end_as_what_their_springs_ask_for_and_xpbd_is_far_from_it(solv
 
 
 def test_a_free_cloth_keeps_its_momentum():
-    made = scene(Grid(), SpringsEffect(stretch=3e4), size=6)
-    problem = first_problem(made)
-    velocity = np.random.default_rng(0).normal(size=problem.current.shape)
-    moving = replace(problem.start, velocity=velocity)
-    problem = replace(problem, target=problem.current + made.system.time_step * velocity, start=moving)
+    made = build_test_scene(GridMesh(), SpringsEffect(stretch=3e4), size=6)
+    problem = build_first_problem(made)
+    velocity = np.random.default_rng(0).normal(size=problem.current_positions.shape)
+    moving = replace(problem.step_start, velocity=velocity)
+    problem = replace(
+        problem, inertial_target=problem.current_positions + made.system.time_step * velocity, step_start=moving
+    )
     after = moving.velocity_at(solved(problem, 5))
     np.testing.assert_allclose(made.system.mass @ after, made.system.mass @ velocity, rtol=0, atol=1e-12)
 
 
 def test_springs_without_stiffness_and_loops_do_nothing():
-    problem = random_problem(3)
-    idle = Springs.at_rest(problem.current, np.array([[0, 5], [4, 4], [2, 9]]), np.array([0.0, 100.0, 0.0]))
+    problem = build_random_problem(3)
+    idle = Springs.from_rest_shape(
+        problem.current_positions, np.array([[0, 5], [4, 4], [2, 9]]), np.array([0.0, 100.0, 0.0])
+    )
     with_, without = (replace(problem, system=replace(problem.system, energies=e)) for e in ((idle,), ()))
     np.testing.assert_array_equal(solved(with_, 5), solved(without, 5))
 
@@ -110,18 +124,18 @@ def test_springs_without_stiffness_and_loops_do_nothing():
 @pytest.mark.parametrize("smoothed", [False, True], ids=["unsmoothed", "smoothed"])
 def test_the_cycle_is_symmetric_and_positive_definite(smoothed):
     A, _, prolongation = dual(STIFF, MultigridXpbd(smoothed=smoothed))
-    cycle = Cycle(A, prolongation)
-    assert cycle.sizes[0] > 400 >= cycle.sizes[-1]
+    cycle = VCycle(A, prolongation)
+    assert cycle.level_sizes[0] > 400 >= cycle.level_sizes[-1]
     r, s = np.random.default_rng(0).normal(size=(2, A.shape[0]))
-    zr, zs = cycle.apply(r), cycle.apply(s)
+    zr, zs = cycle.apply_cycle(r), cycle.apply_cycle(s)
     assert abs(s @ zr - r @ zs) <= 1e-10 * np.abs(r * zs).sum()
     assert r @ zr > 0.0
 
 
 def test_prolongations_hold_the_near_kernel_and_are_orthonormal():
     A, _, _ = dual(STIFF)
-    B = near_kernel(A, 6, 30)
-    P = Prolongation(A, B).levels[0]
+    B = compute_near_nullspace(A, 6, 30)
+    P = ProlongationHierarchy(A, B).prolongators[0]
     gathered = np.diff(P.indptr) > 0
     np.testing.assert_allclose((P.T @ P).toarray(), np.eye(P.shape[1]), rtol=0, atol=1e-12)
     np.testing.assert_allclose((P @ (P.T @ B))[gathered], B[gathered], rtol=0, atol=1e-12)
@@ -130,27 +144,29 @@ def test_prolongations_hold_the_near_kernel_and_are_orthonormal():
 
 def test_sweeps_leave_what_the_matrix_hardly_resists():
     A, _, _ = dual(STIFF)
-    rough, smooth = near_kernel(A, 2, 0), near_kernel(A, 2, 30)
+    rough, smooth = compute_near_nullspace(A, 2, 0), compute_near_nullspace(A, 2, 30)
     resisted = [np.einsum("ij,ij->j", B, A @ B) / np.einsum("ij,ij->j", B, B) for B in (rough, smooth)]
     assert (resisted[1] <= 1e-2 * resisted[0]).all()
 
 
 def test_the_linear_solve_is_that_of_the_dual_system():
-    A, b, prolongation = dual(first_problem(cloth(16, "exact", stretch=100.0)))
-    solving = Solving(A, Cycle(A, prolongation), b, 1e-10)
+    A, b, prolongation = dual(build_first_problem(build_cloth(16, "exact", stretch=100.0)))
+    solving = PreconditionedSolve(A, VCycle(A, prolongation), b, 1e-10)
     assert solving.solve(400) < 400
-    np.testing.assert_allclose(A @ solving.x, b, rtol=0, atol=1e-9 * norm(b))
+    np.testing.assert_allclose(A @ solving.x, b, rtol=0, atol=1e-9 * ordered_norm(b))
 
 
 @pytest.mark.parametrize(("components", "most"), [(0, 40), (6, 80)])
 def test_multigrid_makes_up_for_the_length_of_a_chain(components, most):
     """Whose near-kernel is one tension for all; smoothing alone needs hundreds of iterations."""
     pins = PinsEffect.model_validate({"at": ["ends"], "weight": "exact"})
-    long = first_problem(scene(Chain(length=2.0), SpringsEffect(stretch=1e4), Gravity(), pins, size=1500))
+    long = build_first_problem(
+        build_test_scene(ChainMesh(length=2.0), SpringsEffect(stretch=1e4), GravityEffect(), pins, size=1500)
+    )
     A, b, prolongation = dual(long, MultigridXpbd(components=components))
-    assert Solving(A, Cycle(A, prolongation), b, 1e-6).solve(500) <= most
-    prolongation.levels.clear()
-    assert Solving(A, Cycle(A, prolongation), b, 1e-6).solve(500) > 5 * most
+    assert PreconditionedSolve(A, VCycle(A, prolongation), b, 1e-6).solve(500) <= most
+    prolongation.prolongators.clear()
+    assert PreconditionedSolve(A, VCycle(A, prolongation), b, 1e-6).solve(500) > 5 * most
 
 
 @pytest.mark.parametrize(
@@ -162,7 +178,7 @@ def test_multigrid_makes_up_for_the_length_of_a_chain(components, most):
 )
 def test_what_it_cannot_do_is_said_before_any_work(change, told):
     with pytest.raises(Unsupported, match=told):
-        MultigridXpbd().prepare(change(random_problem(0).system))
+        MultigridXpbd().prepare(change(build_random_problem(0).system))
 
 
 @pytest.mark.parametrize(("settings", "told"), [({"components": -1}, "components"), ({"setup": 0}, "setup")])

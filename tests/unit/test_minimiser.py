@@ -11,32 +11,32 @@ import numpy as np
 import pytest
 
 from harness.config.load import load_scene
-from harness.reference.curvature import curvature
-from harness.reference.frozen import Frozen
+from harness.reference.curvature import compute_curvature
+from harness.reference.frozen import StepSnapshot
 from harness.reference.judge import is_minimum
 from harness.reference.minimiser import (
-    ROUGH,
+    INACCURATE,
     SADDLE,
     VALLEY,
     KnownMinima,
-    Uncertified,
-    certify,
+    UncertifiedError,
+    build_free_hessian,
+    certify_minimum,
     find_minima,
-    free_hessian,
-    polish,
+    refine_minimum,
 )
-from harness.reference.store import Store
+from harness.reference.store import ReferenceStore
 from solvers.energies.springs import Springs
 from solvers.integrators import Motion
-from solvers.methods.newton import Newton
-from solvers.problem import Pins, Positions, Solution, StepProblem, StopRule, System
-from tests.scenes import begun, cloth, first_problem, random_problem
+from solvers.methods.newton import NewtonSolver
+from solvers.problem import DirichletPins, Positions, Solution, StepProblem, StopRule, System
+from tests.scenes import build_cloth, build_first_problem, build_random_problem, build_step_start
 
 PROBLEMS: dict[str, Callable[[], StepProblem]] = {
-    "cloth": lambda: first_problem(cloth(6, "exact")),
-    "random, compressed and stretched": lambda: random_problem(2, weights=(np.inf, np.inf)),
-    "random, pinned by penalty too": lambda: random_problem(3),
-    "random, not pinned": lambda: random_problem(4, weights=()),
+    "cloth": lambda: build_first_problem(build_cloth(6, "exact")),
+    "random, compressed and stretched": lambda: build_random_problem(2, weights=(np.inf, np.inf)),
+    "random, pinned by penalty too": lambda: build_random_problem(3),
+    "random, not pinned": lambda: build_random_problem(4, weights=()),
 }
 problems = pytest.mark.parametrize("problem", [make() for make in PROBLEMS.values()], ids=list(PROBLEMS))
 
@@ -45,24 +45,24 @@ problems = pytest.mark.parametrize("problem", [make() for make in PROBLEMS.value
 class Stays:
     """A solver that ends where it begins."""
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
-    choice: ClassVar[str] = ""
-    facts: ClassVar[dict[str, float]] = {}
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    description: ClassVar[str] = ""
+    stats: ClassVar[dict[str, float]] = {}
 
     def prepare(self, system: System) -> Any:
         return self
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        yield problem.first_guess
+        yield problem.initial_guess
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        return Solution(problem.first_guess.copy(), 1, 0.0, 0.0, "tolerance")
+        return Solution(problem.initial_guess.copy(), 1, 0.0, 0.0, "tolerance")
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         return 0.0
 
-    def phases(self, problem: StepProblem) -> dict:
+    def iteration_phases(self, problem: StepProblem) -> dict:
         return {}
 
 
@@ -70,19 +70,19 @@ def snap_through(weight: float = 0.005, height: float = 0.2) -> StepProblem:
     """A mass on four struts that are too long for their pins, stable above these and below them; its weight [N] makes
     the lower place the better one, for inertia is weak. It starts at a height [m] over the pins."""
     rest = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.0, 0.2, 0.0]])
-    springs = Springs.at_rest(rest, np.array([[0, 4], [1, 4], [2, 4], [3, 4]]), np.full(4, 100.0))
-    system = System(np.full(5, 1e-4), 0.1, (springs,), Pins(np.arange(4), np.full(4, np.inf)))
+    springs = Springs.from_rest_shape(rest, np.array([[0, 4], [1, 4], [2, 4], [3, 4]]), np.full(4, 100.0))
+    system = System(np.full(5, 1e-4), 0.1, (springs,), DirichletPins(np.arange(4), np.full(4, np.inf)))
     force, current = np.zeros((5, 3)), rest.copy()
     force[4, 1], current[4, 1] = -weight, height
-    return StepProblem(system, current, force, rest[:4], current, current, begun(system, current, current))
+    return StepProblem(system, current, force, rest[:4], current, current, build_step_start(system, current, current))
 
 
 FLAT = snap_through(weight=0.0, height=0.0)
 """Between its pins and without weight the mass is in balance, and about to snap."""
 
 
-def frozen(problem: StepProblem) -> Frozen:
-    return Frozen(1, problem, Motion(problem.current, problem.start.velocity), "0123456789ab")
+def frozen(problem: StepProblem) -> StepSnapshot:
+    return StepSnapshot(1, problem, Motion(problem.current_positions, problem.step_start.velocity), "0123456789ab")
 
 
 def lower(p: Positions) -> Positions:
@@ -92,8 +92,8 @@ def lower(p: Positions) -> Positions:
 
 @problems
 def test_the_hessian_is_the_derivative_of_the_gradient(problem):
-    p, free, h = problem.first_guess, problem.system.free, 1e-6
-    H = free_hessian(problem, p).toarray()
+    p, free, h = problem.initial_guess, problem.system.free, 1e-6
+    H = build_free_hessian(problem, p).toarray()
     for column, (vertex, axis) in enumerate((v, a) for v in free for a in range(3)):
         e = np.zeros_like(p)
         e[vertex, axis] = h
@@ -104,16 +104,16 @@ def test_the_hessian_is_the_derivative_of_the_gradient(problem):
 
 @problems
 def test_a_minimum_is_certified_by_the_oracle(problem):
-    for found in find_minima(problem, Newton()).minima:
-        assert found.certified
-        assert found.g == problem.value(found.positions)
-        values = np.linalg.eigvalsh(free_hessian(problem, found.positions).toarray())
+    for found in find_minima(problem, NewtonSolver()).minima:
+        assert found.is_certified
+        assert found.objective == problem.value(found.positions)
+        values = np.linalg.eigvalsh(build_free_hessian(problem, found.positions).toarray())
         assert values[0] > 0.0
-        assert found.smallest_eigenvalue == pytest.approx(values[0], rel=1e-3)  # as the inverse iteration is told
+        assert found.min_eigenvalue == pytest.approx(values[0], rel=1e-3)  # as the inverse iteration is told
         # What round-off leaves of the gradient moves the softest vertex by the error.
         gradient = np.abs(problem.gradient(found.positions)).max()
         assert gradient <= 10 * values[-1] * np.finfo(float).eps * np.abs(found.positions).max()
-        assert found.error <= 1e-12
+        assert found.newton_step_length <= 1e-12
         assert not found.positions.flags.writeable
         exact = problem.system.pins.exact
         held = problem.system.pins.vertices[exact]
@@ -122,85 +122,85 @@ def test_a_minimum_is_certified_by_the_oracle(problem):
 
 @problems
 def test_no_point_beside_a_minimum_is_lower(problem):
-    rng, best = np.random.default_rng(0), find_minima(problem, Newton()).best
+    rng, best = np.random.default_rng(0), find_minima(problem, NewtonSolver()).lowest
     for size in (1e-3, 1e-2):
         for _ in range(20):
             e = np.zeros_like(best.positions)
             e[problem.system.free] = size * rng.normal(size=(len(problem.system.free), 3))
-            assert problem.value(best.positions + e) > best.g
+            assert problem.value(best.positions + e) > best.objective
 
 
 @problems
 def test_newtons_steps_go_on_to_round_off_from_wherever_a_solver_left_them(problem):
-    best = find_minima(problem, Newton()).best
+    best = find_minima(problem, NewtonSolver()).lowest
     for size in (1e-5, 1e-8):
         start = best.positions + size * np.random.default_rng(1).normal(size=best.positions.shape)
-        found = certify(problem, start)
-        assert found.certified
+        found = certify_minimum(problem, start)
+        assert found.is_certified
         # Two ends of the same descent; both know the minimum to round-off times the condition of a few thousand.
         np.testing.assert_allclose(found.positions, best.positions, rtol=0, atol=1e-11)
 
 
 def test_a_saddle_is_not_certified():
-    assert not FLAT.gradient(FLAT.current).any()
-    found = certify(FLAT, FLAT.current)
-    assert not found.certified
+    assert not FLAT.gradient(FLAT.current_positions).any()
+    found = certify_minimum(FLAT, FLAT.current_positions)
+    assert not found.is_certified
     assert found.kind == SADDLE
-    assert found.smallest_eigenvalue < -found.doubt
+    assert found.min_eigenvalue < -found.eigenvalue_uncertainty
 
 
 def test_the_search_for_a_minimum_leaves_a_saddle():
-    found = polish(FLAT, FLAT.current, Newton())
-    assert found.certified
+    found = refine_minimum(FLAT, FLAT.current_positions, NewtonSolver())
+    assert found.is_certified
     assert abs(found.positions[4, 1]) > 0.1
 
 
 def test_a_point_that_is_no_minimum_is_never_a_reference(tmp_path):
-    reference = Store(tmp_path, Stays()).reference(frozen(FLAT))
+    reference = ReferenceStore(tmp_path, Stays()).find_minima(frozen(FLAT))
     assert reference.minima == ()
-    with pytest.raises(Uncertified, match="it is a saddle"):
-        _ = reference.best
+    with pytest.raises(UncertifiedError, match="it is a saddle"):
+        _ = reference.lowest
     assert not list(tmp_path.iterdir())
 
 
 def test_a_lower_minimum_replaces_the_reference(tmp_path):
-    problem, store = snap_through(), Store(tmp_path)
+    problem, store = snap_through(), ReferenceStore(tmp_path)
     one = frozen(problem)
-    above = store.reference(one).best
+    above = store.find_minima(one).lowest
     assert above.positions[4, 1] > 0.1
-    below = store.classify(one, lower(above.positions))
+    below = store.classify_minimum(one, lower(above.positions))
     assert below.positions[4, 1] < -0.1
-    assert below.g < above.g
-    again = Store(tmp_path).reference(one)
-    assert [m.g for m in again.minima] == [below.g, above.g]
-    assert [again.branch(m) for m in (below, above)] == [0, 1]
-    assert again.best.name == below.name != above.name
+    assert below.objective < above.objective
+    again = ReferenceStore(tmp_path).find_minima(one)
+    assert [m.objective for m in again.minima] == [below.objective, above.objective]
+    assert [again.find_index(m) for m in (below, above)] == [0, 1]
+    assert again.lowest.minimum_id == below.minimum_id != above.minimum_id
 
 
 def test_a_point_belongs_to_the_minimum_that_newtons_method_finds_from_it(tmp_path):
-    problem, store = snap_through(), Store(tmp_path)
+    problem, store = snap_through(), ReferenceStore(tmp_path)
     one = frozen(problem)
-    above = store.reference(one).best
+    above = store.find_minima(one).lowest
     rng, names = np.random.default_rng(0), {}
     for side, start in (("above", above.positions), ("below", lower(above.positions))):
         points = [start + 0.02 * rng.normal(size=(5, 3)) for _ in range(4)]
-        names[side] = {store.classify(one, p).name for p in points}
-    assert names["above"] == {above.name}  # one name each, whatever was found in between
+        names[side] = {store.classify_minimum(one, p).minimum_id for p in points}
+    assert names["above"] == {above.minimum_id}  # one name each, whatever was found in between
     assert len(names["below"]) == 1
-    assert len(store.reference(one).minima) == 2
+    assert len(store.find_minima(one).minima) == 2
 
 
 def test_a_point_that_leads_to_no_minimum_has_no_branch(tmp_path):
-    known = Store(tmp_path).reference(frozen(FLAT))
-    found = Store(tmp_path, Stays()).classify(frozen(FLAT), FLAT.current)
-    assert not found.certified
-    assert len(Store(tmp_path).reference(frozen(FLAT)).minima) == len(known.minima)
+    known = ReferenceStore(tmp_path).find_minima(frozen(FLAT))
+    found = ReferenceStore(tmp_path, Stays()).classify_minimum(frozen(FLAT), FLAT.current_positions)
+    assert not found.is_certified
+    assert len(ReferenceStore(tmp_path).find_minima(frozen(FLAT)).minima) == len(known.minima)
 
 
 def test_minima_are_found_once(tmp_path):
     one = frozen(PROBLEMS["cloth"]())
-    found = Store(tmp_path).reference(one).best
-    again = Store(tmp_path, Stays()).reference(one).best
+    found = ReferenceStore(tmp_path).find_minima(one).lowest
+    again = ReferenceStore(tmp_path, Stays()).find_minima(one).lowest
     np.testing.assert_array_equal(found.positions, again.positions)
     fields = ("g", "error", "smallest_eigenvalue", "doubt", "kind", "name")
     assert [getattr(found, f) for f in fields] == [getattr(again, f) for f in fields]
@@ -209,23 +209,23 @@ def test_minima_are_found_once(tmp_path):
 
 def test_minima_are_known_by_where_they_lie():
     problem = snap_through()
-    above = find_minima(problem, Newton()).best
-    below = polish(problem, lower(above.positions), Newton())
+    above = find_minima(problem, NewtonSolver()).lowest
+    below = refine_minimum(problem, lower(above.positions), NewtonSolver())
     nudged = replace(above, positions=above.positions + 1e-12)
-    known = KnownMinima(()).joined(above).joined(nudged).joined(below)
-    assert [m.g for m in known.minima] == [below.g, above.g]
-    assert known.branch(nudged) == 1
-    uncertified = replace(above, positions=above.positions + 0.5, g=-1e9, kind=SADDLE)
-    assert known.joined(uncertified) is known
+    known = KnownMinima(()).add_minimum(above).add_minimum(nudged).add_minimum(below)
+    assert [m.objective for m in known.minima] == [below.objective, above.objective]
+    assert known.find_index(nudged) == 1
+    uncertified = replace(above, positions=above.positions + 0.5, objective=-1e9, kind=SADDLE)
+    assert known.add_minimum(uncertified) is known
 
 
 STANDING = Path(__file__).resolve().parents[2] / "configs" / "hard" / "saddle-standing-chain.yaml"
 """A chain on its first vertex, which may buckle to any side: the minima of a step are a circle."""
 
 
-def standing(folder: Path) -> tuple[Store, Frozen]:
-    store = Store(folder)
-    return store, store.frames(load_scene(STANDING), 9, [1])[1]
+def standing(folder: Path) -> tuple[ReferenceStore, StepSnapshot]:
+    store = ReferenceStore(folder)
+    return store, store.load_frames(load_scene(STANDING), 9, [1])[1]
 
 
 def turned(problem: StepProblem, p: Positions, angle: float) -> Positions:
@@ -236,17 +236,17 @@ def turned(problem: StepProblem, p: Positions, angle: float) -> Positions:
 
 def test_a_valley_of_minima_is_found_as_such_and_is_no_reference(tmp_path):
     store, one = standing(tmp_path)
-    found = polish(one.problem, one.problem.current, Newton())
+    found = refine_minimum(one.problem, one.problem.current_positions, NewtonSolver())
     assert found.kind == VALLEY
-    assert abs(found.smallest_eigenvalue) <= found.doubt < 1e-9
+    assert abs(found.min_eigenvalue) <= found.eigenvalue_uncertainty < 1e-9
     other = turned(one.problem, found.positions, 1.0)
     assert np.linalg.norm(other - found.positions, axis=1).max() > 1e-3
-    assert one.problem.value(other) == pytest.approx(found.g, rel=1e-13)  # a dozen terms
-    with pytest.raises(Uncertified, match="valley"):
-        _ = store.reference(one).best
+    assert one.problem.value(other) == pytest.approx(found.objective, rel=1e-13)  # a dozen terms
+    with pytest.raises(UncertifiedError, match="valley"):
+        _ = store.find_minima(one).lowest
     for solved in (found.positions, other):
         assert not is_minimum(one.problem, solved)
-        assert curvature(one.problem, solved).flat
+        assert compute_curvature(one.problem, solved).is_degenerate
 
 
 def test_a_start_that_is_shaken_is_certified_by_no_eigenvalue_of_another_point(tmp_path):
@@ -254,26 +254,26 @@ def test_a_start_that_is_shaken_is_certified_by_no_eigenvalue_of_another_point(t
     _, one = standing(tmp_path)
     rng = np.random.default_rng(2)
     for size in (1e-2, 1e-3):
-        shaken = one.problem.current + size * rng.normal(size=one.problem.current.shape)
-        found = polish(one.problem, shaken, Newton())
-        assert not found.certified
-        least = np.linalg.eigvalsh(free_hessian(one.problem, found.positions).toarray())[0]
-        assert abs(found.smallest_eigenvalue - least) <= found.doubt
+        shaken = one.problem.current_positions + size * rng.normal(size=one.problem.current_positions.shape)
+        found = refine_minimum(one.problem, shaken, NewtonSolver())
+        assert not found.is_certified
+        least = np.linalg.eigvalsh(build_free_hessian(one.problem, found.positions).toarray())[0]
+        assert abs(found.min_eigenvalue - least) <= found.eigenvalue_uncertainty
 
 
 def test_a_classification_lets_no_valley_in(tmp_path):
     store, one = standing(tmp_path)
-    assert not store.classify(one, one.problem.current).certified
-    assert store.reference(one).minima == ()
+    assert not store.classify_minimum(one, one.problem.current_positions).is_certified
+    assert store.find_minima(one).minima == ()
     assert not list(tmp_path.glob("minima-*"))
 
 
 @pytest.mark.parametrize("name", ["error", "smallest_eigenvalue", "g"])
 def test_a_certificate_is_of_the_very_point_that_is_stored(name: str):
     problem = PROBLEMS["random, pinned by penalty too"]()
-    found = polish(problem, problem.first_guess, Newton())
-    H = free_hessian(problem, found.positions).toarray()
-    step = np.linalg.solve(H, problem.gradient(found.positions)[problem.system.free].ravel()).reshape(-1, 3)
+    found = refine_minimum(problem, problem.initial_guess, NewtonSolver())
+    H = build_free_hessian(problem, found.positions).toarray()
+    step = np.linalg.solve(H, problem.gradient(found.positions)[problem.system.free_vertices].ravel()).reshape(-1, 3)
     there = {
         "error": np.linalg.norm(step, axis=1).max(),
         "smallest_eigenvalue": np.linalg.eigvalsh(H)[0],
@@ -285,16 +285,16 @@ def test_a_certificate_is_of_the_very_point_that_is_stored(name: str):
 
 def test_minima_that_were_stored_with_less_than_a_certificate_are_found_again(tmp_path):
     one = frozen(PROBLEMS["cloth"]())
-    found = Store(tmp_path).reference(one).best
+    found = ReferenceStore(tmp_path).find_minima(one).lowest
     path = tmp_path / f"minima-{one.digest}.npz"
     arrays = dict(np.load(path))
     del arrays["doubt"]
     np.savez(path, allow_pickle=False, **arrays)
-    assert Store(tmp_path).reference(one).best.doubt == found.doubt
+    assert ReferenceStore(tmp_path).find_minima(one).lowest.eigenvalue_uncertainty == found.eigenvalue_uncertainty
     assert "doubt" in np.load(path)
 
 
 def test_a_minimum_that_is_not_known_well_says_by_how_much():
     problem = PROBLEMS["cloth"]()
-    best = find_minima(problem, Newton()).best
-    assert "next step" in replace(best, kind=ROUGH).flaw
+    best = find_minima(problem, NewtonSolver()).lowest
+    assert "next step" in replace(best, kind=INACCURATE).describe_flaw

@@ -6,26 +6,26 @@ import numpy as np
 import pytest
 
 from solvers.linear.multigrid import Multigrid
-from solvers.linear.multigrid_kernels import aggregate, filtered
-from solvers.linear.supernodal import Supernodal
-from tests.networks import grid, grid_springs, network, right_hand_sides
+from solvers.linear.multigrid_kernels import build_aggregates, filter_weak_entries
+from solvers.linear.supernodal import SupernodalCholesky
+from tests.networks import grid_matrix, grid_springs, network_matrix, random_right_hand_sides
 
-SHEET, SOLID = grid(70, 70), grid(14, 14, 14)
+SHEET, SOLID = grid_matrix(70, 70), grid_matrix(14, 14, 14)
 
 
 def cycle(multigrid, r):
     multigrid.right_hand_side[:, :3] = r
-    return multigrid.apply()[:, :3].astype(float)
+    return multigrid.apply_cycle()[:, :3].astype(float)
 
 
 def aggregates(Q):
-    return aggregate(Q.indptr, Q.indices, Q.data, 0.25, 10.0)
+    return build_aggregates(Q.indptr, Q.indices, Q.data, 0.25, 10.0)
 
 
 @pytest.mark.parametrize("Q", [SHEET, SOLID], ids=["sheet", "solid"])
 def test_the_cycle_is_symmetric_and_positive_definite(Q):
     multigrid, n = Multigrid(Q), len(Q.indptr) - 1
-    r, s = right_hand_sides(n, 1), right_hand_sides(n, 2)
+    r, s = random_right_hand_sides(n, 1), random_right_hand_sides(n, 2)
     zr, zs = cycle(multigrid, r), cycle(multigrid, s)
     cross = np.abs(r * zs).sum(axis=0)
     # float32 rounds each of about a hundred operations to 6e-8, of terms that cancel in the sum
@@ -36,7 +36,7 @@ def test_the_cycle_is_symmetric_and_positive_definite(Q):
 @pytest.mark.parametrize("Q", [SHEET, SOLID], ids=["sheet", "solid"])
 def test_a_cycle_takes_out_most_of_any_error(Q):
     multigrid, n = Multigrid(Q), len(Q.indptr) - 1
-    x = right_hand_sides(n)
+    x = random_right_hand_sides(n)
 
     def energy(e):
         return np.einsum("ij,ij->", e, Q @ e)
@@ -54,13 +54,13 @@ def test_a_cycle_takes_out_most_of_any_error(Q):
 def test_levels_shrink_by_the_neighbours_of_a_vertex(Q, most):
     multigrid = Multigrid(Q)
     # 9 and 27 vertices an aggregate, less at the borders
-    assert multigrid.sizes[1] <= most * multigrid.sizes[0]
+    assert multigrid.level_sizes[1] <= most * multigrid.level_sizes[0]
     assert multigrid.nonzeros <= 2.5 * Q.nnz
 
 
 def test_stiffness_over_six_decades_does_not_fill_the_levels():
     springs, rng = grid_springs(70, 70), np.random.default_rng(0)
-    Q = network(springs, 10.0 ** rng.uniform(0, 6, len(springs)), np.full(4900, 1e-3))
+    Q = network_matrix(springs, 10.0 ** rng.uniform(0, 6, len(springs)), np.full(4900, 1e-3))
     # measured: 3; without the filter of weak springs 33 on a sheet of 150 vertices a side
     assert Multigrid(Q).nonzeros <= 4 * Q.nnz
 
@@ -81,13 +81,13 @@ def test_every_vertex_is_in_one_connected_aggregate():
 def test_aggregates_lie_along_stiff_springs():
     springs = grid_springs(40, 40)
     along = springs[:, 1] - springs[:, 0] == 1
-    of, count = aggregates(network(springs, np.where(along, 1e4, 1.0), np.full(1600, 1e-3)))
+    of, count = aggregates(network_matrix(springs, np.where(along, 1e4, 1.0), np.full(1600, 1e-3)))
     for a in range(count):
         assert np.ptp(np.flatnonzero(of == a) // 40) == 0  # in one row of the grid
 
 
 def test_vertices_that_smoothing_determines_are_in_no_aggregate():
-    Q = network(grid_springs(40, 40), 0.01, np.ones(1600))
+    Q = network_matrix(grid_springs(40, 40), 0.01, np.ones(1600))
     of, count = aggregates(Q)
     assert count == 0
     assert (of == -1).all()
@@ -95,9 +95,9 @@ def test_vertices_that_smoothing_determines_are_in_no_aggregate():
 
 def test_weak_entries_go_to_the_diagonal_and_keep_the_sums_of_rows():
     springs, rng = grid_springs(20, 20), np.random.default_rng(0)
-    Q = network(springs, 10.0 ** rng.uniform(0, 6, len(springs)), np.ones(400))
+    Q = network_matrix(springs, 10.0 ** rng.uniform(0, 6, len(springs)), np.ones(400))
     F = Q.copy()
-    F.data = filtered(Q.indptr, Q.indices, Q.data, 0.25)
+    F.data = filter_weak_entries(Q.indptr, Q.indices, Q.data, 0.25)
     # sums of up to nine terms of one size: a few eps of the largest
     np.testing.assert_allclose(F.sum(axis=1), Q.sum(axis=1), rtol=0, atol=1e-14 * np.abs(Q.data).max())
     off = F.toarray() - np.diag(F.diagonal())
@@ -106,8 +106,8 @@ def test_weak_entries_go_to_the_diagonal_and_keep_the_sums_of_rows():
 
 
 def test_a_system_of_the_coarsest_size_is_solved_at_once():
-    Q = grid(20, 20)
-    b, expected = right_hand_sides(400), np.empty((400, 3))
-    Supernodal(Q).solve(b, expected)
+    Q = grid_matrix(20, 20)
+    b, expected = random_right_hand_sides(400), np.empty((400, 3))
+    SupernodalCholesky(Q).solve(b, expected)
     # in and out in float32
     assert np.abs(cycle(Multigrid(Q), b) - expected).max() <= 1e-6 * np.abs(expected).max()

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from harness.base.stated import stated
-from harness.config.load import load_any
-from solvers.about import LOCAL_GLOBAL
+from harness.base.stated import read_solver_metadata
+from harness.config.load import load_config
+from solvers.about import LOCAL_GLOBAL_FAMILY
 from solvers.core import native
 from solvers.core.prefactored import PreparedLocalGlobal
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import NotPositiveDefinite, Positions, StopRule, System, Unsupported
-from solvers.registry import OPTIONAL, SOLVERS, load
-from tests.scenes import cloth, first_problem
+from solvers.registry import OPTIONAL_SOLVERS, SOLVERS, load_target
+from tests.scenes import build_cloth, build_first_problem
 
 NATIVE = ("eigen", "cholmod")
 
@@ -34,7 +34,7 @@ effects: [{kind: springs, stretch: 200}]
 def made(name: str, system: System) -> PreparedLocalGlobal:
     """The real one; where it cannot be compiled it refuses with the reason, and there is nothing to compare."""
     try:
-        return load(OPTIONAL[name])().prepare(system)
+        return load_target(OPTIONAL_SOLVERS[name])().prepare(system)
     except Unsupported as error:
         pytest.skip(str(error))
 
@@ -42,15 +42,15 @@ def made(name: str, system: System) -> PreparedLocalGlobal:
 @pytest.mark.parametrize("name", NATIVE)
 @pytest.mark.parametrize("weight", [1e10, "exact"])
 def test_its_iterates_are_those_of_the_others(name: str, weight: float | str):
-    scene = cloth(12, weight=weight)
-    problem = first_problem(scene)
+    scene = build_cloth(12, weight=weight)
+    problem = build_first_problem(scene)
     ours = SparseLocalGlobal().prepare(scene.system)
     theirs = made(name, scene.system)
     for p, q in islice(zip(ours.iterates(problem), theirs.iterates(problem), strict=True), 30):
         # Two factorisations of a matrix with weights from 1e2 to 1e10: round-off in positions of a metre.
         np.testing.assert_allclose(q, p, rtol=0, atol=1e-11)
     stop = StopRule(1000, 1e-3)
-    assert theirs.solve(problem, stop).iterations == ours.solve(problem, stop).iterations
+    assert theirs.solve(problem, stop).num_iterations == ours.solve(problem, stop).num_iterations
     solution = theirs.solve(problem, StopRule(30))
     np.testing.assert_array_equal(solution.positions, next(islice(theirs.iterates(problem), 29, None)))
     assert solution.residual == pytest.approx(ours.solve(problem, StopRule(30)).residual, rel=1e-6)
@@ -58,19 +58,21 @@ def test_its_iterates_are_those_of_the_others(name: str, weight: float | str):
 
 @pytest.mark.parametrize("name", NATIVE)
 def test_a_matrix_without_a_factor_is_refused(name: str):
-    scene = cloth(3)
+    scene = build_cloth(3)
     made(name, scene.system)
     loose = System(np.full(9, -1.0), scene.system.time_step, scene.system.energies)
     with pytest.raises(NotPositiveDefinite):
-        load(OPTIONAL[name])().prepare(loose)
+        load_target(OPTIONAL_SOLVERS[name])().prepare(loose)
 
 
 @pytest.mark.parametrize("name", NATIVE)
 def test_other_energies_are_refused_before_anything_is_compiled(name: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(native, "library", lambda *_: pytest.fail("compiled"))
-    system = cloth(3).system
+    system = build_cloth(3).system
     with pytest.raises(Unsupported, match=f"{name}: knows springs only"):
-        load(OPTIONAL[name])().prepare(System(system.mass, system.time_step, (*system.energies, _Other())))
+        load_target(OPTIONAL_SOLVERS[name])().prepare(
+            System(system.mass, system.time_step, (*system.energies, _Other()))
+        )
 
 
 class _Other:
@@ -86,19 +88,19 @@ class _Other:
 
 @pytest.mark.parametrize("name", NATIVE)
 def test_without_a_compiler_the_row_says_so(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from harness.experiments.plan import Files
-    from harness.experiments.run import execute
+    from harness.experiments.plan import RunFiles
+    from harness.experiments.run import execute_run
 
     monkeypatch.setattr(native.shutil, "which", lambda _: None)
     (tmp_path / "chain.yaml").write_text(SCENE)
-    (run,) = load_any(tmp_path / "chain.yaml", solvers=[name]).runs()
+    (run,) = load_config(tmp_path / "chain.yaml", solvers=[name]).list_runs()
     (tmp_path / "rows").mkdir()
-    (row,) = execute(run, Files.of(run, tmp_path), lambda phase: None)
-    assert (row["status"], row["family"]) == ("unsupported", LOCAL_GLOBAL)
+    (row,) = execute_run(run, RunFiles.for_run(run, tmp_path), lambda phase: None)
+    assert (row["status"], row["family"]) == ("unsupported", LOCAL_GLOBAL_FAMILY)
     assert "there is no C++ compiler" in row["reason"]
 
 
 def test_they_are_not_among_those_that_are_everywhere():
-    assert set(NATIVE) <= set(OPTIONAL)
-    assert not set(OPTIONAL) & set(SOLVERS)
-    assert all(stated(name)["minimises"] for name in NATIVE)
+    assert set(NATIVE) <= set(OPTIONAL_SOLVERS)
+    assert not set(OPTIONAL_SOLVERS) & set(SOLVERS)
+    assert all(read_solver_metadata(name)["minimises"] for name in NATIVE)

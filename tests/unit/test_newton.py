@@ -8,25 +8,25 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 
-from harness.reference.curvature import free_hessian
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins as PinsEffect
-from harness.scenes.effects.springs import Springs as SpringsEffect
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
-from harness.simulation.step import problem
+from harness.reference.curvature import build_free_hessian
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect as PinsEffect
+from harness.scenes.effects.springs import SpringsEffect as SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
+from harness.simulation.step import build_problem
 from solvers.core.descent import PreparedDescent
-from solvers.core.fixed_objective import Objective
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
-from solvers.core.saddles import certified
-from solvers.methods.hybrid import Hybrid
-from solvers.methods.newton import Newton
+from solvers.core.saddles import is_positive_definite
+from solvers.methods.hybrid import HybridNewton
+from solvers.methods.newton import NewtonSolver
 from solvers.methods.newton_cg import NewtonCG
 from solvers.problem import Positions, StepProblem, StopRule
-from tests.scenes import cloth, first_problem, random_problem, scene
+from tests.scenes import build_cloth, build_first_problem, build_random_problem, build_test_scene
 from tests.stability.test_hard_cases import CASES, resting
 
-SOLVERS = [Newton(), NewtonCG(), Hybrid()]
+SOLVERS = [NewtonSolver(), NewtonCG(), HybridNewton()]
 solvers = pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: type(s).__name__)
 
 ENOUGH = StopRule(300)
@@ -35,19 +35,19 @@ ENOUGH = StopRule(300)
 
 def stated(case) -> StepProblem:
     made = case.scene()
-    return problem(made, resting(case.start(made.mesh.rest)), "assignment")
+    return build_problem(made, resting(case.start(made.mesh.rest)), "assignment")
 
 
 def is_certified(found: StepProblem, p: Positions) -> bool:
-    step = StepObjective(Objective(found.system), found)
-    return certified(step, step.placed(p))
+    step = StepObjective(FixedObjective(found.system), found)
+    return is_positive_definite(step, step.apply_exact_pins(p))
 
 
 @solvers
 @pytest.mark.parametrize("case", CASES.values(), ids=list(CASES))
 def test_a_hard_case_ends_at_a_certified_minimum(case, solver):
     given = stated(case)
-    path = [given.first_guess.copy()]
+    path = [given.initial_guess.copy()]
     for p in islice(solver.prepare(given.system).iterates(given), 300):
         path.append(p.copy())
         if np.array_equal(path[-1], path[-2]):
@@ -55,7 +55,7 @@ def test_a_hard_case_ends_at_a_certified_minimum(case, solver):
     assert np.isfinite(path).all()
     values = [given.value(p) for p in path]
     # The oracle's own round-off: lengths are good to eps, energies of stiff springs to that over their strain.
-    slack = 1e-12 * max(given.magnitude(p) for p in path[1:])
+    slack = 1e-12 * max(given.value_scale(p) for p in path[1:])
     assert all(b <= a + slack for a, b in pairwise(values[1:]))
     assert is_certified(given, path[-1])
 
@@ -63,13 +63,13 @@ def test_a_hard_case_ends_at_a_certified_minimum(case, solver):
 @solvers
 @pytest.mark.parametrize("guess", [1e-3, 1.0, 1e3], ids="{:g} m".format)
 def test_a_random_start_ends_at_a_certified_minimum(solver, guess):
-    given = random_problem(5, n=30, m=80)
-    given = replace(given, first_guess=guess * np.random.default_rng(0).normal(size=given.target.shape))
+    given = build_random_problem(5, n=30, m=80)
+    given = replace(given, initial_guess=guess * np.random.default_rng(0).normal(size=given.inertial_target.shape))
     solution = solver.prepare(given.system).solve(given, ENOUGH)
-    assert solution.stopped == "stalled"
+    assert solution.termination_reason == "stalled"
     assert is_certified(given, solution.positions)
     gradient = np.abs(given.gradient(solution.positions)).max()
-    assert gradient <= 1e-10 * np.abs(given.gradient(given.current)).max()
+    assert gradient <= 1e-10 * np.abs(given.gradient(given.current_positions)).max()
 
 
 # What cannot stretch comes down 1 cm in steps along a curved valley, the narrower the stiffer. With 1e12 the exact
@@ -80,26 +80,26 @@ RATIOS = [(ratio, s) for ratio, s in RATIOS if ratio <= 1e6 or not isinstance(s,
 
 @pytest.mark.parametrize(("ratio", "solver"), RATIOS, ids=lambda x: type(x).__name__ if x in SOLVERS else f"{x:g}")
 def test_any_ratio_of_stiffness_to_inertia_ends_at_a_certified_minimum(ratio, solver):
-    given = first_problem(cloth(6, "exact"))
+    given = build_first_problem(build_cloth(6, "exact"))
     dt = given.system.time_step
-    mass = np.full(given.system.vertices, 300.0 * dt**2 / ratio)
+    mass = np.full(given.system.num_vertices, 300.0 * dt**2 / ratio)
     system = replace(given.system, mass=mass)
-    force = np.zeros_like(given.force)
+    force = np.zeros_like(given.external_force)
     force[:, 1] = -9.8 * mass
-    given = replace(given, system=system, force=force)
+    given = replace(given, system=system, external_force=force)
     solution = solver.prepare(system).solve(given, StopRule(4000))
-    assert solution.stopped == "stalled"
+    assert solution.termination_reason == "stalled"
     assert is_certified(given, solution.positions)
 
 
 def test_newton_converges_quadratically():
     """Each step on the way from 1e-3 to round-off squares the residual, up to a factor."""
-    given = first_problem(cloth(12, "exact"))
-    prepared = Newton().prepare(given.system)
+    given = build_first_problem(build_cloth(12, "exact"))
+    prepared = NewtonSolver().prepare(given.system)
     assert isinstance(prepared, PreparedDescent)
-    step = StepObjective(prepared.objective, given)
+    step = StepObjective(prepared.fixed_objective, given)
     residuals = [prepared.metric.residual(step.gradient(p.copy())) for p in islice(prepared.iterates(given), 40)]
-    start = prepared.metric.residual(step.gradient(given.current))
+    start = prepared.metric.residual(step.gradient(given.current_positions))
     assert residuals[-1] <= 1e-12 * start
     near = [r / start for r in residuals if 1e-11 * start < r < 1e-3 * start]
     # A linear method that comes from 1e-3 to 1e-11 at the rate of the clamped one, a half or worse, takes 27 steps.
@@ -108,40 +108,42 @@ def test_newton_converges_quadratically():
 
 def test_newton_ends_within_few_factorisations_where_clamping_takes_many():
     """k dt^2/m = 6.4e4 at 24 x 24: 25 steps to round-off, where clamping all negative lateral parts takes 96."""
-    given = first_problem(cloth(24, "exact", stretch=1e5))
-    solution = Newton().prepare(given.system).solve(given, StopRule(40))
-    assert solution.stopped == "stalled"
+    given = build_first_problem(build_cloth(24, "exact", stretch=1e5))
+    solution = NewtonSolver().prepare(given.system).solve(given, StopRule(40))
+    assert solution.termination_reason == "stalled"
     assert is_certified(given, solution.positions)
 
 
 def test_newton_leaves_a_saddle():
     """A chain that is pushed together along its own line feels no force sideways, but is not stable."""
     pins = PinsEffect.model_validate({"at": ["ends"], "weight": "exact"})
-    made = scene(Chain(length=1.0), SpringsEffect(stretch=1e4), pins, size=9, time_step=1.0)
-    given = first_problem(made)
-    middle = 0.5 * (made.mesh.rest[0] + made.mesh.rest[-1])
-    squeezed = middle + 0.5 * (made.mesh.rest - middle)
+    made = build_test_scene(ChainMesh(length=1.0), SpringsEffect(stretch=1e4), pins, size=9, time_step=1.0)
+    given = build_first_problem(made)
+    middle = 0.5 * (made.mesh.rest_positions[0] + made.mesh.rest_positions[-1])
+    squeezed = middle + 0.5 * (made.mesh.rest_positions - middle)
     targets = squeezed[given.system.pins.vertices]
-    given = replace(given, target=squeezed, current=squeezed, first_guess=squeezed, pin_targets=targets)
+    given = replace(
+        given, inertial_target=squeezed, current_positions=squeezed, initial_guess=squeezed, pin_targets=targets
+    )
     assert np.abs(given.gradient(squeezed)).max() <= 1e-9
     assert not is_certified(given, squeezed)
-    solution = Newton().prepare(given.system).solve(given, ENOUGH)
+    solution = NewtonSolver().prepare(given.system).solve(given, ENOUGH)
     assert given.value(solution.positions) < 0.5 * given.value(squeezed)
-    curvature = np.linalg.eigvalsh(free_hessian(given, solution.positions).toarray())
+    curvature = np.linalg.eigvalsh(build_free_hessian(given, solution.positions).toarray())
     assert curvature[0] >= -1e-12 * curvature[-1], "zero, where it turns about its own line, but for round-off"
 
 
 def test_a_step_at_rest_ends_at_once():
-    given = first_problem(cloth(6, "exact"))
-    given = replace(given, force=np.zeros_like(given.force))
-    solution = Newton().prepare(given.system).solve(given, StopRule(50, 1e-6))
-    assert solution.iterations == 0
-    np.testing.assert_array_equal(solution.positions, given.current)
+    given = build_first_problem(build_cloth(6, "exact"))
+    given = replace(given, external_force=np.zeros_like(given.external_force))
+    solution = NewtonSolver().prepare(given.system).solve(given, StopRule(50, 1e-6))
+    assert solution.num_iterations == 0
+    np.testing.assert_array_equal(solution.positions, given.current_positions)
 
 
 @solvers
 def test_nothing_to_solve_for_is_solved(solver):
-    given = random_problem(0, weights=(np.inf,) * 12)
+    given = build_random_problem(0, weights=(np.inf,) * 12)
     solution = solver.prepare(given.system).solve(given, StopRule(5, 1e-3))
     np.testing.assert_array_equal(solution.positions, given.pin_targets)
 
@@ -150,8 +152,10 @@ def test_nothing_to_solve_for_is_solved(solver):
 def test_all_newtons_find_the_same_minimum_of_a_taut_cloth(solver):
     """Hanging under its own weight far from rest, springs are taut and the minimum is the only one near."""
     pins = PinsEffect.model_validate({"at": ["top"], "weight": "exact"})
-    made = scene(Grid(), SpringsEffect(stretch=300.0, shear=60.0), Gravity(), pins, size=8, mass=50.0)
-    given = first_problem(made)
-    wanted = Newton().prepare(given.system).solve(given, ENOUGH).positions
+    made = build_test_scene(
+        GridMesh(), SpringsEffect(stretch=300.0, shear=60.0), GravityEffect(), pins, size=8, mass=50.0
+    )
+    given = build_first_problem(made)
+    wanted = NewtonSolver().prepare(given.system).solve(given, ENOUGH).positions
     found = solver.prepare(given.system).solve(given, ENOUGH).positions
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-11)  # gradients of round-off over a stiffness of 1

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from harness.base.errors import InputError
-from harness.base.npz import MAX_BYTES, read_numbers
+from harness.base.npz import MAX_NPZ_BYTES, read_npz_array
 from harness.config.load import load_scene
 
 FRAMES = np.arange(24.0).reshape(2, 4, 3) / 7.0
@@ -85,8 +85,14 @@ BROKEN: dict[str, tuple[bytes | Callable[[bytes], bytes], str]] = {
         "no head of an array|promises",
     ),
     "a head of code": (packed(positions=header("__import__('os').system('true')")), "no head of an array"),
-    "100 MB of zeros in 100 kB": (packed(positions=npy(np.zeros(MAX_BYTES // 8 + 1))), "at most 100,000,000 are read"),
-    "bytes that grow": (packed(positions=npy(np.zeros(MAX_BYTES // 8 + 1, np.uint8))), "at most 12,500,000 are read"),
+    "100 MB of zeros in 100 kB": (
+        packed(positions=npy(np.zeros(MAX_NPZ_BYTES // 8 + 1))),
+        "at most 100,000,000 are read",
+    ),
+    "bytes that grow": (
+        packed(positions=npy(np.zeros(MAX_NPZ_BYTES // 8 + 1, np.uint8))),
+        "at most 12,500,000 are read",
+    ),
 }
 
 
@@ -96,7 +102,7 @@ def test_a_broken_file_is_refused_with_the_reason(tmp_path, case):
     path = tmp_path / "walk.npz"
     path.write_bytes(content if isinstance(content, bytes) else content(WHOLE))
     with pytest.raises(InputError, match=words) as caught:
-        read_numbers(path, "positions")
+        read_npz_array(path, "positions")
     assert caught.value.mistakes[0].file == path
 
 
@@ -105,7 +111,7 @@ def test_a_broken_file_is_refused_with_the_reason(tmp_path, case):
 def test_numbers_of_any_type_and_order_are_read_as_float64(tmp_path, dtype, order):
     stored = np.array(FRAMES, dtype, order=order)
     np.savez_compressed(tmp_path / "walk.npz", other=np.arange(3), positions=stored)
-    found = read_numbers(tmp_path / "walk.npz", "positions")
+    found = read_npz_array(tmp_path / "walk.npz", "positions")
     assert found.dtype == np.float64
     np.testing.assert_array_equal(found, stored.astype(float))
 
@@ -113,7 +119,7 @@ def test_numbers_of_any_type_and_order_are_read_as_float64(tmp_path, dtype, orde
 @pytest.mark.parametrize("name", ["missing.npz", ".", "a\0b.npz"])
 def test_what_is_no_file_is_refused(tmp_path, name):
     with pytest.raises(InputError, match=r"is no file|cannot be read"):
-        read_numbers(tmp_path / name, "positions")
+        read_npz_array(tmp_path / name, "positions")
 
 
 def scene(folder: Path, obstacle: str) -> Path:

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array, diags_array
 
-from solvers.core.fixed_objective import Objective
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
 from solvers.energies.springs import Springs
 from solvers.problem import Positions, StepProblem
-from solvers.registry import SOLVERS, load
-from tests.scenes import cloth, first_problem, random_problem
+from solvers.registry import SOLVERS, load_target
+from tests.scenes import build_cloth, build_first_problem, build_random_problem
 
 SUMS = 1e-12
 """Two orders of adding some hundred terms, relative to the largest."""
@@ -61,7 +61,7 @@ def with_links(problem: StepProblem, reach: float) -> StepProblem:
 
 @pytest.mark.parametrize("solver", ["newton", "newton-cg", "hybrid", "lbfgs"])
 def test_a_solver_says_which_energies_take_the_slow_path(solver):
-    problem, made = random_problem(2), load(SOLVERS[solver])()
+    problem, made = build_random_problem(2), load_target(SOLVERS[solver])()
     assert "Python" not in made.prepare(problem.system).choice
     choice = made.prepare(with_links(problem, 0.5).system).choice
     assert "Python" in choice
@@ -69,35 +69,38 @@ def test_a_solver_says_which_energies_take_the_slow_path(solver):
 
 
 PROBLEMS = {
-    "random": random_problem(0),
-    "random, not pinned": random_problem(1, weights=()),
-    "random, all exact": random_problem(2, weights=(np.inf,) * 12),
-    "cloth": first_problem(cloth(7)),
-    "cloth, exact pins": first_problem(cloth(7, "exact")),
-    "links that springs have": with_links(first_problem(cloth(7, "exact")), 0.2),
-    "links that springs lack": with_links(first_problem(cloth(7, "exact")), 0.4),
-    "random with links": with_links(random_problem(3), 2.0),
+    "random": build_random_problem(0),
+    "random, not pinned": build_random_problem(1, weights=()),
+    "random, all exact": build_random_problem(2, weights=(np.inf,) * 12),
+    "cloth": build_first_problem(build_cloth(7)),
+    "cloth, exact pins": build_first_problem(build_cloth(7, "exact")),
+    "links that springs have": with_links(build_first_problem(build_cloth(7, "exact")), 0.2),
+    "links that springs lack": with_links(build_first_problem(build_cloth(7, "exact")), 0.4),
+    "random with links": with_links(build_random_problem(3), 2.0),
 }
 problems = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=list(PROBLEMS))
 
 
 def stepped(problem: StepProblem) -> tuple[StepObjective, Positions, Positions]:
     """The step, and two points of it."""
-    step = StepObjective(Objective(problem.system), problem)
+    step = StepObjective(FixedObjective(problem.system), problem)
     rng = np.random.default_rng(0)
-    p, q = (step.placed(problem.first_guess + 0.1 * rng.normal(size=problem.target.shape)) for _ in range(2))
+    p, q = (
+        step.apply_exact_pins(problem.initial_guess + 0.1 * rng.normal(size=problem.inertial_target.shape))
+        for _ in range(2)
+    )
     return step, p, q
 
 
 def exact_hessian(problem: StepProblem, p: Positions) -> csr_array:
     """(3f, 3f), from the energies' own Hessians."""
     s = problem.system
-    _, vertices, weight = s.penalty
-    held = np.repeat(s.inertia + np.bincount(vertices, weight, minlength=s.vertices), 3)
+    _, vertices, weight = s.penalty_pins
+    held = np.repeat(s.inertia_diagonal + np.bincount(vertices, weight, minlength=s.num_vertices), 3)
     H = csr_array(diags_array(held))
     for energy in problem.energies:
         H = csr_array(H + energy.hessian(p))
-    free = (3 * s.free[:, None] + np.arange(3)).ravel()
+    free = (3 * s.free_vertices[:, None] + np.arange(3)).ravel()
     return csr_array(H[free][:, free])
 
 
@@ -112,20 +115,20 @@ def test_the_gradient_is_the_oracles(problem):
 def test_the_rise_is_the_difference_of_the_oracles_values(problem):
     step, p, q = stepped(problem)
     wanted = problem.value(q) - problem.value(p)
-    assert step.rise(p, q)[0] == pytest.approx(wanted, rel=1e-9, abs=SUMS * problem.magnitude(p))
+    assert step.objective_change(p, q)[0] == pytest.approx(wanted, rel=1e-9, abs=SUMS * problem.value_scale(p))
 
 
 def test_the_rise_keeps_its_digits_where_values_have_none_left():
     """A step of 1e-9 along the gradient: the rise is the slope, to as many digits as it is short."""
-    problem = first_problem(cloth(7, "exact", stretch=1e6))
+    problem = build_first_problem(build_cloth(7, "exact", stretch=1e6))
     step, p, _ = stepped(problem)
     direction = step.gradient(p)
     q = p - 1e-9 / np.abs(direction).max() * direction
     slope = float((step.gradient(p) * (q - p)).sum())
-    curvature = float(((q - p) * step.hessian(p).multiply(q - p)).sum())
+    curvature = float(((q - p) * step.hessian(p).matvec(q - p)).sum())
     assert abs(0.5 * curvature) < 1e-3 * abs(slope)
     # The step itself is rounded to 1e-7 of its length, but the same way in both.
-    assert step.rise(p, q)[0] == pytest.approx(slope + 0.5 * curvature, rel=1e-9)
+    assert step.objective_change(p, q)[0] == pytest.approx(slope + 0.5 * curvature, rel=1e-9)
 
 
 @problems
@@ -135,7 +138,7 @@ def test_a_product_with_the_hessian_is_that_of_the_energies(problem):
     x = np.zeros_like(p)
     x[free] = np.random.default_rng(1).normal(size=(len(free), 3))
     H = exact_hessian(problem, p)
-    found = step.hessian(p).multiply(x)
+    found = step.hessian(p).matvec(x)
     wanted = np.zeros_like(p)
     wanted[free] = (H @ x[free].ravel()).reshape(-1, 3)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=SUMS * np.abs(wanted).max(initial=1.0))
@@ -150,7 +153,7 @@ def test_a_solve_undoes_a_product(problem):
     assert hessian.factorise(shift=shift)
     x = np.zeros_like(p)
     x[free] = np.random.default_rng(1).normal(size=(len(free), 3))
-    found = hessian.solve(hessian.multiply(x) + shift * x)
+    found = hessian.solve(hessian.matvec(x) + shift * x)
     np.testing.assert_allclose(found, x, rtol=0, atol=1e-9)  # a condition of less than 1e5
 
 
@@ -167,7 +170,7 @@ def test_the_hessian_has_a_factor_just_where_its_eigenvalues_are_positive(proble
 
 
 def test_without_negative_lateral_parts_springs_are_positive_semidefinite():
-    problem = random_problem(4, weights=())
+    problem = build_random_problem(4, weights=())
     step, p, _ = stepped(problem)
     hessian = step.hessian(0.01 * p)  # nearly all springs compressed
     assert not hessian.factorise()
@@ -175,14 +178,14 @@ def test_without_negative_lateral_parts_springs_are_positive_semidefinite():
 
 
 def test_a_pattern_of_the_day_leaves_no_trace():
-    near, far = (with_links(first_problem(cloth(7, "exact")), reach) for reach in (0.4, 0.9))
-    whole = Objective(near.system)
-    fresh = Objective(near.system)
-    p = near.first_guess
+    near, far = (with_links(build_first_problem(build_cloth(7, "exact")), reach) for reach in (0.4, 0.9))
+    whole = FixedObjective(near.system)
+    fresh = FixedObjective(near.system)
+    p = near.initial_guess
     b = np.random.default_rng(0).normal(size=p.shape)
     b[near.system.pins.vertices] = 0.0
 
-    def solved(objective: Objective, problem: StepProblem) -> Positions:
+    def solved(objective: FixedObjective, problem: StepProblem) -> Positions:
         hessian = StepObjective(objective, problem).hessian(p)
         assert hessian.factorise(shift=1e4)
         return hessian.solve(b)
@@ -195,10 +198,12 @@ def test_a_pattern_of_the_day_leaves_no_trace():
 
 def test_springs_of_no_length_have_the_curvature_that_the_energy_says():
     p = np.zeros((3, 3))
-    springs = Springs.at_rest(np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 0]]), np.array([[0, 1], [1, 2]]), np.ones(2))
-    problem = random_problem(0, n=3, m=1, weights=())
+    springs = Springs.from_rest_shape(
+        np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 0]]), np.array([[0, 1], [1, 2]]), np.ones(2)
+    )
+    problem = build_random_problem(0, n=3, m=1, weights=())
     problem = replace(problem, system=replace(problem.system, energies=(springs,)))
-    step = StepObjective(Objective(problem.system), problem)
+    step = StepObjective(FixedObjective(problem.system), problem)
     H = exact_hessian(problem, p)
     x = np.random.default_rng(0).normal(size=(3, 3))
-    np.testing.assert_allclose(step.hessian(p).multiply(x).ravel(), H @ x.ravel(), rtol=SUMS)
+    np.testing.assert_allclose(step.hessian(p).matvec(x).ravel(), H @ x.ravel(), rtol=SUMS)

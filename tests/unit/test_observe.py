@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from harness.config.load import load_any
-from harness.scenes.bind import build
-from harness.simulation.measure import Settings, steps
-from harness.simulation.observe import acting
+from harness.config.load import load_config
+from harness.scenes.bind import build_scene
+from harness.simulation.measure import SteppingSettings, iterate_steps
+from harness.simulation.observe import collect_forces
 from harness.simulation.step import prepare
-from solvers.methods.newton import Newton
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import StopRule
 
 SCENE = """
@@ -30,9 +30,11 @@ effects:
 def test_weight_points_down_and_what_a_plane_answers_points_up(tmp_path: Path):
     """Each of two vertices of 1 kg that rest on a plane weighs 9.81 N, and is pushed up by as much."""
     (tmp_path / "scene.yaml").write_text(SCENE)
-    (run,) = load_any(tmp_path / "scene.yaml", solvers=["newton"]).runs()
-    scene = build(run.scene, run.size)
-    *_, last = steps(scene, prepare(scene, Newton()), Settings(StopRule(50, 1e-10), run.first_guess, 60, 1))
-    forces = acting(last)
+    (run,) = load_config(tmp_path / "scene.yaml", solvers=["newton"]).list_runs()
+    scene = build_scene(run.scene, run.size)
+    *_, last = iterate_steps(
+        scene, prepare(scene, NewtonSolver()), SteppingSettings(StopRule(50, 1e-10), run.first_guess, 60, 1)
+    )
+    forces = collect_forces(last)
     np.testing.assert_allclose(forces["external"], [[0, -9.81, 0]] * 2, rtol=0, atol=1e-12)
     np.testing.assert_allclose(forces["contact"], [[0, 9.81, 0]] * 2, rtol=0, atol=1e-3)  # once drag has settled it

@@ -9,13 +9,13 @@ import pytest
 from typer.testing import CliRunner
 
 from harness.base import rows
-from harness.base.columns import SCHEMA
+from harness.base.columns import RUN_SCHEMA
 from harness.base.errors import InputError
 from harness.cli import app
 from harness.config import load
-from harness.config.load import Sweep, load_any
-from harness.config.options import OPTIONS
-from harness.config.sweep import Include, RunSpec, Varied
+from harness.config.load import SweepPlan, load_config
+from harness.config.options import RUN_OPTIONS
+from harness.config.sweep import IncludeEntry, RunSpec, VariedOptions
 from tests.unit.test_spec import CLOTH
 
 
@@ -32,11 +32,11 @@ def test_the_command_line_gives_numbers_as_numbers(folder: Path) -> None:
 
 
 def test_each_option_that_a_sweep_varies_is_one_of_a_run_of_the_command_line_and_of_rows() -> None:
-    assert set(OPTIONS) == set(Varied.model_fields), "what it is called for short, and its column"
-    assert set(OPTIONS) <= set(RunSpec.model_fields)
+    assert set(RUN_OPTIONS) == set(VariedOptions.model_fields), "what it is called for short, and its column"
+    assert set(RUN_OPTIONS) <= set(RunSpec.model_fields)
     told = CliRunner().invoke(app, ["run", "--help"]).output
-    assert {name for name in OPTIONS if f"--{name.replace('_', '-')} VALUE" in told} == set(OPTIONS)
-    assert {option.column for option in OPTIONS.values()} - {""} <= set(SCHEMA.names)
+    assert {name for name in RUN_OPTIONS if f"--{name.replace('_', '-')} VALUE" in told} == set(RUN_OPTIONS)
+    assert {option.column for option in RUN_OPTIONS.values()} - {""} <= set(RUN_SCHEMA.names)
 
 
 def test_a_value_on_the_command_line_means_what_it_means_in_a_file(
@@ -44,15 +44,15 @@ def test_a_value_on_the_command_line_means_what_it_means_in_a_file(
 ) -> None:
     asked: dict[str, Any] = {}
 
-    def loaded(path: Path, *, solvers: Any, sizes: Any, **options: Any) -> Sweep:
+    def loaded(path: Path, *, solvers: Any, sizes: Any, **options: Any) -> SweepPlan:
         asked.update(options)
-        asked["runs"] = load_any(path, sizes=[4], **options).runs()
+        asked["runs"] = load_config(path, sizes=[4], **options).list_runs()
         raise InputError("enough")
 
     monkeypatch.setattr(load, "load_any", loaded)
     values = {"iterations": "7", "tolerance": "1e-3", "integrator": "bdf2", "time_step": "1/60", "frames": "0x3"}
     values |= {"first_guess": "inertial", "threads": "auto", "rounds": "1"}
-    assert set(values) == set(OPTIONS) - {"accuracy"}, "which would choose most of them"
+    assert set(values) == set(RUN_OPTIONS) - {"accuracy"}, "which would choose most of them"
     given = [part for name, text in values.items() for part in (f"--{name.replace('_', '-')}", text)]
     assert CliRunner().invoke(app, ["run", str(folder / "cloth.yaml"), *given]).exit_code == 2
     (run,) = asked.pop("runs")
@@ -63,9 +63,9 @@ def test_a_value_on_the_command_line_means_what_it_means_in_a_file(
 
 @pytest.mark.parametrize(("key", "value"), [("tolerance", None), ("threads", 2), ("size", [4, 8])])
 def test_an_entry_states_what_it_lists_and_nothing_else(key: str, value: object) -> None:
-    entry = Include.model_validate({key: value})
+    entry = IncludeEntry.model_validate({key: value})
     assert entry.stated(key) == (tuple(value) if isinstance(value, list) else (value,))
-    assert not any(entry.stated(other) for other in Include.model_fields if other != key)
+    assert not any(entry.stated(other) for other in IncludeEntry.model_fields if other != key)
 
 
 SWEEP = "scenes: [cloth.yaml]\nsizes: [4]\nsolvers: [{}]\noptions: {{frames: 4, threads: 1, rounds: 1, {}}}\n"
@@ -85,16 +85,16 @@ SWEEP = "scenes: [cloth.yaml]\nsizes: [4]\nsolvers: [{}]\noptions: {{frames: 4, 
 def test_what_an_error_or_auto_leaves_no_choice_of_is_refused(folder: Path, options: str, said: str) -> None:
     (folder / "sweep.yaml").write_text(SWEEP.format("newton", options))
     with pytest.raises(InputError) as refused:
-        load_any(folder / "sweep.yaml")
+        load_config(folder / "sweep.yaml")
     assert said in str(refused.value)
 
 
 def test_an_error_asked_beside_stated_steps_is_one_run_and_has_no_part_in_the_others_names(folder: Path) -> None:
     (folder / "sweep.yaml").write_text(SWEEP.format("newton", "accuracy: [null, 1e-2], integrator: [bdf2, midpoint]"))
     (folder / "plain.yaml").write_text(SWEEP.format("newton", "integrator: [bdf2, midpoint]"))
-    runs, plain = load_any(folder / "sweep.yaml").runs(), load_any(folder / "plain.yaml").runs()
+    runs, plain = load_config(folder / "sweep.yaml").list_runs(), load_config(folder / "plain.yaml").list_runs()
     assert [run.accuracy for run in runs] == [None, 0.01, None]
-    assert [run.identity() for run in runs if run.accuracy is None] == [run.identity() for run in plain]
+    assert [run.build_identity() for run in runs if run.accuracy is None] == [run.build_identity() for run in plain]
 
 
 def test_a_sweep_keeps_to_an_error_and_its_rows_say_what_it_took(folder: Path) -> None:
@@ -104,7 +104,7 @@ def test_a_sweep_keeps_to_an_error_and_its_rows_say_what_it_took(folder: Path) -
     assert done.exit_code == 1, done.output
     assert "xpbd: tells no error of its steps" in done.output
     (file,) = (folder / "results" / "sweep" / "rows").glob("*-dormand-prince-8-*.parquet")
-    found = [row for row in rows.read([file]).to_pylist() if row["phase"] == "step"]
+    found = [row for row in rows.read_rows([file]).to_pylist() if row["phase"] == "step"]
     assert [row["frame"] for row in found] == [1, 2, 3, 4]
     assert all(0.0 < row["estimated"] <= row["asked"] == 1e-3 for row in found)
     assert all(row["accepted"] > 0 and row["seconds"] > 0 and row["integrator"] == "own" for row in found)

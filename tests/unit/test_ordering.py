@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
-from solvers.linear.ordering import nested_dissection
-from solvers.linear.supernodes import LANES
-from solvers.linear.symbolic import analyse
+from solvers.linear.ordering import nested_dissection_order
+from solvers.linear.supernodes import COLUMN_LANES
+from solvers.linear.symbolic import analyse_with_order
 
 
 def graph(ends, n):
@@ -63,7 +63,7 @@ def eliminated(matrix, order):
 @settings(max_examples=60, deadline=None)
 @given(graphs())
 def test_the_order_is_a_permutation(matrix):
-    order = nested_dissection(*arrays(matrix))
+    order = nested_dissection_order(*arrays(matrix))
     np.testing.assert_array_equal(np.sort(order), np.arange(matrix.shape[0]))
 
 
@@ -71,19 +71,19 @@ def test_the_order_is_a_permutation(matrix):
 @given(graphs())
 def test_the_structure_is_that_of_dense_elimination(matrix):
     pointers, neighbours = arrays(matrix)
-    s = analyse(pointers, neighbours, nested_dissection(pointers, neighbours))
-    order = s.vertex[s.vertex >= 0]
+    s = analyse_with_order(pointers, neighbours, nested_dissection_order(pointers, neighbours))
+    order = s.vertex_of_slot[s.vertex_of_slot >= 0]
     np.testing.assert_array_equal(np.sort(order), np.arange(matrix.shape[0]))
-    np.testing.assert_array_equal(s.vertex[s.slot], np.arange(matrix.shape[0]))
+    np.testing.assert_array_equal(s.vertex_of_slot[s.slot_of_vertex], np.arange(matrix.shape[0]))
     filled = eliminated(matrix, order)
     assert s.nonzeros == filled.sum()
-    place = np.cumsum(s.vertex >= 0) - 1  # of a slot among the vertices
+    place = np.cumsum(s.vertex_of_slot >= 0) - 1  # of a slot among the vertices
     for node in range(len(s.parent)):
-        columns = place[s.first[node]] + np.arange(s.width[node])
+        columns = place[s.first_slot[node]] + np.arange(s.num_columns[node])
         below = place[s.rows[s.row_start[node] : s.row_start[node + 1]]]
         expected = np.flatnonzero(filled[:, columns].any(axis=1))
         np.testing.assert_array_equal(below, expected[expected > columns[-1]])
-        assert s.first[node] % LANES == 0
+        assert s.first_slot[node] % COLUMN_LANES == 0
         assert s.parent[node] == -1 or node < s.parent[node]
 
 
@@ -94,7 +94,7 @@ def test_the_structure_is_that_of_dense_elimination(matrix):
 def test_fills_in_about_as_little_as_minimum_degree(shape, limit):
     matrix = box(*shape)
     pointers, neighbours = arrays(matrix)
-    filled = analyse(pointers, neighbours, nested_dissection(pointers, neighbours)).nonzeros
+    filled = analyse_with_order(pointers, neighbours, nested_dissection_order(pointers, neighbours)).nonzeros
     safe = csc_array(matrix + 100 * csr_array(np.eye(len(pointers) - 1)))
     options = {"SymmetricMode": True}
     yardstick = splu(safe, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options).L.nnz
@@ -104,7 +104,7 @@ def test_fills_in_about_as_little_as_minimum_degree(shape, limit):
 def test_dissects_a_square_as_well_as_its_geometry_does():
     matrix = box(63, 63)
     pointers, neighbours = arrays(matrix)
-    filled = analyse(pointers, neighbours, nested_dissection(pointers, neighbours)).nonzeros
+    filled = analyse_with_order(pointers, neighbours, nested_dissection_order(pointers, neighbours)).nonzeros
 
     def cut(rows, columns):
         """Rows and columns of the grid: the order of George's nested dissection along straight lines."""
@@ -117,12 +117,12 @@ def test_dissects_a_square_as_well_as_its_geometry_does():
         return cut(rows[:middle], columns) + cut(rows[middle + 1 :], columns) + line
 
     order = np.array([i * 63 + j for i, j in cut(list(range(63)), list(range(63)))], np.int32)
-    geometric = analyse(pointers, neighbours, order).nonzeros
+    geometric = analyse_with_order(pointers, neighbours, order).nonzeros
     assert filled <= 1.02 * geometric
 
 
 def test_many_components_take_no_longer_than_one():
     """A hundred thousand separate pairs: peeling them off one at a time would take minutes."""
     ends = np.arange(200_000).reshape(-1, 2)
-    order = nested_dissection(*arrays(graph(ends, 200_000)))
+    order = nested_dissection_order(*arrays(graph(ends, 200_000)))
     np.testing.assert_array_equal(np.sort(order), np.arange(200_000))

@@ -14,41 +14,44 @@ from typer.testing import CliRunner
 
 from harness.cli import app
 from harness.config import solvers
-from harness.config.load import load_any
+from harness.config.load import load_config
 from harness.experiments import run as run_module
-from harness.experiments.code import code, files, parts
-from harness.experiments.plan import Files
+from harness.experiments.code import collect_source_parts, compute_source_fingerprint, list_source_files
+from harness.experiments.plan import RunFiles
 from solvers import device, sources
-from solvers.registry import OPTIONAL, SOLVERS, load
-from tests.own_solvers import OPTIONS, SCENE, Own, own
+from solvers.registry import OPTIONAL_SOLVERS, SOLVERS, load_target
+from tests.own_solvers import SCENE_SOURCE, SWEEP_OPTIONS, PluginSweep, write_plugin_solver
 
 
 @pytest.fixture
-def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Own:
+def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PluginSweep:
     """A sweep of two solvers that was run, and one of them changed since."""
-    made = own(tmp_path, monkeypatch)
+    made = write_plugin_solver(tmp_path, monkeypatch)
     told = ran(made)
     assert "other code" not in told
-    made.solver.write_text(made.solver.read_text() + "\n# changed\n")
+    made.solver_path.write_text(made.solver_path.read_text() + "\n# changed\n")
     return made
 
 
-def ran(made: Own, *options: str) -> str:
+def ran(made: PluginSweep, *options: str) -> str:
     """What the command says, in lines without breaks."""
     told = CliRunner().invoke(
-        app, ["run", str(made.sweep), "--here", "--results", str(made.sweep.parent / "r"), *options]
+        app, ["run", str(made.sweep_path), "--here", "--results", str(made.sweep_path.parent / "r"), *options]
     )
     assert told.exit_code == 0, told.output
     return re.sub(r"\s+", " ", told.output)
 
 
-def started(made: Own) -> dict[str, int]:
+def started(made: PluginSweep) -> dict[str, int]:
     """When each solver's rows were written [ns]."""
-    folder = made.sweep.parent / "r" / "sweep"
-    return {run.solver.name: Files.of(run, folder).rows.stat().st_mtime_ns for run in load_any(made.sweep).runs()}
+    folder = made.sweep_path.parent / "r" / "sweep"
+    return {
+        run.solver.name: RunFiles.for_run(run, folder).rows_path.stat().st_mtime_ns
+        for run in load_config(made.sweep_path).list_runs()
+    }
 
 
-def test_run_says_which_rows_are_of_other_code_and_the_table_marks_them(done: Own):
+def test_run_says_which_rows_are_of_other_code_and_the_table_marks_them(done: PluginSweep):
     before = started(done)
     told = ran(done)
     assert "2 of 2 runs are there already" in told
@@ -60,7 +63,7 @@ def test_run_says_which_rows_are_of_other_code_and_the_table_marks_them(done: Ow
 
 
 @pytest.mark.parametrize(("option", "redone"), [("--changed", {"mine"}), ("--again", {"mine", "sparse"})])
-def test_other_code_s_rows_are_done_again_on_request(done: Own, option: str, redone: set[str]):
+def test_other_code_s_rows_are_done_again_on_request(done: PluginSweep, option: str, redone: set[str]):
     before = started(done)
     assert "other code" not in ran(done, option)
     after = started(done)
@@ -68,48 +71,61 @@ def test_other_code_s_rows_are_done_again_on_request(done: Own, option: str, red
     assert "other code" not in ran(done)
 
 
-def test_the_code_of_a_row_covers_the_solver_s_module_wherever_it_lives(done: Own):
-    for path in (done.sweep.parent / "r" / "sweep" / "rows").iterdir():
+def test_the_code_of_a_row_covers_the_solver_s_module_wherever_it_lives(done: PluginSweep):
+    for path in (done.sweep_path.parent / "r" / "sweep" / "rows").iterdir():
         row = pq.read_table(path).slice(0, 1).to_pylist()[0]
-        (run,) = (run for run in load_any(done.sweep).runs() if run.solver.name == row["solver"])
-        assert (row["code"] == code(parts(run))) == (row["solver"] == "sparse")
+        (run,) = (run for run in load_config(done.sweep_path).list_runs() if run.solver.name == row["solver"])
+        assert (row["code"] == compute_source_fingerprint(collect_source_parts(run))) == (row["solver"] == "sparse")
 
 
 def test_a_run_depends_on_its_own_solver_and_effects_and_on_no_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    made = own(tmp_path, monkeypatch)
-    run = made.run()
-    reached = {path for part in parts(run) for file in files(part) for path in sources.reached(str(file))}
-    reached |= sources.reached(run_module.__file__)
+    made = write_plugin_solver(tmp_path, monkeypatch)
+    run = made.plugin_run()
+    reached = {
+        path
+        for part in collect_source_parts(run)
+        for file in list_source_files(part)
+        for path in sources.find_dependencies(str(file))
+    }
+    reached |= sources.find_dependencies(run_module.__file__)
     names = {"/".join(Path(path).parts[-2:]) for path in reached}
-    assert str(made.solver) in reached
+    assert str(made.solver_path) in reached
     assert {"methods/local_global.py", "effects/springs.py", "effects/gravity.py", "mesh/grid.py"} <= names
-    others = {str(file) for name in ("xpbd", "vbd", "newton") for file in sources.of_class(load(SOLVERS[name]))}
+    others = {
+        str(file)
+        for name in ("xpbd", "vbd", "newton")
+        for file in sources.find_class_sources(load_target(SOLVERS[name]))
+    }
     assert reached & others <= {device.__file__}  # which all ask whether a solver is on one
     assert not names & {"effects/wind.py", "effects/gas.py", "mesh/chain.py", "harness/cli.py", "asked/search.py"}
-    to_error = parts(run.model_copy(update={"accuracy": 0.1}))
-    assert {"kept.py"} == {file.name for part in to_error - parts(run) for file in files(part)}
+    to_error = collect_source_parts(run.model_copy(update={"accuracy": 0.1}))
+    assert {"kept.py"} == {
+        file.name for part in to_error - collect_source_parts(run) for file in list_source_files(part)
+    }
 
 
 def test_the_code_of_a_run_covers_what_its_solver_compiles_in_another_language(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    made = own(tmp_path, monkeypatch)
-    for name in ("another", made.solver.stem):
-        before = code(parts(made.run()))
-        made.solver.with_name(f"{name}.hpp").write_text("import what;\n")
-        sources.reached.cache_clear()
-        sources._imported.cache_clear()
-        sources._reached_by.cache_clear()
-        assert (code(parts(made.run())) != before) == (name == made.solver.stem)
-    (eigen,) = sources.of_class(load(OPTIONAL["eigen"]))
-    assert {str(eigen.with_suffix(ending)) for ending in (".cpp", ".hpp")} <= sources.reached(str(eigen))
+    made = write_plugin_solver(tmp_path, monkeypatch)
+    for name in ("another", made.solver_path.stem):
+        before = compute_source_fingerprint(collect_source_parts(made.plugin_run()))
+        made.solver_path.with_name(f"{name}.hpp").write_text("import what;\n")
+        sources.find_dependencies.cache_clear()
+        sources._find_imports.cache_clear()
+        sources._sorted_dependencies.cache_clear()
+        assert (compute_source_fingerprint(collect_source_parts(made.plugin_run())) != before) == (
+            name == made.solver_path.stem
+        )
+    (eigen,) = sources.find_class_sources(load_target(OPTIONAL_SOLVERS["eigen"]))
+    assert {str(eigen.with_suffix(ending)) for ending in (".cpp", ".hpp")} <= sources.find_dependencies(str(eigen))
 
 
 def test_pictures_are_drawn_later_without_a_run_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    made = own(tmp_path, monkeypatch, options=OPTIONS.replace("record: false", "record: true"))
+    made = write_plugin_solver(tmp_path, monkeypatch, options=SWEEP_OPTIONS.replace("record: false", "record: true"))
     ran(made)
     before = started(made)
-    made.sweep.write_text(made.sweep.read_text().replace("pictures: false", "pictures: true"))
+    made.sweep_path.write_text(made.sweep_path.read_text().replace("pictures: false", "pictures: true"))
     told = ran(made)
     assert "2 of 2 runs are there already" in told
     assert started(made) == before
@@ -119,18 +135,18 @@ def test_pictures_are_drawn_later_without_a_run_done_again(tmp_path: Path, monke
 def test_parameters_by_other_sources_are_kept_beside_each_other_for_a_while(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    (tmp_path / "scene.yaml").write_text(SCENE)
+    (tmp_path / "scene.yaml").write_text(SCENE_SOURCE)
     (tmp_path / "sweep.yaml").write_text("scenes: [scene.yaml]\nsolvers: [sparse]\n")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     for checkout in "ab":
         monkeypatch.setattr(solvers, "_of_sources", lambda checkout=checkout: 16 * checkout)
-        load_any(tmp_path / "sweep.yaml", opens=False)
+        load_config(tmp_path / "sweep.yaml", imports_code=False)
     kept = {path.stem: path for path in (tmp_path / "springbench" / "parameters").iterdir()}
     assert set(kept) == {f"sparse-{16 * checkout}" for checkout in "ab"}
 
     os.utime(kept.pop(f"sparse-{16 * 'a'}"), (0, 0))
     monkeypatch.setattr(solvers, "_of_sources", lambda: 16 * "c")
-    load_any(tmp_path / "sweep.yaml", opens=False)
+    load_config(tmp_path / "sweep.yaml", imports_code=False)
     assert {path.stem[-1] for path in (tmp_path / "springbench" / "parameters").iterdir()} == {"b", "c"}
 
 
@@ -142,8 +158,8 @@ def test_the_file_of_a_class_is_known_however_its_module_was_loaded(tmp_path: Pa
     assert by_hand.loader
     module = module_from_spec(by_hand)
     by_hand.loader.exec_module(module)
-    assert sources.of_class(module.Mine) == {path}
+    assert sources.find_class_sources(module.Mine) == {path}
     monkeypatch.setitem(sys.modules, "by_hand", module)
     monkeypatch.setattr(sources, "_INSTALLED", {str(tmp_path)})  # as a package that brings a solver is
-    sources.of_class.cache_clear()
-    assert sources.of_class(module.Mine) == {path}
+    sources.find_class_sources.cache_clear()
+    assert sources.find_class_sources(module.Mine) == {path}

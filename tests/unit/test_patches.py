@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.mesh.surfaces import Balloon
+from harness.scenes.mesh.grid import GridMesh
+from harness.scenes.mesh.surfaces import BalloonMesh
 from solvers.contact import flat
-from solvers.contact.barrier import distances
-from solvers.contact.boxes import Limits
-from solvers.contact.contacts import Pairs, padded
-from solvers.contact.patches import Patches
+from solvers.contact.barrier import compute_distances
+from solvers.contact.boxes import CollisionQuery
+from solvers.contact.contacts import Candidates, pad_positions
+from solvers.contact.patches import ClusterCulling
 from solvers.contact.self_contact import SelfContact
-from solvers.contact.surface import Surface
-from solvers.contact.trees import Tree, found
-from solvers.contact.ways import LEFT, unevenness
+from solvers.contact.surface import CollisionMesh
+from solvers.contact.trees import BVH, find_candidate_pairs
+from solvers.contact.ways import MIN_GAP_FRACTION, max_relative_displacement
 from solvers.problem import Positions
-from tests.self_contacts import sides
+from tests.self_contacts import unique_edges
 
 REACH = 0.06
 """Half of the spacing of the sheet below [m]."""
@@ -31,35 +31,38 @@ class Made:
     """A mesh, its patches, and all pairs of its primitives that share no vertex."""
 
     def __init__(self, mesh: Mesh) -> None:
-        n, edges = len(mesh.rest), sides(mesh.triangles)
-        self.rest, corners = mesh.rest, mesh.triangles
-        self.trees = [Tree.of(self.rest, x) for x in (np.arange(n)[:, None], edges, corners)]
-        self.patches = Patches.of(self.rest, self.trees[0], self.trees[1], self.trees[2], 4 * REACH)
+        n, edges = len(mesh.rest_positions), unique_edges(mesh.triangles)
+        self.rest, corners = mesh.rest_positions, mesh.triangles
+        self.trees = [BVH.from_primitives(self.rest, x) for x in (np.arange(n)[:, None], edges, corners)]
+        self.patches = ClusterCulling.from_rest_shape(self.rest, self.trees[0], self.trees[1], self.trees[2], 4 * REACH)
         one = [(i, *t) for i in range(n) for t in corners.tolist() if i not in t]
         two = [(*e, *f) for e, f in combinations(edges.tolist(), 2) if not set(e) & set(f)]
         none = np.empty(0)
-        self.pairs = Pairs(np.array(one + two), len(one), none, none, none, 0.0, 0.0)
+        self.pairs = Candidates(np.array(one + two), len(one), none, none, none, 0.0, 0.0)
 
-    def met(self, p: Positions, q: Positions, limits: Limits) -> np.ndarray:
+    def met(self, p: Positions, q: Positions, limits: CollisionQuery) -> np.ndarray:
         """Which pairs come to their limits at one of some times."""
-        first, least = distances(self.pairs, p), np.full(len(self.pairs.vertices), np.inf)
+        first, least = compute_distances(self.pairs, p), np.full(len(self.pairs.vertices), np.inf)
         for t in np.linspace(0.0, 1.0, 13):
-            least = np.minimum(least, distances(self.pairs, p + t * (q - p)))
-        return least < np.maximum(limits.reach, limits.closed + limits.share * first)
+            least = np.minimum(least, compute_distances(self.pairs, p + t * (q - p)))
+        return least < np.maximum(limits.inflation_radius, limits.min_distance + limits.relative_min_distance * first)
 
     def owners(self) -> dict[tuple[int, ...], int]:
         """The patch of each primitive, by its vertices."""
         found = {}
         for one in (self.patches.points, self.patches.edges, self.patches.triangles):
-            of = np.repeat(np.arange(len(one.starts) - 1), np.diff(one.starts))
-            found |= {tuple(x): k for x, k in zip(one.corners.tolist(), of.tolist(), strict=True)}
+            of = np.repeat(np.arange(len(one.cluster_starts) - 1), np.diff(one.cluster_starts))
+            found |= {tuple(x): k for x, k in zip(one.primitives.tolist(), of.tolist(), strict=True)}
         return found
 
     @cached_property
     def near_at_rest(self) -> np.ndarray:
         """Which pairs are of patches that are known."""
-        owner, known = self.owners(), {tuple(x) for x in self.patches.pairs.patches[: self.patches.known].tolist()}
-        cut = np.where(np.arange(len(self.pairs.vertices)) < self.pairs.points, 1, 2).tolist()
+        owner, known = (
+            self.owners(),
+            {tuple(x) for x in self.patches.cluster_pairs.clusters[: self.patches.num_rest_pairs].tolist()},
+        )
+        cut = np.where(np.arange(len(self.pairs.vertices)) < self.pairs.num_point_triangle, 1, 2).tolist()
         both = [
             (owner[tuple(x[:c])], owner[tuple(x[c:])]) for x, c in zip(self.pairs.vertices.tolist(), cut, strict=True)
         ]
@@ -68,7 +71,7 @@ class Made:
 
 @pytest.fixture(scope="module", params=["sheet", "balloon"])
 def made(request) -> Made:
-    return Made(Grid().build(9) if request.param == "sheet" else Balloon(radius=0.9).build(3))
+    return Made(GridMesh().build_mesh(9) if request.param == "sheet" else BalloonMesh(radius=0.9).build_mesh(3))
 
 
 def moved(rest: Positions, seed: int) -> Positions:
@@ -83,16 +86,16 @@ def moved(rest: Positions, seed: int) -> Positions:
     return x @ turn + 10.0 * rng.normal(size=3)
 
 
-@pytest.mark.parametrize("share", [0.0, LEFT])
+@pytest.mark.parametrize("share", [0.0, MIN_GAP_FRACTION])
 def test_nothing_is_near_where_patches_say_so_however_fast_it_moves(made, share):
-    said, limits, near = 0, Limits(REACH, 0.3 * REACH, share), made.near_at_rest
+    said, limits, near = 0, CollisionQuery(REACH, 0.3 * REACH, share), made.near_at_rest
     for seed in range(24):
         p = moved(made.rest, seed)
         q = moved(made.rest, 100 + seed) if seed % 2 else p + 0.4 * (moved(p - p.mean(axis=0), 200 + seed) - p)
         gaps = made.patches.clear(p, q, limits)
         if gaps:
             assert not made.met(p, q, limits).any()
-            apart = distances(made.pairs, q)
+            apart = compute_distances(made.pairs, q)
             assert REACH <= gaps.near <= apart[near].min()
             assert gaps.far <= apart[~near].min(initial=np.inf)
             said += 1
@@ -101,7 +104,7 @@ def test_nothing_is_near_where_patches_say_so_however_fast_it_moves(made, share)
 
 def test_what_patches_remember_of_ways_before_says_nothing_that_is_not_so(made):
     # From each way's end, or from its begin, go on by steps long and short; far things were looked at long before.
-    said, skipped, limits, near = 0, 0, Limits(REACH, 0.3 * REACH, LEFT), made.near_at_rest
+    said, skipped, limits, near = 0, 0, CollisionQuery(REACH, 0.3 * REACH, MIN_GAP_FRACTION), made.near_at_rest
     for seed in range(2):
         rng = np.random.default_rng(seed)
         p = made.rest @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -113,7 +116,7 @@ def test_what_patches_remember_of_ways_before_says_nothing_that_is_not_so(made):
             gaps = made.patches.clear(p, q, limits)
             if gaps:
                 assert not made.met(p, q, limits).any()
-                apart = distances(made.pairs, q)
+                apart = compute_distances(made.pairs, q)
                 assert gaps.near <= apart[near].min()
                 assert gaps.far <= apart[~near].min(initial=np.inf)
                 said += 1
@@ -124,36 +127,36 @@ def test_what_patches_remember_of_ways_before_says_nothing_that_is_not_so(made):
 
 
 def test_a_way_that_begins_where_one_before_began_is_looked_at_from_there(made):
-    limits, patches = Limits(REACH, 0.0, LEFT), made.patches
+    limits, patches = CollisionQuery(REACH, 0.0, MIN_GAP_FRACTION), made.patches
     p = 2.0 * made.rest
     q, r = 1.02 * p, 1.04 * p @ np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
-    patches.seen.clear()
-    patches.apart.clear()
-    wanted = patches.clear(p, r, limits)
-    patches.seen.clear()
-    patches.apart.clear()
-    patches.clear(p, q, limits)
-    begin, end = patches._lies(p, limits), patches._lies(r, limits)
+    patches.recent_poses.clear()
+    patches.remote_clearances.clear()
+    wanted = patches.compute_clearance_bounds(p, r, limits)
+    patches.recent_poses.clear()
+    patches.remote_clearances.clear()
+    patches.compute_clearance_bounds(p, q, limits)
+    begin, end = patches._fit_clusters(p, limits), patches._fit_clusters(r, limits)
     np.testing.assert_array_equal(begin.x[:, :3], p)
     np.testing.assert_array_equal(end.x[:, :3], r)
-    found = patches.clear(p, r, limits)
+    found = patches.compute_clearance_bounds(p, r, limits)
     assert (found is None) == (wanted is None)
     assert found is None or wanted is None or found.near == wanted.near
 
 
 def test_patches_that_are_not_doubted_have_nothing_near_in_them(made):
-    told, patches, owner, limits = 0, made.patches, made.owners(), Limits(REACH, 0.3 * REACH, LEFT)
+    told, patches, owner, limits = 0, made.patches, made.owners(), CollisionQuery(REACH, 0.3 * REACH, MIN_GAP_FRACTION)
     for seed in range(8):
         p = moved(made.rest, 300 + seed)
         q = p + 1e-3 * moved(p, 400 + seed)
-        lies = [patches._lies(x, limits).lie for x in (p, q)]
+        lies = [patches._fit_clusters(x, limits).lie for x in (p, q)]
         memory = patches.scratch
-        doubted = np.empty((patches.known, 2), np.int64)
-        count, near = flat.doubtful(
-            *lies, patches.pairs, patches.known, limits, REACH, memory.sight, memory.tile, doubted
+        doubted = np.empty((patches.num_rest_pairs, 2), np.int64)
+        count, near = flat.unresolved_cluster_pairs(
+            *lies, patches.cluster_pairs, patches.num_rest_pairs, limits, REACH, memory.projection, memory.tile, doubted
         )
-        known = {tuple(x) for x in patches.pairs.patches[: patches.known].tolist()}
-        clear, apart = known - {tuple(x) for x in doubted[:count].tolist()}, distances(made.pairs, q)
+        known = {tuple(x) for x in patches.cluster_pairs.patches[: patches.num_rest_pairs].tolist()}
+        clear, apart = known - {tuple(x) for x in doubted[:count].tolist()}, compute_distances(made.pairs, q)
         told += len(clear)
         bad = made.met(p, q, limits) | (apart < near)
         for k in np.flatnonzero(bad):
@@ -169,7 +172,7 @@ def test_what_is_near_at_rest_moves_beside_itself_by_no_more_than_the_unevenness
         way = q - p
         beside = np.linalg.norm(way[near[:, :, None]] - way[near[:, None, :]], axis=-1).max()
         found = made.patches.unevenness(p, q)
-        assert beside <= found <= unevenness(p, q) * (1.0 + 1e-12)
+        assert beside <= found <= max_relative_displacement(p, q) * (1.0 + 1e-12)
         assert made.patches.unevenness(p, p + 3.0) <= 1e-14
 
 
@@ -181,14 +184,17 @@ def ways(p: Positions) -> list[Positions]:
     return [0.02 * half, half + 3.0, 0.01 * rng.normal(size=p.shape), moved(p, 1) - p + 3.0]
 
 
-@pytest.mark.parametrize("share", [LEFT, 0.9])
+@pytest.mark.parametrize("share", [MIN_GAP_FRACTION, 0.9])
 def test_boxes_leave_out_no_pair_that_comes_to_its_limits(made, share):
     points, edges, triangles = made.trees
     p, bound = 0.3 * moved(made.rest, 504), 0
     for way in ways(p):
-        limits = Limits(0.5 * REACH, 0.2 * REACH, share, unevenness(p, p + way))
-        x, y = padded(p), padded(p + way)
-        one, two = found(points, triangles, x, y, limits), found(edges, edges, x, y, limits)
+        limits = CollisionQuery(0.5 * REACH, 0.2 * REACH, share, max_relative_displacement(p, p + way))
+        x, y = pad_positions(p), pad_positions(p + way)
+        one, two = (
+            find_candidate_pairs(points, triangles, x, y, limits),
+            find_candidate_pairs(edges, edges, x, y, limits),
+        )
         names = {(*points.corners[i], *triangles.corners[j]) for i, j in one}
         names |= {frozenset((tuple(edges.corners[i]), tuple(edges.corners[j]))) for i, j in two}
         met = made.met(p, p + way, limits)
@@ -200,55 +206,64 @@ def test_boxes_leave_out_no_pair_that_comes_to_its_limits(made, share):
 
 
 def test_a_sheet_that_swings_as_one_piece_is_clear_however_far():
-    sheet = Made(Grid().build(9))
+    sheet = Made(GridMesh().build_mesh(9))
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     turn *= np.sign(np.linalg.det(turn))
     p = sheet.rest @ turn
     angle = 0.7
     about = np.array([[1, 0, 0], [0, np.cos(angle), np.sin(angle)], [0, -np.sin(angle), np.cos(angle)]])
-    limits = Limits(REACH, 0.0, LEFT)
-    assert sheet.patches.clear(p, p @ about + 50.0, limits)
-    assert not sheet.patches.clear(p, 1e-3 * p, limits)
+    limits = CollisionQuery(REACH, 0.0, MIN_GAP_FRACTION)
+    assert sheet.patches.compute_clearance_bounds(p, p @ about + 50.0, limits)
+    assert not sheet.patches.compute_clearance_bounds(p, 1e-3 * p, limits)
 
 
 @pytest.mark.parametrize("n", [1, 7, 8, 30])
 def test_unevenness_is_the_diagonal_of_the_box_of_all_ways(n):
     rng = np.random.default_rng(n)
     p, q = rng.normal(size=(2, n, 3))
-    assert unevenness(p, q) == pytest.approx(float(np.linalg.norm(np.ptp(q - p, axis=0))), rel=1e-15)
-    assert unevenness(p, p + 3.0) <= 1e-14
+    assert max_relative_displacement(p, q) == pytest.approx(float(np.linalg.norm(np.ptp(q - p, axis=0))), rel=1e-15)
+    assert max_relative_displacement(p, p + 3.0) <= 1e-14
     for bad in (np.nan, np.inf):
         q[n - 1, 1] = bad
-        assert unevenness(p, q) == np.inf
+        assert max_relative_displacement(p, q) == np.inf
 
 
 def test_patches_of_a_stack_tell_nothing():
-    sheet = Grid().build(5)
-    layers = [sheet.rest + 0.5 * REACH * k * np.eye(3)[1] for k in range(30)]
-    rest, each = np.concatenate(layers), len(sheet.rest)
+    sheet = GridMesh().build_mesh(5)
+    layers = [sheet.rest_positions + 0.5 * REACH * k * np.eye(3)[1] for k in range(30)]
+    rest, each = np.concatenate(layers), len(sheet.rest_positions)
     triangles = np.concatenate([sheet.triangles + each * k for k in range(30)])
-    trees = [Tree.of(rest, x) for x in (np.arange(len(rest))[:, None], sides(triangles), triangles)]
-    patches = Patches.of(rest, trees[0], trees[1], trees[2], 20 * REACH)
-    assert patches.crowded
-    assert not patches.clear(rest, rest + 5.0, Limits(REACH, 0.0, LEFT))
+    trees = [BVH.from_primitives(rest, x) for x in (np.arange(len(rest))[:, None], unique_edges(triangles), triangles)]
+    patches = ClusterCulling.from_rest_shape(rest, trees[0], trees[1], trees[2], 20 * REACH)
+    assert patches.is_dense
+    assert not patches.compute_clearance_bounds(rest, rest + 5.0, CollisionQuery(REACH, 0.0, MIN_GAP_FRACTION))
 
 
 def test_contact_that_is_idle_goes_only_ways_that_are_free_and_mostly_without_a_look(monkeypatch):
-    mesh, asked, ways = Grid().build(17), [], 0
-    surface = Surface.of(mesh.rest, sides(mesh.triangles), mesh.triangles, np.ones(len(mesh.rest)), 0.006, 0.006)
-    contact, clear = SelfContact(surface), Patches.clear
-    monkeypatch.setattr(Patches, "clear", lambda *given: asked.append(given) or clear(*given))
+    mesh, asked, ways = GridMesh().build_mesh(17), [], 0
+    surface = CollisionMesh.from_rest_shape(
+        mesh.rest_positions,
+        unique_edges(mesh.triangles),
+        mesh.triangles,
+        np.ones(len(mesh.rest_positions)),
+        0.006,
+        0.006,
+    )
+    contact, clear = SelfContact(surface), ClusterCulling.compute_clearance_bounds
+    monkeypatch.setattr(ClusterCulling, "clear", lambda *given: asked.append(given) or clear(*given))
     rng = np.random.default_rng(0)
-    p = mesh.rest @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    p = mesh.rest_positions @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
     for k in range(14):
         size = 0.2 if k % 8 == 0 else 0.004
-        way = size * np.sin(mesh.rest @ rng.normal(size=3) * 2.0)[:, None] * rng.normal(size=3) + rng.normal(size=3)
-        if contact.largest_step(p, way) == 1.0:
-            before = surface.within(p, 0.1)
+        way = size * np.sin(mesh.rest_positions @ rng.normal(size=3) * 2.0)[:, None] * rng.normal(size=3) + rng.normal(
+            size=3
+        )
+        if contact.collision_free_step_size(p, way) == 1.0:
+            before = surface.find_proximity_candidates(p, 0.1)
             for t in np.linspace(0.0, 1.0, 5):
-                gap = distances(before, p + t * way) - 0.006
-                assert (gap >= 0.5 * LEFT * (distances(before, p) - 0.006)).all()
+                gap = compute_distances(before, p + t * way) - 0.006
+                assert (gap >= 0.5 * MIN_GAP_FRACTION * (compute_distances(before, p) - 0.006)).all()
             p, ways = p + way, ways + 1
-            assert (contact.value(p) == 0.0) == (len(surface.within(p, 0.012).vertices) == 0)
+            assert (contact.value(p) == 0.0) == (len(surface.find_proximity_candidates(p, 0.012).vertices) == 0)
     assert ways > 10
     assert len(asked) < ways

@@ -13,7 +13,7 @@ from solvers.methods.chebyshev import Chebyshev
 from solvers.methods.lbfgs import Lbfgs
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, Solver, System
-from tests.scenes import cloth, first_problem
+from tests.scenes import build_cloth, build_first_problem
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Foreign:
         self.springs.add_projection(p, out)
 
 
-SYSTEM = first_problem(cloth(6)).system
+SYSTEM = build_first_problem(build_cloth(6)).system
 
 
 def foreign(system: System) -> System:
@@ -51,7 +51,7 @@ METHODS: tuple[Solver, ...] = (CompiledLocalGlobal(), Anderson(), Chebyshev(), L
 
 @pytest.mark.parametrize("solver", METHODS, ids=repr)
 def test_an_energy_that_the_kernels_do_not_know_shows_in_the_choice(solver: Solver):
-    known, unknown = (solver.prepare(system).choice for system in (SYSTEM, foreign(SYSTEM)))
+    known, unknown = (solver.prepare(system).description for system in (SYSTEM, foreign(SYSTEM)))
     assert "iterations compiled" in known
     assert "through Python" not in known
     assert "iterations through Python: the kernels do not know Foreign" in unknown
@@ -60,4 +60,4 @@ def test_an_energy_that_the_kernels_do_not_know_shows_in_the_choice(solver: Solv
 
 @pytest.mark.parametrize("solver", [CompiledLocalGlobal(linear="cg"), Lbfgs(linear="cg")], ids=repr)
 def test_a_linear_solver_that_is_called_from_python_shows_in_the_choice(solver: Solver):
-    assert "iterations through Python: this linear solver" in solver.prepare(SYSTEM).choice
+    assert "iterations through Python: this linear solver" in solver.prepare(SYSTEM).description

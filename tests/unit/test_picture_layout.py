@@ -10,20 +10,22 @@ import numpy as np
 import pytest
 
 from harness.base.errors import RunFailed
-from harness.record.base import Replay
+from harness.record.base import RecordingReplay
 from harness.report import opengl
-from harness.report.comparison import draw_comparison, reference
-from harness.report.frames import shown_limit
-from harness.report.run_picture import draw_run, layout
-from harness.report.style import HEIGHT, WIDTH
+from harness.report.comparison import draw_comparison_picture, find_reference_run
+from harness.report.frames import strain_scale_limit
+from harness.report.run_picture import draw_run_picture, layout_frames
+from harness.report.style import PAGE_HEIGHT, PAGE_WIDTH
 from tests.unit.test_report_pictures import broken, cloth
 
 
 @pytest.mark.parametrize("shape", [0.2, 1.0, 1.3, 4.0])
 def test_frames_of_any_shape_fill_the_page_and_do_not_meet(shape: float) -> None:
-    main, tiles = layout(shape, shape, 5)
+    main, tiles = layout_frames(shape, shape, 5)
     boxes = [main, *tiles]
-    assert all(box.left >= 0 and box.left + box.width <= WIDTH and box.top + box.height <= HEIGHT for box in boxes)
+    assert all(
+        box.left >= 0 and box.left + box.width <= PAGE_WIDTH and box.top + box.height <= PAGE_HEIGHT for box in boxes
+    )
     for a, b in combinations(boxes, 2):
         assert a.left + a.width <= b.left or b.left + b.width <= a.left or a.top + a.height <= b.top
     # What is seen of a scene: the largest rectangle of its shape that fits into its place. Of the page's height and
@@ -37,28 +39,28 @@ def test_the_scale_is_that_of_the_strains_that_are_seen() -> None:
     one = cloth(12, frames=1)
     stretched = one.positions.copy()
     stretched[0, 0] += np.array([-0.4 / 11, 0.0, 0.0], np.float32)
-    assert shown_limit([replace(one, positions=stretched)], [0]) == pytest.approx(0.4, abs=0.35)
-    assert shown_limit([one], [0]) == pytest.approx(0.05)
-    assert shown_limit([cloth(stretch=1.39, frames=1)], [0]) == pytest.approx(0.4)
+    assert strain_scale_limit([replace(one, positions=stretched)], [0]) == pytest.approx(0.4, abs=0.35)
+    assert strain_scale_limit([one], [0]) == pytest.approx(0.05)
+    assert strain_scale_limit([cloth(stretch=1.39, frames=1)], [0]) == pytest.approx(0.4)
 
 
 def test_distances_are_taken_from_the_lowest_residual_that_ends_finite() -> None:
-    def ending(residual: float) -> Replay:
+    def ending(residual: float) -> RecordingReplay:
         return replace(cloth(), scalars={"/residual": (np.array([1]), np.array([residual]))})
 
-    assert reference([ending(1e-2), ending(1e-9), ending(1e-6)]) == 1
-    assert reference([ending(1e-2), broken(ending(1e-9), 3)]) == 0
-    assert reference([replace(cloth(), scalars={}), ending(1e-2)]) == 1
-    assert reference([ending(np.nan), ending(1e-2)]) == 1
+    assert find_reference_run([ending(1e-2), ending(1e-9), ending(1e-6)]) == 1
+    assert find_reference_run([ending(1e-2), broken(ending(1e-9), 3)]) == 0
+    assert find_reference_run([replace(cloth(), scalars={}), ending(1e-2)]) == 1
+    assert find_reference_run([ending(np.nan), ending(1e-2)]) == 1
 
 
 def test_without_opengl_the_message_names_the_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(opengl, "_TRY", "import os; os.kill(os.getpid(), 11)")  # as VTK ends without the libraries
-    opengl.problem.cache_clear()
+    opengl.find_opengl_problem.cache_clear()
     try:
-        for draw in (lambda at: draw_run(cloth(), at), lambda at: draw_comparison({"a": cloth()}, at)):
+        for draw in (lambda at: draw_run_picture(cloth(), at), lambda at: draw_comparison_picture({"a": cloth()}, at)):
             with pytest.raises(RunFailed, match="apt-get install libegl1 libgl1-mesa-dri"):
                 draw(tmp_path / "run.png")
     finally:
-        opengl.problem.cache_clear()
+        opengl.find_opengl_problem.cache_clear()
     assert not list(tmp_path.iterdir())

@@ -9,27 +9,27 @@ import numpy as np
 import pytest
 
 from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import Pins, StepProblem, StopRule
-from tests.scenes import BACKENDS, cloth, first_problem, random_problem
+from solvers.problem import DirichletPins, StepProblem, StopRule
+from tests.scenes import LOCAL_GLOBAL_BACKENDS, build_cloth, build_first_problem, build_random_problem
 
-backends = pytest.mark.parametrize("backend", BACKENDS, ids=lambda b: type(b).__name__)
+backends = pytest.mark.parametrize("backend", LOCAL_GLOBAL_BACKENDS, ids=lambda b: type(b).__name__)
 
 CONVERGED = StopRule(3000, 1e-13)
 
 
 def pinned(problem: StepProblem, vertices: list[int], weight: float, seed: int = 0) -> StepProblem:
     """The problem with these pins, their targets beside the rest positions."""
-    pins = Pins(np.array(vertices, np.int64), np.full(len(vertices), weight))
-    targets = problem.current[vertices] + 0.1 * np.random.default_rng(seed).normal(size=(len(vertices), 3))
+    pins = DirichletPins(np.array(vertices, np.int64), np.full(len(vertices), weight))
+    targets = problem.current_positions[vertices] + 0.1 * np.random.default_rng(seed).normal(size=(len(vertices), 3))
     return replace(problem, system=replace(problem.system, pins=pins), pin_targets=targets)
 
 
 @backends
 @pytest.mark.parametrize("weight", [1e4, 1e7, 1e10])
 def test_a_penalty_pin_gives_way_by_the_force_on_it_over_its_weight(backend, weight):
-    problem = pinned(random_problem(0), [0, 3], weight)
+    problem = pinned(build_random_problem(0), [0, 3], weight)
     p = backend.prepare(problem.system).solve(problem, CONVERGED).positions
-    free = replace(problem, system=replace(problem.system, pins=Pins()), pin_targets=np.empty((0, 3)))
+    free = replace(problem, system=replace(problem.system, pins=DirichletPins()), pin_targets=np.empty((0, 3)))
     reaction = -free.gradient(p)[[0, 3]]  # what springs, inertia and forces pull at the pins with
     gives = p[[0, 3]] - problem.pin_targets
     # Positions of order one are known to 1e-15 after the last solve, the reaction to 1e-9 after convergence.
@@ -38,11 +38,11 @@ def test_a_penalty_pin_gives_way_by_the_force_on_it_over_its_weight(backend, wei
 
 @backends
 def test_a_penalty_becomes_an_exact_pin_in_proportion_to_its_weight(backend):
-    exact = pinned(random_problem(0), [0, 3], np.inf)
+    exact = pinned(build_random_problem(0), [0, 3], np.inf)
     wanted = backend.prepare(exact.system).solve(exact, CONVERGED).positions
     away = []
     for weight in (1e6, 1e7, 1e8):
-        soft = pinned(random_problem(0), [0, 3], weight)
+        soft = pinned(build_random_problem(0), [0, 3], weight)
         away.append(np.abs(backend.prepare(soft.system).solve(soft, CONVERGED).positions - wanted).max())
     # 1/w is the leading term; the next is smaller by stiffness / weight, at most 1e4 / 1e6.
     np.testing.assert_allclose([away[0] / away[1], away[1] / away[2]], 10.0, rtol=0.02)
@@ -50,8 +50,8 @@ def test_a_penalty_becomes_an_exact_pin_in_proportion_to_its_weight(backend):
 
 @backends
 def test_the_assignments_weight_holds_a_cloth_to_a_billionth(backend):
-    made = cloth(8)
-    problem = first_problem(made)
+    made = build_cloth(8)
+    problem = build_first_problem(made)
     p = backend.prepare(made.system).solve(problem, StopRule(50)).positions
     held = made.system.pins.vertices
     # A cloth of 1 kg pulls at a pin with some tens of newtons, which 1e10 N/m answer at some 1e-9 m.
@@ -60,7 +60,7 @@ def test_the_assignments_weight_holds_a_cloth_to_a_billionth(backend):
 
 @backends
 def test_all_vertices_may_be_pinned_exactly(backend):
-    problem = pinned(random_problem(1), list(range(12)), np.inf)
+    problem = pinned(build_random_problem(1), list(range(12)), np.inf)
     prepared = backend.prepare(problem.system)
     solution = prepared.solve(problem, StopRule(5, 1e-6))
     np.testing.assert_array_equal(solution.positions, problem.pin_targets)
@@ -70,7 +70,7 @@ def test_all_vertices_may_be_pinned_exactly(backend):
 
 @backends
 def test_all_vertices_may_be_pinned_by_penalties(backend):
-    problem = pinned(random_problem(1), list(range(12)), 1e10)
+    problem = pinned(build_random_problem(1), list(range(12)), 1e10)
     p = backend.prepare(problem.system).solve(problem, StopRule(5, 1e-6)).positions
     # Forces of some thousand newtons over the weight.
     np.testing.assert_allclose(p, problem.pin_targets, rtol=0, atol=1e-5)
@@ -79,30 +79,30 @@ def test_all_vertices_may_be_pinned_by_penalties(backend):
 @backends
 @pytest.mark.parametrize("weight", [1e3, np.inf])
 def test_a_vertex_alone_may_be_pinned(backend, weight):
-    problem = pinned(random_problem(2, n=1, m=0, weights=()), [0], weight)
+    problem = pinned(build_random_problem(2, n=1, m=0, weights=()), [0], weight)
     (p,) = islice(backend.prepare(problem.system).iterates(problem), 1)
     inertia = problem.system.mass[0] / problem.system.time_step**2
-    pulled = (inertia * problem.target + problem.force + 1e3 * problem.pin_targets) / (inertia + 1e3)
+    pulled = (inertia * problem.inertial_target + problem.external_force + 1e3 * problem.pin_targets) / (inertia + 1e3)
     np.testing.assert_allclose(p, problem.pin_targets if np.isinf(weight) else pulled, rtol=1e-14)
 
 
 @backends
 def test_massless_vertices_follow_springs_and_pins(backend):
-    problem = pinned(random_problem(3), [0, 1], np.inf)
+    problem = pinned(build_random_problem(3), [0, 1], np.inf)
     light = replace(problem.system, mass=np.where(np.arange(12) % 2, 0.0, problem.system.mass))
     problem = replace(problem, system=light)
     p = backend.prepare(light).solve(problem, CONVERGED).positions
     # Without inertia to hold it the slack part of the network settles slowly: six digits in 3000 iterations.
-    assert np.abs(problem.gradient(p)).max() <= 1e-6 * np.abs(problem.gradient(problem.first_guess)).max()
+    assert np.abs(problem.gradient(p)).max() <= 1e-6 * np.abs(problem.gradient(problem.initial_guess)).max()
 
 
 @backends
 def test_the_order_of_magnitude_of_one_pin_does_not_blur_the_others(backend):
     """Weights of 1 and 1e12 N/m in one system, against elimination of the stiff one."""
-    problem = random_problem(4)
-    problem = replace(problem, first_guess=problem.current)
-    mixed = replace(problem.system, pins=Pins(np.array([0, 1]), np.array([1.0, 1e12])))
-    limit = replace(problem.system, pins=Pins(np.array([0, 1]), np.array([1.0, np.inf])))
+    problem = build_random_problem(4)
+    problem = replace(problem, initial_guess=problem.current_positions)
+    mixed = replace(problem.system, pins=DirichletPins(np.array([0, 1]), np.array([1.0, 1e12])))
+    limit = replace(problem.system, pins=DirichletPins(np.array([0, 1]), np.array([1.0, np.inf])))
     found = [
         backend.prepare(system).solve(replace(problem, system=system), StopRule(50)).positions
         for system in (mixed, limit)
@@ -112,10 +112,12 @@ def test_the_order_of_magnitude_of_one_pin_does_not_blur_the_others(backend):
 
 
 def test_targets_follow_the_order_of_the_pins_where_exact_ones_and_penalties_alternate():
-    problem = random_problem(5)
+    problem = build_random_problem(5)
     weights = np.array([np.inf, 1e8, np.inf, 1e8])
     vertices, targets = np.array([1, 2, 5, 8]), np.arange(12.0).reshape(4, 3)
-    problem = replace(problem, system=replace(problem.system, pins=Pins(vertices, weights)), pin_targets=targets)
+    problem = replace(
+        problem, system=replace(problem.system, pins=DirichletPins(vertices, weights)), pin_targets=targets
+    )
     p = SparseLocalGlobal().prepare(problem.system).solve(problem, StopRule(20)).positions
     # Some 1e4 N over 1e8 N/m.
     np.testing.assert_allclose(p[vertices], targets, rtol=0, atol=1e-3)

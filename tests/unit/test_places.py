@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from harness.base.places import Place
+from harness.base.places import RemoteStorage
 from harness.cli import app
 from tests.contracts.hostile import scene
-from tests.dummies import write_dummies
+from tests.dummies import write_dummy_runs
 
 SWEEP = "{scenes: [cloth.yaml], sizes: [4], solvers: [sparse], options: {rounds: 1, record: false, pictures: false}}"
 
@@ -39,22 +39,22 @@ def config(tmp_path: Path) -> Path:
 
 def test_files_travel_both_ways_and_what_is_there_already_does_not(tmp_path: Path):
     there = tmp_path / "there"
-    units = write_dummies(there / "sweep", 3)
+    units = write_dummy_runs(there / "sweep", 3)
     (there / "sweep" / "recordings").mkdir()
     (there / "sweep" / "recordings" / "a.rrd").write_text("a recording")
-    place = Place.of(f"file://{there}")
-    place.fetch(rows_alone=True)
+    place = RemoteStorage.from_url(f"file://{there}")
+    place.download_changes(only_rows=True)
     assert len([path for path in place.folder.rglob("*.*") if path.suffix in (".parquet", ".rrd")]) == 3
     (here,) = place.folder.rglob(units[0].name)
     fetched = here.stat().st_ino
     (place.folder / "sweep" / "rows.parquet").write_text("packed")
     (place.folder / "sweep" / "rows" / units[1].name).unlink()
     os.unlink(units[2])
-    again = Place.of(f"file://{there}/")
-    again.fetch()
+    again = RemoteStorage.from_url(f"file://{there}/")
+    again.download_changes()
     assert here.stat().st_ino == fetched
     assert (again.folder / "sweep" / "recordings" / "a.rrd").read_text() == "a recording"
-    again.send()
+    again.upload_changes()
     left = {path.relative_to(there).as_posix() for path in there.rglob("*") if path.is_file()}
     assert left == {f"sweep/rows/{units[0].name}", "sweep/rows.parquet", "sweep/recordings/a.rrd"}
 
@@ -63,13 +63,13 @@ def test_what_was_changed_on_both_sides_is_taken_from_here(tmp_path: Path):
     (tmp_path / "there").mkdir()
     file = tmp_path / "there" / "a.txt"
     file.write_text("old")
-    place = Place.of(f"file://{tmp_path / 'there'}")
-    place.fetch()
+    place = RemoteStorage.from_url(f"file://{tmp_path / 'there'}")
+    place.download_changes()
     (place.folder / "a.txt").write_text("changed here")
     file.write_text("changed there as well")
-    again = Place.of(f"file://{tmp_path / 'there'}")
-    again.fetch()
-    again.send()
+    again = RemoteStorage.from_url(f"file://{tmp_path / 'there'}")
+    again.download_changes()
+    again.upload_changes()
     assert file.read_text() == "changed here"
 
 

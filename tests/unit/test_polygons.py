@@ -10,10 +10,10 @@ import pytest
 
 from harness.base.errors import InputError
 from harness.config.load import load_scene
-from harness.scenes.bind import build
-from harness.scenes.mesh.files import File
-from harness.scenes.mesh.polygons import MAX_CONCAVE_CORNERS, triangulate, vertex_areas
-from harness.simulation.opinion.second import second_opinion
+from harness.scenes.bind import build_scene
+from harness.scenes.mesh.files import FileMesh
+from harness.scenes.mesh.polygons import MAX_CONCAVE_CORNERS, compute_vertex_areas, triangulate_polygons
+from harness.simulation.opinion.second import verify_terms
 
 ROUND_OFF = 1e-12
 """A few hundred additions of numbers of order one in float64."""
@@ -51,7 +51,7 @@ def scene(folder: Path, path: Path, effects: str, mass: str = "mass: 1"):
     config.write_text(
         f"mesh: {{kind: file, path: {path.name}}}\n{mass}\ntime_step: 0.01\nframes: 2\neffects: [{effects}]\n"
     )
-    return build(load_scene(config), 0)
+    return build_scene(load_scene(config), 0)
 
 
 @pytest.mark.parametrize("case", AREAS)
@@ -65,9 +65,9 @@ def test_areas_and_triangles_are_those_of_the_face_whichever_corner_comes_first(
     for shift in range(k):
         for way in (1, -1):
             faces = np.roll(renumbered, shift)[None, ::way]
-            surface = triangulate(rest, faces)
-            assert not surface.failed.any()
-            weights = vertex_areas(rest, faces, surface)
+            surface = triangulate_polygons(rest, faces)
+            assert not surface.is_self_crossing.any()
+            weights = compute_vertex_areas(rest, faces, surface)
             assert weights.sum() == pytest.approx(area, rel=ROUND_OFF)
             a, b, c = (rest[surface.triangles[0][:, i]] for i in range(3))
             normals = np.cross(b - a, c - a)
@@ -81,26 +81,30 @@ def test_a_quadrangle_gives_its_corners_half_of_each_diagonals_thirds():
     rest, face = np.array(KITE, float), np.array([[0, 1, 2, 3]])
     by_short = np.array([2, 2 + 1, 1, 2 + 1]) / 3  # its triangles have 2 and 1 m^2
     by_long = np.array([1.5 + 1.5, 1.5, 1.5 + 1.5, 1.5]) / 3
-    areas = vertex_areas(rest, face, triangulate(rest, face))
+    areas = compute_vertex_areas(rest, face, triangulate_polygons(rest, face))
     assert areas == pytest.approx((by_short + by_long) / 2, rel=ROUND_OFF)
 
 
 def test_a_quadrangle_is_cut_by_its_shorter_diagonal_and_an_equal_one_by_the_lowest_vertex():
-    assert triangulate(np.array(KITE, float), np.array([[2, 3, 0, 1]])).triangles.tolist() == [[[0, 1, 3], [1, 2, 3]]]
-    assert triangulate(np.array(SQUARE, float), np.array([[1, 2, 3, 0]])).triangles.tolist() == [[[0, 1, 2], [0, 2, 3]]]
+    assert triangulate_polygons(np.array(KITE, float), np.array([[2, 3, 0, 1]])).triangles.tolist() == [
+        [[0, 1, 3], [1, 2, 3]]
+    ]
+    assert triangulate_polygons(np.array(SQUARE, float), np.array([[1, 2, 3, 0]])).triangles.tolist() == [
+        [[0, 1, 2], [0, 2, 3]]
+    ]
 
 
 @pytest.mark.parametrize("first", range(4))
 def test_a_hanging_square_weighs_the_same_at_all_corners(tmp_path, first):
     face = " ".join(str((first + i) % 4 + 1) for i in range(4))
-    assert File(path=obj(tmp_path, SQUARE, face)).build().shares.tolist() == [0.25] * 4
+    assert FileMesh(path=obj(tmp_path, SQUARE, face)).build_mesh().mass_fractions.tolist() == [0.25] * 4
 
 
 def test_a_cube_of_quadrangles_weighs_the_same_at_all_corners(tmp_path):
     cube = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
     faces = ["1 2 4 3", "5 7 8 6", "6 2 1 5", "3 4 8 7", "7 5 1 3", "2 6 8 4"]
     path = obj(tmp_path, cube, *faces)
-    assert File(path=path).build().shares == pytest.approx([1 / 8] * 8, rel=ROUND_OFF)
+    assert FileMesh(path=path).build_mesh().mass_fractions == pytest.approx([1 / 8] * 8, rel=ROUND_OFF)
     made = scene(tmp_path, path, "{kind: springs, stretch: 1}, {kind: gas, pressure: 10}", "mass_per_area: 2")
     assert made.system.mass == pytest.approx([2 * 6 / 8] * 8, rel=ROUND_OFF)
 
@@ -116,7 +120,7 @@ def test_forces_on_the_triangles_of_quadrangles_do_not_depend_on_the_first_corne
     for shift in range(4):
         path = obj(tmp_path, points, *(" ".join(str(v + 1) for v in np.roll(face, shift)) for face in faces))
         made = scene(tmp_path, path, f"{{kind: springs, stretch: 1}}, {effect}")
-        total = sum((force(p, np.zeros_like(p), 0.0) for force in made.forces), np.zeros_like(p))
+        total = sum((force(p, np.zeros_like(p), 0.0) for force in made.varying_forces), np.zeros_like(p))
         for energy in made.system.energies:
             energy.add_gradient(p, total)
         found.append(total)
@@ -131,7 +135,7 @@ def test_the_second_opinion_agrees_on_concave_and_convex_faces(tmp_path, first):
     wind = "{kind: wind, per: triangle, velocity: [3, 1, 2], lift: 0.3}"
     effects = f"{{kind: springs, stretch: 10}}, {{kind: gravity}}, {wind}, {{kind: bending, stiffness: 0.1}}"
     made = scene(tmp_path, path, effects, "mass_per_area: 0.3")
-    assert second_opinion(load_scene(tmp_path / "mesh.yaml"), made, "implicit-euler") == "agrees"
+    assert verify_terms(load_scene(tmp_path / "mesh.yaml"), made, "implicit-euler") == "agrees"
 
 
 @pytest.mark.parametrize(
@@ -146,7 +150,7 @@ def test_the_second_opinion_agrees_on_concave_and_convex_faces(tmp_path, first):
 def test_a_face_that_is_no_polygon_is_refused_with_its_line(tmp_path, points, face, words):
     path = obj(tmp_path, points, face or " ".join(str(i + 1) for i in range(len(points))))
     with pytest.raises(InputError, match=words) as caught:
-        File(path=path).build()
+        FileMesh(path=path).build_mesh()
     assert caught.value.mistakes[0].line == len(points) + 1
 
 
@@ -186,11 +190,11 @@ def test_a_repeated_face_counts_once_with_a_warning(tmp_path, caplog, case, suff
 
 
 def test_what_fills_a_notch_repeats_nothing(tmp_path, caplog):
-    mesh = File(path=obj(tmp_path, ARROW, "1 2 3 4", "3 2 4")).build()
+    mesh = FileMesh(path=obj(tmp_path, ARROW, "1 2 3 4", "3 2 4")).build_mesh()
     assert len(mesh.triangles) == 3
-    assert mesh.areas is not None
-    assert mesh.areas.sum() == pytest.approx(0.5 + 1.5, rel=ROUND_OFF)
-    assert not caplog.messages
+    assert mesh.vertex_areas is not None
+    assert mesh.vertex_areas.sum() == pytest.approx(0.5 + 1.5, rel=ROUND_OFF)
+    assert not caplog.message_counts
 
 
 def test_a_repeated_tetrahedron_counts_once_and_has_its_surface(tmp_path, caplog):
@@ -198,7 +202,7 @@ def test_a_repeated_tetrahedron_counts_once_and_has_its_surface(tmp_path, caplog
     points = "POINTS 5 double\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 1 1\n"
     cells = "CELLS 3 15\n4 0 1 2 3\n4 1 0 2 3\n4 4 1 2 3\nCELL_TYPES 3\n10\n10\n10\n"
     path.write_text(f"# vtk DataFile Version 3.0\nx\nASCII\nDATASET UNSTRUCTURED_GRID\n{points}{cells}")
-    mesh = File(path=path).build()
-    assert mesh.shares[0] == pytest.approx(1 / 6 / 4 / (1 / 6 + 1 / 3), rel=ROUND_OFF)
+    mesh = FileMesh(path=path).build_mesh()
+    assert mesh.mass_fractions[0] == pytest.approx(1 / 6 / 4 / (1 / 6 + 1 / 3), rel=ROUND_OFF)
     assert len(mesh.triangles) == 6
-    assert "1 tetrahedra repeat others" in caplog.messages[0]
+    assert "1 tetrahedra repeat others" in caplog.message_counts[0]

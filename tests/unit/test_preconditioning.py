@@ -10,39 +10,43 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.sparse import bsr_array, csr_array
 
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
-from harness.simulation.step import prepare, simulate
-from solvers.core.descent import Metric, PreparedDescent
-from solvers.core.fixed_objective import Objective
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.simulation.step import prepare, simulate_scene
+from solvers.core.descent import PreparedDescent, ResidualMetric
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import Hessian, StepObjective
-from solvers.core.preconditioning import Preconditioning, diagonal_blocks
-from solvers.core.saddles import certified
-from solvers.linear.schwarz import PATCH, Patches, Schwarz, ordered
-from solvers.methods.newton import Newton
+from solvers.core.preconditioning import PreconditionerName, assemble_diagonal_blocks
+from solvers.core.saddles import is_positive_definite
+from solvers.linear.schwarz import SUBDOMAIN_SIZE, AdditiveSchwarz, SubdomainHierarchy, order_into_subdomains
+from solvers.methods.newton import NewtonSolver
 from solvers.methods.newton_cg import NewtonCG
 from solvers.methods.pncg import NonlinearCG
 from solvers.problem import Positions, StepProblem, StopRule, Unsupported
-from tests.effects import SCENES, stepped
-from tests.scenes import cloth, first_problem, scene
-from tests.unit.test_surface_contact import BALL, contact, draped, intersections
+from tests.effects import EFFECT_SCENES, build_moving_problem
+from tests.scenes import build_cloth, build_first_problem, build_test_scene
+from tests.unit.test_surface_contact import BALL, contact, count_intersections, draped
 
-OTHERS: list[Preconditioning] = [name for name in get_args(Preconditioning) if name != "factor"]
+OTHERS: list[PreconditionerName] = [name for name in get_args(PreconditionerName) if name != "factor"]
 others = pytest.mark.parametrize("name", OTHERS)
 METHODS = {"newton-cg": NewtonCG, "pncg": NonlinearCG}
 
 
-def made(size: int, stretch: float = 300.0) -> tuple[csr_array, Schwarz, NDArray[np.int64], NDArray[np.float64]]:
+def made(
+    size: int, stretch: float = 300.0
+) -> tuple[csr_array, AdditiveSchwarz, NDArray[np.int64], NDArray[np.float64]]:
     """The clamped Hessian (3f, 3f) of a cloth that was disturbed, its S, the order, and its diagonal blocks."""
-    stated = first_problem(cloth(size, "exact", stretch))
-    step = StepObjective(Objective(stated.system), stated)
-    p = step.placed(stated.current + 0.1 / size * np.random.default_rng(0).normal(size=stated.current.shape))
-    matrix = step.hessian(p).convex()
-    order = ordered(matrix.graph)
+    stated = build_first_problem(build_cloth(size, "exact", stretch))
+    step = StepObjective(FixedObjective(stated.system), stated)
+    p = step.apply_exact_pins(
+        stated.current_positions + 0.1 / size * np.random.default_rng(0).normal(size=stated.current_positions.shape)
+    )
+    matrix = step.hessian(p).assemble_clamped()
+    order = order_into_subdomains(matrix.graph)
     bsr = bsr_array((matrix.values, matrix.graph.indices, matrix.graph.indptr))
-    blocks = matrix.values[matrix.places.diagonal[stated.system.free]]
-    return csr_array(bsr), Patches(matrix.graph, order).inverted(matrix.values), order, blocks
+    blocks = matrix.values[matrix.block_indices.diagonal_block[stated.system.free_vertices]]
+    return csr_array(bsr), SubdomainHierarchy(matrix.graph, order).build_preconditioner(matrix.values), order, blocks
 
 
 def by_levels(A: csr_array, order: NDArray[np.int64], b: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -54,28 +58,28 @@ def by_levels(A: csr_array, order: NDArray[np.int64], b: NDArray[np.float64]) ->
         P = csr_array((np.ones(3 * f), (np.arange(3 * f), of)))
         M, r = csr_array(P.T @ csr_array(A @ P)).toarray(), np.asarray(P.T @ b)
         moved = np.zeros_like(r)
-        for first in range(0, len(M), 3 * PATCH):
-            some = slice(first, first + 3 * PATCH)
+        for first in range(0, len(M), 3 * SUBDOMAIN_SIZE):
+            some = slice(first, first + 3 * SUBDOMAIN_SIZE)
             moved[some] = np.linalg.solve(M[some, some], r[some])
         out += P @ moved
-        if len(M) <= 3 * PATCH:
+        if len(M) <= 3 * SUBDOMAIN_SIZE:
             return out
-        nodes = nodes // PATCH
+        nodes = nodes // SUBDOMAIN_SIZE
 
 
 @pytest.mark.parametrize(("size", "levels"), [(4, 1), (12, 2), (33, 3)])
 def test_schwarz_is_the_sum_of_its_levels(size, levels):
     A, S, order, _ = made(size)
-    assert len(S.inverses) == levels
+    assert len(S.subdomain_inverses) == levels
     np.testing.assert_array_equal(np.sort(order), np.arange(len(order)))
     b = np.random.default_rng(1).normal(size=(len(order), 3))
     wanted = by_levels(A, order, b.reshape(-1, 1)).reshape(-1, 3)
-    np.testing.assert_allclose(S.solve(b), wanted, rtol=0, atol=1e-10 * np.abs(wanted).max())
+    np.testing.assert_allclose(S.apply_preconditioner(b), wanted, rtol=0, atol=1e-10 * np.abs(wanted).max())
 
 
-def whole(S: Schwarz, f: int) -> NDArray[np.float64]:
+def whole(S: AdditiveSchwarz, f: int) -> NDArray[np.float64]:
     """S as a dense matrix (3f, 3f)."""
-    return np.column_stack([S.solve(unit.reshape(-1, 3)).ravel() for unit in np.eye(3 * f)])
+    return np.column_stack([S.apply_preconditioner(unit.reshape(-1, 3)).ravel() for unit in np.eye(3 * f)])
 
 
 def condition(A: NDArray[np.float64], S: NDArray[np.float64]) -> float:
@@ -96,41 +100,43 @@ def test_schwarz_is_symmetric_positive_definite_and_better_than_blocks_on_stiff_
 
 def test_patches_are_of_neighbours():
     """Most of a cloth's neighbours are in the same patch, whatever parts it has, and all vertices are in one."""
-    graph = metric(33).inner
+    graph = metric(33).free_block
     for some in (graph, csr_array(block_diag(graph.toarray(), np.eye(70), graph.toarray()[:40, :40]))):
-        order, ends = ordered(some), some.tocoo()
+        order, ends = order_into_subdomains(some), some.tocoo()
         np.testing.assert_array_equal(np.sort(order), np.arange(len(order)))
-        place = np.argsort(order) // PATCH
+        place = np.argsort(order) // SUBDOMAIN_SIZE
         apart = ends.row != ends.col
         assert (place[ends.row] == place[ends.col])[apart].mean() > 0.6
 
 
-def metric(size: int) -> Metric:
-    return Metric(first_problem(cloth(size, "exact")).system)
+def metric(size: int) -> ResidualMetric:
+    return ResidualMetric(build_first_problem(build_cloth(size, "exact")).system)
 
 
 def given(scene: str) -> StepProblem:
-    return stepped(SCENES[scene]())
+    return build_moving_problem(EFFECT_SCENES[scene]())
 
 
-@pytest.mark.parametrize("scene", [s for s in SCENES if "gas" not in s])
+@pytest.mark.parametrize("scene", [s for s in EFFECT_SCENES if "gas" not in s])
 def test_diagonal_blocks_are_those_of_the_clamped_matrix(scene):
     stated = given(scene)
-    step = StepObjective(Objective(stated.system), stated)
-    p = step.placed(stated.current)
+    step = StepObjective(FixedObjective(stated.system), stated)
+    p = step.apply_exact_pins(stated.current_positions)
     hessian = step.hessian(p)
-    matrix = hessian.convex()
-    wanted = matrix.values[matrix.places.diagonal[stated.system.free]]
-    np.testing.assert_allclose(diagonal_blocks(step, hessian, p), wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
+    matrix = hessian.assemble_clamped()
+    wanted = matrix.values[matrix.block_indices.diagonal_block[stated.system.free_vertices]]
+    np.testing.assert_allclose(
+        assemble_diagonal_blocks(step, hessian, p), wanted, rtol=0, atol=1e-12 * np.abs(wanted).max()
+    )
 
 
 @others
 @pytest.mark.parametrize("method", METHODS)
 def test_the_minimum_is_that_of_newtons_method(method, name):
     stated = given("all that are projective")
-    wanted = Newton().prepare(stated.system).solve(stated, StopRule(200)).positions
+    wanted = NewtonSolver().prepare(stated.system).solve(stated, StopRule(200)).positions
     solution = METHODS[method](preconditioner=name).prepare(stated.system).solve(stated, StopRule(3000, 1e-9))
-    assert solution.stopped != "iterations"
+    assert solution.termination_reason != "iterations"
     np.testing.assert_allclose(solution.positions, wanted, rtol=0, atol=1e-7)
 
 
@@ -139,27 +145,27 @@ def test_what_lies_on_a_floor_is_at_a_minimum(name):
     """Which of them, friction leaves to the way there."""
     stated = given("contact")
     p = NewtonCG(preconditioner=name).prepare(stated.system).solve(stated, StopRule(500, 1e-9)).positions
-    assert np.abs(stated.gradient(p)).max() <= 1e-6 * np.abs(stated.gradient(stated.current)).max()
-    step = StepObjective(Objective(stated.system), stated)
-    assert certified(step, step.placed(p))
+    assert np.abs(stated.gradient(p)).max() <= 1e-6 * np.abs(stated.gradient(stated.current_positions)).max()
+    step = StepObjective(FixedObjective(stated.system), stated)
+    assert is_positive_definite(step, step.apply_exact_pins(p))
 
 
 @pytest.mark.parametrize(("method", "name"), [*(("newton-cg", name) for name in OTHERS), ("pncg", "block-jacobi")])
 def test_a_sheet_that_lies_on_a_ball_is_held_by_it(method, name):
     made = draped(BALL, size=6)
     rule, ends = StopRule(2000, 1e-8), list[Positions]()
-    for solver in (Newton(), METHODS[method](preconditioner=name)):
-        *_, last = simulate(made, prepare(made, solver), rule, first_guess="current", frames=9)
-        assert intersections(made, last.positions, made.time(last.index)) == 0
-        assert last.solution.stopped != "iterations"
+    for solver in (NewtonSolver(), METHODS[method](preconditioner=name)):
+        *_, last = simulate_scene(made, prepare(made, solver), rule, initial_guess="current", frames=9)
+        assert count_intersections(made, last.positions, made.compute_time(last.index)) == 0
+        assert last.solution.termination_reason != "iterations"
         ends.append(last.positions)
-    assert contact(made).blocks(ends[0]).vertices.size
+    assert contact(made).hessian_blocks(ends[0]).vertices.size
     np.testing.assert_allclose(*ends, rtol=0, atol=1e-6)
 
 
 def products(prepared: PreparedDescent, stated: StepProblem, monkeypatch: pytest.MonkeyPatch) -> int:
     """With the Hessian, in a solve to 1e-6."""
-    count, multiply = [0], Hessian.multiply
+    count, multiply = [0], Hessian.matvec
 
     def counting(self: Hessian, x: Positions) -> Positions:
         count[0] += 1
@@ -167,12 +173,12 @@ def products(prepared: PreparedDescent, stated: StepProblem, monkeypatch: pytest
 
     with monkeypatch.context() as patched:
         patched.setattr(Hessian, "multiply", counting)
-        assert prepared.solve(stated, StopRule(500, 1e-6)).stopped == "tolerance"
+        assert prepared.solve(stated, StopRule(500, 1e-6)).termination_reason == "tolerance"
     return count[0]
 
 
 def test_schwarz_takes_fewer_iterations_of_conjugate_gradients_than_blocks_on_stiff_cloth(monkeypatch):
-    stated = first_problem(cloth(24, "exact", 1e5))
+    stated = build_first_problem(build_cloth(24, "exact", 1e5))
     found: dict[str, int] = {}
     for name in OTHERS:
         prepared = NewtonCG(preconditioner=name).prepare(stated.system)
@@ -190,18 +196,20 @@ def test_energies_without_elements_are_refused_by_name(method, name):
 
 
 def test_nothing_is_solved_for_where_all_is_held():
-    stated = first_problem(scene(Chain(), Springs(stretch=1.0), Pins(at=("ends",), weight="exact"), size=2))
+    stated = build_first_problem(
+        build_test_scene(ChainMesh(), SpringsEffect(stretch=1.0), PinsEffect(at=("ends",), weight="exact"), size=2)
+    )
     for name in OTHERS:
         solution = NewtonCG(preconditioner=name).prepare(stated.system).solve(stated, StopRule(3))
-        np.testing.assert_array_equal(solution.positions, stated.current)
+        np.testing.assert_array_equal(solution.positions, stated.current_positions)
 
 
 def test_blocks_take_the_memory_of_local_global():
     """Nothing looks for the structure of a Hessian's factor."""
-    stated = first_problem(cloth(6, "exact"))
+    stated = build_first_problem(build_cloth(6, "exact"))
     prepared = NewtonCG(preconditioner="block-jacobi").prepare(stated.system)
     assert isinstance(prepared, PreparedDescent)
     prepared.solve(stated, StopRule(2))
-    for phase in prepared.phases(stated).values():
+    for phase in prepared.iteration_phases(stated).values():
         phase()
-    assert "matrix" not in vars(prepared.objective)
+    assert "matrix" not in vars(prepared.fixed_objective)

@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from harness.base.console import err, say
+from harness.base.console import get_error_console, print_message
 from harness.base.errors import InputError
-from harness.base.progress import display
+from harness.base.progress import create_display
 from harness.cli import app
-from harness.config.load import load_any, load_scene
-from harness.experiments.ablation.price_unit import price_all
-from harness.experiments.ablation.prices import only, priced
-from harness.report.ablation import price_table, read
+from harness.config.load import load_config, load_scene
+from harness.experiments.ablation.price_unit import measure_all_overheads
+from harness.experiments.ablation.prices import list_measured_effects, select_effects
+from harness.report.ablation import build_overhead_table, read_ablation
 
 CLOTH = """
 mesh: {kind: grid}
@@ -40,9 +40,9 @@ def cloth(tmp_path: Path) -> Path:
 
 
 def test_every_solver_has_a_price_of_each_effect_or_says_why_not(cloth: Path, tmp_path: Path):
-    sweep = load_any(cloth, solvers=["newton", "dense"], rounds=4, tolerance=1e-6, threads=1)
-    paths = price_all(sweep, tmp_path, display(err()), say, isolated=False)
-    told = {(row["name"], row["solver"]): row for path in paths for row in read(path)}
+    sweep = load_config(cloth, solvers=["newton", "dense"], rounds=4, tolerance=1e-6, threads=1)
+    paths = measure_all_overheads(sweep, tmp_path, create_display(get_error_console()), print_message, isolated=False)
+    told = {(row["name"], row["solver"]): row for path in paths for row in read_ablation(path)}
     assert set(told) == {(e, s) for e in ("bending", "air-drag", "all") for s in ("newton", "dense")}
     for (effect, solver), row in told.items():
         if solver == "dense" and effect != "air-drag":
@@ -54,7 +54,7 @@ def test_every_solver_has_a_price_of_each_effect_or_says_why_not(cloth: Path, tm
         assert row["price_bound"] == 1.0 if effect == "air-drag" else 1.0 < row["price_bound"] < 2.0  # some kilobytes
         assert 3 <= row["rounds"] <= 4
         assert row["seconds"] > 0.0
-    table = price_table(list(told.values()))
+    table = build_overhead_table(list(told.values()))
     assert [str(column.header) for column in table.columns] == ["effect", "newton", "dense"]
     assert next(iter(table.columns[2].cells)) == "unsupported"
 
@@ -68,4 +68,4 @@ def test_what_is_of_one_solver_is_refused(cloth: Path, also: list[str]):
 
 def test_what_has_no_effect_beside_the_plain_ones_has_no_price(cloth: Path):
     with pytest.raises(InputError, match="no effect that has a price"):
-        priced(only(load_scene(cloth)))
+        list_measured_effects(select_effects(load_scene(cloth)))

@@ -8,12 +8,12 @@ import pytest
 
 from solvers.energies.springs import Springs
 from solvers.problem import StepProblem
-from tests.scenes import random_problem
+from tests.scenes import build_random_problem
 
 
 def named(name: str) -> StepProblem:
     """A problem with an energy more, of a class of this name."""
-    problem = random_problem(3)
+    problem = build_random_problem(3)
     (springs,) = problem.system.energies
     assert isinstance(springs, Springs)
     more = type(name, (Springs,), {})(springs.edges, springs.stiffness, springs.rest_length, springs.rest_direction)
@@ -22,9 +22,12 @@ def named(name: str) -> StepProblem:
 
 @pytest.mark.parametrize("name", ["Inertia", "Force", "Pins", "Springs", "Glue"])
 def test_an_energy_counts_whatever_its_class_is_called(name: str):
-    plain, problem = random_problem(3), named(name)
-    p, (springs, _) = problem.current + 0.01, problem.system.energies
+    plain, problem = build_random_problem(3), named(name)
+    p, (springs, _) = problem.current_positions + 0.01, problem.system.energies
     assert springs.value(p) > 0.0
     # Sums of a dozen terms in another order.
     assert problem.value(p) == pytest.approx(plain.value(p) + springs.value(p), rel=1e-13)
-    assert problem.terms(p).items() >= {key: plain.terms(p)[key] for key in ("inertia", "force", "pins")}.items()
+    assert (
+        problem.evaluate_terms(p).items()
+        >= {key: plain.evaluate_terms(p)[key] for key in ("inertia", "force", "pins")}.items()
+    )

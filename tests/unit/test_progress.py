@@ -9,8 +9,8 @@ import pytest
 from rich.console import Console
 
 from harness.base import progress
-from harness.base.asides import COMPILING, LOOK, aside
-from harness.base.progress import Bars, Display, Effort, Lines, Pace
+from harness.base.asides import COMPILING, POLL, report_activity
+from harness.base.progress import ProgressBars, ProgressDisplay, ProgressLines, RemainingTime, RunCost
 
 
 @pytest.fixture
@@ -21,27 +21,35 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-def told(kind: Callable[[Console], Display], does: Callable[[Display], None]) -> str:
+def told(kind: Callable[[Console], ProgressDisplay], does: Callable[[ProgressDisplay], None]) -> str:
     out = io.StringIO()
-    display = kind(Console(file=out, force_terminal=kind is Bars, width=200))
+    display = kind(Console(file=out, force_terminal=kind is ProgressBars, width=200))
     does(display)
-    display.end()
+    display.finish_sweep()
     return out.getvalue()
 
 
-SWEEP = [Effort("fast", 10.0), Effort("slow", 10.0), Effort("fast", 40.0), Effort("slow", 40.0), Effort("fast", 100.0)]
+SWEEP = [
+    RunCost("fast", 10.0),
+    RunCost("slow", 10.0),
+    RunCost("fast", 40.0),
+    RunCost("slow", 40.0),
+    RunCost("fast", 100.0),
+]
 
 
-@pytest.mark.parametrize("kind", [Lines, Bars])
-def test_the_time_left_follows_from_the_latest_run_of_each_kind(kind: Callable[..., Display], clock: list[float]):
-    def does(display: Display) -> None:
-        display.begin(SWEEP)
+@pytest.mark.parametrize("kind", [ProgressLines, ProgressBars])
+def test_the_time_left_follows_from_the_latest_run_of_each_kind(
+    kind: Callable[..., ProgressDisplay], clock: list[float]
+):
+    def does(display: ProgressDisplay) -> None:
+        display.start_sweep(SWEEP)
         for effort, seconds in zip(SWEEP, (3.0, 5.0, 9.0, 35.0), strict=False):
-            run = display.run("one", 10, effort)
-            with aside(run.tick, COMPILING):
+            run = display.start_run("one", 10, effort)
+            with report_activity(run.report_tick, COMPILING):
                 clock[0] += 3000.0  # is no work
             clock[0] += seconds
-            run.finished("ok")
+            run.finish_run("ok")
 
     lines = told(kind, does)
     # 3 s come with any run. After the second one: fast 0 s and slow 0.2 s for each of the amount, so 3, 3 + 8 and 3 s.
@@ -51,44 +59,44 @@ def test_the_time_left_follows_from_the_latest_run_of_each_kind(kind: Callable[.
 
 
 def test_a_run_that_is_done_elsewhere_is_left_out(clock: list[float]):
-    pace = Pace(SWEEP)
-    pace.leave_out(SWEEP[-1])
-    pace.add_ended(SWEEP[0], 3.0)
-    pace.add_ended(SWEEP[1], 3.0)
-    assert pace.left() == 2 * 3.0
+    pace = RemainingTime(SWEEP)
+    pace.remove_run(SWEEP[-1])
+    pace.record_run(SWEEP[0], 3.0)
+    pace.record_run(SWEEP[1], 3.0)
+    assert pace.estimate_seconds() == 2 * 3.0
 
 
 def test_a_run_that_goes_on_tells_its_own_pace(clock: list[float]):
-    def does(display: Display) -> None:
-        display.begin([Effort(), Effort()])
-        display.run("one", 10, Effort()).finished("ok")
-        run = display.run("two", 10, Effort())
+    def does(display: ProgressDisplay) -> None:
+        display.start_sweep([RunCost(), RunCost()])
+        display.start_run("one", 10, RunCost()).finish_run("ok")
+        run = display.start_run("two", 10, RunCost())
         for _ in range(4):
             clock[0] += 12.0
-            run.tick("timed pass")
+            run.report_tick("timed pass")
 
-    assert "40 %; about 72 s left" in told(Lines, does)
+    assert "40 %; about 72 s left" in told(ProgressLines, does)
 
 
 def test_a_line_comes_though_no_run_ends(clock: list[float]):
-    def does(display: Display) -> None:
-        display.begin([Effort()])
-        run = display.run("one", 10, Effort())
-        run.tick("timed pass")
+    def does(display: ProgressDisplay) -> None:
+        display.start_sweep([RunCost()])
+        run = display.start_run("one", 10, RunCost())
+        run.report_tick("timed pass")
         for _ in range(35):
             clock[0] += 1.0
-            run.tick(LOOK)
+            run.report_tick(POLL)
 
-    lines = told(Lines, does).splitlines()
+    lines = told(ProgressLines, does).splitlines()
     assert lines == ["[0/1] one: timed pass, 10 %"] * 3
 
 
 def test_what_is_compiled_is_told_while_it_is(clock: list[float]):
-    def does(display: Display) -> None:
-        display.begin([Effort()])
-        run = display.run("one", 10, Effort())
-        with aside(run.tick, COMPILING):
+    def does(display: ProgressDisplay) -> None:
+        display.start_sweep([RunCost()])
+        run = display.start_run("one", 10, RunCost())
+        with report_activity(run.report_tick, COMPILING):
             clock[0] += 11.0
-            run.tick(LOOK)
+            run.report_tick(POLL)
 
-    assert "one: compiling (once), 0 %" in told(Lines, does)
+    assert "one: compiling (once), 0 %" in told(ProgressLines, does)

@@ -15,13 +15,13 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from harness.base import rows
-from harness.base.console import err
-from harness.base.progress import Lines
+from harness.base.console import get_error_console
+from harness.base.progress import ProgressLines
 from harness.cli import app
 from harness.experiments.archive import verify
-from harness.experiments.archive.verify import Claim, Holds, Published, Row
+from harness.experiments.archive.verify import ClaimVerdict, PublishedRun, ResultRow, VerifiedClaim
 from tests.contracts.hostile import scene
-from tests.dummies import dummy_rows
+from tests.dummies import build_dummy_rows
 
 SWEEP = """
 scenes: [cloth.yaml]
@@ -68,14 +68,16 @@ def changed(archive: Path, into: Path, change: Callable[[dict[str, bytes]], None
 
 @pytest.mark.parametrize("name", ["x.zip", "packed.zip"])
 def test_what_was_published_comes_out_again(home: Path, name: str, tmp_path: Path):
-    with verify.unpacked(home / name) as folder:
+    with verify.unpack_archive(home / name) as folder:
         subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=folder, check=True)
-        assert verify.checksums(folder) == []
-        runs, wrong = verify.published(folder, print, own_code=False)
+        assert verify.verify_checksums(folder) == []
+        runs, wrong = verify.load_published_runs(folder, print, with_user_code=False)
         assert [one.title for one in runs] == ["cloth 4 dense", "cloth 4 sparse"]
         assert wrong == []
-        taken = verify.chosen(runs, seed=1)
-        claims = verify.compare(taken, verify.again(taken, tmp_path, Lines(err())))
+        taken = verify.sample_runs(runs, seed=1)
+        claims = verify.verify_reruns(
+            taken, verify.rerun_published(taken, tmp_path, ProgressLines(get_error_console()))
+        )
         listed = command("list", folder / "configs" / "sweep" / "sweep.yaml", "--results", folder / "results")
         assert listed.output.count("done") == 2
     told = [*map(str, claims)]
@@ -83,7 +85,7 @@ def test_what_was_published_comes_out_again(home: Path, name: str, tmp_path: Pat
         assert f"cloth 4 {solver}, positions: holds (2 steps, to the bit)" in told
         assert any(line.startswith(f"cloth 4 {solver}, other columns: holds (") for line in told), told
         assert any(line.startswith(f"cloth 4 {solver}, time of a step: ") for line in told)
-    assert "times as long as" in claims[-1].what
+    assert "times as long as" in claims[-1].subject
 
 
 def test_the_metadata_name_each_file_with_its_sum_and_what_may_be_done_with_it(home: Path):
@@ -110,22 +112,22 @@ def test_an_archive_that_was_changed_is_named_and_none_of_it_is_run(home: Path, 
 
 
 @pytest.fixture(scope="module")
-def repeated(home: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Published], list[list[Row]]]:
+def repeated(home: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[PublishedRun], list[list[ResultRow]]]:
     """The published runs, dense and sparse, and what they leave when they are done again."""
-    with verify.unpacked(home / "x.zip") as folder:
-        runs, _ = verify.published(folder, print, own_code=False)
-        return runs, verify.again(runs, tmp_path_factory.mktemp("again"), Lines(err()))
+    with verify.unpack_archive(home / "x.zip") as folder:
+        runs, _ = verify.load_published_runs(folder, print, with_user_code=False)
+        return runs, verify.rerun_published(runs, tmp_path_factory.mktemp("again"), ProgressLines(get_error_console()))
 
 
-def scaled(name: str, factor: float) -> Callable[[Row], Row]:
+def scaled(name: str, factor: float) -> Callable[[ResultRow], ResultRow]:
     return lambda row: row if row[name] is None else row | {name: row[name] * factor}
 
 
-def only(change: Callable[[Row], Row], **at: Any) -> Callable[[Row], Row]:
+def only(change: Callable[[ResultRow], ResultRow], **at: Any) -> Callable[[ResultRow], ResultRow]:
     return lambda row: change(row) if all(row[name] == value for name, value in at.items()) else row
 
 
-FORGED: dict[str, tuple[Callable[[Row], Row], str]] = {
+FORGED: dict[str, tuple[Callable[[ResultRow], ResultRow], str]] = {
     "solvers exchanged": (
         lambda row: row | {"solver": "sparse" if row["solver"] == "dense" else "dense"},
         "names and options",
@@ -165,15 +167,17 @@ FORGED: dict[str, tuple[Callable[[Row], Row], str]] = {
 }
 
 
-def claims_of(runs: list[Published], new: list[list[Row]]) -> list[str]:
+def claims_of(runs: list[PublishedRun], new: list[list[ResultRow]]) -> list[str]:
     """All claims that do not hold, where nothing here was interrupted."""
     undisturbed = [[row | {"interrupted": False} for row in found] for found in new]
-    named = [claim for one in runs if (claim := verify._names(one))]
-    return [str(claim) for claim in (*named, *verify.compare(runs, undisturbed)) if claim.holds is Holds.NO]
+    named = [claim for one in runs if (claim := verify._verify_options(one))]
+    return [
+        str(claim) for claim in (*named, *verify.verify_reruns(runs, undisturbed)) if claim.verdict is ClaimVerdict.FAIL
+    ]
 
 
 @pytest.mark.parametrize("kind", FORGED)
-def test_a_forged_column_does_not_hold(kind: str, repeated: tuple[list[Published], list[list[Row]]]):
+def test_a_forged_column_does_not_hold(kind: str, repeated: tuple[list[PublishedRun], list[list[ResultRow]]]):
     runs, new = repeated
     seconds = [
         [row | {"interrupted": False} for row in found] for found in new
@@ -186,7 +190,7 @@ def test_a_forged_column_does_not_hold(kind: str, repeated: tuple[list[Published
     assert any(re.search(said, line) for line in told), told
 
 
-def test_rows_that_are_missing_or_doubled_do_not_hold(repeated: tuple[list[Published], list[list[Row]]]):
+def test_rows_that_are_missing_or_doubled_do_not_hold(repeated: tuple[list[PublishedRun], list[list[ResultRow]]]):
     runs, new = repeated
     for one, here in zip(runs, new, strict=True):
         fewer = replace(one, rows=[row for row in here if row["phase"] != "step" or row["frame"] == 1])
@@ -197,19 +201,19 @@ def test_rows_that_are_missing_or_doubled_do_not_hold(repeated: tuple[list[Publi
 
 
 def test_elsewhere_what_differs_refutes_nothing_and_confirms_nothing(
-    repeated: tuple[list[Published], list[list[Row]]],
+    repeated: tuple[list[PublishedRun], list[list[ResultRow]]],
 ):
     runs, new = repeated
     for change in (scaled("residual", 0.5), scaled("seconds", 1e-3), lambda row: row | {"digest": "0"}):
         there = [replace(one, rows=[change(row) | {"machine": "another"} for row in one.rows]) for one in runs]
         assert claims_of(there, new) == []
-        assert Holds.UNKNOWN in {claim.holds for claim in verify.compare(there, new)}
+        assert ClaimVerdict.INCONCLUSIVE in {claim.verdict for claim in verify.verify_reruns(there, new)}
 
 
 def test_runs_that_no_config_asks_for_cannot_be_told(home: Path, tmp_path: Path):
     def change(content: dict[str, bytes]) -> None:
-        made_up = [row | {"run_id": "f" * 12, "solver": "magic"} for row in dummy_rows(1)]
-        content["results/sweep/rows/cloth-4-magic.parquet"] = rows.encoded(made_up)
+        made_up = [row | {"run_id": "f" * 12, "solver": "magic"} for row in build_dummy_rows(1)]
+        content["results/sweep/rows/cloth-4-magic.parquet"] = rows.encode_rows(made_up)
 
     told = command("verify", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True), "--seed", "1")
     assert "1 of 3 runs of sweep: cannot tell (the config asks for none such)" in told.output
@@ -222,7 +226,7 @@ def test_rows_that_lie_under_true_checksums_do_not_hold(home: Path, tmp_path: Pa
         for name in [name for name in content if name.endswith(".parquet")]:
             (tmp_path / "x.parquet").write_bytes(content[name])
             lies = pq.read_table(tmp_path / "x.parquet").to_pylist()
-            rows.write(tmp_path / "x.parquet", [row | {"digest": row["digest"] and "0" * 64} for row in lies])
+            rows.write_rows(tmp_path / "x.parquet", [row | {"digest": row["digest"] and "0" * 64} for row in lies])
             content[name] = (tmp_path / "x.parquet").read_bytes()
 
     told = command("verify", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True))
@@ -261,32 +265,32 @@ def test_damaged_rows_are_not_published(home: Path, tmp_path: Path):
     assert command("publish", home / "results", "-o", tmp_path / "x.tar").exit_code == 2
 
 
-def claim(home: Path, factor: float, *, interrupted: bool = False, machine: str = "00000000") -> Claim:
+def claim(home: Path, factor: float, *, interrupted: bool = False, machine: str = "00000000") -> VerifiedClaim:
     """What is said of a ratio that was 1 and is `factor`."""
-    with verify.unpacked(home / "x.zip") as folder:
-        run = verify.published(folder, print, own_code=False)[0][0].run
-    old = [row | {"interrupted": False} for row in dummy_rows(1)]
-    there = (Published(old, run), Published(old, run.but(size=5)))
+    with verify.unpack_archive(home / "x.zip") as folder:
+        run = verify.load_published_runs(folder, print, with_user_code=False)[0][0].run
+    old = [row | {"interrupted": False} for row in build_dummy_rows(1)]
+    there = (PublishedRun(old, run), PublishedRun(old, run.replace_options(size=5)))
     slower = [row | {"seconds": row["seconds"] * factor, "interrupted": interrupted} for row in old]
     here = [[row | {"machine": machine} for row in found] for found in (slower, old)]
-    return verify._ratio(there, (here[0], here[1]))
+    return verify._verify_time_ratio(there, (here[0], here[1]))
 
 
 def test_a_ratio_holds_or_not_or_cannot_be_told(home: Path):
-    assert claim(home, 1.2).holds is claim(home, 1 / 1.2).holds is Holds.YES
-    assert claim(home, 1.4).holds is claim(home, 1 / 1.4).holds is Holds.NO
-    assert claim(home, 1.4, interrupted=True).holds is Holds.UNKNOWN
-    assert claim(home, 1.4, machine="another").holds is Holds.YES
-    assert claim(home, 2.4, machine="another").holds is Holds.UNKNOWN
+    assert claim(home, 1.2).verdict is claim(home, 1 / 1.2).verdict is ClaimVerdict.PASS
+    assert claim(home, 1.4).verdict is claim(home, 1 / 1.4).verdict is ClaimVerdict.FAIL
+    assert claim(home, 1.4, interrupted=True).verdict is ClaimVerdict.INCONCLUSIVE
+    assert claim(home, 1.4, machine="another").verdict is ClaimVerdict.PASS
+    assert claim(home, 2.4, machine="another").verdict is ClaimVerdict.INCONCLUSIVE
 
 
 def test_a_tenth_is_chosen_and_each_has_another_solver_beside_it(home: Path):
-    with verify.unpacked(home / "x.zip") as folder:
-        (a, b), _ = verify.published(folder, print, own_code=False)
-    runs = [replace(one, run=one.run.but(size=size)) for size in range(10) for one in (a, b)]
+    with verify.unpack_archive(home / "x.zip") as folder:
+        (a, b), _ = verify.load_published_runs(folder, print, with_user_code=False)
+    runs = [replace(one, run=one.run.replace_options(size=size)) for size in range(10) for one in (a, b)]
     for seed in range(20):
-        taken = verify.chosen(runs, seed)
+        taken = verify.sample_runs(runs, seed)
         assert len(taken) in (2, 4)
-        assert all(sum(other.group == one.group for other in taken) == 2 for one in taken)
-    assert len({one.title for seed in range(20) for one in verify.chosen(runs, seed)}) > 8
-    assert verify.chosen([], 0) == []
+        assert all(sum(other.comparison_group == one.comparison_group for other in taken) == 2 for one in taken)
+    assert len({one.title for seed in range(20) for one in verify.sample_runs(runs, seed)}) > 8
+    assert verify.sample_runs([], 0) == []

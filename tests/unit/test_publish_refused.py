@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from harness.base.errors import InputError
-from harness.experiments.archive.publish import publish
+from harness.experiments.archive.publish import publish_results
 from tests.contracts.hostile import scene
-from tests.dummies import write_dummies
+from tests.dummies import write_dummy_runs
 
 SWEEP = "scenes: [cloth.yaml]\nsizes: [4]\nsolvers: [sparse]\n"
 OWN = "{kind: './mine.py:Mesh', path: PATH}"
@@ -27,7 +27,7 @@ def home(tmp_path: Path) -> Path:
     (home / "sweep.yaml").write_text(SWEEP)
     for name in ("mine.py", "data.txt"):
         (home / name).write_text(name)
-    write_dummies(home / "results" / "sweep", 1)
+    write_dummy_runs(home / "results" / "sweep", 1)
     (home / "results" / "sweep" / ".config").write_text("../../sweep.yaml\n")
     (tmp_path / "secret").write_text("secret")
     return home
@@ -35,7 +35,7 @@ def home(tmp_path: Path) -> Path:
 
 def published(home: Path, said: Callable[[str], None] = lambda line: None) -> dict[str, bytes]:
     """The files of the results' archive."""
-    publish(home / "results", home.parent / "x.zip", said)
+    publish_results(home / "results", home.parent / "x.zip", said)
     with zipfile.ZipFile(home.parent / "x.zip") as packed:
         return {name: packed.read(name) for name in packed.namelist()}
 
@@ -134,4 +134,4 @@ def test_files_from_before_1980_and_after_2107_are_published(home: Path):
 def test_where_no_archive_can_be_written_is_the_users_mistake(archive: str, home: Path):
     (home / "folder.zip").mkdir()
     with pytest.raises(InputError, match="--output"):
-        publish(home / "results", home / archive, print)
+        publish_results(home / "results", home / archive, print)

@@ -16,21 +16,21 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
-from harness.base.columns import SCHEMA
-from harness.base.quantities import largest_strain as largest_of
-from harness.base.quantities import ms_per_step, times_as_long
-from harness.record.base import Replay
+from harness.base.columns import RUN_SCHEMA
+from harness.base.quantities import compute_max_strain as largest_of
+from harness.base.quantities import compute_ms_per_step, compute_slowdown
+from harness.record.base import RecordingReplay
 from harness.report import comparison
-from harness.report.ablation import ablation_table
-from harness.report.equal_accuracy import comparisons
-from harness.report.equal_accuracy import sentences as compared
-from harness.report.figures.of_runs import timing
-from harness.report.frames import largest_strain, strain_ends
-from harness.report.medians import medians
-from harness.report.render import spacing
-from harness.report.robustness import OTHER, RIGHT, judged
-from harness.report.site import update
-from harness.report.timing_table import labels, runs, summary_table
+from harness.report.ablation import build_ablation_table
+from harness.report.equal_accuracy import compare_runs
+from harness.report.equal_accuracy import describe_comparison as compared
+from harness.report.figures.of_runs import timing_panels
+from harness.report.frames import max_recorded_strain, strain_extremes
+from harness.report.medians import write_medians
+from harness.report.render import mean_rest_length
+from harness.report.robustness import CORRECT, OTHER_MINIMUM, classify_run
+from harness.report.site import update_page
+from harness.report.timing_table import build_summary_table, label_runs, read_run_times
 from tests import site_results
 
 MILLISECONDS = {"sparse": [1.0, 2.0, 9.0, 3.0, 4.0, 50.0], "numba": [1.5, 0.5, 0.25, 2.0, 40.0, 1.0]}
@@ -39,8 +39,13 @@ STRAINS = (0.389, 0.284, 0.2)
 
 
 def rows_of(solver: str) -> list[dict[str, Any]]:
-    number = site_results.SOLVERS.index(solver)
-    same = site_results.run(number) | {"phase": "step", "iterations": 5, "stopped": "tolerance", "residual": 1e-6}
+    number = site_results.SOLVER_NAMES.index(solver)
+    same = site_results.build_run_columns(number) | {
+        "phase": "step",
+        "iterations": 5,
+        "stopped": "tolerance",
+        "residual": 1e-6,
+    }
     return [
         same
         | {"frame": k % 3 + 1, "round": k // 3, "seconds": 1e-3 * ms}
@@ -49,43 +54,45 @@ def rows_of(solver: str) -> list[dict[str, Any]]:
     ]
 
 
-def replay_of(solver: str) -> Replay:
+def replay_of(solver: str) -> RecordingReplay:
     """A single spring of length 1, stretched in each frame as the rows say, and more at the start."""
     stretched = np.array([[[0, 0, 0], [1 + strain, 0, 0]] for strain in (0.9, *STRAINS)], np.float32)
     own = {"scene": "hanging-cloth", "size": 8, "solver": solver}
-    return Replay(
+    return RecordingReplay(
         title="", run_id="", frames=np.arange(4), times=np.arange(4.0), positions=stretched,
         triangles=np.zeros((0, 3), np.int64), springs=np.array([[0, 1]]), rest_lengths=np.ones(1),
-        pinned=np.zeros(0, np.int64), strain_range=0.1,
+        pinned_vertices=np.zeros(0, np.int64), strain_range=0.1,
         scalars={"/strain/largest": (np.arange(4), np.array([0.9, *STRAINS])), "/residual": (np.arange(1), np.ones(1))},
-        properties=own | {"milliseconds_per_step": ms_per_step([1e-3 * ms for ms in MILLISECONDS[solver]])},
+        properties=own | {"milliseconds_per_step": compute_ms_per_step([1e-3 * ms for ms in MILLISECONDS[solver]])},
     )  # fmt: skip
 
 
 def test_every_place_states_the_same_numbers_of_a_run(tmp_path: Path):
     told = rows_of("sparse") + rows_of("numba")
-    table = pa.table({field.name: [row.get(field.name) for row in told] for field in SCHEMA}, schema=SCHEMA)
+    table = pa.table({field.name: [row.get(field.name) for row in told] for field in RUN_SCHEMA}, schema=RUN_SCHEMA)
     (tmp_path / "made" / "rows").mkdir(parents=True)
     pq.write_table(table, tmp_path / "made" / "rows" / "all.parquet")
 
-    sparse, numba = runs(table)
+    sparse, numba = read_run_times(table)
     assert (sparse.step, numba.step) == pytest.approx((3.5, 1.25))
     assert sparse.least == pytest.approx(1.0)
-    assert sparse.largest_strain == pytest.approx(0.389)
+    assert sparse.max_strain == pytest.approx(0.389)
 
     console = Console(width=200, record=True, file=StringIO())
-    console.print(summary_table(table))
+    console.print(build_summary_table(table))
     assert re.search(r"8 sparse +– +– +3\.5 +1 .* 38\.9 % +10 %", console.export_text())
 
     for run in (sparse, numba):
-        facts = comparison._facts(replay_of(run.solver), replay_of("sparse"))  # pyright: ignore[reportPrivateUsage]
+        facts = comparison._collect_facts(replay_of(run.solver), replay_of("sparse"))  # pyright: ignore[reportPrivateUsage]
         assert facts["ms a step"] == {"sparse": "3.5", "numba": "1.25"}[run.solver]
         assert facts["largest strain"] == "38.9 %"
 
-    ((words, _),) = [said for one in comparisons(runs(table)) for said in compared(one, labels(runs(table)))]
+    ((words, _),) = [
+        said for one in compare_runs(read_run_times(table)) for said in compared(one, label_runs(read_run_times(table)))
+    ]
     assert "fastest at equal accuracy is numba, 1.25 ms a step; sparse 2.8 times as long" in words
 
-    update(tmp_path)
+    update_page(tmp_path)
     page = (tmp_path / "site" / "data" / "made" / "runs.js").read_text()
     columns = json.loads(page.partition(", ")[2].strip().removesuffix(");"))["columns"]
     assert columns["step"] == [1.25, 3.5]
@@ -93,29 +100,31 @@ def test_every_place_states_the_same_numbers_of_a_run(tmp_path: Path):
     index = (tmp_path / "site" / "data" / "index.js").read_text()
     assert "numba, 1.25 ms a step; sparse 2.8 times as long" in index
 
-    (path,) = medians(table, tmp_path)
+    (path,) = write_medians(table, tmp_path)
     with path.open() as file:
         assert {row["solver"]: float(row["median_seconds"]) for row in csv.DictReader(file)} == pytest.approx(
             {"sparse": 3.5e-3, "numba": 1.25e-3}
         )
-    plot: Any = next(entry for entry in timing(tmp_path / "made", lambda rows: ()) if "step" in entry.name).make()
+    plot: Any = next(
+        entry for entry in timing_panels(tmp_path / "made", lambda rows: ()) if "step" in entry.name
+    ).build_panel()
     assert sorted(float(series.x[0]) for series in plot.series) == pytest.approx([1.25e-3, 3.5e-3])
 
 
 def test_the_largest_strain_leaves_the_start_out_and_no_frame_after_it():
     replay = replay_of("sparse")
-    assert largest_strain(replay) == 0.389
-    assert strain_ends([replay]) == pytest.approx((0.0, 0.389), abs=1e-12)
+    assert max_recorded_strain(replay) == 0.389
+    assert strain_extremes([replay]) == pytest.approx((0.0, 0.389), abs=1e-12)
     bare = replace(replay, scalars={})
-    assert largest_strain(bare) == pytest.approx(0.389, abs=1e-6)
+    assert max_recorded_strain(bare) == pytest.approx(0.389, abs=1e-6)
     squeezed = replace(bare, positions=replay.positions * np.float32(0.5))
-    assert strain_ends([squeezed, replay]) == pytest.approx((-0.4, 0.389), abs=1e-6)
+    assert strain_extremes([squeezed, replay]) == pytest.approx((-0.4, 0.389), abs=1e-6)
     assert np.isnan(largest_of(np.array([0]), np.array([0.9])))
 
 
 def test_times_as_long_is_the_quotient_of_ms_a_step():
-    assert times_as_long(3.5, 1.25) == pytest.approx(2.8)
-    assert ms_per_step([0.001, 0.002, 0.009]) == pytest.approx(2.0), "the median, where the mean is 4"
+    assert compute_slowdown(3.5, 1.25) == pytest.approx(2.8)
+    assert compute_ms_per_step([0.001, 0.002, 0.009]) == pytest.approx(2.0), "the median, where the mean is 4"
 
 
 def test_a_distance_in_pictures_is_the_largest_in_mean_rest_lengths():
@@ -123,14 +132,14 @@ def test_a_distance_in_pictures_is_the_largest_in_mean_rest_lengths():
     springs, lengths = np.array([[0, 1], [1, 2], [2, 3]]), np.array([1.0, 1.0, 10.0])
     best = replace(replay_of("sparse"), frames=np.array([3]), positions=line, springs=springs, rest_lengths=lengths)
     moved = replace(best, positions=line + np.array([[0, 0, 0], [0, 0, 0], [0, 2, 0], [0, 6, 0]], np.float32))
-    assert spacing(best) == pytest.approx(4.0), "the mean of 1, 1 and 10; the median is 1"
-    assert comparison.distance_words(moved, best) == "1.5", "6 m of 4; the mean distance is 2"
+    assert mean_rest_length(best) == pytest.approx(4.0), "the mean of 1, 1 and 10; the median is 1"
+    assert comparison.format_distance(moved, best) == "1.5", "6 m of 4; the mean distance is 2"
 
 
 def test_the_share_of_an_effect_is_of_the_whole_step():
     plain = {"bytes": 1024, "nnz_factor": None, "status": "ok", "name": "wind", "largest": 1.0, "rms": 1.0}
     plain |= {"energy": 0.1, "centre": 0.1, "cost": 5e-4, "cost_low": 4e-4, "cost_high": 6e-4, "seconds": 2e-3}
-    table = ablation_table([plain | {"kind": "whole"}, plain | {"kind": "without"}])
+    table = build_ablation_table([plain | {"kind": "whole"}, plain | {"kind": "without"}])
     console = Console(width=200, record=True, file=StringIO())
     console.print(table)
     # 0.5 ms of 2; of the 1.5 that are left it would be a third.
@@ -139,6 +148,6 @@ def test_the_share_of_an_effect_is_of_the_whole_step():
 
 def test_a_motion_within_one_percent_of_the_reference_is_the_same():
     solved = {"status": "ok", "stationarity": 1e-9, "beyond": 1e-9, "tolerance": 1e-6, "minimum": True, "flat": False}
-    for distance, outcome in ((0.0, RIGHT), (0.0099, RIGHT), (0.0101, OTHER), (0.03, OTHER)):
+    for distance, outcome in ((0.0, CORRECT), (0.0099, CORRECT), (0.0101, OTHER_MINIMUM), (0.03, OTHER_MINIMUM)):
         frames = [solved | {"stopped": "tolerance", "distance": way} for way in (0.0, distance, 0.0)]
-        assert judged(frames)[0] == outcome, distance
+        assert classify_run(frames)[0] == outcome, distance

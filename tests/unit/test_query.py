@@ -6,8 +6,8 @@ import pytest
 
 from harness.base import rows
 from harness.base.errors import InputError
-from harness.experiments.ablation.ablation_rows import SCHEMA
-from harness.report.query import answer
+from harness.experiments.ablation.ablation_rows import ABLATION_SCHEMA
+from harness.report.query import run_query
 
 
 @pytest.fixture
@@ -15,23 +15,23 @@ def results(tmp_path: Path) -> Path:
     """Two sweeps of one row each."""
     for sweep, seconds in (("first", 0.5), ("second", 0.25)):
         (tmp_path / sweep / "rows").mkdir(parents=True)
-        rows.write(tmp_path / sweep / "rows" / "a.parquet", [{"sweep": sweep, "seconds": seconds}])
+        rows.write_rows(tmp_path / sweep / "rows" / "a.parquet", [{"sweep": sweep, "seconds": seconds}])
     return tmp_path
 
 
 def test_a_query_sees_the_rows_of_all_sweeps(results: Path):
-    found = answer("SELECT sweep, seconds FROM rows ORDER BY seconds", results)
+    found = run_query("SELECT sweep, seconds FROM rows ORDER BY seconds", results)
     assert found.columns == ["sweep", "seconds"]
     assert found.values == [("second", 0.25), ("first", 0.5)]
-    assert found.table().row_count == 2
+    assert found.build_table().row_count == 2
 
 
 def test_a_query_sees_the_rows_of_all_ablations(results: Path):
     for scene, cost in (("cloth", 0.5), ("chain", 0.25)):
         (results / scene / "ablation").mkdir(parents=True)
         row = {"kind": "without", "name": "bending", "scene": scene, "cost": cost}
-        rows.write(results / scene / "ablation" / "a.parquet", [row], SCHEMA)
-    found = answer("SELECT scene, cost FROM ablation ORDER BY cost", results)
+        rows.write_rows(results / scene / "ablation" / "a.parquet", [row], ABLATION_SCHEMA)
+    found = run_query("SELECT scene, cost FROM ablation ORDER BY cost", results)
     assert found.values == [("chain", 0.25), ("cloth", 0.5)]
 
 
@@ -50,10 +50,10 @@ def test_what_is_wrong_or_leaves_the_rows_is_the_users_mistake(results: Path, sq
     monkeypatch.chdir(results)
     before = sorted(results.rglob("*"))
     with pytest.raises(InputError, match="query"):
-        answer(sql, results)
+        run_query(sql, results)
     assert sorted(results.rglob("*")) == before
 
 
 def test_without_rows_the_answer_says_what_to_do(tmp_path: Path):
     with pytest.raises(InputError, match="run a sweep first"):
-        answer("SELECT 1", tmp_path)
+        run_query("SELECT 1", tmp_path)

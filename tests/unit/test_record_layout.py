@@ -8,11 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.record.blueprint import panels, plot, run_document, scale_name, scene_view, spring_cadence
-from harness.record.camera import Extent
-from harness.record.shading import LEVELS
-from harness.scenes.mesh.grid import Grid
-from tests.recordings import MESHES, info
+from harness.record.blueprint import (
+    build_panels,
+    build_plot,
+    build_scene_view,
+    compute_spring_interval,
+    format_run_document,
+    format_scale_name,
+)
+from harness.record.camera import ViewExtent
+from harness.record.shading import NUM_LEVELS
+from harness.scenes.mesh.grid import GridMesh
+from tests.recordings import MESHES_BY_KIND, build_recording_info
 
 CORNER = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 2.0]])
 
@@ -26,9 +33,9 @@ def numbers(component: Any) -> np.ndarray:
     return np.array(component.as_arrow_array().to_pylist()[0])
 
 
-def seen(box: Extent, points: np.ndarray, aspect: float) -> np.ndarray:
+def seen(box: ViewExtent, points: np.ndarray, aspect: float) -> np.ndarray:
     """How far points are from the middle of the picture, 1 at its edge, (n, 2): across, up."""
-    controls = box.eye()
+    controls = box.build_eye_controls()
     eye, target = numbers(controls.position), numbers(controls.look_target)
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, numbers(controls.eye_up))
@@ -39,9 +46,9 @@ def seen(box: Extent, points: np.ndarray, aspect: float) -> np.ndarray:
     return np.abs(np.stack([(points - eye) @ right / aspect, (points - eye) @ up], axis=1) / depth[:, None] / tangent)
 
 
-def height(box: Extent, points: np.ndarray) -> np.ndarray:
+def height(box: ViewExtent, points: np.ndarray) -> np.ndarray:
     """How high points are seen, 1 at the upper edge of the view, -1 at the lower."""
-    controls = box.eye()
+    controls = box.build_eye_controls()
     eye, target = numbers(controls.position), numbers(controls.look_target)
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, numbers(controls.eye_up))
@@ -53,14 +60,14 @@ def height(box: Extent, points: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("fall", [0.0, -1.0, -5.0])
 def test_the_camera_sees_all_that_happens_and_little_more(aspect: float, fall: float):
     points = np.vstack([CORNER, CORNER + np.array([0.0, fall, 0.0])])
-    box = Extent(CORNER, aspect)
-    box.add(CORNER)
-    box.add(CORNER + np.array([0.0, fall, 0.0]))
+    box = ViewExtent(CORNER, aspect)
+    box.add_positions(CORNER)
+    box.add_positions(CORNER + np.array([0.0, fall, 0.0]))
     places = seen(box, points, aspect)
     assert places.max() <= 1.0
     if fall:  # else the nearest camera is nearer than any that has room around it
         assert places.max() > 0.65, "of half the view; the rest of the lower half is the scale's, and 4 % margin"
-    strip, numbers_below = box.scale(0.1)
+    strip, numbers_below = box.build_colour_scale(0.1)
     below = listed(strip.vertex_positions)
     assert seen(box, below, aspect).max() <= 1.0
     assert listed(numbers_below.labels).tolist() == ["−10 %", "−5 %", "strain 0", "+5 %", "+10 %"]
@@ -72,62 +79,64 @@ def test_the_camera_sees_all_that_happens_and_little_more(aspect: float, fall: f
     ("ends", "told"), [((-0.05, 0.39), ["to +39 %"]), ((-0.2, 0.05), ["to −20 %"]), ((-0.1, 0.1), [])]
 )
 def test_the_scale_ends_in_a_tip_with_a_figure_where_strain_lies_beyond(ends: tuple[float, float], told: list[str]):
-    strip, words = Extent(MESHES["cloth"].rest).scale(0.1, ends)
+    strip, words = ViewExtent(MESHES_BY_KIND["cloth"].rest_positions).build_colour_scale(0.1, ends)
     assert listed(words.labels).tolist()[5:] == told
-    assert len(listed(strip.triangle_indices)) == 2 * (LEVELS - 1) + len(told)
+    assert len(listed(strip.triangle_indices)) == 2 * (NUM_LEVELS - 1) + len(told)
 
 
 def test_what_is_wide_and_low_stands_in_the_middle_of_the_room_above_the_scale():
     flat = np.array([[x, 0.0, z] for x in (0.0, 1.0) for z in (0.0, 1.0)])
-    heights = height(Extent(flat), flat)
+    heights = height(ViewExtent(flat), flat)
     above, below = 1.0 - heights.max(), heights.min() + 0.72
     assert above == pytest.approx(below, abs=0.2), "in half views; shares are tried in steps of 0.2"
 
 
 @pytest.mark.parametrize("bad", [1e6, np.nan, np.inf])
 def test_the_camera_ignores_positions_that_have_blown_up(bad: float):
-    box, same = Extent(CORNER), Extent(CORNER)
-    box.add(CORNER + np.array([[bad, 0.0, 0.0]]))
-    assert numbers(box.eye().position) == pytest.approx(numbers(same.eye().position))
+    box, same = ViewExtent(CORNER), ViewExtent(CORNER)
+    box.add_positions(CORNER + np.array([[bad, 0.0, 0.0]]))
+    assert numbers(box.build_eye_controls().position) == pytest.approx(numbers(same.build_eye_controls().position))
 
 
 def test_the_camera_leaves_out_what_falls_away_and_says_so():
     net = np.array([[x, y, 0.0] for x in (0.0, 0.5, 1.0) for y in (0.0, -0.5)])
     start = np.vstack([net, [[2.0, 0.0, 0.0]]])
-    box, without = Extent(start), Extent(net)
+    box, without = ViewExtent(start), ViewExtent(net)
     for fallen in (0.1, 3.0, 15.0, 44.0):
-        box.add(np.vstack([net, [[2.0, -fallen, 0.0]]]))
-        without.add(net)
-    assert numbers(box.eye().position) == pytest.approx(numbers(without.eye().position), rel=0.02)
-    assert box.outside() == ["1 of 7 vertices is outside"]
-    assert scene_view("", "net", box, springs_visible=True).name == "net, 1 of 7 vertices is outside"
-    assert scene_view("", "net", without, springs_visible=True).name == "net"
+        box.add_positions(np.vstack([net, [[2.0, -fallen, 0.0]]]))
+        without.add_positions(net)
+    assert numbers(box.build_eye_controls().position) == pytest.approx(
+        numbers(without.build_eye_controls().position), rel=0.02
+    )
+    assert box.describe_outside() == ["1 of 7 vertices is outside"]
+    assert build_scene_view("", "net", box, springs_visible=True).name == "net, 1 of 7 vertices is outside"
+    assert build_scene_view("", "net", without, springs_visible=True).name == "net"
 
 
 def test_a_recording_opens_at_its_first_frame_playing():
-    time, *_ = panels(1 / 30)
+    time, *_ = build_panels(1 / 30)
     assert (time.play_state, time.loop_mode, time.timeline) == ("playing", "all", "frame")
 
 
 def test_a_plot_ends_at_the_last_frame_and_its_legend_has_room_above_the_data():
-    drawn: Any = plot("Energies", ["+ /energy/**"], last=40, ends=(-1.0, 3.0))
+    drawn: Any = build_plot("Energies", ["+ /energy/**"], last=40, value_range=(-1.0, 3.0))
     assert drawn.properties["TimeAxis"].view_range.as_arrow_array().to_pylist()[0]["end"] == 40
     low, high = drawn.properties["ScalarAxis"].range.as_arrow_array().to_pylist()[0]
     assert (low, high) == (-1.0, pytest.approx(3.0 + 1.2 * 4.0))
 
 
 def test_a_single_point_can_be_looked_at():
-    assert np.isfinite(numbers(Extent(np.zeros((1, 3))).eye().position)).all()
+    assert np.isfinite(numbers(ViewExtent(np.zeros((1, 3))).build_eye_controls().position)).all()
 
 
 def test_springs_of_small_meshes_are_drawn_in_every_frame():
-    assert spring_cadence(info()) == 1
-    mesh = Grid().build(40)
-    assert spring_cadence(replace(info(), mesh=mesh, springs=mesh.springs)) > 10
+    assert compute_spring_interval(build_recording_info()) == 1
+    mesh = GridMesh().build_mesh(40)
+    assert compute_spring_interval(replace(build_recording_info(), mesh=mesh, springs=mesh.springs)) > 10
 
 
 def test_the_words_name_colours_run_and_machine():
-    text = run_document(info())
+    text = format_run_document(build_recording_info())
     for words in ("cloth - test", "| cpu | `a, b [c]` |", "time step", "blue = compressed 10 %", "/scene/springs"):
         assert words in text
-    assert scale_name(0.025).count("2.5 %") == 2
+    assert format_scale_name(0.025).count("2.5 %") == 2

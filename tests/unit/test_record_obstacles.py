@@ -11,21 +11,21 @@ import numpy as np
 import pytest
 
 from harness.record.reader import open_recording, read_replay
-from harness.report.solids import seen, solids
-from harness.scenes.motion import Key, KeyedMotion
-from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
-from harness.scenes.shapes import from_json
-from tests.recordings import TIME_STEP, info, record
+from harness.report.solids import build_obstacle_meshes, points_to_frame
+from harness.scenes.motion import KeyFrame, KeyFrameMotion
+from harness.scenes.obstacles import BoxObstacle, CapsuleObstacle, PlaneObstacle, SphereObstacle
+from harness.scenes.shapes import parse_obstacles
+from tests.recordings import TIME_STEP, build_recording_info, write_recording
 
-RISES = KeyedMotion(
-    keys=(Key(time=0.0), Key(time=10 * TIME_STEP, offset=(0.0, 2.0, 0.0), turn=90.0)), axis=(1.0, 2.0, 0.0)
+RISES = KeyFrameMotion(
+    keys=(KeyFrame(time=0.0), KeyFrame(time=10 * TIME_STEP, offset=(0.0, 2.0, 0.0), turn=90.0)), axis=(1.0, 2.0, 0.0)
 )
 OBSTACLES = (
-    Sphere(center=(1.0, 2.0, 3.0), radius=0.5, motion=RISES),
-    Capsule(ends=((0.0, 0.5, 0.0), (1.0, -1.0, 0.3)), radius=0.2),
-    Capsule(ends=((0.0, 0.0, 1.0), (0.0, 0.0, -1.0)), radius=0.2),
-    Box(low=(-1.0, 0.0, 0.0), high=(1.0, 0.5, 2.0), motion=RISES),
-    Plane(point=(0.0, 1.0, 0.0), normal=(1.0, 1.0, 0.0)),
+    SphereObstacle(center=(1.0, 2.0, 3.0), radius=0.5, motion=RISES),
+    CapsuleObstacle(ends=((0.0, 0.5, 0.0), (1.0, -1.0, 0.3)), radius=0.2),
+    CapsuleObstacle(ends=((0.0, 0.0, 1.0), (0.0, 0.0, -1.0)), radius=0.2),
+    BoxObstacle(low=(-1.0, 0.0, 0.0), high=(1.0, 0.5, 2.0), motion=RISES),
+    PlaneObstacle(point=(0.0, 1.0, 0.0), normal=(1.0, 1.0, 0.0)),
 )
 
 
@@ -33,7 +33,7 @@ def rows(path: Path, entity: str) -> dict[str, Any]:
     """All that was logged at an entity: by component the values of its rows."""
     found: dict[str, Any] = {}
     with open_recording(path) as source:
-        for chunk in source.chunks(content=entity):
+        for chunk in source.iterate_chunks(content=entity):
             batch = chunk.to_record_batch()
             for name in batch.schema.names:
                 found.setdefault(name.rpartition(":")[2], []).extend(batch[name].to_pylist())
@@ -42,11 +42,13 @@ def rows(path: Path, entity: str) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record(tmp_path_factory.mktemp("obstacles") / "a.rrd", info(obstacles=OBSTACLES), count=11)
+    return write_recording(
+        tmp_path_factory.mktemp("obstacles") / "a.rrd", build_recording_info(obstacles=OBSTACLES), frame_count=11
+    )
 
 
 def test_a_recording_declares_its_obstacles_as_a_scene_does(recorded: Path):
-    assert from_json(str(read_replay(recorded).properties["obstacles"])) == OBSTACLES
+    assert parse_obstacles(str(read_replay(recorded).properties["obstacles"])) == OBSTACLES
 
 
 def test_each_shape_is_recorded_once_with_its_extents(recorded: Path):
@@ -54,15 +56,19 @@ def test_each_shape_is_recorded_once_with_its_extents(recorded: Path):
     assert (sphere["half_sizes"], sphere["centers"]) == ([[[0.5] * 3]], [[[1.0, 2.0, 3.0]]])
     assert (box["half_sizes"], box["centers"]) == ([[[1.0, 0.25, 1.0]]], [[[0.0, 0.25, 1.0]]])
     (corners,) = rows(recorded, "/scene/obstacles/4-plane")["vertex_positions"]
-    np.testing.assert_allclose(OBSTACLES[4].obstacle().distance(np.array(corners), 0.0), 0.0, atol=1e-6)  # float32
-    middle = info().mesh.rest.mean(axis=0)
-    assert np.linalg.norm(corners - middle, axis=1).min() > info().mesh.size  # it reaches beyond the mesh on all sides
+    np.testing.assert_allclose(
+        OBSTACLES[4].build_obstacle().signed_distance(np.array(corners), 0.0), 0.0, atol=1e-6
+    )  # float32
+    middle = build_recording_info().mesh.rest_positions.mean(axis=0)
+    assert (
+        np.linalg.norm(corners - middle, axis=1).min() > build_recording_info().mesh.bounding_box_diagonal
+    )  # it reaches beyond the mesh on all sides
 
 
 @pytest.mark.parametrize("k", [1, 2])
 def test_a_capsule_is_turned_from_the_axis_z_to_its_own(recorded: Path, k: int):
     found, obstacle = rows(recorded, f"/scene/obstacles/{k}-capsule"), OBSTACLES[k]
-    assert isinstance(obstacle, Capsule)
+    assert isinstance(obstacle, CapsuleObstacle)
     ((turn,),), ((length,),), ((start,),) = (found[n] for n in ("rotation_axis_angles", "lengths", "translations"))
     x, y, z = np.array(turn["axis"]) / np.linalg.norm(turn["axis"])
     assert turn["angle"] == pytest.approx(np.pi)
@@ -77,27 +83,29 @@ def test_what_moves_is_taken_along_in_each_frame_and_what_rests_is_not(recorded:
         np.array(m).reshape(3, 3).T @ OBSTACLES[0].center + t
         for (m,), (t,) in zip([v for v in moved["mat3x3"] if v], [v for v in moved["translation"] if v], strict=True)
     ]
-    wanted = [RISES.moved(np.array([OBSTACLES[0].center]), k * TIME_STEP)[0] for k in range(11)]
+    wanted = [RISES.transform_points(np.array([OBSTACLES[0].center]), k * TIME_STEP)[0] for k in range(11)]
     np.testing.assert_allclose(centers, wanted, atol=1e-5)  # float32, of positions of some metres
 
 
 def test_pictures_see_the_obstacles_where_they_are(recorded: Path):
     replay = read_replay(recorded, [0, 10])
-    assert len(solids(replay, 0)) == len(OBSTACLES)
+    assert len(build_obstacle_meshes(replay, 0)) == len(OBSTACLES)
     for frame, time in ((0, 0.0), (1, 10 * TIME_STEP)):
-        sphere = np.asarray(solids(replay, frame)[0].points, np.float64)
-        np.testing.assert_allclose(OBSTACLES[0].obstacle().distance(sphere, time), 0.0, atol=1e-5)  # float32
-    assert len(seen(replay, [0, 1])) > 2 * replay.positions.shape[1]
+        sphere = np.asarray(build_obstacle_meshes(replay, frame)[0].points, np.float64)
+        np.testing.assert_allclose(
+            OBSTACLES[0].build_obstacle().signed_distance(sphere, time), 0.0, atol=1e-5
+        )  # float32
+    assert len(points_to_frame(replay, [0, 1])) > 2 * replay.positions.shape[1]
 
 
 def test_a_recording_without_obstacles_has_no_trace_of_any(tmp_path: Path):
-    path = record(tmp_path / "a.rrd", count=3)
+    path = write_recording(tmp_path / "a.rrd", frame_count=3)
     replay = read_replay(path)
     assert "obstacles" not in replay.properties
-    assert solids(replay, 0) == []
-    np.testing.assert_array_equal(seen(replay, [0]), replay.positions[0])
+    assert build_obstacle_meshes(replay, 0) == []
+    np.testing.assert_array_equal(points_to_frame(replay, [0]), replay.positions[0])
     with open_recording(path) as source:
-        assert list(source.chunks(content="/scene/obstacles/**")) == []
+        assert list(source.iterate_chunks(content="/scene/obstacles/**")) == []
 
 
 def test_who_records_and_draws_scenes_without_obstacles_does_not_import_them():

@@ -9,8 +9,8 @@ import pytest
 
 from harness.base.errors import InputError
 from harness.record import sound
-from harness.record.sound import require_sound, trust
-from tests.recordings import record
+from harness.record.sound import mark_verified, require_intact
+from tests.recordings import write_recording
 
 
 def refuse(path: Path) -> None:
@@ -19,40 +19,40 @@ def refuse(path: Path) -> None:
 
 
 def another_process() -> None:
-    sound._sound.clear()
-    sound._read.clear()
+    sound._verified_states.clear()
+    sound._notes_offset.clear()
 
 
 @pytest.fixture
 def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    path = record(tmp_path / "a.rrd")
+    path = write_recording(tmp_path / "a.rrd")
     another_process()
     return path
 
 
 def test_what_one_process_wrote_or_read_is_not_read_in_every_way_by_another(recording: Path):
-    require_sound(recording, refuse)
+    require_intact(recording, refuse)
     other = recording.with_name("b.rrd")
     other.write_bytes(recording.read_bytes())  # another file, of the same bytes
     with pytest.raises(InputError, match="it is read"):
-        require_sound(other, refuse)
-    trust(other, noted=False)
-    require_sound(other, refuse)
+        require_intact(other, refuse)
+    mark_verified(other, shared=False)
+    require_intact(other, refuse)
     another_process()
     with pytest.raises(InputError, match="it is read"):
-        require_sound(other, refuse)
+        require_intact(other, refuse)
 
 
 def test_notes_that_come_meanwhile_are_seen(recording: Path):
     other = recording.with_name("b.rrd")
     other.write_bytes(recording.read_bytes())
-    require_sound(recording, refuse)
-    known = sound._sound.copy()
-    trust(other)  # by another process, as it were
-    sound._sound.clear()
-    sound._sound.update(known)
-    require_sound(other, refuse)
+    require_intact(recording, refuse)
+    known = sound._verified_states.copy()
+    mark_verified(other)  # by another process, as it were
+    sound._verified_states.clear()
+    sound._verified_states.update(known)
+    require_intact(other, refuse)
 
 
 def test_a_recording_that_was_cut_or_changed_since_is_read_again_whatever_its_times_say(recording: Path):
@@ -61,19 +61,19 @@ def test_a_recording_that_was_cut_or_changed_since_is_read_again_whatever_its_ti
         recording.write_bytes(changed)
         os.utime(recording, ns=(before.st_atime_ns, before.st_mtime_ns))
         with pytest.raises(InputError, match="it is read"):
-            require_sound(recording, refuse)
+            require_intact(recording, refuse)
 
 
 def test_notes_that_cannot_be_kept_are_no_failure(recording: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(recording))
-    trust(recording)
-    require_sound(recording, refuse)
+    mark_verified(recording)
+    require_intact(recording, refuse)
 
 
 def test_notes_begin_anew_before_they_are_many(recording: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sound, "_NOTED", 64)
     for _ in range(20):
-        trust(recording)
-    assert sound._notes().stat().st_size <= 64 + 16
+        mark_verified(recording)
+    assert sound._notes_path().stat().st_size <= 64 + 16
     another_process()
-    require_sound(recording, refuse)
+    require_intact(recording, refuse)

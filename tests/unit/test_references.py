@@ -5,13 +5,13 @@ from dataclasses import asdict
 
 import pytest
 
-from harness.base.stated import stated
-from harness.report.references import bibtex, cited
-from solvers.about import LIU_2013, Reference
-from solvers.registry import SOLVERS, load
+from harness.base.stated import read_solver_metadata
+from harness.report.references import format_bibtex, format_citation
+from solvers.about import LIU_2013, Citation
+from solvers.registry import SOLVERS, load_target
 
 
-def told(reference: Reference) -> str:
+def told(reference: Citation) -> str:
     return json.dumps(asdict(reference))
 
 
@@ -22,31 +22,31 @@ def told(reference: Reference) -> str:
             LIU_2013,
             "Liu, Bargteil, O'Brien and Kavan 2013, Fast simulation of mass-spring systems, doi:10.1145/",
         ),
-        (Reference("Wang, Huamin", 2015, "A title"), "Wang 2015, A title"),
+        (Citation("Wang, Huamin", 2015, "A title"), "Wang 2015, A title"),
     ],
 )
-def test_a_reference_is_a_line_of_words(reference: Reference, words: str):
-    assert cited(told(reference)).startswith(words)
+def test_a_reference_is_a_line_of_words(reference: Citation, words: str):
+    assert format_citation(told(reference)).startswith(words)
 
 
 def test_what_has_no_reference_has_no_words():
-    assert (cited(None), cited(""), bibtex([None, ""])) == ("", "", "")
+    assert (format_citation(None), format_citation(""), format_bibtex([None, ""])) == ("", "", "")
 
 
 def test_each_work_has_one_entry_and_a_key_of_its_own():
-    other = Reference("Liu, Tiantian", 2013, "Another of the year")
-    found = bibtex(map(told, (LIU_2013, other, LIU_2013)))
+    other = Citation("Liu, Tiantian", 2013, "Another of the year")
+    found = format_bibtex(map(told, (LIU_2013, other, LIU_2013)))
     assert [line for line in found.splitlines() if line.startswith("@")] == ["@misc{liu2013a,", "@misc{liu2013b,"]
     assert "  author = {Liu, Tiantian and Bargteil, Adam W. and O'Brien, James F. and Kavan, Ladislav},\n" in found
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_rows_carry_what_each_solver_states(solver: str):
-    found, method = stated(solver), load(SOLVERS[solver])
-    assert json.loads(found["reference"]) == asdict(method.about.reference)
-    assert (found["family"], found["minimises"]) == (method.about.family, method.minimises)
-    assert method.about.reference.doi.startswith("10.")
+    found, method = read_solver_metadata(solver), load_target(SOLVERS[solver])
+    assert json.loads(found["reference"]) == asdict(method.solver_info.reference)
+    assert (found["family"], found["minimises"]) == (method.solver_info.family, method.is_minimiser)
+    assert method.solver_info.reference.doi.startswith("10.")
 
 
 def test_what_is_no_solver_states_nothing():
-    assert stated("machine") == {}
+    assert read_solver_metadata("machine") == {}

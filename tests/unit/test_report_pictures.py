@@ -15,24 +15,31 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from harness.record.base import Replay
-from harness.record.framing import outside_words
+from harness.record.base import RecordingReplay
+from harness.record.framing import describe_outside
 from harness.record.shading import STRAIN_COLOURS
 from harness.report import comparison, opengl, page, run_picture
-from harness.report.comparison import draw_comparison
-from harness.report.frames import drawable_frames
-from harness.report.render import Studio, area_vectors, frame_all, natural_angles, spring_strain, vertex_strain
-from harness.report.run_picture import PixelBox, draw_run, layout
-from harness.report.self_contact import self_contact_words
-from harness.report.solids import framed, seen
-from harness.report.style import HEIGHT, PAGE, WIDTH
+from harness.report.comparison import draw_comparison_picture
+from harness.report.frames import find_drawable_frames
+from harness.report.render import (
+    OffscreenRenderer,
+    choose_view_angles,
+    compute_area_vectors,
+    compute_spring_strain,
+    compute_vertex_strain,
+    fit_camera,
+)
+from harness.report.run_picture import PixelBox, draw_run_picture, layout_frames
+from harness.report.self_contact import describe_self_intersection
+from harness.report.solids import framed_vertex_mask, points_to_frame
+from harness.report.style import BACKGROUND_COLOUR, PAGE_HEIGHT, PAGE_WIDTH
 
-needs_opengl = pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
+needs_opengl = pytest.mark.skipif(opengl.find_opengl_problem() is not None, reason=opengl.find_opengl_problem() or "")
 
 STRETCHED = 0.1  # strain at the ends of the scale in these tests
 
 
-def cloth(n: int = 6, frames: int = 8, *, stretch: float = 1.05, triangles: bool = True) -> Replay:
+def cloth(n: int = 6, frames: int = 8, *, stretch: float = 1.05, triangles: bool = True) -> RecordingReplay:
     """A square cloth in the plane z = 0 that sinks, all its springs at the strain `stretch` - 1."""
     u, v = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="ij")
     rest = np.stack([u, -v, 0 * u], axis=-1).reshape(-1, 3)
@@ -43,7 +50,7 @@ def cloth(n: int = 6, frames: int = 8, *, stretch: float = 1.05, triangles: bool
         [np.stack([k[:-1].ravel(), k[1:].ravel()], 1), np.stack([k[:, :-1].ravel(), k[:, 1:].ravel()], 1)]
     )
     sinking = np.linspace(0, 0.3, frames)[:, None] * np.array([0.0, -1.0, 0.0])
-    return Replay(
+    return RecordingReplay(
         title="cloth 6 - sparse",
         run_id="0123",
         frames=2 * np.arange(frames),
@@ -52,21 +59,23 @@ def cloth(n: int = 6, frames: int = 8, *, stretch: float = 1.05, triangles: bool
         triangles=faces if triangles else np.empty((0, 3), np.int64),
         springs=springs,
         rest_lengths=np.full(len(springs), 1 / (n - 1)),
-        pinned=k[[0, -1], 0],
+        pinned_vertices=k[[0, -1], 0],
         strain_range=STRETCHED,
         scalars={"/residual": (2 * np.arange(1, frames), np.geomspace(1e-2, 1e-6, frames - 1))},
         properties={"scene": "cloth", "size": n, "solver": "sparse", "milliseconds_per_step": 1.25},
     )
 
 
-def chain(n: int = 10) -> Replay:
+def chain(n: int = 10) -> RecordingReplay:
     whole = cloth(n, triangles=False)
     links = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1)
     lengths = np.full(n - 1, 1 / (n - 1))
-    return replace(whole, positions=whole.positions[:, :n], springs=links, rest_lengths=lengths, pinned=np.array([0]))
+    return replace(
+        whole, positions=whole.positions[:, :n], springs=links, rest_lengths=lengths, pinned_vertices=np.array([0])
+    )
 
 
-def broken(replay: Replay, frame: int, value: float = np.nan) -> Replay:
+def broken(replay: RecordingReplay, frame: int, value: float = np.nan) -> RecordingReplay:
     positions = replay.positions.copy()
     positions[frame:, 3] = value
     return replace(replay, positions=positions)
@@ -74,13 +83,13 @@ def broken(replay: Replay, frame: int, value: float = np.nan) -> Replay:
 
 def pixels(path: Path) -> NDArray[np.float64]:
     with Image.open(path) as image:
-        return np.asarray(image.convert("RGB")).astype(float)
+        return np.asarray(image.convert_node("RGB")).astype(float)
 
 
 def drawn(image: NDArray[np.float64], left: int, top: int, width: int, height: int) -> float:
     """The share of pixels in a region that are far from the colour of the page."""
     region = image[top : top + height, left : left + width]
-    return float((np.abs(region - 255 * np.array(to_rgb(PAGE))).max(axis=-1) > 60).mean())
+    return float((np.abs(region - 255 * np.array(to_rgb(BACKGROUND_COLOUR))).max(axis=-1) > 60).mean())
 
 
 @pytest.fixture
@@ -90,7 +99,7 @@ def words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     def save(sheet: Figure, path: Path, **more: Any) -> None:
         written.extend(text.get_text() for text in sheet.texts)
-        page.save(sheet, path, **more)
+        page.save_page(sheet, path, **more)
 
     for module in (run_picture, comparison):
         monkeypatch.setattr(module, "save", save)
@@ -103,7 +112,7 @@ def boxes(monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[PixelBox, list[
     found: list[tuple[PixelBox, list[PixelBox]]] = []
 
     def kept(*given: Any) -> tuple[PixelBox, list[PixelBox]]:
-        found.append(layout(*given))
+        found.append(layout_frames(*given))
         return found[-1]
 
     monkeypatch.setattr(run_picture, "layout", kept)
@@ -113,11 +122,11 @@ def boxes(monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[PixelBox, list[
 @needs_opengl
 @pytest.mark.parametrize("make", [cloth, lambda: cloth(triangles=False), chain], ids=["cloth", "net", "chain"])
 def test_a_run_is_drawn_large_and_four_frames_before_it(
-    make: Callable[[], Replay], boxes: Callable[[], tuple[PixelBox, list[PixelBox]]], tmp_path: Path
+    make: Callable[[], RecordingReplay], boxes: Callable[[], tuple[PixelBox, list[PixelBox]]], tmp_path: Path
 ) -> None:
-    draw_run(make(), tmp_path / "run.png")
+    draw_run_picture(make(), tmp_path / "run.png")
     image = pixels(tmp_path / "run.png")
-    assert image.shape == (HEIGHT, WIDTH, 3)
+    assert image.shape == (PAGE_HEIGHT, PAGE_WIDTH, 3)
     # A chain covers the fewest pixels: a rod of about 10 x 400 of 1244 x 750.
     main, tiles = boxes()
     assert drawn(image, *main) > 0.002
@@ -128,7 +137,7 @@ def test_a_run_is_drawn_large_and_four_frames_before_it(
 
 @needs_opengl
 def test_the_title_names_scene_size_solver_counts_and_cost(words: list[str], tmp_path: Path) -> None:
-    draw_run(cloth(), tmp_path / "run.png")
+    draw_run_picture(cloth(), tmp_path / "run.png")
     text = "\n".join(words)
     for said in ("cloth, size 6", "sparse", "36 vertices, 60 springs", "1.25 ms a step", "+5 %", "−5 %", "pinned"):
         assert said in text
@@ -138,9 +147,9 @@ def test_the_title_names_scene_size_solver_counts_and_cost(words: list[str], tmp
 @pytest.mark.parametrize(("strain", "colour"), list(zip((-0.1, -0.05, 0.0, 0.05, 0.1), STRAIN_COLOURS, strict=True)))
 def test_a_uniform_strain_has_the_documented_colour(strain: float, colour: str) -> None:
     replay = cloth(stretch=1 + strain)
-    view = frame_all(replay.positions[0], aspect=1.0, angles=(0.0, 0.0))
-    with Studio(160, 160) as studio:
-        image = studio.draw(replay, 0, view)
+    view = fit_camera(replay.positions[0], aspect=1.0, angles=(0.0, 0.0))
+    with OffscreenRenderer(160, 160) as studio:
+        image = studio.render_frame(replay, 0, view)
     found = seen_colour(image)
     # Light and mesh lines change a facing surface's brightness by up to a tenth; the colours differ by more.
     assert np.abs(found - to_rgb(colour)).max() < 0.1
@@ -151,7 +160,7 @@ def seen_colour(image: NDArray[np.float64] | NDArray[np.uint8]) -> NDArray[np.fl
     return np.median(image[60:100, 60:100].reshape(-1, 3), axis=0) / 255
 
 
-def pulled(triangles: bool) -> tuple[Replay, list[Replay]]:
+def pulled(triangles: bool) -> tuple[RecordingReplay, list[RecordingReplay]]:
     """A cloth or a net in three frames, compressed, at rest, and stretched; and each of them alone."""
     frames = [cloth(frames=1, stretch=1 + strain, triangles=triangles) for strain in (-0.1, 0.0, 0.1)]
     whole = cloth(frames=3, triangles=triangles)
@@ -162,10 +171,10 @@ def pulled(triangles: bool) -> tuple[Replay, list[Replay]]:
 @pytest.mark.parametrize("triangles", [True, False], ids=["cloth", "net"])
 def test_each_frame_is_drawn_as_it_would_be_alone(triangles: bool) -> None:
     replay, frames = pulled(triangles)
-    view = frame_all(frames[1].positions[0], aspect=1.0, angles=(20.0, 10.0))
-    with Studio(160, 160) as studio:
-        together = [studio.draw(replay, k, view) for k in range(3)]
-        alone = [studio.draw(frame, 0, view) for frame in frames]
+    view = fit_camera(frames[1].positions[0], aspect=1.0, angles=(20.0, 10.0))
+    with OffscreenRenderer(160, 160) as studio:
+        together = [studio.render_frame(replay, k, view) for k in range(3)]
+        alone = [studio.render_frame(frame, 0, view) for frame in frames]
     for k in range(3):
         np.testing.assert_array_equal(together[k], alone[k])
         assert not np.array_equal(together[k], together[k - 1])
@@ -175,17 +184,17 @@ def test_each_frame_is_drawn_as_it_would_be_alone(triangles: bool) -> None:
 def test_each_frame_is_drawn_in_its_own_colours_and_positions() -> None:
     """Drawn out of order, by one window."""
     replay, frames = pulled(True)
-    view = frame_all(frames[1].positions[0], aspect=1.0, angles=(0.0, 0.0))
-    with Studio(160, 160) as studio:
-        seen = {k: studio.draw(replay, k, view) for k in (2, 0, 1)}
+    view = fit_camera(frames[1].positions[0], aspect=1.0, angles=(0.0, 0.0))
+    with OffscreenRenderer(160, 160) as studio:
+        seen = {k: studio.render_frame(replay, k, view) for k in (2, 0, 1)}
     for k, colour in zip((0, 1, 2), STRAIN_COLOURS[::2], strict=True):
         # As above.
         assert np.abs(seen_colour(seen[k]) - to_rgb(colour)).max() < 0.1
     shares = [drawn(seen[k].astype(float), 0, 0, 160, 160) for k in (0, 1, 2)]
     assert shares[0] < shares[2], "a stretched cloth covers more"
     for k, frame in enumerate(frames):
-        assert spring_strain(replay, k) == pytest.approx(spring_strain(frame, 0))
-        assert vertex_strain(replay, k) == pytest.approx(vertex_strain(frame, 0))
+        assert compute_spring_strain(replay, k) == pytest.approx(compute_spring_strain(frame, 0))
+        assert compute_vertex_strain(replay, k) == pytest.approx(compute_vertex_strain(frame, 0))
 
 
 def test_a_vertex_shows_its_most_strained_spring_with_its_sign() -> None:
@@ -194,15 +203,15 @@ def test_a_vertex_shows_its_most_strained_spring_with_its_sign() -> None:
     replay = replace(replay, positions=positions, rest_lengths=np.array([1, 1, 0]) / 3)
     expected = np.array([-0.1, 0.2, 0.0])
     # Positions are recorded in float32.
-    assert spring_strain(replay, 0) == pytest.approx(expected, abs=1e-6)
-    assert vertex_strain(replay, 0) == pytest.approx([-0.1, 0.2, 0.2, 0.0], abs=1e-6)
+    assert compute_spring_strain(replay, 0) == pytest.approx(expected, abs=1e-6)
+    assert compute_vertex_strain(replay, 0) == pytest.approx([-0.1, 0.2, 0.2, 0.0], abs=1e-6)
 
 
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 1.7])
 @pytest.mark.parametrize("angles", [(0.0, 0.0), (32.0, 20.0), (-148.0, 15.0)])
 def test_the_camera_sees_every_point_from_near_by(aspect: float, angles: tuple[float, float]) -> None:
     points = np.random.default_rng(7).normal(size=(50, 3)) * [3.0, 1.0, 2.0]
-    view = frame_all(points, aspect=aspect, angles=angles)
+    view = fit_camera(points, aspect=aspect, angles=angles)
     forward = view.target - view.position
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 1.0, 0.0])
@@ -222,8 +231,8 @@ def test_the_view_is_from_the_side_where_most_surface_shows() -> None:
     for side in (1, -1):
         replay = cloth()
         replay = replace(replay, positions=replay.positions @ tilt * np.array([1, 1, side], np.float32))
-        areas = area_vectors(replay, -1)
-        azimuth, elevation = natural_angles(replay.positions[-1], areas)
+        areas = compute_area_vectors(replay, -1)
+        azimuth, elevation = choose_view_angles(replay.positions[-1], areas)
         shown = {}
         for corner in (32.0, -32.0, 148.0, -148.0):
             a, e = np.radians([corner, elevation])
@@ -238,14 +247,18 @@ def test_the_view_is_from_the_side_where_most_surface_shows() -> None:
 @needs_opengl
 @pytest.mark.parametrize("make", [cloth, chain], ids=["cloth", "chain"])
 @pytest.mark.parametrize("scale", [2.0**-30, 2.0**40], ids=["nanometres", "terametres"])
-def test_a_picture_does_not_depend_on_the_unit_of_length(make: Callable[[], Replay], scale: float) -> None:
+def test_a_picture_does_not_depend_on_the_unit_of_length(make: Callable[[], RecordingReplay], scale: float) -> None:
     plain = make()
     scaled = replace(plain, positions=np.float32(scale) * plain.positions, rest_lengths=scale * plain.rest_lengths)
     images = []
-    with Studio(80, 80) as studio:
+    with OffscreenRenderer(80, 80) as studio:
         for replay in (plain, scaled):
-            assert len(drawable_frames(replay)) == len(replay.frames)
-            images.append(studio.draw(replay, 7, frame_all(seen(replay, [7]), aspect=1.0, angles=(20.0, 10.0))))
+            assert len(find_drawable_frames(replay)) == len(replay.frames)
+            images.append(
+                studio.render_frame(
+                    replay, 7, fit_camera(points_to_frame(replay, [7]), aspect=1.0, angles=(20.0, 10.0))
+                )
+            )
     np.testing.assert_array_equal(*images)
     assert drawn(images[0].astype(float), 0, 0, 80, 80) > 0.01
 
@@ -267,11 +280,15 @@ def test_obstacles_far_from_zero_are_drawn_as_near_it() -> None:
         return json.dumps([sphere, capsule, box | {"motion": turns | {"about": at(0, 0, 0)}}, plane])
 
     images = []
-    with Studio(80, 80) as studio:
+    with OffscreenRenderer(80, 80) as studio:
         for o in (np.zeros(3), far):
             plain = cloth()
             replay = replace(plain, origin=o, properties={**plain.properties, "obstacles": obstacles(o)})
-            images.append(studio.draw(replay, 7, frame_all(seen(replay, [7]), aspect=1.0, angles=(20.0, 10.0))))
+            images.append(
+                studio.render_frame(
+                    replay, 7, fit_camera(points_to_frame(replay, [7]), aspect=1.0, angles=(20.0, 10.0))
+                )
+            )
     changed = (np.abs(images[0].astype(int) - images[1]).max(axis=2) > 8).mean()
     assert changed < 0.005, "of the pixels; turned corners are rounded at 33,000 km"
 
@@ -279,11 +296,13 @@ def test_obstacles_far_from_zero_are_drawn_as_near_it() -> None:
 @needs_opengl
 def test_a_mesh_without_springs_is_drawn_by_its_vertices(tmp_path: Path) -> None:
     plain = chain()
-    draw_run(replace(plain, springs=plain.springs[:0], rest_lengths=plain.rest_lengths[:0]), tmp_path / "run.png")
-    assert drawn(pixels(tmp_path / "run.png"), 0, 114, WIDTH, 750) > 0.0001
+    draw_run_picture(
+        replace(plain, springs=plain.springs[:0], rest_lengths=plain.rest_lengths[:0]), tmp_path / "run.png"
+    )
+    assert drawn(pixels(tmp_path / "run.png"), 0, 114, PAGE_WIDTH, 750) > 0.0001
 
 
-def falling(replay: Replay, vertices: slice, metres: float) -> Replay:
+def falling(replay: RecordingReplay, vertices: slice, metres: float) -> RecordingReplay:
     """Some vertices fall by so much until the last frame."""
     positions = replay.positions.copy()
     positions[:, vertices, 1] -= metres * np.linspace(0, 1, len(positions))[:, None].astype(np.float32) ** 2
@@ -304,12 +323,12 @@ LEFT_OUT = {
 @pytest.mark.parametrize(("vertices", "metres", "count"), LEFT_OUT.values(), ids=LEFT_OUT)
 def test_what_leaves_the_others_far_behind_is_not_framed(vertices: slice, metres: float, count: int) -> None:
     replay = falling(cloth(), vertices, metres)
-    found = framed(replay, range(8))
+    found = framed_vertex_mask(replay, range(8))
     assert np.flatnonzero(~found).tolist() == list(range(36))[vertices][:count]
-    points = seen(replay, range(8))
+    points = points_to_frame(replay, range(8))
     assert (np.ptp(points, axis=0).max() < 3.0) == (count > 0 or metres < 2.0)
     wanted = {0: [], 1: ["1 of 36 vertices is outside"]}.get(count, [f"{count} of 36 vertices are outside"])
-    assert outside_words(found) == wanted
+    assert describe_outside(found) == wanted
 
 
 SURFACES = {
@@ -329,17 +348,17 @@ def test_a_picture_says_of_a_surface_that_nothing_keeps_it_apart(apart: bool, fo
     replay = replace(plain, positions=positions, properties={**plain.properties, "self_contact": apart})
     if not folded:
         replay = replace(replay, positions=plain.positions)
-    assert self_contact_words(replay, [0, 7]) == wanted
-    assert apart or self_contact_words(replay, [0]) == ["no self-contact"]
-    assert self_contact_words(plain, [7]) == [], "a recording that does not say is not judged"
+    assert describe_self_intersection(replay, [0, 7]) == wanted
+    assert apart or describe_self_intersection(replay, [0]) == ["no self-contact"]
+    assert describe_self_intersection(plain, [7]) == [], "a recording that does not say is not judged"
     net = replace(replay, triangles=replay.triangles[:0])
-    assert self_contact_words(net, [7]) == [], "a net has no surface"
+    assert describe_self_intersection(net, [7]) == [], "a net has no surface"
 
 
 def test_what_is_stretched_evenly_is_framed_whole() -> None:
     replay = chain()
     pulled = replay.positions * np.linspace(1, 100, 8, dtype=np.float32)[:, None, None]
-    assert framed(replace(replay, positions=pulled), range(8)).all()
+    assert framed_vertex_mask(replace(replay, positions=pulled), range(8)).all()
 
 
 def test_where_one_point_is_framed_the_start_gives_the_size() -> None:
@@ -348,41 +367,41 @@ def test_where_one_point_is_framed_the_start_gives_the_size() -> None:
         replace(replay, springs=replay.springs[:0], rest_lengths=replay.rest_lengths[:0]), slice(1, 2), 490.0
     )
     replay.positions[:, 0] = replay.positions[0, 0]
-    assert framed(replay, [7]).tolist() == [True, False]
-    assert np.ptp(seen(replay, [7]), axis=0).max() == pytest.approx(1.05)
+    assert framed_vertex_mask(replay, [7]).tolist() == [True, False]
+    assert np.ptp(points_to_frame(replay, [7]), axis=0).max() == pytest.approx(1.05)
 
 
 @needs_opengl
 def test_a_picture_says_how_many_vertices_are_outside(words: list[str], tmp_path: Path) -> None:
     replay = falling(cloth(), slice(3, 4), 44.0)
-    draw_run(replay, tmp_path / "run.png")
+    draw_run_picture(replay, tmp_path / "run.png")
     assert sum("1 of 36 vertices is outside" in word for word in words) == 1, words
     assert drawn(pixels(tmp_path / "run.png"), 36, 114, 700, 750) > 0.05, "the cloth is no dot"
     words.clear()
-    draw_comparison({"a": replay, "b": cloth()}, tmp_path / "both.png")
+    draw_comparison_picture({"a": replay, "b": cloth()}, tmp_path / "both.png")
     assert words.count("1 of 36 vertices is outside") == 1
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
 def test_frames_are_drawn_up_to_the_first_that_is_not_finite(value: float) -> None:
-    assert drawable_frames(cloth()).tolist() == list(range(8))
-    assert drawable_frames(broken(cloth(), 5, value)).tolist() == [0, 1, 2, 3, 4]
+    assert find_drawable_frames(cloth()).tolist() == list(range(8))
+    assert find_drawable_frames(broken(cloth(), 5, value)).tolist() == [0, 1, 2, 3, 4]
 
 
 @needs_opengl
 def test_positions_that_are_not_finite_are_told_in_words(
     words: list[str], boxes: Callable[[], tuple[PixelBox, list[PixelBox]]], tmp_path: Path
 ) -> None:
-    draw_run(broken(cloth(), 5), tmp_path / "run.png")
+    draw_run_picture(broken(cloth(), 5), tmp_path / "run.png")
     assert "not finite from frame 10 on" in "\n".join(words)
     assert drawn(pixels(tmp_path / "run.png"), *boxes()[0]) > 0.01, "the last finite frame is drawn"
 
 
 @needs_opengl
 def test_a_run_without_a_finite_frame_is_a_picture_that_says_so(words: list[str], tmp_path: Path) -> None:
-    draw_run(broken(cloth(), 0), tmp_path / "run.png")
+    draw_run_picture(broken(cloth(), 0), tmp_path / "run.png")
     assert "not finite from frame 0 on" in "\n".join(words)
-    assert pixels(tmp_path / "run.png").shape == (HEIGHT, WIDTH, 3)
+    assert pixels(tmp_path / "run.png").shape == (PAGE_HEIGHT, PAGE_WIDTH, 3)
 
 
 @needs_opengl
@@ -391,15 +410,15 @@ def test_a_comparison_shows_solvers_side_by_side_with_their_distance(words: list
     moved = first.positions + np.array([0.0, 0.0, 0.1], np.float32)
     second = replace(first, positions=moved, properties={**first.properties, "solver": "dense"})
     third = replace(broken(first, 4), properties={**first.properties, "solver": "xpbd"})
-    draw_comparison({"a": first, "b": second, "c": third}, tmp_path / "side.png")
+    draw_comparison_picture({"a": first, "b": second, "c": third}, tmp_path / "side.png")
     for said in ("cloth, size 6", "sparse", "dense", "xpbd", "reference", "1.0e-06", "not finite\nfrom frame 8 on"):
         assert said in words
     assert "0.5" in words, "0.1 m are half a rest length of 0.2 m"
     image = pixels(tmp_path / "side.png")
-    assert image.shape[1:] == (WIDTH, 3)
+    assert image.shape[1:] == (PAGE_WIDTH, 3)
     assert drawn(image, 40, 118, 480, image.shape[0] - 118) > 0.01
     assert drawn(image, 540, 118, 480, image.shape[0] - 118) > 0.01
-    assert drawn(image, 0, image.shape[0] - 60, WIDTH, 60) > 0.0, "nothing is left empty below"
+    assert drawn(image, 0, image.shape[0] - 60, PAGE_WIDTH, 60) > 0.0, "nothing is left empty below"
 
 
 @needs_opengl
@@ -411,7 +430,7 @@ def test_a_comparison_has_a_panel_for_each_scene_and_size(words: list[str], tmp_
                 replay = cloth(size, triangles=scene == "cloth")
                 known = {"scene": scene, "size": size, "solver": "sparse", "threads": threads}
                 runs[f"{label}, {scene} {size}"] = replace(replay, properties=known)
-    draw_comparison(runs, tmp_path / "side.png")
+    draw_comparison_picture(runs, tmp_path / "side.png")
     assert [word for word in words if "size" in word] == [
         "cloth, size 5",
         "cloth, size 6",

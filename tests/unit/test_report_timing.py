@@ -16,17 +16,23 @@ from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
-from harness.base.columns import SCHEMA
+from harness.base.columns import RUN_SCHEMA
 from harness.report import page, timing_plot
-from harness.report.labels import LINE, spread
-from harness.report.learned import closing, sentences
-from harness.report.style import HEIGHT, WIDTH, marks
-from harness.report.timing_plot import draw_timing
-from harness.report.timing_table import APART, INTERRUPTED, labels, runs, summary_table
-from harness.scenes.material import RULES, modulus_exponent, spring_stiffness
+from harness.report.labels import LABEL_SPACING, spread_heights
+from harness.report.learned import build_closing_lines, summarise_sweep
+from harness.report.style import PAGE_HEIGHT, PAGE_WIDTH, assign_solver_styles
+from harness.report.timing_plot import draw_timing_plot
+from harness.report.timing_table import (
+    INCONSISTENT_NOTE,
+    PREEMPTED_NOTE,
+    build_summary_table,
+    label_runs,
+    read_run_times,
+)
+from harness.scenes.material import SCALING_RULES, compute_modulus_exponent, compute_spring_stiffness
 from harness.scenes.mesh.base import STRETCH
-from harness.scenes.mesh.mesh_names import MESHES
-from solvers.registry import EVERY, load
+from harness.scenes.mesh.mesh_names import MESH_CLASSES
+from solvers.registry import SOLVER_TABLE, load_target
 
 ROOT = Path(__file__).parents[2]
 POWERS = {"sparse": 1.0, "dense": 2.0, "xpbd": 1.5}  # of the vertices, in the times of each solver
@@ -48,7 +54,7 @@ def rows(
             for solver in solvers:
                 for omega in omegas:
                     out += run_rows(scene, size, solver, omega, failed=(size, solver) in failed)
-    return pa.Table.from_pylist(out, schema=SCHEMA)
+    return pa.Table.from_pylist(out, schema=RUN_SCHEMA)
 
 
 def run_rows(scene: str, size: int, solver: str, omega: float, *, failed: bool) -> list[dict[str, Any]]:
@@ -99,7 +105,7 @@ def learned(**how: Any) -> list[str]:
 
 
 def learned_from(told: list[dict[str, Any]]) -> list[str]:
-    lines = "\n".join(sentences(runs(pa.Table.from_pylist(told, schema=SCHEMA))))
+    lines = "\n".join(summarise_sweep(read_run_times(pa.Table.from_pylist(told, schema=RUN_SCHEMA))))
     return lines.replace("\n  ", " ").splitlines()
 
 
@@ -110,7 +116,7 @@ def sheets(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 
     def save(sheet: Figure, path: Path, **more: Any) -> None:
         drawn.append(sheet)
-        page.save(sheet, path, **more)
+        page.save_page(sheet, path, **more)
 
     monkeypatch.setattr(timing_plot, "save", save)
     return drawn
@@ -121,7 +127,7 @@ def written(sheet: Figure) -> list[str]:
 
 
 def test_a_run_is_summed_up_in_milliseconds() -> None:
-    (run,) = runs(rows(sizes=(10,), solvers=("sparse",)))
+    (run,) = read_run_times(rows(sizes=(10,), solvers=("sparse",)))
     # The step takes 1e-6 s * 100 = 0.1 ms; round-off of a few products.
     expected = {"cold": 0.8, "warm": 0.3, "step": 0.1, "least": 0.099, "lower": 0.0995, "upper": 0.1005}
     expected |= {
@@ -134,19 +140,19 @@ def test_a_run_is_summed_up_in_milliseconds() -> None:
     }
     assert {name: getattr(run, name) for name in expected} == pytest.approx(expected, rel=1e-9)
     assert (run.scene, run.size, run.vertices, run.springs, run.status) == ("cloth", 10, 100, 400, "ok")
-    assert run.stopped == "iterations", "one step of five was cut off"
+    assert run.termination_reason == "iterations", "one step of five was cut off"
 
 
 def test_runs_keep_the_order_of_their_rows() -> None:
     table = rows(scenes=("net", "cloth"), sizes=(16, 8))
     order = list(dict.fromkeys(table["run_id"].to_pylist()))
-    assert [run.run_id for run in runs(table)] == order
+    assert [run.run_id for run in read_run_times(table)] == order
 
 
 def test_labels_name_only_the_settings_in_which_a_solvers_runs_differ() -> None:
-    same, varied = (runs(rows(solvers=("sparse",), omegas=omegas)) for omegas in ((1.0,), (1.0, 1.5)))
-    assert set(labels(same).values()) == {"sparse"}
-    assert set(labels(varied).values()) == {"sparse, omega 1.0", "sparse, omega 1.5"}
+    same, varied = (read_run_times(rows(solvers=("sparse",), omegas=omegas)) for omegas in ((1.0,), (1.0, 1.5)))
+    assert set(label_runs(same).values()) == {"sparse"}
+    assert set(label_runs(varied).values()) == {"sparse, omega 1.0", "sparse, omega 1.5"}
 
 
 @pytest.mark.parametrize(
@@ -156,20 +162,20 @@ def test_labels_name_only_the_settings_in_which_a_solvers_runs_differ() -> None:
         pytest.param(rows(sizes=(8,), solvers=("sparse",)), id="one run"),
         pytest.param(rows(scenes=("a-scene-with-a-long-name-" * 4, "b", "c", "d", "e")), id="five scenes"),
         pytest.param(rows(sizes=(2,), solvers=("dense",), failed=[(2, "dense")]), id="nothing succeeded"),
-        pytest.param(SCHEMA.empty_table(), id="no rows"),
+        pytest.param(RUN_SCHEMA.empty_table(), id="no rows"),
     ],
 )
 def test_every_table_gives_a_plot_of_the_page_s_width(table: pa.Table, tmp_path: Path) -> None:
-    draw_timing(table, tmp_path / "time.png", "A title that is too long for the page " * 5)
+    draw_timing_plot(table, tmp_path / "time.png", "A title that is too long for the page " * 5)
     with Image.open(tmp_path / "time.png") as image:
-        assert image.width == WIDTH
-        assert 200 < image.height <= HEIGHT
+        assert image.width == PAGE_WIDTH
+        assert 200 < image.height <= PAGE_HEIGHT
         assert np.asarray(image.convert("L")).std() > 3, "an empty page has no variance"
     assert [file.name for file in tmp_path.iterdir()] == ["time.png"], "no partial file is left"
 
 
 def test_each_solver_is_a_line_named_with_its_fitted_power(sheets: list[Figure], tmp_path: Path) -> None:
-    draw_timing(rows(), tmp_path / "time.png", "Scaling")
+    draw_timing_plot(rows(), tmp_path / "time.png", "Scaling")
     said = written(sheets[0])
     for solver, power in POWERS.items():
         assert f"{solver}  $n^{{{power:.1f}}}$" in said
@@ -179,42 +185,44 @@ def test_each_solver_is_a_line_named_with_its_fitted_power(sheets: list[Figure],
 
 
 def test_failed_runs_are_crosses_at_the_upper_edge_and_words(sheets: list[Figure], tmp_path: Path) -> None:
-    draw_timing(rows(failed=[(16, "dense"), (32, "dense")]), tmp_path / "time.png", "Scaling")
+    draw_timing_plot(rows(failed=[(16, "dense"), (32, "dense")]), tmp_path / "time.png", "Scaling")
     step = sheets[0].axes[0]
     crosses = [line for line in step.lines if line.get_marker() == "x"]
     assert [list(map(float, np.asarray(line.get_xdata()))) for line in crosses] == [[256.0], [1024.0]]
     assert all(float(np.asarray(line.get_ydata())[0]) > 0.9 for line in crosses), "in shares of the panel's height"
-    assert {line.get_color() for line in crosses} == {marks(POWERS)["dense"].color}
+    assert {line.get_color() for line in crosses} == {assign_solver_styles(POWERS)["dense"].color}
     said = written(sheets[0])
     assert said.count("diverged") == 2
     assert f"dense on cloth, size 32 diverged: {EXPLOSION}" in said
 
 
 def test_preparing_has_its_own_panel_cold_and_warm(sheets: list[Figure], tmp_path: Path) -> None:
-    draw_timing(rows(solvers=("sparse",)), tmp_path / "time.png", "Scaling")
+    draw_timing_plot(rows(solvers=("sparse",)), tmp_path / "time.png", "Scaling")
     cold, warm = (np.asarray(line.get_ydata(), float) for line in sheets[0].axes[1].lines)
     assert cold == pytest.approx(8 / 3 * warm)
 
 
 @pytest.mark.parametrize("wanted", [[10.0, 11.0, 12.0], [10.0, 60.0, 99.0], [90.0, 95.0, 99.0]])
 def test_direct_labels_do_not_overlap_and_stay_on_the_panel(wanted: list[float]) -> None:
-    at = spread(wanted, 6.0, 100.0)
-    assert (np.diff(at) >= LINE).all()
+    at = spread_heights(wanted, 6.0, 100.0)
+    assert (np.diff(at) >= LABEL_SPACING).all()
     assert min(at) >= 6.0
     assert max(at) <= 100.0
 
 
 def test_solvers_have_marks_of_their_own_that_stay_the_same() -> None:
     names = [f"method-{k:02}" for k in range(20)]
-    assert len(set(marks(names).values())) == 20 + len(EVERY), "colour and marker together tell solvers apart"
-    for solver in EVERY:
-        assert marks([])[solver] == marks(names)[solver]
-    assert marks(names) == marks(reversed(names))
+    assert len(set(assign_solver_styles(names).values())) == 20 + len(SOLVER_TABLE), (
+        "colour and marker together tell solvers apart"
+    )
+    for solver in SOLVER_TABLE:
+        assert assign_solver_styles([])[solver] == assign_solver_styles(names)[solver]
+    assert assign_solver_styles(names) == assign_solver_styles(reversed(names))
 
 
 def test_the_summary_has_a_line_for_each_run() -> None:
     console = Console(width=200, record=True, file=StringIO())
-    console.print(summary_table(rows(sizes=(10,), failed=[(10, "dense")])))
+    console.print(build_summary_table(rows(sizes=(10,), failed=[(10, "dense")])))
     lines = [" ".join(line.split()) for line in console.export_text().splitlines()]
     assert "cloth: times in milliseconds, medians over the rounds and over the steps" in lines
     assert "10 sparse 0.8 0.3 0.1 0.099 0.01 0.02 10 iterations 1.0e-04 40 % 4 %" in lines
@@ -225,9 +233,9 @@ def test_the_summary_and_the_words_after_it_fit_a_hundred_columns() -> None:
     scenes, sizes = ("hanging-cloth", "a-scene-with-a-long-name"), (8, 32)
     table = rows(scenes=scenes, sizes=sizes, solvers=("local-global-sparse", "dense"), omegas=(1.0, 1.25))
     console = Console(width=240, record=True, file=StringIO())
-    console.print(summary_table(table))
+    console.print(build_summary_table(table))
     assert max(len(line.rstrip()) for line in console.export_text().splitlines()) <= 100
-    assert max(map(len, sentences(runs(table)))) <= 98, "two more go before each"
+    assert max(map(len, summarise_sweep(read_run_times(table)))) <= 98, "two more go before each"
 
 
 def changed(solvers: Sequence[str], sizes: Sequence[int] = (20,), **by: Callable[[dict[str, Any]], Any]) -> list[str]:
@@ -243,7 +251,9 @@ def test_times_are_compared_at_equal_errors_by_the_median_step() -> None:
     assert speed.startswith("cloth 10: fastest at equal accuracy is sparse, 0.1 ms a step; xpbd 10 times, dense 100")
     assert "(largest residual 1.0e+00 to 10 times that" in speed
     assert limit.startswith("All 5 runs stopped at the limit of iterations")
-    assert max(runs(rows()), key=lambda run: run.worst_residual or 0.0).worst_residual == 1.0, "of the first frame"
+    assert max(read_run_times(rows()), key=lambda run: run.worst_residual or 0.0).worst_residual == 1.0, (
+        "of the first frame"
+    )
 
 
 def test_times_at_unequal_or_unknown_errors_are_not_compared() -> None:
@@ -298,8 +308,8 @@ def test_a_limit_of_iterations_stops_only_what_has_one() -> None:
     for row in told:
         row["own_steps"] = row["solver"] == "symplectic-euler"
     assert learned_from(told)[-1].startswith("1 of 2 runs stopped at the limit of iterations")
-    sparse, explicit = runs(pa.Table.from_pylist(told, schema=SCHEMA))
-    assert (sparse.stopped, explicit.stopped) == ("iterations", "tolerance")
+    sparse, explicit = read_run_times(pa.Table.from_pylist(told, schema=RUN_SCHEMA))
+    assert (sparse.termination_reason, explicit.termination_reason) == ("iterations", "tolerance")
     for row in told:
         row["iterations"] = row["iterations"] and 1  # of 10 that were allowed, as of one linear solve a step
     assert not [line for line in learned_from(told) if "limit" in line]
@@ -335,17 +345,19 @@ def test_strains_of_two_sizes_are_told_with_what_happens_to_the_material() -> No
 
 def test_the_modulus_follows_the_spacing_by_rule_and_dimension() -> None:
     for dimension, mesh in ((1, "chain"), (2, "grid"), (3, "block")):
-        for rule in RULES:
+        for rule in SCALING_RULES:
             by_size: dict[int, float] = {}
             for size in (3, 5):
-                made = load(MESHES[mesh]).model_validate({"kind": mesh}).build(size)
+                made = load_target(MESH_CLASSES[mesh]).model_validate({"kind": mesh}).build(size)
                 assert made.dimension == dimension
                 reference = 3 if rule == "liu2013" else None
-                k = spring_stiffness(made, rule=rule, stretch=7.0, shear=0.0, bend=0.0, reference=reference)
-                stretch = float(np.median(k[made.families[STRETCH]]))
+                k = compute_spring_stiffness(
+                    made, scaling_rule=rule, stretch=7.0, shear=0.0, bend=0.0, reference_size=reference
+                )
+                stretch = float(np.median(k[made.spring_families[STRETCH]]))
                 by_size[size] = stretch * made.spacing ** (2 - dimension)  # EA = k h, E t = k, E = k / h
                 spacing = made.spacing
-            expected = 2.0 ** -modulus_exponent(rule, dimension)
+            expected = 2.0 ** -compute_modulus_exponent(rule, dimension)
             assert by_size[5] / by_size[3] == pytest.approx(expected), (rule, mesh, spacing)
 
 
@@ -355,7 +367,7 @@ def test_a_sweep_ends_with_three_commands_and_one_link(tmp_path: Path) -> None:
     (results / "q" / "recordings").mkdir(parents=True)
     seen = results / "q" / "recordings" / "hanging-cloth-32-sparse-hanging-cloth 32 sparse 1.0.rrd"
     seen.touch()
-    lines = closing(table, config, results, results / "q")
+    lines = build_closing_lines(table, config, results, results / "q")
     commands = [shlex.split(line) for line in lines if line.startswith("  springbench")]
     scene = str(ROOT / "configs" / "scenes" / "hanging-cloth.yaml")
     assert commands == [
@@ -364,7 +376,7 @@ def test_a_sweep_ends_with_three_commands_and_one_link(tmp_path: Path) -> None:
         ["springbench", "report", str(results)],
     ]
     (results / "index.html").touch()
-    assert closing(table, config, results, results / "q")[-1].endswith("/my%20results/index.html")
+    assert build_closing_lines(table, config, results, results / "q")[-1].endswith("/my%20results/index.html")
 
 
 def test_the_summary_marks_times_that_are_doubtful_and_says_why() -> None:
@@ -373,11 +385,11 @@ def test_the_summary_marks_times_that_are_doubtful_and_says_why() -> None:
         row["interrupted"] = row["phase"] == "step" and row["frame"] == 2
         row["adds_up"] = False if row["phase"] in ("local", "global") else None
     console = Console(width=200, record=True, file=StringIO())
-    console.print(summary_table(pa.Table.from_pylist(told, schema=SCHEMA)))
+    console.print(build_summary_table(pa.Table.from_pylist(told, schema=RUN_SCHEMA)))
     text = " ".join(console.export_text().split())
     assert "10 sparse 0.8 0.3 0.1! 0.099 0.01~ 0.02~ 10" in text
-    assert INTERRUPTED in text
-    assert APART in text
-    console.print(summary_table(rows(sizes=(10,), solvers=("sparse",))))
+    assert PREEMPTED_NOTE in text
+    assert INCONSISTENT_NOTE in text
+    console.print(build_summary_table(rows(sizes=(10,), solvers=("sparse",))))
     text = " ".join(console.export_text().split())
     assert not {"!", "~"} & set(text.split("below")[-1]), "rows that say nothing of it have no marks"

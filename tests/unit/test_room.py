@@ -7,23 +7,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.scenes.motion import Key, KeyedMotion
-from harness.scenes.obstacles import Plane, Sphere
-from harness.scenes.room import gap, key_times, looks, nearest
+from harness.scenes.motion import KeyFrame, KeyFrameMotion
+from harness.scenes.obstacles import PlaneObstacle, SphereObstacle
+from harness.scenes.room import find_first_violation, largest_gap_radius, merge_key_times, sample_times
 
 POINT = np.array([[0.0, 0.0, 0.0]])
 LIMIT = 0.01
 
 
-def moving(*keys: dict[str, Any], **more: Any) -> KeyedMotion:
-    return KeyedMotion.model_validate({"keys": list(keys), **more})
+def moving(*keys: dict[str, Any], **more: Any) -> KeyFrameMotion:
+    return KeyFrameMotion.model_validate({"keys": list(keys), **more})
 
 
 ACROSS = moving({"time": 0.0}, {"time": 1.0, "offset": (4.0, 0.0, 0.0)})
 ROUND = moving({"time": 0.0}, {"time": 1.0, "turn": 360.0}, about=(2.0, 0.0, 0.0))
 SMOOTH = moving({"time": 0.0}, {"time": 1.0, "offset": (4.0, 0.0, 0.0)}, between="smooth")
-BALL = Sphere(center=(2.0, 0.0, 0.0), radius=0.1)
-FAR = Sphere(center=(4.0, 0.0, 0.0), radius=0.05)
+BALL = SphereObstacle(center=(2.0, 0.0, 0.0), radius=0.1)
+FAR = SphereObstacle(center=(4.0, 0.0, 0.0), radius=0.05)
 
 
 # The way is one long step and many short ones: the time of contact is where the distance is the limit, or a step later.
@@ -32,8 +32,8 @@ FAR = Sphere(center=(4.0, 0.0, 0.0), radius=0.05)
     [(BALL, ACROSS, 0.4725), (FAR, ROUND, 0.4952), (BALL, SMOOTH, 0.4725)],
     ids=["along a line", "along a circle", "along a cubic"],
 )
-def test_a_way_through_a_ball_is_found_where_it_begins(ball: Sphere, motion: KeyedMotion, when: float):
-    found = nearest(ball.obstacle(), None, POINT, motion, LIMIT)
+def test_a_way_through_a_ball_is_found_where_it_begins(ball: SphereObstacle, motion: KeyFrameMotion, when: float):
+    found = find_first_violation(ball.build_obstacle(), None, POINT, motion, LIMIT)
     assert found is not None
     assert found[0] == pytest.approx(when, abs=0.01)
     assert found[1].min() < LIMIT
@@ -41,40 +41,42 @@ def test_a_way_through_a_ball_is_found_where_it_begins(ball: Sphere, motion: Key
 
 def test_a_ball_that_comes_is_found_like_a_way_to_it():
     back = moving({"time": 0.0}, {"time": 1.0, "offset": (-4.0, 0.0, 0.0)})
-    ball = Sphere(center=(2.0, 0.0, 0.0), radius=0.1, motion=back)
-    found = nearest(ball.obstacle(), back, POINT, None, LIMIT)
+    ball = SphereObstacle(center=(2.0, 0.0, 0.0), radius=0.1, motion=back)
+    found = find_first_violation(ball.build_obstacle(), back, POINT, None, LIMIT)
     assert found is not None
     assert found[0] == pytest.approx(0.4725, abs=0.01)
 
 
 @pytest.mark.parametrize("motion", [None, ACROSS, ROUND, SMOOTH])
-def test_a_way_beside_a_ball_is_free(motion: KeyedMotion | None):
-    beside = Sphere(center=(2.0, 5.0, 0.0), radius=0.1)
-    assert nearest(beside.obstacle(), None, POINT, motion, LIMIT) is None
+def test_a_way_beside_a_ball_is_free(motion: KeyFrameMotion | None):
+    beside = SphereObstacle(center=(2.0, 5.0, 0.0), radius=0.1)
+    assert find_first_violation(beside.build_obstacle(), None, POINT, motion, LIMIT) is None
 
 
 @pytest.mark.parametrize("motion", [ACROSS, ROUND, SMOOTH])
-def test_no_point_is_faster_than_is_said(motion: KeyedMotion):
+def test_no_point_is_faster_than_is_said(motion: KeyFrameMotion):
     times = np.linspace(0.0, 1.0, 1001)
-    way = np.array([motion.moved(POINT, t)[0] for t in times])
+    way = np.array([motion.transform_points(POINT, t)[0] for t in times])
     fastest = np.linalg.norm(np.diff(way, axis=0), axis=1).max() / times[1]
-    assert fastest <= motion.speed(0.0, 1.0, POINT) * (1 + 1e-9)  # round-off of differences of 1e-3
+    assert fastest <= motion.bound_speed(0.0, 1.0, POINT) * (1 + 1e-9)  # round-off of differences of 1e-3
 
 
 @pytest.mark.parametrize(("height", "radius"), [(1.0, 0.5), (0.1, 0.05), (-1.0, -0.5)])
 def test_the_gap_between_two_planes_is_that_of_the_largest_ball(height: float, radius: float):
-    lid = Plane(point=(0.0, height, 0.0), normal=(0.0, -1.0, 0.0))
-    assert gap([Plane().obstacle(), lid.obstacle()], 0.0) == pytest.approx(radius, abs=1e-9)
+    lid = PlaneObstacle(point=(0.0, height, 0.0), normal=(0.0, -1.0, 0.0))
+    assert largest_gap_radius([PlaneObstacle().build_obstacle(), lid.build_obstacle()], 0.0) == pytest.approx(
+        radius, abs=1e-9
+    )
 
 
 def test_four_planes_may_leave_no_room_where_any_three_do():
     normals = [(1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0)]
-    planes = [Plane(point=normal, normal=normal).obstacle() for normal in normals]
-    assert gap(planes, 0.0) < 0.0
-    assert all(gap(planes[:k] + planes[k + 1 :], 0.0) > 0.0 for k in range(4))
+    planes = [PlaneObstacle(point=normal, normal=normal).build_obstacle() for normal in normals]
+    assert largest_gap_radius(planes, 0.0) < 0.0
+    assert all(largest_gap_radius(planes[:k] + planes[k + 1 :], 0.0) > 0.0 for k in range(4))
 
 
 def test_planes_that_turn_are_looked_at_between_their_keys():
-    assert list(looks([ACROSS])) == [0.0, 1.0]
-    assert len(list(looks([ROUND]))) > 32
-    assert key_times(ACROSS, None, KeyedMotion(keys=(Key(time=0.5),))) == [0.0, 0.5, 1.0]
+    assert list(sample_times([ACROSS])) == [0.0, 1.0]
+    assert len(list(sample_times([ROUND]))) > 32
+    assert merge_key_times(ACROSS, None, KeyFrameMotion(keys=(KeyFrame(time=0.5),))) == [0.0, 0.5, 1.0]

@@ -9,12 +9,12 @@ from typing import Any
 import pyarrow as pa
 import pytest
 
-from harness.base.columns import SCHEMA
+from harness.base.columns import RUN_SCHEMA
 from harness.base.errors import InputError
-from harness.config.load import load_any
-from harness.experiments.plan import Files
-from harness.experiments.run import execute
-from harness.report.certificates import certificates
+from harness.config.load import load_config
+from harness.experiments.plan import RunFiles
+from harness.experiments.run import execute_run
+from harness.report.certificates import write_certificates
 
 SCENE = """
 mesh: {kind: grid}
@@ -30,10 +30,10 @@ def executed(folder: Path, timing: str) -> tuple[list[dict[str, Any]], list[str]
     """The rows of a run, and the passes that it told of."""
     (folder / "scene.yaml").write_text(SCENE)
     asked: dict[str, Any] = {"solvers": ["newton"], "timing": timing, "record": False, "tolerance": 1e-3}
-    (spec,) = load_any(folder / "scene.yaml", **asked).runs()
-    files, told = Files.of(spec, folder), list[str]()
-    files.rows.parent.mkdir(exist_ok=True)
-    return execute(spec, files, told.append), told
+    (spec,) = load_config(folder / "scene.yaml", **asked).list_runs()
+    files, told = RunFiles.for_run(spec, folder), list[str]()
+    files.rows_path.parent.mkdir(exist_ok=True)
+    return execute_run(spec, files, told.append), told
 
 
 def test_a_rough_run_does_its_steps_once_and_ends_where_a_timed_one_does(tmp_path: Path):
@@ -51,7 +51,7 @@ def test_certificates_count_the_frames_that_are_free(tmp_path: Path):
     rows, _ = executed(tmp_path, "rough")
     rows += [row | {"run_id": "other", "solver": "broken", "intersections": int(row["frame"] == 2)} for row in rows]
     rows.append(rows[0] | {"run_id": "none", "solver": "refuses", "phase": "run", "status": "unsupported"})
-    (path,) = certificates(pa.Table.from_pylist(rows, schema=SCHEMA), tmp_path)
+    (path,) = write_certificates(pa.Table.from_pylist(rows, schema=RUN_SCHEMA), tmp_path)
     with path.open() as file:
         found = {row["solver"]: (row["frames"], row["free"], row["status"]) for row in csv.DictReader(file)}
     assert found == {"newton": ("3", "3", "ok"), "broken": ("3", "2", "ok"), "refuses": ("", "0", "unsupported")}
@@ -60,4 +60,4 @@ def test_certificates_count_the_frames_that_are_free(tmp_path: Path):
 def test_a_rough_run_keeps_no_recording(tmp_path: Path):
     (tmp_path / "scene.yaml").write_text(SCENE)
     with pytest.raises(InputError, match=r"options: timing: .*give `record: false`|timing.*record: false"):
-        load_any(tmp_path / "scene.yaml", timing="rough")
+        load_config(tmp_path / "scene.yaml", timing="rough")

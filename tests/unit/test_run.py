@@ -6,38 +6,38 @@ from pathlib import Path
 import pytest
 
 from harness.base import machine
-from harness.config.load import load_any
+from harness.config.load import load_config
 from harness.experiments import run
-from harness.experiments.plan import Files
-from harness.experiments.run import execute
-from harness.record.reader import summary
-from harness.simulation.measure import StepFailed
-from harness.simulation.observe import require_numbers
+from harness.experiments.plan import RunFiles
+from harness.experiments.run import execute_run
+from harness.record.reader import summarise_recording
+from harness.simulation.measure import StepError
+from harness.simulation.observe import require_finite
 
 
 def test_a_run_that_fails_now_keeps_nothing_of_when_it_did_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "scene.yaml").write_text(
         "mesh: {kind: chain}\nmass: 1\ntime_step: 0.1\nframes: 2\ndefault_size: 3\neffects: [{kind: gravity}]\n"
     )
-    (spec,) = load_any(tmp_path / "scene.yaml", solvers=["sparse"]).runs()
-    files = Files.of(spec, tmp_path)
-    files.rows.parent.mkdir()
-    assert {row["status"] for row in execute(spec, files, lambda phase: None)} == {"ok"}
-    files.picture.parent.mkdir()
-    files.picture.touch()
-    assert files.recording.exists()
-    assert files.recording.name == f"{spec.label(machine.describe().id)}.rrd"
+    (spec,) = load_config(tmp_path / "scene.yaml", solvers=["sparse"]).list_runs()
+    files = RunFiles.for_run(spec, tmp_path)
+    files.rows_path.parent.mkdir()
+    assert {row["status"] for row in execute_run(spec, files, lambda phase: None)} == {"ok"}
+    files.picture_path.parent.mkdir()
+    files.picture_path.touch()
+    assert files.recording_path.exists()
+    assert files.recording_path.name == f"{spec.build_file_stem(machine.describe_machine().machine_id)}.rrd"
 
     def broken(*_):
         raise ZeroDivisionError("nothing to divide by")
 
     monkeypatch.setattr(run, "measure", broken)
-    (row,) = execute(spec, files, lambda phase: None)
+    (row,) = execute_run(spec, files, lambda phase: None)
     assert row["status"] == "failed"
     assert "ZeroDivisionError: nothing to divide by (test_run.py:" in row["reason"]
-    assert not files.recording.exists()
-    assert not files.picture.exists()
-    assert files.rows.exists()
+    assert not files.recording_path.exists()
+    assert not files.picture_path.exists()
+    assert files.rows_path.exists()
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of NumPy, that something overflows: it is what is tested
@@ -48,10 +48,10 @@ def test_a_run_whose_residual_is_no_number_is_not_ok(tmp_path: Path, solver: str
         "mesh: {kind: chain}\nmass: 1\ntime_step: 0.1\nframes: 2\ndefault_size: 3\neffects: [{kind: gravity}, "
         f"{{kind: springs, stretch: {stretch}}}, {{kind: pins, at: [first]}}]\n"
     )
-    (spec,) = load_any(tmp_path / "scene.yaml", solvers=[solver]).runs()
-    files = Files.of(spec, tmp_path)
-    files.rows.parent.mkdir()
-    for row in execute(spec, files, lambda phase: None):
+    (spec,) = load_config(tmp_path / "scene.yaml", solvers=[solver]).list_runs()
+    files = RunFiles.for_run(spec, tmp_path)
+    files.rows_path.parent.mkdir()
+    for row in execute_run(spec, files, lambda phase: None):
         assert row["status"] != "ok" or all(math.isfinite(v) for v in row.values() if isinstance(v, float))
 
 
@@ -59,17 +59,17 @@ def test_a_run_whose_residual_is_no_number_is_not_ok(tmp_path: Path, solver: str
 @pytest.mark.parametrize("name", ["residual", "objective", "stationarity", "energy_springs"])
 def test_a_measured_column_that_is_no_number_fails_its_frame(name: str, value: float):
     columns = {1: {name: 0.0, "digest": "", "minimum": True}, 2: {name: value, "digest": "", "minimum": None}}
-    with pytest.raises(StepFailed) as caught:
-        require_numbers(columns, minimises=True, tolerance=True)
+    with pytest.raises(StepError) as caught:
+        require_finite(columns, is_minimiser=True, has_rtol=True)
     assert caught.value.frame == 2
-    assert run.failure(caught.value)["status"] == "diverged"
-    assert run.failure(caught.value)["reason"].startswith(f"{name} is {value}")
+    assert run.build_failure_columns(caught.value)["status"] == "diverged"
+    assert run.build_failure_columns(caught.value)["reason"].startswith(f"{name} is {value}")
 
 
 @pytest.mark.parametrize("tolerance", [False, True])
 def test_what_a_method_does_not_have_is_null_and_no_failure(tolerance: bool):
     columns = {1: {"residual": float("nan"), "yardstick": float("nan"), "objective": 1.0}}
-    require_numbers(columns, minimises=False, tolerance=tolerance)
+    require_finite(columns, is_minimiser=False, has_rtol=tolerance)
     assert columns == {1: {"residual": None, "yardstick": None, "objective": 1.0}}
 
 
@@ -79,10 +79,10 @@ def test_a_method_that_minimises_nothing_may_be_asked_for_a_tolerance(tmp_path: 
         "mesh: {kind: chain}\nmass: 1\ntime_step: 0.01\nframes: 2\ndefault_size: 3\neffects: [{kind: gravity}, "
         "{kind: springs, stretch: 100}, {kind: pins, at: [first]}]\n"
     )
-    (spec,) = load_any(tmp_path / "scene.yaml", solvers=[solver], tolerance=1e-6).runs()
-    files = Files.of(spec, tmp_path)
-    files.rows.parent.mkdir()
-    found = execute(spec, files, lambda phase: None)
+    (spec,) = load_config(tmp_path / "scene.yaml", solvers=[solver], tolerance=1e-6).list_runs()
+    files = RunFiles.for_run(spec, tmp_path)
+    files.rows_path.parent.mkdir()
+    found = execute_run(spec, files, lambda phase: None)
     assert {row["status"] for row in found} == {"ok"}, found[0]["reason"]
     assert all(row["residual"] is row["yardstick"] is None for row in found if row["phase"] == "step")
 
@@ -93,10 +93,10 @@ def test_a_scene_at_rest_is_recorded_with_no_iterations(tmp_path: Path, solver: 
         "mesh: {kind: chain}\nmass: 1\ntime_step: 0.1\nframes: 3\ndefault_size: 3\n"
         "effects: [{kind: springs, stretch: 10}]\n"
     )
-    (spec,) = load_any(tmp_path / "scene.yaml", solvers=[solver], tolerance=1e-6).runs()
-    files = Files.of(spec, tmp_path)
-    files.rows.parent.mkdir()
-    found = execute(spec, files, lambda phase: None)
+    (spec,) = load_config(tmp_path / "scene.yaml", solvers=[solver], tolerance=1e-6).list_runs()
+    files = RunFiles.for_run(spec, tmp_path)
+    files.rows_path.parent.mkdir()
+    found = execute_run(spec, files, lambda phase: None)
     assert {row["status"] for row in found} == {"ok"}, found[0]["reason"]
     assert [row["iterations"] for row in found if row["phase"] == "step" and row["round"] == 0] == [0, 0, 0]
-    assert summary(files.recording).complete
+    assert summarise_recording(files.recording_path).is_complete

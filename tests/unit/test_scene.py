@@ -9,100 +9,115 @@ import numpy as np
 import pytest
 
 from harness.base.errors import InputError
-from harness.scenes.bind import build
-from harness.scenes.effects.contact import Contact
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.surfaces import Skirt
+from harness.scenes.bind import build_scene
+from harness.scenes.effects.contact import ContactEffect
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.surfaces import SkirtMesh
 from harness.scenes.spec import SceneSpec
-from harness.simulation.observe import penetration
-from harness.simulation.opinion.second import second_opinion
-from tests.scenes import scene
+from harness.simulation.observe import compute_penetration
+from harness.simulation.opinion.second import verify_terms
+from tests.scenes import build_test_scene
 
 
 def test_the_total_mass_is_dealt_out_by_the_meshs_shares():
-    made = scene(Chain(), size=5, mass=8.0)
+    made = build_test_scene(ChainMesh(), size=5, mass=8.0)
     np.testing.assert_allclose(made.system.mass, [1, 2, 2, 2, 1], rtol=1e-15)
 
 
 def test_a_mesh_without_masses_needs_a_total_mass():
-    spec = SceneSpec(mesh=Chain(), time_step=0.1, frames=1, path=Path("scene.yaml"))
+    spec = SceneSpec(mesh=ChainMesh(), time_step=0.1, frames=1, path=Path("scene.yaml"))
     with pytest.raises(InputError, match="mass: is missing"):
-        build(spec, 3)
+        build_scene(spec, 3)
 
 
 def test_a_woven_cloth_of_a_mass_per_area_weighs_that_and_the_second_opinion_agrees():
-    woven = Springs.model_validate({"stretch": {"warp": 400, "weft": 200, "bias": 10, "direction": (0, 1, 0)}})
+    woven = SpringsEffect.model_validate({"stretch": {"warp": 400, "weft": 200, "bias": 10, "direction": (0, 1, 0)}})
     given: dict[str, Any] = {"mass_per_area": 0.2, "time_step": 0.1, "frames": 1, "effects": (woven,)}
     given["path"] = Path("scene.yaml")
-    spec = SceneSpec(mesh=Skirt(), **given)
-    made = build(spec, 8)
-    corners = made.mesh.rest[made.mesh.triangles]
+    spec = SceneSpec(mesh=SkirtMesh(), **given)
+    made = build_scene(spec, 8)
+    corners = made.mesh.rest_positions[made.mesh.triangles]
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
     assert made.system.mass.sum() == pytest.approx(0.2 * area, rel=1e-12)
-    assert second_opinion(spec, made, "implicit-euler") == "agrees"
-    for mesh, more, told in ((Chain(), {}, "needs a surface"), (Skirt(), {"mass": 1.0}, "is given beside `mass`")):
+    assert verify_terms(spec, made, "implicit-euler") == "agrees"
+    for mesh, more, told in (
+        (ChainMesh(), {}, "needs a surface"),
+        (SkirtMesh(), {"mass": 1.0}, "is given beside `mass`"),
+    ):
         with pytest.raises(InputError, match=told):
-            build(SceneSpec.model_validate({"mesh": mesh, **given, **more}), 8)
+            build_scene(SceneSpec.model_validate({"mesh": mesh, **given, **more}), 8)
 
 
 def test_pins_of_several_effects_are_joined_in_the_order_of_their_vertices():
-    made = scene(Chain(), Pins(indices=(4, 1), weight=10.0), Pins(indices=(2,), weight="exact"), size=5)
+    made = build_test_scene(
+        ChainMesh(), PinsEffect(indices=(4, 1), weight=10.0), PinsEffect(indices=(2,), weight="exact"), size=5
+    )
     pins = made.system.pins
     assert (pins.vertices.tolist(), pins.weight.tolist()) == ([1, 2, 4], [10.0, np.inf, 10.0])
-    np.testing.assert_array_equal(made.pin_targets, made.mesh.rest[[1, 2, 4]])
-    assert made.system.free.tolist() == [0, 1, 3, 4]
-    assert made.system.unpinned.tolist() == [True, False, False, True, False]
+    np.testing.assert_array_equal(made.pin_targets, made.mesh.rest_positions[[1, 2, 4]])
+    assert made.system.free_vertices.tolist() == [0, 1, 3, 4]
+    assert made.system.unpinned_mask.tolist() == [True, False, False, True, False]
 
 
 def test_a_vertex_may_be_pinned_twice_in_the_same_way():
-    made = scene(Chain(), Pins(at=("ends",)), Pins(indices=(0,)), size=4)
+    made = build_test_scene(ChainMesh(), PinsEffect(at=("ends",)), PinsEffect(indices=(0,)), size=4)
     assert made.system.pins.vertices.tolist() == [0, 3]
 
 
 def test_a_vertex_pinned_twice_with_different_weights_is_refused():
     with pytest.raises(InputError, match="vertex 0 is pinned twice"):
-        scene(Chain(), Pins(at=("ends",)), Pins(indices=(0,), weight="exact"), size=4)
+        build_test_scene(ChainMesh(), PinsEffect(at=("ends",)), PinsEffect(indices=(0,), weight="exact"), size=4)
 
 
 def test_springs_of_several_effects_are_all_the_springs():
-    made = scene(Chain(), Springs(stretch=1.0, rule="fixed"), Springs(stretch=2.0, rule="fixed"), size=3)
-    assert made.springs.stiffness.tolist() == [1.0, 1.0, 2.0, 2.0]
-    assert len(scene(Chain(), size=3).springs.edges) == 0
+    made = build_test_scene(
+        ChainMesh(), SpringsEffect(stretch=1.0, rule="fixed"), SpringsEffect(stretch=2.0, rule="fixed"), size=3
+    )
+    assert made.all_springs.stiffness.tolist() == [1.0, 1.0, 2.0, 2.0]
+    assert len(build_test_scene(ChainMesh(), size=3).all_springs.edges) == 0
 
 
 def test_gravity_twice_is_refused_with_both_places():
     with pytest.raises(InputError, match=r"effects\[2\]: gravity is there already, as effects\[0\]"):
-        scene(Chain(), Gravity(), Springs(stretch=1.0), Gravity(acceleration=(0.0, 0.0, -1.0)), size=4)
+        build_test_scene(
+            ChainMesh(),
+            GravityEffect(),
+            SpringsEffect(stretch=1.0),
+            GravityEffect(acceleration=(0.0, 0.0, -1.0)),
+            size=4,
+        )
 
 
 def test_a_gravity_of_zero_is_none():
-    scene(Chain(), Gravity(), Springs(stretch=1.0), Gravity(acceleration=(0.0, 0.0, 0.0)), size=4)
+    build_test_scene(
+        ChainMesh(), GravityEffect(), SpringsEffect(stretch=1.0), GravityEffect(acceleration=(0.0, 0.0, 0.0)), size=4
+    )
 
 
 @pytest.mark.parametrize(
     ("time_step", "effects", "said"),
     [
-        (60.0, [Springs(stretch=1.0)], "a time step of 60 s is long"),
-        (0.1, [Springs(stretch=1.0), Springs(stretch=1.0)], "effects[1] repeats effects[0] (springs)"),
-        (1.0, [Springs(stretch=1.0), Springs(stretch=2.0)], ""),
+        (60.0, [SpringsEffect(stretch=1.0)], "a time step of 60 s is long"),
+        (0.1, [SpringsEffect(stretch=1.0), SpringsEffect(stretch=1.0)], "effects[1] repeats effects[0] (springs)"),
+        (1.0, [SpringsEffect(stretch=1.0), SpringsEffect(stretch=2.0)], ""),
     ],
 )
 def test_what_is_allowed_and_seldom_meant_is_asked_about(
-    time_step: float, effects: list[Springs], said: str, caplog: pytest.LogCaptureFixture
+    time_step: float, effects: list[SpringsEffect], said: str, caplog: pytest.LogCaptureFixture
 ):
     with caplog.at_level("WARNING", logger="springbench"):
-        scene(Chain(), *effects, size=4, time_step=time_step)
+        build_test_scene(ChainMesh(), *effects, size=4, time_step=time_step)
     assert (said in caplog.text) if said else not caplog.records
 
 
 @pytest.mark.parametrize(("height", "deep"), [(0.5, 0.0), (-0.25, 0.25)])
 def test_penetration_is_the_depth_of_the_deepest_vertex_in_an_obstacle(height: float, deep: float):
-    floor = Contact.model_validate({"obstacles": [{"kind": "plane", "point": [0, -5, 0]}]})
-    made = scene(Chain(), Springs(stretch=1.0), floor, size=4)
-    p = made.mesh.rest.copy()
+    floor = ContactEffect.model_validate({"obstacles": [{"kind": "plane", "point": [0, -5, 0]}]})
+    made = build_test_scene(ChainMesh(), SpringsEffect(stretch=1.0), floor, size=4)
+    p = made.mesh.rest_positions.copy()
     p[2, 1] = -5.0 + height
-    assert penetration(made, p, 0.0) == pytest.approx(deep, abs=1e-12)
-    assert penetration(scene(Chain(), Springs(stretch=1.0), size=4), p, 0.0) is None
+    assert compute_penetration(made, p, 0.0) == pytest.approx(deep, abs=1e-12)
+    assert compute_penetration(build_test_scene(ChainMesh(), SpringsEffect(stretch=1.0), size=4), p, 0.0) is None

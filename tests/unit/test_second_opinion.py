@@ -14,42 +14,42 @@ import pytest
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from harness.base.model import Model
-from harness.config.load import load_any, load_scene
+from harness.base.model import ConfigModel
+from harness.config.load import load_config, load_scene
 from harness.experiments import run as runs
 from harness.experiments import standing
-from harness.report.robustness import DISPUTED, RIGHT, judged
+from harness.report.robustness import CORRECT, FORMULA_MISMATCH, classify_run
 from harness.scenes.bind import Scene
-from harness.scenes.effects.base import Contribution, Pin
+from harness.scenes.effects.base import EffectContribution, PinGroup
 from harness.scenes.mesh.base import Mesh
-from harness.simulation.opinion.second import second_opinion
+from harness.simulation.opinion.second import verify_terms
 from solvers.energies.bending import Bending
 from solvers.energies.quadratic import Quadratic
 from solvers.integrators import INTEGRATORS
 from solvers.problem import Energy, Positions
 from tests.lies import (
-    BALL,
-    BEND,
-    DASHPOTS,
-    DRAG,
-    FLOOR,
-    FORCES,
-    GAS,
-    GRAVITY,
-    GUSTS,
-    LIMITS,
-    METHODS,
-    PINS,
-    RAYLEIGH,
-    SKIP_ONE,
-    SLOWED,
-    SPRINGS,
-    TIED,
-    bound,
-    declared,
-    opinion,
-    patched,
-    scaled,
+    AIR_DRAG_SPEC,
+    ATTACHMENTS_SPEC,
+    BALLOON_SPEC,
+    BEND_SPRINGS_SPEC,
+    BENDING_SPEC,
+    DASHPOTS_SPEC,
+    DRAG_SPECS,
+    FLOOR_SPEC,
+    FORCE_SPECS,
+    GAS_SPEC,
+    GRAVITY_SPEC,
+    GUSTS_SPEC,
+    INTEGRATOR_NAMES,
+    PINS_SPEC,
+    RAYLEIGH_SPEC,
+    SPRINGS_SPEC,
+    STRAIN_LIMITS_SPEC,
+    build_scene_spec,
+    mutate_energy,
+    patch_attribute,
+    run_reference_check,
+    scale_fields,
 )
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -64,36 +64,59 @@ def test_both_opinions_agree_on_a_scene(name: str):
     spec = load_scene(SCENES[name])
     # A third of the size has the same formulas and takes a tenth of the time; the integrators take turns.
     size = SIZES.get(name) or max(getattr(spec.mesh, "SMALLEST", 2), (spec.default_size or 0) // 3)
-    assert opinion(spec, size, METHODS[list(SCENES).index(name) % 3]) == "agrees"
+    assert run_reference_check(spec, size, INTEGRATOR_NAMES[list(SCENES).index(name) % 3]) == "agrees"
 
 
 @pytest.mark.parametrize("name", HARD)
 def test_both_opinions_agree_on_a_hard_case(name: str):
     spec = load_scene(HARD[name])
-    assert opinion(spec, spec.default_size or 0) == "agrees"
+    assert run_reference_check(spec, spec.default_size or 0) == "agrees"
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("integrator", METHODS)
+@pytest.mark.parametrize("integrator", INTEGRATOR_NAMES)
 @pytest.mark.parametrize("name", [*SCENES, *HARD])
 def test_both_opinions_agree_with_every_integrator_at_full_size(name: str, integrator: str):
     spec = load_scene((SCENES | HARD)[name])
-    assert opinion(spec, spec.default_size or 0, integrator) == "agrees"
+    assert run_reference_check(spec, spec.default_size or 0, integrator) == "agrees"
 
 
-@pytest.mark.parametrize("integrator", [*METHODS, "sdirk-2"])
+@pytest.mark.parametrize("integrator", [*INTEGRATOR_NAMES, "sdirk-2"])
 def test_both_opinions_agree_where_all_effects_are(integrator: str):
-    every = [SKIP_ONE, PINS, TIED, LIMITS, GUSTS, BEND, DASHPOTS, RAYLEIGH, DRAG, FLOOR, *FORCES, *SLOWED]
-    assert opinion(declared(*every, velocity=(0.1, 0.2, 0.3)), 5, integrator) == "agrees"
-    gas = [SPRINGS, GAS, LIMITS, GUSTS, BEND, DASHPOTS, RAYLEIGH, DRAG, *FORCES]
-    assert opinion(declared(*gas, mesh=BALL), 2, integrator) == "agrees"
+    every = [
+        BEND_SPRINGS_SPEC,
+        PINS_SPEC,
+        ATTACHMENTS_SPEC,
+        STRAIN_LIMITS_SPEC,
+        GUSTS_SPEC,
+        BENDING_SPEC,
+        DASHPOTS_SPEC,
+        RAYLEIGH_SPEC,
+        AIR_DRAG_SPEC,
+        FLOOR_SPEC,
+        *FORCE_SPECS,
+        *DRAG_SPECS,
+    ]
+    assert run_reference_check(build_scene_spec(*every, velocity=(0.1, 0.2, 0.3)), 5, integrator) == "agrees"
+    gas = [
+        SPRINGS_SPEC,
+        GAS_SPEC,
+        STRAIN_LIMITS_SPEC,
+        GUSTS_SPEC,
+        BENDING_SPEC,
+        DASHPOTS_SPEC,
+        RAYLEIGH_SPEC,
+        AIR_DRAG_SPEC,
+        *FORCE_SPECS,
+    ]
+    assert run_reference_check(build_scene_spec(*gas, mesh=BALLOON_SPEC), 2, integrator) == "agrees"
 
 
 def test_steps_of_two_lengths_are_compared(monkeypatch: pytest.MonkeyPatch):
-    spec = declared(SPRINGS, PINS, DASHPOTS, FLOOR, *SLOWED, alternate_time_step=1 / 50)
-    assert opinion(spec, 5) == "agrees"
-    patched(Scene, "time", lambda true: lambda self, index: index * self.system.time_step)(monkeypatch)
-    assert "times" in opinion(spec, 5)
+    spec = build_scene_spec(SPRINGS_SPEC, PINS_SPEC, DASHPOTS_SPEC, FLOOR_SPEC, *DRAG_SPECS, alternate_time_step=1 / 50)
+    assert run_reference_check(spec, 5) == "agrees"
+    patch_attribute(Scene, "time", lambda true: lambda self, index: index * self.system.time_step)(monkeypatch)
+    assert "times" in run_reference_check(spec, 5)
 
 
 class Well(Quadratic):
@@ -123,7 +146,7 @@ class Cast(Cone):
         return self.weight * float(np.sqrt((p**2).sum(axis=1)).sum())
 
 
-class Outside(Model):
+class Outside(ConfigModel):
     """An effect that nobody but its author knows."""
 
     kind: Literal["magnet"] = "magnet"
@@ -131,18 +154,18 @@ class Outside(Model):
     """The gradient in parts of what it should be, times 3."""
     shape: Literal["well", "cone", "cast"] = "well"
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         n = len(mass)
         well = Well(csr_array(np.eye(n)), np.full(n, 3.0), np.zeros((n, 3)))
         if self.told != 3.0:
             true = well.add_gradient
             object.__setattr__(well, "add_gradient", lambda p, out: scaled_sum(true, p, out, self.told / 3.0))
         energy: Energy = well if self.shape == "well" else (Cone if self.shape == "cone" else Cast)(3.0, self.told)
-        return Contribution(
+        return EffectContribution(
             energies=(energy,),
             forces=(lambda p, v, t: 0.1 * np.sin(p) - v + t,),
-            filters=(lambda v: 0.99 * v,),
-            pins=(Pin(np.array([0]), mesh.rest[:1], 1e5),),
+            velocity_filters=(lambda v: 0.99 * v,),
+            pins=(PinGroup(np.array([0]), mesh.rest_positions[:1], 1e5),),
         )
 
 
@@ -152,12 +175,15 @@ def scaled_sum(true: Callable[[Positions, Positions], None], p: Positions, out: 
     out += by * added
 
 
-STAGED = [name for name in INTEGRATORS if name not in METHODS]
+STAGED = [name for name in INTEGRATORS if name not in INTEGRATOR_NAMES]
 
 
 @pytest.mark.parametrize("integrator", STAGED)
 def test_both_opinions_agree_with_every_integrator_of_several_unknowns(integrator: str):
-    assert opinion(declared(SPRINGS, PINS, GUSTS, *SLOWED), 3, integrator) == "agrees"
+    assert (
+        run_reference_check(build_scene_spec(SPRINGS_SPEC, PINS_SPEC, GUSTS_SPEC, *DRAG_SPECS), 3, integrator)
+        == "agrees"
+    )
 
 
 @pytest.mark.parametrize("integrator", [name for name in STAGED if hasattr(INTEGRATORS[name], "a")])
@@ -166,17 +192,17 @@ def test_a_weight_that_is_wrong_by_a_millionth_is_told(integrator: str, monkeypa
     rows = [list(row) for row in method.a]
     rows[-1][0] += 1e-6
     monkeypatch.setitem(INTEGRATORS, integrator, replace(method, a=tuple(map(tuple, rows))))
-    assert "target" in opinion(declared(SPRINGS), 3, integrator)
+    assert "target" in run_reference_check(build_scene_spec(SPRINGS_SPEC), 3, integrator)
 
 
-@pytest.mark.parametrize("integrator", METHODS)
+@pytest.mark.parametrize("integrator", INTEGRATOR_NAMES)
 @pytest.mark.parametrize("shape", ["well", "cone", "cast"])
 def test_an_effect_from_outside_is_held_against_its_own_value(shape: Any, integrator: str):
-    spec = declared(SPRINGS, GRAVITY, FLOOR)
+    spec = build_scene_spec(SPRINGS_SPEC, GRAVITY_SPEC, FLOOR_SPEC)
     known = spec.effects
 
     def asked(outside: Outside) -> str:
-        return opinion(spec.model_copy(update={"effects": (*known, outside)}), 4, integrator)
+        return run_reference_check(spec.model_copy(update={"effects": (*known, outside)}), 4, integrator)
 
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
@@ -191,15 +217,15 @@ def test_an_effect_that_takes_a_known_name_is_from_outside():
     class Springs(Outside):
         kind: Literal["springs"] = "springs"  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    spec = declared(GRAVITY)
+    spec = build_scene_spec(GRAVITY_SPEC)
     spec = spec.model_copy(update={"effects": (*spec.effects, Springs())})
-    assert opinion(spec, 4) == "single opinion: effects[1] springs"
+    assert run_reference_check(spec, 4) == "single opinion: effects[1] springs"
 
 
 def test_damping_of_what_comes_from_outside_has_no_second_opinion():
-    spec = declared(SPRINGS, RAYLEIGH)
+    spec = build_scene_spec(SPRINGS_SPEC, RAYLEIGH_SPEC)
     spec = spec.model_copy(update={"effects": (*spec.effects, Outside())})
-    assert opinion(spec, 4) == "single opinion: effects[1] rayleigh, effects[2] magnet"
+    assert run_reference_check(spec, 4) == "single opinion: effects[1] rayleigh, effects[2] magnet"
 
 
 SCENE = """mesh: {kind: grid}
@@ -214,42 +240,42 @@ effects: [{kind: gravity}, {kind: springs, stretch: 100}, {kind: bending, stiffn
 def test_a_run_that_is_disputed_is_not_right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "scene.yaml").write_text(SCENE)
     asked = {"tolerance": 1e-6, "rounds": 1, "judge": True, "record": False, "iterations": 200}
-    newton, sparse = load_any(tmp_path / "scene.yaml", solvers=["newton", "sparse"], **asked).runs()
+    newton, sparse = load_config(tmp_path / "scene.yaml", solvers=["newton", "sparse"], **asked).list_runs()
     times: list[str] = []
 
     def counted(*given: Any) -> str:
-        times.append(second_opinion(*given))
+        times.append(verify_terms(*given))
         return times[-1]
 
     monkeypatch.setattr(standing, "second_opinion", counted)
 
     def rows_of(run: Any) -> list[dict[str, Any]]:
-        files = runs.Files.of(run, tmp_path)
-        files.rows.parent.mkdir(exist_ok=True)
-        done = runs.execute(run, files, lambda phase: None)
+        files = runs.RunFiles.for_run(run, tmp_path)
+        files.rows_path.parent.mkdir(exist_ok=True)
+        done = runs.execute_run(run, files, lambda phase: None)
         named = {"distance": None, "stationarity": None, "frame": None, "reason": None, "minimum": None}
         return [named | row for row in done if row["phase"] == "step"]
 
-    standing.opinion.cache_clear()
+    standing.verify_formulas.cache_clear()
     for run in (newton, sparse):
         done = rows_of(run)
         assert {(row["status"], row["second_opinion"]) for row in done} == {("ok", "agrees")}
-    assert judged(rows_of(newton))[0] is RIGHT
+    assert classify_run(rows_of(newton))[0] is CORRECT
     assert times == ["agrees"]  # once for the scene
-    bound(Bending, scaled(weight=2.0))(monkeypatch)
-    standing.opinion.cache_clear()
+    mutate_energy(Bending, scale_fields(weight=2.0))(monkeypatch)
+    standing.verify_formulas.cache_clear()
     done = rows_of(newton)
     assert {row["status"] for row in done} == {"disputed"}
-    outcome, _, _, reason = judged(done)
-    assert outcome is DISPUTED
+    outcome, _, _, reason = classify_run(done)
+    assert outcome is FORMULA_MISMATCH
     assert reason.startswith("the second opinion disagrees: effects[2] bending")
-    standing.opinion.cache_clear()
+    standing.verify_formulas.cache_clear()
 
 
 def test_a_run_that_is_not_judged_asks_for_no_second_opinion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "scene.yaml").write_text(SCENE)
     monkeypatch.setattr(standing, "second_opinion", lambda *given: pytest.fail("was asked"))
-    (run,) = load_any(tmp_path / "scene.yaml", solvers=["sparse"], rounds=1, record=False).runs()
-    files = runs.Files.of(run, tmp_path)
-    files.rows.parent.mkdir()
-    assert {row["status"] for row in runs.execute(run, files, lambda phase: None)} == {"ok"}
+    (run,) = load_config(tmp_path / "scene.yaml", solvers=["sparse"], rounds=1, record=False).list_runs()
+    files = runs.RunFiles.for_run(run, tmp_path)
+    files.rows_path.parent.mkdir()
+    assert {row["status"] for row in runs.execute_run(run, files, lambda phase: None)} == {"ok"}

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from harness.config.load import load_scene
-from harness.scenes.bind import Scene, build
-from harness.simulation.step import prepare, simulate
-from solvers.contact.settling import Settling
+from harness.scenes.bind import Scene, build_scene
+from harness.simulation.step import prepare, simulate_scene
+from solvers.contact.settling import FrictionGaussSeidel
 from solvers.core.descent import PreparedDescent
-from solvers.core.fixed_objective import Objective
+from solvers.core.fixed_objective import FixedObjective
 from solvers.core.objective import StepObjective
-from solvers.methods.newton import Newton
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import Solution, StepProblem, StopRule
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
@@ -25,39 +25,39 @@ FRAMES = 40
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return build(load_scene(SCENES / "net-catches-ball.yaml"), 9)
+    return build_scene(load_scene(SCENES / "net-catches-ball.yaml"), 9)
 
 
 @pytest.fixture(scope="module")
 def solved(scene) -> list[tuple[StepProblem, Solution]]:
-    prepared = prepare(scene, Newton())
-    run = simulate(scene, prepared, STOP, first_guess="current", frames=FRAMES)
+    prepared = prepare(scene, NewtonSolver())
+    run = simulate_scene(scene, prepared, STOP, initial_guess="current", frames=FRAMES)
     return [(step.problem, prepared.solve(step.problem, STOP)) for step in run]
 
 
 def test_it_finds_the_minima_of_newtons_method_alone_in_less_than_half_of_the_iterations(scene, solved):
-    alone = Newton().prepare(scene.system)
+    alone = NewtonSolver().prepare(scene.system)
     assert isinstance(alone, PreparedDescent)
     alone.method._settling = None  # pyright: ignore[reportAttributeAccessIssue]
     iterations = 0
     for problem, solution in solved[20:]:
         wanted = alone.solve(problem, STOP)
         np.testing.assert_allclose(solution.positions, wanted.positions, rtol=0, atol=1e-6)
-        iterations += wanted.iterations
+        iterations += wanted.num_iterations
     assert 2 * sum(solution.iterations for _, solution in solved[20:]) < iterations
 
 
 def test_settling_lowers_the_objective_and_leaves_a_minimum_where_it_is(scene, solved):
-    prepared, objective = Newton().prepare(scene.system), Objective(scene.system)
-    settling, noise = Settling(prepared.metric), np.random.default_rng(0)
+    prepared, objective = NewtonSolver().prepare(scene.system), FixedObjective(scene.system)
+    settling, noise = FrictionGaussSeidel(prepared.metric), np.random.default_rng(0)
     lowered = 0
     for problem, solution in solved[20:]:
         step, p = StepObjective(objective, problem), solution.positions
         np.testing.assert_allclose(
-            settling.settled(step, p), p, rtol=0, atol=1e-7
+            settling.relax_friction(step, p), p, rtol=0, atol=1e-7
         )  # ten times what a tolerance of 1e-9 leaves to go
-        away = step.placed(p + 1e-3 * noise.normal(size=p.shape))
-        settled = settling.settled(step, away)
+        away = step.apply_exact_pins(p + 1e-3 * noise.normal(size=p.shape))
+        settled = settling.relax_friction(step, away)
         lowered += settled is not away
         assert problem.value(settled) <= problem.value(away)
     assert lowered == len(solved[20:])

@@ -15,9 +15,9 @@ import pytest
 from harness.base import rows, shelf, union
 from harness.base.errors import InputError
 from harness.experiments.archive import compact as module
-from harness.experiments.archive.compact import compact
-from harness.report.query import answer
-from tests.dummies import dummy_rows, write_dummies
+from harness.experiments.archive.compact import compact_results
+from harness.report.query import run_query
+from tests.dummies import build_dummy_rows, write_dummy_runs
 
 COUNT = 12
 
@@ -25,7 +25,7 @@ COUNT = 12
 @pytest.fixture
 def sweep(tmp_path: Path) -> Path:
     """A sweep of so many runs: of two schemas, one with a column of somebody's own."""
-    units = write_dummies(tmp_path / "sweep", COUNT)
+    units = write_dummy_runs(tmp_path / "sweep", COUNT)
     older = pq.read_table(units[3]).drop_columns(["graded", "second_opinion"])
     pq.write_table(older, units[3])
     pq.write_table(pq.read_table(units[5]).append_column("colour", pa.array(["red", "blue"])), units[5])
@@ -38,49 +38,49 @@ def told(table: pa.Table) -> list[str]:
 
 
 def one_by_one(units: list[Path]) -> pa.Table:
-    return pa.concat_tables([rows.read([unit]) for unit in units], promote_options="default")
+    return pa.concat_tables([rows.read_rows([unit]) for unit in units], promote_options="default")
 
 
 def test_many_units_are_read_as_one_by_one_in_the_order_asked_for(sweep: Path):
-    units = shelf.units(sweep / "rows")
+    units = shelf.list_units(sweep / "rows")
     for asked in (units, units[::-1]):
-        assert told(rows.read(asked)) == told(one_by_one(asked))
-        assert rows.read(asked).schema.equals(one_by_one(asked).schema)
-    heads = rows.heads(units, ["status", "digest"], needed=("run_id",))
-    assert heads == {u: {"status": "ok", "digest": rows.read([u])["digest"][0].as_py()} for u in units}
+        assert told(rows.read_rows(asked)) == told(one_by_one(asked))
+        assert rows.read_rows(asked).schema.equals(one_by_one(asked).schema)
+    heads = rows.read_first_rows(units, ["status", "digest"], required_columns=("run_id",))
+    assert heads == {u: {"status": "ok", "digest": rows.read_rows([u])["digest"][0].as_py()} for u in units}
 
 
 def test_all_damaged_units_of_many_are_named(sweep: Path):
-    units = shelf.units(sweep / "rows")
+    units = shelf.list_units(sweep / "rows")
     os.truncate(units[1], 1000)
-    rows.write(units[4], [])
+    rows.write_rows(units[4], [])
     pq.write_table(pa.table({"status": ["ok"], "seconds": ["soon"]}), units[7])
     with pytest.raises(InputError) as caught:
-        rows.read(units, needed=("status",))
+        rows.read_rows(units, required_columns=("status",))
     assert [mistake.file for mistake in caught.value.mistakes] == [units[k] for k in (1, 4, 7)]
-    heads = rows.heads(units, ["status"], needed=("status",))
+    heads = rows.read_first_rows(units, ["status"], required_columns=("status",))
     assert [u for u, head in heads.items() if isinstance(head, str)] == [units[k] for k in (1, 4, 7)]
     with pytest.raises(InputError, match=units[1].name):
-        answer("SELECT count(*) FROM rows", sweep.parent)
+        run_query("SELECT count(*) FROM rows", sweep.parent)
 
 
 QUERY = "SELECT * FROM rows ORDER BY run_id, frame"
 
 
 def test_packed_rows_are_the_same_to_all_who_read(sweep: Path):
-    units = shelf.units(sweep / "rows")
-    before, asked = told(rows.read(units)), repr(answer(QUERY, sweep.parent).values)
-    heads = rows.heads(units, ["code"])
-    assert compact(sweep.parent, lambda line: None) == COUNT
+    units = shelf.list_units(sweep / "rows")
+    before, asked = told(rows.read_rows(units)), repr(run_query(QUERY, sweep.parent).values)
+    heads = rows.read_first_rows(units, ["code"])
+    assert compact_results(sweep.parent, lambda line: None) == COUNT
     assert list((sweep / "rows").iterdir()) == []
-    assert shelf.units(sweep / "rows") == units
-    assert told(rows.read(units)) == before
-    assert repr(answer(QUERY, sweep.parent).values) == asked
-    assert rows.heads(units, ["code"]) == heads
-    first = rows.first(units[2])
+    assert shelf.list_units(sweep / "rows") == units
+    assert told(rows.read_rows(units)) == before
+    assert repr(run_query(QUERY, sweep.parent).values) == asked
+    assert rows.read_first_rows(units, ["code"]) == heads
+    first = rows.read_first_row(units[2])
     assert isinstance(first, dict)
     assert first["run_id"] == units[2].stem[-12:]
-    turned = answer("PIVOT rows ON solver USING count(*) GROUP BY status", sweep.parent)
+    turned = run_query("PIVOT rows ON solver USING count(*) GROUP BY status", sweep.parent)
     assert turned.columns == ["status", "hybrid", "lbfgs", "numba", "sparse", "xpbd"]
 
 
@@ -95,20 +95,20 @@ SHORT = ("run_id", "size", "solver", "scene", "status")
 def test_no_name_of_a_folder_sets_a_column_or_leads_to_other_files(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    write_dummies(tmp_path / "abc" / "sweep", 1, first=99)  # what patterns match
+    write_dummy_runs(tmp_path / "abc" / "sweep", 1, first_number=99)  # what patterns match
     monkeypatch.chdir(tmp_path)
     results = Path(place)
-    units = write_dummies(results / "sweep", 9, frames=1)
-    short = [tuple(dummy_rows(int(unit.stem[-12:], 16))[0][name] for name in SHORT) for unit in units]
+    units = write_dummy_runs(results / "sweep", 9, frames=1)
+    short = [tuple(build_dummy_rows(int(unit.stem[-12:], 16))[0][name] for name in SHORT) for unit in units]
 
     def check() -> None:
-        assert list(zip(*(rows.read(units)[name].to_pylist() for name in SHORT), strict=True)) == short
-        heads: Any = rows.heads(units, SHORT)
+        assert list(zip(*(rows.read_rows(units)[name].to_pylist() for name in SHORT), strict=True)) == short
+        heads: Any = rows.read_first_rows(units, SHORT)
         assert [tuple(heads[unit][name] for name in SHORT) for unit in units] == short
-        assert answer(f"SELECT {', '.join(SHORT)} FROM rows ORDER BY ALL", results).values == sorted(short)
+        assert run_query(f"SELECT {', '.join(SHORT)} FROM rows ORDER BY ALL", results).values == sorted(short)
 
     check()
-    assert compact(results, lambda line: None) == len(units)
+    assert compact_results(results, lambda line: None) == len(units)
     assert list((results / "sweep" / "rows").iterdir()) == []
     check()
 
@@ -118,7 +118,7 @@ def test_nothing_is_removed_where_the_packed_rows_differ_from_the_originals(
 ):
     before = {path: path.read_bytes() for path in sweep.rglob("*.parquet")}
 
-    right = union.table
+    right = union.read_table
 
     def wrong(*arguments: Any, **named: Any) -> Any:
         table, number = right(*arguments, **named)
@@ -127,48 +127,48 @@ def test_nothing_is_removed_where_the_packed_rows_differ_from_the_originals(
     monkeypatch.setattr(union, "table", wrong)
     monkeypatch.setattr(rows, "_FEW", 0)
     with pytest.raises(InputError, match="nothing was removed"):
-        compact(sweep, lambda line: None)
+        compact_results(sweep, lambda line: None)
     assert {path: path.read_bytes() for path in sweep.rglob("*.parquet")} == before
 
 
 def test_columns_that_duckdb_cannot_tell_apart_are_read_by_their_exact_names(tmp_path: Path):
-    units = write_dummies(tmp_path / "sweep", 9, frames=1)
+    units = write_dummy_runs(tmp_path / "sweep", 9, frames=1)
     for name in ("SIZE", "file_index"):
         for number, unit in enumerate(units):
             pq.write_table(pq.read_table(unit).append_column(name, pa.array([number])), unit)
-        read = rows.read(units)
+        read = rows.read_rows(units)
         assert (read[name].to_pylist(), read["size"].to_pylist()) == (list(range(9)), [8 + k for k in range(9)])
 
 
 def test_a_run_that_is_done_again_takes_the_place_of_its_packed_rows_and_packing_goes_on(sweep: Path):
-    compact(sweep, lambda line: None)
-    unit = shelf.units(sweep / "rows")[0]
+    compact_results(sweep, lambda line: None)
+    unit = shelf.list_units(sweep / "rows")[0]
     number = int(unit.stem[-12:], 16)
-    rows.write(unit, [row | {"status": "failed"} for row in dummy_rows(number)])
-    write_dummies(sweep, 1, first=COUNT)
+    rows.write_rows(unit, [row | {"status": "failed"} for row in build_dummy_rows(number)])
+    write_dummy_runs(sweep, 1, first_number=COUNT)
     for _ in range(2):
-        found = answer("SELECT status, count(*) FROM rows GROUP BY ALL ORDER BY ALL", sweep.parent)
+        found = run_query("SELECT status, count(*) FROM rows GROUP BY ALL ORDER BY ALL", sweep.parent)
         assert found.values == [("failed", 2), ("ok", 2 * COUNT)]
-        compact(sweep, lambda line: None)
+        compact_results(sweep, lambda line: None)
     assert list((sweep / "rows").iterdir()) == []
 
 
 def test_damaged_and_recent_units_are_left_as_they_are(sweep: Path):
-    units = shelf.units(sweep / "rows")
+    units = shelf.list_units(sweep / "rows")
     os.truncate(units[1], 1000)
     said: list[str] = []
-    assert compact(sweep, said.append, days=1.0) == 0
-    assert compact(sweep, said.append) == COUNT - 1
+    assert compact_results(sweep, said.append, min_age_days=1.0) == 0
+    assert compact_results(sweep, said.append) == COUNT - 1
     assert any("1 damaged file left" in line for line in said)
     assert [path.name for path in (sweep / "rows").iterdir()] == [units[1].name]
     with pytest.raises(InputError, match=units[1].name):
-        rows.read(shelf.units(sweep / "rows"))
+        rows.read_rows(shelf.list_units(sweep / "rows"))
 
 
 def test_a_packed_file_that_is_damaged_is_named(sweep: Path):
-    compact(sweep, lambda line: None)
-    os.truncate(shelf.packed_file(sweep / "rows"), 1000)
-    for look in (lambda: shelf.units(sweep / "rows"), lambda: answer("SELECT 1", sweep.parent)):
+    compact_results(sweep, lambda line: None)
+    os.truncate(shelf.packed_path(sweep / "rows"), 1000)
+    for look in (lambda: shelf.list_units(sweep / "rows"), lambda: run_query("SELECT 1", sweep.parent)):
         with pytest.raises(InputError, match=r"rows\.parquet"):
             look()
 
@@ -189,30 +189,30 @@ def killed_at(call: int, sweep: Path) -> None:
 
     os.replace, Path.unlink, os.fsync = deadly(os.replace), deadly(Path.unlink), deadly(os.fsync)  # type: ignore[assignment]
     pq.ParquetWriter.write_table = deadly(pq.ParquetWriter.write_table)  # type: ignore[method-assign]
-    module._BATCH = 2
-    compact(sweep, lambda line: None)
+    module._BATCH_SIZE = 2
+    compact_results(sweep, lambda line: None)
 
 
 def test_packing_that_is_killed_at_any_moment_loses_and_doubles_nothing_and_goes_on(sweep: Path, tmp_path: Path):
-    units = shelf.units(sweep / "rows")
+    units = shelf.list_units(sweep / "rows")
     for unit in (*units[:2], *units[6:]):  # four are left, of three schemas
         unit.unlink()
-    before, moments = told(rows.read(units[2:6])), 0
+    before, moments = told(rows.read_rows(units[2:6])), 0
     while True:
         copy = tmp_path / str(moments) / "sweep"
         shutil.copytree(sweep, copy)
         process = get_context("fork").Process(target=killed_at, args=(moments, copy))
         process.start()
         process.join()
-        left = shelf.units(copy / "rows")
+        left = shelf.list_units(copy / "rows")
         assert [unit.name for unit in left] == [unit.name for unit in units[2:6]]
-        assert told(rows.read(left)) == before
+        assert told(rows.read_rows(left)) == before
         if process.exitcode == 0:  # it had done all before
             break
         assert process.exitcode == -signal.SIGKILL
-        compact(copy, lambda line: None)
+        compact_results(copy, lambda line: None)
         assert {path.name for path in copy.iterdir()} == {"rows", "rows.parquet", ".lock"}
         assert list((copy / "rows").iterdir()) == []
-        assert told(rows.read(left)) == before
+        assert told(rows.read_rows(left)) == before
         moments += 1
     assert moments == 2 + 3 + 1 + 4, "two batches, to sync, rename and sync, the partial file, and each unit"

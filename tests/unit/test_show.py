@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from harness.cli import app
 from harness.report import opengl
-from harness.report.style import numbered
+from harness.report.style import indexed_style
 
 SCENE = """
 mesh: {kind: grid, plane: vertical}
@@ -27,7 +27,7 @@ effects:
 """
 
 
-@pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
+@pytest.mark.skipif(opengl.find_opengl_problem() is not None, reason=opengl.find_opengl_problem() or "")
 def test_what_is_chosen_is_said_and_drawn(tmp_path: Path):
     (tmp_path / "cloth.yaml").write_text(SCENE)
     picture = tmp_path / "cloth.png"
@@ -38,10 +38,10 @@ def test_what_is_chosen_is_said_and_drawn(tmp_path: Path):
     assert "effects[2] sewing: second: 3 vertices (at (right), every 2): 4, 14, 24" in lines
     assert "boundary loops (loops): 0: 4 m" in lines
     with Image.open(picture) as drawn:
-        pixels = np.asarray(drawn.convert("RGB"), np.float64) / 255
+        pixels = np.asarray(drawn.convert_node("RGB"), np.float64) / 255
     hue = pixels - pixels.mean(axis=2, keepdims=True)
     for k in range(3):  # lit from one side, so lighter and darker: by its hue
-        colour = np.array(to_rgb(numbered(k).color))
+        colour = np.array(to_rgb(indexed_style(k).color))
         wanted = colour - colour.mean()
         alike = (hue @ wanted) / np.maximum(np.linalg.norm(hue, axis=2) * np.linalg.norm(wanted), 1e-9)
         assert int(((alike > 0.98) & (np.linalg.norm(hue, axis=2) > 0.3)).sum()) > 100

@@ -14,17 +14,17 @@ import pyarrow.parquet as pq
 import pytest
 
 from harness.base import rows
-from harness.base.columns import SCHEMA
+from harness.base.columns import RUN_SCHEMA
 from harness.base.errors import InputError
-from harness.report.site import build, keep, update
-from harness.report.site.failures import Failed, causes
-from harness.report.site.folders import folder_of
-from harness.report.site.overview import _pictures
-from harness.report.site.runs import table_of
-from harness.report.site.script import column
-from harness.report.site.sentences import sentences
+from harness.report.site import build, refresh_results_page, update_page
+from harness.report.site.failures import FailedRun, group_failures
+from harness.report.site.folders import locate_folder
+from harness.report.site.overview import _select_pictures
+from harness.report.site.runs import build_run_table
+from harness.report.site.script import encode_column
+from harness.report.site.sentences import describe_runs
 from tests import accuracy_rows, figure_results, gate_results, site_results
-from tests.site_results import fails, run
+from tests.site_results import build_run_columns, is_failing_run
 
 COUNT = 40
 
@@ -32,11 +32,15 @@ COUNT = 40
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("results")
-    made = site_results.write(folder, COUNT)
-    site_results.picture(made / "pictures" / f"{run(0)['file']}.png")
-    small = accuracy_rows.problem("net", 6, "early") + list(accuracy_rows.curve("net", 6, "early", "numba"))
-    accuracy_rows.write(folder / "study", [*small, accuracy_rows.failure("net", 6, "early", "dense", "failed", "why")])
-    update(folder)
+    made = site_results.write_site_results(folder, COUNT)
+    site_results.write_foreign_picture(made / "pictures" / f"{build_run_columns(0)['file']}.png")
+    small = accuracy_rows.build_snapshot_rows("net", 6, "early") + list(
+        accuracy_rows.build_curve_rows("net", 6, "early", "numba")
+    )
+    accuracy_rows.write_accuracy_rows(
+        folder / "study", [*small, accuracy_rows.build_failure_row("net", 6, "early", "dense", "failed", "why")]
+    )
+    update_page(folder)
     return folder
 
 
@@ -49,8 +53,8 @@ def read(results: Path, name: str) -> Any:
 
 def test_the_overview_shows_times_beside_what_was_simulated(tmp_path: Path):
     for name in ("timing", "net-9-numba-0123456789ab", "net-9-solvers", "net-5-solvers", "net-3-solvers"):
-        site_results.picture(tmp_path / "made" / "pictures" / f"{name}.png")
-    shown = _pictures(folder_of(tmp_path / "made", tmp_path))
+        site_results.write_foreign_picture(tmp_path / "made" / "pictures" / f"{name}.png")
+    shown = _select_pictures(locate_folder(tmp_path / "made", tmp_path))
     assert [one["words"] for one in shown] == ["net 9 solvers", "net 5 solvers", "timing"]
 
 
@@ -62,11 +66,13 @@ def cells(table: dict[str, Any], name: str) -> list[Any]:
 def test_every_run_is_a_line_of_the_table(results: Path):
     table = read(results, "made/runs")
     assert table["n"] == COUNT
-    assert sorted(cells(table, "run_id")) == [run(k)["run_id"] for k in range(COUNT)]
-    first = cells(table, "run_id").index(run(0)["run_id"])
+    assert sorted(cells(table, "run_id")) == [build_run_columns(k)["run_id"] for k in range(COUNT)]
+    first = cells(table, "run_id").index(build_run_columns(0)["run_id"])
     # Steps of 1 and 1.1 times 3.2 ms, and 2 % more a frame: the median of frames 3 and 4.
     assert cells(table, "step")[first] == pytest.approx(3.2 * (1.05 + 0.07), rel=1e-3)
-    assert cells(table, "residual")[first] == pytest.approx(1e-3 / site_results.FRAMES, rel=1e-4), "of the last frame"
+    assert cells(table, "residual")[first] == pytest.approx(1e-3 / site_results.FRAME_COUNT, rel=1e-4), (
+        "of the last frame"
+    )
     assert cells(table, "largest_strain")[first] == pytest.approx(0.3)
     assert cells(table, "picture")[first] == 1
     assert sum(cells(table, "picture")) == 1
@@ -76,25 +82,28 @@ def test_every_run_is_a_line_of_the_table(results: Path):
 def test_rows_of_other_code_are_marked(results: Path):
     table = read(results, "made/runs")
     marked = dict(zip(cells(table, "run_id"), cells(table, "by"), strict=True))
-    assert [name for name, how in marked.items() if how == "other code"] == [run(1)["run_id"]]
+    assert [name for name, how in marked.items() if how == "other code"] == [build_run_columns(1)["run_id"]]
 
 
 def test_one_cause_is_told_once_with_the_number_of_its_runs(results: Path):
     index = read(results, "index")
     made = next(sweep for sweep in index["sweeps"] if sweep["name"] == "made")
     (cause,) = made["failures"]
-    assert cause["count"] == sum(fails(k) for k in range(COUNT)) == 2
+    assert cause["count"] == sum(is_failing_run(k) for k in range(COUNT)) == 2
     assert cause["varied"], "their reasons differ in a number"
-    assert site_results.REASON in cause["reason"]
+    assert site_results.UNSUPPORTED_REASON in cause["reason"]
     assert made["statuses"] == {"ok": COUNT - 2, "unsupported": 2}
     study = next(sweep for sweep in index["sweeps"] if sweep["name"] == "study")
     assert [(cause["status"], cause["reason"]) for cause in study["failures"]] == [("failed", "why")]
 
 
 def test_causes_differ_in_more_than_numbers_and_names():
-    failed = [Failed(f"net {k}", "one", "failed", f"one: net {k} needs {k}.5 GiB") for k in (4, 8)]
-    failed += [Failed("net 4", "two", "failed", "two: net 4 needs 4.5 GiB"), Failed("net 4", "one", "diverged", "x")]
-    assert [(cause["status"], cause["count"]) for cause in causes(failed)] == [("failed", 3), ("diverged", 1)]
+    failed = [FailedRun(f"net {k}", "one", "failed", f"one: net {k} needs {k}.5 GiB") for k in (4, 8)]
+    failed += [
+        FailedRun("net 4", "two", "failed", "two: net 4 needs 4.5 GiB"),
+        FailedRun("net 4", "one", "diverged", "x"),
+    ]
+    assert [(cause["status"], cause["count"]) for cause in group_failures(failed)] == [("failed", 3), ("diverged", 1)]
 
 
 def test_all_that_is_shown_says_by_which_code_and_where(results: Path):
@@ -107,17 +116,17 @@ def test_all_that_is_shown_says_by_which_code_and_where(results: Path):
 
 
 def test_the_fastest_is_told_among_those_that_are_equally_accurate():
-    told = site_results.rows(0)
+    told = site_results.build_run_rows(0)
     made = []
     for name, ms, residual in (("slow", 4.0, 1e-6), ("fair", 2.0, 5e-6), ("hasty", 1.0, 1e-2), ("blind", 0.5, None)):
         own = {"run_id": name, "parameters": json.dumps({"kind": name})}
         made += [row | own | {"seconds": 1e-3 * ms, "residual": residual} for row in told if row["phase"] == "step"]
-    columns = {field.name: [row.get(field.name) for row in made] for field in SCHEMA}
-    rows_of = pa.table(columns, schema=SCHEMA).append_column("file", [[row["file"] for row in made]])
-    found = table_of(folder_of(Path("made"), Path()), rows_of)
+    columns = {field.name: [row.get(field.name) for row in made] for field in RUN_SCHEMA}
+    rows_of = pa.table(columns, schema=RUN_SCHEMA).append_column("file", [[row["file"] for row in made]])
+    found = build_run_table(locate_folder(Path("made"), Path()), rows_of)
     for one in found:
         one["label"] = one["run_id"]
-    fastest, others, limit = sentences(found)
+    fastest, others, limit = describe_runs(found)
     assert fastest["words"].startswith("hanging-cloth 8: fastest at equal accuracy is fair, 2 ms a step; slow 2 times")
     assert fastest["runs"][:2] == ["fair", "slow"]
     words = "not compared with it: hasty (its error is 10 000 times as large), blind (its error is unknown)."
@@ -126,11 +135,11 @@ def test_the_fastest_is_told_among_those_that_are_equally_accurate():
 
 
 def test_a_run_s_frames_are_a_script_of_their_own(results: Path):
-    frames = read(results, f"made/runs/{run(0)['run_id']}")
-    assert frames["frame"] == list(range(1, site_results.FRAMES + 1))
+    frames = read(results, f"made/runs/{build_run_columns(0)['run_id']}")
+    assert frames["frame"] == list(range(1, site_results.FRAME_COUNT + 1))
     assert frames["least"][0] == pytest.approx(3.2 * 1.02, rel=1e-5)
     assert frames["ms"][0] == pytest.approx(3.2 * 1.07, rel=1e-5), "the median of both rounds"
-    assert frames["distance"] == [None] * site_results.FRAMES, "what is not in the rows is missing"
+    assert frames["distance"] == [None] * site_results.FRAME_COUNT, "what is not in the rows is missing"
 
 
 def test_the_table_comes_as_parquet_too(results: Path):
@@ -148,11 +157,11 @@ def test_accuracy_s_charts_are_there_with_the_solvers_marks(results: Path):
 
 
 def test_stored_gates_are_a_chart_with_their_changes(tmp_path: Path):
-    gates = {"solve": gate_results.series(2, 12, (6, 1.2)), "step": gate_results.series(3, 12)}
-    there = gate_results.write(tmp_path / "bench" / "Linux-CPython-3.11-64bit", gates)
+    gates = {"solve": gate_results.build_ratio_series(2, 12, (6, 1.2)), "step": gate_results.build_ratio_series(3, 12)}
+    there = gate_results.write_benchmark_files(tmp_path / "bench" / "Linux-CPython-3.11-64bit", gates)
     (there / "0099_damaged.json").write_text("{")
     told: list[str] = []
-    update(tmp_path, say=told.append)
+    update_page(tmp_path, print_message=told.append)
     assert len(told) == 1
     assert "0099_damaged.json" in told[0]
     chart = read(tmp_path, "bench/gates")
@@ -167,15 +176,15 @@ def test_stored_gates_are_a_chart_with_their_changes(tmp_path: Path):
 
 
 def test_points_of_other_code_than_the_newest_are_told_in_every_chart(tmp_path: Path):
-    rows = accuracy_rows.problem("net", 6, "early") + accuracy_rows.problem("net", 12, "early")
+    rows = accuracy_rows.build_snapshot_rows("net", 6, "early") + accuracy_rows.build_snapshot_rows("net", 12, "early")
     for solver, code, day in (("numba", "new", "2"), ("newton", "old", "1")):
         known: dict[str, Any] = {"code": code, "started": f"2026-11-0{day}T10:00:00+00:00"}
         for size in (6, 12):
-            rows += accuracy_rows.curve("net", size, "early", solver, **known)
-        rows += [row | known for row in accuracy_rows.work("net", 6, (solver,))]
-    accuracy_rows.write(tmp_path / "study", rows)
-    figure_results.speed(tmp_path / "speed")
-    update(tmp_path)
+            rows += accuracy_rows.build_curve_rows("net", size, "early", solver, **known)
+        rows += [row | known for row in accuracy_rows.build_work_rows("net", 6, (solver,))]
+    accuracy_rows.write_accuracy_rows(tmp_path / "study", rows)
+    figure_results.write_speed_results(tmp_path / "speed")
+    update_page(tmp_path)
     for name in ("study/convergence", "study/times", "study/work", "study/growth"):
         told = {item["label"] for item in read(tmp_path, name)["items"] if np.any(item["older"])}
         assert told == {"newton"}, name
@@ -187,40 +196,40 @@ def test_points_of_other_code_than_the_newest_are_told_in_every_chart(tmp_path: 
 
 def test_only_what_is_new_is_written_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for name in ("one", "other"):
-        site_results.write(tmp_path, 3, name)
-    update(tmp_path)
+        site_results.write_site_results(tmp_path, 3, name)
+    update_page(tmp_path)
     seen: list[str] = []
-    told = build.overview
+    told = build.build_overview
     monkeypatch.setattr(build, "overview", lambda folder, *a, **k: (seen.append(folder.name), told(folder, *a, **k))[1])
-    update(tmp_path)
+    update_page(tmp_path)
     assert not seen
-    frames = tmp_path / "site" / "data" / "one" / "runs" / f"{run(0)['run_id']}.js"
+    frames = tmp_path / "site" / "data" / "one" / "runs" / f"{build_run_columns(0)['run_id']}.js"
     os.utime(frames, (0, 0))  # older than its rows
     packed = tmp_path / "one" / "rows.parquet"
     later = packed.stat().st_mtime_ns + 10**9
     os.utime(packed, ns=(later, later))
-    update(tmp_path, only=[tmp_path / "one"])
+    update_page(tmp_path, changed_folders=[tmp_path / "one"])
     assert seen == ["one"]
     assert frames.stat().st_mtime > 1
     (tmp_path / "other" / "rows.parquet").rename(tmp_path / "gone")
-    update(tmp_path)
+    update_page(tmp_path)
     assert [sweep["name"] for sweep in read(tmp_path, "index")["sweeps"]] == ["one"], "what went is not shown"
 
 
 @pytest.mark.long
 def test_a_new_run_comes_to_the_page_of_a_thousand_within_its_time(tmp_path: Path):
     goal, room = 0.3, 2.0  # seconds of a processor; where others compute too caches are theirs as well
-    made = site_results.write(tmp_path, 1000)
-    update(tmp_path)
+    made = site_results.write_site_results(tmp_path, 1000)
+    update_page(tmp_path)
     took: list[float] = []
     for number in range(1000, 1003):
-        unit = made / "rows" / f"{run(number)['file']}.parquet"
+        unit = made / "rows" / f"{build_run_columns(number)['file']}.parquet"
         unit.parent.mkdir(exist_ok=True)
-        found = site_results.rows(number)
-        columns = {field.name: [row.get(field.name) for row in found] for field in SCHEMA}
-        pq.write_table(pa.table(columns, schema=SCHEMA), unit)
+        found = site_results.build_run_rows(number)
+        columns = {field.name: [row.get(field.name) for row in found] for field in RUN_SCHEMA}
+        pq.write_table(pa.table(columns, schema=RUN_SCHEMA), unit)
         before = time.process_time()
-        keep(tmp_path, made, print, quiet=True)
+        refresh_results_page(tmp_path, made, print, is_quiet=True)
         took.append(time.process_time() - before)
         assert read(tmp_path, "made/runs")["n"] == number + 1
     assert min(took) < room * goal
@@ -228,16 +237,16 @@ def test_a_new_run_comes_to_the_page_of_a_thousand_within_its_time(tmp_path: Pat
 
 def test_sweeps_that_were_never_taken_in_are_named(tmp_path: Path):
     for name in ("one", "other"):
-        site_results.write(tmp_path, 3, name)
-    update(tmp_path, only=[tmp_path / "one"])
+        site_results.write_site_results(tmp_path, 3, name)
+    update_page(tmp_path, changed_folders=[tmp_path / "one"])
     index = read(tmp_path, "index")
     assert [sweep["name"] for sweep in index["sweeps"]] == ["one"]
     assert index["absent"] == ["other"]
 
 
 def test_one_sweep_s_folder_has_a_page_of_its_own(tmp_path: Path):
-    folder = site_results.write(tmp_path, 3)
-    assert update(folder) == folder / "index.html"
+    folder = site_results.write_site_results(tmp_path, 3)
+    assert update_page(folder) == folder / "index.html"
     (sweep,) = read(folder, "index")["sweeps"]
     assert (sweep["slug"], sweep["up"], sweep["name"]) == ("this", "./", "made")
 
@@ -246,37 +255,37 @@ def test_damaged_rows_keep_no_run_from_ending(tmp_path: Path):
     (tmp_path / "sweep" / "rows").mkdir(parents=True)
     (tmp_path / "sweep" / "rows" / "x.parquet").write_text("no rows")
     said: list[str] = []
-    keep(tmp_path, tmp_path / "sweep", said.append)
+    refresh_results_page(tmp_path, tmp_path / "sweep", said.append)
     assert "stays as it was" in said[0]
     assert "x.parquet" in said[0]
     with pytest.raises(InputError, match=r"x\.parquet"):
-        update(tmp_path)
+        update_page(tmp_path)
 
 
 def test_a_folder_without_rows_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match="holds no rows"):
-        update(tmp_path)
+        update_page(tmp_path)
     with pytest.raises(InputError, match="is no folder"):
-        update(tmp_path / "none")
+        update_page(tmp_path / "none")
 
 
 def test_words_are_kept_once():
-    assert column(["b", "a", "b", None]) == {"of": ["b", "a"], "at": [0, 1, 0, -1]}
-    assert column([1.23456789, None, float("nan"), 2]) == [1.2346, None, None, 2]
+    assert encode_column(["b", "a", "b", None]) == {"of": ["b", "a"], "at": [0, 1, 0, -1]}
+    assert encode_column([1.23456789, None, float("nan"), 2]) == [1.2346, None, None, 2]
 
 
 def test_a_run_alone_is_on_the_page(tmp_path: Path):
-    same = {key: value for key, value in site_results.rows(12)[0].items() if key != "file"}
+    same = {key: value for key, value in site_results.build_run_rows(12)[0].items() if key != "file"}
     (tmp_path / "sweep" / "rows").mkdir(parents=True)
-    rows.write(tmp_path / "sweep" / "rows" / "a-failed-run.parquet", [same])
-    update(tmp_path)
+    rows.write_rows(tmp_path / "sweep" / "rows" / "a-failed-run.parquet", [same])
+    update_page(tmp_path)
     assert cells(read(tmp_path, "sweep/runs"), "status") == ["unsupported"]
 
 
 def test_figures_of_what_blew_up_are_shown_as_large_as_a_page_can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    normal = site_results.rows
+    normal = site_results.build_run_rows
     monkeypatch.setattr(site_results, "rows", lambda k: [row | {"largest_strain": 5.2e39} for row in normal(k)])
-    site_results.write(tmp_path, 1)
-    update(tmp_path)
-    found = read(tmp_path, f"made/runs/{run(0)['run_id']}")
+    site_results.write_site_results(tmp_path, 1)
+    update_page(tmp_path)
+    found = read(tmp_path, f"made/runs/{build_run_columns(0)['run_id']}")
     assert found["strain"] == pytest.approx([3e38] * len(found["frame"]))

@@ -16,8 +16,8 @@ import pytest
 
 from harness.record.reader import read_replay
 from harness.report.site import viewer
-from tests.browser import chromium
-from tests.recordings import record
+from tests.browser import launch_chromium
+from tests.recordings import write_recording
 
 REPLAY = Path(viewer.__file__).parent / "static" / "replay.js"
 PAGE = (
@@ -28,16 +28,16 @@ PAGE = (
 
 def test_the_viewer_is_the_one_that_the_page_was_written_for():
     words = "open recordings in it (pytest -m long tests/unit/test_site_viewer.py), then raise VERSION"
-    assert version("rerun-sdk") == viewer.VERSION, words
+    assert version("rerun-sdk") == viewer.RERUN_VERSION, words
 
 
 def test_a_script_holds_its_recording_and_is_written_once(tmp_path: Path):
-    recording = record(tmp_path / "a.rrd", count=3)
+    recording = write_recording(tmp_path / "a.rrd", frame_count=3)
     script = viewer.write_recording(recording, tmp_path / "site" / "a.js", 'cloth "6"')
     name, value = script.read_text().removesuffix(";\n").split(" = ", 1)
     told = json.loads(value)
     assert (name, told["title"]) == ("springbench.taken", 'cloth "6"')
-    assert gzip.decompress(b64decode(told["rrd"])) == viewer.layout_first(recording.read_bytes())
+    assert gzip.decompress(b64decode(told["rrd"])) == viewer.move_layout_first(recording.read_bytes())
     made = script.stat().st_mtime_ns
     viewer.write_recording(recording, script, "other")
     assert script.stat().st_mtime_ns == made
@@ -58,14 +58,14 @@ def messages(data: bytes) -> list[bytes]:
 
 
 def test_a_script_has_the_layout_first_all_that_was_recorded_and_no_index(tmp_path: Path):
-    whole = record(tmp_path / "a.rrd", count=12).read_bytes()
+    whole = write_recording(tmp_path / "a.rrd", frame_count=12).read_bytes()
     *parts, index = messages(whole)
-    turned = messages(viewer.layout_first(whole))
+    turned = messages(viewer.move_layout_first(whole))
     assert sorted(turned) == sorted(parts)
     assert index[0] == 0
     complete = next(k for k, message in enumerate(turned) if message[0] == 3)
     assert all(b"scene/mesh" not in message[:600] for message in turned[:complete])
-    (tmp_path / "b.rrd").write_bytes(viewer.layout_first(whole))
+    (tmp_path / "b.rrd").write_bytes(viewer.move_layout_first(whole))
     a, b = (read_replay(tmp_path / name) for name in ("a.rrd", "b.rrd"))
     np.testing.assert_array_equal(a.positions, b.positions)
 
@@ -74,7 +74,7 @@ def site(folder: Path) -> Path:
     """A page that can replay, without the viewer."""
     (folder / "site").mkdir()
     shutil.copy(REPLAY, folder / "site")
-    viewer.write_recording(record(folder / "a.rrd"), folder / "site" / "a.js", "cloth 6")
+    viewer.write_recording(write_recording(folder / "a.rrd"), folder / "site" / "a.js", "cloth 6")
     (folder / "index.html").write_text(PAGE)
     return folder / "index.html"
 
@@ -101,7 +101,7 @@ def test_the_viewer_is_given_a_theme_that_it_knows_and_hidden_until_a_recording_
 def test_a_page_replays_recordings_from_the_file_system_and_says_what_it_lacks(tmp_path: Path):
     page = site(tmp_path)
     ask = "([script, file]) => springbench.replay('id', script, {file})"
-    with chromium() as browser:
+    with launch_chromium() as browser:
         tab, said, asked = browser.new_page(viewport={"width": 1280, "height": 800}), [], []
         tab.on("console", lambda message: said.append(message.text))
         tab.on("request", lambda request: asked.append(request.url))

@@ -9,24 +9,24 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from harness.base.columns import SCHEMA
-from harness.config.load import load_any
+from harness.base.columns import RUN_SCHEMA
+from harness.config.load import load_config
 from harness.experiments import run as runs
-from harness.experiments.plan import Files
-from harness.experiments.run import execute
-from harness.report.learned import SOLVED, sentences
-from harness.report.timing_table import runs as runs_of
-from tests.own_solvers import OPTIONS, Own, own
+from harness.experiments.plan import RunFiles
+from harness.experiments.run import execute_run
+from harness.report.learned import SOLVED_RESIDUAL, summarise_sweep
+from harness.report.timing_table import read_run_times as runs_of
+from tests.own_solvers import SWEEP_OPTIONS, PluginSweep, write_plugin_solver
 
 
-def rows_of(made: Own, folder: Path) -> list[dict[str, Any]]:
+def rows_of(made: PluginSweep, folder: Path) -> list[dict[str, Any]]:
     (folder / "rows").mkdir()
-    spec = made.run()
-    return execute(spec, Files.of(spec, folder), lambda phase: None)
+    spec = made.plugin_run()
+    return execute_run(spec, RunFiles.for_run(spec, folder), lambda phase: None)
 
 
 def test_a_sound_solver_is_ok_and_graded_by_the_oracle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    found = rows_of(own(tmp_path, monkeypatch), tmp_path)
+    found = rows_of(write_plugin_solver(tmp_path, monkeypatch), tmp_path)
     assert {row["status"] for row in found} == {"ok"}
     graded = {row["frame"]: row["graded"] for row in found if row["phase"] == "step"}
     assert all(0.0 < graded[frame] < 1.0 for frame in (1, 2, 3))  # it descends in five iterations
@@ -35,7 +35,7 @@ def test_a_sound_solver_is_ok_and_graded_by_the_oracle(tmp_path: Path, monkeypat
 def test_a_run_is_judged_whose_solver_says_no_more_than_the_readme_asks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    found = rows_of(own(tmp_path, monkeypatch, options=OPTIONS + ", judge: true"), tmp_path)
+    found = rows_of(write_plugin_solver(tmp_path, monkeypatch, options=SWEEP_OPTIONS + ", judge: true"), tmp_path)
     steps = [row for row in found if row["phase"] == "step"]
     assert len(steps) == 3
     for row in steps:
@@ -92,30 +92,32 @@ WRONG = {
 def test_what_a_solver_does_wrong_while_it_solves_is_told(
     wrong: Wrong, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    made = own(tmp_path, monkeypatch, solving=wrong.does)
+    made = write_plugin_solver(tmp_path, monkeypatch, solve_code=wrong.does)
     (row,) = rows_of(made, tmp_path)
     assert row["status"] == ("diverged" if "not finite" in wrong.said else "failed")
     assert row["frame"] == 1
     assert wrong.said in row["reason"]
     if wrong.line:
-        assert made.line(wrong.line) in row["reason"]
+        assert made.source_line(wrong.line) in row["reason"]
 
 
 def test_what_a_solver_writes_to_while_it_prepares_itself_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     does = "system.mass.flags.writeable = True; system.mass[:] *= 2"
-    made = own(tmp_path, monkeypatch, preparing=does)
+    made = write_plugin_solver(tmp_path, monkeypatch, prepare_code=does)
     (row,) = rows_of(made, tmp_path)
     assert row["status"] == "failed"
     assert "wrote to system.mass" in row["reason"]
-    assert made.line("def prepare") in row["reason"]
+    assert made.source_line("def prepare") in row["reason"]
 
 
 def test_a_solver_that_cannot_write_is_blamed_at_the_line_where_it_tried(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    made = own(tmp_path, monkeypatch, preparing="system.mass.flags.writeable = False; system.mass[:] = 2")
+    made = write_plugin_solver(
+        tmp_path, monkeypatch, prepare_code="system.mass.flags.writeable = False; system.mass[:] = 2"
+    )
     (row,) = rows_of(made, tmp_path)
-    assert f"({made.line('system.mass')})" in row["reason"]
+    assert f"({made.source_line('system.mass')})" in row["reason"]
 
 
 def test_checks_take_no_timed_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -127,11 +129,11 @@ def test_checks_take_no_timed_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         seen.append(type(measured.prepared).__module__)
         return measured
 
-    sound = runs.measure
+    sound = runs.measure_run
     monkeypatch.setattr(runs, "measure", spied)
-    made = own(tmp_path, monkeypatch)
+    made = write_plugin_solver(tmp_path, monkeypatch)
     rows_of(made, tmp_path)
-    assert seen == [made.solver.stem]
+    assert seen == [made.solver_path.stem]
 
 
 TURNING = """
@@ -155,11 +157,11 @@ def test_of_a_solver_that_does_not_minimise_is_said_what_it_leaves_of_a_step(tmp
     (tmp_path / "rows").mkdir()
     asked: dict[str, Any] = {"solvers": ["xpbd", "newton"], "rounds": 1, "record": False, "iterations": 2000}
     found = list[dict[str, Any]]()
-    for spec in load_any(tmp_path / "scene.yaml", **asked).runs():
-        found += execute(spec, Files.of(spec, tmp_path), lambda phase: None)
+    for spec in load_config(tmp_path / "scene.yaml", **asked).list_runs():
+        found += execute_run(spec, RunFiles.for_run(spec, tmp_path), lambda phase: None)
     left = {row["solver"]: row["graded"] for row in found if row["phase"] == "step" and row["frame"] == 3}
-    assert left["newton"] < 1e-6 < SOLVED < left["xpbd"]
+    assert left["newton"] < 1e-6 < SOLVED_RESIDUAL < left["xpbd"]
     assert all(row.get("residual") is None for row in found if row["solver"] == "xpbd")
-    said = " ".join(sentences(runs_of(pa.Table.from_pylist(found, SCHEMA))))
+    said = " ".join(summarise_sweep(runs_of(pa.Table.from_pylist(found, RUN_SCHEMA))))
     assert "xpbd on scene does not converge to the minimum of a step's objective" in said
     assert "newton on scene does not" not in said

@@ -14,11 +14,11 @@ import pytest
 
 from harness.api import Simulation
 from harness.base.errors import InputError
-from harness.config.load import Sweep, load_any, load_scene, load_sweep
-from harness.config.options import DEFAULT_SOLVER, DEFAULT_STOP
-from harness.config.schema import schema
+from harness.config.load import SweepPlan, load_config, load_scene, load_sweep
+from harness.config.options import DEFAULT_SOLVER, DEFAULT_STOP_RULE
+from harness.config.schema import build_json_schema
 from harness.config.sweep import RunSpec
-from harness.scenes.bind import build
+from harness.scenes.bind import build_scene
 
 ROOT = Path(__file__).resolve().parents[2]
 ASSIGNMENT = ROOT.parent / "shared" / "scenes"
@@ -51,7 +51,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def sweep_of(folder: Path, text: str) -> Sweep:
+def sweep_of(folder: Path, text: str) -> SweepPlan:
     (folder / "sweep.yaml").write_text(text)
     return load_sweep(folder / "sweep.yaml")
 
@@ -67,7 +67,7 @@ GRID = [
 
 
 def test_a_sweep_is_every_combination_in_the_order_of_its_lists(folder: Path) -> None:
-    assert points(sweep_of(folder, SWEEP).runs()) == GRID
+    assert points(sweep_of(folder, SWEEP).list_runs()) == GRID
 
 
 KEPT = {
@@ -83,7 +83,7 @@ KEPT = {
 
 @pytest.mark.parametrize("entry", KEPT)
 def test_a_grid_point_that_matches_all_keys_of_an_exclude_is_left_out(folder: Path, entry: str) -> None:
-    runs = sweep_of(folder, f"{SWEEP}exclude: [{entry}]\n").runs()
+    runs = sweep_of(folder, f"{SWEEP}exclude: [{entry}]\n").list_runs()
     assert points(runs) == [point for point in GRID if KEPT[entry](*point)]
 
 
@@ -100,16 +100,16 @@ ADDED = {
 
 @pytest.mark.parametrize("entry", ADDED)
 def test_an_include_adds_its_runs_and_no_run_twice(folder: Path, entry: str) -> None:
-    assert points(sweep_of(folder, f"{SWEEP}include: [{entry}]\n").runs()) == GRID + ADDED[entry]
+    assert points(sweep_of(folder, f"{SWEEP}include: [{entry}]\n").list_runs()) == GRID + ADDED[entry]
 
 
 def test_an_include_survives_the_excludes(folder: Path) -> None:
     text = f"{SWEEP}exclude: [{{scene: cloth}}]\ninclude: [{{scene: cloth, size: 4, solver: dense}}]\n"
-    assert points(sweep_of(folder, text).runs()) == [*GRID[8:], ("cloth", 4, "dense", 10)]
+    assert points(sweep_of(folder, text).list_runs()) == [*GRID[8:], ("cloth", 4, "dense", 10)]
 
 
 def test_what_a_sweep_leaves_out_comes_from_the_scene_or_the_defaults(folder: Path) -> None:
-    (run,) = load_any(folder / "cloth.yaml", sizes=[4]).runs()
+    (run,) = load_config(folder / "cloth.yaml", sizes=[4]).list_runs()
     assert (run.sweep, run.scene_name, run.size) == ("cloth", "cloth", 4)
     assert (run.first_guess, run.threads) == ("current", "auto")
     assert (run.frames, run.rounds, run.convergence_frames, run.strain_range) == (5, 2, None, None)
@@ -124,8 +124,11 @@ def stop(run: RunSpec) -> tuple[str, int, Any]:
 
 def test_one_scene_is_solved_to_a_tolerance_by_the_recommended_solver_as_in_python(folder: Path) -> None:
     scene = folder / "cloth.yaml"
-    (run,), (other,) = load_any(scene, sizes=[4]).runs(), load_any(scene, sizes=[4], solvers=["sparse"]).runs()
-    assert stop(run) == (DEFAULT_SOLVER, *DEFAULT_STOP.values()) == ("hybrid", 500, 1e-4)
+    (run,), (other,) = (
+        load_config(scene, sizes=[4]).list_runs(),
+        load_config(scene, sizes=[4], solvers=["sparse"]).list_runs(),
+    )
+    assert stop(run) == (DEFAULT_SOLVER, *DEFAULT_STOP_RULE.values()) == ("hybrid", 500, 1e-4)
     assert stop(other) == ("sparse", 500, 1e-4)
     usual = signature(Simulation).parameters
     assert stop(run) == tuple(usual[name].default for name in ("solver", "iterations", "tolerance"))
@@ -133,12 +136,12 @@ def test_one_scene_is_solved_to_a_tolerance_by_the_recommended_solver_as_in_pyth
 
 @pytest.mark.parametrize("options", [{"iterations": 7}, {"tolerance": None}, {"tolerance": 1e-3}, {"accuracy": 1e-2}])
 def test_what_is_stated_of_how_steps_end_means_what_it_means_in_a_sweep(folder: Path, options: dict[str, Any]) -> None:
-    (run,) = load_any(folder / "cloth.yaml", sizes=[4], **options).runs()
+    (run,) = load_config(folder / "cloth.yaml", sizes=[4], **options).list_runs()
     assert stop(run) == ("hybrid", options.get("iterations", 50), options.get("tolerance"))
 
 
 def test_options_of_the_command_line_make_the_grid_of_a_lone_scene(folder: Path) -> None:
-    runs = load_any(folder / "cloth.yaml", solvers=["dense", "sparse"], sizes=[4, 6], frames=2).runs()
+    runs = load_config(folder / "cloth.yaml", solvers=["dense", "sparse"], sizes=[4, 6], frames=2).list_runs()
     assert [(run.size, run.solver.name, run.frames) for run in runs] == [
         (4, "dense", 2),
         (4, "sparse", 2),
@@ -150,8 +153,8 @@ def test_options_of_the_command_line_make_the_grid_of_a_lone_scene(folder: Path)
 def identified(folder: Path, text: str = "", machine: str = "machine", **options: Any) -> str:
     if text:
         (folder / "cloth.yaml").write_text(text)
-    (run,) = load_any(folder / "cloth.yaml", sizes=[4], **options).runs()
-    return run.run_id(machine)
+    (run,) = load_config(folder / "cloth.yaml", sizes=[4], **options).list_runs()
+    return run.compute_run_id(machine)
 
 
 CHANGES = {
@@ -198,41 +201,41 @@ def test_what_means_the_same_keeps_the_run_id(folder: Path, change: str) -> None
 
 
 def test_the_names_of_the_sweep_and_of_the_mesh_file_are_no_part_of_the_run_id(folder: Path) -> None:
-    (run,) = load_any(folder / "file.yaml").runs()
+    (run,) = load_config(folder / "file.yaml").list_runs()
     (folder / "mesh.obj").rename(folder / "renamed.obj")
     (folder / "file.yaml").write_text(FILE.replace("mesh.obj", "renamed.obj"))
-    (again,) = load_any(folder / "file.yaml").runs()
-    assert again.but(sweep="other").run_id("m") == run.run_id("m")
+    (again,) = load_config(folder / "file.yaml").list_runs()
+    assert again.replace_options(sweep="other").compute_run_id("m") == run.compute_run_id("m")
 
 
 def test_the_content_of_the_mesh_file_is_part_of_the_run_id(folder: Path) -> None:
-    (run,) = load_any(folder / "file.yaml").runs()
+    (run,) = load_config(folder / "file.yaml").list_runs()
     (folder / "mesh.obj").write_text(OBJ.replace("v 1 0 0", "v 1.0000001 0 0"))
-    (again,) = load_any(folder / "file.yaml").runs()
-    assert again.run_id("m") != run.run_id("m")
+    (again,) = load_config(folder / "file.yaml").list_runs()
+    assert again.compute_run_id("m") != run.compute_run_id("m")
 
 
 def test_a_label_names_the_run_and_fits_a_file_name(folder: Path) -> None:
-    (run,) = load_any(folder / "cloth.yaml", sizes=[4]).runs()
-    assert run.label("m") == f"cloth-4-hybrid-{run.run_id('m')}"
-    assert len(run.run_id("m")) == 12
-    assert set(run.run_id("m")) <= set("0123456789abcdef")
+    (run,) = load_config(folder / "cloth.yaml", sizes=[4]).list_runs()
+    assert run.build_file_stem("m") == f"cloth-4-hybrid-{run.compute_run_id('m')}"
+    assert len(run.compute_run_id("m")) == 12
+    assert set(run.compute_run_id("m")) <= set("0123456789abcdef")
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_every_shipped_config_asks_for_runs_and_names_its_schema(path: Path) -> None:
-    assert load_any(path).runs()
+    assert load_config(path).list_runs()
     relative = "schema.json" if path.parent.name == "configs" else "../schema.json"
     assert path.read_text().splitlines()[0] == f"# yaml-language-server: $schema={relative}"
 
 
 def test_the_committed_schema_is_the_models() -> None:
     committed = json.loads((ROOT / "configs" / "schema.json").read_text())
-    assert committed == schema(), "write it anew: springbench schema > configs/schema.json"
+    assert committed == build_json_schema(), "write it anew: springbench schema > configs/schema.json"
 
 
 def test_the_schema_describes_every_key_of_a_scene_and_a_sweep() -> None:
-    definitions = schema()["$defs"]
+    definitions = build_json_schema()["$defs"]
     for name in ("Scene", "Sweep", "Options", "Include", "Exclude", "Accuracy", "CurveStudy", "WorkStudy"):
         assert all(key.get("description") for key in definitions[name]["properties"].values()), name
 
@@ -268,17 +271,17 @@ FACTS = {
 def test_an_assignment_file_is_the_scene_with_its_conventions(name: str) -> None:
     vertices, springs, stiffness, pins, mass = FACTS[name]
     spec = load_scene(ASSIGNMENT / f"{name}.json")
-    scene = build(spec, 0)
-    assert (len(scene.mesh.rest), len(scene.springs.edges)) == (vertices, springs)
-    assert set(scene.springs.stiffness) == {stiffness}
+    scene = build_scene(spec, 0)
+    assert (len(scene.mesh.rest_positions), len(scene.all_springs.edges)) == (vertices, springs)
+    assert set(scene.all_springs.stiffness) == {stiffness}
     assert len(scene.system.pins.vertices) == pins
     assert set(scene.system.pins.weight) == {1e10}
     # the table gives the flag's mass to two digits; the others are whole
     assert scene.system.mass.sum() == pytest.approx(mass, rel=0.05 if name == "flag" else 1e-12)
-    assert np.array_equal(scene.load, np.tile([0.0, -9.8, 0.0], (vertices, 1)))
-    assert scene.forces == ()
+    assert np.array_equal(scene.constant_force, np.tile([0.0, -9.8, 0.0], (vertices, 1)))
+    assert scene.varying_forces == ()
     assert (spec.time_step, spec.frames, spec.first_guess) == (1 / 30, 30, "assignment")
-    (run,) = load_any(ASSIGNMENT / f"{name}.json").runs()
+    (run,) = load_config(ASSIGNMENT / f"{name}.json").list_runs()
     assert (run.first_guess, stop(run), run.size) == ("assignment", ("numba", 50, None), 0)
 
 

@@ -13,22 +13,28 @@ import pytest
 
 from harness.base import machine
 from harness.base.errors import InputError, RunFailed
-from harness.base.holding import alone
-from harness.config.load import load_any, load_sweep
+from harness.base.holding import lock_folder_exclusive
+from harness.config.load import load_config, load_sweep
 from harness.config.sweep import RunSpec, SolverSpec
 from harness.experiments.speed import candidates, limits, round_robin
-from harness.experiments.speed.candidates import Reading, average
-from harness.experiments.speed.comparison import run_speed
-from harness.experiments.speed.rest import apart, rest_of
-from harness.experiments.speed.round_robin import PREPARES, Past, measure, name, predicted
-from harness.report.speed.counts import count
-from harness.report.speed.figures import figures
-from harness.report.speed.speed_table import remarks, speed_table
+from harness.experiments.speed.candidates import CandidateTiming, compute_call_seconds
+from harness.experiments.speed.comparison import run_roofline
+from harness.experiments.speed.rest import compute_precision_error, find_converged_problem
+from harness.experiments.speed.round_robin import (
+    NUM_PREPARATIONS,
+    PastTiming,
+    format_candidate_name,
+    measure_round_robin,
+    predict_seconds,
+)
+from harness.report.speed.counts import count_operations
+from harness.report.speed.figures import compute_speed_figures
+from harness.report.speed.speed_table import build_speed_table, describe_speed
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Unsupported
-from tests.displays import Quiet
-from tests.scenes import cloth, first_problem
-from tests.undisturbed import undisturbed
+from tests.displays import SilentDisplay
+from tests.scenes import build_cloth, build_first_problem
+from tests.undisturbed import retry_if_preempted
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = ROOT / "configs" / "scenes" / "yardstick-cloth.yaml"
@@ -38,8 +44,8 @@ ROUNDS = 3
 
 def run(solver: str, **parameters: Any) -> RunSpec:
     """A run of the yardstick cloth under another solver's name."""
-    (made,) = load_any(SCENE, solvers=["sparse"], sizes=[4], rounds=ROUNDS, threads=1, iterations=50).runs()
-    return made.but(solver=SolverSpec(solver, parameters))
+    (made,) = load_config(SCENE, solvers=["sparse"], sizes=[4], rounds=ROUNDS, threads=1, iterations=50).list_runs()
+    return made.replace_options(solver=SolverSpec(solver, parameters))
 
 
 class Scripted:
@@ -55,9 +61,9 @@ class Scripted:
             raise self.fails
         return 0.5
 
-    def turn(self) -> list[Reading]:
+    def time_phases(self) -> list[CandidateTiming]:
         self.calls.append(self.run.solver.name)
-        return [Reading("step", 0.25, {"iterations": 50})]
+        return [CandidateTiming("step", 0.25, {"iterations": 50})]
 
     def close(self):
         # The second coordinate gives the scene a size of 1.
@@ -66,10 +72,10 @@ class Scripted:
 
 def test_candidates_take_turns():
     calls: list[str] = []
-    found = measure([Scripted("a", calls), Scripted("b", calls)], COUNTS, {}, budget=1.0)
-    assert calls == ["prepare a", "prepare b"] * PREPARES + ["a", "b"] * ROUNDS
+    found = measure_round_robin([Scripted("a", calls), Scripted("b", calls)], COUNTS, {}, budget=1.0)
+    assert calls == ["prepare a", "prepare b"] * NUM_PREPARATIONS + ["a", "b"] * ROUNDS
     for rows, solver in zip(found, "ab", strict=True):
-        assert [row["round"] for row in rows if row["phase"] == "prepare"] == list(range(PREPARES))
+        assert [row["round"] for row in rows if row["phase"] == "prepare"] == list(range(NUM_PREPARATIONS))
         assert [row["seconds"] for row in rows if row["phase"] == "step"] == [0.25] * ROUNDS
         assert {row["status"] for row in rows} == {"ok"}
         assert {(row["solver"], row["choice"], row["vertices"]) for row in rows} == {(solver, solver, 16)}
@@ -80,7 +86,7 @@ def test_candidates_take_turns():
 )
 def test_one_that_fails_says_why_and_the_others_go_on(error: Exception, status: str):
     calls: list[str] = []
-    bad, good = measure([Scripted("a", calls, fails=error), Scripted("b", calls)], COUNTS, {}, budget=1.0)
+    bad, good = measure_round_robin([Scripted("a", calls, fails=error), Scripted("b", calls)], COUNTS, {}, budget=1.0)
     assert [(row["phase"], row["status"]) for row in bad] == [("run", status)]
     assert str(error) in bad[0]["reason"]
     assert calls.count("b") == ROUNDS
@@ -88,7 +94,7 @@ def test_one_that_fails_says_why_and_the_others_go_on(error: Exception, status: 
 
 
 def test_no_time_is_believed_of_one_that_ends_elsewhere():
-    first, near, far = measure(
+    first, near, far = measure_round_robin(
         [Scripted("a", []), Scripted("b", [], at=1e-10), Scripted("c", [], at=1e-8)], COUNTS, {}, budget=1.0
     )
     assert first[-1]["status"] == near[-1]["status"] == "ok"
@@ -100,8 +106,8 @@ def test_no_time_is_believed_of_one_that_ends_elsewhere():
 def test_one_that_would_take_too_long_is_left_out_with_a_row_that_says_so():
     calls: list[str] = []
     slow = Scripted("a", calls)
-    past = {name(slow.run): [Past(4, prepare=1.0, iteration=1.0)]}
-    (rows,) = measure([slow], COUNTS, past, budget=10.0)
+    past = {format_candidate_name(slow.run): [PastTiming(4, prepare_seconds=1.0, iteration_seconds=1.0)]}
+    (rows,) = measure_round_robin([slow], COUNTS, past, budget=10.0)
     assert calls == []
     assert [(row["status"], row["phase"]) for row in rows] == [("skipped", "run")]
     assert "budget of each candidate is 10 s" in rows[0]["reason"]
@@ -112,30 +118,30 @@ def test_a_long_preparation_is_not_repeated(monkeypatch: pytest.MonkeyPatch):
     slow, quick = Scripted("a", calls), Scripted("b", calls)
     monkeypatch.setattr(round_robin, "LONG", 0.7)
     monkeypatch.setattr(slow, "prepare", lambda: calls.append("prepare a") or 1.0)
-    found, _ = measure([slow, quick], COUNTS, {}, budget=10.0)
-    assert [calls.count(f"prepare {name}") for name in "ab"] == [1, PREPARES]
+    found, _ = measure_round_robin([slow, quick], COUNTS, {}, budget=10.0)
+    assert [calls.count(f"prepare {name}") for name in "ab"] == [1, NUM_PREPARATIONS]
     assert [row["round"] for row in found if row["phase"] == "prepare"] == [0]
 
 
 @pytest.mark.parametrize("precision", ["float32", "float16"])
 def test_less_precision_moves_nothing_that_has_converged(precision):
-    problem = first_problem(cloth(8))
-    rest = rest_of(problem)
+    problem = build_first_problem(build_cloth(8))
+    rest = find_converged_problem(problem)
     assert rest is not None
-    assert np.abs(problem.gradient(rest.problem.first_guess)).max() < 1e-6  # beside 9.81 N of weight
+    assert np.abs(problem.gradient(rest.problem.initial_guess)).max() < 1e-6  # beside 9.81 N of weight
     # What was asked of the method; rounding leaves 1e-13.
-    assert apart(rest, CompiledLocalGlobal("supernodal", precision).prepare(problem.system)) <= 1e-9
+    assert compute_precision_error(rest, CompiledLocalGlobal("supernodal", precision).prepare(problem.system)) <= 1e-9
 
 
 @pytest.mark.parametrize("power", [1.0, 1.5, 3.0])
 def test_a_power_law_is_predicted_exactly(power: float):
-    past = [Past(n, prepare=2.0 * n**power, iteration=0.1 * n**power) for n in (10, 40)]
-    seconds = PREPARES * 2.0 * 90**power + ROUNDS * 50 * 0.1 * 90**power
+    past = [PastTiming(n, prepare_seconds=2.0 * n**power, iteration_seconds=0.1 * n**power) for n in (10, 40)]
+    seconds = NUM_PREPARATIONS * 2.0 * 90**power + ROUNDS * 50 * 0.1 * 90**power
     # Logarithms and back: a few units in the last place.
-    assert predicted(past, 90, run("a")) == pytest.approx(seconds, rel=1e-12)
-    assert predicted([], 90, run("a")) == 0.0
+    assert predict_seconds(past, 90, run("a")) == pytest.approx(seconds, rel=1e-12)
+    assert predict_seconds([], 90, run("a")) == 0.0
     # What is known of larger sizes says nothing about smaller ones.
-    assert predicted(past, 10, run("a")) == 0.0
+    assert predict_seconds(past, 10, run("a")) == 0.0
 
 
 def test_a_short_call_is_repeated_after_a_first_one_and_a_long_one_is_not():
@@ -145,31 +151,31 @@ def test_a_short_call_is_repeated_after_a_first_one_and_a_long_one_is_not():
         asked.append(number)
         return number * 1e-3
 
-    assert average(seconds, 0.02) == pytest.approx(1e-3, rel=1e-12)
-    assert average(seconds, 1e-4) == pytest.approx(1e-3, rel=1e-12)
+    assert compute_call_seconds(seconds, 0.02) == pytest.approx(1e-3, rel=1e-12)
+    assert compute_call_seconds(seconds, 1e-4) == pytest.approx(1e-3, rel=1e-12)
     assert asked == [1, 20, 1]
 
 
 def test_an_entry_that_is_read_is_a_multiply_and_an_add_for_each_of_three_sides():
     facts = {"nnz_factor": 100.0, "panel_bytes": 960.0, "flops_per_solve": 1440.0}
-    work = count(facts, vertices=10, springs=20)
-    assert work["global"].flops == 1440
-    assert work["global"].bytes == 240 * 8 + 176 * 10
-    assert work["global"].working_set == 960 + 80 * 10
-    assert work["iteration"].bytes == work["global"].bytes + work["local"].bytes
-    assert work["iteration"].working_set == 960 + 80 * 10 + 16 * 20  # vectors are there once
+    work = count_operations(facts, vertices=10, springs=20)
+    assert work["global"].flop_count == 1440
+    assert work["global"].bytes_moved == 240 * 8 + 176 * 10
+    assert work["global"].working_set_bytes == 960 + 80 * 10
+    assert work["iteration"].bytes_moved == work["global"].bytes_moved + work["local"].bytes_moved
+    assert work["iteration"].working_set_bytes == 960 + 80 * 10 + 16 * 20  # vectors are there once
     # L alone is read once in each pass.
-    assert count({"nnz_factor": 100.0}, 10, 20, "float32")["global"].bytes == 2 * 100 * 4 + 176 * 10
-    assert set(count({}, 10, 20)) == {"local"}
+    assert count_operations({"nnz_factor": 100.0}, 10, 20, "float32")["global"].bytes_moved == 2 * 100 * 4 + 176 * 10
+    assert set(count_operations({}, 10, 20)) == {"local"}
 
 
 def test_the_probes_do_what_they_count():
-    found = list(limits.probes((1 << 14, 1 << 16)))
+    found = list(limits.build_probes((1 << 14, 1 << 16)))
     assert [p.name for p in found] == ["read", "triad"] * 2 + ["fma float64", "fma float32"]
-    assert all(p.bytes % p.working_set == 0 for p in found if p.name == "read")
+    assert all(p.bytes_moved % p.working_set_bytes == 0 for p in found if p.name == "read")
     total = found[0].call()
     # The array holds ones: every entry that was counted was read.
-    assert 8 * total == found[0].bytes
+    assert 8 * total == found[0].bytes_moved
     b, c, a = np.full(8, 2.0), np.full(8, 5.0), np.empty(8)
     limits._triad(a, b, c, 1, 1)
     assert (a == 17.0).all()
@@ -191,28 +197,28 @@ def sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / SCENE.name).write_bytes(SCENE.read_bytes())
     monkeypatch.setattr(shutil, "which", lambda _: None)
     monkeypatch.setattr(limits, "WORKING_SETS", (1 << 14, 1 << 16))
-    monkeypatch.setattr(limits.probes, "__defaults__", ((1 << 14, 1 << 16),))
-    monkeypatch.setattr(candidates.average, "__defaults__", (0.0,))
+    monkeypatch.setattr(limits.build_probes, "__defaults__", ((1 << 14, 1 << 16),))
+    monkeypatch.setattr(candidates.compute_call_seconds, "__defaults__", (0.0,))
     return load_sweep(tmp_path / "small.yaml")
 
 
 def test_a_folder_is_for_one_report_at_a_time(sweep, tmp_path: Path):
     (tmp_path / "out" / "rows").mkdir(parents=True)
-    with alone(tmp_path / "out"), pytest.raises(InputError, match="another springbench"):
-        run_speed(sweep, tmp_path / "out", Quiet(), print)
+    with lock_folder_exclusive(tmp_path / "out"), pytest.raises(InputError, match="another springbench"):
+        run_roofline(sweep, tmp_path / "out", SilentDisplay(), print)
 
 
 def test_a_report_is_complete_and_done_once(sweep, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     said: list[str] = []
-    display = Quiet()
+    display = SilentDisplay()
 
     def done() -> pa.Table:
-        return run_speed(sweep, tmp_path / "out", display, said.append, isolated=False)
+        return run_roofline(sweep, tmp_path / "out", display, said.append, isolated=False)
 
     table = done()
     titles = [f"yardstick-cloth {size}: 5 candidates take turns" for size in (4, 5)]
     assert (display.titles, said) == (titles, [])
-    found = figures(table)
+    found = compute_speed_figures(table)
     assert [(f.size, f.label, f.status) for f in found] == [
         (size, label, status)
         for size in (4, 5)
@@ -224,9 +230,9 @@ def test_a_report_is_complete_and_done_once(sweep, tmp_path: Path, monkeypatch: 
         )
     ]
     assert "there is no C++ compiler" in (found[2].reason or "")
-    assert all(f.reached and f.local and f.global_ and f.step and f.warm for f in found if f.status == "ok")
-    assert speed_table(found).row_count == len(found)
-    assert sum("there is no C++ compiler" in line and line.endswith("(at 4, 5)") for line in remarks(found)) == 2
+    assert all(f.roofline_fraction and f.local and f.global_ and f.step and f.warm for f in found if f.status == "ok")
+    assert build_speed_table(found).row_count == len(found)
+    assert sum("there is no C++ compiler" in line and line.endswith("(at 4, 5)") for line in describe_speed(found)) == 2
     # What is there is not measured again.
     assert done().equals(table)
     assert (display.titles, said) == (titles, ["2 of 2 sizes are there already"])
@@ -244,11 +250,11 @@ def test_a_time_that_another_clock_does_not_bear_out_is_a_failure(monkeypatch: p
             pass
 
     def timed() -> tuple[list[dict[str, Any]], float]:
-        calls = candidates.Repeated(busy)
-        found = average(calls)
-        return [{"interrupted": calls.interrupted}], found
+        calls = candidates.RepeatedCall(busy)
+        found = compute_call_seconds(calls)
+        return [{"interrupted": calls.preempted}], found
 
     assert timed()[1] >= 0.005
     monkeypatch.setattr(candidates, "perf_counter", lambda: perf_counter() / 1000)
     with pytest.raises(RunFailed, match="the times of calls add up to"):
-        undisturbed(timed)
+        retry_if_preempted(timed)

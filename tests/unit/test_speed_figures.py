@@ -7,10 +7,10 @@ from typing import Any
 import pyarrow as pa
 import pytest
 
-from harness.base.columns import SCHEMA
-from harness.report.speed.counts import count
-from harness.report.speed.figures import Figures, MachineLimits, figures
-from harness.report.speed.speed_table import exponents, remarks
+from harness.base.columns import RUN_SCHEMA
+from harness.report.speed.counts import count_operations
+from harness.report.speed.figures import MachineLimits, SpeedFigures, compute_speed_figures
+from harness.report.speed.speed_table import describe_speed, fit_exponents
 
 
 def machine_row(phase: str, seconds: float, *, bytes: float = 0.0, flops: float = 0.0, working_set: float = 0.0):
@@ -43,9 +43,9 @@ LIMITS = [
 def test_bandwidth_is_read_off_between_the_measured_working_sets():
     machine = MachineLimits(LIMITS)
     # 100 bytes a second at 1e2 and 1 at 1e8: on logarithmic scales a straight line, level beyond its ends.
-    assert machine.bandwidth(1, 1e5) == pytest.approx(10.0, rel=1e-12)
-    assert machine.bandwidth(1, 1.0) == pytest.approx(100.0, rel=1e-12)
-    assert machine.flops(1, "float16") == machine.flops(1, "float32") == 2000.0
+    assert machine.measured_bandwidth(1, 1e5) == pytest.approx(10.0, rel=1e-12)
+    assert machine.measured_bandwidth(1, 1.0) == pytest.approx(100.0, rel=1e-12)
+    assert machine.measured_flops(1, "float16") == machine.measured_flops(1, "float32") == 2000.0
 
 
 def timed(solver: str, parameters: str, seconds: list[float], **columns: Any) -> list[dict[str, Any]]:
@@ -79,29 +79,31 @@ def test_figures_say_how_near_the_binding_limit_is():
         *timed("numba", '{"linear": "cholespy"}', [3.0, 3.0, 3.0]),
         *timed("numba", '{"linear": "supernodal"}', [1.0, 2.0, 1.0], nnz_factor=100, flops_per_solve=2400),
     ]
-    found = {f.label: f for f in figures(pa.Table.from_pylist(rows, schema=SCHEMA))}
+    found = {f.label: f for f in compute_speed_figures(pa.Table.from_pylist(rows, schema=RUN_SCHEMA))}
     assert list(found) == ["eigen default", "eigen cheap", "cholmod", "numba cholespy", "numba supernodal"]
     ours = found["numba supernodal"]
     assert ours.iterations == 10
     # 1 s an iteration in the median, so a step of 50 takes 50 s.
     assert (ours.cold, ours.warm, ours.local, ours.step) == (1e3, 1.5e3, 1e3, 5e4)
-    assert ours.faster is not None
-    assert ours.faster.middle == 8.0
-    assert ours.cheap_faster is not None
-    assert ours.cheap_faster.middle == 4.0
-    assert ours.careful_faster is not None
-    assert ours.careful_faster.middle == 2.0
-    assert ours.solves_faster is not None
-    assert ours.solves_faster.middle == 3.0
-    work = count({"nnz_factor": 100, "flops_per_solve": 2400}, 16, 42)["iteration"]
-    bandwidth = MachineLimits(LIMITS).bandwidth(1, work.working_set)
-    assert (ours.binds, ours.touched) == ("bandwidth", work.bytes)
+    assert ours.speedup is not None
+    assert ours.speedup.estimate == 8.0
+    assert ours.speedup_over_cheap is not None
+    assert ours.speedup_over_cheap.estimate == 4.0
+    assert ours.speedup_over_cholmod is not None
+    assert ours.speedup_over_cholmod.estimate == 2.0
+    assert ours.solve_speedup_over_cholespy is not None
+    assert ours.solve_speedup_over_cholespy.estimate == 3.0
+    work = count_operations({"nnz_factor": 100, "flops_per_solve": 2400}, 16, 42)["iteration"]
+    bandwidth = MachineLimits(LIMITS).measured_bandwidth(1, work.working_set_bytes)
+    assert (ours.binding_limit, ours.achieved_bandwidth) == ("bandwidth", work.bytes_moved)
     # At best each byte comes from afar once, 1 s an iteration, and the others at 100 bytes a second.
-    at_best = work.working_set / bandwidth + (work.bytes - work.working_set) / 100
-    assert ours.reached == pytest.approx(at_best, rel=1e-12)
-    bare = count({"nnz_factor": 100}, 16, 42)["iteration"]
-    assert ours.passes == pytest.approx(bare.bytes / MachineLimits(LIMITS).bandwidth(1, bare.working_set), rel=1e-12)
-    assert found["numba cholespy"].reached is None
+    at_best = work.working_set_bytes / bandwidth + (work.bytes_moved - work.working_set_bytes) / 100
+    assert ours.roofline_fraction == pytest.approx(at_best, rel=1e-12)
+    bare = count_operations({"nnz_factor": 100}, 16, 42)["iteration"]
+    assert ours.two_pass_fraction == pytest.approx(
+        bare.bytes_moved / MachineLimits(LIMITS).measured_bandwidth(1, bare.working_set_bytes), rel=1e-12
+    )
+    assert found["numba cholespy"].roofline_fraction is None
 
 
 def test_the_growth_of_a_solve_is_the_power_in_its_times():
@@ -109,15 +111,19 @@ def test_the_growth_of_a_solve_is_the_power_in_its_times():
     for size in (100, 200, 400):
         for row in timed("sparse", "{}", [1e-9 * size ** (2 * 1.25)]):
             rows.append(row | {"run_id": f"s{size}", "size": size, "vertices": size**2})
-    found = figures(pa.Table.from_pylist(rows, schema=SCHEMA))
-    assert exponents(found) == {("cloth", "sparse"): pytest.approx(1.25, rel=1e-9)}  # the fit's round-off
+    found = compute_speed_figures(pa.Table.from_pylist(rows, schema=RUN_SCHEMA))
+    assert fit_exponents(found) == {("cloth", "sparse"): pytest.approx(1.25, rel=1e-9)}  # the fit's round-off
 
 
 def test_the_growth_of_a_factor_is_told_beside_that_of_its_solve():
     found = [
-        Figures("cloth", size, size**2, "a", 1, "ok", None, None, global_=float(size) ** 2.6, entries=size**2 * size)
+        SpeedFigures(
+            "cloth", size, size**2, "a", 1, "ok", None, None, global_=float(size) ** 2.6, factor_entries=size**2 * size
+        )
         for size in (100, 200)
     ]
-    assert "a: from 10,000 vertices of cloth on a solve costs n^1.30, its factor has n^1.50 entries" in remarks(found)
-    bare = [f._replace(entries=None) for f in found]
-    assert "a: from 10,000 vertices of cloth on a solve costs n^1.30" in remarks(bare)
+    assert "a: from 10,000 vertices of cloth on a solve costs n^1.30, its factor has n^1.50 entries" in describe_speed(
+        found
+    )
+    bare = [f._replace(factor_entries=None) for f in found]
+    assert "a: from 10,000 vertices of cloth on a solve costs n^1.30" in describe_speed(bare)

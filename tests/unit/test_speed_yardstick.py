@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from harness.base.errors import RunFailed
-from harness.experiments.speed.yardstick import CHEAP_TEMPORARIES, Yardstick, build
-from harness.report.speed.size_plot import CandidateLine, draw_by_size
-from harness.report.style import HEIGHT, WIDTH
+from harness.experiments.speed.yardstick import MALLOC_TUNABLES, CppBaseline, compile_baseline
+from harness.report.speed.size_plot import CandidateLine, draw_size_plot
+from harness.report.style import PAGE_HEIGHT, PAGE_WIDTH
 from solvers.core import native
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import StopRule, Unsupported
-from tests.scenes import cloth, first_problem
+from tests.scenes import build_cloth, build_first_problem
 
 ECHO = f"""#!{sys.executable}
 import sys
@@ -42,7 +42,7 @@ def echo(tmp_path: Path) -> Path:
 def test_without_a_compiler_it_is_unsupported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(native.shutil, "which", lambda _: None)
     with pytest.raises(Unsupported, match=r"no C\+\+ compiler"):
-        build(tmp_path)
+        compile_baseline(tmp_path)
 
 
 def test_what_the_compiler_says_is_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -51,13 +51,13 @@ def test_what_the_compiler_says_is_the_reason(tmp_path: Path, monkeypatch: pytes
     compiler.chmod(0o755)
     monkeypatch.setenv("CXX", str(compiler))
     with pytest.raises(Unsupported, match=r"Eigen/Sparse: No such file.*libeigen3-dev"):
-        build(tmp_path / "build")
+        compile_baseline(tmp_path / "build")
     assert list((tmp_path / "build").iterdir()) == []
 
 
 def test_it_is_asked_line_by_line(echo: Path, tmp_path: Path):
-    made = cloth(4)
-    running = Yardstick(echo, first_problem(made), made.springs, tmp_path, "")
+    made = build_cloth(4)
+    running = CppBaseline(echo, build_first_problem(made), made.all_springs, tmp_path, "")
     assert running.prepare_seconds == 0.125
     assert running.step(7) == [7.0, 1.5, 2.5]
     assert running.close().shape == (16, 3)
@@ -65,8 +65,8 @@ def test_it_is_asked_line_by_line(echo: Path, tmp_path: Path):
 
 
 def test_a_program_that_ends_early_is_a_failed_run(echo: Path, tmp_path: Path):
-    made = cloth(4)
-    running = Yardstick(echo, first_problem(made), made.springs, tmp_path, "")
+    made = build_cloth(4)
+    running = CppBaseline(echo, build_first_problem(made), made.all_springs, tmp_path, "")
     with pytest.raises(RunFailed, match="too short"):
         running.step(101)
     with pytest.raises(RunFailed):
@@ -75,26 +75,26 @@ def test_a_program_that_ends_early_is_a_failed_run(echo: Path, tmp_path: Path):
 
 
 def test_exact_pins_are_not_its_kind(tmp_path: Path):
-    made = cloth(4, weight="exact")
+    made = build_cloth(4, weight="exact")
     with pytest.raises(Unsupported, match="penalty"):
-        Yardstick(tmp_path / "none", first_problem(made), made.springs, tmp_path, "")
+        CppBaseline(tmp_path / "none", build_first_problem(made), made.all_springs, tmp_path, "")
 
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The real one; where it cannot be built the report says so in a row, and there is nothing to compare."""
     try:
-        return build(tmp_path_factory.mktemp("build"))
+        return compile_baseline(tmp_path_factory.mktemp("build"))
     except Unsupported as error:
         pytest.skip(str(error))
 
 
-@pytest.mark.parametrize("tunables", ["", CHEAP_TEMPORARIES], ids=["default", "cheap temporaries"])
+@pytest.mark.parametrize("tunables", ["", MALLOC_TUNABLES], ids=["default", "cheap temporaries"])
 def test_it_takes_the_same_steps_as_ours(program: Path, tmp_path: Path, tunables: str):
-    made = cloth(12)
-    stated = first_problem(made)
+    made = build_cloth(12)
+    stated = build_first_problem(made)
     ours = SparseLocalGlobal().prepare(made.system).solve(stated, StopRule(50)).positions
-    running = Yardstick(program, stated, made.springs, tmp_path, tunables)
+    running = CppBaseline(program, stated, made.all_springs, tmp_path, tunables)
     for _ in range(2):  # each step starts from the first guess again
         step, local, global_ = running.step(50)
         assert step >= local + global_ > 0.0
@@ -112,6 +112,6 @@ def test_a_picture_has_its_size_whatever_is_in_it(tmp_path: Path, share: bool):
     one = [CandidateLine("sparse", "sparse", "sparse", (100,), (0.3,), (True,))]
     for name, series in (("full", lines), ("one", one), ("none", [])):
         path = tmp_path / f"{name}.png"
-        draw_by_size(path, "Title", ["fact"], series, share=share)
+        draw_size_plot(path, "Title", ["fact"], series, is_share=share)
         header = path.read_bytes()[16:24]
-        assert (int.from_bytes(header[:4], "big"), int.from_bytes(header[4:], "big")) == (WIDTH, HEIGHT)
+        assert (int.from_bytes(header[:4], "big"), int.from_bytes(header[4:], "big")) == (PAGE_WIDTH, PAGE_HEIGHT)

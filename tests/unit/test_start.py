@@ -7,14 +7,14 @@ import pytest
 from pydantic import TypeAdapter
 
 from harness.base.errors import InputError
-from harness.config.load import load_any, load_scene
-from harness.scenes.bind import build
-from harness.scenes.effects.pins import Pins
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.mesh.network import Network
-from harness.scenes.mesh.star import Star
+from harness.config.load import load_config, load_scene
+from harness.scenes.bind import build_scene
+from harness.scenes.effects.pins import PinsEffect
+from harness.scenes.mesh.grid import GridMesh
+from harness.scenes.mesh.network import NetworkMesh
+from harness.scenes.mesh.star import StarMesh
 from harness.scenes.start import AnyStart
-from harness.simulation.step import start
+from harness.simulation.step import build_initial_state
 
 REST = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 4.0, 0.0], [0.0, 4.0, 8.0]])
 MEAN = [1.0, 2.0, 2.0]
@@ -23,7 +23,7 @@ MEAN = [1.0, 2.0, 2.0]
 def positions(**keys) -> np.ndarray:
     made = TypeAdapter(AnyStart).validate_python(keys)
     before = REST.copy()
-    p = made.positions(REST)
+    p = made.compute_positions(REST)
     np.testing.assert_array_equal(REST, before)
     return p
 
@@ -59,7 +59,7 @@ def test_perturbed_starts_lie_about_as_far_off_as_they_say():
 
 def test_a_spin_turns_about_the_mean_and_carries_no_momentum():
     made = TypeAdapter(AnyStart).validate_python({"kind": "rest", "spin": [0, 0, 2]})
-    v = made.velocity(REST)
+    v = made.compute_spin_velocity(REST)
     np.testing.assert_allclose(v.sum(axis=0), 0.0, atol=1e-15)
     np.testing.assert_array_equal(v[0], np.cross([0, 0, 2], REST[0] - MEAN))
 
@@ -75,12 +75,14 @@ def written(folder: Path, text: str) -> Path:
 
 def test_a_scene_starts_as_it_says_and_its_digest_tells(tmp_path: Path):
     spec = load_scene(written(tmp_path, SCENE.format("{kind: collapsed, spin: [0, 5, 0]}")))
-    begun = start(build(spec, 3)).now
-    np.testing.assert_allclose(begun.positions, np.tile(Grid().build(3).rest.mean(axis=0), (9, 1)), atol=1e-15)
+    begun = build_initial_state(build_scene(spec, 3)).motion
+    np.testing.assert_allclose(
+        begun.positions, np.tile(GridMesh().build_mesh(3).rest_positions.mean(axis=0), (9, 1)), atol=1e-15
+    )
     np.testing.assert_allclose(begun.velocity, np.tile([1.0, 0.0, 0.0], (9, 1)), atol=1e-14)  # no arm, no spin
     other = load_scene(written(tmp_path, SCENE.format("{kind: rest}")))
     plain = load_scene(written(tmp_path, SCENE.format("null")))
-    assert len({spec.digest, other.digest, plain.digest}) == 3
+    assert len({spec.scene_digest, other.scene_digest, plain.scene_digest}) == 3
 
 
 @pytest.mark.parametrize(
@@ -95,7 +97,7 @@ def test_a_scene_starts_as_it_says_and_its_digest_tells(tmp_path: Path):
 )
 def test_a_start_that_means_nothing_is_refused(tmp_path: Path, text: str, needle: str):
     with pytest.raises(InputError) as caught:
-        load_any(written(tmp_path, text))
+        load_config(written(tmp_path, text))
     assert needle in str(caught.value)
     assert str(tmp_path / "scene.yaml:7: ") in str(caught.value)
 
@@ -125,7 +127,7 @@ def test_a_network_that_cannot_be_simulated_is_refused_with_its_place_and_a_reme
     tmp_path: Path, mesh: str, mass: str, needles: list[str]
 ):
     with pytest.raises(InputError) as caught:
-        load_any(written(tmp_path, NETWORK.format(mesh, mass)))
+        load_config(written(tmp_path, NETWORK.format(mesh, mass)))
     assert len(caught.value.mistakes) == 1
     assert str(tmp_path / "scene.yaml:") in str(caught.value)
     for needle in needles:
@@ -135,23 +137,27 @@ def test_a_network_that_cannot_be_simulated_is_refused_with_its_place_and_a_reme
 def test_a_massless_vertex_that_a_pin_holds_is_welcome(tmp_path: Path):
     text = NETWORK.format(f"{{kind: network, {PAIR}, mass: [1, 0]}}", "")
     pinned = text.replace("stretch: 1}]", "stretch: 1}, {kind: pins, indices: [1]}]")
-    assert len(load_any(written(tmp_path, pinned)).runs()) == 1
+    assert len(load_config(written(tmp_path, pinned)).list_runs()) == 1
 
 
 def test_a_network_is_what_it_was_written_as():
-    mesh = Network(
+    mesh = NetworkMesh(
         positions=((0, 0, 0), (3, 0, 0), (3, 4, 0)), springs=((0, 1), (1, 0)), bend=((0, 2),), mass=(1.0, 0.0, 3.0)
-    ).build()
+    ).build_mesh()
     np.testing.assert_array_equal(mesh.springs, [[0, 1], [1, 0], [0, 2]])
     np.testing.assert_array_equal(mesh.rest_lengths, [3, 3, 5])
-    assert {name: list(part) for name, part in mesh.families.items()} == {"stretch": [0, 1], "shear": [], "bend": [2]}
+    assert {name: list(part) for name, part in mesh.spring_families.items()} == {
+        "stretch": [0, 1],
+        "shear": [],
+        "bend": [2],
+    }
     np.testing.assert_array_equal(mesh.mass, [1, 0, 3])
     assert mesh.spacing == 3.0
 
 
 def test_a_star_has_a_hub_of_as_many_springs_as_its_size():
-    mesh = Star(radius=2.0).build(1000)
+    mesh = StarMesh(radius=2.0).build_mesh(1000)
     assert np.bincount(mesh.springs.ravel())[0] == 1000
     np.testing.assert_allclose(mesh.rest_lengths, 2.0, rtol=1e-15)
-    np.testing.assert_allclose(mesh.shares[0], 0.5, rtol=1e-12)
-    assert Pins(at=("hub",)).chosen(mesh, "pins").tolist() == [0]
+    np.testing.assert_allclose(mesh.mass_fractions[0], 0.5, rtol=1e-12)
+    assert PinsEffect(at=("hub",)).select_vertices(mesh, "pins").tolist() == [0]

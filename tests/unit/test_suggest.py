@@ -8,32 +8,34 @@ import numpy as np
 import pytest
 
 from harness.experiments.ablation import suggest
-from harness.experiments.ablation.suggest import Suggestion
+from harness.experiments.ablation.suggest import EffectSuggestion
 from harness.scenes.bind import Scene
-from harness.scenes.effects.springs import Springs
-from harness.scenes.mesh.grid import Grid
-from tests.effects import cloth
-from tests.scenes import scene
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.mesh.grid import GridMesh
+from tests.effects import build_effect_cloth
+from tests.scenes import build_test_scene
 
 
 def asked(
     made: Scene, kinds: set[str], positions: np.ndarray, velocities: np.ndarray | float = 0.0
-) -> list[Suggestion]:
+) -> list[EffectSuggestion]:
     """What a motion calls for that passes through positions (n, 3) for 12 frames."""
     places = np.tile(positions, (12, 1, 1))
-    return suggest.suggestions(suggest.seen(made, kinds, places, np.broadcast_to(velocities, places.shape)), kinds)
+    return suggest.suggest_effects(
+        suggest.build_evidence(made, kinds, places, np.broadcast_to(velocities, places.shape)), kinds
+    )
 
 
 def folded(made: Scene, angle: float) -> np.ndarray:
     """The level cloth, folded along its middle."""
-    x, y, z = made.mesh.rest.T
+    x, y, z = made.mesh.rest_positions.T
     right = np.maximum(x, 0.0)
     return np.stack([x - right + right * np.cos(angle), y + right * np.sin(angle), z], axis=1)
 
 
 def still() -> Scene:
-    made = replace(cloth(), forces=(), moving=())
-    assert asked(made, set(), made.mesh.rest) == []
+    made = replace(build_effect_cloth(), varying_forces=(), pin_motions=())
+    assert asked(made, set(), made.mesh.rest_positions) == []
     return made
 
 
@@ -52,36 +54,40 @@ def test_a_motion_that_asks_for_nothing_gets_no_suggestion():
 )
 def test_a_suggestion_comes_with_its_evidence_unless_the_effect_is_listed(effect: str, listed: str, evidence: str):
     made = still()
-    places = {"strain-limits": 1.12 * made.mesh.rest, "bending": folded(made, 0.8 * np.pi), "air-drag": made.mesh.rest}
+    places = {
+        "strain-limits": 1.12 * made.mesh.rest_positions,
+        "bending": folded(made, 0.8 * np.pi),
+        "air-drag": made.mesh.rest_positions,
+    }
     speed = 1.0 if effect == "air-drag" else 0.0
-    found = {s.effect: s.evidence for s in asked(made, set(), places[effect], speed)}
+    found = {s.effect_kind: s.evidence for s in asked(made, set(), places[effect], speed)}
     assert evidence in found[effect]
-    assert effect not in {s.effect for s in asked(made, {listed}, places[effect], speed)}
+    assert effect not in {s.effect_kind for s in asked(made, {listed}, places[effect], speed)}
 
 
 def test_a_corner_alone_asks_for_no_effect():
-    made = scene(Grid(), Springs(stretch=300.0, shear=60.0), size=20)
-    p, h = made.mesh.rest.copy(), made.mesh.spacing
+    made = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0, shear=60.0), size=20)
+    p, h = made.mesh.rest_positions.copy(), made.mesh.spacing
     p[0] += [-h, 2 * h, -h]  # three springs of 1482, and two edges of 1083
     assert asked(made, set(), p) == []
     p[made.mesh.parts["left"]] += [0.0, 3 * h, 0.0]
-    assert {s.effect for s in asked(made, set(), p)} == {"strain-limits", "bending"}
+    assert {s.effect_kind for s in asked(made, set(), p)} == {"strain-limits", "bending"}
 
 
 def test_vertices_that_come_close_are_counted():
     made = still()
-    found = {s.effect: s.evidence for s in asked(made, set(), folded(made, np.pi * 0.99))}
+    found = {s.effect_kind: s.evidence for s in asked(made, set(), folded(made, np.pi * 0.99))}
     # Of 6 columns the inner two are joined by springs; each outer pair lies on each other in all 6 rows.
     assert found["self-contact"].startswith("12 pairs of vertices without a spring")
 
 
 def test_a_body_that_flies_as_a_whole_is_not_asked_to_rest():
-    free = scene(Grid(), Springs(stretch=300.0), size=4)
-    assert asked(free, set(), free.mesh.rest, 1.0) == []
-    swelling = asked(free, set(), free.mesh.rest, free.mesh.rest)
-    assert [s.effect for s in swelling] == ["air-drag"]
+    free = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), size=4)
+    assert asked(free, set(), free.mesh.rest_positions, 1.0) == []
+    swelling = asked(free, set(), free.mesh.rest_positions, free.mesh.rest_positions)
+    assert [s.effect_kind for s in swelling] == ["air-drag"]
 
 
 def test_a_driven_motion_is_not_asked_to_rest():
-    made = replace(still(), forces=(lambda p, v, t: p,))
-    assert asked(made, set(), made.mesh.rest, 1.0) == []
+    made = replace(still(), varying_forces=(lambda p, v, t: p,))
+    assert asked(made, set(), made.mesh.rest_positions, 1.0) == []

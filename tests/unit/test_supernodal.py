@@ -14,15 +14,17 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from solvers.linear import supernodal
-from solvers.linear.supernodal import Supernodal
-from solvers.matrices import diagonal, signed_incidence_matrix_sparse, without_zeros
+from solvers.linear.supernodal import SupernodalCholesky
+from solvers.matrices import diagonal_matrix, drop_zeros, signed_incidence_matrix_sparse
 from solvers.problem import NotPositiveDefinite
 
 
 def network(springs, stiffness, held):
     """A'KA + diag(held) [N/m]."""
     A = signed_incidence_matrix_sparse(np.asarray(springs, np.int64).reshape(-1, 2), len(held))
-    return without_zeros(A.T @ diagonal(np.asarray(stiffness, float)) @ A + diagonal(np.asarray(held, float)))
+    return drop_zeros(
+        A.T @ diagonal_matrix(np.asarray(stiffness, float)) @ A + diagonal_matrix(np.asarray(held, float))
+    )
 
 
 def sheet(n, stiffness=1e5):
@@ -42,7 +44,7 @@ def sheet(n, stiffness=1e5):
 
 def solution(Q, b, **options):
     out = np.full_like(b, np.nan)
-    Supernodal(Q, **options).solve(b, out)
+    SupernodalCholesky(Q, **options).solve(b, out)
     return out
 
 
@@ -105,7 +107,7 @@ def test_a_float32_factor_is_accurate_to_float32(Q):
 def test_a_rounded_factor_in_correction_form_reaches_the_solution_of_float64(precision, corrections):
     Q = sheet(40)
     b = right_hand_sides(1600)
-    factor = Supernodal(Q, precision=precision)
+    factor = SupernodalCholesky(Q, precision=precision)
     x, step = np.zeros_like(b), np.empty_like(b)
     for _ in range(corrections):
         factor.solve(b - Q @ x, step)
@@ -118,7 +120,7 @@ def test_a_rounded_factor_in_correction_form_reaches_the_solution_of_float64(pre
 def test_a_correction_by_a_half_precision_factor_overshoots_by_next_to_nothing():
     """Descent needs eigenvalues below 2 of what the factor makes of Q. Rounded entry by entry they grow with n."""
     Q, v = sheet(64), right_hand_sides(4096)
-    factor, out = Supernodal(Q, precision="float16"), np.empty((4096, 3))
+    factor, out = SupernodalCholesky(Q, precision="float16"), np.empty((4096, 3))
     growth = 0.0
     for _ in range(40):
         factor.solve(Q @ v, out)
@@ -131,7 +133,7 @@ def test_a_correction_by_a_half_precision_factor_overshoots_by_next_to_nothing()
 @pytest.mark.parametrize("precision", ["float64", "float32", "float16"])
 def test_what_a_factor_applies_is_symmetric_and_positive_definite(precision):
     Q = sheet(12)
-    factor = Supernodal(Q, precision=precision)
+    factor = SupernodalCholesky(Q, precision=precision)
     inverse = np.empty((144, 144))
     for k in range(0, 144, 3):
         out = np.empty((144, 3))
@@ -191,7 +193,7 @@ def test_leaves_the_right_hand_sides_as_they_are():
 @pytest.mark.parametrize("precision", ["float64", "float32", "float16"])
 def test_gives_the_same_bits_each_time(precision):
     Q, b = sheet(40), right_hand_sides(1600)
-    first, second = Supernodal(Q, precision=precision), Supernodal(Q, precision=precision)
+    first, second = SupernodalCholesky(Q, precision=precision), SupernodalCholesky(Q, precision=precision)
     results = [np.empty_like(b) for _ in range(4)]
     for k, out in enumerate(results):
         (first, second)[k % 2].solve(b, out)
@@ -211,31 +213,31 @@ def threads():
 def test_gives_the_same_bits_whatever_the_number_of_threads(precision, threads, monkeypatch):
     monkeypatch.setattr(supernodal, "_WORTH_THREADS", 0)
     Q, b = sheet(64), right_hand_sides(4096)
-    factor = Supernodal(Q, precision=precision)
+    factor = SupernodalCholesky(Q, precision=precision)
     results = []
     for count in range(1, numba.get_num_threads() + 1):
         threads(count)
         results.append(np.empty_like(b))
         factor.solve(b, results[-1])
-    assert len(factor.shares) > 1  # large enough to be shared out
+    assert len(factor.work_shares) > 1  # large enough to be shared out
     for out in results[1:]:
         np.testing.assert_array_equal(out, results[0])
 
 
 def test_shares_work_out_evenly_with_little_at_the_top():
-    shares = Supernodal(sheet(64)).shares
+    shares = SupernodalCholesky(sheet(64)).work_shares
     assert len(shares) == 5
     assert max(shares[:-1]) <= 1.1 / 4 + 1e-9
     assert shares[-1] <= 0.06  # the separators of two levels of dissection, of eight
-    assert len(Supernodal(sheet(16)).shares) == 2
-    assert Supernodal(sheet(16)).shares[-1] == 0.0
+    assert len(SupernodalCholesky(sheet(16)).work_shares) == 2
+    assert SupernodalCholesky(sheet(16)).work_shares[-1] == 0.0
 
 
 def test_separate_components_are_shared_out_too():
     parts = block_diag([sheet(30)] * 8, format="csr")
     b = right_hand_sides(vertices(parts))
-    factor = Supernodal(csr_array(parts))
-    assert max(factor.shares) <= 0.26
+    factor = SupernodalCholesky(csr_array(parts))
+    assert max(factor.work_shares) <= 0.26
     out = np.empty_like(b)
     factor.solve(b, out)
     assert backward_error(parts, out, b) <= 1e-12
@@ -246,13 +248,13 @@ def test_refuses_a_matrix_that_is_not_finite_and_says_where(value):
     Q = sheet(5)
     Q.data[Q.indptr[7]] = value
     with pytest.raises(NotPositiveDefinite, match=r"not finite in row 7\b"):
-        Supernodal(Q)
+        SupernodalCholesky(Q)
 
 
 def test_names_the_vertex_that_a_negative_mass_makes_indefinite():
-    Q = csr_array(diagonal(np.where(np.arange(50) == 31, -1.0, 1.0)))
+    Q = csr_array(diagonal_matrix(np.where(np.arange(50) == 31, -1.0, 1.0)))
     with pytest.raises(NotPositiveDefinite, match=r"vertex 31\b"):
-        Supernodal(Q)
+        SupernodalCholesky(Q)
 
 
 def test_names_a_vertex_of_the_component_that_nothing_holds():
@@ -260,7 +262,7 @@ def test_names_a_vertex_of_the_component_that_nothing_holds():
     held = np.where(np.arange(200) < 100, 1.0, 0.0)
     Q = network(springs, np.random.default_rng(3).uniform(1, 2, 198), held)
     with pytest.raises(NotPositiveDefinite, match=r"vertex \d+") as error:
-        Supernodal(Q)
+        SupernodalCholesky(Q)
     named = int(re.findall(r"vertex (\d+)", str(error.value))[0])
     assert connected_components(Q)[1][named] == connected_components(Q)[1][150]
 
@@ -270,18 +272,18 @@ def test_refuses_a_row_without_entries():
     Q.data[4] = 0.0
     Q.eliminate_zeros()
     with pytest.raises(NotPositiveDefinite, match=r"vertex 4\b"):
-        Supernodal(Q)
+        SupernodalCholesky(Q)
 
 
 def test_counts_bytes_and_flops_of_a_matrix_known_by_hand():
     # A dense 20 x 20: chunks of 16 and 4 columns. Panels: 20 rows of 16 and 4 rows of 4 entries.
     # Backwards all of them, forwards the rows below the chunk (4 of 16); 2 flops an entry and right-hand side.
     Q = csr_array(np.full((20, 20), -1.0) + 21.0 * np.eye(20))
-    factor = Supernodal(Q)
+    factor = SupernodalCholesky(Q)
     assert factor.nonzeros == 20 * 21 // 2
-    assert factor.panel_bytes == (20 * 16 + 4 * 4) * 8
+    assert factor.factor_bytes == (20 * 16 + 4 * 4) * 8
     assert factor.flops == 2 * 3 * (20 * 16 + 4 * 4 + 4 * 16)
-    assert factor.shares == [1.0, 0.0]
-    assert Supernodal(Q, precision="float32").panel_bytes == factor.panel_bytes // 2
+    assert factor.work_shares == [1.0, 0.0]
+    assert SupernodalCholesky(Q, precision="float32").factor_bytes == factor.factor_bytes // 2
     # The inverses of the chunks, 16 x 16 and 4 x 4, stay in float32.
-    assert Supernodal(Q, precision="float16").panel_bytes == (16 * 16 + 4 * 4) * 4 + 4 * 16 * 2
+    assert SupernodalCholesky(Q, precision="float16").factor_bytes == (16 * 16 + 4 * 4) * 4 + 4 * 16 * 2

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numba import njit  # noqa: TID251
 
-from solvers.linear.supernodal_solve import backwards, forwards
-from solvers.memory import aligned
+from solvers.linear.supernodal_solve import backward_substitution, forward_substitution
+from solvers.memory import allocate_aligned
 
 TYPES = {"float64": (np.float64, 1e-12), "float32": (np.float32, 1e-5), "float16": (np.float32, 1e-5)}
 """The work vector's type for panels of each precision, and the round-off to allow in sums of some 40 numbers of 1."""
@@ -17,12 +17,12 @@ ROWS = 96
 
 @njit
 def go_forwards(panels, index, chunks, work):
-    forwards(panels, index, chunks, 0, len(chunks), work)
+    forward_substitution(panels, index, chunks, 0, len(chunks), work)
 
 
 @njit
 def go_backwards(squares, panels, index, chunks, work):
-    backwards(squares, panels, index, chunks, 0, len(chunks), work)
+    backward_substitution(squares, panels, index, chunks, 0, len(chunks), work)
 
 
 def tiles(W):
@@ -48,7 +48,7 @@ def test_a_pass_over_a_panel_is_a_product_with_it(precision, quads, below):
     before[:, :3] = rng.normal(size=(ROWS, 3)).astype(kind)
     W, S, own = W.astype(float), S.astype(float), slice(first, first + width)
 
-    work, expected = aligned(4 * ROWS, kind), before.copy()
+    work, expected = allocate_aligned(4 * ROWS, kind), before.copy()
     work[:] = before.ravel()
     go_forwards(panels, index, chunks, work)
     expected[names] += W @ before[own]

@@ -10,41 +10,41 @@ import pytest
 from pydantic import ValidationError
 
 from harness.base.errors import InputError
-from harness.record.obstacles import declared
-from harness.scenes.bind import Scene, build
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.self_contact import SelfContact
-from harness.scenes.effects.springs import Springs
-from harness.scenes.effects.surface_contact import SurfaceContact
+from harness.record.obstacles import build_obstacles_property
+from harness.scenes.bind import Scene, build_scene
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.self_contact import SelfContactEffect
+from harness.scenes.effects.springs import SpringsEffect
+from harness.scenes.effects.surface_contact import SurfaceContactEffect
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.mesh.body import Body
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.mesh.stack import Stack
-from harness.scenes.mesh.surfaces import Balloon
-from harness.scenes.motion import Key, KeyedMotion
-from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
-from harness.scenes.shapes import Solid, Triangles, from_json, shape
+from harness.scenes.mesh.body import BodyMesh
+from harness.scenes.mesh.grid import GridMesh
+from harness.scenes.mesh.stack import StackMesh
+from harness.scenes.mesh.surfaces import BalloonMesh
+from harness.scenes.motion import KeyFrame, KeyFrameMotion
+from harness.scenes.obstacles import BoxObstacle, CapsuleObstacle, PlaneObstacle, SphereObstacle
+from harness.scenes.shapes import MeshObstacle, TriangleSurface, build_obstacle_surface, parse_obstacles
 from harness.scenes.spec import SceneSpec
-from harness.simulation.observe import intersections
-from harness.simulation.opinion.second import second_opinion
-from harness.simulation.step import State, prepare, problem, simulate, start
+from harness.simulation.observe import count_intersections
+from harness.simulation.opinion.second import verify_terms
+from harness.simulation.step import MotionState, build_initial_state, build_problem, prepare, simulate_scene
 from solvers.contact.self_contact import ObstacleContact
-from solvers.core.clearing import Blocked
+from solvers.core.clearing import NoClearance
 from solvers.integrators import Motion
-from solvers.methods.newton import Newton
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import Positions, StopRule
-from solvers.registry import SOLVERS, load
-from tests.scenes import scene
-from tests.self_contacts import way
+from solvers.registry import SOLVERS, load_target
+from tests.scenes import build_test_scene
+from tests.self_contacts import random_displacement
 
-BALL = Solid(mesh=Balloon(radius=0.3), size=4, offset=(0.02, -0.33, 0.01))
+BALL = MeshObstacle(mesh=BalloonMesh(radius=0.3), size=4, offset=(0.02, -0.33, 0.01))
 RULE = StopRule(100, 1e-4)
 
 
 def draped(*obstacles: object, size: int = 7, **options: float) -> Scene:
     """A level sheet of 1 m over obstacles."""
-    effect = SurfaceContact.model_validate({"thickness": 0.01, "obstacles": obstacles or (BALL,), **options})
-    return scene(Grid(), Springs(stretch=100.0, shear=20.0), Gravity(), effect, size=size)
+    effect = SurfaceContactEffect.model_validate({"thickness": 0.01, "obstacles": obstacles or (BALL,), **options})
+    return build_test_scene(GridMesh(), SpringsEffect(stretch=100.0, shear=20.0), GravityEffect(), effect, size=size)
 
 
 def contact(made: Scene) -> ObstacleContact:
@@ -55,11 +55,11 @@ def contact(made: Scene) -> ObstacleContact:
 def touching(friction: float = 0.0) -> tuple[ObstacleContact, Positions]:
     """The contact in a step, and positions where it presses, and slips."""
     made = draped(friction=friction)
-    *_, last = simulate(made, prepare(made, Newton()), RULE, first_guess="current", frames=8)
-    stated = problem(made, last.state, "current")
+    *_, last = simulate_scene(made, prepare(made, NewtonSolver()), RULE, initial_guess="current", frames=8)
+    stated = build_problem(made, last.state, "current")
     (energy,) = (e for e in stated.energies if isinstance(e, ObstacleContact))
-    p = last.positions + way(0, last.positions, 1e-5)
-    assert len(energy.blocks(p).vertices) > 20
+    p = last.positions + random_displacement(0, last.positions, 1e-5)
+    assert len(energy.hessian_blocks(p).vertices) > 20
     return energy, p
 
 
@@ -69,7 +69,7 @@ def test_gradients_and_second_derivatives_are_those_of_the_value(friction):
     gradient, h, hessian = np.zeros_like(p), 1e-8, energy.hessian(p)
     energy.add_gradient(p, gradient)
     for seed in range(3):
-        d = way(seed, p, 1.0)
+        d = random_displacement(seed, p, 1.0)
         change = (energy.value(p + h * d) - energy.value(p - h * d)) / (2 * h)
         # Central differences over a gap of some 1e-3: (h/gap)^2, and round-off over h.
         assert change == pytest.approx(float((gradient * d).sum()), rel=1e-5)
@@ -79,30 +79,30 @@ def test_gradients_and_second_derivatives_are_those_of_the_value(friction):
         bent = (ahead - behind).ravel() / (2 * h)
         np.testing.assert_allclose(hessian @ d.ravel(), bent, atol=1e-5 * np.abs(bent).max())
         product = np.zeros_like(p)
-        energy.blocks(p).add_product(d, product)
+        energy.hessian_blocks(p).add_product(d, product)
         np.testing.assert_allclose(product.ravel(), hessian @ d.ravel(), atol=1e-12 * np.abs(product).max())
 
 
 def test_frictions_own_derivatives_are_positive_semidefinite_and_pull_against_the_slip():
     energy, p = touching(0.5)
-    grip = energy.grip
-    blocks = grip.blocks(energy.whole(p)).values
+    grip = energy.tangential_collisions
+    blocks = grip.hessian_blocks(energy.append_obstacle_positions(p)).values
     assert len(blocks) > 20
     assert np.linalg.eigvalsh(blocks)[:, 0].min() >= -1e-13 * np.abs(blocks).max()
-    slipped = np.zeros((len(p) + len(energy.placed), 3))
-    grip.add_gradient(energy.whole(p), slipped)
-    moved = energy.whole(p) - np.concatenate([p, energy.placed])
+    slipped = np.zeros((len(p) + len(energy.current_positions), 3))
+    grip.add_gradient(energy.append_obstacle_positions(p), slipped)
+    moved = energy.append_obstacle_positions(p) - np.concatenate([p, energy.current_positions])
     assert not moved.any()
     assert np.abs(slipped.sum(axis=0)).max() <= 1e-12 * np.abs(slipped).sum()
 
 
 OBSTACLES = {
     "mesh": BALL,
-    "body": Solid(mesh=Body(height=0.6), size=8, offset=(0.0, -0.63, 0.0)),
-    "sphere": Sphere(center=(0.0, -0.33, 0.0), radius=0.3),
-    "capsule": Capsule(ends=((-0.3, -0.15, 0.1), (0.2, -0.15, 0.0)), radius=0.1),
-    "box": Box(low=(-0.2, -0.3, -0.2), high=(0.13, -0.04, 0.17)),
-    "plane": Plane(point=(0.0, -0.09, 0.0), normal=(0.1, 1.0, 0.0)),
+    "body": MeshObstacle(mesh=BodyMesh(height=0.6), size=8, offset=(0.0, -0.63, 0.0)),
+    "sphere": SphereObstacle(center=(0.0, -0.33, 0.0), radius=0.3),
+    "capsule": CapsuleObstacle(ends=((-0.3, -0.15, 0.1), (0.2, -0.15, 0.0)), radius=0.1),
+    "box": BoxObstacle(low=(-0.2, -0.3, -0.2), high=(0.13, -0.04, 0.17)),
+    "plane": PlaneObstacle(point=(0.0, -0.09, 0.0), normal=(0.1, 1.0, 0.0)),
 }
 
 
@@ -110,62 +110,74 @@ OBSTACLES = {
 def test_nothing_passes_through_any_obstacle(name):
     made = draped(OBSTACLES[name])
     touched = 0
-    for step in simulate(made, prepare(made, Newton()), RULE, first_guess="current", frames=12):
-        assert intersections(made, step.positions, made.time(step.index)) == 0
-        touched += len(contact(made).blocks(step.positions).vertices)
+    for step in simulate_scene(made, prepare(made, NewtonSolver()), RULE, initial_guess="current", frames=12):
+        assert count_intersections(made, step.positions, made.compute_time(step.index)) == 0
+        touched += len(contact(made).hessian_blocks(step.positions).vertices)
     assert touched > 20
 
 
 @pytest.mark.parametrize("name", ["newton", "newton-cg", "pncg", "lbfgs", "hybrid"])
 @pytest.mark.parametrize("sideways", [0.0, 6.0])
 def test_an_obstacle_that_moves_pushes_the_sheet_and_never_passes_it(name, sideways):
-    keys = (Key(time=0.0), Key(time=0.1, offset=(0.0, 0.3, 0.0)), Key(time=0.3, offset=(0.2, 0.3, 0.0), turn=120.0))
-    speed = {"motion": KeyedMotion(keys=keys, axis=(0.0, 1.0, 0.3))}
-    table = Plane(point=(0.0, -0.7, 0.0))
+    keys = (
+        KeyFrame(time=0.0),
+        KeyFrame(time=0.1, offset=(0.0, 0.3, 0.0)),
+        KeyFrame(time=0.3, offset=(0.2, 0.3, 0.0), turn=120.0),
+    )
+    speed = {"motion": KeyFrameMotion(keys=keys, axis=(0.0, 1.0, 0.3))}
+    table = PlaneObstacle(point=(0.0, -0.7, 0.0))
     made = draped(BALL.model_copy(update=speed), table, friction=0.3, size=6)
-    begun = start(made).now
-    state = State(Motion(begun.positions, begun.velocity + np.array([sideways, 0.0, 0.0])), None, 0)
-    prepared = prepare(made, load(SOLVERS[name])())
+    begun = build_initial_state(made).motion
+    state = MotionState(Motion(begun.positions, begun.velocity + np.array([sideways, 0.0, 0.0])), None, 0)
+    prepared = prepare(made, load_target(SOLVERS[name])())
     highest = 0.0
-    for step in simulate(made, prepared, RULE, first_guess="current", frames=12, state=state):
+    for step in simulate_scene(made, prepared, RULE, initial_guess="current", frames=12, initial_state=state):
         highest = float(step.positions[:, 1].max())
-        assert intersections(made, step.positions, made.time(step.index)) == 0
+        assert count_intersections(made, step.positions, made.compute_time(step.index)) == 0
         assert not any(
-            energy.closed(step.positions) for energy in step.problem.energies if isinstance(energy, ObstacleContact)
+            energy.find_violated_pairs(step.positions)
+            for energy in step.problem.energies
+            if isinstance(energy, ObstacleContact)
         )
     assert highest > 0.1 or sideways
 
 
-def deforming(path: Path, rate: float) -> Solid:
+def deforming(path: Path, rate: float) -> MeshObstacle:
     """The ball grows taller and thinner from frame to frame, and rises."""
-    ball = Balloon(radius=0.3).build(4).rest
+    ball = BalloonMesh(radius=0.3).build_mesh(4).rest_positions
     stored = [ball * (1 / s, s, 1 / s) + (0.0, 0.4 * (s - 1), 0.0) for s in 1 + 0.08 * np.arange(7)]
     np.savez(path / "ball.npz", positions=np.array(stored))
     frames = {"positions": str(path / "ball.npz"), "rate": rate}
-    return Solid.model_validate(BALL.model_dump() | {"mesh": {"kind": "balloon", "radius": 0.3}, "frames": frames})
+    return MeshObstacle.model_validate(
+        BALL.model_dump() | {"mesh": {"kind": "balloon", "radius": 0.3}, "frames": frames}
+    )
 
 
 def test_an_obstacle_that_deforms_along_stored_frames_lifts_the_sheet(tmp_path):
     one = deforming(tmp_path, 30.0)
     made, highest = draped(one, friction=0.3, size=6), 0.0
-    for step in simulate(made, prepare(made, Newton()), RULE, first_guess="current", frames=8):
-        assert intersections(made, step.positions, made.time(step.index)) == 0
+    for step in simulate_scene(made, prepare(made, NewtonSolver()), RULE, initial_guess="current", frames=8):
+        assert count_intersections(made, step.positions, made.compute_time(step.index)) == 0
         highest = float(step.positions[:, 1].max())
     assert highest > 0.2
-    points, _ = one.shape()
+    points, _ = one.build_surface()
     for time, frame in ((0.0, 0), (0.1, 3), (9.0, 6)):
         assert one.frames is not None
-        np.testing.assert_allclose(one.placed(points, time), one.frames.stored[frame] + one.offset, atol=1e-12)
-    (back,) = from_json(f"[{one.model_dump_json(exclude_none=True)}]")
-    assert isinstance(back, Solid)
-    np.testing.assert_allclose(back.placed(back.shape()[0], 0.15), one.placed(points, 0.15), atol=1e-12)
+        np.testing.assert_allclose(
+            one.place_points(points, time), one.frames.frame_positions[frame] + one.offset, atol=1e-12
+        )
+    (back,) = parse_obstacles(f"[{one.model_dump_json(exclude_none=True)}]")
+    assert isinstance(back, MeshObstacle)
+    np.testing.assert_allclose(
+        back.place_points(back.build_surface()[0], 0.15), one.place_points(points, 0.15), atol=1e-12
+    )
 
 
 def test_the_second_opinion_agrees_on_an_obstacle_that_deforms(tmp_path):
-    effect = SurfaceContact(thickness=0.01, friction=0.3, obstacles=(deforming(tmp_path, 3.0),))
-    given = {"mesh": Grid(), "mass": 1.0, "time_step": 1 / 30, "frames": 6, "path": Path("scene.yaml")}
-    spec = SceneSpec.model_validate(given | {"effects": (Springs(stretch=100.0), effect)})
-    assert second_opinion(spec, build(spec, 4), "implicit-euler") == "agrees"
+    effect = SurfaceContactEffect(thickness=0.01, friction=0.3, obstacles=(deforming(tmp_path, 3.0),))
+    given = {"mesh": GridMesh(), "mass": 1.0, "time_step": 1 / 30, "frames": 6, "path": Path("scene.yaml")}
+    spec = SceneSpec.model_validate(given | {"effects": (SpringsEffect(stretch=100.0), effect)})
+    assert verify_terms(spec, build_scene(spec, 4), "implicit-euler") == "agrees"
 
 
 def test_frames_of_another_mesh_are_refused(tmp_path):
@@ -177,18 +189,21 @@ def test_frames_of_another_mesh_are_refused(tmp_path):
 
 
 def test_what_is_squeezed_between_obstacles_is_said():
-    down = KeyedMotion(keys=(Key(time=0.0), Key(time=1.0, offset=(0.0, -5.0, 0.0))))
-    press = Plane(point=(0.0, 0.05, 0.0), normal=(0.0, -1.0, 0.0), motion=down)
-    made = draped(Plane(point=(0, -0.05, 0)), press, size=4)
-    with pytest.raises(Blocked, match="obstacles leave no room"):
-        list(simulate(made, prepare(made, Newton()), RULE, first_guess="current", frames=12))
+    down = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=1.0, offset=(0.0, -5.0, 0.0))))
+    press = PlaneObstacle(point=(0.0, 0.05, 0.0), normal=(0.0, -1.0, 0.0), motion=down)
+    made = draped(PlaneObstacle(point=(0, -0.05, 0)), press, size=4)
+    with pytest.raises(NoClearance, match="obstacles leave no room"):
+        list(simulate_scene(made, prepare(made, NewtonSolver()), RULE, initial_guess="current", frames=12))
 
 
 @pytest.mark.parametrize(
     ("obstacle", "words"),
     [
-        (Sphere(center=(0.0, 0.0, 0.0), radius=0.3), "passes through obstacles, .* edge .* of the obstacles"),
-        (Plane(point=(0.0, -0.005, 0.0)), "nearer than the thickness of 0.01 m: .* of the obstacles 0.005 m apart"),
+        (SphereObstacle(center=(0.0, 0.0, 0.0), radius=0.3), "passes through obstacles, .* edge .* of the obstacles"),
+        (
+            PlaneObstacle(point=(0.0, -0.005, 0.0)),
+            "nearer than the thickness of 0.01 m: .* of the obstacles 0.005 m apart",
+        ),
     ],
 )
 def test_a_start_that_is_not_free_is_refused_with_the_pairs(obstacle, words):
@@ -199,7 +214,7 @@ def test_a_start_that_is_not_free_is_refused_with_the_pairs(obstacle, words):
 def test_surfaces_of_round_obstacles_lie_inside_by_no_more_than_is_said():
     rng = np.random.default_rng(0)
     for one in (OBSTACLES["sphere"], OBSTACLES["capsule"]):
-        points, triangles = shape(one, 1e-3, np.zeros((1, 3)))
+        points, triangles = build_obstacle_surface(one, 1e-3, np.zeros((1, 3)))
         weights = rng.dirichlet(np.ones(3), size=(20, len(triangles)))
         inside = np.einsum("kfc,fcx->kfx", weights, points[triangles]).reshape(-1, 3)
         depth = -one.obstacle().distance(inside, 0.0)
@@ -211,30 +226,30 @@ def test_a_mesh_from_a_file_is_told_by_what_it_holds(tmp_path):
     (tmp_path / "one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 3 2\n")
     context = {"folder": tmp_path}
     given = {"kind": "mesh", "mesh": {"kind": "file", "path": "one.obj"}, "scale": 2.0, "offset": (0.0, -1.0, 0.0)}
-    one = Solid.model_validate_json(json.dumps(given), strict=True, context=context)  # as configs are read
+    one = MeshObstacle.model_validate_json(json.dumps(given), strict=True, context=context)  # as configs are read
     (tmp_path / "one.obj").unlink()
     with pytest.raises(InputError):
-        one.shape()
+        one.build_surface()
     (tmp_path / "one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 3 2\n")
-    (read,) = from_json(declared([one])["obstacles"])
-    assert isinstance(read, Solid)
-    for found, wanted in zip(read.shape(), one.shape(), strict=True):
+    (read,) = parse_obstacles(build_obstacles_property([one])["obstacles"])
+    assert isinstance(read, MeshObstacle)
+    for found, wanted in zip(read.build_surface(), one.build_surface(), strict=True):
         np.testing.assert_array_equal(found, wanted)
-    np.testing.assert_array_equal(read.shape()[0][1], [2.0, -1.0, 0.0])
+    np.testing.assert_array_equal(read.build_surface()[0][1], [2.0, -1.0, 0.0])
     with pytest.raises(ValueError, match=r"there is no file .*two\.obj"):
-        Solid.model_validate(given | {"mesh": {"kind": "file", "path": "two.obj"}}, context=context)
+        MeshObstacle.model_validate(given | {"mesh": {"kind": "file", "path": "two.obj"}}, context=context)
     with pytest.raises(ValueError, match="three different points from 0 to 2"):
-        Triangles(points=((0.0, 0.0, 0.0),) * 3, triangles=((0, 1, 3),))
+        TriangleSurface(points=((0.0, 0.0, 0.0),) * 3, triangles=((0, 1, 3),))
 
 
 def test_a_body_is_closed_and_faces_outwards():
-    mesh: Mesh = Body().build(12)
+    mesh: Mesh = BodyMesh().build_mesh(12)
     sides = np.sort(np.concatenate([mesh.triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
     assert (np.unique(sides, axis=0, return_counts=True)[1] == 2).all()
-    a, b, c = (mesh.rest[mesh.triangles[:, k]] for k in range(3))
+    a, b, c = (mesh.rest_positions[mesh.triangles[:, k]] for k in range(3))
     assert 0.02 < np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 < 0.06  # m^3, of a form 0.9 m high
-    assert mesh.rest[:, 1].max() == pytest.approx(0.9)
-    assert len(mesh.rest) == Body().count(12)
+    assert mesh.rest_positions[:, 1].max() == pytest.approx(0.9)
+    assert len(mesh.rest_positions) == BodyMesh().count_vertices(12)
 
 
 MU = 0.4
@@ -246,11 +261,13 @@ DT = 0.005
 def slide(tangent: float) -> tuple[np.ndarray, float]:
     """How fast a small sheet slides down a slope at the end of each step [m/s], and how it should accelerate."""
     angle, g = np.arctan(tangent), 9.81
-    down = Gravity(acceleration=(g * np.sin(angle), -g * np.cos(angle), 0.0))
-    floor = SurfaceContact(thickness=0.01, friction=MU, obstacles=(Plane(point=(0.0, -0.0186, 0.0)),))
-    made = scene(Grid(width=0.2, height=0.2), Springs(stretch=100.0, shear=20.0), down, floor, size=3, time_step=DT)
-    steps = simulate(made, prepare(made, Newton()), StopRule(100, 1e-6), first_guess="motion", frames=80)
-    speeds = np.array([step.state.now.velocity[:, 0].mean() for step in steps])
+    down = GravityEffect(acceleration=(g * np.sin(angle), -g * np.cos(angle), 0.0))
+    floor = SurfaceContactEffect(thickness=0.01, friction=MU, obstacles=(PlaneObstacle(point=(0.0, -0.0186, 0.0)),))
+    made = build_test_scene(
+        GridMesh(width=0.2, height=0.2), SpringsEffect(stretch=100.0, shear=20.0), down, floor, size=3, time_step=DT
+    )
+    steps = simulate_scene(made, prepare(made, NewtonSolver()), StopRule(100, 1e-6), initial_guess="motion", frames=80)
+    speeds = np.array([step.state.motion.velocity[:, 0].mean() for step in steps])
     return speeds, g * (np.sin(angle) - MU * np.cos(angle))
 
 
@@ -266,18 +283,18 @@ def test_it_slides_above_the_angle_of_friction_and_rests_below_within_a_twentiet
 
 
 def test_sheets_that_collide_with_friction_keep_their_momentum():
-    rough = SelfContact(thickness=0.01, friction=0.5)
-    made = scene(Stack(apart=0.05), Springs(stretch=100.0, shear=20.0), rough, size=5)
-    p, v = made.mesh.rest, np.zeros_like(made.mesh.rest)
+    rough = SelfContactEffect(thickness=0.01, friction=0.5)
+    made = build_test_scene(StackMesh(apart=0.05), SpringsEffect(stretch=100.0, shear=20.0), rough, size=5)
+    p, v = made.mesh.rest_positions, np.zeros_like(made.mesh.rest_positions)
     upper = np.arange(len(p)) >= len(p) // 2
     v[upper] = (1.0, -2.0, 0.0)
-    state, mass = State(Motion(p, v), None, 0), made.system.mass
+    state, mass = MotionState(Motion(p, v), None, 0), made.system.mass
     before, after = mass @ v, v
-    for step in simulate(
-        made, prepare(made, Newton()), StopRule(100, 1e-11), first_guess="motion", frames=8, state=state
+    for step in simulate_scene(
+        made, prepare(made, NewtonSolver()), StopRule(100, 1e-11), initial_guess="motion", frames=8, initial_state=state
     ):
         # Forces of pairs add up to nothing; what is left is the solve's tolerance.
-        after = step.state.now.velocity
+        after = step.state.motion.velocity
         np.testing.assert_allclose(mass @ after, before, atol=1e-8)
     # Friction has taken the lower one along.
     assert (mass[~upper] @ after[~upper])[0] > 0.02 * before[0]

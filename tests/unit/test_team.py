@@ -7,13 +7,21 @@ from threading import Thread
 import numpy as np
 import pytest
 
-from solvers.compiling import kernel
-from solvers.linear.team import Team, claim, finish, following, go_on, last, start
+from solvers.compiling import jit_kernel
+from solvers.linear.team import (
+    ThreadTeam,
+    complete_task,
+    finish_phases,
+    release_phase,
+    reset_team,
+    try_claim,
+    wait_for_phase,
+)
 
-begin = kernel(lambda team: start(team))
+begin = jit_kernel(lambda team: reset_team(team))
 
 
-@kernel
+@jit_kernel
 def work(team, first, phases, log, by):
     """A thread that adds the phase to each task's entry of `log`, and one to its own count `by` of tasks."""
     tasks = len(team.sums)
@@ -21,26 +29,26 @@ def work(team, first, phases, log, by):
     while phase >= 0:
         for i in range(tasks):
             task = (first + i) % tasks
-            if claim(team, task, phase):
+            if try_claim(team, task, phase):
                 log[task] = 3 * log[task] + phase
                 by[0] += 1
-                if last(team):
+                if complete_task(team):
                     # All tasks of this phase are done and none of the next one is begun.
                     for other in range(tasks):
                         if log[other] != log[0]:
                             by[1] += 1
                     if phase == phases:
-                        finish(team)
+                        finish_phases(team)
                     else:
-                        go_on(team, phase + 1)
-        phase = following(team, phase)
+                        release_phase(team, phase + 1)
+        phase = wait_for_phase(team, phase)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
 @pytest.mark.parametrize("tasks", [1, 4])
 def test_each_task_is_done_once_a_phase_and_phases_do_not_mix(threads, tasks):
     phases = 300
-    team, log, counts = Team.of(tasks), np.zeros(tasks, np.int64), np.zeros((threads, 2), np.int64)
+    team, log, counts = ThreadTeam.from_task_count(tasks), np.zeros(tasks, np.int64), np.zeros((threads, 2), np.int64)
     begin(team)
     crew = [Thread(target=work, args=(team, k, phases, log, counts[k])) for k in range(threads)]
     for thread in crew:
@@ -57,7 +65,7 @@ def test_each_task_is_done_once_a_phase_and_phases_do_not_mix(threads, tasks):
 
 
 def test_one_that_comes_when_all_is_done_does_nothing():
-    team, log, counts = Team.of(3), np.zeros(3, np.int64), np.zeros((2, 2), np.int64)
+    team, log, counts = ThreadTeam.from_task_count(3), np.zeros(3, np.int64), np.zeros((2, 2), np.int64)
     begin(team)
     for k in range(2):
         work(team, k, 7, log, counts[k])

@@ -8,26 +8,26 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 
-from harness.simulation.step import FIRST_GUESSES
-from solvers.contact.energy import Planes
-from solvers.contact.touching import without_contact
+from harness.simulation.step import INITIAL_GUESSES
+from solvers.contact.energy import ContactPlanes
+from solvers.contact.touching import without_vertex_contact
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.methods.vbd import PreparedVertexBlockDescent, Sweeps, VertexBlockDescent
+from solvers.methods.vbd import PreparedVertexBlockDescent, SweepState, VertexBlockDescent
 from solvers.problem import NotPositiveDefinite, StepProblem, StopRule, Unsupported
-from tests.contacts import OBSTACLES, contact, sheet, steps
-from tests.scenes import SCENES, cloth, first_problem, random_problem
+from tests.contacts import OBSTACLE_SPECS, build_contact, build_sheet, collect_steps
+from tests.scenes import SCENE_BUILDERS, build_cloth, build_first_problem, build_random_problem
 from tests.unit.test_xpbd import Other
 
 METHODS = {"plain": VertexBlockDescent(0.0), "accelerated": VertexBlockDescent()}
 methods = pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
 
 PROBLEMS = {
-    "chain": lambda: first_problem(SCENES["chain"](1e10)),
-    "net, exact pins": lambda: first_problem(SCENES["net"]("exact")),
-    "cloth": lambda: first_problem(cloth(8)),
-    "cloth, exact pins, inertial guess": lambda: first_problem(cloth(8, "exact"), "inertial"),
-    "random": lambda: random_problem(0, weights=(1e4, np.inf, 1e2)),
-    "random, not pinned": lambda: random_problem(1, weights=()),
+    "chain": lambda: build_first_problem(SCENE_BUILDERS["chain"](1e10)),
+    "net, exact pins": lambda: build_first_problem(SCENE_BUILDERS["net"]("exact")),
+    "cloth": lambda: build_first_problem(build_cloth(8)),
+    "cloth, exact pins, inertial guess": lambda: build_first_problem(build_cloth(8, "exact"), "inertial"),
+    "random": lambda: build_random_problem(0, weights=(1e4, np.inf, 1e2)),
+    "random, not pinned": lambda: build_random_problem(1, weights=()),
 }
 problems = pytest.mark.parametrize("problem", [make() for make in PROBLEMS.values()], ids=list(PROBLEMS))
 
@@ -63,10 +63,10 @@ STARTS = {
 @problems
 @pytest.mark.parametrize("start", STARTS)
 def test_no_iteration_raises_the_objective(method, problem, start):
-    problem = replace(problem, first_guess=STARTS[start](problem.first_guess, np.random.default_rng(0)))
+    problem = replace(problem, first_guess=STARTS[start](problem.initial_guess, np.random.default_rng(0)))
     path = iterates(method, problem, 60)
     for before, after in pairwise(path):
-        assert problem.value(after) <= problem.value(before) + 1e-13 * problem.magnitude(before)  # a hundred terms
+        assert problem.value(after) <= problem.value(before) + 1e-13 * problem.value_scale(before)  # a hundred terms
     assert problem.value(path[-1]) < problem.value(path[0])
 
 
@@ -74,25 +74,25 @@ def test_no_iteration_raises_the_objective(method, problem, start):
 @pytest.mark.parametrize("seed", range(5))
 def test_vertices_without_mass_descend_as_well(method, seed):
     """Blocks of those are singular where their springs lie in a line or a plane: the majorant's step takes over."""
-    problem = random_problem(seed)
+    problem = build_random_problem(seed)
     light = replace(problem.system, mass=np.where(np.arange(12) % 3, 0.0, problem.system.mass))
-    problem = replace(problem, system=light, first_guess=problem.current * [1.0, 1.0, 0.0])
+    problem = replace(problem, system=light, initial_guess=problem.current_positions * [1.0, 1.0, 0.0])
     for before, after in pairwise(iterates(method, problem, 40)):
         assert np.isfinite(after).all()
-        assert problem.value(after) <= problem.value(before) + 1e-13 * problem.magnitude(before)
+        assert problem.value(after) <= problem.value(before) + 1e-13 * problem.value_scale(before)
 
 
 @pytest.mark.parametrize(("name", "times"), [("cloth", 2), ("block", 4), ("tower", 4)])
 def test_acceleration_needs_a_fraction_of_the_iterations(name, times):
-    problem = first_problem(SCENES[name](1e10))
+    problem = build_first_problem(SCENE_BUILDERS[name](1e10))
     plain, fast = (iterates(method, problem, 100) for method in METHODS.values())
     assert problem.value(fast[100 // times - 1]) <= problem.value(plain[-1])
 
 
 def test_a_single_vertex_takes_a_newton_step():
     """One free vertex: the iteration is Newton's, and squares the error."""
-    made = random_problem(0, n=4, m=0, weights=(np.inf,) * 3)
-    springs = SCENES["chain"](1e10).springs
+    made = build_random_problem(0, n=4, m=0, weights=(np.inf,) * 3)
+    springs = SCENE_BUILDERS["chain"](1e10).all_springs
     star = replace(springs, edges=np.array([[0, 3], [1, 3], [2, 3]]))
     star = replace(star, stiffness=np.full(3, 50.0), rest_length=np.full(3, 0.2), rest_direction=np.eye(3))
     problem = replace(made, system=replace(made.system, energies=(star,)))
@@ -104,41 +104,41 @@ def test_a_single_vertex_takes_a_newton_step():
 
 @methods
 def test_a_tolerance_ends_a_solve_at_the_first_iterate_whose_residual_is_below_it(method):
-    problem = first_problem(cloth(8))
+    problem = build_first_problem(build_cloth(8))
     prepared = method.prepare(problem.system)
     yardstick = prepared.solve(problem, StopRule(1, 0.5)).yardstick
     residuals = [prepared.solve(problem, StopRule(k)).residual for k in range(1, 40)]
     below = next(k for k, residual in enumerate(residuals, 1) if residual <= 0.02 * yardstick)
     solution = prepared.solve(problem, StopRule(100, 0.02))
-    assert (solution.iterations, solution.stopped) == (below, "tolerance")
+    assert (solution.num_iterations, solution.termination_reason) == (below, "tolerance")
     assert solution.residual == residuals[below - 1]
 
 
 @methods
 def test_the_yardstick_is_taken_at_the_current_positions_whatever_the_first_guess(method):
     found = []
-    for guess in FIRST_GUESSES:
-        problem = first_problem(replace(cloth(8), velocity=(1.0, 0.0, 0.0)), guess)
+    for guess in INITIAL_GUESSES:
+        problem = build_first_problem(replace(build_cloth(8), initial_velocity=(1.0, 0.0, 0.0)), guess)
         found.append(method.prepare(problem.system).solve(problem, StopRule(1, 1e-9)).yardstick)
     assert len(set(found)) == 1
 
 
 @methods
 def test_a_scene_at_rest_stops_after_one_iteration(method):
-    problem = first_problem(cloth(8))
-    p = problem.current
-    still = replace(problem, target=p, force=np.zeros_like(p), first_guess=p)
+    problem = build_first_problem(build_cloth(8))
+    p = problem.current_positions
+    still = replace(problem, inertial_target=p, external_force=np.zeros_like(p), initial_guess=p)
     solution = method.prepare(problem.system).solve(still, StopRule(50, 1e-6))
-    assert solution.iterations == 1
-    assert solution.stopped in ("floor", "tolerance")
+    assert solution.num_iterations == 1
+    assert solution.termination_reason in ("floor", "tolerance")
 
 
 @methods
 def test_a_solve_that_diverged_says_so(method):
-    problem = random_problem(0, weights=())
-    lost = replace(problem, first_guess=np.full_like(problem.first_guess, np.nan))
+    problem = build_random_problem(0, weights=())
+    lost = replace(problem, initial_guess=np.full_like(problem.initial_guess, np.nan))
     solution = method.prepare(problem.system).solve(lost, StopRule(4, 1e-3))
-    assert (solution.iterations, solution.stopped) == (4, "iterations")
+    assert (solution.num_iterations, solution.termination_reason) == (4, "iterations")
     assert np.isnan(solution.residual)
 
 
@@ -149,7 +149,7 @@ def test_a_spectral_radius_is_less_than_one(radius):
 
 
 def test_what_it_cannot_do_is_said_before_any_work():
-    system = random_problem(0).system
+    system = build_random_problem(0).system
     with pytest.raises(Unsupported, match="Other"):
         VertexBlockDescent().prepare(replace(system, energies=(*system.energies, Other())))
     with pytest.raises(NotPositiveDefinite, match="nothing determines"):
@@ -157,16 +157,18 @@ def test_what_it_cannot_do_is_said_before_any_work():
 
 
 def test_a_push_by_pairs_leaves_the_half_spaces_of_obstacles_where_they_were():
-    problem = steps(sheet(contact(OBSTACLES["plane"])), 8)[-1].problem
-    p, none = problem.first_guess, np.empty(0)
+    problem = collect_steps(build_sheet(build_contact(OBSTACLE_SPECS["plane"])), 8)[-1].problem
+    p, none = problem.initial_guess, np.empty(0)
 
-    def sweeps(problem: StepProblem) -> Sweeps:
+    def sweeps(problem: StepProblem) -> SweepState:
         prepared = VertexBlockDescent().prepare(problem.system)
         assert isinstance(prepared, PreparedVertexBlockDescent)  # on no device
-        return Sweeps(prepared, problem, p)
+        return SweepState(prepared, problem, p)
 
-    swept = sweeps(problem).alone(p)
-    assert np.any(sweeps(replace(problem, system=without_contact(problem.system))).alone(p) != swept)
+    swept = sweeps(problem).sweep_without_contact(p)
+    assert np.any(
+        sweeps(replace(problem, system=without_vertex_contact(problem.system))).sweep_without_contact(p) != swept
+    )
     after = sweeps(problem)
-    after.pushed(p, Planes(none.astype(int), np.empty((0, 3)), none, np.empty((0, 3)), none, none))
-    np.testing.assert_array_equal(after.alone(p), swept)
+    after.sweep_with_planes(p, ContactPlanes(none.astype(int), np.empty((0, 3)), none, np.empty((0, 3)), none, none))
+    np.testing.assert_array_equal(after.sweep_without_contact(p), swept)

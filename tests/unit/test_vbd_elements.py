@@ -9,20 +9,29 @@ from typing import Any
 import numpy as np
 import pytest
 
-from solvers.compiling import kernel
-from solvers.core.vertex_elements import Beside
-from solvers.kernels.stencils import Kind, Vertices
-from solvers.methods.newton import Newton
+from solvers.compiling import jit_kernel
+from solvers.core.vertex_elements import VertexElements
+from solvers.kernels.stencils import ElementKind, VertexFunctions
+from solvers.methods.newton import NewtonSolver
 from solvers.methods.vbd import PreparedVertexBlockDescent, VertexBlockDescent
 from solvers.problem import StopRule, Unsupported
-from tests.effects import BEND, DASHPOTS, FLOOR, LIMITS, RAYLEIGH, SCENES, cloth, stepped
+from tests.effects import (
+    BENDING_EFFECT,
+    DASHPOT_EFFECT,
+    EFFECT_SCENES,
+    FLOOR_CONTACT,
+    RAYLEIGH_EFFECT,
+    STRAIN_LIMIT_EFFECT,
+    build_effect_cloth,
+    build_moving_problem,
+)
 
 METHODS = {"plain": VertexBlockDescent(0.0), "accelerated": VertexBlockDescent()}
 EFFECTS = {
-    "strain limits": (LIMITS,),
-    "dashpots": (DASHPOTS,),
-    "rayleigh": (RAYLEIGH, BEND),
-    "both, and contact": (LIMITS, DASHPOTS, FLOOR),
+    "strain limits": (STRAIN_LIMIT_EFFECT,),
+    "dashpots": (DASHPOT_EFFECT,),
+    "rayleigh": (RAYLEIGH_EFFECT, BENDING_EFFECT),
+    "both, and contact": (STRAIN_LIMIT_EFFECT, DASHPOT_EFFECT, FLOOR_CONTACT),
 }
 NOISE = np.random.default_rng(0)
 
@@ -30,13 +39,13 @@ NOISE = np.random.default_rng(0)
 @pytest.mark.parametrize("effect", ["strain limits", "dashpots"])
 def test_a_vertex_feels_what_the_oracle_says(effect):
     """Value, gradient, diagonal blocks of the Hessian, and the rise by a step of one vertex."""
-    problem = stepped(cloth(*EFFECTS[effect]))
-    n = problem.system.vertices
-    p, d = problem.current, 0.01 * NOISE.normal(size=(n, 3))
-    beside = Beside.of(problem.system)
-    around = beside.among(np.arange(n), n).begun(problem)
-    energy: Any = problem.energies[beside.numbers[0]]
-    total, felt, risen = Vertices.of([Kind(energy.law, 2)])
+    problem = build_moving_problem(build_effect_cloth(*EFFECTS[effect]))
+    n = problem.system.num_vertices
+    p, d = problem.current_positions, 0.01 * NOISE.normal(size=(n, 3))
+    beside = VertexElements.from_system(problem.system)
+    around = beside.with_rows(np.arange(n), n).update_elements(problem)
+    energy: Any = problem.energies[beside.energy_indices[0]]
+    total, felt, risen = VertexFunctions.from_kinds([ElementKind(energy.element_law, 2)])
 
     def tell(around, p, d, gradient, block, rises, value):
         value[0] = total(around, p)
@@ -45,7 +54,7 @@ def test_a_vertex_feels_what_the_oracle_says(effect):
             rises[i] = risen(around, i, p, (d[i, 0], d[i, 1], d[i, 2]))
 
     gradient, block, rises, value = (np.empty(shape) for shape in ((n, 3), (n, 6), n, 1))
-    kernel(tell)(around, np.pad(p, ((0, 0), (0, 1))).ravel(), d, gradient, block, rises, value)
+    jit_kernel(tell)(around, np.pad(p, ((0, 0), (0, 1))).ravel(), d, gradient, block, rises, value)
     wanted = np.zeros_like(p)
     energy.add_gradient(p, wanted)
     blocks = energy.hessian(p).toarray().reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
@@ -62,16 +71,16 @@ def test_a_vertex_feels_what_the_oracle_says(effect):
 @pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_no_iteration_raises_the_objective_and_the_end_is_newtons_minimum(method, effect):
-    problem = stepped(cloth(*EFFECTS[effect]))
+    problem = build_moving_problem(build_effect_cloth(*EFFECTS[effect]))
     prepared = method.prepare(problem.system)
-    tangle = replace(problem, first_guess=NOISE.normal(size=problem.current.shape))
-    one_point = replace(problem, first_guess=np.zeros_like(problem.current))
+    tangle = replace(problem, initial_guess=NOISE.normal(size=problem.current_positions.shape))
+    one_point = replace(problem, initial_guess=np.zeros_like(problem.current_positions))
     for given in (problem, tangle, one_point):
         path = [p.copy() for p in islice(prepared.iterates(given), 40)]
         for before, after in pairwise(path):
-            assert given.value(after) <= given.value(before) + 1e-13 * given.magnitude(before)  # a hundred terms
-    wanted = Newton().prepare(problem.system).solve(problem, StopRule(100, 1e-12)).positions
-    near = replace(problem, first_guess=wanted + 1e-3 * NOISE.normal(size=wanted.shape))
+            assert given.value(after) <= given.value(before) + 1e-13 * given.value_scale(before)  # a hundred terms
+    wanted = NewtonSolver().prepare(problem.system).solve(problem, StopRule(100, 1e-12)).positions
+    near = replace(problem, initial_guess=wanted + 1e-3 * NOISE.normal(size=wanted.shape))
     found = prepared.solve(near, StopRule(4000)).positions
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)  # what a linear rate leaves
     assert np.array_equal(found, method.prepare(problem.system).solve(near, StopRule(4000)).positions)
@@ -79,21 +88,21 @@ def test_no_iteration_raises_the_objective_and_the_end_is_newtons_minimum(method
 
 def test_vertices_of_one_element_have_different_colours():
     """Elements that join vertices which no spring joins."""
-    problem = stepped(cloth(DASHPOTS))
+    problem = build_moving_problem(build_effect_cloth(DASHPOT_EFFECT))
     system = problem.system
-    beside = Beside.of(system)
+    beside = VertexElements.from_system(system)
     far = [
-        replace(energy, edges=np.array([[0, 35], [5, 30]]), stiffness=energy.stiffness[:2], offset=energy.offset[:2],
+        replace(energy, edges=np.array([[0, 35], [5, 30]]), entry_stiffness=energy.entry_stiffness[:2], offset=energy.offset[:2],
                 direction=energy.direction[:2])
         for energy in beside.energies
     ]  # fmt: skip
     apart = replace(system, energies=(*(e for e in system.energies if e not in beside.energies), *far))
     made = VertexBlockDescent().prepare(apart)
     assert isinstance(made, PreparedVertexBlockDescent)
-    bundle = {int(place) // 4: k // 8 for k, place in enumerate(made.blocks.bundles.own)}
-    assert all(bundle[int(made.row[i])] != bundle[int(made.row[j])] for i, j in ((0, 35), (5, 30)))
+    bundle = {int(place) // 4: k // 8 for k, place in enumerate(made.colour_packets.spring_packets.row_offset)}
+    assert all(bundle[int(made.row_of_vertex[i])] != bundle[int(made.row_of_vertex[j])] for i, j in ((0, 35), (5, 30)))
 
 
 def test_what_has_no_bound_on_its_curvature_is_refused_and_the_refusal_says_so():
     with pytest.raises(Unsupported, match=r"Gas.*bound of the second derivatives"):
-        VertexBlockDescent().prepare(SCENES["gas"]().system)
+        VertexBlockDescent().prepare(EFFECT_SCENES["gas"]().system)

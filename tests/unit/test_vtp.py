@@ -15,10 +15,10 @@ from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
 from harness.base.errors import InputError
 from harness.scenes.mesh import vtp
-from harness.scenes.mesh.files import File
-from harness.scenes.mesh.grid import Grid
+from harness.scenes.mesh.files import FileMesh
+from harness.scenes.mesh.grid import GridMesh
 
-MESH = Grid().build(5)
+MESH = GridMesh().build_mesh(5)
 HEAT = np.arange(25) / 7
 
 
@@ -31,7 +31,7 @@ def cells(*corners: list[int]) -> vtkCellArray:
 
 def surface() -> vtkPolyData:
     data, points = vtkPolyData(), vtkPoints()
-    points.SetData(numpy_to_vtk(MESH.rest, deep=True))
+    points.SetData(numpy_to_vtk(MESH.rest_positions, deep=True))
     data.SetPoints(points)
     data.SetPolys(cells([0, 1, 6, 5], [1, 2, 7]))
     data.SetStrips(cells([10, 11, 15, 16, 20]))
@@ -57,33 +57,33 @@ def written(path: Path, mode: str, compressor: str, wide: bool) -> Path:
 @pytest.mark.parametrize("mode", ["ascii", "binary", "base64", "raw"])
 def test_every_form_holds_the_same(tmp_path, mode):
     for compressor, wide in product(("None", "ZLib", "LZMA"), (False, True)):
-        read = vtp.read(written(tmp_path / "mesh.vtp", mode, compressor, wide).read_bytes())
-        np.testing.assert_array_equal(read.points, MESH.rest)
+        read = vtp.read_vtp(written(tmp_path / "mesh.vtp", mode, compressor, wide).read_bytes())
+        np.testing.assert_array_equal(read.points, MESH.rest_positions)
         corners = [polygon.tolist() for polygon in read.polygons]
         assert corners == [[0, 1, 6, 5], [1, 2, 7], [10, 11, 15], [11, 16, 15], [15, 16, 20]]
         assert [line.tolist() for line in read.lines] == [[2, 3, 4]]
-        np.testing.assert_array_equal(read.numbers["heat"][:, 0], HEAT)
+        np.testing.assert_array_equal(read.point_attributes["heat"][:, 0], HEAT)
 
 
 def test_it_becomes_a_mesh_and_what_was_cut_is_refused(tmp_path):
     path = written(tmp_path / "mesh.vtp", "raw", "None", wide=False)
-    mesh = File(path=path).build()
+    mesh = FileMesh(path=path).build_mesh()
     assert len(mesh.triangles) == 6
     np.testing.assert_array_equal(mesh.attributes["heat"], HEAT)
     whole = path.read_bytes()
     path.write_bytes(whole[: whole.rfind(b"</AppendedData>") - 200])
     with pytest.raises(InputError, match=r"an array promises \d+ bytes, and \d+ are there; the file was cut"):
-        File(path=path).build()
+        FileMesh(path=path).build_mesh()
     path.write_bytes(whole.replace(b"vtkZLib", b"").replace(b'type="PolyData"', b'type="ImageData"'))
     with pytest.raises(InputError, match="holds ImageData; wanted PolyData"):
-        File(path=path).build()
+        FileMesh(path=path).build_mesh()
 
 
 def test_an_objs_groups_are_parts_and_its_colours_numbers(tmp_path):
     corners = ("0 0 0 1 0 0", "1 0 0 0 1 0", "1 1 0 0 0 1", "0 1 0 0 0 0.5")
     path = tmp_path / "mesh.obj"
     path.write_text("".join(f"v {x}\n" for x in corners) + "g cuff seam\nf 1 2 3\no left\nf 1 3 4\nl 2 4\n")
-    mesh = File(path=path).build()
+    mesh = FileMesh(path=path).build_mesh()
     assert {name: mesh.parts[name].tolist() for name in ("cuff", "seam", "left", "right")} == {
         "cuff": [0, 1, 2],
         "seam": [0, 1, 2],
@@ -96,12 +96,14 @@ def test_an_objs_groups_are_parts_and_its_colours_numbers(tmp_path):
 def test_groups_of_gmsh_are_parts(tmp_path):
     one = [("triangle", MESH.triangles[:4]), ("line", np.array([[0, 1], [1, 2]]))]
     made = meshio.Mesh(
-        MESH.rest,
+        MESH.rest_positions,
         one,
         cell_data={"gmsh:physical": [np.full(4, 2), np.array([1, 7])], "gmsh:geometrical": [np.ones(4, int), [1, 1]]},
         field_data={"collar": np.array([1, 1]), "panel": np.array([2, 2])},
     )
     meshio.write(tmp_path / "mesh.msh", made, file_format="gmsh22", binary=False)
-    mesh = File(path=tmp_path / "mesh.msh").build()
-    np.testing.assert_array_equal(mesh.rest[mesh.parts["collar"]], MESH.rest[[0, 1]])
-    np.testing.assert_array_equal(mesh.rest[mesh.parts["panel"]], MESH.rest[np.unique(MESH.triangles[:4])])
+    mesh = FileMesh(path=tmp_path / "mesh.msh").build_mesh()
+    np.testing.assert_array_equal(mesh.rest_positions[mesh.parts["collar"]], MESH.rest_positions[[0, 1]])
+    np.testing.assert_array_equal(
+        mesh.rest_positions[mesh.parts["panel"]], MESH.rest_positions[np.unique(MESH.triangles[:4])]
+    )

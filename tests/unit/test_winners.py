@@ -8,14 +8,14 @@ from typing import Any
 
 import pytest
 
-from harness.report.accuracy.findings import findings
-from harness.report.accuracy.reading import read
-from harness.report.accuracy.winners import NOBODY, Cell, cells, family
-from harness.report.figures.of_accuracy import work
-from harness.report.figures.of_winners import winners
-from harness.report.figures.panel import CellMap, Plot
-from harness.report.site.accuracy import charts
-from harness.report.site.winners import chart
+from harness.report.accuracy.findings import summarise_findings
+from harness.report.accuracy.reading import read_accuracy
+from harness.report.accuracy.winners import NO_WINNER, WinnerCell, build_winner_cells, method_family
+from harness.report.figures.of_accuracy import work_precision_panels
+from harness.report.figures.of_winners import winner_panels
+from harness.report.figures.panel import CellMap, CurvePlot
+from harness.report.site.accuracy import build_accuracy_charts
+from harness.report.site.winners import build_winner_chart
 from tests import accuracy_rows as made
 from tests import figure_results
 
@@ -30,7 +30,12 @@ def row(solver: str, integrator: str, error: float, cpu: float, **other: Any) ->
         "seconds": [9.9],
     }
     told |= {"horizon": 0.5, "time_step": 0.01, "iterations": 50, "stiffness_ratio": 0.09, "vertices": 81}
-    return made.shared("net", 9, solver=solver, parameters="{}", kind="work") | {"minimises": True} | told | other
+    return (
+        made.build_shared_columns("net", 9, solver=solver, parameters="{}", kind="work")
+        | {"minimises": True}
+        | told
+        | other
+    )
 
 
 ROWS = (
@@ -43,8 +48,11 @@ ROWS = (
 
 
 @pytest.fixture
-def found(tmp_path: Path) -> dict[float, Cell]:
-    return {cell.error: cell for cell in cells(read(made.write(tmp_path, ROWS)).works)}
+def found(tmp_path: Path) -> dict[float, WinnerCell]:
+    return {
+        cell.error: cell
+        for cell in build_winner_cells(read_accuracy(made.write_accuracy_rows(tmp_path, ROWS)).work_points)
+    }
 
 
 def test_the_cheapest_by_processor_time_within_the_error_wins(found):
@@ -53,13 +61,13 @@ def test_the_cheapest_by_processor_time_within_the_error_wins(found):
         "linearly implicit",
         "linearly implicit",
         "implicit, order 2",
-        NOBODY,
+        NO_WINNER,
     ]
     assert found[0.1].prices["implicit, order 2"].cpu == 0.8, "seconds a simulated second, the cheaper of the two"
 
 
 def test_the_page_has_a_point_for_each_error_that_somebody_reaches(tmp_path: Path):
-    told = chart(read(made.write(tmp_path, ROWS)))
+    told = build_winner_chart(read_accuracy(made.write_accuracy_rows(tmp_path, ROWS)))
     points = {(error, item["label"]) for item in told["items"] for error in item["error"]}
     order = ("implicit, order 1", "linearly implicit", "linearly implicit", "implicit, order 2")
     assert points == {(10.0**-k, name) for k, name in enumerate(order, 1)}
@@ -67,7 +75,9 @@ def test_the_page_has_a_point_for_each_error_that_somebody_reaches(tmp_path: Pat
     first = next(item for item in told["items"] if item["label"] == order[0])
     assert (first["next"], first["ahead"]) == (["linearly implicit"], ["3 times as much"])
     assert "numba" in first["setting"][0]
-    assert not chart(read(made.write(tmp_path / "one", ROWS[:1])))["items"], "one family alone wins nothing"
+    assert not build_winner_chart(read_accuracy(made.write_accuracy_rows(tmp_path / "one", ROWS[:1])))["items"], (
+        "one family alone wins nothing"
+    )
 
 
 def test_a_cell_tells_how_far_ahead_its_winner_is(found):
@@ -81,13 +91,15 @@ def test_the_stiffness_number_is_that_of_a_frame_whatever_the_step(found):
 
 
 def test_an_integrator_from_outside_is_a_family_by_its_name(tmp_path):
-    (work,) = read(made.write(tmp_path, [row("newton", "mine:METHOD", 0.1, 1.0)])).works
-    assert family(work) == "mine:METHOD"
+    (work,) = read_accuracy(made.write_accuracy_rows(tmp_path, [row("newton", "mine:METHOD", 0.1, 1.0)])).work_points
+    assert method_family(work) == "mine:METHOD"
 
 
 def test_each_number_of_vertices_is_a_grid_of_errors_by_stiffness(tmp_path):
     panels = [
-        panel for entry in winners(figure_results.winners(tmp_path)) if isinstance(panel := entry.make(), CellMap)
+        panel
+        for entry in winner_panels(figure_results.write_winner_results(tmp_path))
+        if isinstance(panel := entry.build_panel(), CellMap)
     ]
     assert [panel.title for panel in panels] == ["81 vertices", "289 vertices", "1\u2009089 vertices"]
     assert {len({cell.column for cell in panel.cells}) for panel in panels} == {5}
@@ -96,13 +108,17 @@ def test_each_number_of_vertices_is_a_grid_of_errors_by_stiffness(tmp_path):
 
 @pytest.mark.parametrize("truth", ["integrated", "self-converged"])
 def test_errors_by_a_self_converged_motion_are_marked_wherever_they_are_shown(tmp_path, truth):
-    folder = made.write(tmp_path, [one | {"truth": truth} for one in ROWS])
-    table = read(folder)
-    panels = [panel for entry in (*work(folder), *winners(folder)) if isinstance(panel := entry.make(), Plot | CellMap)]
+    folder = made.write_accuracy_rows(tmp_path, [one | {"truth": truth} for one in ROWS])
+    table = read_accuracy(folder)
+    panels = [
+        panel
+        for entry in (*work_precision_panels(folder), *winner_panels(folder))
+        if isinstance(panel := entry.build_panel(), CurvePlot | CellMap)
+    ]
     shown = [" ".join(panel.notes) for panel in panels]
-    on_page = charts(table, folder)
+    on_page = build_accuracy_charts(table, folder)
     shown += [on_page[name]["note"] for name in ("work", "winners")]
-    shown += [" ".join(findings(table)["Work and precision"])]
+    shown += [" ".join(summarise_findings(table)["Work and precision"])]
     assert {"by a self-converged reference, for there is contact: net 9." in text for text in shown} == {
         truth == "self-converged"
     }

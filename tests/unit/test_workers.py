@@ -12,19 +12,19 @@ from typing import NamedTuple
 import psutil
 import pytest
 
-from harness.base.errors import InputError, Mistake
-from harness.base.files import CannotWrite
-from harness.base.workers import Limits, Lost, Piece, Tick, Workers
+from harness.base.errors import InputError, InputMistake
+from harness.base.files import WriteError
+from harness.base.workers import IsolatedWorker, ProgressCallback, TaskFailure, TaskFunction, TaskLimits
 from tests import workers as does
 
-NONE = Limits()
+NONE = TaskLimits()
 
 
 @pytest.fixture
-def workers() -> Iterator[Workers]:
-    made = Workers()
+def workers() -> Iterator[IsolatedWorker]:
+    made = IsolatedWorker()
     yield made
-    made.end()
+    made.stop_worker()
 
 
 def quiet(phase: str) -> None:
@@ -34,94 +34,108 @@ def quiet(phase: str) -> None:
 class Case(NamedTuple):
     """A piece, what its loss is called, and what is said of it, in parts."""
 
-    piece: Piece
+    piece: TaskFunction
     status: str
     said: tuple[str, ...]
-    limits: Limits = NONE
+    limits: TaskLimits = NONE
 
 
 CASES = {
     "a crash": Case(
-        does.crash, "failed", ("crashed by SIGSEGV at workers.py", "in crash", "after 2 steps of the crashing")
+        does.crash_process, "failed", ("crashed by SIGSEGV at workers.py", "in crash", "after 2 steps of the crashing")
     ),
-    "an abort": Case(does.abort, "failed", ("crashed by SIGABRT at workers.py", "in abort", "it said: I cannot go on")),
-    "an exit by the system": Case(does.leave, "failed", ("ended its process with exit code 7, before its first step",)),
-    "an exit that says that all is well": Case(does.leave_well, "failed", ("exit code 0",)),
-    "an exit by Python": Case(does.leave_by_python, "failed", ("raised SystemExit: I am off (workers.py",)),
-    "the end of a generator": Case(does.leave_as_a_generator, "failed", ("raised GeneratorExit (workers.py",)),
-    "an interrupt that nobody made": Case(does.interrupt, "failed", ("raised KeyboardInterrupt (workers.py",)),
-    "a kill": Case(does.be_killed, "killed", ("SIGKILL",)),
+    "an abort": Case(
+        does.abort_process, "failed", ("crashed by SIGABRT at workers.py", "in abort", "it said: I cannot go on")
+    ),
+    "an exit by the system": Case(
+        does.exit_with_error, "failed", ("ended its process with exit code 7, before its first step",)
+    ),
+    "an exit that says that all is well": Case(does.exit_cleanly, "failed", ("exit code 0",)),
+    "an exit by Python": Case(does.raise_system_exit, "failed", ("raised SystemExit: I am off (workers.py",)),
+    "the end of a generator": Case(does.raise_generator_exit, "failed", ("raised GeneratorExit (workers.py",)),
+    "an interrupt that nobody made": Case(
+        does.raise_keyboard_interrupt, "failed", ("raised KeyboardInterrupt (workers.py",)
+    ),
+    "a kill": Case(does.kill_process, "killed", ("SIGKILL",)),
     "a loop": Case(
-        does.loop, "time-limit", ("did not end within 1 s; it was at workers.py", "in loop"), Limits(seconds=1.0)
+        does.loop_forever,
+        "time-limit",
+        ("did not end within 1 s; it was at workers.py", "in loop"),
+        TaskLimits(wall_seconds=1.0),
     ),
-    "too much memory": Case(does.swell, "failed", ("raised MemoryError (workers.py",), Limits(gib=0.5)),
+    "too much memory": Case(
+        does.exhaust_memory, "failed", ("raised MemoryError (workers.py",), TaskLimits(memory_gib=0.5)
+    ),
 }
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_what_a_piece_does_to_its_process_is_told_and_the_next_one_is_done(case: Case, workers: Workers):
+def test_what_a_piece_does_to_its_process_is_told_and_the_next_one_is_done(case: Case, workers: IsolatedWorker):
     for _ in range(2):
-        with pytest.raises(Lost) as lost:
-            workers.do(case.piece, quiet, case.limits)
+        with pytest.raises(TaskFailure) as lost:
+            workers.run_task(case.piece, quiet, case.limits)
         assert lost.value.status == case.status
         for part in case.said:
             assert part in str(lost.value)
-        assert workers.do(partial(does.double, 21), quiet, NONE) == 42
+        assert workers.run_task(partial(does.double_number, 21), quiet, NONE) == 42
 
 
-def test_a_worker_is_another_process_and_stays(workers: Workers):
-    one, two = (workers.do(does.name, quiet, NONE) for _ in range(2))
+def test_a_worker_is_another_process_and_stays(workers: IsolatedWorker):
+    one, two = (workers.run_task(does.worker_pid, quiet, NONE) for _ in range(2))
     assert one == two != os.getpid()
 
 
-def test_a_worker_that_died_in_between_is_replaced(workers: Workers):
-    first = workers.do(does.name, quiet, NONE)
+def test_a_worker_that_died_in_between_is_replaced(workers: IsolatedWorker):
+    first = workers.run_task(does.worker_pid, quiet, NONE)
     os.kill(first, 9)
     psutil.wait_procs([psutil.Process(first)], timeout=10.0) if psutil.pid_exists(first) else None
-    assert workers.do(does.name, quiet, NONE) != first
+    assert workers.run_task(does.worker_pid, quiet, NONE) != first
 
 
-def test_a_piece_that_leaves_threads_behind_costs_its_worker(workers: Workers):
-    first = workers.do(does.leave_a_thread, quiet, NONE)
-    assert workers.do(does.name, quiet, NONE) != first
+def test_a_piece_that_leaves_threads_behind_costs_its_worker(workers: IsolatedWorker):
+    first = workers.run_task(does.start_daemon_thread, quiet, NONE)
+    assert workers.run_task(does.worker_pid, quiet, NONE) != first
 
 
-def test_a_piece_that_loses_the_device_costs_its_worker(workers: Workers):
+def test_a_piece_that_loses_the_device_costs_its_worker(workers: IsolatedWorker):
     """A process does not get it back: the next runs on it need another one."""
-    first = workers.do(does.lose_the_device, quiet, NONE)
-    assert workers.do(does.name, quiet, NONE) != first
+    first = workers.run_task(does.break_device, quiet, NONE)
+    assert workers.run_task(does.worker_pid, quiet, NONE) != first
 
 
-def test_a_copy_that_a_piece_makes_of_its_process_answers_nothing(workers: Workers):
-    first = workers.do(does.copy, quiet, NONE)
-    assert workers.do(does.name, quiet, NONE) == first
+def test_a_copy_that_a_piece_makes_of_its_process_answers_nothing(workers: IsolatedWorker):
+    first = workers.run_task(does.fork_process, quiet, NONE)
+    assert workers.run_task(does.worker_pid, quiet, NONE) == first
 
 
-def test_memory_is_free_again_after_a_piece(workers: Workers):
-    with pytest.raises(Lost):
-        workers.do(does.swell, quiet, Limits(gib=0.5))
-    assert workers.do(does.swell, quiet, NONE) == 2**11
+def test_memory_is_free_again_after_a_piece(workers: IsolatedWorker):
+    with pytest.raises(TaskFailure):
+        workers.run_task(does.exhaust_memory, quiet, TaskLimits(memory_gib=0.5))
+    assert workers.run_task(does.exhaust_memory, quiet, NONE) == 2**11
 
 
-def refuse(error: Exception, tick: Tick) -> None:
+def refuse(error: Exception, tick: ProgressCallback) -> None:
     raise error
 
 
 @pytest.mark.parametrize(
-    "error", [CannotWrite("x: No space left on device"), InputError([Mistake("is odd", key="a"), Mistake("is even")])]
+    "error",
+    [WriteError("x: No space left on device"), InputError([InputMistake("is odd", key="a"), InputMistake("is even")])],
 )
-def test_errors_that_end_an_experiment_come_back_as_they_were(error: Exception, workers: Workers):
+def test_errors_that_end_an_experiment_come_back_as_they_were(error: Exception, workers: IsolatedWorker):
     with pytest.raises(type(error)) as found:
-        workers.do(partial(refuse, error), quiet, NONE)
+        workers.run_task(partial(refuse, error), quiet, NONE)
     assert str(found.value) == str(error)
     assert getattr(found.value, "mistakes", None) == getattr(error, "mistakes", None)
 
 
 def test_all_ticks_arrive_and_what_is_said_is_passed_on(
-    workers: Workers, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    workers: IsolatedWorker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     heard: list[str] = []
-    assert workers.do(does.chat, heard.append, Limits(log=tmp_path / "logs" / "said.txt")) == "said"
+    assert (
+        workers.run_task(does.flood_stderr, heard.append, TaskLimits(log_path=tmp_path / "logs" / "said.txt")) == "said"
+    )
     assert [said for said in heard if said] == ["chatting"] * 5000
     shown = capsys.readouterr().err
     assert len(shown) < 10_000
@@ -131,9 +145,9 @@ def test_all_ticks_arrive_and_what_is_said_is_passed_on(
     assert (tmp_path / "logs" / "said.txt").read_text() == 5000 * ("x" * 99 + "\n")
 
 
-def test_writing_much_costs_a_piece_little(workers: Workers, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_writing_much_costs_a_piece_little(workers: IsolatedWorker, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """18 kB take 4 us to write; a pipe of 64 kB that is read every 0.1 s makes it 28 ms."""
-    assert workers.do(does.log_much, quiet, Limits(log=tmp_path / "said.txt")) < 5e-3
+    assert workers.run_task(does.time_logging, quiet, TaskLimits(log_path=tmp_path / "said.txt")) < 5e-3
     assert (tmp_path / "said.txt").stat().st_size == 200 * 18_001
 
 
@@ -141,39 +155,39 @@ HOW = ["a child", "a session of its own", "an orphan"]
 
 
 @pytest.mark.parametrize("how", HOW)
-def test_what_a_piece_starts_ends_with_it(how: str, workers: Workers):
-    first = workers.do(partial(does.leave_processes, how), quiet, NONE)
-    assert workers.do(partial(does.double, 21), quiet, NONE) == 42
+def test_what_a_piece_starts_ends_with_it(how: str, workers: IsolatedWorker):
+    first = workers.run_task(partial(does.start_orphans, how), quiet, NONE)
+    assert workers.run_task(partial(does.double_number, 21), quiet, NONE) == 42
     assert not psutil.pid_exists(first)
 
 
 @pytest.mark.parametrize("how", HOW)
-def test_what_a_piece_starts_ends_where_it_crashes(how: str, workers: Workers, tmp_path: Path):
-    with pytest.raises(Lost, match="SIGSEGV"):
-        workers.do(partial(does.leave_processes_and_crash, how, tmp_path / "pid"), quiet, NONE)
+def test_what_a_piece_starts_ends_where_it_crashes(how: str, workers: IsolatedWorker, tmp_path: Path):
+    with pytest.raises(TaskFailure, match="SIGSEGV"):
+        workers.run_task(partial(does.start_orphans_and_crash, how, tmp_path / "pid"), quiet, NONE)
     assert not psutil.pid_exists(int((tmp_path / "pid").read_text()))
 
 
-def test_the_memory_of_what_a_piece_starts_counts(workers: Workers):
-    with pytest.raises(Lost, match=r"took more than 0.5 GiB with the processes it started"):
-        workers.do(does.swell_in_children, quiet, Limits(60.0, 0.5))
+def test_the_memory_of_what_a_piece_starts_counts(workers: IsolatedWorker):
+    with pytest.raises(TaskFailure, match=r"took more than 0.5 GiB with the processes it started"):
+        workers.run_task(does.exhaust_memory_in_children, quiet, TaskLimits(60.0, 0.5))
 
 
-def test_a_piece_that_closes_all_files_is_lost_alone(workers: Workers, capsys: pytest.CaptureFixture[str]):
-    with pytest.raises(Lost, match="ended its process"):
-        workers.do(does.close_all_files, quiet, Limits(20.0))
+def test_a_piece_that_closes_all_files_is_lost_alone(workers: IsolatedWorker, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(TaskFailure, match="ended its process"):
+        workers.run_task(does.close_file_descriptors, quiet, TaskLimits(20.0))
     assert "Traceback" not in capsys.readouterr().err
-    assert workers.do(partial(does.double, 21), quiet, NONE) == 42
+    assert workers.run_task(partial(does.double_number, 21), quiet, NONE) == 42
 
 
-def test_a_changed_folder_stays_with_its_piece(workers: Workers):
-    workers.do(does.leave_the_folder, quiet, NONE)
-    assert workers.do(does.folder, quiet, NONE) == os.getcwd()
+def test_a_changed_folder_stays_with_its_piece(workers: IsolatedWorker):
+    workers.run_task(does.change_folder, quiet, NONE)
+    assert workers.run_task(does.current_folder, quiet, NONE) == os.getcwd()
 
 
-def test_pieces_with_others_code_share_no_worker_with_pieces_without(workers: Workers):
+def test_pieces_with_others_code_share_no_worker_with_pieces_without(workers: IsolatedWorker):
     def name(*own: str) -> int:
-        going = workers.doing(does.name, quiet, NONE, frozenset(own))
+        going = workers.start_task(does.worker_pid, quiet, NONE, frozenset(own))
         while True:
             try:
                 wait([next(going)])

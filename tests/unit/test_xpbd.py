@@ -10,19 +10,19 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from harness.scenes.bind import Scene
-from harness.scenes.effects.gravity import Gravity
-from harness.scenes.effects.pins import Pins as PinsEffect
-from harness.scenes.effects.springs import Springs as SpringsEffect
-from harness.scenes.mesh.chain import Chain
-from harness.scenes.mesh.grid import Grid
-from harness.simulation.step import prepare, simulate
+from harness.scenes.effects.gravity import GravityEffect
+from harness.scenes.effects.pins import PinsEffect as PinsEffect
+from harness.scenes.effects.springs import SpringsEffect as SpringsEffect
+from harness.scenes.mesh.chain import ChainMesh
+from harness.scenes.mesh.grid import GridMesh
+from harness.simulation.step import prepare, simulate_scene
 from solvers.energies.springs import Springs
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.methods.vbd import VertexBlockDescent
 from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
-from solvers.problem import Pins, StepProblem, StopRule, System, Unsupported
+from solvers.problem import DirichletPins, StepProblem, StopRule, System, Unsupported
 from tests.bench.primal_dual import MOST, hanging, iterations
-from tests.scenes import SCENES, cloth, first_problem, random_problem, scene
+from tests.scenes import SCENE_BUILDERS, build_cloth, build_first_problem, build_random_problem, build_test_scene
 
 G, DT = 9.81, 1 / 30
 methods = pytest.mark.parametrize("method", [Xpbd(), XpbdSmallSteps()], ids=lambda m: type(m).__name__)
@@ -30,8 +30,8 @@ methods = pytest.mark.parametrize("method", [Xpbd(), XpbdSmallSteps()], ids=lamb
 
 def chain(time_step: float = DT, *, direction=(1.0, 0.0, 0.0), stretch: float = 20.0, at: str = "ends") -> Scene:
     pins = PinsEffect.model_validate({"at": [at], "weight": "exact"})
-    mesh = Chain(length=2.0, direction=direction)
-    return scene(mesh, SpringsEffect(stretch=stretch), Gravity(), pins, size=10, time_step=time_step)
+    mesh = ChainMesh(length=2.0, direction=direction)
+    return build_test_scene(mesh, SpringsEffect(stretch=stretch), GravityEffect(), pins, size=10, time_step=time_step)
 
 
 def solved(method, problem: StepProblem, iterations: int) -> np.ndarray:
@@ -45,8 +45,8 @@ def minimiser(problem: StepProblem) -> np.ndarray:
 @pytest.mark.parametrize("stretch", [2.0, 2e3, 2e6])
 @pytest.mark.parametrize("factor", [1.0, 2.25, 4.0], ids="c = {:g}".format)
 def test_springs_that_do_not_turn_reach_the_minimiser_of_the_step(stretch, factor):
-    problem = first_problem(chain(direction=(0.0, -1.0, 0.0), stretch=stretch, at="first"))
-    problem = replace(problem, system=replace(problem.system, factor=factor))
+    problem = build_first_problem(chain(direction=(0.0, -1.0, 0.0), stretch=stretch, at="first"))
+    problem = replace(problem, system=replace(problem.system, inertia_factor=factor))
     # A chain of ten: Gauss-Seidel needs some hundred passes where springs outweigh inertia. The rest is round-off.
     np.testing.assert_allclose(solved(Xpbd(), problem, 5000), minimiser(problem), rtol=0, atol=1e-12)
 
@@ -57,7 +57,7 @@ def test_springs_that_turn_in_a_step_leave_an_error_of_fourth_order_in_the_time_
     for frames in (24, 48, 96):
         made = chain(0.2 / frames)
         prepared, stop = prepare(made, CompiledLocalGlobal()), StopRule(2000, 1e-12)
-        *_, last = simulate(made, prepared, stop, first_guess="current", frames=frames)
+        *_, last = simulate_scene(made, prepared, stop, initial_guess="current", frames=frames)
         apart.append(np.abs(solved(Xpbd(), last.problem, 2000) - last.solution.positions).max())
     ratios = [a / b for a, b in pairwise(apart)]
     np.testing.assert_allclose(ratios, 16.0, rtol=0.1)  # the next order
@@ -65,13 +65,13 @@ def test_springs_that_turn_in_a_step_leave_an_error_of_fourth_order_in_the_time_
 
 def test_multipliers_add_up_over_iterations_instead_of_stiffening_the_springs():
     """Position based dynamics without them would pull springs to their rest lengths as the iterations go on."""
-    problem = first_problem(chain())
+    problem = build_first_problem(chain())
     few, many = solved(Xpbd(), problem, 500), solved(Xpbd(), problem, 5000)
     np.testing.assert_allclose(many, few, rtol=0, atol=1e-14)  # it has converged, and stays
 
 
 def test_tension_begins_at_zero_in_each_step():
-    problem = first_problem(chain())
+    problem = build_first_problem(chain())
     prepared = Xpbd().prepare(problem.system)
     one, two = (prepared.solve(problem, StopRule(3)).positions for _ in range(2))
     np.testing.assert_array_equal(one, two)
@@ -80,24 +80,24 @@ def test_tension_begins_at_zero_in_each_step():
 @methods
 def test_a_free_cloth_falls_as_its_steps_say(method):
     """v = -g t, and y after n steps of h is -g h^2 n (n + 1)/2: of the substeps for small steps, else of dt."""
-    made = scene(Grid(), SpringsEffect(stretch=300.0), Gravity(), size=6, time_step=DT)
+    made = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), GravityEffect(), size=6, time_step=DT)
     frames, iterations = 12, 5
     prepared, stop = prepare(made, method), StopRule(iterations)
-    *_, last = simulate(made, prepared, stop, first_guess="current", frames=frames)
+    *_, last = simulate_scene(made, prepared, stop, initial_guess="current", frames=frames)
     n = frames * iterations if isinstance(method, XpbdSmallSteps) else frames
     h = frames * DT / n
-    fallen = made.mesh.rest - [0.0, G * h**2 * n * (n + 1) / 2, 0.0]
+    fallen = made.mesh.rest_positions - [0.0, G * h**2 * n * (n + 1) / 2, 0.0]
     np.testing.assert_allclose(last.positions, fallen, rtol=0, atol=1e-12)  # a hundred roundings of a metre
-    np.testing.assert_allclose(last.state.now.velocity[:, 1], -G * frames * DT, rtol=0, atol=1e-10)  # divided by h
+    np.testing.assert_allclose(last.state.motion.velocity[:, 1], -G * frames * DT, rtol=0, atol=1e-10)  # divided by h
 
 
 @methods
 def test_linear_momentum_is_conserved(method):
-    made = scene(Grid(), SpringsEffect(stretch=300.0), size=6, time_step=DT)
-    problem = first_problem(made)
-    velocity = np.random.default_rng(0).normal(size=problem.current.shape)
-    start = replace(problem.start, velocity=velocity)
-    problem = replace(problem, target=problem.current + DT * velocity, start=start)
+    made = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), size=6, time_step=DT)
+    problem = build_first_problem(made)
+    velocity = np.random.default_rng(0).normal(size=problem.current_positions.shape)
+    start = replace(problem.step_start, velocity=velocity)
+    problem = replace(problem, inertial_target=problem.current_positions + DT * velocity, step_start=start)
     solution = method.prepare(made.system).solve(problem, StopRule(7))
     after = start.velocity_at(solution.positions) if solution.velocity is None else solution.velocity
     # Round-off of positions, 1e-16, divided by the substep.
@@ -105,7 +105,7 @@ def test_linear_momentum_is_conserved(method):
 
 
 def test_one_small_step_is_one_iteration():
-    problem = first_problem(cloth(8))
+    problem = build_first_problem(build_cloth(8))
     np.testing.assert_allclose(
         solved(XpbdSmallSteps(), problem, 1), solved(Xpbd(), problem, 1), rtol=0, atol=1e-14
     )  # the same terms, added in another order
@@ -113,31 +113,31 @@ def test_one_small_step_is_one_iteration():
 
 def test_small_steps_converge_to_the_motion_in_first_order():
     made = chain(0.1, stretch=200.0)
-    stated = first_problem(made)
-    free, n = made.system.free, made.system.vertices
+    stated = build_first_problem(made)
+    free, n = made.system.free_vertices, made.system.num_vertices
 
     def motion(t: float, state: np.ndarray) -> np.ndarray:
         p, v = state.reshape(2, n, 3)
         gradient = np.zeros((n, 3))
-        made.springs.add_gradient(p, gradient)
+        made.all_springs.add_gradient(p, gradient)
         a = np.zeros((n, 3))
-        a[free] = (made.load - gradient)[free] / made.system.mass[free, None]
+        a[free] = (made.constant_force - gradient)[free] / made.system.mass[free, None]
         return np.concatenate([v.ravel(), a.ravel()])
 
-    begin = np.concatenate([stated.start.positions.ravel(), stated.start.velocity.ravel()])
+    begin = np.concatenate([stated.step_start.positions.ravel(), stated.step_start.velocity.ravel()])
     truth = solve_ivp(motion, (0.0, 0.1), begin, "DOP853", rtol=1e-10, atol=1e-12).y[: 3 * n, -1].reshape(n, 3)
     errors = [np.abs(solved(XpbdSmallSteps(), stated, k) - truth).max() for k in (200, 400, 800)]
     ratios = [a / b for a, b in pairwise(errors)]
     np.testing.assert_allclose(ratios, 2.0, rtol=0.05)  # the next order
-    assert errors[-1] <= 5e-3 * np.abs(truth - stated.current).max()  # of order 1/800
+    assert errors[-1] <= 5e-3 * np.abs(truth - stated.current_positions).max()  # of order 1/800
 
 
 def test_pins_that_move_do_so_evenly_in_small_steps():
     rest = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    made = random_problem(0, n=2, m=0, weights=(np.inf, 1e12))
+    made = build_random_problem(0, n=2, m=0, weights=(np.inf, 1e12))
     goal = rest + np.array([0.3, 0.2, 0.1])
-    start = replace(made.start, positions=rest, velocity=np.zeros((2, 3)))
-    problem = replace(made, pin_targets=goal, start=start, force=np.zeros((2, 3)))
+    start = replace(made.step_start, positions=rest, velocity=np.zeros((2, 3)))
+    problem = replace(made, pin_targets=goal, step_start=start, external_force=np.zeros((2, 3)))
     solution = XpbdSmallSteps().prepare(made.system).solve(problem, StopRule(4))
     assert solution.velocity is not None
     np.testing.assert_array_equal(solution.positions[0], goal[0])
@@ -149,14 +149,16 @@ def test_pins_that_move_do_so_evenly_in_small_steps():
 @methods
 @pytest.mark.parametrize("name", ["chain", "net", "cloth"])
 def test_the_heaviest_pins_by_penalty_are_exact_pins(method, name):
-    heavy, exact = (solved(method, first_problem(SCENES[name](w)), 20) for w in (1e14, "exact"))
+    heavy, exact = (solved(method, build_first_problem(SCENE_BUILDERS[name](w)), 20) for w in (1e14, "exact"))
     np.testing.assert_allclose(heavy, exact, rtol=0, atol=1e-10)  # 1e14 N/m give way by 1e-13 m under the cloth
 
 
 @methods
 def test_springs_without_stiffness_and_loops_do_nothing(method):
-    problem = random_problem(3)
-    idle = Springs.at_rest(problem.current, np.array([[0, 5], [4, 4], [2, 9]]), np.array([0.0, 100.0, 0.0]))
+    problem = build_random_problem(3)
+    idle = Springs.from_rest_shape(
+        problem.current_positions, np.array([[0, 5], [4, 4], [2, 9]]), np.array([0.0, 100.0, 0.0])
+    )
     with_, without = (replace(problem, system=replace(problem.system, energies=e)) for e in ((idle,), ()))
     np.testing.assert_array_equal(solved(method, with_, 5), solved(method, without, 5))
 
@@ -164,10 +166,16 @@ def test_springs_without_stiffness_and_loops_do_nothing(method):
 @methods
 def test_coincident_vertices_come_apart_along_the_rest_shape(method):
     made = chain()
-    problem = first_problem(made)
-    collapsed = np.zeros_like(problem.current)
-    start = replace(problem.start, positions=collapsed)
-    problem = replace(problem, target=collapsed, start=start, pin_targets=np.zeros((2, 3)), force=0.0 * problem.force)
+    problem = build_first_problem(made)
+    collapsed = np.zeros_like(problem.current_positions)
+    start = replace(problem.step_start, positions=collapsed)
+    problem = replace(
+        problem,
+        inertial_target=collapsed,
+        step_start=start,
+        pin_targets=np.zeros((2, 3)),
+        external_force=0.0 * problem.external_force,
+    )
     p = solved(method, problem, 4)
     assert np.isfinite(p).all()
     assert np.abs(p[1:-1, 0]).min() > 0.0
@@ -187,7 +195,7 @@ class Other:
 
 
 def without_mass(system: System) -> System:
-    return replace(system, mass=np.where(np.arange(system.vertices) == 3, 0.0, system.mass))
+    return replace(system, mass=np.where(np.arange(system.num_vertices) == 3, 0.0, system.mass))
 
 
 @methods
@@ -200,41 +208,43 @@ def without_mass(system: System) -> System:
 )
 def test_what_it_cannot_do_is_said_before_any_work(method, change, told):
     with pytest.raises(Unsupported, match=told):
-        method.prepare(change(random_problem(0).system))
+        method.prepare(change(build_random_problem(0).system))
 
 
 def test_small_steps_take_the_place_of_the_integrator():
     with pytest.raises(Unsupported, match="implicit-euler"):
-        XpbdSmallSteps().prepare(replace(random_problem(0).system, factor=2.25))
+        XpbdSmallSteps().prepare(replace(build_random_problem(0).system, inertia_factor=2.25))
 
 
 @methods
 def test_a_vertex_without_mass_may_be_pinned(method):
     made = chain()
     system = replace(made.system, mass=np.where(np.arange(10) == 0, 0.0, made.system.mass))
-    assert np.isfinite(solved(method, replace(first_problem(made), system=system), 3)).all()
+    assert np.isfinite(solved(method, replace(build_first_problem(made), system=system), 3)).all()
 
 
 @methods
 def test_a_method_that_does_not_minimise_has_no_residual_and_no_tolerance(method):
-    problem = first_problem(cloth(6))
+    problem = build_first_problem(build_cloth(6))
     solution = method.prepare(problem.system).solve(problem, StopRule(5, 0.5))
-    assert (solution.iterations, solution.stopped) == (5, "iterations")
-    assert np.isnan([solution.residual, solution.yardstick]).all()
+    assert (solution.num_iterations, solution.termination_reason) == (5, "iterations")
+    assert np.isnan([solution.residual, solution.initial_residual]).all()
 
 
 def test_iterates_of_small_steps_are_whole_steps_in_ever_more_substeps():
-    problem = first_problem(chain())
+    problem = build_first_problem(chain())
     prepared = XpbdSmallSteps().prepare(problem.system)
     for k, p in enumerate(islice(prepared.iterates(problem), 4), 1):
         np.testing.assert_array_equal(p, prepared.solve(problem, StopRule(k)).positions)
 
 
 def test_nothing_but_pins_needs_no_springs():
-    system = System(np.ones(3), DT, (), Pins(np.array([1]), np.array([np.inf])))
-    problem = replace(random_problem(0, n=3, m=0, weights=(np.inf,)), system=system)
+    system = System(np.ones(3), DT, (), DirichletPins(np.array([1]), np.array([np.inf])))
+    problem = replace(build_random_problem(0, n=3, m=0, weights=(np.inf,)), system=system)
     np.testing.assert_allclose(
-        solved(Xpbd(), problem, 2)[[0, 2]], (problem.target + DT**2 * problem.force)[[0, 2]], rtol=1e-15
+        solved(Xpbd(), problem, 2)[[0, 2]],
+        (problem.inertial_target + DT**2 * problem.external_force)[[0, 2]],
+        rtol=1e-15,
     )
 
 

@@ -14,53 +14,67 @@ from __future__ import annotations
 
 import pyarrow as pa
 
-from harness.base.columns import OF_SOLVER, PROVENANCE, Column, as_in_runs, schema_of
+from harness.base.columns import (
+    PROVENANCE_COLUMN_SPECS,
+    SOLVER_COLUMN_SPECS,
+    ColumnSpec,
+    build_schema,
+    select_run_columns,
+)
 
 _TEXT, _INT, _REAL = pa.string(), pa.int64(), pa.float64()
 
-COLUMNS = (
-    Column("kind", _TEXT, "", "whole, without, error, suggestion or price"),
-    Column("name", _TEXT, "", "the effects left out, joined by +; `solver` or `time-step`; a price's effect, or `all`"),
-    *as_in_runs("scene", "size", "vertices", "springs", "solver", "parameters", "own", "time_step", "integrator"),
-    *OF_SOLVER,
-    *as_in_runs("first_guess", "max_iterations", "tolerance", "asked", "threads"),
-    Column("frames", _INT, "", "steps simulated"),
-    Column("rounds", _INT, "", "how often each of them was timed"),
-    Column(
+ABLATION_COLUMNS = (
+    ColumnSpec("kind", _TEXT, "", "whole, without, error, suggestion or price"),
+    ColumnSpec(
+        "name", _TEXT, "", "the effects left out, joined by +; `solver` or `time-step`; a price's effect, or `all`"
+    ),
+    *select_run_columns(
+        "scene", "size", "vertices", "springs", "solver", "parameters", "own", "time_step", "integrator"
+    ),
+    *SOLVER_COLUMN_SPECS,
+    *select_run_columns("first_guess", "max_iterations", "tolerance", "asked", "threads"),
+    ColumnSpec("frames", _INT, "", "steps simulated"),
+    ColumnSpec("rounds", _INT, "", "how often each of them was timed"),
+    ColumnSpec(
         "status",
         _TEXT,
         "",
         "ok, impossible (no solution without the effects), unknown (an error); of whole and price as in runs",
     ),
-    Column("reason", _TEXT, "", "why the status is not ok; of a suggestion the evidence"),
-    Column(
+    ColumnSpec("reason", _TEXT, "", "why the status is not ok; of a suggestion the evidence"),
+    ColumnSpec(
         "seconds",
         _REAL,
         "s",
         "CPU time per step, the mean over frames of the median over rounds; of a price, per iteration",
     ),
-    Column("cost", _REAL, "s", "what the effects cost a step: the same of the differences from the whole scene"),
-    Column("cost_low", _REAL, "s", "lower end of its 95 % interval"),
-    Column("cost_high", _REAL, "s", "upper end of its 95 % interval"),
-    Column("price", _REAL, "", "CPU time of an iteration with the effect over one without, the median over the rounds"),
-    Column("price_low", _REAL, "", "lower end of its 95 % interval"),
-    Column("price_high", _REAL, "", "upper end of its 95 % interval"),
-    Column(
+    ColumnSpec("cost", _REAL, "s", "what the effects cost a step: the same of the differences from the whole scene"),
+    ColumnSpec("cost_low", _REAL, "s", "lower end of its 95 % interval"),
+    ColumnSpec("cost_high", _REAL, "s", "upper end of its 95 % interval"),
+    ColumnSpec(
+        "price", _REAL, "", "CPU time of an iteration with the effect over one without, the median over the rounds"
+    ),
+    ColumnSpec("price_low", _REAL, "", "lower end of its 95 % interval"),
+    ColumnSpec("price_high", _REAL, "", "upper end of its 95 % interval"),
+    ColumnSpec(
         "price_bound",
         _REAL,
         "",
         "lower bound: the effect's own numbers are read once, by a dot product, or multiplied once, at the "
         "rate of a matrix product, whichever takes longer",
     ),
-    Column("bytes", _INT, "B", "memory of the bound scene and the prepared solver, as Python's allocators see it"),
-    *as_in_runs("nnz_system"),
-    Column("nnz_factor", _INT, "", "stored entries of the triangular factor L: of the Hessian's where one is made"),
-    Column("largest", _REAL, "", "largest displacement of a vertex in any frame, in mean rest lengths"),
-    Column("rms", _REAL, "", "root mean square of the displacements over vertices and frames, in mean rest lengths"),
-    Column("energy", _REAL, "", "largest difference of kinetic and elastic energy in any frame, over its largest"),
-    Column("centre", _REAL, "", "largest displacement of the centre of mass in any frame, in mean rest lengths"),
-    Column("extent", _REAL, "", "the diagonal of the rest shape's bounding box, in mean rest lengths"),
-    *PROVENANCE,
+    ColumnSpec("bytes", _INT, "B", "memory of the bound scene and the prepared solver, as Python's allocators see it"),
+    *select_run_columns("nnz_system"),
+    ColumnSpec("nnz_factor", _INT, "", "stored entries of the triangular factor L: of the Hessian's where one is made"),
+    ColumnSpec("largest", _REAL, "", "largest displacement of a vertex in any frame, in mean rest lengths"),
+    ColumnSpec(
+        "rms", _REAL, "", "root mean square of the displacements over vertices and frames, in mean rest lengths"
+    ),
+    ColumnSpec("energy", _REAL, "", "largest difference of kinetic and elastic energy in any frame, over its largest"),
+    ColumnSpec("centre", _REAL, "", "largest displacement of the centre of mass in any frame, in mean rest lengths"),
+    ColumnSpec("extent", _REAL, "", "the diagonal of the rest shape's bounding box, in mean rest lengths"),
+    *PROVENANCE_COLUMN_SPECS,
 )
 
-SCHEMA = schema_of(COLUMNS)
+ABLATION_SCHEMA = build_schema(ABLATION_COLUMNS)

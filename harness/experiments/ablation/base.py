@@ -12,72 +12,76 @@ from typing import Any
 
 from harness.base import machine, rows
 from harness.base.errors import InputError
-from harness.base.progress import ANY_EFFORT, Effort
-from harness.base.workers import Limits, Lost, Tick
+from harness.base.progress import UNIT_COST, RunCost
+from harness.base.workers import ProgressCallback, TaskFailure, TaskLimits
 from harness.config.sweep import RunSpec
-from harness.experiments.ablation.ablation_rows import SCHEMA
-from harness.experiments.failure import failure
-from harness.experiments.resume import Standing, standings
+from harness.experiments.ablation.ablation_rows import ABLATION_SCHEMA
+from harness.experiments.failure import build_failure_columns
+from harness.experiments.resume import CompletionStatus, read_completion_statuses
 
-Row = dict[str, Any]
+ResultRow = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class OfEffects(ABC):
+class EffectUnit(ABC):
     """Unit that measures a scene's effects in a run (`harness.experiments.experiment_units.ExperimentUnit`)."""
 
     run: RunSpec
     folder: Path
 
     @property
-    def path(self) -> Path:
+    def rows_path(self) -> Path:
         """File of the unit's rows."""
-        return self.folder / "ablation" / f"{self.run.label(machine.describe().id)}{self.suffix()}.parquet"
+        return (
+            self.folder
+            / "ablation"
+            / f"{self.run.build_file_stem(machine.describe_machine().machine_id)}{self.file_suffix()}.parquet"
+        )
 
     @property
-    def standing(self) -> Standing:
+    def completion_status(self) -> CompletionStatus:
         """Completion status: completed if the rows exist."""
-        return standings({self.path: lambda row: True}, (), SCHEMA)[self.path]
+        return read_completion_statuses({self.rows_path: lambda row: True}, (), ABLATION_SCHEMA)[self.rows_path]
 
     @property
-    def effort(self) -> Effort:
+    def cost_estimate(self) -> RunCost:
         """Estimated cost, which is unknown."""
-        return ANY_EFFORT
+        return UNIT_COST
 
     @property
-    def limits(self) -> Limits:
+    def task_limits(self) -> TaskLimits:
         """Limits of the run."""
-        return Limits(self.run.time_limit, self.run.memory_limit)
+        return TaskLimits(self.run.time_limit, self.run.memory_limit)
 
-    def do(self, tick: Tick) -> str:
+    def execute_unit(self, tick: ProgressCallback) -> str:
         """Measure, write the rows and return the outcome as text."""
         try:
-            found = self.measured(tick)
+            found = self.measure_rows(tick)
         except InputError:
             raise
         except Exception as error:  # a solver may fail in any way
-            told = failure(error)
-            found = self.unanswered(told["status"], told["reason"])
-        return self._written(found)
+            told = build_failure_columns(error)
+            found = self.build_failure_rows(told["status"], told["reason"])
+        return self._write_rows(found)
 
-    def lost(self, lost: Lost) -> str:
+    def write_lost_rows(self, task_loss: TaskFailure) -> str:
         """Write the rows of a lost unit, and return the outcome as text."""
-        return self._written(self.unanswered(lost.status, str(lost)))
+        return self._write_rows(self.build_failure_rows(task_loss.status, str(task_loss)))
 
     @abstractmethod
-    def suffix(self) -> str:
+    def file_suffix(self) -> str:
         """Return the suffix that distinguishes its file from others of the same run."""
 
     @abstractmethod
-    def measured(self, tick: Tick) -> list[Row]:
+    def measure_rows(self, tick: ProgressCallback) -> list[ResultRow]:
         """Measure and return the rows. Errors of the solver are raised unchanged."""
 
     @abstractmethod
-    def unanswered(self, status: str, reason: str) -> list[Row]:
+    def build_failure_rows(self, status: str, reason: str) -> list[ResultRow]:
         """Build the rows for a unit without a result."""
 
-    def _written(self, found: list[Row]) -> str:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        rows.write(self.path, found, SCHEMA)
-        first = found[0]
-        return "ok" if any(row["status"] == "ok" for row in found) else f"{first['status']}: {first['reason']}"
+    def _write_rows(self, result_rows: list[ResultRow]) -> str:
+        self.rows_path.parent.mkdir(parents=True, exist_ok=True)
+        rows.write_rows(self.rows_path, result_rows, ABLATION_SCHEMA)
+        first = result_rows[0]
+        return "ok" if any(row["status"] == "ok" for row in result_rows) else f"{first['status']}: {first['reason']}"

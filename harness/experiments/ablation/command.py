@@ -7,68 +7,72 @@ from typing import Annotated
 
 import typer
 
-from harness.base.commands import Again, Changed, InThisProcess, Results
-from harness.base.console import err, narrow, out, say
+from harness.base.commands import InProcessOption, RerunOption, RerunStaleOption, ResultsOption
+from harness.base.console import get_error_console, get_output_console, print_message, split_wide_table
 
-SOLVER, TOLERANCE = "hybrid", 1e-4
+DEFAULT_ABLATION_SOLVER, DEFAULT_ABLATION_TOLERANCE = "hybrid", 1e-4
 """Default solver, which supports all effects, and its tolerance.
 
 It converges far enough that the solver's own error does not hide the change from an effect.
 """
 
-PRICED = 1e-6
+DEFAULT_OVERHEAD_TOLERANCE = 1e-6
 """Default tolerance of --all-solvers: it includes iterations far from the minimum and close to it."""
 
-ROUNDS = 5
+DEFAULT_NUM_ROUNDS = 5
 """Default number of times that each step is timed."""
 
 
 def ablate(
-    given: typer.Context,
+    context: typer.Context,
     scene: Annotated[Path, typer.Argument(help="A scene (YAML), or an assignment's scene (JSON).")],
-    results: Results = Path("results"),
-    solver: Annotated[str | None, typer.Option(help=f"{SOLVER}, to {TOLERANCE:g}, if left out.")] = None,
+    results: ResultsOption = Path("results"),
+    solver: Annotated[
+        str | None, typer.Option(help=f"{DEFAULT_ABLATION_SOLVER}, to {DEFAULT_ABLATION_TOLERANCE:g}, if left out.")
+    ] = None,
     size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default if left out.")] = None,
     pairs: Annotated[bool, typer.Option("--pairs", help="Leave out each pair of effects too.")] = False,
     all_solvers: Annotated[
         bool, typer.Option("--all-solvers", help="What each effect alone adds to an iteration, by every solver.")
     ] = False,
-    again: Again = False,
-    changed: Changed = False,
-    here: InThisProcess = False,
+    again: RerunOption = False,
+    changed: RerunStaleOption = False,
+    in_process: InProcessOption = False,
 ) -> None:
     """Measure the cost and the influence of each effect, and suggest missing ones."""
-    from harness.base.claim import claimed
-    from harness.base.progress import display
-    from harness.config.load import load_any
+    from harness.base.claim import claim_folder
+    from harness.base.progress import create_display
+    from harness.config.load import load_config
     from harness.experiments.ablation.unit import run_ablation
-    from harness.report.ablation import ablation_table, read, sentences
-    from harness.report.ablation_plot import draw_ablation
-    from harness.report.site import keep
+    from harness.report.ablation import build_ablation_table, read_ablation, summarise_ablation
+    from harness.report.ablation_plot import draw_ablation_plot
+    from harness.report.site import refresh_results_page
 
     if all_solvers:
-        _prices(given, scene, results, solver, size, pairs, again, changed, here)
+        _measure_overheads(context, scene, results, solver, size, pairs, again, changed, in_process)
         return
-    usual = {"rounds": ROUNDS, "threads": 1} | ({} if solver else {"tolerance": TOLERANCE})
-    sweep = load_any(scene, solvers=[solver or SOLVER], sizes=[size] if size else [], **usual | given.obj)
-    folder = claimed(results / sweep.name, scene)
-    how = {"pairs": pairs, "again": again, "changed": changed, "isolated": not here}
-    path = run_ablation(sweep, folder, display(err()), say, **how)
-    rows, picture = read(path), folder / "pictures" / f"ablation-{path.stem}.png"
+    usual = {"rounds": DEFAULT_NUM_ROUNDS, "threads": 1} | ({} if solver else {"tolerance": DEFAULT_ABLATION_TOLERANCE})
+    sweep = load_config(
+        scene, solvers=[solver or DEFAULT_ABLATION_SOLVER], sizes=[size] if size else [], **usual | context.obj
+    )
+    folder = claim_folder(results / sweep.name, scene)
+    how = {"pairs": pairs, "again": again, "changed": changed, "isolated": not in_process}
+    path = run_ablation(sweep, folder, create_display(get_error_console()), print_message, **how)
+    rows, picture = read_ablation(path), folder / "pictures" / f"ablation-{path.stem}.png"
     if rows[0]["status"] != "ok":  # of the whole scene, with which all others are compared
-        say(f"{sweep.name}: {rows[0]['status']}: {rows[0]['reason']}")
+        print_message(f"{sweep.name}: {rows[0]['status']}: {rows[0]['reason']}")
         raise typer.Exit(1)
-    out().print(narrow(ablation_table(rows)))
-    for line in sentences(rows):
-        say(line)
+    get_output_console().print(split_wide_table(build_ablation_table(rows)))
+    for line in summarise_ablation(rows):
+        print_message(line)
     picture.parent.mkdir(parents=True, exist_ok=True)
-    draw_ablation(rows, picture)
-    say(f"rows are in {path}, the picture is {picture}")
-    keep(results, folder, say)
+    draw_ablation_plot(rows, picture)
+    print_message(f"rows are in {path}, the picture is {picture}")
+    refresh_results_page(results, folder, print_message)
 
 
-def _prices(
-    given: typer.Context,
+def _measure_overheads(
+    context: typer.Context,
     scene: Path,
     results: Path,
     solver: str | None,
@@ -76,25 +80,35 @@ def _prices(
     pairs: bool,
     again: bool,
     changed: bool,
-    here: bool,
+    in_process: bool,
 ) -> None:
     """Run `--all-solvers`."""
-    from harness.base.claim import claimed
+    from harness.base.claim import claim_folder
     from harness.base.errors import InputError
-    from harness.base.progress import display
-    from harness.config.load import load_any
-    from harness.experiments.ablation.price_unit import price_all
-    from harness.report.ablation import price_table, read
-    from harness.report.site import keep
-    from solvers.registry import SOLVERS, load
+    from harness.base.progress import create_display
+    from harness.config.load import load_config
+    from harness.experiments.ablation.price_unit import measure_all_overheads
+    from harness.report.ablation import build_overhead_table, read_ablation
+    from harness.report.site import refresh_results_page
+    from solvers.registry import SOLVERS, load_target
 
     if solver is not None or pairs:
         raise InputError("--all-solvers: takes neither --solver nor --pairs; leave them out, or do without it")
-    minimising = [name for name, target in SOLVERS.items() if load(target).minimises]
-    usual = {"rounds": ROUNDS, "threads": 1, "tolerance": PRICED}
-    sweep = load_any(scene, solvers=minimising, sizes=[size] if size else [], **usual | given.obj)
-    folder = claimed(results / sweep.name, scene)
-    paths = price_all(sweep, folder, display(err()), say, again=again, changed=changed, isolated=not here)
-    out().print(narrow(price_table([row for path in paths for row in read(path)])))
-    say(f"rows are in {paths[0].parent}")
-    keep(results, folder, say)
+    minimising = [name for name, target in SOLVERS.items() if load_target(target).minimises]
+    usual = {"rounds": DEFAULT_NUM_ROUNDS, "threads": 1, "tolerance": DEFAULT_OVERHEAD_TOLERANCE}
+    sweep = load_config(scene, solvers=minimising, sizes=[size] if size else [], **usual | context.obj)
+    folder = claim_folder(results / sweep.name, scene)
+    paths = measure_all_overheads(
+        sweep,
+        folder,
+        create_display(get_error_console()),
+        print_message,
+        rerun=again,
+        rerun_stale=changed,
+        isolated=not in_process,
+    )
+    get_output_console().print(
+        split_wide_table(build_overhead_table([row for path in paths for row in read_ablation(path)]))
+    )
+    print_message(f"rows are in {paths[0].parent}")
+    refresh_results_page(results, folder, print_message)

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from harness.scenes.bind import Scene
 from solvers.energies.springs import Springs
 
-States = tuple[NDArray[np.float64], NDArray[np.float64]]
+MotionStates = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Positions [m] and velocities [m/s], (frames, n, 3) each."""
 
 
-def difference(scene: Scene, a: States, b: States) -> dict[str, float]:
+def compute_motion_difference(scene: Scene, a: MotionStates, b: MotionStates) -> dict[str, float]:
     """Return the columns `largest`, `rms`, `energy` and `centre` for two motions.
 
     Args:
@@ -21,10 +21,10 @@ def difference(scene: Scene, a: States, b: States) -> dict[str, float]:
         b: second motion.
     """
     (p, _), (q, _) = a, b
-    unit, mass = rest_length(scene), scene.system.mass
+    unit, mass = compute_mean_rest_length(scene), scene.system.mass
     away = np.linalg.norm(p - q, axis=2)
     centres = np.einsum("i,fix->fx", mass, p - q) / mass.sum()
-    energies = np.array([[_energy(scene, x, v) for x, v in zip(*motion, strict=True)] for motion in (a, b)])
+    energies = np.array([[_compute_energy(scene, x, v) for x, v in zip(*motion, strict=True)] for motion in (a, b)])
     most = float(np.abs(energies[0]).max())
     return {
         "largest": float(away.max()) / unit,
@@ -34,13 +34,13 @@ def difference(scene: Scene, a: States, b: States) -> dict[str, float]:
     }
 
 
-def rest_length(scene: Scene) -> float:
+def compute_mean_rest_length(scene: Scene) -> float:
     """Return the mean rest length of the scene's springs; the mesh spacing without springs [m]."""
-    lengths = scene.springs.rest_length
+    lengths = scene.all_springs.rest_length
     return float(lengths.mean()) if lengths.any() else scene.mesh.spacing
 
 
-def _energy(scene: Scene, p: NDArray[np.float64], v: NDArray[np.float64]) -> float:
+def _compute_energy(scene: Scene, p: NDArray[np.float64], v: NDArray[np.float64]) -> float:
     """Return the kinetic energy plus the energy of the full scene's springs [J].
 
     The same energies are evaluated for all motions.

@@ -7,22 +7,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from harness.base import holding, machine
-from harness.base.progress import Display
-from harness.base.workers import Tick
-from harness.config.load import Sweep
-from harness.experiments.ablation.base import OfEffects, Row
-from harness.experiments.ablation.prices import Price, only, priced, prices
-from harness.experiments.core import do_all
-from harness.experiments.provenance import asked, provenance
-from harness.experiments.resume import wanted
-from harness.scenes.bind import build
-from harness.simulation.algebraic import stop_rule
+from harness.base.progress import ProgressDisplay
+from harness.base.workers import ProgressCallback
+from harness.config.load import SweepPlan
+from harness.experiments.ablation.base import EffectUnit, ResultRow
+from harness.experiments.ablation.prices import EffectOverhead, list_measured_effects, measure_overheads, select_effects
+from harness.experiments.core import execute_units
+from harness.experiments.provenance import build_provenance_columns, build_specification_columns
+from harness.experiments.resume import select_missing_units
+from harness.scenes.bind import build_scene
+from harness.simulation.algebraic import build_stop_rule
 from solvers.problem import Solver
-from solvers.registry import EVERY, load
+from solvers.registry import SOLVER_TABLE, load_target
 
 
 @dataclass(frozen=True, slots=True)
-class Prices(OfEffects):
+class OverheadUnit(EffectUnit):
     """Unit that measures the per-iteration overheads of a scene's effects with a run's solver."""
 
     @property
@@ -31,54 +31,60 @@ class Prices(OfEffects):
         return f"{self.run.title}: the price of each effect"
 
     @property
-    def ticks(self) -> int:
+    def num_progress_steps(self) -> int:
         """Number of measured effects."""
-        return len(priced(self.run.scene))
+        return len(list_measured_effects(self.run.scene))
 
-    def suffix(self) -> str:
+    def file_suffix(self) -> str:
         """Return the suffix of the file of overheads."""
         return "-prices"
 
-    def measured(self, tick: Tick) -> list[Row]:
+    def measure_rows(self, tick: ProgressCallback) -> list[ResultRow]:
         """Measure the overhead of each effect and return the rows."""
         run = self.run
-        solver: Solver = load(EVERY[run.solver.name])(**run.solver.parameters)
-        stop, told = stop_rule(run.iterations, run.tolerance), list[Row]()
-        plain = build(only(run.scene), run.size)
-        counts = {"vertices": len(plain.mesh.rest), "springs": len(plain.springs.edges)}
-        with machine.pinned_threads(machine.threads(run.threads).number):
-            for found in prices(run.scene, run.size, solver, stop, frames=run.frames, rounds=run.rounds):
-                told.append(counts | _row(found))
-                tick(found.effect)
-        return self._shared(told)
+        solver: Solver = load_target(SOLVER_TABLE[run.solver.name])(**run.solver.parameters)
+        stop, told = build_stop_rule(run.iterations, run.tolerance), list[ResultRow]()
+        plain = build_scene(select_effects(run.scene), run.size)
+        counts = {"vertices": len(plain.mesh.rest_positions), "springs": len(plain.all_springs.edges)}
+        with machine.limit_threads(machine.choose_threads(run.threads).count):
+            for found in measure_overheads(run.scene, run.size, solver, stop, frames=run.frames, max_rounds=run.rounds):
+                told.append(counts | _build_row(found))
+                tick(found.effect_kind)
+        return self._add_shared_columns(told)
 
-    def unanswered(self, status: str, reason: str) -> list[Row]:
+    def build_failure_rows(self, status: str, reason: str) -> list[ResultRow]:
         """Build the rows of a unit without a result: no effect has an overhead."""
-        return self._shared([{"name": effect, "status": status, "reason": reason} for effect in priced(self.run.scene)])
+        return self._add_shared_columns(
+            [{"name": effect, "status": status, "reason": reason} for effect in list_measured_effects(self.run.scene)]
+        )
 
-    def _shared(self, told: list[Row]) -> list[Row]:
-        shared = asked(self.run) | provenance() | {"kind": "price", "frames": self.run.frames}
+    def _add_shared_columns(self, told: list[ResultRow]) -> list[ResultRow]:
+        shared = (
+            build_specification_columns(self.run)
+            | build_provenance_columns()
+            | {"kind": "price", "frames": self.run.frames}
+        )
         return [shared | row for row in told]
 
 
-def _row(found: Price) -> Row:
-    row: Row = {"name": found.effect, "rounds": found.rounds}
-    if found.refused:
-        return row | {"status": "unsupported", "reason": found.refused}
-    row["max_iterations"] = found.iterations
-    middle, low, high = found.price
-    measured = {"price": middle, "price_low": low, "price_high": high, "price_bound": found.bound}
-    return row | {"status": "ok", "seconds": found.seconds} | measured
+def _build_row(overhead: EffectOverhead) -> ResultRow:
+    row: ResultRow = {"name": overhead.effect_kind, "rounds": overhead.num_rounds}
+    if overhead.unsupported_reason:
+        return row | {"status": "unsupported", "reason": overhead.unsupported_reason}
+    row["max_iterations"] = overhead.max_iterations
+    middle, low, high = overhead.ratio_interval
+    measured = {"price": middle, "price_low": low, "price_high": high, "price_bound": overhead.min_ratio}
+    return row | {"status": "ok", "seconds": overhead.seconds} | measured
 
 
-def price_all(
-    sweep: Sweep,
+def measure_all_overheads(
+    sweep: SweepPlan,
     folder: Path,
-    display: Display,
-    say: Callable[[str], None],
+    display: ProgressDisplay,
+    print_message: Callable[[str], None],
     *,
-    again: bool = False,
-    changed: bool = False,
+    rerun: bool = False,
+    rerun_stale: bool = False,
     isolated: bool = True,
 ) -> list[Path]:
     """Measure the missing overheads of a scene's effects for each solver of a sweep.
@@ -97,11 +103,15 @@ def price_all(
     Raises:
         InputError: the scene has no effect to measure, or no fixed time step.
     """
-    units = [Prices(run, folder) for run in sweep.runs()]
+    units = [OverheadUnit(run, folder) for run in sweep.list_runs()]
     scene = units[0].run.scene
-    scene.require_even_steps()
-    priced(scene)
+    scene.require_fixed_time_step()
+    list_measured_effects(scene)
     folder.mkdir(parents=True, exist_ok=True)
-    with holding.alone(folder):
-        do_all(wanted(units, "prices", say, again=again, changed=changed), display, isolated=isolated)
-    return [unit.path for unit in units]
+    with holding.lock_folder_exclusive(folder):
+        execute_units(
+            select_missing_units(units, "prices", print_message, rerun=rerun, rerun_stale=rerun_stale),
+            display,
+            isolated=isolated,
+        )
+    return [unit.rows_path for unit in units]

@@ -24,33 +24,33 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from harness.base.errors import InputError
-from harness.base.statistics import Interval, ratio
-from harness.scenes.bind import Scene, build
-from harness.scenes.effects.base import Effect
+from harness.base.statistics import ConfidenceInterval, estimate_ratio
+from harness.scenes.bind import Scene, build_scene
+from harness.scenes.effects.base import SceneEffect
 from harness.scenes.spec import SceneSpec
-from harness.simulation.algebraic import Stop
-from harness.simulation.step import Step, prepare, simulate
+from harness.simulation.algebraic import StopCriterion
+from harness.simulation.step import SimulationStep, prepare, simulate_scene
 from solvers.energies.springs import Springs
-from solvers.problem import NotPositiveDefinite, Prepared, ProjectiveEnergy, Solver, Unsupported
+from solvers.problem import NotPositiveDefinite, PreparedSolver, ProjectiveEnergy, Solver, Unsupported
 
-ALL = "all"
+ALL_EFFECTS = "all"
 """Name of all effects together."""
-CLOSE, LEAST = 0.03, 3
+MAX_INTERVAL_WIDTH, MIN_ROUNDS = 0.03, 3
 """Relative width of the interval at which rounds end; number of rounds that an interval needs."""
-WARM = 2
+NUM_WARMUP_STEPS = 2
 """Number of steps before those that count."""
-ENOUGH = 2.0
+MAX_ROUND_SECONDS = 2.0
 """CPU time of both scenes' steps after which a round has only one more counted step [s]."""
-_READS = 20
-_SIDE = 256
+_NUM_REPEATS = 20
+_MATRIX_SIZE = 256
 """Size of the matrices whose product determines the peak number of flops per second."""
 
 
-Ready = tuple[Scene, Prepared]
+PreparedScene = tuple[Scene, PreparedSolver]
 """Scene, and the solver prepared for it."""
 
 
-class Price(NamedTuple):
+class EffectOverhead(NamedTuple):
     """Per-iteration overhead of an effect.
 
     Attributes:
@@ -63,66 +63,68 @@ class Price(NamedTuple):
         unsupported_reason: why there is no measurement; empty if there is one.
     """
 
-    effect: str
-    price: Interval = Interval(np.nan, np.nan, np.nan)
+    effect_kind: str
+    ratio_interval: ConfidenceInterval = ConfidenceInterval(np.nan, np.nan, np.nan)
     seconds: float = np.nan
-    bound: float = np.nan
-    rounds: int = 0
-    iterations: int = 0
-    refused: str = ""
+    min_ratio: float = np.nan
+    num_rounds: int = 0
+    max_iterations: int = 0
+    unsupported_reason: str = ""
 
 
 @dataclass(eq=False)
-class _Run:
+class _TimedRun:
     """Running simulation of a scene by one solver.
 
     `seconds` and `iterations` are those of the counted steps, `total_seconds` those of all steps [s].
     """
 
-    steps: Iterator[Step]
+    steps: Iterator[SimulationStep]
     seconds: float = 0.0
     iterations: int = 0
-    spent: float = 0.0
+    total_seconds: float = 0.0
 
-    def step(self, *, counts: bool) -> None:
+    def run_step(self, *, is_counted: bool) -> None:
         """Compute the next step; it is included in `seconds` and `iterations` if `is_counted`."""
         began = thread_time()
         done = next(self.steps)
         took = thread_time() - began
-        self.spent += took
-        if counts:
+        self.total_seconds += took
+        if is_counted:
             self.seconds += took
-            self.iterations += done.iterations
+            self.iterations += done.num_iterations
 
     @property
-    def each(self) -> float:
+    def seconds_per_iteration(self) -> float:
         """CPU time per iteration [s]."""
         return self.seconds / max(1, self.iterations)
 
 
-def priced(scene: SceneSpec) -> list[str]:
+def list_measured_effects(scene: SceneSpec) -> list[str]:
     """Return the kinds of effects to measure, then ALL_EFFECTS. Raises InputError if there are none."""
-    kinds = list(dict.fromkeys(effect.kind for effect in scene.effects if not _plain(effect)))
+    kinds = list(dict.fromkeys(effect.kind for effect in scene.effects if not _is_baseline_effect(effect)))
     if not kinds:
         listed = ", ".join(dict.fromkeys(effect.kind for effect in scene.effects))
         raise InputError(f"{scene.path}: has no effect that has a price; those without one: {listed or 'none'}")
-    return [*kinds, ALL]
+    return [*kinds, ALL_EFFECTS]
 
 
-def only(scene: SceneSpec, *kinds: str) -> SceneSpec:
+def select_effects(scene: SceneSpec, *kinds: str) -> SceneSpec:
     """Return the scene with these effects and the baseline effects only; ALL_EFFECTS selects all."""
-    if ALL in kinds:
+    if ALL_EFFECTS in kinds:
         return scene
-    kept = [i for i, e in enumerate(scene.effects) if e.kind in kinds or _plain(e)]
-    return scene.model_copy(update=scene.of_effects(kept))
+    kept = [i for i, e in enumerate(scene.effects) if e.kind in kinds or _is_baseline_effect(e)]
+    return scene.model_copy(update=scene.keep_effects(kept))
 
 
-def _plain(effect: Effect) -> bool:
+def _is_baseline_effect(effect: SceneEffect) -> bool:
     """Return whether an effect is declared part of the baseline."""
     return bool(getattr(effect, "plain", False))
 
 
-def prices(scene: SceneSpec, size: int, solver: Solver, stop: Stop, *, frames: int, rounds: int) -> Iterator[Price]:
+def measure_overheads(
+    scene: SceneSpec, size: int, solver: Solver, stop_rule: StopCriterion, *, frames: int, max_rounds: int
+) -> Iterator[EffectOverhead]:
     """Measure the overhead of each effect with one solver; unsupported effects yield a reason.
 
     Args:
@@ -134,17 +136,24 @@ def prices(scene: SceneSpec, size: int, solver: Solver, stop: Stop, *, frames: i
         max_rounds: largest number of rounds.
     """
     plain = None
-    for effect in priced(scene):
+    for effect in list_measured_effects(scene):
         try:
             if plain is None:
-                plain = ready(scene, size, solver)
-                stop = _affordable(plain, stop)
-            yield price(effect, ready(scene, size, solver, effect), plain, stop, frames=frames, rounds=rounds)
+                plain = prepare_scene(scene, size, solver)
+                stop_rule = _limit_iterations(plain, stop_rule)
+            yield measure_overhead(
+                effect,
+                prepare_scene(scene, size, solver, effect),
+                plain,
+                stop_rule,
+                frames=frames,
+                max_rounds=max_rounds,
+            )
         except (InputError, NotPositiveDefinite, Unsupported) as error:
-            yield Price(effect, refused=str(error))
+            yield EffectOverhead(effect, unsupported_reason=str(error))
 
 
-def ready(scene: SceneSpec, size: int, solver: Solver, *effects: str) -> Ready:
+def prepare_scene(scene: SceneSpec, size: int, solver: Solver, *effects: str) -> PreparedScene:
     """Build the scene with these effects and the baseline effects, and prepare the solver.
 
     Raises:
@@ -152,11 +161,19 @@ def ready(scene: SceneSpec, size: int, solver: Solver, *effects: str) -> Ready:
         NotPositiveDefinite: the system matrix is not positive definite.
         Unsupported: the solver does not support an effect.
     """
-    made = build(only(scene, *effects), size)
+    made = build_scene(select_effects(scene, *effects), size)
     return made, prepare(made, solver)
 
 
-def price(effect: str, one: Ready, plain: Ready, stop: Stop, *, frames: int, rounds: int) -> Price:
+def measure_overhead(
+    effect: str,
+    with_effect: PreparedScene,
+    baseline: PreparedScene,
+    stop_rule: StopCriterion,
+    *,
+    frames: int,
+    max_rounds: int,
+) -> EffectOverhead:
     """Measure the overhead of an effect from scenes with and without it.
 
     Args:
@@ -168,75 +185,91 @@ def price(effect: str, one: Ready, plain: Ready, stop: Stop, *, frames: int, rou
         max_rounds: largest number of rounds.
     """
     pairs: list[tuple[float, float]] = []
-    found = Interval(np.nan, np.nan, np.nan)
-    while len(pairs) < rounds:
-        runs = [_Run(iter(simulate(*it, stop, first_guess="current", frames=WARM + frames))) for it in (one, plain)]
+    found = ConfidenceInterval(np.nan, np.nan, np.nan)
+    while len(pairs) < max_rounds:
+        runs = [
+            _TimedRun(iter(simulate_scene(*it, stop_rule, initial_guess="current", frames=NUM_WARMUP_STEPS + frames)))
+            for it in (with_effect, baseline)
+        ]
         enough = False
-        for k in range(WARM + frames):
+        for k in range(NUM_WARMUP_STEPS + frames):
             last = enough
             for run in runs[:: 1 if len(pairs) % 2 else -1]:
-                run.step(counts=last or k >= WARM)
-            enough = sum(run.spent for run in runs) > ENOUGH
-            if last or (enough and k >= WARM):
+                run.run_step(is_counted=last or k >= NUM_WARMUP_STEPS)
+            enough = sum(run.total_seconds for run in runs) > MAX_ROUND_SECONDS
+            if last or (enough and k >= NUM_WARMUP_STEPS):
                 break
-        pairs.append((runs[0].each, runs[1].each))
-        found = ratio(*np.array(pairs).T)
-        if len(pairs) >= LEAST and (enough or found.high - found.low <= CLOSE * found.middle):
+        pairs.append((runs[0].seconds_per_iteration, runs[1].seconds_per_iteration))
+        found = estimate_ratio(*np.array(pairs).T)
+        if len(pairs) >= MIN_ROUNDS and (enough or found.high - found.low <= MAX_INTERVAL_WIDTH * found.estimate):
             break
     each, without = np.array(pairs).min(axis=0)
-    return Price(effect, found, float(each), 1.0 + _least(one[0]) / without, len(pairs), stop.iterations)
+    return EffectOverhead(
+        effect,
+        found,
+        float(each),
+        1.0 + _compute_min_seconds(with_effect[0]) / without,
+        len(pairs),
+        stop_rule.max_iterations,
+    )
 
 
-def _affordable(plain: Ready, stop: Stop) -> Stop:
+def _limit_iterations(baseline: PreparedScene, stop_rule: StopCriterion) -> StopCriterion:
     """Return the stop rule, with fewer iterations if a step takes longer than MAX_ROUND_SECONDS.
 
     The reduced number of iterations takes a quarter of that time.
     """
-    run = _Run(iter(simulate(*plain, stop, first_guess="current", frames=WARM)))
-    for k in range(WARM):  # what the first compiles does not count
-        run.step(counts=k == WARM - 1)
-    return replace(stop, iterations=max(1, int(ENOUGH / 4.0 / run.each))) if run.seconds > ENOUGH else stop
+    run = _TimedRun(iter(simulate_scene(*baseline, stop_rule, initial_guess="current", frames=NUM_WARMUP_STEPS)))
+    for k in range(NUM_WARMUP_STEPS):  # what the first compiles does not count
+        run.run_step(is_counted=k == NUM_WARMUP_STEPS - 1)
+    return (
+        replace(stop_rule, iterations=max(1, int(MAX_ROUND_SECONDS / 4.0 / run.seconds_per_iteration)))
+        if run.seconds > MAX_ROUND_SECONDS
+        else stop_rule
+    )
 
 
-def _least(scene: Scene) -> float:
+def _compute_min_seconds(scene: Scene) -> float:
     """Return the smallest time for the arithmetic of all non-spring energies [s].
 
     Each energy is evaluated once.
     """
-    n = scene.system.vertices
-    work = [_work(energy, n) for energy in scene.system.energies if not isinstance(energy, Springs)]
-    size, flops = sum(one.bytes for one in work), sum(one.flops for one in work)
+    n = scene.system.num_vertices
+    work = [_count_energy_work(energy, n) for energy in scene.system.energies if not isinstance(energy, Springs)]
+    size, flops = sum(one.memory_bytes for one in work), sum(one.flops for one in work)
     if not size:
         return 0.0
-    x, A = np.ones(size // 8), np.ones((_SIDE, _SIDE))
-    return max(_fastest(lambda: x.dot(x)), flops / (2.0 * _SIDE**3) * _fastest(lambda: A @ A))
+    x, A = np.ones(size // 8), np.ones((_MATRIX_SIZE, _MATRIX_SIZE))
+    return max(
+        _measure_min_seconds(lambda: x.dot(x)), flops / (2.0 * _MATRIX_SIZE**3) * _measure_min_seconds(lambda: A @ A)
+    )
 
 
-def _fastest(work: Callable[[], object]) -> float:
+def _measure_min_seconds(work: Callable[[], object]) -> float:
     """Return the smallest of several wall times of a function [s]."""
     best = np.inf
-    for _ in range(_READS):
+    for _ in range(_NUM_REPEATS):
         began = perf_counter()
         work()
         best = min(best, perf_counter() - began)
     return best
 
 
-class _Work(NamedTuple):
+class _EnergyWork(NamedTuple):
     """Bytes that an energy reads, and flops that are linear in them."""
 
-    bytes: int = 0
+    memory_bytes: int = 0
     flops: int = 0
 
 
-def _work(energy: Any, n: int) -> _Work:
+def _count_energy_work(energy: Any, n: int) -> _EnergyWork:
     """Count the work of an energy's elements, or of its entries of Q.
 
     Data known only in steps is not counted.
     """
     if hasattr(energy, "elements"):
-        return _Work(sum(x.nbytes for x in energy.elements), 12 * energy.elements.vertices.size)
+        return _EnergyWork(sum(x.nbytes for x in energy.elements), 12 * energy.elements.vertices.size)
     if isinstance(energy, ProjectiveEnergy):
         share = csr_array(energy.stiffness_matrix(n))
-        return _Work(share.data.nbytes + share.indices.nbytes, 6 * share.nnz)
-    return _Work()
+        return _EnergyWork(share.data.nbytes + share.indices.nbytes, 6 * share.nnz)
+    return _EnergyWork()

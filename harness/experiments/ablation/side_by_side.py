@@ -22,19 +22,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.base.errors import InputError
-from harness.base.statistics import Interval, added
-from harness.base.worker import Tick
-from harness.experiments.ablation.variants import Variant
-from harness.scenes.bind import Scene, build
-from harness.simulation.measure import Settings, StepFailed, steps
-from harness.simulation.step import Step, prepare
-from solvers.problem import NotPositiveDefinite, Prepared, Solver, Unsupported
+from harness.base.statistics import ConfidenceInterval, estimate_added_time
+from harness.base.worker import ProgressCallback
+from harness.experiments.ablation.variants import SceneVariant
+from harness.scenes.bind import Scene, build_scene
+from harness.simulation.measure import StepError, SteppingSettings, iterate_steps
+from harness.simulation.step import SimulationStep, prepare
+from solvers.problem import NotPositiveDefinite, PreparedSolver, Solver, Unsupported
 
-Array = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 
 @dataclass(eq=False)
-class Contender:
+class VariantRun:
     """Running simulation of a variant.
 
     Attributes:
@@ -48,24 +48,24 @@ class Contender:
         velocities: (frames, n, 3) [m/s].
     """
 
-    variant: Variant
+    variant: SceneVariant
     scene: Scene | None = None
-    prepared: Prepared | None = None
-    bytes: int = 0
-    failure: str = ""
+    prepared: PreparedSolver | None = None
+    memory_bytes: int = 0
+    failure_reason: str = ""
     seconds: list[list[float]] = field(default_factory=list[list[float]])
-    positions: Array = field(default_factory=lambda: np.empty(0))
-    velocities: Array = field(default_factory=lambda: np.empty(0))
+    positions: FloatArray = field(default_factory=lambda: np.empty(0))
+    velocities: FloatArray = field(default_factory=lambda: np.empty(0))
 
 
-def turns(
-    variants: Sequence[Variant],
+def time_interleaved(
+    variants: Sequence[SceneVariant],
     size: int,
     integrator: str,
     solver: Solver,
-    settings: Settings,
-    tick: Tick,
-) -> list[Contender]:
+    settings: SteppingSettings,
+    tick: ProgressCallback,
+) -> list[VariantRun]:
     """Simulate every variant `rounds` times, interleaved, after a warm-up pass that stores the motion.
 
     Args:
@@ -80,18 +80,18 @@ def turns(
         InputError: the full scene is invalid; other variants store the reason.
         Unsupported: the solver does not support the full scene; other variants store the reason.
     """
-    _prepared(variants[0], size, integrator, solver)  # what is compiled and imported is not the scene's memory
-    found = [_prepared(variant, size, integrator, solver) for variant in variants]
+    _prepare_variant(variants[0], size, integrator, solver)  # what is compiled and imported is not the scene's memory
+    found = [_prepare_variant(variant, size, integrator, solver) for variant in variants]
     for turn in found:
-        _keep_motion(turn, settings)
+        _store_motion(turn, settings)
         tick("motion")
     for round in range(settings.rounds):
         # The order rotates from round to round: the first one after a pause has cold caches.
-        alive = [turn for turn in found if not turn.failure]
+        alive = [turn for turn in found if not turn.failure_reason]
         alive = alive[round % len(alive) :] + alive[: round % len(alive)]
         for turn in alive:
             turn.seconds.append([])
-        running = [_steps(turn, settings) for turn in alive]
+        running = [_iterate_steps(turn, settings) for turn in alive]
         for _ in range(settings.frames):
             for turn, run in zip(alive, running, strict=True):
                 began = thread_time()
@@ -101,56 +101,60 @@ def turns(
     return found
 
 
-def cost(whole: Contender, without: Contender) -> Interval:
+def compute_cost(full: VariantRun, without: VariantRun) -> ConfidenceInterval:
     """Return the CPU time per step that the full scene takes in addition [s]."""
-    return added(np.array(whole.seconds) - np.array(without.seconds))
+    return estimate_added_time(np.array(full.seconds) - np.array(without.seconds))
 
 
-def seconds(turn: Contender) -> float:
+def compute_step_seconds(variant_run: VariantRun) -> float:
     """Return the CPU time per step [s].
 
     This is the mean over the frames of the median over the rounds.
     """
-    return float(np.median(np.array(turn.seconds), axis=0).mean())
+    return float(np.median(np.array(variant_run.seconds), axis=0).mean())
 
 
-def _prepared(variant: Variant, size: int, integrator: str, solver: Solver) -> Contender:
-    turn = Contender(variant)
+def _prepare_variant(variant: SceneVariant, size: int, integrator: str, solver: Solver) -> VariantRun:
+    turn = VariantRun(variant)
     tracemalloc.start()
     try:
-        turn.scene = build(variant.scene, size, integrator)
+        turn.scene = build_scene(variant.scene, size, integrator)
         turn.prepared = prepare(turn.scene, solver)
-        turn.bytes = tracemalloc.get_traced_memory()[0]
+        turn.memory_bytes = tracemalloc.get_traced_memory()[0]
     except (InputError, NotPositiveDefinite, Unsupported) as error:
-        if not variant.left_out:
+        if not variant.omitted_effects:
             raise
-        turn.failure = str(error)
+        turn.failure_reason = str(error)
     finally:
         tracemalloc.stop()
     return turn
 
 
-def _keep_motion(turn: Contender, settings: Settings) -> None:
+def _store_motion(variant_run: VariantRun, settings: SteppingSettings) -> None:
     """Simulate once, and store positions and velocities."""
-    if turn.failure:
+    if variant_run.failure_reason:
         return
     try:
-        kept = [(step.state.now.positions, step.state.now.velocity) for step in _steps(turn, settings)]
-    except StepFailed as error:
-        if not turn.variant.left_out:
+        kept = [
+            (step.state.motion.positions, step.state.motion.velocity) for step in _iterate_steps(variant_run, settings)
+        ]
+    except StepError as error:
+        if not variant_run.variant.omitted_effects:
             raise
-        turn.failure = f"{error}: {error.__cause__}"
+        variant_run.failure_reason = f"{error}: {error.__cause__}"
         return
-    turn.positions, turn.velocities = (np.array(part) for part in zip(*kept, strict=True))
+    variant_run.positions, variant_run.velocities = (np.array(part) for part in zip(*kept, strict=True))
 
 
-def _steps(turn: Contender, settings: Settings) -> Iterator[Step]:
-    assert turn.scene is not None
-    assert turn.prepared is not None
-    return steps(turn.scene, turn.prepared, settings)
+def _iterate_steps(variant_run: VariantRun, settings: SteppingSettings) -> Iterator[SimulationStep]:
+    assert variant_run.scene is not None
+    assert variant_run.prepared is not None
+    return iterate_steps(variant_run.scene, variant_run.prepared, settings)
 
 
-def motion(scene: Scene, solver: Solver, settings: Settings, *, every: int = 1) -> tuple[Array, Array]:
+def simulate_motion(
+    scene: Scene, solver: Solver, settings: SteppingSettings, *, stride: int = 1
+) -> tuple[FloatArray, FloatArray]:
     """Simulate, and return positions and velocities (frames, n, 3) of every `stride`-th step.
 
     Args:
@@ -159,6 +163,6 @@ def motion(scene: Scene, solver: Solver, settings: Settings, *, every: int = 1) 
         settings: settings, whose number of frames is that of the result.
         stride: number of steps per frame of the result.
     """
-    run = replace(settings, frames=settings.frames * every)
-    kept = [s.state.now for s in steps(scene, prepare(scene, solver), run) if s.index % every == 0]
+    run = replace(settings, frames=settings.frames * stride)
+    kept = [s.state.motion for s in iterate_steps(scene, prepare(scene, solver), run) if s.index % stride == 0]
     return np.array([now.positions for now in kept]), np.array([now.velocity for now in kept])

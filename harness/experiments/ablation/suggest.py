@@ -13,21 +13,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.experiments.ablation.difference import rest_length
+from harness.experiments.ablation.difference import compute_mean_rest_length
 from harness.scenes.bind import Scene
-from harness.scenes.effects.base import Seen
-from harness.scenes.effects.effect_names import EFFECTS
-from solvers.registry import load
+from harness.scenes.effects.base import ObservedMotion
+from harness.scenes.effects.effect_names import EFFECT_CLASSES
+from solvers.registry import load_target
 
 
-class Suggestion(NamedTuple):
+class EffectSuggestion(NamedTuple):
     """Kind of the suggested effect, and the evidence for it."""
 
-    effect: str
+    effect_kind: str
     evidence: str
 
 
-def seen(scene: Scene, kinds: Collection[str], positions: NDArray[np.float64], velocities: NDArray[np.float64]) -> Seen:
+def build_evidence(
+    scene: Scene, effect_kinds: Collection[str], positions: NDArray[np.float64], velocities: NDArray[np.float64]
+) -> ObservedMotion:
     """Collect the evidence from a scene and its motion.
 
     Args:
@@ -36,31 +38,33 @@ def seen(scene: Scene, kinds: Collection[str], positions: NDArray[np.float64], v
         positions: (frames, n, 3) [m].
         velocities: (frames, n, 3) [m/s].
     """
-    return Seen(
+    return ObservedMotion(
         mesh=scene.mesh,
-        springs=scene.springs,
-        length=rest_length(scene),
+        springs=scene.all_springs,
+        mean_spring_length=compute_mean_rest_length(scene),
         mass=scene.system.mass,
         time_step=scene.system.time_step,
-        held=bool(len(scene.system.pins.vertices)),
-        driven=bool(scene.forces or scene.moving),
-        damped=any(getattr(_class(kind), "damps", False) for kind in kinds),
+        has_pins=bool(len(scene.system.pins.vertices)),
+        is_driven=bool(scene.varying_forces or scene.pin_motions),
+        is_damped=any(getattr(_load_effect_class(kind), "damps", False) for kind in effect_kinds),
         positions=positions,
         velocities=velocities,
     )
 
 
-def suggestions(found: Seen, kinds: Collection[str]) -> list[Suggestion]:
+def suggest_effects(evidence: ObservedMotion, effect_kinds: Collection[str]) -> list[EffectSuggestion]:
     """Return the unlisted effects that the evidence indicates, in a fixed order.
 
     Args:
         evidence: evidence from the motion.
         effect_kinds: kinds of the effects that the scene lists.
     """
-    absent = [kind for kind in EFFECTS if kind not in kinds and hasattr(_class(kind), "called_for")]
-    told = (Suggestion(kind, _class(kind).called_for(found)) for kind in absent)
+    absent = [
+        kind for kind in EFFECT_CLASSES if kind not in effect_kinds and hasattr(_load_effect_class(kind), "called_for")
+    ]
+    told = (EffectSuggestion(kind, _load_effect_class(kind).called_for(evidence)) for kind in absent)
     return [suggestion for suggestion in told if suggestion.evidence]
 
 
-def _class(kind: str) -> Any:
-    return load(EFFECTS[kind])
+def _load_effect_class(kind: str) -> Any:
+    return load_target(EFFECT_CLASSES[kind])

@@ -7,42 +7,48 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from harness.base import holding, machine
-from harness.base.progress import Display
-from harness.base.workers import Tick
-from harness.config.load import Sweep
+from harness.base.progress import ProgressDisplay
+from harness.base.workers import ProgressCallback
+from harness.config.load import SweepPlan
 from harness.config.sweep import RunSpec
-from harness.experiments.ablation.base import OfEffects, Row
-from harness.experiments.ablation.difference import States, difference, rest_length
-from harness.experiments.ablation.side_by_side import Contender, cost, motion, seconds, turns
-from harness.experiments.ablation.suggest import seen, suggestions
-from harness.experiments.ablation.variants import variants
-from harness.experiments.core import do_all
-from harness.experiments.failure import failure
-from harness.experiments.provenance import asked, provenance
-from harness.experiments.resume import wanted
-from harness.scenes.bind import Scene, build
-from harness.simulation.algebraic import stop_rule
-from harness.simulation.measure import Settings
+from harness.experiments.ablation.base import EffectUnit, ResultRow
+from harness.experiments.ablation.difference import MotionStates, compute_mean_rest_length, compute_motion_difference
+from harness.experiments.ablation.side_by_side import (
+    VariantRun,
+    compute_cost,
+    compute_step_seconds,
+    simulate_motion,
+    time_interleaved,
+)
+from harness.experiments.ablation.suggest import build_evidence, suggest_effects
+from harness.experiments.ablation.variants import build_variants
+from harness.experiments.core import execute_units
+from harness.experiments.failure import build_failure_columns
+from harness.experiments.provenance import build_provenance_columns, build_specification_columns
+from harness.experiments.resume import select_missing_units
+from harness.scenes.bind import Scene, build_scene
+from harness.simulation.algebraic import build_stop_rule
+from harness.simulation.measure import SteppingSettings
 from solvers.problem import Solver, StopRule
-from solvers.registry import EVERY, SOLVERS, load
+from solvers.registry import SOLVER_TABLE, SOLVERS, load_target
 
-_BETTER_ANSWERS = ("solver", "time-step")
+_REFERENCE_KINDS = ("solver", "time-step")
 """What is improved in each of the more accurate solutions."""
 
-BETTER = "newton"
+REFERENCE_SOLVER = "newton"
 """Solver whose solution determines the distance of the scene's own solver from the minimum."""
-CONVERGED = StopRule(200, 1e-8)
+CONVERGED_STOP_RULE = StopRule(200, 1e-8)
 """Its tolerance is far below any difference that an effect makes."""
 
 
 @dataclass(frozen=True, slots=True)
-class Ablation(OfEffects):
+class AblationUnit(EffectUnit):
     """Run of a scene, in full and without its effects, timed interleaved in one process.
 
     `with_pairs` selects variants without each pair of effects, too.
     """
 
-    pairs: bool
+    with_pairs: bool
 
     @property
     def title(self) -> str:
@@ -50,33 +56,33 @@ class Ablation(OfEffects):
         return f"{self.run.title}: without each effect"
 
     @property
-    def ticks(self) -> int:
+    def num_progress_steps(self) -> int:
         """Number of variants, timed rounds and more accurate solutions."""
-        return len(variants(self.run.scene, pairs=self.pairs)) + self.run.rounds + len(_BETTER_ANSWERS)
+        return len(build_variants(self.run.scene, with_pairs=self.with_pairs)) + self.run.rounds + len(_REFERENCE_KINDS)
 
-    def suffix(self) -> str:
+    def file_suffix(self) -> str:
         """Return the suffix of the file: `-pairs` with pairs of effects."""
-        return "-pairs" if self.pairs else ""
+        return "-pairs" if self.with_pairs else ""
 
-    def measured(self, tick: Tick) -> list[Row]:
+    def measure_rows(self, tick: ProgressCallback) -> list[ResultRow]:
         """Measure all variants and return the rows."""
-        return _measured(self.run, self.pairs, tick)
+        return _measure_ablation(self.run, self.with_pairs, tick)
 
-    def unanswered(self, status: str, reason: str) -> list[Row]:
+    def build_failure_rows(self, status: str, reason: str) -> list[ResultRow]:
         """Build the row of a failed unit: without the full scene no comparison is possible."""
         why = {"kind": "whole", "name": "", "status": status, "reason": reason}
-        return [asked(self.run) | provenance() | why]
+        return [build_specification_columns(self.run) | build_provenance_columns() | why]
 
 
 def run_ablation(
-    sweep: Sweep,
+    sweep: SweepPlan,
     folder: Path,
-    display: Display,
-    say: Callable[[str], None],
+    display: ProgressDisplay,
+    print_message: Callable[[str], None],
     *,
-    pairs: bool,
-    again: bool = False,
-    changed: bool = False,
+    with_pairs: bool,
+    rerun: bool = False,
+    rerun_stale: bool = False,
     isolated: bool = True,
 ) -> Path:
     """Execute the ablation of the only run of a scene's sweep, if it is missing.
@@ -98,89 +104,108 @@ def run_ablation(
     Raises:
         InputError: the scene or an option is invalid.
     """
-    (run,) = sweep.runs()
-    run.scene.require_even_steps()
-    unit = Ablation(run, folder, pairs)
+    (run,) = sweep.list_runs()
+    run.scene.require_fixed_time_step()
+    unit = AblationUnit(run, folder, with_pairs)
     folder.mkdir(parents=True, exist_ok=True)
-    with holding.alone(folder):
-        do_all(wanted([unit], "ablations", say, again=again, changed=changed), display, isolated=isolated)
-    return unit.path
+    with holding.lock_folder_exclusive(folder):
+        execute_units(
+            select_missing_units([unit], "ablations", print_message, rerun=rerun, rerun_stale=rerun_stale),
+            display,
+            isolated=isolated,
+        )
+    return unit.rows_path
 
 
-def _measured(run: RunSpec, pairs: bool, tick: Tick) -> list[Row]:
+def _measure_ablation(run: RunSpec, with_pairs: bool, tick: ProgressCallback) -> list[ResultRow]:
     """Measure all variants and build the rows. Errors for the full scene are raised unchanged."""
-    settings = Settings(stop_rule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
-    solver: Solver = load(EVERY[run.solver.name])(**run.solver.parameters)
-    with machine.pinned_threads(machine.threads(run.threads).number):
-        found = turns(variants(run.scene, pairs=pairs), run.size, run.integrator, solver, settings, tick)
+    settings = SteppingSettings(build_stop_rule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
+    solver: Solver = load_target(SOLVER_TABLE[run.solver.name])(**run.solver.parameters)
+    with machine.limit_threads(machine.choose_threads(run.threads).count):
+        found = time_interleaved(
+            build_variants(run.scene, with_pairs=with_pairs), run.size, run.integrator, solver, settings, tick
+        )
         whole = found[0]
         assert whole.scene is not None
-        told = [_whole(whole), *(_without(whole, turn) for turn in found[1:])]
-        told += _errors(run, whole, settings, tick)
+        told = [_build_full_row(whole), *(_build_variant_row(whole, turn) for turn in found[1:])]
+        told += _measure_reference_errors(run, whole, settings, tick)
         kinds = {effect.kind for effect in run.scene.effects}
-        motion_seen = seen(whole.scene, kinds, whole.positions, whole.velocities)
+        motion_seen = build_evidence(whole.scene, kinds, whole.positions, whole.velocities)
         told += [
-            {"kind": "suggestion", "name": s.effect, "reason": s.evidence} for s in suggestions(motion_seen, kinds)
+            {"kind": "suggestion", "name": s.effect_kind, "reason": s.evidence}
+            for s in suggest_effects(motion_seen, kinds)
         ]
-    return _shared(run, whole.scene, told)
+    return _add_shared_columns(run, whole.scene, told)
 
 
-def _whole(whole: Contender) -> Row:
-    return {"kind": "whole", "name": "", "status": "ok", "seconds": seconds(whole)} | _built(whole)
+def _build_full_row(full: VariantRun) -> ResultRow:
+    return {"kind": "whole", "name": "", "status": "ok", "seconds": compute_step_seconds(full)} | _build_size_columns(
+        full
+    )
 
 
-def _without(whole: Contender, turn: Contender) -> Row:
-    row: Row = {"kind": "without", "name": turn.variant.name}
-    if turn.failure:
-        return row | {"status": "impossible", "reason": turn.failure}
-    assert whole.scene is not None
-    middle, low, high = cost(whole, turn)
-    costs = {"seconds": seconds(turn), "cost": middle, "cost_low": low, "cost_high": high}
-    apart = difference(whole.scene, (whole.positions, whole.velocities), (turn.positions, turn.velocities))
-    return row | {"status": "ok"} | costs | _built(turn) | apart
+def _build_variant_row(full: VariantRun, variant_run: VariantRun) -> ResultRow:
+    row: ResultRow = {"kind": "without", "name": variant_run.variant.name}
+    if variant_run.failure_reason:
+        return row | {"status": "impossible", "reason": variant_run.failure_reason}
+    assert full.scene is not None
+    middle, low, high = compute_cost(full, variant_run)
+    costs = {"seconds": compute_step_seconds(variant_run), "cost": middle, "cost_low": low, "cost_high": high}
+    apart = compute_motion_difference(
+        full.scene, (full.positions, full.velocities), (variant_run.positions, variant_run.velocities)
+    )
+    return row | {"status": "ok"} | costs | _build_size_columns(variant_run) | apart
 
 
-def _built(turn: Contender) -> Row:
-    assert turn.prepared is not None
-    facts = turn.prepared.facts
+def _build_size_columns(variant_run: VariantRun) -> ResultRow:
+    assert variant_run.prepared is not None
+    facts = variant_run.prepared.stats
     factor = facts.get("nnz_hessian_factor", facts.get("nnz_factor"))
     counts = {"nnz_system": facts.get("nnz_system"), "nnz_factor": factor}
-    return {"bytes": turn.bytes, **{name: None if value is None else int(value) for name, value in counts.items()}}
+    return {
+        "bytes": variant_run.memory_bytes,
+        **{name: None if value is None else int(value) for name, value in counts.items()},
+    }
 
 
-def _errors(run: RunSpec, whole: Contender, settings: Settings, tick: Tick) -> list[Row]:
+def _measure_reference_errors(
+    run: RunSpec, full: VariantRun, settings: SteppingSettings, tick: ProgressCallback
+) -> list[ResultRow]:
     """Measure the error of the full scene's solver, and that of its time step.
 
     These are the distance from the minima of the steps, and the distance of those from half the time step.
     """
-    assert whole.scene is not None
-    settings = replace(settings, stop=CONVERGED)
-    found: list[Row] = []
-    finer: States = (whole.positions, whole.velocities)
-    for every, name in enumerate(_BETTER_ANSWERS, start=1):
-        row: Row = {"kind": "error", "name": name}
+    assert full.scene is not None
+    settings = replace(settings, stop_criterion=CONVERGED_STOP_RULE)
+    found: list[ResultRow] = []
+    finer: MotionStates = (full.positions, full.velocities)
+    for every, name in enumerate(_REFERENCE_KINDS, start=1):
+        row: ResultRow = {"kind": "error", "name": name}
         try:
-            scene = build(run.scene.stepped(run.scene.time_step / every), run.size, run.integrator)
-            coarser, finer = finer, motion(scene, load(SOLVERS[BETTER])(), settings, every=every)
-            found.append(row | {"status": "ok"} | difference(whole.scene, coarser, finer))
+            scene = build_scene(run.scene.with_time_step(run.scene.time_step / every), run.size, run.integrator)
+            coarser, finer = (
+                finer,
+                simulate_motion(scene, load_target(SOLVERS[REFERENCE_SOLVER])(), settings, stride=every),
+            )
+            found.append(row | {"status": "ok"} | compute_motion_difference(full.scene, coarser, finer))
         except Exception as error:  # the better solver may fail in any way: then the error is not known
-            told = failure(error)
+            told = build_failure_columns(error)
             found += [
                 {"kind": "error", "name": n, "status": "unknown", "reason": told["reason"]}
-                for n in _BETTER_ANSWERS[every - 1 :]
+                for n in _REFERENCE_KINDS[every - 1 :]
             ]
             break
         tick(f"error of the {name}")
     return found
 
 
-def _shared(run: RunSpec, scene: Scene, told: list[Row]) -> list[Row]:
+def _add_shared_columns(run: RunSpec, scene: Scene, told: list[ResultRow]) -> list[ResultRow]:
     """Add the columns that all rows share."""
-    shared = asked(run) | {
-        "vertices": len(scene.mesh.rest),
-        "springs": len(scene.springs.edges),
+    shared = build_specification_columns(run) | {
+        "vertices": len(scene.mesh.rest_positions),
+        "springs": len(scene.all_springs.edges),
         "frames": run.frames,
         "rounds": run.rounds,
-        "extent": scene.mesh.size / rest_length(scene),
+        "extent": scene.mesh.bounding_box_diagonal / compute_mean_rest_length(scene),
     }
-    return [shared | provenance() | row for row in told]
+    return [shared | build_provenance_columns() | row for row in told]

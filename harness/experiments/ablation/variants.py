@@ -10,28 +10,28 @@ from harness.scenes.spec import SceneSpec
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Variant:
+class SceneVariant:
     """Scene without the effects `omitted_effects`, by name; the full scene omits none."""
 
-    left_out: tuple[str, ...]
+    omitted_effects: tuple[str, ...]
     scene: SceneSpec
 
     @property
     def name(self) -> str:
         """The omitted effects, joined by +."""
-        return "+".join(self.left_out)
+        return "+".join(self.omitted_effects)
 
 
-def variants(scene: SceneSpec, *, pairs: bool) -> list[Variant]:
+def build_variants(scene: SceneSpec, *, with_pairs: bool) -> list[SceneVariant]:
     """Build the full scene, then one variant without each effect in order; `with_pairs` adds pairs."""
-    names = effect_names(scene)
+    names = name_effects(scene)
     chosen: list[tuple[int, ...]] = [(), *((i,) for i in range(len(names)))]
-    if pairs:
+    if with_pairs:
         chosen += combinations(range(len(names)), 2)
-    return [Variant(tuple(names[i] for i in out), _without(scene, out)) for out in chosen]
+    return [SceneVariant(tuple(names[i] for i in out), _omit_effects(scene, out)) for out in chosen]
 
 
-def effect_names(scene: SceneSpec) -> list[str]:
+def name_effects(scene: SceneSpec) -> list[str]:
     """Return the name of each effect.
 
     It is the kind, with the index in the list where a scene lists two of a kind.
@@ -40,7 +40,7 @@ def effect_names(scene: SceneSpec) -> list[str]:
     return [e.kind if count[e.kind] == 1 else f"{e.kind}[{i}]" for i, e in enumerate(scene.effects)]
 
 
-def _without(scene: SceneSpec, out: tuple[int, ...]) -> SceneSpec:
+def _omit_effects(scene: SceneSpec, omitted: tuple[int, ...]) -> SceneSpec:
     values = {key: getattr(scene, key) for key in SceneSpec.model_fields}
-    kept = [i for i in range(len(scene.effects)) if i not in out]
-    return SceneSpec.model_construct(None, **values | scene.of_effects(kept))
+    kept = [i for i in range(len(scene.effects)) if i not in omitted]
+    return SceneSpec.model_construct(None, **values | scene.keep_effects(kept))

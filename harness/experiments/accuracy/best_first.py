@@ -161,7 +161,7 @@ def _outcome(row: Mapping[str, Any]) -> tuple[float, float]:
 def _limited(spec: WorkSpec, best: float) -> WorkSpec:
     """Return the specification with a time limit of SLOWER times the best cost."""
     limit = max(LEAST_LIMIT, SLOWER * best * spec.horizon)
-    return replace(spec, how=replace(spec.how, time_limit=min(spec.how.time_limit, limit)))
+    return replace(spec, measurement=replace(spec.measurement, time_limit=min(spec.measurement.time_limit, limit)))
 
 
 def _methods(work: Iterable[WorkSpec]) -> list[_Method]:

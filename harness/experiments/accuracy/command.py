@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from harness.base.commands import Results
-from harness.base.console import err, narrow, out, say
+from harness.base.commands import ResultsOption
+from harness.base.console import get_error_console, get_output_console, print_message, split_wide_table
 
 
 def recommend(
@@ -24,40 +24,47 @@ def recommend(
     ] = None,
     time_limit: Annotated[float, typer.Option(help="Wall seconds that a simulation may take.")] = 5.0,
     budget: Annotated[float, typer.Option(help="Wall seconds that all simulations together may take.")] = 60.0,
-    results: Results = Path("results"),
+    results: ResultsOption = Path("results"),
 ) -> None:
     """Find and check the cheapest integrator, time step, tolerance and solver for an error."""
     from rich.table import Table
 
-    from harness.base.progress import display
-    from harness.experiments.accuracy.recommend import recommend as find
-    from harness.report.accuracy.runners_up import RunnerUp, draw_ways
+    from harness.base.progress import create_display
+    from harness.experiments.accuracy.recommend import recommend_method as find
+    from harness.report.accuracy.runners_up import CandidatePoint, draw_recommendation
 
     found = find(
         scene,
         error,
         size=size,
-        horizon=horizon,
+        t_end=horizon,
         time_limit=time_limit,
         budget=budget,
         results=results,
-        display=display(err()),
-        say=say,
+        display=create_display(get_error_console()),
+        print_message=print_message,
     )
-    integrated = found.checked.truth == "integrated"
-    table = Table("", "error" if integrated else f"error ({found.checked.truth})", "wall s per simulated s", "way")
-    for name, way in (("predicted", found.best), ("measured", found.checked)):
-        table.add_row(name, f"{way.error:.3g}", f"{way.cost:.4g}", str(way))
-    out().print(narrow(table))
-    say(found.verdict)
-    points = [RunnerUp(way.spec.solver.name, way.error, way.cost, str(way)) for way in found.ways]
-    title = f"Ways to an error of {100 * error:g} %: {scene.stem} {found.best.spec.case.size or ''}".rstrip()
+    integrated = found.checked_method.reference_kind == "integrated"
+    table = Table(
+        "", "error" if integrated else f"error ({found.checked_method.reference_kind})", "wall s per simulated s", "way"
+    )
+    for name, way in (("predicted", found.best_method), ("measured", found.checked_method)):
+        table.add_row(name, f"{way.error:.3g}", f"{way.seconds_per_simulated_second:.4g}", str(way))
+    get_output_console().print(split_wide_table(table))
+    print_message(found.verdict)
+    points = [
+        CandidatePoint(way.work_spec.solver.name, way.error, way.seconds_per_simulated_second, str(way))
+        for way in found.measured_methods
+    ]
+    title = (
+        f"Ways to an error of {100 * error:g} %: {scene.stem} {found.best_method.work_spec.case.size or ''}".rstrip()
+    )
     folder = results / f"recommend-{scene.stem}" / "pictures"
-    horizon = found.best.spec.horizon
-    name = f"ways-{scene.stem}-{found.best.spec.case.size}-{error:g}-{horizon:g}".replace(".", "_")
+    horizon = found.best_method.work_spec.horizon
+    name = f"ways-{scene.stem}-{found.best_method.work_spec.case.size}-{error:g}-{horizon:g}".replace(".", "_")
     facts = [f"{horizon:g} s simulated", "time stepping and solver together"]
-    facts += [] if integrated else [f"by a {found.checked.truth} reference"]
-    picture, *_ = draw_ways(folder / name, title, facts, points, error)
-    say(f"the runners-up are in {picture}")
-    if command := found.best.command(scene):
-        say(f"to run it:\n  {command}")
+    facts += [] if integrated else [f"by a {found.checked_method.reference_kind} reference"]
+    picture, *_ = draw_recommendation(folder / name, title, facts, points, error)
+    print_message(f"the runners-up are in {picture}")
+    if command := found.best_method.format_command(scene):
+        print_message(f"to run it:\n  {command}")

@@ -4,28 +4,28 @@ from __future__ import annotations
 
 from typing import Any
 
-from harness.experiments.failure import failure
-from harness.reference.minimiser import Uncertified
-from harness.reference.motion import Unintegrable
+from harness.experiments.failure import build_failure_columns
+from harness.reference.minimiser import UncertifiedError
+from harness.reference.motion import NotIntegrable
 from harness.reference.self_converged import NotConverged
-from harness.reference.trajectory import Unpredictable
+from harness.reference.trajectory import UnpredictableMotion
 
 
-class OverTime(Exception):
+class TimeLimitExceeded(Exception):
     """Simulation that reached its time limit; the message states its last frame."""
 
 
-_STATUS: dict[type[Exception], str] = {
-    OverTime: "time-limit",
-    Uncertified: "uncertified",
-    Unintegrable: "uncertified",
-    Unpredictable: "uncertified",
+_STATUS_OF_ERROR: dict[type[Exception], str] = {
+    TimeLimitExceeded: "time-limit",
+    UncertifiedError: "uncertified",
+    NotIntegrable: "uncertified",
+    UnpredictableMotion: "uncertified",
     NotConverged: "uncertified",
 }
 
 
-def lost(error: Exception) -> dict[str, Any]:
+def build_accuracy_failure_columns(error: Exception) -> dict[str, Any]:
     """Return the status and the reason of a measurement that ended with an error."""
-    told = failure(error)
-    reason = str(error) if type(error) in _STATUS else told["reason"]
-    return {"status": _STATUS.get(type(error), told["status"]), "reason": reason}
+    told = build_failure_columns(error)
+    reason = str(error) if type(error) in _STATUS_OF_ERROR else told["reason"]
+    return {"status": _STATUS_OF_ERROR.get(type(error), told["status"]), "reason": reason}

@@ -19,67 +19,69 @@ from time import monotonic
 from typing import Any
 
 from harness.base import machine, rows, shelf
-from harness.base.claim import claimed
-from harness.base.document import Document
-from harness.base.errors import InputError, Mistake, RunFailed
-from harness.base.progress import Display
-from harness.config.accuracy import AccuracyFields, Case, How, WorkSpec
-from harness.config.accuracy_load import Accuracy, expand
-from harness.config.load import load_scene, misfits
-from harness.config.options import OF_STEPS
-from harness.config.solvers import solvers_of
+from harness.base.claim import claim_folder
+from harness.base.document import ConfigDocument
+from harness.base.errors import InputError, InputMistake, RunFailed
+from harness.base.progress import ProgressDisplay
+from harness.config.accuracy import AccuracyConfig, BenchmarkCase, MeasurementSettings, WorkSpec
+from harness.config.accuracy_load import AccuracyPlan, expand_studies
+from harness.config.load import find_scene_mistakes, load_scene
+from harness.config.options import STEP_OPTIONS
+from harness.config.solvers import read_solvers
 from harness.config.sweep import SolverSpec
-from harness.experiments.accuracy.accuracy_rows import SCHEMA
+from harness.experiments.accuracy.accuracy_rows import ACCURACY_SCHEMA
 from harness.experiments.accuracy.best_first import SLOWER, Omitted, search
 from harness.experiments.accuracy.studies import measuring
-from harness.experiments.accuracy.units import references, trajectory_of
-from harness.experiments.accuracy.work import work_rows
-from harness.reference.frozen import bind
-from harness.reference.self_converged import told_once, touches
-from harness.reference.store import Store
-from harness.scenes.mesh.generator import Generator
+from harness.experiments.accuracy.units import load_reference_trajectory, open_reference_store
+from harness.experiments.accuracy.work import build_work_rows
+from harness.reference.frozen import build_exact_scene
+from harness.reference.self_converged import describe_self_convergence, has_contact
+from harness.reference.store import ReferenceStore
+from harness.scenes.mesh.generator import MeshGenerator
 from harness.scenes.spec import SceneSpec
-from solvers.about import LOCAL_GLOBAL
-from solvers.registry import EVERY, SOLVERS, about, load, minimises
+from solvers.about import LOCAL_GLOBAL_FAMILY
+from solvers.registry import SOLVER_TABLE, SOLVERS, find_solver_info, is_minimiser, load_target
 
-REFINEMENTS = (0.5, 1, 2, 4, 8)
+TIME_STEP_REFINEMENTS = (0.5, 1, 2, 4, 8)
 """Numbers of steps up to the horizon, relative to those at the scene's own time step."""
 
-HORIZON = 1.0
+DEFAULT_T_END = 1.0
 """Default simulated time at which the error counts [s]."""
 BUDGET = 60.0
 """Default limit for the wall time of all measurements together [s]."""
-_SAID = 2.0
+_MESSAGE_INTERVAL = 2.0
 """Interval between two messages about the reference [s]."""
-_SAME, _APART = 1e-6, 1.3
+_ERROR_RTOL, _MAX_TIME_RATIO = 1e-6, 1.3
 """Relative difference of two errors of one simulation that compilers may cause; accepted ratio of its two times."""
 
-TRIED = ["implicit-euler", "bdf2", "midpoint", "sdirk-4"]
+CANDIDATE_INTEGRATORS = ["implicit-euler", "bdf2", "midpoint", "sdirk-4"]
 """Integrators to try: one of each order and kind."""
 
 
-def candidates() -> list[dict[str, Any]]:
+def build_candidate_grid() -> list[dict[str, Any]]:
     """Return the grid that is measured where no rows exist.
 
     The first solver of each family runs with steps solved to a tolerance, or with 50 iterations or substeps. All
     adaptive
     solvers with their own integrator are included.
     """
-    made = {name: load(target) for name, target in SOLVERS.items()}
-    told = {name: about(solver, name) for name, solver in made.items()}
-    own = [name for name, of in told.items() if of.own_steps and of.to_error]
-    first = {name: made[name] for name, of in told.items() if of.first}
-    implicit = [name for name, solver in first.items() if minimises(solver)]
-    fixed = [name for name, solver in first.items() if not minimises(solver) or told[name].family == LOCAL_GLOBAL]
+    made = {name: load_target(target) for name, target in SOLVERS.items()}
+    told = {name: find_solver_info(solver, name) for name, solver in made.items()}
+    own = [name for name, of in told.items() if of.is_substepping and of.supports_error_control]
+    first = {name: made[name] for name, of in told.items() if of.is_family_default}
+    implicit = [name for name, solver in first.items() if is_minimiser(solver)]
+    fixed = [
+        name for name, solver in first.items() if not is_minimiser(solver) or told[name].family == LOCAL_GLOBAL_FAMILY
+    ]
     return [
-        {"solver": implicit, "tolerance": [1e-1, 1e-2, 1e-3], "iterations": 500, "integrator": TRIED},
+        {"solver": implicit, "tolerance": [1e-1, 1e-2, 1e-3], "iterations": 500, "integrator": CANDIDATE_INTEGRATORS},
         {"solver": fixed, "iterations": 50},
         {"solver": own, "iterations": 1, "integrator": ["own"]},
     ]
 
 
 @dataclass(frozen=True, slots=True)
-class Recommended:
+class MeasuredMethod:
     """Method that was measured on the scene.
 
     Attributes:
@@ -91,24 +93,24 @@ class Recommended:
         sweep: name of the study that measured it.
     """
 
-    spec: WorkSpec
+    work_spec: WorkSpec
     error: float
-    cost: float
-    truth: str
-    choice: str
+    seconds_per_simulated_second: float
+    reference_kind: str
+    solver_description: str
     sweep: str = ""
 
     def __str__(self) -> str:
-        u = self.spec
-        if about(load(EVERY[u.solver.name]), u.solver.name).own_steps:
-            return f"solver {u.solver.name}, {self.choice}, in each frame of {u.case.scene.time_step:.6g} s"
+        u = self.work_spec
+        if find_solver_info(load_target(SOLVER_TABLE[u.solver.name]), u.solver.name).is_substepping:
+            return f"solver {u.solver.name}, {self.solver_description}, in each frame of {u.case.scene.time_step:.6g} s"
         tolerance = u.options["tolerance"]
         stop = f"{u.options['iterations']} iterations" if tolerance is None else f"tolerance {tolerance:g}"
         return f"{u.case.integrator}, time step {u.case.scene.time_step:.6g} s, {stop}, solver {u.solver.name}"
 
-    def command(self, scene: Path) -> str:
+    def format_command(self, scene: Path) -> str:
         """Return the command line for this method; empty where the solver's parameters need a sweep."""
-        u, made = self.spec, load(EVERY[self.spec.solver.name])
+        u, made = self.work_spec, load_target(SOLVER_TABLE[self.work_spec.solver.name])
         if made(**u.solver.parameters) != made():
             return ""
         steps = round(u.horizon / u.case.scene.time_step)
@@ -120,7 +122,7 @@ class Recommended:
 
 
 @dataclass(frozen=True, slots=True)
-class Recommendation:
+class MethodRecommendation:
     """Result of a recommendation.
 
     Attributes:
@@ -129,21 +131,21 @@ class Recommendation:
         checked_method: a repeated measurement of it.
     """
 
-    ways: tuple[Recommended, ...]
-    best: Recommended
-    checked: Recommended
+    measured_methods: tuple[MeasuredMethod, ...]
+    best_method: MeasuredMethod
+    checked_method: MeasuredMethod
 
     @property
     def verdict(self) -> str:
         """Comparison of the predicted with the repeated measurement, as text."""
-        before, now = self.best, self.checked
-        if not math.isclose(now.error, before.error, rel_tol=_SAME):
+        before, now = self.best_method, self.checked_method
+        if not math.isclose(now.error, before.error, rel_tol=_ERROR_RTOL):
             return (
                 f"not as predicted: the error is {now.error:.3g}, not {before.error:.3g}; what was measured before is "
                 "not this simulation, so remove it and repeat the command"
             )
-        ratio = now.cost / before.cost
-        if not 1.0 / _APART <= ratio <= _APART:
+        ratio = now.seconds_per_simulated_second / before.seconds_per_simulated_second
+        if not 1.0 / _MAX_TIME_RATIO <= ratio <= _MAX_TIME_RATIO:
             return (
                 f"the error is as predicted, the time {ratio:.2g} times that: other programs ran beside one of the "
                 "two, so repeat the command on an idle machine before you rely on the time"
@@ -151,18 +153,18 @@ class Recommendation:
         return f"as predicted: the same error, {ratio:.2g} times the time"
 
 
-def recommend(
+def recommend_method(
     path: Path,
-    error: float,
+    max_error: float,
     *,
     size: int | None,
-    horizon: float | None,
+    t_end: float | None,
     time_limit: float,
     results: Path,
-    display: Display,
-    say: Callable[[str], None],
+    display: ProgressDisplay,
+    print_message: Callable[[str], None],
     budget: float = BUDGET,
-) -> Recommendation:
+) -> MethodRecommendation:
     """Return the cheapest method for a relative error at `t_end`.
 
     Args:
@@ -182,86 +184,105 @@ def recommend(
         InputError: an option is invalid.
         RunFailed: no method meets the error.
     """
-    asked_for = {"--error": error, "--horizon": horizon, "--time-limit": time_limit, "--budget": budget}
+    asked_for = {"--error": max_error, "--horizon": t_end, "--time-limit": time_limit, "--budget": budget}
     for key, value in asked_for.items():
         if value is not None and not 0 < value < math.inf:
-            raise InputError(Mistake(f"came {value:g}; wanted a number above 0", key=key))
+            raise InputError(InputMistake(f"came {value:g}; wanted a number above 0", key=key))
     scene = load_scene(path)
-    scene.require_even_steps()
-    size = (size or scene.default_size or 0) if isinstance(scene.mesh, Generator) else 0
-    store = references(results)
-    if horizon is None:
-        horizon = _longest(path, scene, size, error, store, say)
+    scene.require_fixed_time_step()
+    size = (size or scene.default_size or 0) if isinstance(scene.mesh, MeshGenerator) else 0
+    store = open_reference_store(results)
+    if t_end is None:
+        t_end = _find_longest_t_end(path, scene, size, max_error, store, print_message)
     try:
-        asked = _grid(path, scene, size, horizon, time_limit)
+        asked = _build_study(path, scene, size, t_end, time_limit)
     except InputError as refused:  # the studies are ours; what is wrong came with an option
-        raise InputError(list(dict.fromkeys(map(_of_option, refused.mistakes)))) from refused
-    _referenced(scene, size, error, horizon, store, say)
-    ways, reasons = _known(path.stem, scene, size, horizon, results)
+        raise InputError(list(dict.fromkeys(map(_convert_to_option, refused.mistakes)))) from refused
+    _compute_reference(scene, size, max_error, t_end, store, print_message)
+    ways, reasons = _read_measured_methods(path.stem, scene, size, t_end, results)
     omitted: Omitted | None = None
-    if not any(way.error <= error and way.sweep != asked.name for way in ways):
-        omitted = _measured(asked, ways, reasons, error, claimed(results / asked.name, path), display, say, budget)
-        say(f"{path.stem} {size or ''}: {omitted}")
-        ways, reasons = _known(path.stem, scene, size, horizon, results)
-    within = [way for way in ways if way.error <= error]
+    if not any(way.error <= max_error and way.sweep != asked.name for way in ways):
+        omitted = _measured(
+            asked, ways, reasons, max_error, claim_folder(results / asked.name, path), display, print_message, budget
+        )
+        print_message(f"{path.stem} {size or ''}: {omitted}")
+        ways, reasons = _read_measured_methods(path.stem, scene, size, t_end, results)
+    within = [way for way in ways if way.error <= max_error]
     if not within:
-        raise RunFailed(_nothing(ways, reasons, error, horizon, omitted))
+        raise RunFailed(_explain_no_method(ways, reasons, max_error, t_end, omitted))
     best = within[0]
-    say(f"checking {best}")
-    return Recommendation(tuple(ways), best, _check(best, store))
+    print_message(f"checking {best}")
+    return MethodRecommendation(tuple(ways), best, _check_method(best, store))
 
 
-def _longest(path: Path, scene: SceneSpec, size: int, error: float, store: Store, say: Callable[[str], None]) -> float:
+def _find_longest_t_end(
+    path: Path,
+    scene: SceneSpec,
+    size: int,
+    max_error: float,
+    reference_store: ReferenceStore,
+    print_message: Callable[[str], None],
+) -> float:
     """Return the default end time [s]. Raises InputError, Unpredictable."""
-    if mistakes := misfits(scene, [size]):
+    if mistakes := find_scene_mistakes(scene, [size]):
         raise InputError(mistakes)
-    if touches(bind(scene, size).system):
-        return HORIZON
-    seen = store.growth(scene, size, HORIZON)
-    if seen.least <= error:
-        return HORIZON
-    longest = seen.longest(error)
+    if has_contact(build_exact_scene(scene, size).system):
+        return DEFAULT_T_END
+    seen = reference_store.load_growth(scene, size, DEFAULT_T_END)
+    if seen.min_error <= max_error:
+        return DEFAULT_T_END
+    longest = seen.compute_longest_horizon(max_error)
     if not longest:
-        seen.require(error)
-    say(
-        f"{path.stem} {size or ''}: an error of {error:g} can be measured up to {longest:g} s, for a perturbation of "
-        f"1e-12 of the size grows to {seen.grown[-1]:.1e} of the displacement after {HORIZON:g} s"
+        seen.require_predictable(max_error)
+    print_message(
+        f"{path.stem} {size or ''}: an error of {max_error:g} can be measured up to {longest:g} s, for a perturbation of "
+        f"1e-12 of the size grows to {seen.growth_factor[-1]:.1e} of the displacement after {DEFAULT_T_END:g} s"
     )
     return longest
 
 
-def _referenced(
-    scene: SceneSpec, size: int, error: float, horizon: float, store: Store, say: Callable[[str], None]
+def _compute_reference(
+    scene: SceneSpec,
+    size: int,
+    max_error: float,
+    t_end: float,
+    reference_store: ReferenceStore,
+    print_message: Callable[[str], None],
 ) -> None:
     """Compute the reference, or report without delay why there is none. Raises RunFailed."""
-    if touches(bind(scene, size).system):
-        say(told_once(scene.path.stem))
-    say(f"the reference first, the motion up to {horizon:g} s, which is made once")
+    if has_contact(build_exact_scene(scene, size).system):
+        print_message(describe_self_convergence(scene.path.stem))
+    print_message(f"the reference first, the motion up to {t_end:g} s, which is made once")
     last = [monotonic()]
 
     def told(motion: int, time: float) -> None:
-        if monotonic() - last[0] > _SAID:
+        if monotonic() - last[0] > _MESSAGE_INTERVAL:
             last[0] = monotonic()
-            say(f"  motion {motion} of 2, at {time:.3g} of {horizon:g} s")
+            print_message(f"  motion {motion} of 2, at {time:.3g} of {t_end:g} s")
 
-    store.trajectory(scene, size, [horizon], error=error, told=told)
+    reference_store.load_trajectory(scene, size, [t_end], error=max_error, report_progress=told)
 
 
 def _measured(
-    asked: Accuracy,
-    ways: list[Recommended],
+    asked: AccuracyPlan,
+    ways: list[MeasuredMethod],
     without: list[dict[str, Any]],
     error: float,
     folder: Path,
-    display: Display,
+    display: ProgressDisplay,
     say: Callable[[str], None],
     budget: float,
 ) -> Omitted:
     """Measure the methods that may be the cheapest and have no rows. Raises InputError, CannotWrite."""
     known: dict[str, dict[str, Any]] = {
-        way.spec.label(): {"status": "ok", "error": way.error, "seconds_per_simulated": way.cost} for way in ways
+        way.work_spec.build_file_stem(): {
+            "status": "ok",
+            "error": way.error,
+            "seconds_per_simulated": way.seconds_per_simulated_second,
+        }
+        for way in ways
     }
-    failed, here = {row["unit"]: row for row in without}, machine.describe().id
+    failed, here = {row["unit"]: row for row in without}, machine.describe_machine().machine_id
     say(
         f"measuring up to {len(asked.work)} settings, cheap ones first, for at most {budget:g} s (--budget); a "
         f"simulation ends once it is {SLOWER:g} times as slow as the best that keeps to the error"
@@ -269,72 +290,72 @@ def _measured(
     with measuring(asked.work, folder, display) as measure:
 
         def look_up(spec: WorkSpec) -> dict[str, Any]:
-            return known.get(spec.label()) or failed.get(spec.unit_id(here)) or measure(spec)
+            return known.get(spec.build_file_stem()) or failed.get(spec.compute_unit_id(here)) or measure(spec)
 
-        best = min((way.cost for way in ways if way.error <= error), default=math.inf)
+        best = min((way.seconds_per_simulated_second for way in ways if way.error <= error), default=math.inf)
         return search(asked.work, error, best, look_up, budget)
 
 
-def _grid(path: Path, scene: SceneSpec, size: int, horizon: float, time_limit: float) -> Accuracy:
+def _build_study(path: Path, scene: SceneSpec, size: int, t_end: float, time_limit: float) -> AccuracyPlan:
     """Build the study that is measured where no rows exist."""
-    steps = max(1, round(horizon / scene.time_step))
-    time_steps = [horizon / round(steps * factor) for factor in REFINEMENTS if round(steps * factor)]
-    shared = {"horizon": horizon, "time_step": time_steps, "time_limit": time_limit} | ({"size": size} if size else {})
-    work: list[dict[str, Any]] = [shared | way for way in candidates()]
+    steps = max(1, round(t_end / scene.time_step))
+    time_steps = [t_end / round(steps * factor) for factor in TIME_STEP_REFINEMENTS if round(steps * factor)]
+    shared = {"horizon": t_end, "time_step": time_steps, "time_limit": time_limit} | ({"size": size} if size else {})
+    work: list[dict[str, Any]] = [shared | way for way in build_candidate_grid()]
     solvers = list(dict.fromkeys(name for way in work for name in way["solver"]))
     data = {"scenes": [path.name], "solvers": solvers, "work": work}
-    document = Document(path, data)
-    fields = document.check(AccuracyFields, data)
-    solvers = solvers_of(document)
+    document = ConfigDocument(path, data)
+    fields = document.validate_data(AccuracyConfig, data)
+    solvers = read_solvers(document)
     if fields is None or document.mistakes:
-        raise document.error()
-    return replace(expand(document, fields, {path.stem: scene}, solvers), name=f"recommend-{path.stem}")
+        raise document.build_error()
+    return replace(expand_studies(document, fields, {path.stem: scene}, solvers), name=f"recommend-{path.stem}")
 
 
-def _of_option(mistake: Mistake) -> Mistake:
+def _convert_to_option(mistake: InputMistake) -> InputMistake:
     """Convert a mistake in a study to one in a command-line option."""
-    return Mistake(mistake.problem, key="--" + mistake.key.rpartition(".")[2].replace("_", "-"))
+    return InputMistake(mistake.problem, key="--" + mistake.key.rpartition(".")[2].replace("_", "-"))
 
 
-def _known(
-    name: str, scene: SceneSpec, size: int, horizon: float, results: Path
-) -> tuple[list[Recommended], list[dict[str, Any]]]:
+def _read_measured_methods(
+    name: str, scene: SceneSpec, size: int, t_end: float, results: Path
+) -> tuple[list[MeasuredMethod], list[dict[str, Any]]]:
     """Read the rows of this scene on this machine.
 
     Returns the methods that have an error, cheapest first, and the rows of those that have none.
     """
-    here, ways, without = machine.describe().id, list[Recommended](), list[dict[str, Any]]()
-    units = (unit for folder in shelf.folders(results, "accuracy", "*/") for unit in shelf.units(folder))
+    here, ways, without = machine.describe_machine().machine_id, list[MeasuredMethod](), list[dict[str, Any]]()
+    units = (unit for folder in shelf.find_row_folders(results, "accuracy", "*/") for unit in shelf.list_units(folder))
     for path in sorted(unit for unit in units if unit.name.startswith(f"{name}-{size}-work-")):
-        row = rows.read([path], SCHEMA).to_pylist()[0]
-        spec = _spec(row, name, scene)
-        if path.stem != spec.label() or row["machine"] != here or row["horizon"] != horizon:
+        row = rows.read_rows([path], ACCURACY_SCHEMA).to_pylist()[0]
+        spec = _build_work_spec(row, name, scene)
+        if path.stem != spec.build_file_stem() or row["machine"] != here or row["horizon"] != t_end:
             continue  # the scene was another then, or the machine, or the question
         if row["status"] == "ok":
-            ways.append(_recommended(spec, row))
+            ways.append(_build_measured_method(spec, row))
         else:
             without.append(row)
-    return sorted(ways, key=lambda way: way.cost), without
+    return sorted(ways, key=lambda way: way.seconds_per_simulated_second), without
 
 
-def _spec(row: dict[str, Any], name: str, scene: SceneSpec) -> WorkSpec:
+def _build_work_spec(row: dict[str, Any], name: str, scene: SceneSpec) -> WorkSpec:
     """Build the specification that a row was measured with, assuming an unchanged scene."""
-    case = Case(name, scene.stepped(row["time_step"]), row["size"], row["integrator"])
+    case = BenchmarkCase(name, scene.with_time_step(row["time_step"]), row["size"], row["integrator"])
     solver = SolverSpec(row["solver"], json.loads(row["parameters"]))
-    how = How(row["threads"], rounds=1, time_limit=float("inf"))
-    return WorkSpec(case, row["horizon"], solver, {name: row[name] for name in OF_STEPS}, how)
+    how = MeasurementSettings(row["threads"], rounds=1, time_limit=float("inf"))
+    return WorkSpec(case, row["horizon"], solver, {name: row[name] for name in STEP_OPTIONS}, how)
 
 
-def _check(best: Recommended, store: Store) -> Recommended:
+def _check_method(best: MeasuredMethod, reference_store: ReferenceStore) -> MeasuredMethod:
     """Repeat the measurement of a method."""
-    row = work_rows(best.spec, trajectory_of(best.spec, store), lambda: None)[0]
+    row = build_work_rows(best.work_spec, load_reference_trajectory(best.work_spec, reference_store), lambda: None)[0]
     if row["status"] != "ok":
         raise RunFailed(f"the check of {best} ended otherwise than before: {row['status']}: {row['reason']}")
-    return _recommended(best.spec, row)
+    return _build_measured_method(best.work_spec, row)
 
 
-def _recommended(spec: WorkSpec, row: dict[str, Any]) -> Recommended:
-    return Recommended(
+def _build_measured_method(spec: WorkSpec, row: dict[str, Any]) -> MeasuredMethod:
+    return MeasuredMethod(
         spec,
         row["error"],
         row["seconds_per_simulated"],
@@ -344,20 +365,24 @@ def _recommended(spec: WorkSpec, row: dict[str, Any]) -> Recommended:
     )
 
 
-def _nothing(
-    ways: list[Recommended], without: list[dict[str, Any]], error: float, horizon: float, omitted: Omitted | None
+def _explain_no_method(
+    methods: list[MeasuredMethod],
+    failed_rows: list[dict[str, Any]],
+    max_error: float,
+    t_end: float,
+    omitted: Omitted | None,
 ) -> str:
     """Explain why no method meets the error, and suggest what to change."""
     if omitted and not omitted.complete:
         return (
-            f"nothing that was measured keeps to an error of {error:g} over {horizon:g} s, and settings remain "
+            f"nothing that was measured keeps to an error of {max_error:g} over {t_end:g} s, and settings remain "
             f"({omitted}): the same command with a larger --budget goes on where this one ended"
         )
-    if ways:
-        nearest = min(ways, key=lambda way: way.error)
+    if methods:
+        nearest = min(methods, key=lambda way: way.error)
         return (
-            f"nothing that was measured keeps to an error of {error:g} over {horizon:g} s; the nearest is {nearest}, "
+            f"nothing that was measured keeps to an error of {max_error:g} over {t_end:g} s; the nearest is {nearest}, "
             f"which errs by {nearest.error:.2g}: ask for a larger --error or a shorter --horizon"
         )
-    reasons = {row["reason"] for row in without}
-    return f"no error over {horizon:g} s could be measured: {'; '.join(sorted(reasons)) or 'nothing was simulated'}"
+    reasons = {row["reason"] for row in failed_rows}
+    return f"no error over {t_end:g} s could be measured: {'; '.join(sorted(reasons)) or 'nothing was simulated'}"

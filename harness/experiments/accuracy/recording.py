@@ -9,37 +9,37 @@ import numpy as np
 
 from harness.base import machine
 from harness.config.accuracy import CurveSpec
-from harness.experiments.accuracy.curves import GradedCurve
-from harness.experiments.accuracy.scales import round_off
-from harness.record.base import Frame, RecordingInfo
+from harness.experiments.accuracy.curves import ScoredCurve
+from harness.experiments.accuracy.scales import compute_energy_roundoff
+from harness.record.base import RecordedFrame, RecordingInfo
 from harness.record.rerun import RerunRecorder
-from harness.record.shading import strain_range
-from harness.reference.frozen import Frozen
+from harness.record.shading import compute_strain_range
+from harness.reference.frozen import StepSnapshot
 from harness.reference.minimiser import KnownMinima
 from harness.scenes.bind import Scene
 
 
-class FrozenStep(Protocol):
+class EvaluatedStep(Protocol):
     """Step snapshot with its known minima."""
 
     @property
-    def moment(self) -> str:
+    def snapshot_name(self) -> str:
         """Name of the snapshot."""
         ...
 
     @property
-    def frozen(self) -> Frozen:
+    def step_snapshot(self) -> StepSnapshot:
         """The problem of the step."""
         ...
 
     @property
-    def reference(self) -> KnownMinima:
+    def known_minima(self) -> KnownMinima:
         """The known minima of the step."""
         ...
 
 
-def record(
-    spec: CurveSpec, graded: FrozenStep, scene: Scene, first_guess: str, curve: GradedCurve, folder: Path
+def record_solve(
+    spec: CurveSpec, step: EvaluatedStep, scene: Scene, initial_guess: str, curve: ScoredCurve, folder: Path
 ) -> Path:
     """Write the recording of a curve under `folder`/recordings and return its path.
 
@@ -54,47 +54,51 @@ def record(
     Raises:
         RunFailed: the recording is incomplete.
     """
-    path = folder / "recordings" / f"{spec.label()}-{first_guess}.rrd"
-    problem, here = graded.frozen.problem, machine.describe()
+    path = folder / "recordings" / f"{spec.build_file_stem()}-{initial_guess}.rrd"
+    problem, here = step.step_snapshot.problem, machine.describe_machine()
     finite = [p for p in curve.positions if np.isfinite(p).all()]
     info = RecordingInfo(
-        title=f"{spec.case.title}, {graded.moment}: {spec.solver.name} from the {first_guess} positions",
-        run_id=f"{spec.unit_id(here.id)}-{first_guess}",
+        title=f"{spec.case.title}, {step.snapshot_name}: {spec.solver.name} from the {initial_guess} positions",
+        run_id=f"{spec.compute_unit_id(here.machine_id)}-{initial_guess}",
         mesh=scene.mesh,
-        springs=scene.springs.edges,
-        rest_lengths=scene.springs.rest_length,
-        pinned=problem.system.pins.vertices,
+        springs=scene.all_springs.edges,
+        rest_lengths=scene.all_springs.rest_length,
+        pinned_vertices=problem.system.pins.vertices,
         time_step=problem.system.time_step,
-        strain_range=strain_range(finite[-1:], scene.springs.edges, scene.springs.rest_length),
+        strain_range=compute_strain_range(finite[-1:], scene.all_springs.edges, scene.all_springs.rest_length),
         properties={
             "scene": spec.case.scene_name,
             "size": spec.case.size,
             "solver": spec.solver.name,
-            "moment": graded.moment,
-            "step": graded.frozen.frame,
-            "problem": graded.frozen.digest,
-            "first_guess": first_guess,
+            "moment": step.snapshot_name,
+            "step": step.step_snapshot.frame,
+            "problem": step.step_snapshot.digest,
+            "first_guess": initial_guess,
             "status": curve.status,
             "cpu": here.cpu,
-            "commit": machine.commit(),
+            "commit": machine.read_commit(),
         },
-        iterates=True,
+        is_solve=True,
     )
     recorder = RerunRecorder(path, info)
     try:
         for k, p in enumerate(curve.positions):
             if np.isfinite(p).all():
-                terms = problem.terms(p)
-                number, stationarity = curve.numbers[k], curve.stationarity[k]
-                recorder.frame(Frame(number, problem.start.time, p, terms, stationarity, number))
-        best = graded.reference.minima[:1]
-        recorder.solve(curve.numbers, _curves(curve, graded, best[0].g if best else float("nan")))
-        return recorder.close({})
+                terms = problem.evaluate_terms(p)
+                number, stationarity = curve.iterate_indices[k], curve.stationarity[k]
+                recorder.record_frame(RecordedFrame(number, problem.step_start.time, p, terms, stationarity, number))
+        best = step.known_minima.minima[:1]
+        recorder.record_solve(
+            curve.iterate_indices, _build_plot_curves(curve, step, best[0].objective if best else float("nan"))
+        )
+        return recorder.finish_recording({})
     finally:
-        recorder.abandon()
+        recorder.abandon_recording()
 
 
-def _curves(curve: GradedCurve, graded: FrozenStep, lowest: float) -> dict[str, list[float]]:
-    problem = graded.frozen.problem
-    gap = (np.array(curve.g) - lowest) / max(problem.value(problem.current) - lowest, round_off(problem))
+def _build_plot_curves(curve: ScoredCurve, step: EvaluatedStep, lowest_energy: float) -> dict[str, list[float]]:
+    problem = step.step_snapshot.problem
+    gap = (np.array(curve.g) - lowest_energy) / max(
+        problem.value(problem.current_positions) - lowest_energy, compute_energy_roundoff(problem)
+    )
     return {"energy gap": gap.tolist(), "stationarity": curve.stationarity}

@@ -11,33 +11,33 @@ from time import perf_counter
 from typing import Any
 
 from harness.base import machine
-from harness.config.accuracy import Case, CurveSpec, moment_name
-from harness.experiments.accuracy.curves import GradedCurve, measure
-from harness.experiments.accuracy.failures import lost
-from harness.experiments.accuracy.recording import record
-from harness.experiments.accuracy.scales import distances, stiffness_ratio
-from harness.experiments.provenance import provenance
-from harness.reference.frozen import Frozen, bind
-from harness.reference.minimiser import KnownMinima, Minimum
-from harness.reference.oracle import Oracle
-from harness.reference.store import Store
+from harness.config.accuracy import BenchmarkCase, CurveSpec, format_snapshot
+from harness.experiments.accuracy.curves import ScoredCurve, measure_convergence
+from harness.experiments.accuracy.failures import build_accuracy_failure_columns
+from harness.experiments.accuracy.recording import record_solve
+from harness.experiments.accuracy.scales import compute_stiffness_ratio, compute_vertex_distances
+from harness.experiments.provenance import build_provenance_columns
+from harness.reference.frozen import StepSnapshot, build_exact_scene
+from harness.reference.minimiser import KnownMinima, MinimumCertificate
+from harness.reference.oracle import ReferenceEvaluator
+from harness.reference.store import ReferenceStore
 from harness.scenes.bind import Scene
-from harness.simulation.step import guessed
+from harness.simulation.step import apply_initial_guess
 from solvers import device
-from solvers.problem import Positions, Prepared, Solver, System
-from solvers.registry import EVERY, load
+from solvers.problem import Positions, PreparedSolver, Solver, System
+from solvers.registry import SOLVER_TABLE, load_target
 
-Row = dict[str, Any]
+ResultRow = dict[str, Any]
 
-CONVERGED = 1e-2
+BASIN_STATIONARITY_TOLERANCE = 1e-2
 """Stationarity below which a solver counts as having reached the basin of its last iterate."""
 
-CLOSE = 1e-3
+MINIMUM_DISTANCE_TOLERANCE = 1e-3
 """Largest distance of a vertex from a known minimum at which the minimum counts as reached, in mean rest lengths."""
 
 
 @dataclass(frozen=True, eq=False)
-class GradedStep:
+class SnapshotEvaluation:
     """Step snapshot of a case, with the objects that score iterates on it.
 
     Attributes:
@@ -47,13 +47,15 @@ class GradedStep:
         reference_store: store of the reference solutions.
     """
 
-    case: Case
-    moment: str
-    frozen: Frozen
-    store: Store
+    case: BenchmarkCase
+    snapshot_name: str
+    step_snapshot: StepSnapshot
+    reference_store: ReferenceStore
 
     @classmethod
-    def find(cls, case: Case, moment: str | int, store: Store) -> GradedStep:
+    def load_snapshot(
+        cls, case: BenchmarkCase, snapshot_name: str | int, reference_store: ReferenceStore
+    ) -> SnapshotEvaluation:
         """Load a step snapshot and find its minima. Raises InputError, RunFailed.
 
         Args:
@@ -62,92 +64,99 @@ class GradedStep:
             reference_store: store of the reference solutions.
         """
         scene, size, integrator = case.scene, case.size, case.integrator
-        if isinstance(moment, int):
-            frozen = store.frames(scene, size, [moment], integrator)[moment]
+        if isinstance(snapshot_name, int):
+            frozen = reference_store.load_frames(scene, size, [snapshot_name], integrator)[snapshot_name]
         else:
-            frozen = store.moments(scene, size, integrator)[moment]
-        return cls(case, moment_name(moment), frozen, store)
+            frozen = reference_store.load_snapshots(scene, size, integrator)[snapshot_name]
+        return cls(case, format_snapshot(snapshot_name), frozen, reference_store)
 
     @cached_property
     def scene(self) -> Scene:
         """The scene with all pins exact."""
-        return bind(self.case.scene, self.case.size, self.case.integrator)
+        return build_exact_scene(self.case.scene, self.case.size, self.case.integrator)
 
     @cached_property
-    def oracle(self) -> Oracle:
+    def reference_evaluator(self) -> ReferenceEvaluator:
         """Reference evaluator that scores iterates."""
-        return Oracle(self.frozen.problem.system)
+        return ReferenceEvaluator(self.step_snapshot.problem.system)
 
     @property
-    def reference(self) -> KnownMinima:
+    def known_minima(self) -> KnownMinima:
         """The minima that are known at the time of the call."""
-        return self.store.reference(self.frozen)
+        return self.reference_store.find_minima(self.step_snapshot)
 
     @cached_property
     def mean_rest_length(self) -> float:
         """Mean rest length of the springs [m]; nan without springs."""
-        lengths = self.scene.springs.rest_length
+        lengths = self.scene.all_springs.rest_length
         return float(lengths.mean()) if len(lengths) else float("nan")
 
-    def common(self) -> Row:
+    def build_shared_columns(self) -> ResultRow:
         """Build the columns of the step that all its rows share."""
         return {
-            "vertices": self.frozen.problem.system.vertices,
-            "springs": len(self.scene.springs.edges),
-            "problem": self.frozen.digest,
-            "moment": self.moment,
-            "frame": self.frozen.frame,
+            "vertices": self.step_snapshot.problem.system.num_vertices,
+            "springs": len(self.scene.all_springs.edges),
+            "problem": self.step_snapshot.digest,
+            "moment": self.snapshot_name,
+            "frame": self.step_snapshot.frame,
             "status": "ok",
         }
 
-    def rows(self) -> list[Row]:
+    def build_rows(self) -> list[ResultRow]:
         """Build the rows of the step and of its minima.
 
         The first is `uncertified` without a certified minimum.
         """
-        case, problem, reference = self.case, self.frozen.problem, self.reference
-        common = self.common() | provenance()
+        case, problem, reference = self.case, self.step_snapshot.problem, self.known_minima
+        common = self.build_shared_columns() | build_provenance_columns()
         common |= {"scene": case.scene_name, "size": case.size, "integrator": case.integrator}
         common["time_step"] = case.scene.time_step
-        best = reference.minima[0].positions if reference.minima else problem.current
+        best = reference.minima[0].positions if reference.minima else problem.current_positions
         row = common | {
             "kind": "problem",
-            "stiffness_ratio": stiffness_ratio(problem.system, self.scene.springs.stiffness),
+            "stiffness_ratio": compute_stiffness_ratio(problem.system, self.scene.all_springs.stiffness),
             "mean_rest_length": self.mean_rest_length,
-            "g0": problem.value(problem.current),
-            "g0_inertial": problem.value(guessed(problem, "inertial").first_guess),
-            "magnitude": problem.magnitude(best),
+            "g0": problem.value(problem.current_positions),
+            "g0_inertial": problem.value(apply_initial_guess(problem, "inertial").initial_guess),
+            "magnitude": problem.value_scale(best),
         }
         if not reference.minima:
             row |= {"status": "uncertified", "reason": reference.reason}
-        return [row, *(common | self._minimum(branch, m) for branch, m in enumerate(reference.minima))]
+        return [row, *(common | self._build_minimum_row(branch, m) for branch, m in enumerate(reference.minima))]
 
-    def _minimum(self, branch: int, minimum: Minimum) -> Row:
+    def _build_minimum_row(self, index: int, minimum: MinimumCertificate) -> ResultRow:
         return {
             "kind": "minimum",
-            "branch": branch,
-            "minimum": minimum.name,
-            "g": minimum.g,
-            "stationarity": self.oracle.stationarity(self.frozen.problem, minimum.positions).reached,
-            "smallest_eigenvalue": minimum.smallest_eigenvalue,
-            "certified": minimum.certified,
+            "branch": index,
+            "minimum": minimum.minimum_id,
+            "g": minimum.objective,
+            "stationarity": self.reference_evaluator.measure_stationarity(
+                self.step_snapshot.problem, minimum.positions
+            ).stationarity,
+            "smallest_eigenvalue": minimum.min_eigenvalue,
+            "certified": minimum.is_certified,
         }
 
-    def reached(self, p: Positions, stationarity: float) -> Minimum | None:
+    def find_reached_minimum(self, p: Positions, stationarity: float) -> MinimumCertificate | None:
         """Return the minimum whose basin contains p (n, 3) [m].
 
         The result is None if p has not converged enough.
         """
-        if not stationarity <= CONVERGED:
+        if not stationarity <= BASIN_STATIONARITY_TOLERANCE:
             return None
-        for known in self.reference.minima:
-            if distances(self.frozen.problem.system, p, known.positions)[0] <= CLOSE * self.mean_rest_length:
+        for known in self.known_minima.minima:
+            if (
+                compute_vertex_distances(self.step_snapshot.problem.system, p, known.positions)[0]
+                <= MINIMUM_DISTANCE_TOLERANCE * self.mean_rest_length
+            ):
                 return known
-        found = self.store.classify(self.frozen, p)
-        return found if found.certified else None
+        found = self.reference_store.classify_minimum(self.step_snapshot, p)
+        return found if found.is_certified else None
 
 
-def curve_rows(spec: CurveSpec, graded: GradedStep, folder: Path, tick: Callable[[], None]) -> list[Row]:
+def build_curve_rows(
+    spec: CurveSpec, step: SnapshotEvaluation, results_folder: Path, tick: Callable[[], None]
+) -> list[ResultRow]:
     """Measure one solver on one step: its preparation, and a curve from each initial guess.
 
     An error of the solver becomes a row.
@@ -158,80 +167,89 @@ def curve_rows(spec: CurveSpec, graded: GradedStep, folder: Path, tick: Callable
         results_folder: folder of the config's results.
         tick: called after each curve.
     """
-    solver: Solver = load(EVERY[spec.solver.name])(**spec.solver.parameters)
-    shared = graded.common()
+    solver: Solver = load_target(SOLVER_TABLE[spec.solver.name])(**spec.solver.parameters)
+    shared = step.build_shared_columns()
     try:
-        with machine.pinned_threads(spec.how.threads):
-            prepared, row = _prepared(solver, graded, spec.how.rounds)
-            shared |= device.told(prepared)
+        with machine.limit_threads(spec.measurement.threads):
+            prepared, row = _time_preparation(solver, step, spec.measurement.rounds)
+            shared |= device.device_columns_of(prepared)
             found = [shared | row]
-            for first_guess in spec.first_guesses:
-                found += [shared | row for row in _curve(spec, prepared, graded, first_guess, folder)]
+            for first_guess in spec.initial_guesses:
+                found += [shared | row for row in _measure_curve(spec, prepared, step, first_guess, results_folder)]
                 tick()
     except Exception as error:  # whatever a solver raises, the others go on
-        return [shared | lost(error) | {"kind": "curve", "first_guess": guess} for guess in spec.first_guesses]
+        return [
+            shared | build_accuracy_failure_columns(error) | {"kind": "curve", "first_guess": guess}
+            for guess in spec.initial_guesses
+        ]
     return found
 
 
-def _prepared(solver: Solver, graded: GradedStep, rounds: int) -> tuple[Prepared, Row]:
-    system, seconds = graded.frozen.problem.system, list[float]()
+def _time_preparation(solver: Solver, step: SnapshotEvaluation, num_rounds: int) -> tuple[PreparedSolver, ResultRow]:
+    system, seconds = step.step_snapshot.problem.system, list[float]()
     began = perf_counter()
     prepared = solver.prepare(system)
     cold = perf_counter() - began
-    for _ in range(rounds):
+    for _ in range(num_rounds):
         began = perf_counter()
         prepared = solver.prepare(system)
         seconds.append(perf_counter() - began)
     return prepared, {"kind": "prepare", "cold": cold, "seconds": seconds}
 
 
-def _curve(spec: CurveSpec, prepared: Prepared, graded: GradedStep, first_guess: str, folder: Path) -> list[Row]:
-    known = graded.reference.minima
-    curve = measure(
+def _measure_curve(
+    spec: CurveSpec, prepared: PreparedSolver, step: SnapshotEvaluation, initial_guess: str, folder: Path
+) -> list[ResultRow]:
+    known = step.known_minima.minima
+    curve = measure_convergence(
         prepared,
-        graded.frozen.stated(first_guess),
-        graded.oracle,
-        known[0].g if known else None,
-        iterations=spec.iterations,
-        time_limit=spec.how.time_limit,
-        rounds=spec.how.rounds,
+        step.step_snapshot.build_problem(initial_guess),
+        step.reference_evaluator,
+        known[0].objective if known else None,
+        max_iterations=spec.iterations,
+        time_limit=spec.measurement.time_limit,
+        num_rounds=spec.measurement.rounds,
     )
-    reached = graded.reached(curve.positions[-1], curve.stationarity[-1]) if curve.status != "saddle" else None
-    shared: Row = {
+    reached = (
+        step.find_reached_minimum(curve.positions[-1], curve.stationarity[-1]) if curve.status != "saddle" else None
+    )
+    shared: ResultRow = {
         "kind": "curve",
-        "first_guess": first_guess,
+        "first_guess": initial_guess,
         "iterations": spec.iterations,
         "status": curve.status,
         "reason": curve.reason or None,
-        "interrupted": curve.interrupted,
+        "interrupted": curve.preempted,
     }
-    reference = graded.reference  # again: this solver may have found a minimum
+    reference = step.known_minima  # again: this solver may have found a minimum
     if not reference.minima and curve.status == "ok":
         shared |= {"status": "uncertified", "reason": reference.reason}
     if reached:
-        shared["branch"] = reference.branch(reached)
-    if spec.recordings and first_guess == spec.first_guesses[0]:
-        shared["recording"] = str(record(spec, graded, graded.scene, first_guess, curve, folder).relative_to(folder))
+        shared["branch"] = reference.find_index(reached)
+    if spec.recordings and initial_guess == spec.initial_guesses[0]:
+        shared["recording"] = str(
+            record_solve(spec, step, step.scene, initial_guess, curve, folder).relative_to(folder)
+        )
     against = reached or next(iter(reference.minima), None)
-    return [shared | row for row in _points(curve, graded.frozen.problem.system, against)]
+    return [shared | row for row in _build_iterate_rows(curve, step.step_snapshot.problem.system, against)]
 
 
-def _points(curve: GradedCurve, system: System, minimum: Minimum | None) -> list[Row]:
-    rows: list[Row] = []
-    for k, number in enumerate(curve.numbers):
-        row: Row = {
+def _build_iterate_rows(curve: ScoredCurve, system: System, minimum: MinimumCertificate | None) -> list[ResultRow]:
+    rows: list[ResultRow] = []
+    for k, number in enumerate(curve.iterate_indices):
+        row: ResultRow = {
             "iteration": number,
-            "g": _number(curve.g[k]),
-            "stationarity": _number(curve.stationarity[k]),
+            "g": _finite_or_none(curve.g[k]),
+            "stationarity": _finite_or_none(curve.stationarity[k]),
             "seconds": curve.seconds[k].tolist(),
         }
         if minimum:
-            largest, rms = distances(system, curve.positions[k], minimum.positions)
-            row |= {"minimum": minimum.name, "largest_error": largest, "rms_error": rms}
+            largest, rms = compute_vertex_distances(system, curve.positions[k], minimum.positions)
+            row |= {"minimum": minimum.minimum_id, "largest_error": largest, "rms_error": rms}
         rows.append(row)
     return rows
 
 
-def _number(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     """Return the value, or None if it is not finite because an iterate overflows."""
     return value if math.isfinite(value) else None

@@ -15,38 +15,38 @@ from pathlib import Path
 from typing import Any
 
 from harness.base import holding, machine, rows
-from harness.base.progress import Display, Effort
-from harness.base.workers import Lost, Workers
+from harness.base.progress import ProgressDisplay, RunCost
+from harness.base.workers import IsolatedWorker, TaskFailure
 from harness.config.accuracy import CurveSpec, WorkSpec
-from harness.config.accuracy_load import Accuracy
-from harness.experiments.accuracy.accuracy_rows import SCHEMA
-from harness.experiments.accuracy.units import CurveUnit, Home, Row, StepsUnit, WorkUnit
-from harness.experiments.core import TABLES, do_all, ready, require_threads, watched
-from harness.experiments.resume import Standing, standings, wanted
-from harness.reference.frozen import bind
-from harness.reference.self_converged import told_once, touches
+from harness.config.accuracy_load import AccuracyPlan
+from harness.experiments.accuracy.accuracy_rows import ACCURACY_SCHEMA
+from harness.experiments.accuracy.units import AccuracyResults, CurveUnit, ResultRow, SnapshotUnit, WorkPrecisionUnit
+from harness.experiments.core import REGISTRY_TABLES, execute_timed, execute_units, require_threads, update_registries
+from harness.experiments.resume import CompletionStatus, read_completion_statuses, select_missing_units
+from harness.reference.frozen import build_exact_scene
+from harness.reference.self_converged import describe_self_convergence, has_contact
 
 
 @dataclass(frozen=True, slots=True)
-class _Planned:
+class _PlannedUnit:
     """Unit and its completion status (`harness.experiments.completion_status.PlannedUnit`)."""
 
-    unit: CurveUnit | WorkUnit
-    standing: Standing
+    unit: CurveUnit | WorkPrecisionUnit
+    completion_status: CompletionStatus
 
     @property
     def title(self) -> str:
         return self.unit.title
 
 
-def run_accuracy(
-    accuracy: Accuracy,
+def run_accuracy_study(
+    accuracy: AccuracyPlan,
     folder: Path,
-    display: Display,
-    say: Callable[[str], None],
+    display: ProgressDisplay,
+    print_message: Callable[[str], None],
     *,
-    again: bool = False,
-    changed: bool = False,
+    rerun: bool = False,
+    rerun_stale: bool = False,
     isolated: bool = True,
 ) -> list[Path]:
     """Execute the missing units and return the files of all units and their step snapshots.
@@ -66,23 +66,29 @@ def run_accuracy(
         InputError: the input is invalid.
         CannotWrite: the rows cannot be written.
     """
-    home = Home(accuracy.name, folder)
+    home = AccuracyResults(accuracy.name, folder)
     for name, case in {spec.case.scene_name: spec.case for spec in reversed(accuracy.work)}.items():
-        if touches(bind(case.scene, case.size).system):
-            say(told_once(name))
-    require_threads({spec.how.threads for spec in (*accuracy.curves, *accuracy.work)})
+        if has_contact(build_exact_scene(case.scene, case.size).system):
+            print_message(describe_self_convergence(name))
+    require_threads({spec.measurement.threads for spec in (*accuracy.curves, *accuracy.work)})
     (folder / "accuracy").mkdir(parents=True, exist_ok=True)
-    with holding.alone(folder):
-        do_all(_steps(accuracy.curves, home), display, isolated=isolated)  # quick where they were found before
-        planned = _planned([*_curves(accuracy.curves, home), *_work(accuracy.work, home)], home)
-        todo = wanted(planned, "units", say, again=again, changed=changed)
-        do_all([p.unit for p in todo], display, isolated=isolated)
-    paths = [home.rows(label) for p in planned for label in _labels(p.unit.spec)]
+    with holding.lock_folder_exclusive(folder):
+        execute_units(
+            _build_snapshot_units(accuracy.curves, home), display, isolated=isolated
+        )  # quick where they were found before
+        planned = _plan_units(
+            [*_build_curve_units(accuracy.curves, home), *_build_work_units(accuracy.work, home)], home
+        )
+        todo = select_missing_units(planned, "units", print_message, rerun=rerun, rerun_stale=rerun_stale)
+        execute_units([p.unit for p in todo], display, isolated=isolated)
+    paths = [home.rows_path(label) for p in planned for label in _list_labels(p.unit.spec)]
     return list(dict.fromkeys(paths))
 
 
 @contextmanager
-def measuring(work: Sequence[WorkSpec], folder: Path, display: Display) -> Generator[Callable[[WorkSpec], Row]]:
+def measuring(
+    work: Sequence[WorkSpec], folder: Path, display: ProgressDisplay
+) -> Generator[Callable[[WorkSpec], ResultRow]]:
     """Yield a function that measures one simulation in a worker and returns its row.
 
     Args:
@@ -94,37 +100,37 @@ def measuring(work: Sequence[WorkSpec], folder: Path, display: Display) -> Gener
         InputError: the input is invalid.
         CannotWrite: the rows cannot be written.
     """
-    home = Home(folder.name, folder)
-    require_threads({spec.how.threads for spec in work})
+    home = AccuracyResults(folder.name, folder)
+    require_threads({spec.measurement.threads for spec in work})
     (folder / "accuracy").mkdir(parents=True, exist_ok=True)
-    workers = Workers(partial(ready, [dict(table) for table in TABLES]))
+    workers = IsolatedWorker(partial(update_registries, [dict(table) for table in REGISTRY_TABLES]))
 
-    def measure(spec: WorkSpec) -> Row:
-        unit = WorkUnit(spec, home)
-        run = display.run(unit.title, unit.ticks, unit.effort)
+    def measure(spec: WorkSpec) -> ResultRow:
+        unit = WorkPrecisionUnit(spec, home)
+        run = display.start_run(unit.title, unit.num_progress_steps, unit.cost_estimate)
         try:
-            outcome = workers.do(partial(watched, unit), run.tick, unit.limits)
-        except Lost as lost:
-            outcome = unit.lost(lost)
-        run.finished(outcome)
-        return rows.read([home.rows(spec.label())], SCHEMA).to_pylist()[0]
+            outcome = workers.run_task(partial(execute_timed, unit), run.report_tick, unit.task_limits)
+        except TaskFailure as lost:
+            outcome = unit.write_lost_rows(lost)
+        run.finish_run(outcome)
+        return rows.read_rows([home.rows_path(spec.build_file_stem())], ACCURACY_SCHEMA).to_pylist()[0]
 
-    with holding.alone(folder):
+    with holding.lock_folder_exclusive(folder):
         # No run ends with this kind, so no remaining time is estimated: most of these are omitted in the end.
-        display.begin([Effort("omitted")] * len(work))
+        display.start_sweep([RunCost("omitted")] * len(work))
         try:
             yield measure
         finally:
-            workers.end()
-            display.end()
+            workers.stop_worker()
+            display.finish_sweep()
 
 
-def failures(files: Sequence[Path]) -> list[str]:
+def list_failed_units(paths: Sequence[Path]) -> list[str]:
     """Return a line for each failed unit: scene, size, snapshot, solver and reason.
 
     Other statuses are results.
     """
-    found = [rows.read([path], SCHEMA).to_pylist()[0] for path in files]
+    found = [rows.read_rows([path], ACCURACY_SCHEMA).to_pylist()[0] for path in paths]
     return [
         f"{r['scene']} {r['size']} {r['moment'] or r['integrator']} {r['solver']}: {r['reason']}"
         for r in found
@@ -132,53 +138,58 @@ def failures(files: Sequence[Path]) -> list[str]:
     ]
 
 
-def _labels(spec: CurveSpec | WorkSpec) -> list[str]:
-    return [spec.label(), spec.problem_label()] if isinstance(spec, CurveSpec) else [spec.label()]
+def _list_labels(spec: CurveSpec | WorkSpec) -> list[str]:
+    return (
+        [spec.build_file_stem(), spec.build_problem_stem()] if isinstance(spec, CurveSpec) else [spec.build_file_stem()]
+    )
 
 
-def _steps(curves: Sequence[CurveSpec], home: Home) -> list[StepsUnit]:
+def _build_snapshot_units(curves: Sequence[CurveSpec], results: AccuracyResults) -> list[SnapshotUnit]:
     """Return one unit for each case."""
     moments: dict[str, CurveSpec] = {}
     for spec in curves:
-        moments.setdefault(spec.problem_label(), spec)
+        moments.setdefault(spec.build_problem_stem(), spec)
     cases: dict[str, list[CurveSpec]] = {}
     for spec in moments.values():
-        cases.setdefault(_case(spec), []).append(spec)
-    return [StepsUnit(tuple(specs), home) for specs in cases.values()]
+        cases.setdefault(_format_case(spec), []).append(spec)
+    return [SnapshotUnit(tuple(specs), results) for specs in cases.values()]
 
 
-def _case(spec: CurveSpec) -> str:
-    return f"{spec.case.scene_name} {spec.case.identity()}"
+def _format_case(spec: CurveSpec) -> str:
+    return f"{spec.case.scene_name} {spec.case.build_identity()}"
 
 
-def _curves(curves: Sequence[CurveSpec], home: Home) -> Iterator[CurveUnit]:
+def _build_curve_units(curves: Sequence[CurveSpec], results: AccuracyResults) -> Iterator[CurveUnit]:
     """Yield the units for the curves of each step.
 
     A step is used once where two snapshots of a case are one step.
     """
-    paths = dict.fromkeys(home.rows(spec.problem_label()) for spec in curves)
-    steps = rows.heads(paths, ("problem", "moment", "frame", "status", "reason"), SCHEMA)
+    paths = dict.fromkeys(results.rows_path(spec.build_problem_stem()) for spec in curves)
+    steps = rows.read_first_rows(paths, ("problem", "moment", "frame", "status", "reason"), ACCURACY_SCHEMA)
     moments: dict[tuple[str, str], str] = {}
     for spec in curves:
-        label = spec.problem_label()
-        step = steps.get(home.rows(label))
-        if isinstance(step, dict) and moments.setdefault((_case(spec), step["problem"] or label), label) == label:
-            yield CurveUnit(spec, home, step)
+        label = spec.build_problem_stem()
+        step = steps.get(results.rows_path(label))
+        if (
+            isinstance(step, dict)
+            and moments.setdefault((_format_case(spec), step["problem"] or label), label) == label
+        ):
+            yield CurveUnit(spec, results, step)
 
 
-def _work(work: Sequence[WorkSpec], home: Home) -> Iterator[WorkUnit]:
+def _build_work_units(work: Sequence[WorkSpec], results: AccuracyResults) -> Iterator[WorkPrecisionUnit]:
     for spec in sorted(work, key=lambda spec: (spec.case.scene_name, spec.case.size, spec.horizon)):
-        yield WorkUnit(spec, home)
+        yield WorkPrecisionUnit(spec, results)
 
 
-def _planned(units: Sequence[CurveUnit | WorkUnit], home: Home) -> list[_Planned]:
+def _plan_units(units: Sequence[CurveUnit | WorkPrecisionUnit], results: AccuracyResults) -> list[_PlannedUnit]:
     """Return the units and whether their rows match the request and the current step snapshot."""
-    here = machine.describe().id
+    here = machine.describe_machine().machine_id
 
-    def as_asked(unit: CurveUnit | WorkUnit, row: Mapping[str, Any]) -> bool:
-        of_step = not isinstance(unit, CurveUnit) or row["problem"] == unit.step["problem"]
-        return of_step and row["unit"] == unit.spec.unit_id(here)
+    def as_asked(unit: CurveUnit | WorkPrecisionUnit, row: Mapping[str, Any]) -> bool:
+        of_step = not isinstance(unit, CurveUnit) or row["problem"] == unit.snapshot_row["problem"]
+        return of_step and row["unit"] == unit.spec.compute_unit_id(here)
 
-    asked = {home.rows(unit.spec.label()): partial(as_asked, unit) for unit in units}
-    found = standings(asked, ("unit", "problem"), SCHEMA)
-    return [_Planned(unit, found[home.rows(unit.spec.label())]) for unit in units]
+    asked = {results.rows_path(unit.spec.build_file_stem()): partial(as_asked, unit) for unit in units}
+    found = read_completion_statuses(asked, ("unit", "problem"), ACCURACY_SCHEMA)
+    return [_PlannedUnit(unit, found[results.rows_path(unit.spec.build_file_stem())]) for unit in units]

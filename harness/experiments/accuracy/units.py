@@ -15,27 +15,27 @@ from typing import Any
 
 from harness.base import machine, rows
 from harness.base.errors import InputError
-from harness.base.progress import ANY_EFFORT, Effort
-from harness.base.workers import Limits, Lost, Tick
-from harness.config.accuracy import Case, CurveSpec, WorkSpec, moment_name
-from harness.experiments.accuracy.accuracy_rows import SCHEMA
-from harness.experiments.accuracy.failures import lost as ended
-from harness.experiments.accuracy.solves import GradedStep, curve_rows
-from harness.experiments.accuracy.work import options, work_rows
-from harness.experiments.provenance import provenance
-from harness.reference.store import Store
-from harness.reference.trajectory import Trajectory
+from harness.base.progress import UNIT_COST, RunCost
+from harness.base.workers import ProgressCallback, TaskFailure, TaskLimits
+from harness.config.accuracy import BenchmarkCase, CurveSpec, WorkSpec, format_snapshot
+from harness.experiments.accuracy.accuracy_rows import ACCURACY_SCHEMA
+from harness.experiments.accuracy.failures import build_accuracy_failure_columns as ended
+from harness.experiments.accuracy.solves import SnapshotEvaluation, build_curve_rows
+from harness.experiments.accuracy.work import build_option_columns, build_work_rows
+from harness.experiments.provenance import build_provenance_columns
+from harness.reference.store import ReferenceStore
+from harness.reference.trajectory import ReferenceTrajectory
 
-Row = dict[str, Any]
+ResultRow = dict[str, Any]
 
-PATIENCE = 3600.0
+EXTRA_WALL_SECONDS = 3600.0
 """Wall time in addition to the solver's limit, for compiling, scoring and finding minima [s]."""
-SHARE = 4.0
+WALL_TIME_FACTOR = 4.0
 """Wall time of a pass as a multiple of the solver's time limit, since iterates are scored meanwhile."""
 
 
 @dataclass(frozen=True, slots=True)
-class Home:
+class AccuracyResults:
     """Results of the config of this name.
 
     Reference solutions are stored next to them, for all configs.
@@ -45,22 +45,22 @@ class Home:
     folder: Path
 
     @property
-    def store(self) -> Store:
+    def reference_store(self) -> ReferenceStore:
         """Store of the reference solutions."""
-        return references(self.folder.parent)
+        return open_reference_store(self.folder.parent)
 
-    def rows(self, label: str) -> Path:
+    def rows_path(self, label: str) -> Path:
         """Return the path of a file of rows."""
         return self.folder / "accuracy" / f"{label}.parquet"
 
 
-def references(results: Path) -> Store:
+def open_reference_store(results: Path) -> ReferenceStore:
     """Open the store of reference solutions for all configs in one folder of results."""
-    return Store(results / ".references")
+    return ReferenceStore(results / ".references")
 
 
 @dataclass(frozen=True, slots=True)
-class StepsUnit:
+class SnapshotUnit:
     """Unit that finds the step snapshots of a case and their minima, one per spec.
 
     Specs differ in the snapshot.
@@ -69,62 +69,73 @@ class StepsUnit:
     that the step is measured once.
     """
 
-    specs: tuple[CurveSpec, ...]
-    home: Home
-    effort: Effort = ANY_EFFORT
+    curve_specs: tuple[CurveSpec, ...]
+    results: AccuracyResults
+    cost_estimate: RunCost = UNIT_COST
 
     @property
     def title(self) -> str:
         """Title of the unit, for messages."""
-        return f"{self.specs[0].case.title} {self.specs[0].case.integrator}: steps to freeze"
+        return f"{self.curve_specs[0].case.title} {self.curve_specs[0].case.integrator}: steps to freeze"
 
     @property
-    def ticks(self) -> int:
+    def num_progress_steps(self) -> int:
         """Number of snapshots."""
-        return len(self.specs)
+        return len(self.curve_specs)
 
     @property
-    def limits(self) -> Limits:
+    def task_limits(self) -> TaskLimits:
         """Wall-time limit, proportional to the number of snapshots."""
-        return Limits(PATIENCE * len(self.specs))
+        return TaskLimits(EXTRA_WALL_SECONDS * len(self.curve_specs))
 
-    def do(self, tick: Tick) -> str:
+    def execute_unit(self, tick: ProgressCallback) -> str:
         """Find the snapshots, write their rows and return the outcome as text."""
         told: list[str] = []
         known: set[str] = set()
-        for spec in self.specs:
-            path = self.home.rows(spec.problem_label())
+        for spec in self.curve_specs:
+            path = self.results.rows_path(spec.build_problem_stem())
             try:
-                step = _graded(_Asked.of(spec, self.home))
-                found = step.rows()
+                step = _load_snapshot_evaluation(_ReferenceRequest.for_snapshot(spec, self.results))
+                found = step.build_rows()
             except InputError:
                 raise
             except Exception as error:  # no solver can be graded here; the other steps go on
-                found = [_unfound(spec, ended(error))]
+                found = [_build_missing_snapshot_row(spec, ended(error))]
                 told.append(f"{spec.moment}: {found[0]['status']}: {found[0]['reason']}")
             else:
-                if step.frozen.digest in known:
+                if step.step_snapshot.digest in known:
                     continue
-                known.add(step.frozen.digest)
-            _write_step(path, self.home, found)
+                known.add(step.step_snapshot.digest)
+            _write_snapshot_rows(path, self.results, found)
             tick(str(spec.moment))
         return "; ".join(told) or "ok"
 
-    def lost(self, lost: Lost) -> str:
+    def write_lost_rows(self, task_loss: TaskFailure) -> str:
         """Write a row for each snapshot of a lost unit, and return a message."""
-        why = {"status": lost.status, "reason": str(lost)}
-        for spec in self.specs:
-            _write_step(self.home.rows(spec.problem_label()), self.home, [_unfound(spec, why)])
-        return f"{lost.status}: {lost}"
+        why = {"status": task_loss.status, "reason": str(task_loss)}
+        for spec in self.curve_specs:
+            _write_snapshot_rows(
+                self.results.rows_path(spec.build_problem_stem()),
+                self.results,
+                [_build_missing_snapshot_row(spec, why)],
+            )
+        return f"{task_loss.status}: {task_loss}"
 
 
-def _unfound(spec: CurveSpec, why: Row) -> Row:
+def _build_missing_snapshot_row(spec: CurveSpec, failure_columns: ResultRow) -> ResultRow:
     """Build the row of a snapshot that could not be found."""
-    return why | {"kind": "problem", "moment": moment_name(spec.moment)} | _of_case(spec.case) | provenance()
+    return (
+        failure_columns
+        | {"kind": "problem", "moment": format_snapshot(spec.moment)}
+        | _build_case_columns(spec.case)
+        | build_provenance_columns()
+    )
 
 
-def _write_step(path: Path, home: Home, found: Sequence[Row]) -> None:
-    rows.write(path, [{"sweep": home.name, "unit": row.get("problem")} | row for row in found], SCHEMA)
+def _write_snapshot_rows(path: Path, results: AccuracyResults, result_rows: Sequence[ResultRow]) -> None:
+    rows.write_rows(
+        path, [{"sweep": results.name, "unit": row.get("problem")} | row for row in result_rows], ACCURACY_SCHEMA
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,60 +146,66 @@ class CurveUnit:
     """
 
     spec: CurveSpec
-    home: Home
-    step: Mapping[str, Any]
-    effort: Effort = ANY_EFFORT
+    results: AccuracyResults
+    snapshot_row: Mapping[str, Any]
+    cost_estimate: RunCost = UNIT_COST
 
     @property
     def title(self) -> str:
         """Title of the unit, for messages."""
-        return f"{self.spec.case.title} {self.step['moment']} {self.spec.solver.name}"
+        return f"{self.spec.case.title} {self.snapshot_row['moment']} {self.spec.solver.name}"
 
     @property
-    def ticks(self) -> int:
+    def num_progress_steps(self) -> int:
         """Number of curves."""
-        return len(self.spec.first_guesses)
+        return len(self.spec.initial_guesses)
 
     @property
-    def limits(self) -> Limits:
+    def task_limits(self) -> TaskLimits:
         """Wall-time limit for all rounds of all curves."""
-        how = self.spec.how
-        return Limits(PATIENCE + SHARE * how.time_limit * (how.rounds + 2) * self.ticks)
+        how = self.spec.measurement
+        return TaskLimits(
+            EXTRA_WALL_SECONDS + WALL_TIME_FACTOR * how.time_limit * (how.rounds + 2) * self.num_progress_steps
+        )
 
-    def do(self, tick: Tick) -> str:
+    def execute_unit(self, tick: ProgressCallback) -> str:
         """Measure the curves, write their rows and return the outcome as text."""
-        return _written(self.home, self.spec, self._measured(tick))
+        return _write_unit_rows(self.results, self.spec, self._measure_rows(tick))
 
-    def lost(self, lost: Lost) -> str:
+    def write_lost_rows(self, task_loss: TaskFailure) -> str:
         """Write the rows of a lost unit, and return the outcome as text."""
-        return _written(self.home, self.spec, self._without({"status": lost.status, "reason": str(lost)}))
+        return _write_unit_rows(
+            self.results, self.spec, self._build_failure_rows({"status": task_loss.status, "reason": str(task_loss)})
+        )
 
-    def _measured(self, tick: Tick) -> list[Row]:
-        if self.step["problem"] is None:
-            return self._without({key: self.step[key] for key in ("status", "reason")})
+    def _measure_rows(self, tick: ProgressCallback) -> list[ResultRow]:
+        if self.snapshot_row["problem"] is None:
+            return self._build_failure_rows({key: self.snapshot_row[key] for key in ("status", "reason")})
         try:
-            graded = _graded(_Asked.of(self.spec, self.home))
+            graded = _load_snapshot_evaluation(_ReferenceRequest.for_snapshot(self.spec, self.results))
         except InputError:
             raise
         except Exception as error:
-            return self._without(ended(error))
-        found = curve_rows(self.spec, graded, self.home.folder, lambda: tick(graded.moment))
+            return self._build_failure_rows(ended(error))
+        found = build_curve_rows(self.spec, graded, self.results.folder, lambda: tick(graded.snapshot_name))
         # The curves may have found more minima; the rows of the step are updated before those of its curves exist.
-        _write_step(self.home.rows(self.spec.problem_label()), self.home, graded.rows())
+        _write_snapshot_rows(self.results.rows_path(self.spec.build_problem_stem()), self.results, graded.build_rows())
         return found
 
-    def _without(self, why: Row) -> list[Row]:
-        of_step = {key: self.step[key] for key in ("problem", "moment", "frame")}
-        return [of_step | why | {"kind": "curve", "first_guess": guess} for guess in self.spec.first_guesses]
+    def _build_failure_rows(self, failure_columns: ResultRow) -> list[ResultRow]:
+        of_step = {key: self.snapshot_row[key] for key in ("problem", "moment", "frame")}
+        return [
+            of_step | failure_columns | {"kind": "curve", "first_guess": guess} for guess in self.spec.initial_guesses
+        ]
 
 
 @dataclass(frozen=True, slots=True)
-class WorkUnit:
+class WorkPrecisionUnit:
     """Unit that measures one simulation of a scene up to a horizon."""
 
     spec: WorkSpec
-    home: Home
-    effort: Effort = ANY_EFFORT
+    results: AccuracyResults
+    cost_estimate: RunCost = UNIT_COST
 
     @property
     def title(self) -> str:
@@ -197,45 +214,48 @@ class WorkUnit:
         return f"{case.title} {case.integrator} dt {case.scene.time_step:.3g} {self.spec.solver.name}"
 
     @property
-    def ticks(self) -> int:
+    def num_progress_steps(self) -> int:
         """Number of rounds."""
-        return self.spec.how.rounds
+        return self.spec.measurement.rounds
 
     @property
-    def limits(self) -> Limits:
+    def task_limits(self) -> TaskLimits:
         """Wall-time limit for all rounds."""
-        return Limits(PATIENCE + SHARE * self.spec.how.time_limit * (self.spec.how.rounds + 1))
+        return TaskLimits(
+            EXTRA_WALL_SECONDS
+            + WALL_TIME_FACTOR * self.spec.measurement.time_limit * (self.spec.measurement.rounds + 1)
+        )
 
-    def do(self, tick: Tick) -> str:
+    def execute_unit(self, tick: ProgressCallback) -> str:
         """Measure the simulation, write its row and return the outcome as text."""
-        trajectory = _trajectory(_Asked.of_motion(self.spec, self.home))
-        return _written(self.home, self.spec, work_rows(self.spec, trajectory, lambda: tick("rounds")))
+        trajectory = _load_trajectory(_ReferenceRequest.for_trajectory(self.spec, self.results))
+        return _write_unit_rows(self.results, self.spec, build_work_rows(self.spec, trajectory, lambda: tick("rounds")))
 
-    def lost(self, lost: Lost) -> str:
+    def write_lost_rows(self, task_loss: TaskFailure) -> str:
         """Write the row of a lost unit, and return the outcome as text."""
         spec = self.spec
-        row: Row = {"kind": "work", "status": lost.status, "reason": str(lost), "horizon": spec.horizon}
-        return _written(self.home, spec, [row | options(spec)])
+        row: ResultRow = {"kind": "work", "status": task_loss.status, "reason": str(task_loss), "horizon": spec.horizon}
+        return _write_unit_rows(self.results, spec, [row | build_option_columns(spec)])
 
 
-def _written(home: Home, spec: CurveSpec | WorkSpec, found: Sequence[Row]) -> str:
+def _write_unit_rows(results: AccuracyResults, spec: CurveSpec | WorkSpec, result_rows: Sequence[ResultRow]) -> str:
     """Write measured rows with the common columns, and return the outcome as text."""
     shared = {
-        "unit": spec.unit_id(machine.describe().id),
-        "sweep": home.name,
-        **_of_case(spec.case),
+        "unit": spec.compute_unit_id(machine.describe_machine().machine_id),
+        "sweep": results.name,
+        **_build_case_columns(spec.case),
         "solver": spec.solver.name,
         "parameters": json.dumps(dict(spec.solver.parameters), sort_keys=True),
-        **spec.solver.columns,
-        "threads": spec.how.threads,
-        **provenance(spec.solver),
+        **spec.solver.metadata_columns,
+        "threads": spec.measurement.threads,
+        **build_provenance_columns(spec.solver),
     }
-    rows.write(home.rows(spec.label()), [shared | row for row in found], SCHEMA)
-    bad = next((row for row in found if row["status"] != "ok"), None)
+    rows.write_rows(results.rows_path(spec.build_file_stem()), [shared | row for row in result_rows], ACCURACY_SCHEMA)
+    bad = next((row for row in result_rows if row["status"] != "ok"), None)
     return f"{bad['status']}: {bad['reason']}" if bad else "ok"
 
 
-def _of_case(case: Case) -> Row:
+def _build_case_columns(case: BenchmarkCase) -> ResultRow:
     return {
         "scene": case.scene_name,
         "size": case.size,
@@ -245,34 +265,38 @@ def _of_case(case: Case) -> Row:
 
 
 @dataclass(frozen=True, slots=True)
-class _Asked:
+class _ReferenceRequest:
     """Cache key of a reference request, which is equal for consecutive units."""
 
     key: tuple[Any, ...]
     spec: Any = field(compare=False)
-    store: Store = field(compare=False)
+    reference_store: ReferenceStore = field(compare=False)
 
     @classmethod
-    def of(cls, spec: CurveSpec, home: Home) -> _Asked:
-        return cls((spec.problem_label(), home.folder), spec, home.store)
+    def for_snapshot(cls, spec: CurveSpec, results: AccuracyResults) -> _ReferenceRequest:
+        return cls((spec.build_problem_stem(), results.folder), spec, results.reference_store)
 
     @classmethod
-    def of_motion(cls, spec: WorkSpec, home: Home) -> _Asked:
+    def for_trajectory(cls, spec: WorkSpec, results: AccuracyResults) -> _ReferenceRequest:
         """Build the key of a trajectory, which is equal for all time steps."""
-        return cls((spec.case.scene.stepped(1.0).digest, spec.case.size, spec.horizon, home.folder), spec, home.store)
+        return cls(
+            (spec.case.scene.with_time_step(1.0).scene_digest, spec.case.size, spec.horizon, results.folder),
+            spec,
+            results.reference_store,
+        )
 
 
 @lru_cache(maxsize=1)
-def _graded(asked: _Asked) -> GradedStep:
-    return GradedStep.find(asked.spec.case, asked.spec.moment, asked.store)
+def _load_snapshot_evaluation(request: _ReferenceRequest) -> SnapshotEvaluation:
+    return SnapshotEvaluation.load_snapshot(request.spec.case, request.spec.moment, request.reference_store)
 
 
 @lru_cache(maxsize=1)
-def _trajectory(asked: _Asked) -> Trajectory | Exception:
-    return trajectory_of(asked.spec, asked.store)
+def _load_trajectory(request: _ReferenceRequest) -> ReferenceTrajectory | Exception:
+    return load_reference_trajectory(request.spec, request.reference_store)
 
 
-def trajectory_of(spec: WorkSpec, store: Store) -> Trajectory | Exception:
+def load_reference_trajectory(spec: WorkSpec, reference_store: ReferenceStore) -> ReferenceTrajectory | Exception:
     """Return the reference trajectory up to a simulation's horizon, or the error that prevents it.
 
     Each row checks which errors the reference can resolve. Raises InputError.
@@ -282,7 +306,7 @@ def trajectory_of(spec: WorkSpec, store: Store) -> Trajectory | Exception:
         reference_store: store of the reference solutions.
     """
     try:
-        return store.trajectory(spec.case.scene, spec.case.size, [spec.horizon], error=1.0)
+        return reference_store.load_trajectory(spec.case.scene, spec.case.size, [spec.horizon], error=1.0)
     except InputError:
         raise
     except Exception as error:

@@ -16,26 +16,28 @@ import numpy as np
 
 from harness.base import machine
 from harness.config.accuracy import WorkSpec
-from harness.experiments.accuracy.failures import OverTime, lost
-from harness.experiments.accuracy.scales import stiffness_ratio
-from harness.experiments.provenance import tolerance
-from harness.reference.frozen import bind
-from harness.reference.trajectory import Trajectory
+from harness.experiments.accuracy.failures import TimeLimitExceeded, build_accuracy_failure_columns
+from harness.experiments.accuracy.scales import compute_stiffness_ratio
+from harness.experiments.provenance import convert_tolerance
+from harness.reference.frozen import build_exact_scene
+from harness.reference.trajectory import ReferenceTrajectory
 from harness.scenes.bind import Scene
-from harness.simulation.algebraic import stop_rule
-from harness.simulation.clock import Clock, Watch, measured_again
-from harness.simulation.measure import Diverged
-from harness.simulation.step import prepare, simulate
-from solvers.problem import Positions, Prepared, Solver
-from solvers.registry import EVERY, load
+from harness.simulation.algebraic import build_stop_rule
+from harness.simulation.clock import PhaseWatch, Stopwatch, retry_on_mismatch
+from harness.simulation.measure import DivergenceError
+from harness.simulation.step import prepare, simulate_scene
+from solvers.problem import Positions, PreparedSolver, Solver
+from solvers.registry import SOLVER_TABLE, load_target
 
-Row = dict[str, Any]
+ResultRow = dict[str, Any]
 
-WARM_UP = 2
+NUM_WARMUP_STEPS = 2
 """Steps before the clock starts: they compile, and access memory for the first time."""
 
 
-def work_rows(spec: WorkSpec, trajectory: Trajectory | Exception, tick: Callable[[], None]) -> list[Row]:
+def build_work_rows(
+    spec: WorkSpec, trajectory: ReferenceTrajectory | Exception, tick: Callable[[], None]
+) -> list[ResultRow]:
     """Measure one simulation and build its row; an error becomes status and reason.
 
     Args:
@@ -43,70 +45,76 @@ def work_rows(spec: WorkSpec, trajectory: Trajectory | Exception, tick: Callable
         trajectory: reference up to the horizon, or the error that prevents it.
         tick: called after each round.
     """
-    shared: Row = {"kind": "work", "status": "ok", **options(spec), "horizon": spec.horizon}
+    shared: ResultRow = {"kind": "work", "status": "ok", **build_option_columns(spec), "horizon": spec.horizon}
     try:
         if isinstance(trajectory, Exception):
             raise trajectory
-        with machine.pinned_threads(spec.how.threads):
-            return [shared | _simulated(spec, trajectory, tick)]
+        with machine.limit_threads(spec.measurement.threads):
+            return [shared | _measure_simulation(spec, trajectory, tick)]
     except Exception as error:  # whatever a solver raises, the others go on
-        return [shared | lost(error)]
+        return [shared | build_accuracy_failure_columns(error)]
 
 
-def options(spec: WorkSpec) -> Row:
+def build_option_columns(spec: WorkSpec) -> ResultRow:
     """Build the columns of a simulation's options."""
-    return {**spec.options, "tolerance": tolerance(spec.options["tolerance"])}
+    return {**spec.options, "tolerance": convert_tolerance(spec.options["tolerance"])}
 
 
-def _simulated(spec: WorkSpec, trajectory: Trajectory, tick: Callable[[], None]) -> Row:
+def _measure_simulation(spec: WorkSpec, trajectory: ReferenceTrajectory, tick: Callable[[], None]) -> ResultRow:
     case = spec.case
-    scene = bind(case.scene, case.size, case.integrator)
-    solver: Solver = load(EVERY[spec.solver.name])(**spec.solver.parameters)
+    scene = build_exact_scene(case.scene, case.size, case.integrator)
+    solver: Solver = load_target(SOLVER_TABLE[spec.solver.name])(**spec.solver.parameters)
     prepared = prepare(scene, solver)
-    row: Row = {"vertices": scene.system.vertices, "springs": len(scene.springs.edges), "choice": prepared.choice}
-    row["stiffness_ratio"] = stiffness_ratio(scene.system, scene.springs.stiffness)
+    row: ResultRow = {
+        "vertices": scene.system.num_vertices,
+        "springs": len(scene.all_springs.edges),
+        "choice": prepared.description,
+    }
+    row["stiffness_ratio"] = compute_stiffness_ratio(scene.system, scene.all_springs.stiffness)
     frames = round(spec.horizon / case.scene.time_step)
     seconds: list[float] = []
     row["interrupted"] = False
-    p, *_ = _run(spec, scene, prepared, min(WARM_UP, frames), limit=inf)  # compiling counts against nobody
-    for _ in range(spec.how.rounds):
-        p, iterations, watched = _run(spec, scene, prepared, frames)
+    p, *_ = _simulate_timed(
+        spec, scene, prepared, min(NUM_WARMUP_STEPS, frames), time_limit=inf
+    )  # compiling counts against nobody
+    for _ in range(spec.measurement.rounds):
+        p, iterations, watched = _simulate_timed(spec, scene, prepared, frames)
         seconds.append(watched["summed_seconds"])
         row["cpu_seconds"] = min(row.get("cpu_seconds", inf), watched["cpu_seconds"])
         row["interrupted"] |= watched["interrupted"]
         row["iterations_done"] = iterations
         tick()
-    away = (p - trajectory.positions[-1])[scene.system.free]
-    row["error"], row["truth"] = trajectory.error(-1, p), trajectory.truth
+    away = (p - trajectory.positions[-1])[scene.system.free_vertices]
+    row["error"], row["truth"] = trajectory.measure_error(-1, p), trajectory.reference_kind
     row["error_rms_m"] = float(np.sqrt(np.einsum("ij,ij->i", away, away).mean()))
     row |= {"seconds": seconds, "seconds_per_simulated": float(np.median(seconds)) / spec.horizon}
-    trajectory.require(row["error"])
+    trajectory.require_accuracy(row["error"])
     return row
 
 
-@measured_again
-def _run(
-    spec: WorkSpec, scene: Scene, prepared: Prepared, frames: int, *, limit: float | None = None
-) -> tuple[Positions, int, Row]:
+@retry_on_mismatch
+def _simulate_timed(
+    spec: WorkSpec, scene: Scene, prepared: PreparedSolver, frames: int, *, time_limit: float | None = None
+) -> tuple[Positions, int, ResultRow]:
     """Simulate under a clock.
 
     Return the last positions (n, 3) [m], the number of iterations and timing columns.
 
     `time_limit` is in seconds; that of the spec if left out. Raises RunFailed where another clock disagrees.
     """
-    seconds, iterations, p, watch = 0.0, 0, scene.mesh.rest, Watch(spec.how.threads)
-    clock = Clock(watch)
-    stop = stop_rule(spec.options["iterations"], spec.options["tolerance"])
-    limit = spec.how.time_limit if limit is None else limit
-    run = simulate(scene, prepared, stop, first_guess=spec.options["first_guess"], frames=frames)
+    seconds, iterations, p, watch = 0.0, 0, scene.mesh.rest_positions, PhaseWatch(spec.measurement.threads)
+    clock = Stopwatch(watch)
+    stop = build_stop_rule(spec.options["iterations"], spec.options["tolerance"])
+    time_limit = spec.measurement.time_limit if time_limit is None else time_limit
+    run = simulate_scene(scene, prepared, stop, initial_guess=spec.options["first_guess"], frames=frames)
     for _ in range(frames):
         with clock:
             step = next(run)
         p = step.positions
         seconds += clock.seconds
-        iterations += step.iterations
+        iterations += step.num_iterations
         if not np.isfinite(p).all():
-            raise Diverged(f"positions are not finite from frame {step.index} on")
-        if seconds > limit and step.index < frames:
-            raise OverTime(f"the limit of {limit:g} s was reached in frame {step.index} of {frames}")
-    return p, iterations, watch.columns("step", [seconds])
+            raise DivergenceError(f"positions are not finite from frame {step.index} on")
+        if seconds > time_limit and step.index < frames:
+            raise TimeLimitExceeded(f"the limit of {time_limit:g} s was reached in frame {step.index} of {frames}")
+    return p, iterations, watch.build_columns("step", [seconds])

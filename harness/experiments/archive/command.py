@@ -8,26 +8,30 @@ from typing import Annotated, Any
 import typer
 
 from harness.base import places
-from harness.base.console import say
-from harness.base.errors import InputError, Mistake
+from harness.base.console import print_message
+from harness.base.errors import InputError, InputMistake
 
-_FOLDER: Any = {"parser": places.parse, "metavar": "PATH|URL", "help": "A folder of results, or that of one sweep."}
-Folder = Annotated[Path, typer.Argument(callback=places.everything, **_FOLDER)]
+_FOLDER_ARGUMENT: Any = {
+    "parser": places.parse_location,
+    "metavar": "PATH|URL",
+    "help": "A folder of results, or that of one sweep.",
+}
+ResultsFolder = Annotated[Path, typer.Argument(callback=places.sync_results, **_FOLDER_ARGUMENT)]
 
 
 def compact(
-    results: Folder,
+    results: ResultsFolder,
     days: Annotated[float, typer.Option(help="Pack what was written so many days ago or more; 0 is all.")] = 0.0,
 ) -> None:
     """Pack the rows of many runs into one file.
 
     All commands read the same rows before and after.
     """
-    from harness.experiments.archive.compact import compact as pack
+    from harness.experiments.archive.compact import compact_results as pack
 
     if not 0.0 <= days < 1e6:
-        raise InputError(Mistake(f"came {days:g}; wanted a number of days, 0 or more", key="--days"))
-    pack(results, say, days=days)
+        raise InputError(InputMistake(f"came {days:g}; wanted a number of days, 0 or more", key="--days"))
+    pack(results, print_message, min_age_days=days)
 
 
 def merge(
@@ -38,21 +42,21 @@ def merge(
 
     Exit code 1: runs of one machine and source code ended at different positions.
     """
-    from harness.experiments.archive.merge import merge as bring_together
+    from harness.experiments.archive.merge import merge_results as bring_together
 
-    found = bring_together(sources, into, say)
-    say(f"{found.written} units of rows written, {found.known} were there")
+    found = bring_together(sources, into, print_message)
+    print_message(f"{found.num_written} units of rows written, {found.num_existing} were there")
     for line in found.conflicts:
-        say(f"conflict, on one machine and by one code: {line} positions differ")
-    for line in [line for line in found.others if line not in found.conflicts]:
-        say(f"differs between machines or codes: {line}")
-    for line in found.machines:
-        say(line)
+        print_message(f"conflict, on one machine and by one code: {line} positions differ")
+    for line in [line for line in found.cross_machine_differences if line not in found.conflicts]:
+        print_message(f"differs between machines or codes: {line}")
+    for line in found.machine_summary:
+        print_message(line)
     raise typer.Exit(1 if found.conflicts else 0)
 
 
 def publish(
-    results: Folder,
+    results: ResultsFolder,
     output: Annotated[Path, typer.Option("-o", "--output", help="The archive to write (.zip).")],
     license: Annotated[str, typer.Option(help="What others may do with it: a name or a URL.")] = "",
 ) -> None:
@@ -60,13 +64,13 @@ def publish(
 
     Others can cite and verify it.
     """
-    from harness.experiments.archive.publish import publish as put_together
+    from harness.experiments.archive.publish import publish_results as put_together
 
-    count = put_together(results, output, say, license=license)
-    say(f"{output} holds {count} files; `springbench verify {output}` does a tenth of its runs again")
+    count = put_together(results, output, print_message, license_text=license)
+    print_message(f"{output} holds {count} files; `springbench verify {output}` does a tenth of its runs again")
 
 
-def verify(
+def verify_archive(
     archive: Annotated[Path, typer.Argument(help="What `springbench publish` wrote (.zip).")],
     seed: Annotated[int | None, typer.Option(help="Chooses the runs; another each time if left out.")] = None,
     own_code: Annotated[
@@ -80,29 +84,31 @@ def verify(
     from secrets import randbelow
     from tempfile import TemporaryDirectory
 
-    from harness.base.console import err
-    from harness.base.progress import display
+    from harness.base.console import get_error_console
+    from harness.base.progress import create_display
     from harness.experiments.archive import verify as checks
 
-    with checks.unpacked(archive) as folder, TemporaryDirectory() as scratch:
-        if wrong := checks.checksums(folder):
+    with checks.unpack_archive(archive) as folder, TemporaryDirectory() as scratch:
+        if wrong := checks.verify_checksums(folder):
             for claim in wrong:
-                say(str(claim))
-            say(f"{archive} is not what was published; nothing of it was run")
+                print_message(str(claim))
+            print_message(f"{archive} is not what was published; nothing of it was run")
             raise typer.Exit(1)
-        say("all checksums hold")
-        found, claims = checks.published(folder, say, own_code=own_code)
-        runs = checks.possible(found, say)
+        print_message("all checksums hold")
+        found, claims = checks.load_published_runs(folder, print_message, with_user_code=own_code)
+        runs = checks.select_runnable(found, print_message)
         chance = randbelow(10**6) if seed is None else seed
-        taken = checks.chosen(runs, chance)
-        say(f"{len(taken)} of {len(runs)} runs are done again (--seed {chance})")
-        claims += checks.compare(taken, checks.again(taken, Path(scratch), display(err())))
+        taken = checks.sample_runs(runs, chance)
+        print_message(f"{len(taken)} of {len(runs)} runs are done again (--seed {chance})")
+        claims += checks.verify_reruns(
+            taken, checks.rerun_published(taken, Path(scratch), create_display(get_error_console()))
+        )
     for claim in claims:
-        say(str(claim))
-    say(f"no repeat confirms these columns: {', '.join(sorted(checks.UNREPEATED))}")
-    states = {claim.holds for claim in claims}
-    bad, unknown = checks.Holds.NO in states, checks.Holds.UNKNOWN in states or not claims
-    say(
+        print_message(str(claim))
+    print_message(f"no repeat confirms these columns: {', '.join(sorted(checks.IRREPRODUCIBLE_COLUMNS))}")
+    states = {claim.verdict for claim in claims}
+    bad, unknown = checks.ClaimVerdict.FAIL in states, checks.ClaimVerdict.INCONCLUSIVE in states or not claims
+    print_message(
         "something does not hold" if bad else "not all can be told here" if unknown else "all that was done again holds"
     )
     raise typer.Exit(1 if bad else 3 if unknown else 0)

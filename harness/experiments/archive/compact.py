@@ -23,21 +23,21 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.base import columns, holding, rows, shelf
-from harness.base.errors import InputError, Mistake
-from harness.base.files import replacing
+from harness.base.errors import InputError, InputMistake
+from harness.base.files import atomic_write
 
-TABLES = ("rows", "accuracy", "ablation")
+TABLE_FOLDERS = ("rows", "accuracy", "ablation")
 """Folders of rows in a folder of results."""
 
-_BATCH = 2_000
+_BATCH_SIZE = 2_000
 """Number of units that are in memory at a time."""
-_DAY = 86_400.0
-_ANY = pa.schema([])
-_NAME = pa.field(shelf.FILE, pa.string())
-_STARTED = pa.schema([columns.SCHEMA.field("started")])
+_SECONDS_PER_DAY = 86_400.0
+_EMPTY_SCHEMA = pa.schema([])
+_FILE_FIELD = pa.field(shelf.FILE_COLUMN, pa.string())
+_STARTED_SCHEMA = pa.schema([columns.RUN_SCHEMA.field("started")])
 
 
-def compact(results: Path, say: Callable[[str], None], *, days: float = 0.0) -> int:
+def compact_results(results: Path, print_message: Callable[[str], None], *, min_age_days: float = 0.0) -> int:
     """Pack the old units of all folders of rows, and return their number.
 
     Args:
@@ -48,50 +48,58 @@ def compact(results: Path, say: Callable[[str], None], *, days: float = 0.0) -> 
     Raises:
         InputError: there are no rows, a sweep is running, or the schemas of rows do not match.
     """
-    folders = [folder for table in TABLES for folder in shelf.folders(results, table)]
+    folders = [folder for table in TABLE_FOLDERS for folder in shelf.find_row_folders(results, table)]
     if not folders:
-        raise InputError(Mistake("holds no rows; wanted a folder of results, or that of a sweep", results))
+        raise InputError(InputMistake("holds no rows; wanted a folder of results, or that of a sweep", results))
     count = 0
     for folder in folders:
-        with holding.alone(folder.parent):
-            count += _compact(folder, time() - _DAY * days, say)
+        with holding.lock_folder_exclusive(folder.parent):
+            count += _compact_folder(folder, time() - _SECONDS_PER_DAY * min_age_days, print_message)
     return count
 
 
-def _compact(folder: Path, before: float, say: Callable[[str], None]) -> int:
+def _compact_folder(folder: Path, max_modified_time: float, print_message: Callable[[str], None]) -> int:
     for left in folder.parent.glob(f".{folder.name}.*.partial.parquet"):
         left.unlink()
-    packed = shelf.packed_file(folder)
-    names = sorted(shelf.own_files(folder))
-    old = [unit for name in names if (unit := folder / f"{name}.parquet").is_file() and unit.stat().st_mtime <= before]
-    heads = rows.heads(old, ["started"], _STARTED)
-    whole = [unit for unit in old if isinstance(heads.get(unit), dict) and _is_text(unit.stem)]
+    packed = shelf.packed_path(folder)
+    names = sorted(shelf.list_unit_files(folder))
+    old = [
+        unit
+        for name in names
+        if (unit := folder / f"{name}.parquet").is_file() and unit.stat().st_mtime <= max_modified_time
+    ]
+    heads = rows.read_first_rows(old, ["started"], _STARTED_SCHEMA)
+    whole = [unit for unit in old if isinstance(heads.get(unit), dict) and _is_utf8(unit.stem)]
     if damaged := len(old) - len(whole):
-        say(f"{folder}: {damaged} damaged file{'s' * (damaged > 1)} left as {'they are' if damaged > 1 else 'it is'}")
+        print_message(
+            f"{folder}: {damaged} damaged file{'s' * (damaged > 1)} left as {'they are' if damaged > 1 else 'it is'}"
+        )
     if not whole:
-        say(f"{folder}: nothing to pack; {len(shelf.packed_units(folder))} units are packed")
+        print_message(f"{folder}: nothing to pack; {len(shelf.list_packed_units(folder))} units are packed")
         return 0
-    stays = sorted(shelf.packed_units(folder) - {unit.stem for unit in whole})
+    stays = sorted(shelf.list_packed_units(folder) - {unit.stem for unit in whole})
     asked = sorted([*whole, *(folder / f"{name}.parquet" for name in stays)])
-    schema = fitting_schema(asked)
-    if shelf.FILE in schema.names:
-        raise InputError(Mistake(f"rows have a column {shelf.FILE!r} of their own; they cannot be packed", packed))
-    with replacing(packed) as partial:
-        with partial.open("wb") as into, pq.ParquetWriter(into, schema.append(_NAME)) as writer:
-            for batch in _batches(asked):
-                table = rows.read(batch, schema, named=True)
+    schema = unify_schemas(asked)
+    if shelf.FILE_COLUMN in schema.names:
+        raise InputError(
+            InputMistake(f"rows have a column {shelf.FILE_COLUMN!r} of their own; they cannot be packed", packed)
+        )
+    with atomic_write(packed) as partial:
+        with partial.open("wb") as into, pq.ParquetWriter(into, schema.append(_FILE_FIELD)) as writer:
+            for batch in _iterate_batches(asked):
+                table = rows.read_rows(batch, schema, with_unit_names=True)
                 writer.write_table(table, row_group_size=len(table))
         with partial.open("rb") as written:
             os.fsync(written.fileno())
-            _compare(written, asked, schema)
-    _sync(packed.parent)
+            _check_compacted_rows(written, asked, schema)
+    _sync_folder(packed.parent)
     for unit in whole:
         unit.unlink()
-    say(f"{folder}: {len(whole)} units packed into {packed.name}, which holds {len(asked)}")
+    print_message(f"{folder}: {len(whole)} units packed into {packed.name}, which holds {len(asked)}")
     return len(whole)
 
 
-def _is_text(name: str) -> bool:
+def _is_utf8(name: str) -> bool:
     """Return whether a name is valid UTF-8, which the names of packed units must be."""
     try:
         name.encode()
@@ -100,39 +108,41 @@ def _is_text(name: str) -> bool:
     return True
 
 
-def fitting_schema(units: Sequence[Path], schema: pa.Schema = _ANY) -> pa.Schema:
+def unify_schemas(units: Sequence[Path], schema: pa.Schema = _EMPTY_SCHEMA) -> pa.Schema:
     """Return the common schema of all units; columns of `schema` come first.
 
     Raises:
         InputError: a file has columns of other types; the message names it.
     """
-    found, _ = shelf.parts(units)
+    found, _ = shelf.group_units(units)
     for part in found:
         try:
-            schema = pa.unify_schemas([schema, shelf.schema(part)]).remove_metadata()
+            schema = pa.unify_schemas([schema, shelf.read_group_schema(part)]).remove_metadata()
         except (pa.ArrowException, OSError) as error:
             why = f"rows do not fit those of other files ({error}); take it out of the results"
-            raise InputError(Mistake(why, Path(part.files[0]))) from error
+            raise InputError(InputMistake(why, Path(part.files[0]))) from error
     return schema
 
 
-def _batches(units: Sequence[Path]) -> Iterator[Sequence[Path]]:
-    return (units[start : start + _BATCH] for start in range(0, len(units), _BATCH))
+def _iterate_batches(units: Sequence[Path]) -> Iterator[Sequence[Path]]:
+    return (units[start : start + _BATCH_SIZE] for start in range(0, len(units), _BATCH_SIZE))
 
 
-def _compare(written: BinaryIO, units: Sequence[Path], schema: pa.Schema) -> None:
+def _check_compacted_rows(written: BinaryIO, units: Sequence[Path], schema: pa.Schema) -> None:
     """Compare the packed rows with the originals.
 
     Raises InputError if they differ; nothing is removed then.
     """
     with pq.ParquetFile(written) as file:
-        for group, batch in enumerate(_batches(units)):
-            if not rows.same(file.read_row_group(group), rows.read_each(batch, schema, named=True)):
+        for group, batch in enumerate(_iterate_batches(units)):
+            if not rows.is_bitwise_equal(
+                file.read_row_group(group), rows.read_rows_by_file(batch, schema, with_unit_names=True)
+            ):
                 why = f"the packed rows differ from those in the {len(batch)} files from here on; nothing was removed"
-                raise InputError(Mistake(why, batch[0]))
+                raise InputError(InputMistake(why, batch[0]))
 
 
-def _sync(folder: Path) -> None:
+def _sync_folder(folder: Path) -> None:
     """Flush a folder to the disk.
 
     A rename is then durable before the replaced files are removed.

@@ -29,29 +29,35 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from harness.base import machine, rows, shelf
-from harness.base.claim import NAME as CLAIM
-from harness.base.claim import config_of
+from harness.base.claim import OWNER_FILE as CLAIM
+from harness.base.claim import read_owner
 from harness.base.document import is_list
-from harness.base.errors import InputError, Mistake
-from harness.base.files import replacing
-from harness.base.model import Model
+from harness.base.errors import InputError, InputMistake
+from harness.base.files import atomic_write
+from harness.base.model import ConfigModel
 from harness.base.yaml import read_yaml
-from harness.config.load import load_any
-from harness.experiments.archive.merge import sweeps
-from harness.scenes.mesh.scene_json import read_scene_json
-from solvers.plugins import Plugin, found
+from harness.config.load import load_config
+from harness.experiments.archive.merge import list_sweep_folders
+from harness.scenes.mesh.scene_json import read_assignment_json
+from solvers.plugins import PluginName, select_plugins
 
-SUMS, CRATE, CITATION = "SHA256SUMS", "ro-crate-metadata.json", "CITATION.cff"
-_PACKAGE = Path(__file__).resolve().parents[2]
-_KINDS = {".parquet": "application/vnd.apache.parquet", ".rrd": "application/octet-stream", ".yaml": "application/yaml"}
-_BUFFER = 2**20
-_ODD = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
+CHECKSUM_FILE, CRATE_FILE, CITATION_FILE = "SHA256SUMS", "ro-crate-metadata.json", "CITATION.cff"
+_PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
+_MEDIA_TYPES = {
+    ".parquet": "application/vnd.apache.parquet",
+    ".rrd": "application/octet-stream",
+    ".yaml": "application/yaml",
+}
+_BUFFER_SIZE = 2**20
+_INVALID_NAME_CHARACTERS = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 """Characters that archives or checksum files do not support in file names."""
 
-Content = Path | bytes
+FileContent = Path | bytes
 
 
-def publish(results: Path, archive: Path, say: Callable[[str], None], *, license: str = "") -> int:
+def publish_results(
+    results: Path, archive: Path, print_message: Callable[[str], None], *, license_text: str = ""
+) -> int:
     """Write an archive (.zip) of results, and return its number of files.
 
     Args:
@@ -65,41 +71,46 @@ def publish(results: Path, archive: Path, say: Callable[[str], None], *, license
         CannotWrite: the archive cannot be written.
     """
     if archive.suffix.lower() != ".zip" or archive.is_dir():
-        raise InputError(Mistake("wanted the name of a file that ends in .zip", archive, key="--output"))
+        raise InputError(InputMistake("wanted the name of a file that ends in .zip", archive, key="--output"))
     if not archive.parent.is_dir():
-        raise InputError(Mistake(f"there is no folder {archive.parent}; make it first", archive, key="--output"))
-    content: dict[str, Content] = {}
-    refused: list[Mistake] = []
-    for folder in sweeps(results):
+        raise InputError(InputMistake(f"there is no folder {archive.parent}; make it first", archive, key="--output"))
+    content: dict[str, FileContent] = {}
+    refused: list[InputMistake] = []
+    for folder in list_sweep_folders(results):
         name = "/".join(folder.relative_to(results).parts) or folder.resolve().name
-        files = [file for file in _shown(folder) if file.resolve() != archive.resolve()]
-        refused += [Mistake(why, file) for file in files if (why := _unfit(file, results))]
+        files = [file for file in _list_published_files(folder) if file.resolve() != archive.resolve()]
+        refused += [InputMistake(why, file) for file in files if (why := _explain_exclusion(file, results))]
         content |= {f"results/{name}/{file.relative_to(folder).as_posix()}": file for file in files}
-        config = config_of(folder)
+        config = read_owner(folder)
         if config and _is_config(config):
-            files = _needed(config)
-            refused += [Mistake(why, file) for file in files if (why := _unfit(file, config.parent))]
+            files = _list_required_files(config)
+            refused += [InputMistake(why, file) for file in files if (why := _explain_exclusion(file, config.parent))]
             content |= {f"configs/{name}/{os.path.relpath(file, config.parent)}": file for file in files}
             way = os.path.relpath(f"configs/{name}/{config.name}", f"results/{name}")
             content[f"results/{name}/{CLAIM}"] = os.fsencode(f"{way}\n")
         else:
             gone = f"what it names as its config, {config}, is none" if config else "its config is not there any more"
-            say(f"{folder}: {gone}, so nobody can do its runs again")
+            print_message(f"{folder}: {gone}, so nobody can do its runs again")
     odd = "its name is no UTF-8, or breaks a line; rename it"
-    refused += [Mistake(odd, Path(name)) for name in content if _ODD.search(name)]
+    refused += [InputMistake(odd, Path(name)) for name in content if _INVALID_NAME_CHARACTERS.search(name)]
     if refused:
         raise InputError(refused)
-    for folder in sweeps(results):
-        rows.read(shelf.units(folder / "rows"))  # names what is damaged
-    content |= {"environment/machine.json": _environment(), "environment/requirements.txt": _requirements()}
-    if citation := next((p for p in (_PACKAGE.parent / CITATION, _PACKAGE / CITATION) if p.is_file()), None):
-        content[CITATION] = citation
-    with replacing(archive) as partial:
-        _write(partial, content, results.resolve().name, license)
+    for folder in list_sweep_folders(results):
+        rows.read_rows(shelf.list_units(folder / "rows"))  # names what is damaged
+    content |= {
+        "environment/machine.json": _describe_environment(),
+        "environment/requirements.txt": _list_requirements(),
+    }
+    if citation := next(
+        (p for p in (_PACKAGE_FOLDER.parent / CITATION_FILE, _PACKAGE_FOLDER / CITATION_FILE) if p.is_file()), None
+    ):
+        content[CITATION_FILE] = citation
+    with atomic_write(archive) as partial:
+        _write_archive(partial, content, results.resolve().name, license_text)
     return len(content) + 2
 
 
-def _shown(folder: Path) -> Iterator[Path]:
+def _list_published_files(folder: Path) -> Iterator[Path]:
     """Yield the files of a sweep's results that are intended for readers."""
     for path in sorted(folder.rglob("*")):
         place = path.relative_to(folder)
@@ -108,7 +119,7 @@ def _shown(folder: Path) -> Iterator[Path]:
             yield path
 
 
-def _unfit(path: Path, folder: Path) -> str:
+def _explain_exclusion(path: Path, folder: Path) -> str:
     """Return why a file is excluded.
 
     The result is empty if it lies in the folder after resolving all links.
@@ -127,35 +138,35 @@ def _is_config(path: Path) -> bool:
     """
     if path.suffix.lower() == ".json":
         with suppress(InputError):
-            return bool(read_scene_json(path))
+            return bool(read_assignment_json(path))
     with suppress(InputError):
-        return path.suffix.lower() in (".yaml", ".yml") and bool(_KEYS & set(read_yaml(path).data))
+        return path.suffix.lower() in (".yaml", ".yml") and bool(_CONFIG_KEYS & set(read_yaml(path).data))
     return False
 
 
-_KEYS = {"scenes", "mesh", "curves", "work", "goals"}
+_CONFIG_KEYS = {"scenes", "mesh", "curves", "work", "goals"}
 """A required key of each kind of config."""
 
 
-def _needed(config: Path) -> list[Path]:
+def _list_required_files(config: Path) -> list[Path]:
     """Return a config and the files that it names, without running its code."""
     files = {config}
     with suppress(InputError):  # a config of another kind, or one that was changed; it goes along all the same
-        sweep = load_any(config, opens=False)
-        plugins = found(sweep.reports)
-        for run in sweep.runs():
+        sweep = load_config(config, imports_code=False)
+        plugins = select_plugins(sweep.reports)
+        for run in sweep.list_runs():
             scene = run.scene
             files.add(scene.path)
             if scene.path.suffix.lower() == ".json":
-                files.add(scene.path.parent / read_scene_json(scene.path).obj)
+                files.add(scene.path.parent / read_assignment_json(scene.path).obj)
             for part in (scene.mesh, *scene.effects):
-                if isinstance(part, Model):  # what is somebody's own is not opened
+                if isinstance(part, ConfigModel):  # what is somebody's own is not opened
                     files |= {value for value in vars(part).values() if isinstance(value, Path)}
             for _, given in scene.own.values():  # names of files come with their digests there
                 there = scene.path.parent
                 files |= {there / value[0] for value in given.values() if _is_file(value, there)}
-            plugins += run.own()
-        files |= {Path(plugin.source) for plugin in plugins if _is_beside(plugin)}
+            plugins += run.find_plugins()
+        files |= {Path(plugin.source_path) for plugin in plugins if _is_local_plugin(plugin)}
     return sorted({Path(os.path.abspath(path)) for path in files})
 
 
@@ -163,30 +174,33 @@ def _is_file(value: Any, folder: Path) -> bool:
     return is_list(value) and len(value) == 2 and isinstance(value[0], str) and (folder / value[0]).is_file()
 
 
-def _is_beside(plugin: Plugin) -> bool:
-    return plugin.startswith("./") and Path(plugin.source).is_file()
+def _is_local_plugin(plugin: PluginName) -> bool:
+    return plugin.startswith("./") and Path(plugin.source_path).is_file()
 
 
-def _environment() -> bytes:
-    told = asdict(machine.describe()) | {"versions": machine.versions(), "commit": machine.commit()}
+def _describe_environment() -> bytes:
+    told = asdict(machine.describe_machine()) | {
+        "versions": machine.collect_versions(),
+        "commit": machine.read_commit(),
+    }
     return (json.dumps(told, indent=2, sort_keys=True, default=str) + "\n").encode()
 
 
-def _requirements() -> bytes:
+def _list_requirements() -> bytes:
     return "".join(sorted({f"{d.metadata['Name']}=={d.version}\n" for d in distributions()}, key=str.lower)).encode()
 
 
-def _write(path: Path, content: Mapping[str, Content], title: str, license: str) -> None:
+def _write_archive(path: Path, content: Mapping[str, FileContent], title: str, license_text: str) -> None:
     sums: dict[str, str] = {}
     sizes: dict[str, int] = {}
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as packed:
 
-        def put(name: str, data: Content) -> None:
+        def put(name: str, data: FileContent) -> None:
             digest, size = hashlib.sha256(), 0
             of_file = isinstance(data, Path)
             info = zipfile.ZipInfo.from_file(data, name, strict_timestamps=False) if of_file else name
             with packed.open(info, "w") as into:
-                for chunk in _chunks(data):
+                for chunk in _iterate_chunks(data):
                     digest.update(chunk)
                     into.write(chunk)
                     size += len(chunk)
@@ -194,46 +208,50 @@ def _write(path: Path, content: Mapping[str, Content], title: str, license: str)
 
         for name, data in sorted(content.items()):
             put(name, data)
-        put(CRATE, (json.dumps(_crate(sums, sizes, title, license), indent=2) + "\n").encode())
-        packed.writestr(SUMS, "".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items())))
+        put(CRATE_FILE, (json.dumps(_build_crate_metadata(sums, sizes, title, license_text), indent=2) + "\n").encode())
+        packed.writestr(CHECKSUM_FILE, "".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items())))
 
 
-def _chunks(data: Content) -> Iterator[bytes]:
+def _iterate_chunks(data: FileContent) -> Iterator[bytes]:
     if isinstance(data, bytes):
         yield data
         return
     with data.open("rb") as file:
-        while chunk := file.read(_BUFFER):
+        while chunk := file.read(_BUFFER_SIZE):
             yield chunk
 
 
-def _crate(sums: Mapping[str, str], sizes: Mapping[str, int], title: str, license: str) -> dict[str, Any]:
+def _build_crate_metadata(
+    checksums: Mapping[str, str], sizes: Mapping[str, int], title: str, license_text: str
+) -> dict[str, Any]:
     """Build the metadata: the data set, its files, and the program that made them."""
     files = [
         {
             "@id": name,
             "@type": "File",
             "name": PurePosixPath(name).name,
-            "encodingFormat": _KINDS.get(PurePosixPath(name).suffix) or mimetypes.guess_type(name)[0] or "text/plain",
+            "encodingFormat": _MEDIA_TYPES.get(PurePosixPath(name).suffix)
+            or mimetypes.guess_type(name)[0]
+            or "text/plain",
             "contentSize": str(sizes[name]),
             "sha256": digest,
         }
-        for name, digest in sums.items()
+        for name, digest in checksums.items()
     ]
     program = {
         "@id": "#springbench",
         "@type": "SoftwareApplication",
         "name": "springbench",
         "softwareVersion": version("springbench"),
-        "description": f"at the commit {machine.commit()}",
+        "description": f"at the commit {machine.read_commit()}",
     }
     made = {
         "@id": "#runs",
         "@type": "CreateAction",
         "name": "The runs of these sweeps",
         "instrument": {"@id": "#springbench"},
-        "object": [{"@id": name} for name in sums if name.startswith("configs/")],
-        "result": [{"@id": name} for name in sums if name.startswith("results/")],
+        "object": [{"@id": name} for name in checksums if name.startswith("configs/")],
+        "result": [{"@id": name} for name in checksums if name.startswith("results/")],
     }
     root = {
         "@id": "./",
@@ -241,12 +259,12 @@ def _crate(sums: Mapping[str, str], sizes: Mapping[str, int], title: str, licens
         "name": f"springbench results: {title}",
         "description": "Measurements of implicit time stepping of mass-spring systems, with what made them",
         "datePublished": datetime.now(UTC).isoformat(timespec="seconds"),
-        "license": license or "not stated; ask those who published it",
+        "license": license_text or "not stated; ask those who published it",
         "hasPart": [{"@id": file["@id"]} for file in files],
         "mentions": [{"@id": "#runs"}],
     }
     about = {
-        "@id": CRATE,
+        "@id": CRATE_FILE,
         "@type": "CreativeWork",
         "conformsTo": {"@id": "https://w3id.org/ro/crate/1.1"},
         "about": {"@id": "./"},

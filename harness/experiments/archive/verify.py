@@ -30,28 +30,28 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from harness.base import columns, machine, rows, shelf, statistics
-from harness.base.claim import config_of
-from harness.base.errors import InputError, Mistake
-from harness.base.progress import Display
-from harness.base.stated import stated
-from harness.config.load import load_any
+from harness.base.claim import read_owner
+from harness.base.errors import InputError, InputMistake
+from harness.base.progress import ProgressDisplay
+from harness.base.stated import read_solver_metadata
+from harness.config.load import load_config
 from harness.config.options import AUTO
 from harness.config.sweep import RunSpec
-from harness.experiments.archive.merge import sweeps
-from harness.experiments.archive.publish import SUMS
-from harness.experiments.core import do_all
-from harness.experiments.plan import Files
-from harness.experiments.provenance import asked
+from harness.experiments.archive.merge import list_sweep_folders
+from harness.experiments.archive.publish import CHECKSUM_FILE
+from harness.experiments.core import execute_units
+from harness.experiments.plan import RunFiles
+from harness.experiments.provenance import build_specification_columns
 from harness.experiments.run_unit import RunUnit
 
-RATIO, ELSEWHERE, SECONDS = 1.25, 2.0, 3.0
+MAX_RATIO_SAME_MACHINE, MAX_RATIO_OTHER_MACHINE, MAX_SECONDS_RATIO = 1.25, 2.0, 3.0
 """Accepted ratios of times.
 
 Minima of two runs of the same code differ by up to 4 % on an idle machine, ratios far more on busy ones. Another
 processor has other vector units and caches. Times themselves depend on the entire load of the machine.
 """
 
-UNREPEATED = frozenset(
+IRREPRODUCIBLE_COLUMNS = frozenset(
     (
         *("seconds", "pass_seconds", "summed_seconds", "cpu_seconds", "interrupted", "adds_up", "estimate_seconds"),
         *("kernel_seconds", "transfer_seconds", "load", "started", "machine", "node", "cpu", "cores", "memory_gib"),
@@ -67,39 +67,39 @@ These are times, state and type of the machine, the sweep's name, how the run wa
 which is not repeated.
 """
 
-_MOST_FILES, _MOST_SUMS, _MOST_TIMES = 200_000, 2**26, 200
+_MAX_FILES, _MAX_CHECKSUM_BYTES, _MAX_COMPRESSION_RATIO = 200_000, 2**26, 200
 """Largest number of files in an archive, of bytes of its checksums, and ratio of unpacked to packed size."""
-_MOST_LOADED = 200
+_MAX_LOADED_CONFIGS = 200
 """Largest number of different option sets with which configs are read."""
 
-Row = dict[str, Any]
+ResultRow = dict[str, Any]
 
 
-class Holds(Enum):
+class ClaimVerdict(Enum):
     """Verdict on a published claim: pass, fail or inconclusive."""
 
-    YES = "holds"
-    NO = "does not hold"
-    UNKNOWN = "cannot tell"
+    PASS = "holds"
+    FAIL = "does not hold"
+    INCONCLUSIVE = "cannot tell"
 
 
 @dataclass(frozen=True, slots=True)
-class Claim:
+class VerifiedClaim:
     """Published claim with its verdict and an explanation."""
 
-    what: str
-    holds: Holds
-    why: str
+    subject: str
+    verdict: ClaimVerdict
+    explanation: str
 
     def __str__(self) -> str:
-        return f"{self.what}: {self.holds.value}{f' ({self.why})' if self.why else ''}"
+        return f"{self.subject}: {self.verdict.value}{f' ({self.explanation})' if self.explanation else ''}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Published:
+class PublishedRun:
     """Run of an archive: its rows, and the specification to repeat it."""
 
-    rows: list[Row]
+    rows: list[ResultRow]
     run: RunSpec
 
     @property
@@ -108,38 +108,46 @@ class Published:
         return self.run.title
 
     @property
-    def group(self) -> tuple[str, str, int]:
+    def comparison_group(self) -> tuple[str, str, int]:
         """Key of runs whose times are compared: sweep, scene and size."""
         return self.run.sweep, self.run.scene_name, self.run.size
 
     @property
-    def steps(self) -> list[Row]:
+    def step_rows(self) -> list[ResultRow]:
         """Rows of the run's steps."""
         return [row for row in self.rows if row["phase"] == "step"]
 
 
 @contextmanager
-def unpacked(archive: Path) -> Generator[Path]:
+def unpack_archive(archive: Path) -> Generator[Path]:
     """Unpack an archive to a temporary folder. Raises InputError for a damaged or oversized archive."""
     wanted = "wanted an archive that `springbench publish` wrote (.zip)"
     if not archive.is_file():  # a device or a pipe would be read for ever
-        raise InputError(Mistake(f"is {'no plain file' if archive.exists() else 'not there'}; {wanted}", archive))
+        raise InputError(InputMistake(f"is {'no plain file' if archive.exists() else 'not there'}; {wanted}", archive))
     with TemporaryDirectory() as scratch:
         try:
             with zipfile.ZipFile(archive) as packed:
-                if why := _excess(packed.infolist(), archive.stat().st_size, shutil.disk_usage(scratch).free):
-                    raise InputError(Mistake(f"{why}; {wanted}", archive))
+                if why := _explain_excess(packed.infolist(), archive.stat().st_size, shutil.disk_usage(scratch).free):
+                    raise InputError(InputMistake(f"{why}; {wanted}", archive))
                 packed.extractall(scratch)  # names that lead out of the folder are made to stay in it
-        except (*_DAMAGE, OSError) as error:
-            raise InputError(Mistake(f"cannot be unpacked ({error}); {wanted}", archive)) from error
+        except (*_DAMAGED_ARCHIVE_ERRORS, OSError) as error:
+            raise InputError(InputMistake(f"cannot be unpacked ({error}); {wanted}", archive)) from error
         yield Path(scratch)
 
 
-_DAMAGE = (zipfile.BadZipFile, RuntimeError, NotImplementedError, ValueError, EOFError, zlib.error, struct.error)
+_DAMAGED_ARCHIVE_ERRORS = (
+    zipfile.BadZipFile,
+    RuntimeError,
+    NotImplementedError,
+    ValueError,
+    EOFError,
+    zlib.error,
+    struct.error,
+)
 """Errors that zipfile raises for damaged or forged archives."""
 
 
-def _excess(files: Sequence[zipfile.ZipInfo], size: int, free: int) -> str:
+def _explain_excess(files: Sequence[zipfile.ZipInfo], size: int, free: int) -> str:
     """Return why an archive is not unpacked; empty if it is.
 
     Args:
@@ -148,41 +156,45 @@ def _excess(files: Sequence[zipfile.ZipInfo], size: int, free: int) -> str:
         free: free space on the disk [B].
     """
     unpacked = sum(info.file_size for info in files)
-    if len(files) > _MOST_FILES:
-        return f"holds {len(files):,} files, and at most {_MOST_FILES:,} are unpacked"
+    if len(files) > _MAX_FILES:
+        return f"holds {len(files):,} files, and at most {_MAX_FILES:,} are unpacked"
     if unpacked > free:
         return f"takes {unpacked:,} bytes unpacked; there are {free:,}"
-    if unpacked > _MOST_TIMES * size or sum(info.compress_size for info in files) > size:
+    if unpacked > _MAX_COMPRESSION_RATIO * size or sum(info.compress_size for info in files) > size:
         return f"takes {unpacked:,} bytes unpacked of {size:,}, which no results do"
     if any(info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for info in files):
         return "is compressed by another method"
     return ""
 
 
-def checksums(folder: Path) -> list[Claim]:
+def verify_checksums(folder: Path) -> list[VerifiedClaim]:
     """Return a failed claim for each file that differs from the published one.
 
     The result is empty if all match. Raises InputError if there are no checksums.
     """
-    sums = folder / SUMS
-    if not sums.is_file() or sums.stat().st_size > _MOST_SUMS:
-        raise InputError(Mistake(f"holds no {SUMS}; wanted an archive that `springbench publish` wrote", folder))
+    sums = folder / CHECKSUM_FILE
+    if not sums.is_file() or sums.stat().st_size > _MAX_CHECKSUM_BYTES:
+        raise InputError(
+            InputMistake(f"holds no {CHECKSUM_FILE}; wanted an archive that `springbench publish` wrote", folder)
+        )
     lines = [line.partition("  ") for line in os.fsdecode(sums.read_bytes()).splitlines()]
     stated = {name: digest for digest, _, name in lines if name}
     there = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
-    del there[SUMS]
+    del there[CHECKSUM_FILE]
     wrong = dict.fromkeys(stated.keys() - there.keys(), "missing")
     wrong |= dict.fromkeys(there.keys() - stated.keys(), "was not published")
-    wrong |= {n: "was changed" for n in there.keys() & stated.keys() if _digest(there[n]) != stated[n]}
-    return [Claim(name, Holds.NO, why) for name, why in sorted(wrong.items())]
+    wrong |= {n: "was changed" for n in there.keys() & stated.keys() if _compute_digest(there[n]) != stated[n]}
+    return [VerifiedClaim(name, ClaimVerdict.FAIL, why) for name, why in sorted(wrong.items())]
 
 
-def _digest(path: Path) -> str:
+def _compute_digest(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def published(folder: Path, say: Callable[[str], None], *, own_code: bool) -> tuple[list[Published], list[Claim]]:
+def load_published_runs(
+    folder: Path, print_message: Callable[[str], None], *, with_user_code: bool
+) -> tuple[list[PublishedRun], list[VerifiedClaim]]:
     """Load the runs of an archive that can be repeated, according to its configs.
 
     Args:
@@ -192,104 +204,119 @@ def published(folder: Path, say: Callable[[str], None], *, own_code: bool) -> tu
 
     Returns: the runs, and failed or inconclusive claims on the names of runs.
     """
-    runs: list[Published] = []
-    claims: list[Claim] = []
-    _LOADED.clear()
-    for sweep in sweeps(folder / "results"):
-        config = config_of(sweep)
+    runs: list[PublishedRun] = []
+    claims: list[VerifiedClaim] = []
+    _LOADED_RUNS.clear()
+    for sweep in list_sweep_folders(folder / "results"):
+        config = read_owner(sweep)
         if config and not config.is_relative_to(folder.resolve()):
-            raise InputError(Mistake("leads out of the archive; nothing of it was run", sweep / ".config"))
-        by_run: dict[str, list[Row]] = defaultdict(list)
-        for row in _rows(sweep):
+            raise InputError(InputMistake("leads out of the archive; nothing of it was run", sweep / ".config"))
+        by_run: dict[str, list[ResultRow]] = defaultdict(list)
+        for row in _read_rows(sweep):
             by_run[row["run_id"]].append(row)
-        specs = {name: _spec(config, of_run, own_code=own_code) if config else None for name, of_run in by_run.items()}
-        found = [Published(by_run[name], spec) for name, spec in specs.items() if spec]
-        claims += [claim for one in found if (claim := _names(one))]
+        specs = {
+            name: _find_run_spec(config, of_run, with_user_code=with_user_code) if config else None
+            for name, of_run in by_run.items()
+        }
+        found = [PublishedRun(by_run[name], spec) for name, spec in specs.items() if spec]
+        claims += [claim for one in found if (claim := _verify_options(one))]
         if unknown := len(specs) - len(found):
             why = "the config asks for none such" if config else "there is no config"
-            claims.append(Claim(f"{unknown} of {len(specs)} runs of {sweep.name}", Holds.UNKNOWN, why))
-        repeated = [one for one in found if all(row["status"] in _REPEATED for row in one.rows)]
+            claims.append(
+                VerifiedClaim(f"{unknown} of {len(specs)} runs of {sweep.name}", ClaimVerdict.INCONCLUSIVE, why)
+            )
+        repeated = [one for one in found if all(row["status"] in _REPRODUCIBLE_STATUSES for row in one.rows)]
         if left := len(found) - len(repeated):
-            say(f"{sweep.name}: {left} runs failed, which depends on more than their config: they are not done again")
-        safe = [one for one in repeated if own_code or not one.run.own()]
+            print_message(
+                f"{sweep.name}: {left} runs failed, which depends on more than their config: they are not done again"
+            )
+        safe = [one for one in repeated if with_user_code or not one.run.find_plugins()]
         if left := len(repeated) - len(safe):
-            say(f"{sweep.name}: {left} runs need code from the archive: read it, then give --own-code")
+            print_message(f"{sweep.name}: {left} runs need code from the archive: read it, then give --own-code")
         runs += safe
     return runs, claims
 
 
-_REPEATED = ("ok", "unsupported", "diverged", "disputed")
+_REPRODUCIBLE_STATUSES = ("ok", "unsupported", "diverged", "disputed")
 """Statuses that depend on the config of a run only."""
 
 
-def _rows(sweep: Path) -> list[Row]:
+def _read_rows(sweep: Path) -> list[ResultRow]:
     """Return the rows of a sweep. Raises InputError if they need too much memory."""
-    units = shelf.units(sweep / "rows")
-    with rows.memory_for(units):
-        return rows.read(units, needed=("run_id", "status")).to_pylist()
+    units = shelf.list_units(sweep / "rows")
+    with rows.limit_read_memory(units):
+        return rows.read_rows(units, required_columns=("run_id", "status")).to_pylist()
 
 
-def _spec(config: Path, of_run: Sequence[Row], *, own_code: bool) -> RunSpec | None:
+def _find_run_spec(config: Path, run_rows: Sequence[ResultRow], *, with_user_code: bool) -> RunSpec | None:
     """Find the run specification that produced these rows.
 
     The run id is a hash of its content.
 
     The result is None where the config requests no such run.
     """
-    steps = [row for row in of_run if row["phase"] == "step"]
-    first = (steps or of_run)[0]
+    steps = [row for row in run_rows if row["phase"] == "step"]
+    first = (steps or run_rows)[0]
     names = {"iterations": "max_iterations"} | {n: n for n in ("tolerance", "integrator", "time_step", "first_guess")}
     options = {name: first[column] for name, column in names.items()}
-    options |= {"frames": _largest(steps, "frame"), "rounds": 1 + _largest(steps, "round")}
+    options |= {"frames": _find_max(steps, "frame"), "rounds": 1 + _find_max(steps, "round")}
     options["tolerance"] = AUTO if options["tolerance"] == 0.0 else options["tolerance"]
     if first["asked"] is not None:
         options = {name: options[name] for name in ("time_step", "frames", "rounds")} | {"accuracy": first["asked"]}
     sizes = [first["size"]] if first["size"] else []
     scene = {"solvers": [first["solver"]], "sizes": sizes, **options}
     for given in ({}, scene | {"threads": "auto"}, scene | {"threads": first["threads"]}):
-        for opens in (False, True) if own_code else (False,):
-            for run in _runs(config, json.dumps(given, sort_keys=True), opens):
-                if run.run_id(str(first["machine"])) == first["run_id"] and (opens or not own_code or not run.own()):
+        for opens in (False, True) if with_user_code else (False,):
+            for run in _load_runs(config, json.dumps(given, sort_keys=True), opens):
+                if run.compute_run_id(str(first["machine"])) == first["run_id"] and (
+                    opens or not with_user_code or not run.find_plugins()
+                ):
                     return run
     return None
 
 
-def _largest(steps: Sequence[Row], name: str) -> int:
+def _find_max(steps: Sequence[ResultRow], name: str) -> int:
     return max((row[name] for row in steps if row[name] is not None), default=0)
 
 
-def _runs(config: Path, given: str, opens: bool) -> list[RunSpec]:
+def _load_runs(config: Path, options_json: str, imports_code: bool) -> list[RunSpec]:
     """Load the runs of a config with options, given as JSON.
 
     The result is empty if they are invalid.
 
     `imports_code` states whether code that the config names is imported.
     """
-    key = config, given, opens
-    if key not in _LOADED:
-        if len(_LOADED) >= _MOST_LOADED:
+    key = config, options_json, imports_code
+    if key not in _LOADED_RUNS:
+        if len(_LOADED_RUNS) >= _MAX_LOADED_CONFIGS:
             return []
         try:
-            _LOADED[key] = load_any(config, opens=opens, **json.loads(given)).runs()
+            _LOADED_RUNS[key] = load_config(config, imports_code=imports_code, **json.loads(options_json)).list_runs()
         except InputError:
-            _LOADED[key] = []
-    return _LOADED[key]
+            _LOADED_RUNS[key] = []
+    return _LOADED_RUNS[key]
 
 
-_LOADED: dict[tuple[Path, str, bool], list[RunSpec]] = {}
+_LOADED_RUNS: dict[tuple[Path, str, bool], list[RunSpec]] = {}
 
 
-def _names(one: Published) -> Claim | None:
+def _verify_options(published_run: PublishedRun) -> VerifiedClaim | None:
     """Return a failed claim if a run's names or options differ from its config."""
-    left_out = {"threads", *stated(one.run.solver.name)}  # of the machine, and of the code
-    if one.run.accuracy is not None:
+    left_out = {"threads", *read_solver_metadata(published_run.run.solver.name)}  # of the machine, and of the code
+    if published_run.run.accuracy is not None:
         left_out |= {"integrator", "time_step", "tolerance", "max_iterations", "first_guess"}  # are chosen
-    asked_for = {name: value for name, value in asked(one.run).items() if name not in left_out}
-    wrong = _differing([(row, asked_for) for row in one.rows], asked_for)
-    return Claim(f"{one.title}, names and options", Holds.NO, _listed(wrong)) if wrong else None
+    asked_for = {
+        name: value for name, value in build_specification_columns(published_run.run).items() if name not in left_out
+    }
+    wrong = _find_differences([(row, asked_for) for row in published_run.rows], asked_for)
+    return (
+        VerifiedClaim(f"{published_run.title}, names and options", ClaimVerdict.FAIL, _format_differences(wrong))
+        if wrong
+        else None
+    )
 
 
-def chosen(runs: Sequence[Published], seed: int, part: float = 0.1) -> list[Published]:
+def sample_runs(runs: Sequence[PublishedRun], seed: int, fraction: float = 0.1) -> list[PublishedRun]:
     """Select a random fraction of the runs, at least one.
 
     A second solver on the same scene and size is added to each where possible.
@@ -300,91 +327,103 @@ def chosen(runs: Sequence[Published], seed: int, part: float = 0.1) -> list[Publ
         fraction: fraction of the runs.
     """
     chance = random.Random(seed)
-    taken = chance.sample(list(runs), max(1, math.ceil(part * len(runs)))) if runs else []
+    taken = chance.sample(list(runs), max(1, math.ceil(fraction * len(runs)))) if runs else []
     for one in list(taken):
-        rivals = [run for run in runs if run.group == one.group and run not in taken]
-        if rivals and sum(run.group == one.group for run in taken) == 1:
+        rivals = [run for run in runs if run.comparison_group == one.comparison_group and run not in taken]
+        if rivals and sum(run.comparison_group == one.comparison_group for run in taken) == 1:
             taken.append(chance.choice(rivals))
     return taken
 
 
-def again(runs: Sequence[Published], folder: Path, display: Display) -> list[list[Row]]:
+def rerun_published(runs: Sequence[PublishedRun], folder: Path, display: ProgressDisplay) -> list[list[ResultRow]]:
     """Repeat runs in a folder, and return the rows of each. Raises InputError."""
     for part in ("rows", "recordings", "pictures"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    bare = [one.run.but(record=False, pictures=False) for one in runs]
-    units = [RunUnit(run, Files.of(run, folder)) for run in bare]
-    do_all(units, display)
-    return [rows.read([unit.files.rows]).to_pylist() for unit in units]
+    bare = [one.run.replace_options(record=False, pictures=False) for one in runs]
+    units = [RunUnit(run, RunFiles.for_run(run, folder)) for run in bare]
+    execute_units(units, display)
+    return [rows.read_rows([unit.files.rows_path]).to_pylist() for unit in units]
 
 
-def compare(runs: Sequence[Published], new: Sequence[list[Row]]) -> list[Claim]:
+def verify_reruns(runs: Sequence[PublishedRun], rerun_rows: Sequence[list[ResultRow]]) -> list[VerifiedClaim]:
     """Verify repeated runs, and return the claims.
 
     Args:
         runs: published runs.
         rerun_rows: rows of the repetition of each.
     """
-    claims: list[Claim] = []
-    for one, here in zip(runs, new, strict=True):
-        claims += _repeated(one, here)
+    claims: list[VerifiedClaim] = []
+    for one, here in zip(runs, rerun_rows, strict=True):
+        claims += _verify_rerun(one, here)
     for k, one in enumerate(runs):
         for j in range(k):
-            ended = (runs[j].rows, one.rows, new[j], new[k])
-            if runs[j].group == one.group and all(row["status"] == "ok" for found in ended for row in found):
-                claims.append(_ratio((runs[j], one), (new[j], new[k])))
+            ended = (runs[j].rows, one.rows, rerun_rows[j], rerun_rows[k])
+            if runs[j].comparison_group == one.comparison_group and all(
+                row["status"] == "ok" for found in ended for row in found
+            ):
+                claims.append(_verify_time_ratio((runs[j], one), (rerun_rows[j], rerun_rows[k])))
                 break
     return claims
 
 
-def _repeated(old: Published, new: list[Row]) -> list[Claim]:
+def _verify_rerun(original: PublishedRun, rerun_rows: list[ResultRow]) -> list[VerifiedClaim]:
     """Verify the end, the positions, the other columns and the times of a repeated run."""
-    ended, here = ({(row["status"], row["reason"]) for row in found} for found in (old.rows, new))
+    ended, here = ({(row["status"], row["reason"]) for row in found} for found in (original.rows, rerun_rows))
     if {status for status, _ in here} != {status for status, _ in ended}:
         status, reason = next(iter(here - ended), next(iter(here)))
-        return [Claim(f"{old.title}, end", Holds.NO, f"here it ended as {status}: {reason}")]
+        return [VerifiedClaim(f"{original.title}, end", ClaimVerdict.FAIL, f"here it ended as {status}: {reason}")]
     if {status for status, _ in here} != {"ok"}:
-        return [Claim(f"{old.title}, end", Holds.YES, f"here it ended as {next(iter(here))[0]}, too")]
-    return [_positions(old, new), _columns(old, new), *_seconds_hold(old, new)]
+        return [
+            VerifiedClaim(f"{original.title}, end", ClaimVerdict.PASS, f"here it ended as {next(iter(here))[0]}, too")
+        ]
+    return [
+        _verify_positions(original, rerun_rows),
+        _verify_columns(original, rerun_rows),
+        *_verify_seconds(original, rerun_rows),
+    ]
 
 
-def _positions(old: Published, new: list[Row]) -> Claim:
-    what = f"{old.title}, positions"
-    now = {row["frame"]: row["digest"] for row in new if row["phase"] == "step"}
-    others = {row["frame"] for row in old.steps if row["digest"] != now.get(row["frame"])}
-    others |= now.keys() - {row["frame"] for row in old.steps}
+def _verify_positions(original: PublishedRun, rerun_rows: list[ResultRow]) -> VerifiedClaim:
+    what = f"{original.title}, positions"
+    now = {row["frame"]: row["digest"] for row in rerun_rows if row["phase"] == "step"}
+    others = {row["frame"] for row in original.step_rows if row["digest"] != now.get(row["frame"])}
+    others |= now.keys() - {row["frame"] for row in original.step_rows}
     if not others:
-        return Claim(what, Holds.YES, f"{len(now)} steps, to the bit")
+        return VerifiedClaim(what, ClaimVerdict.PASS, f"{len(now)} steps, to the bit")
     first = min(others, key=lambda frame: -1 if frame is None else frame)
-    return _refuted(what, f"they differ from step {first} of {len(now)} on", old, new)
+    return _build_failed_claim(what, f"they differ from step {first} of {len(now)} on", original, rerun_rows)
 
 
-def _columns(old: Published, new: list[Row]) -> Claim:
+def _verify_columns(original: PublishedRun, rerun_rows: list[ResultRow]) -> VerifiedClaim:
     """Verify the columns that a repetition determines; an empty published column claims nothing."""
-    what = f"{old.title}, other columns"
-    of_place = {_place(row): row for row in new}
-    if lost := [_place(row) for row in old.rows if _place(row) not in of_place]:
+    what = f"{original.title}, other columns"
+    of_place = {_row_key(row): row for row in rerun_rows}
+    if lost := [_row_key(row) for row in original.rows if _row_key(row) not in of_place]:
         phase, frame, round = lost[0]
-        return _refuted(what, f"a repeat has no {phase} of step {frame} in round {round}", old, new)
-    if fewer := {place for place in of_place if place[0] == "step"} - {_place(row) for row in old.steps}:
-        return _refuted(what, f"{len(fewer)} steps are missing", old, new)
-    names = [name for name in columns.SCHEMA.names if name not in UNREPEATED | {"digest"}]
-    wrong = _differing([(row, of_place[_place(row)]) for row in old.rows], names)
-    filled = [name for name in names if any(row[name] is not None for row in old.rows)]
+        return _build_failed_claim(
+            what, f"a repeat has no {phase} of step {frame} in round {round}", original, rerun_rows
+        )
+    if fewer := {place for place in of_place if place[0] == "step"} - {_row_key(row) for row in original.step_rows}:
+        return _build_failed_claim(what, f"{len(fewer)} steps are missing", original, rerun_rows)
+    names = [name for name in columns.RUN_SCHEMA.names if name not in IRREPRODUCIBLE_COLUMNS | {"digest"}]
+    wrong = _find_differences([(row, of_place[_row_key(row)]) for row in original.rows], names)
+    filled = [name for name in names if any(row[name] is not None for row in original.rows)]
     return (
-        _refuted(what, _listed(wrong), old, new)
+        _build_failed_claim(what, _format_differences(wrong), original, rerun_rows)
         if wrong
-        else Claim(what, Holds.YES, f"{len(filled)} in {len(old.rows)} rows, to the bit")
+        else VerifiedClaim(what, ClaimVerdict.PASS, f"{len(filled)} in {len(original.rows)} rows, to the bit")
     )
 
 
-def _place(row: Row) -> tuple[Any, ...]:
+def _row_key(row: ResultRow) -> tuple[Any, ...]:
     return row["phase"], row["frame"], row["round"]
 
 
-def _differing(pairs: Sequence[tuple[Row, Row]], names: Iterable[str]) -> dict[str, tuple[Row, Any, Any]]:
+def _find_differences(
+    pairs: Sequence[tuple[ResultRow, ResultRow]], names: Iterable[str]
+) -> dict[str, tuple[ResultRow, Any, Any]]:
     """Return the columns whose published values differ: the first such row, and both values."""
-    wrong: dict[str, tuple[Row, Any, Any]] = {}
+    wrong: dict[str, tuple[ResultRow, Any, Any]] = {}
     for row, here in pairs:
         for name in names:
             was, now = row[name], here[name]
@@ -393,93 +432,105 @@ def _differing(pairs: Sequence[tuple[Row, Row]], names: Iterable[str]) -> dict[s
     return wrong
 
 
-def _listed(wrong: Mapping[str, tuple[Row, Any, Any]]) -> str:
-    told = [f"{name} is {was!r:.60}, here {now!r:.60}" for name, (_, was, now) in list(wrong.items())[:5]]
-    more = f", and {len(wrong) - len(told)} more columns" if len(wrong) > len(told) else ""
+def _format_differences(differences: Mapping[str, tuple[ResultRow, Any, Any]]) -> str:
+    told = [f"{name} is {was!r:.60}, here {now!r:.60}" for name, (_, was, now) in list(differences.items())[:5]]
+    more = f", and {len(differences) - len(told)} more columns" if len(differences) > len(told) else ""
     return "; ".join(told) + more
 
 
-def _refuted(what: str, why: str, old: Published, new: list[Row]) -> Claim:
+def _build_failed_claim(
+    subject: str, explanation: str, original: PublishedRun, rerun_rows: list[ResultRow]
+) -> VerifiedClaim:
     """Build the claim for a difference.
 
     It is a failure only with the same source code on such a machine.
     """
-    if elsewhere := _elsewhere(old.rows[0], new[0]):
-        return Claim(what, Holds.UNKNOWN, f"{why}; {elsewhere}")
-    return Claim(what, Holds.NO, why)
+    if elsewhere := _describe_environment_change(original.rows[0], rerun_rows[0]):
+        return VerifiedClaim(subject, ClaimVerdict.INCONCLUSIVE, f"{explanation}; {elsewhere}")
+    return VerifiedClaim(subject, ClaimVerdict.FAIL, explanation)
 
 
-def _seconds_hold(old: Published, new: list[Row]) -> list[Claim]:
+def _verify_seconds(original: PublishedRun, rerun_rows: list[ResultRow]) -> list[VerifiedClaim]:
     """Verify the time of a step; no claim where another machine may explain the difference."""
-    what = f"{old.title}, time of a step"
-    was, now = _seconds(old.rows), _seconds(new)
+    what = f"{original.title}, time of a step"
+    was, now = _read_step_seconds(original.rows), _read_step_seconds(rerun_rows)
     if was.keys() != now.keys():
-        return [_refuted(what, "a step has no time", old, new)]
-    times = statistics.changed(now, was).middle
+        return [_build_failed_claim(what, "a step has no time", original, rerun_rows)]
+    times = statistics.estimate_slowdown(now, was).estimate
     why = f"here {times:.3g} times as long"
-    elsewhere = _elsewhere(old.rows[0], new[0])
-    if 1 / SECONDS <= times <= SECONDS:
-        return [Claim(what, Holds.YES, why)]
-    if elsewhere and 1 / _OTHER_MACHINE <= times <= _OTHER_MACHINE:
+    elsewhere = _describe_environment_change(original.rows[0], rerun_rows[0])
+    if 1 / MAX_SECONDS_RATIO <= times <= MAX_SECONDS_RATIO:
+        return [VerifiedClaim(what, ClaimVerdict.PASS, why)]
+    if elsewhere and 1 / _MAX_MACHINE_RATIO <= times <= _MAX_MACHINE_RATIO:
         return []
-    if not elsewhere and (share := _interrupted([*old.rows, *new])) > 0.1:
-        return [Claim(what, Holds.UNKNOWN, f"{why}; {100 * share:.0f} % of the steps were interrupted")]
-    return [_refuted(what, why, old, new)]
+    if not elsewhere and (share := _compute_preempted_share([*original.rows, *rerun_rows])) > 0.1:
+        return [
+            VerifiedClaim(what, ClaimVerdict.INCONCLUSIVE, f"{why}; {100 * share:.0f} % of the steps were interrupted")
+        ]
+    return [_build_failed_claim(what, why, original, rerun_rows)]
 
 
-_OTHER_MACHINE = 20.0
+_MAX_MACHINE_RATIO = 20.0
 """Ratio of speeds that is plausible between two machines."""
 
 
-def _interrupted(found: Sequence[Row]) -> float:
+def _compute_preempted_share(result_rows: Sequence[ResultRow]) -> float:
     """Compute the fraction of steps that were preempted."""
-    steps = [row for row in found if row["phase"] == "step"]
+    steps = [row for row in result_rows if row["phase"] == "step"]
     return sum(bool(row["interrupted"]) for row in steps) / len(steps)
 
 
-def _elsewhere(old: Row, new: Row) -> str:
+def _describe_environment_change(old: ResultRow, new: ResultRow) -> str:
     """Describe the differences of machine, libraries, source code and threads."""
-    differ = [f"{told}" for name, told in _WHERE.items() if old[name] != new[name]]
+    differ = [f"{told}" for name, told in _ENVIRONMENT_COLUMNS.items() if old[name] != new[name]]
     return f"other {' and '.join(differ)}" if differ else ""
 
 
-_WHERE = {"machine": "machine", "versions": "libraries", "code": "code", "threads": "threads"}
+_ENVIRONMENT_COLUMNS = {"machine": "machine", "versions": "libraries", "code": "code", "threads": "threads"}
 
 
-def _ratio(old: tuple[Published, Published], new: tuple[list[Row], list[Row]]) -> Claim:
-    was, now = ([_seconds(run) for run in pair] for pair in ((old[0].rows, old[1].rows), new))
+def _verify_time_ratio(
+    old: tuple[PublishedRun, PublishedRun], new: tuple[list[ResultRow], list[ResultRow]]
+) -> VerifiedClaim:
+    was, now = ([_read_step_seconds(run) for run in pair] for pair in ((old[0].rows, old[1].rows), new))
     what = f"{old[0].title} beside {old[1].run.solver.name}, ratio of times"
     if not was[0].keys() & was[1].keys() & now[0].keys() & now[1].keys():
-        return Claim(what, Holds.UNKNOWN, "they have no step in common that has a time")
-    published, here = (statistics.changed(*pair).middle for pair in (was, now))
-    apart = statistics.changed(*(_ratios(*pair) for pair in (now, was))).middle
+        return VerifiedClaim(what, ClaimVerdict.INCONCLUSIVE, "they have no step in common that has a time")
+    published, here = (statistics.estimate_slowdown(*pair).estimate for pair in (was, now))
+    apart = statistics.estimate_slowdown(*(_compute_step_ratios(*pair) for pair in (now, was))).estimate
     what = f"{old[0].title} takes {published:.3g} times as long as {old[1].run.solver.name}"
     why = f"here {here:.3g} times"
-    elsewhere = _elsewhere(old[0].rows[0], new[0][0])
-    limit = ELSEWHERE if elsewhere else RATIO
+    elsewhere = _describe_environment_change(old[0].rows[0], new[0][0])
+    limit = MAX_RATIO_OTHER_MACHINE if elsewhere else MAX_RATIO_SAME_MACHINE
     if 1 / limit <= apart <= limit:
-        return Claim(what, Holds.YES, why)
-    share = _interrupted([row for found in (old[0].rows, old[1].rows, *new) for row in found])
+        return VerifiedClaim(what, ClaimVerdict.PASS, why)
+    share = _compute_preempted_share([row for found in (old[0].rows, old[1].rows, *new) for row in found])
     if elsewhere or share > 0.1:
-        return Claim(what, Holds.UNKNOWN, f"{why}; {elsewhere or f'{100 * share:.0f} % of the steps were interrupted'}")
-    return Claim(what, Holds.NO, why)
+        return VerifiedClaim(
+            what,
+            ClaimVerdict.INCONCLUSIVE,
+            f"{why}; {elsewhere or f'{100 * share:.0f} % of the steps were interrupted'}",
+        )
+    return VerifiedClaim(what, ClaimVerdict.FAIL, why)
 
 
-def _seconds(run: Sequence[Row]) -> dict[int, float]:
+def _read_step_seconds(run: Sequence[ResultRow]) -> dict[int, float]:
     """Read the times of a run's steps by frame, where there are any [s]."""
     timed = [row for row in run if row["phase"] == "step" and row["frame"] is not None and row["seconds"] is not None]
-    return statistics.least((row["frame"], row["seconds"]) for row in timed if 0.0 < row["seconds"] < math.inf)
+    return statistics.compute_min_seconds(
+        (row["frame"], row["seconds"]) for row in timed if 0.0 < row["seconds"] < math.inf
+    )
 
 
-def _ratios(ours: Mapping[int, float], theirs: Mapping[int, float]) -> dict[int, float]:
+def _compute_step_ratios(ours: Mapping[int, float], theirs: Mapping[int, float]) -> dict[int, float]:
     """Compute the ratio of the two times of each frame."""
     return {frame: taken / theirs[frame] for frame, taken in ours.items() if frame in theirs}
 
 
-def possible(runs: Sequence[Published], say: Callable[[str], None]) -> list[Published]:
+def select_runnable(runs: Sequence[PublishedRun], print_message: Callable[[str], None]) -> list[PublishedRun]:
     """Return the runs for which this machine has enough cores."""
-    usable = machine.describe().cores
-    found = [one for one in runs if machine.threads(one.run.threads).number <= usable]
+    usable = machine.describe_machine().cores
+    found = [one for one in runs if machine.choose_threads(one.run.threads).count <= usable]
     if left := len(runs) - len(found):
-        say(f"{left} of {len(runs)} runs need more cores than this machine has: they are not done again")
+        print_message(f"{left} of {len(runs)} runs need more cores than this machine has: they are not done again")
     return found

@@ -13,44 +13,50 @@ from pathlib import Path
 from typing import Any
 
 from harness.base import machine, rows
-from harness.base.claim import claimed
-from harness.base.errors import InputError, Mistake, RunFailed
-from harness.base.stated import stated
+from harness.base.claim import claim_folder
+from harness.base.errors import InputError, InputMistake, RunFailed
+from harness.base.stated import read_solver_metadata
 from harness.config.load import load_scene
-from harness.experiments.accuracy.accuracy_rows import SCHEMA
-from harness.experiments.accuracy.units import references
-from harness.experiments.apart import apart
-from harness.experiments.asked.known import Row, known, problem, promising, way_rows
-from harness.experiments.asked.peers import peers as peers_of
-from harness.experiments.asked.search import Answer, foresee, search
-from harness.experiments.asked.ways import Asked, in_words
-from harness.experiments.provenance import provenance
+from harness.experiments.accuracy.accuracy_rows import ACCURACY_SCHEMA
+from harness.experiments.accuracy.units import open_reference_store
+from harness.experiments.apart import run_isolated
+from harness.experiments.asked.known import (
+    ResultRow,
+    build_trial_rows,
+    format_problem_id,
+    read_stored_trials,
+    select_promising_methods,
+)
+from harness.experiments.asked.peers import compare_third_party as peers_of
+from harness.experiments.asked.search import SearchResult, compute_predictability_horizon, search_cheapest_method
+from harness.experiments.asked.ways import ErrorTarget, format_method_name
+from harness.experiments.provenance import build_provenance_columns
 from harness.experiments.run import save_positions
-from harness.record.base import Frame, RecordingInfo
+from harness.record.base import RecordedFrame, RecordingInfo
 from harness.record.rerun import RerunRecorder
-from harness.record.shading import strain_range
-from harness.reference.growth import Growth
+from harness.record.shading import compute_strain_range
+from harness.reference.growth import PerturbationGrowth
 from harness.scenes.spec import SceneSpec
 from solvers.problem import Positions
 
-Say = Callable[[str], None]
-_SHARED = ("sweep", "scene", "size", "vertices", "threads", "horizon", "asked")
+PrintMessage = Callable[[str], None]
+_SHARED_COLUMNS = ("sweep", "scene", "size", "vertices", "threads", "horizon", "asked")
 """Columns that the rows of third-party integrators share."""
 
 
-def run_to_error(
+def run_error_control(
     config: Path,
     error: float,
     results: Path,
-    say: Say,
+    print_message: PrintMessage,
     *,
-    horizon: float | None = None,
+    t_end: float | None = None,
     sizes: Sequence[int] = (),
     check: bool = False,
     peers: bool = False,
     positions: Path | None = None,
-    again: bool = False,
-    others: Mapping[str, Any] | None = None,
+    rerun: bool = False,
+    rejected_options: Mapping[str, Any] | None = None,
 ) -> bool:
     """Simulate the scene in a file to a relative error, and print the cost.
 
@@ -73,172 +79,207 @@ def run_to_error(
         InputError: an option is invalid.
         RunFailed: no method reaches the error.
     """
-    _require(error, horizon, {**(others or {}), "second --size": sizes[1:]})
+    _check_options(error, t_end, {**(rejected_options or {}), "second --size": sizes[1:]})
     scene = load_scene(config)
-    given = config, scene, error, results, horizon, sizes[0] if sizes else None, check, peers, positions, again
-    return apart(partial(_done, *given), [plugin for plugin, _ in scene.own.values()], say)
+    given = config, scene, error, results, t_end, sizes[0] if sizes else None, check, peers, positions, rerun
+    return run_isolated(
+        partial(_execute_error_control, *given), [plugin for plugin, _ in scene.own.values()], print_message
+    )
 
 
-def _done(
+def _execute_error_control(
     config: Path,
     scene: SceneSpec,
     error: float,
     results: Path,
-    horizon: float | None,
+    t_end: float | None,
     size: int | None,
     check: bool,
     peers: bool,
     positions: Path | None,
-    again: bool,
-    say: Say,
+    rerun: bool,
+    print_message: PrintMessage,
 ) -> bool:
-    asked = Asked.of(scene, size, horizon, say)
-    folder = claimed(results / config.stem, config)
-    with machine.pinned_threads(1):
-        seen = foresee(asked, error, say)
-        before = known(folder / "accuracy", asked)
-        answer = _searched(asked, error, seen, [] if again else before, say)
-    path, best = answer.best.path, answer.best
-    say(f"asked {error:g}, estimated {best.estimated:.1g}, {path.processor:.3g} s of processor time")
-    factors = f", {path.factorisations} factorisations" if path.factorisations else ""
-    say(
-        f"by {best.way}: {path.accepted} steps, {path.rejected} rejected{factors}"
+    asked = ErrorTarget.from_scene(scene, size, t_end, print_message)
+    folder = claim_folder(results / config.stem, config)
+    with machine.limit_threads(1):
+        seen = compute_predictability_horizon(asked, error, print_message)
+        before = read_stored_trials(folder / "accuracy", asked)
+        answer = _search_method(asked, error, seen, [] if rerun else before, print_message)
+    path, best = answer.best_trial.trajectory, answer.best_trial
+    print_message(f"asked {error:g}, estimated {best.error_estimated:.1g}, {path.cpu_seconds:.3g} s of processor time")
+    factors = f", {path.num_factorisations} factorisations" if path.num_factorisations else ""
+    print_message(
+        f"by {best.method}: {path.num_accepted_steps} steps, {path.num_rejected_steps} rejected{factors}"
         + (f"; more exact than asked, for {answer.note}" if answer.note else "")
     )
-    say(f"choosing, and a closer motion for the estimate, took {answer.seconds:.3g} s besides")
-    measured = _checked(asked, error, path.positions[-1], results, say) if check else None
-    label = f"{config.stem}-{asked.size}-asked-{error:g}-{asked.horizon:g}"
-    recording = _record(folder / "recordings" / f"{label}.rrd", config.stem, asked, answer)
-    row = _row(config.stem, asked, error, answer) | {"error": measured, "recording": f"recordings/{recording.name}"}
+    print_message(f"choosing, and a closer motion for the estimate, took {answer.search_seconds:.3g} s besides")
+    measured = _verify_error(asked, error, path.positions[-1], results, print_message) if check else None
+    label = f"{config.stem}-{asked.size}-asked-{error:g}-{asked.t_end:g}"
+    recording = _record_motion(folder / "recordings" / f"{label}.rrd", config.stem, asked, answer)
+    row = _build_row(config.stem, asked, error, answer) | {
+        "error": measured,
+        "recording": f"recordings/{recording.name}",
+    }
     (folder / "accuracy").mkdir(exist_ok=True)
-    found = [row, *(_beside(row, asked, error, answer, say) if peers else ())]
-    shared = {name: row[name] for name in (*_SHARED, "problem")} | provenance()
-    found += [shared | way for way in way_rows(answer, before, error)]
-    rows.write(folder / "accuracy" / f"{label}.parquet", [one | {"unit": label} for one in found], SCHEMA)
+    found = [row, *(_build_third_party_rows(row, asked, error, answer, print_message) if peers else ())]
+    shared = {name: row[name] for name in (*_SHARED_COLUMNS, "problem")} | build_provenance_columns()
+    found += [shared | way for way in build_trial_rows(answer, before, error)]
+    rows.write_rows(folder / "accuracy" / f"{label}.parquet", [one | {"unit": label} for one in found], ACCURACY_SCHEMA)
     if positions:
         save_positions(positions, path.positions[1:])
-    say(f"the row is in {folder / 'accuracy'}, the recording is {recording}")
+    print_message(f"the row is in {folder / 'accuracy'}, the recording is {recording}")
     return not check or (measured is not None and measured <= error)
 
 
-def _searched(asked: Asked, error: float, seen: Growth, before: Sequence[Row], say: Say) -> Answer:
+def _search_method(
+    error_target: ErrorTarget,
+    error: float,
+    growth: PerturbationGrowth,
+    stored_trials: Sequence[ResultRow],
+    print_message: PrintMessage,
+) -> SearchResult:
     """Search the cheapest method, first among those that were cheap for a similar error.
 
     Raises RunFailed.
     """
-    nearest, pairs = promising(before, error)
+    nearest, pairs = select_promising_methods(stored_trials, error)
     if not pairs:
-        return search(asked, error, seen, say)
-    names = ", ".join(in_words(integrator, solver.name) for integrator, solver in pairs)
-    say(f"worth trying by rows measured before, for an error of {nearest:g}: {names}; --again tries all ways")
+        return search_cheapest_method(error_target, error, growth, print_message)
+    names = ", ".join(format_method_name(integrator, solver.name) for integrator, solver in pairs)
+    print_message(f"worth trying by rows measured before, for an error of {nearest:g}: {names}; --again tries all ways")
     try:
-        return search(asked, error, seen, say, pairs)
+        return search_cheapest_method(error_target, error, growth, print_message, pairs)
     except RunFailed as failed:
-        say(f"{failed}; so all ways are tried")
-        return search(asked, error, seen, say)
+        print_message(f"{failed}; so all ways are tried")
+        return search_cheapest_method(error_target, error, growth, print_message)
 
 
-def _checked(asked: Asked, error: float, p: Positions, results: Path, say: Say) -> float | None:
+def _verify_error(
+    error_target: ErrorTarget, error: float, p: Positions, results: Path, print_message: PrintMessage
+) -> float | None:
     """Print and return the error of positions p (n, 3) [m] against the reference.
 
     The result is None if there is none.
     """
     try:
-        trajectory = references(results).trajectory(asked.scene, asked.size, [asked.horizon], error=error)
+        trajectory = open_reference_store(results).load_trajectory(
+            error_target.scene, error_target.size, [error_target.t_end], error=error
+        )
     except RunFailed as failed:
-        say(f"the reference cannot grade it: {failed}")
+        print_message(f"the reference cannot grade it: {failed}")
         return None
-    measured = trajectory.error(-1, p)
-    say(f"by the reference it errs by {measured:.2g}, {'as' if measured <= error else 'not as'} asked")
+    measured = trajectory.measure_error(-1, p)
+    print_message(f"by the reference it errs by {measured:.2g}, {'as' if measured <= error else 'not as'} asked")
     return measured
 
 
-def _require(error: float, horizon: float | None, others: Mapping[str, Any]) -> None:
+def _check_options(error: float, t_end: float | None, rejected_options: Mapping[str, Any]) -> None:
     """Raise InputError for invalid options."""
     mistakes = [
-        Mistake("with --error, solver and steps are chosen; leave it out", key=f"--{name.replace('_', '-')}")
-        for name, value in others.items()
+        InputMistake("with --error, solver and steps are chosen; leave it out", key=f"--{name.replace('_', '-')}")
+        for name, value in rejected_options.items()
         if value
     ]
     if not 0.0 < error < 1.0:
-        mistakes.append(Mistake(f"came {error:g}; wanted a number between 0 and 1", key="--error"))
-    if horizon is not None and not (isfinite(horizon) and 0.0 < horizon <= 1e4):
-        mistakes.append(Mistake(f"came {horizon:g}; wanted seconds above 0, at most 10,000", key="--horizon"))
+        mistakes.append(InputMistake(f"came {error:g}; wanted a number between 0 and 1", key="--error"))
+    if t_end is not None and not (isfinite(t_end) and 0.0 < t_end <= 1e4):
+        mistakes.append(InputMistake(f"came {t_end:g}; wanted seconds above 0, at most 10,000", key="--horizon"))
     if mistakes:
         raise InputError(mistakes)
 
 
-def _row(name: str, asked: Asked, error: float, answer: Answer) -> dict[str, Any]:
-    best, path = answer.best, answer.best.path
+def _build_row(name: str, error_target: ErrorTarget, error: float, search_result: SearchResult) -> dict[str, Any]:
+    best, path = search_result.best_trial, search_result.best_trial.trajectory
     return {
         "kind": "asked",
         "status": "ok",
-        "reason": answer.note,
+        "reason": search_result.note,
         "sweep": name,
         "scene": name,
-        "problem": problem(asked),
-        "size": asked.size,
+        "problem": format_problem_id(error_target),
+        "size": error_target.size,
         "vertices": path.positions.shape[1],
-        "solver": best.way.solver,
+        "solver": best.method.solver,
         "parameters": json.dumps({}),
-        **stated(best.way.solver),
-        "time_step": asked.frame,
+        **read_solver_metadata(best.method.solver),
+        "time_step": error_target.frame_seconds,
         "threads": 1,
-        "horizon": asked.horizon,
+        "horizon": error_target.t_end,
         "asked": error,
         **best.columns,
-        "iterations_done": path.iterations,
-        "seconds": [path.seconds],
-        "cpu_seconds": path.processor,
-        "seconds_per_simulated": path.seconds / asked.horizon,
-        "estimate_seconds": answer.seconds,
-        **provenance(),
+        "iterations_done": path.num_iterations,
+        "seconds": [path.wall_seconds],
+        "cpu_seconds": path.cpu_seconds,
+        "seconds_per_simulated": path.wall_seconds / error_target.t_end,
+        "estimate_seconds": search_result.search_seconds,
+        **build_provenance_columns(),
     }
 
 
-def _beside(row: dict[str, Any], asked: Asked, error: float, answer: Answer, say: Say) -> list[dict[str, Any]]:
+def _build_third_party_rows(
+    row: dict[str, Any],
+    error_target: ErrorTarget,
+    error: float,
+    search_result: SearchResult,
+    print_message: PrintMessage,
+) -> list[dict[str, Any]]:
     """Build the rows of third-party integrators, and print their relative times."""
-    shared = {name: row[name] for name in _SHARED} | provenance()
+    shared = {name: row[name] for name in _SHARED_COLUMNS} | build_provenance_columns()
     found = list[dict[str, Any]]()
-    say("beside it, on the same machine in the same process, to the same error:")
-    for peer in peers_of(asked, error, answer):
-        told = f"{peer.ratio:.3g} times the processor time, an error of {peer.estimated:.1g}"
-        say(f"  {peer.name}: {peer.reason or told}")
+    print_message("beside it, on the same machine in the same process, to the same error:")
+    for peer in peers_of(error_target, error, search_result):
+        told = f"{peer.cpu_time_ratio:.3g} times the processor time, an error of {peer.error_estimated:.1g}"
+        print_message(f"  {peer.name}: {peer.reason or told}")
         became = {"status": "failed", "reason": peer.reason} if peer.reason else {"status": "ok"}
         times = (
-            {} if peer.reason else {"seconds": [peer.seconds], "seconds_per_simulated": peer.seconds / asked.horizon}
+            {}
+            if peer.reason
+            else {"seconds": [peer.wall_seconds], "seconds_per_simulated": peer.wall_seconds / error_target.t_end}
         )
-        estimated = {} if peer.reason else {"estimated": peer.estimated}
+        estimated = {} if peer.reason else {"estimated": peer.error_estimated}
         found.append(shared | became | times | estimated | {"kind": "peer", "solver": peer.name})
     return found
 
 
-def _record(path: Path, name: str, asked: Asked, answer: Answer) -> Path:
+def _record_motion(path: Path, name: str, error_target: ErrorTarget, search_result: SearchResult) -> Path:
     """Write the recording of the motion, with the requested error as a property."""
-    scene, best, here = asked.bound(asked.frame, "own"), answer.best, machine.describe()
-    properties = {"scene": name, "size": asked.size, "solver": best.way.solver, "integrator": best.way.integrator}
+    scene, best, here = (
+        error_target.build_scene(error_target.frame_seconds, "own"),
+        search_result.best_trial,
+        machine.describe_machine(),
+    )
+    properties = {
+        "scene": name,
+        "size": error_target.size,
+        "solver": best.method.solver,
+        "integrator": best.method.integrator,
+    }
     info = RecordingInfo(
-        title=f"{name} {asked.size or ''}".strip() + f" - {best.way}, estimated error {best.estimated:.1g}",
-        run_id=f"{path.stem}-{here.id}",
+        title=f"{name} {error_target.size or ''}".strip()
+        + f" - {best.method}, estimated error {best.error_estimated:.1g}",
+        run_id=f"{path.stem}-{here.machine_id}",
         mesh=scene.mesh,
-        springs=scene.springs.edges,
-        rest_lengths=scene.springs.rest_length,
-        pinned=scene.system.pins.vertices,
-        time_step=asked.frame,
-        strain_range=strain_range(best.path.positions[-1:], scene.springs.edges, scene.springs.rest_length),
+        springs=scene.all_springs.edges,
+        rest_lengths=scene.all_springs.rest_length,
+        pinned_vertices=scene.system.pins.vertices,
+        time_step=error_target.frame_seconds,
+        strain_range=compute_strain_range(
+            best.trajectory.positions[-1:], scene.all_springs.edges, scene.all_springs.rest_length
+        ),
         properties={
             **properties,
             "status": "ok",
-            "estimated": best.estimated,
+            "estimated": best.error_estimated,
             "cpu": here.cpu,
-            "commit": machine.commit(),
+            "commit": machine.read_commit(),
         },
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     recorder = RerunRecorder(path, info)
     try:
-        for k, p in enumerate(best.path.positions):
-            recorder.frame(Frame(k, k * asked.frame, p, {}, float("nan"), 0))
-        return recorder.close({})
+        for k, p in enumerate(best.trajectory.positions):
+            recorder.record_frame(RecordedFrame(k, k * error_target.frame_seconds, p, {}, float("nan"), 0))
+        return recorder.finish_recording({})
     finally:
-        recorder.abandon()
+        recorder.abandon_recording()

@@ -13,21 +13,26 @@ from math import inf
 from time import thread_time
 
 from harness.base.errors import RunFailed
-from harness.config.goals import Goals, OneGoal
-from harness.experiments.asked.held import Held, held
-from harness.experiments.asked.search import WIDE, Found, foresee, search
-from harness.experiments.asked.ways import Asked
-from harness.reference.store import Store
+from harness.config.goals import TargetCase, TargetPlan
+from harness.experiments.asked.held import TargetBaseline, find_baseline
+from harness.experiments.asked.search import (
+    MIN_ERROR_FRACTION,
+    Trial,
+    compute_predictability_horizon,
+    search_cheapest_method,
+)
+from harness.experiments.asked.ways import ErrorTarget
+from harness.reference.store import ReferenceStore
 from solvers.problem import NotPositiveDefinite, Unsupported
 
-ROUNDS, MOST_ROUNDS, LONG = 3, 15, 0.5
+MIN_ROUNDS, MAX_ROUNDS, MIN_TOTAL_SECONDS = 3, 15, 0.5
 """Smallest and largest number of rounds; rounds above the minimum end at this total CPU time of the method [s]."""
-MOST = 2.0
+MAX_TARGET_ERROR_RATIO = 2.0
 """Largest accepted ratio of the error to the requested one."""
 
 
 @dataclass(frozen=True, slots=True)
-class Met:
+class TargetResult:
     """Measured result of a performance target.
 
     Attributes:
@@ -46,42 +51,46 @@ class Met:
         reason: why there is no result; empty if there is one.
     """
 
-    asked: OneGoal
+    target: TargetCase
     size: int
     vertices: int = 0
-    way: str = ""
-    estimated: float = inf
+    method: str = ""
+    error_estimated: float = inf
     seconds: float = inf
-    other: str = ""
-    other_error: float = inf
-    other_seconds: float = inf
-    bound: bool = False
+    baseline: str = ""
+    baseline_error: float = inf
+    baseline_seconds: float = inf
+    is_lower_bound: bool = False
     error: float | None = None
     note: str = ""
     reason: str = ""
 
     @property
-    def ratio(self) -> float:
+    def time_ratio(self) -> float:
         """CPU time of the method divided by that of the baseline.
 
         It is an upper bound if `is_lower_bound`.
         """
-        return self.seconds / self.other_seconds
+        return self.seconds / self.baseline_seconds
 
     @property
-    def as_asked(self) -> bool:
+    def is_error_accepted(self) -> bool:
         """Whether the error against the reference solution, if known, is close to the requested one."""
         if self.error is None:
             return True
-        return self.error <= MOST * self.asked.error and (self.error >= WIDE * self.asked.error or bool(self.note))
+        return self.error <= MAX_TARGET_ERROR_RATIO * self.target.error and (
+            self.error >= MIN_ERROR_FRACTION * self.target.error or bool(self.note)
+        )
 
     @property
-    def holds(self) -> bool:
+    def is_met(self) -> bool:
         """Whether the error is as requested and the time ratio at most the target ratio."""
-        return not self.reason and self.as_asked and self.ratio <= self.asked.goal.wanted
+        return not self.reason and self.is_error_accepted and self.time_ratio <= self.target.target.wanted
 
 
-def met(goals: Goals, store: Store, say: Callable[[str], None]) -> Iterator[Met]:
+def measure_targets(
+    targets: TargetPlan, reference_store: ReferenceStore, print_message: Callable[[str], None]
+) -> Iterator[TargetResult]:
     """Measure the targets one after the other; a failure is reported as `reason`.
 
     Args:
@@ -89,42 +98,59 @@ def met(goals: Goals, store: Store, say: Callable[[str], None]) -> Iterator[Met]
         reference_store: store of the reference solutions.
         print_message: prints a remark.
     """
-    for one in goals.goals:
-        say(f"{one.scene} {one.size or ''} to {one.error:g} after {one.goal.horizon:g} s:")
+    for one in targets.goals:
+        print_message(f"{one.scene} {one.size or ''} to {one.error:g} after {one.target.horizon:g} s:")
         asked = None
         try:
-            asked = Asked.of(goals.scenes[one.scene], one.size, one.goal.horizon)
-            yield _met(one, asked, store, say)
+            asked = ErrorTarget.from_scene(targets.scenes[one.scene], one.size, one.target.horizon)
+            yield _measure_target(one, asked, reference_store, print_message)
         except (RunFailed, Unsupported, NotPositiveDefinite) as error:
-            yield Met(one, asked.size if asked else one.size or 0, reason=str(error))
+            yield TargetResult(one, asked.size if asked else one.size or 0, reason=str(error))
 
 
-def _met(one: OneGoal, asked: Asked, store: Store, say: Callable[[str], None]) -> Met:
-    seen = foresee(asked, one.error, say)
-    truth = store.trajectory(asked.scene, asked.size, [asked.horizon], error=one.error) if one.goal.graded else None
-    answer = search(asked, one.error, seen, say)
-    best, free = answer.best, asked.bound(asked.frame, "own").system.free
-    end = best.path.positions[-1]
-    other = held(one, asked, answer, lambda p: truth.error(-1, p) if truth else answer.error(p, free), say)
-    ours, its = _in_turns(best, other)
-    return Met(
-        *(one, asked.size, len(end), str(best.way), best.estimated, ours),
-        *(other.name, other.error, its, other.bound),
-        error=truth.error(-1, end) if truth else None,
+def _measure_target(
+    performance_target: TargetCase,
+    error_target: ErrorTarget,
+    reference_store: ReferenceStore,
+    print_message: Callable[[str], None],
+) -> TargetResult:
+    seen = compute_predictability_horizon(error_target, performance_target.error, print_message)
+    truth = (
+        reference_store.load_trajectory(
+            error_target.scene, error_target.size, [error_target.t_end], error=performance_target.error
+        )
+        if performance_target.target.graded
+        else None
+    )
+    answer = search_cheapest_method(error_target, performance_target.error, seen, print_message)
+    best, free = answer.best_trial, error_target.build_scene(error_target.frame_seconds, "own").system.free_vertices
+    end = best.trajectory.positions[-1]
+    other = find_baseline(
+        performance_target,
+        error_target,
+        answer,
+        lambda p: truth.measure_error(-1, p) if truth else answer.compute_error(p, free),
+        print_message,
+    )
+    ours, its = _time_interleaved(best, other)
+    return TargetResult(
+        *(performance_target, error_target.size, len(end), str(best.method), best.error_estimated, ours),
+        *(other.name, other.error, its, other.is_lower_bound),
+        error=truth.measure_error(-1, end) if truth else None,
         note=answer.note,
     )
 
 
-def _in_turns(best: Found, other: Held) -> tuple[float, float]:
+def _time_interleaved(trial: Trial, baseline: TargetBaseline) -> tuple[float, float]:
     """Return the smallest CPU seconds of the method and of the baseline, timed interleaved."""
-    ours, its = list[float](), [other.seconds]
-    while len(ours) < ROUNDS or (sum(ours) < LONG and len(ours) < MOST_ROUNDS):
-        ours.append(_timed(best.again))
-        its += [other.again()] if other.again else []
+    ours, its = list[float](), [baseline.seconds]
+    while len(ours) < MIN_ROUNDS or (sum(ours) < MIN_TOTAL_SECONDS and len(ours) < MAX_ROUNDS):
+        ours.append(_measure_cpu_seconds(trial.rerun_trial))
+        its += [baseline.rerun_timed()] if baseline.rerun_timed else []
     return min(ours), min(its)
 
 
-def _timed(call: Callable[[], object]) -> float:
+def _measure_cpu_seconds(call: Callable[[], object]) -> float:
     began = thread_time()
     call()
     return thread_time() - began

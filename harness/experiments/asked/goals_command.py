@@ -8,66 +8,74 @@ from typing import Annotated
 
 import typer
 
-from harness.base.commands import Results
-from harness.base.console import narrow, out, say
+from harness.base.commands import ResultsOption
+from harness.base.console import get_output_console, print_message, split_wide_table
 
 
-def goals(
+def targets(
     config: Annotated[Path, typer.Argument(help="Goals (YAML).")],
-    results: Results = Path("results"),
+    results: ResultsOption = Path("results"),
 ) -> None:
     """Measure performance targets: the cheapest method for an error, against a baseline."""
     from rich.table import Table
 
     from harness.base import machine, rows
-    from harness.base.claim import claimed
-    from harness.config.goals import load_goals
-    from harness.experiments.accuracy.accuracy_rows import SCHEMA
-    from harness.experiments.accuracy.units import references
-    from harness.experiments.asked.goals import Met, met
-    from harness.experiments.asked.libraries import LIBRARIES
-    from harness.experiments.provenance import provenance
-    from solvers.registry import EVERY
+    from harness.base.claim import claim_folder
+    from harness.config.goals import load_targets
+    from harness.experiments.accuracy.accuracy_rows import ACCURACY_SCHEMA
+    from harness.experiments.accuracy.units import open_reference_store
+    from harness.experiments.asked.goals import TargetResult, measure_targets
+    from harness.experiments.asked.libraries import THIRD_PARTY_INTEGRATORS
+    from harness.experiments.provenance import build_provenance_columns
+    from solvers.registry import SOLVER_TABLE
 
-    asked = load_goals(config, list(LIBRARIES), list(EVERY))
-    folder = claimed(results / asked.name, config)
+    asked = load_targets(config, list(THIRD_PARTY_INTEGRATORS), list(SOLVER_TABLE))
+    folder = claim_folder(results / asked.name, config)
     table = Table("", "asked", "error", "way", "against", "times its cost", "wanted", "")
-    found = list[Met]()
-    with machine.pinned_threads(1):
-        for one in met(asked, references(results), say):
+    found = list[TargetResult]()
+    with machine.limit_threads(1):
+        for one in measure_targets(asked, open_reference_store(results), print_message):
             found.append(one)
-            wanted, ratio = _part(one.asked.goal.wanted), "–" if one.reason else _part(one.ratio, at_most=one.bound)
-            verdict = one.reason or ("holds" if one.holds else "does not hold") + (f": {one.note}" if one.note else "")
-            error = f"{one.estimated:.1g} estimated" if one.error is None else f"{one.error:.2g}"
-            say(f"  an error of {error}, {ratio} of the processor time, wanted {wanted}: {verdict}")
-            cells = f"{one.asked.scene} {one.size or ''}", f"{one.asked.error:g}", "" if one.reason else error, one.way
-            table.add_row(*cells, one.other, ratio, wanted, verdict)
+            wanted, ratio = (
+                _format_ratio(one.target.target.wanted),
+                "–" if one.reason else _format_ratio(one.time_ratio, is_upper_bound=one.is_lower_bound),
+            )
+            verdict = one.reason or ("holds" if one.is_met else "does not hold") + (f": {one.note}" if one.note else "")
+            error = f"{one.error_estimated:.1g} estimated" if one.error is None else f"{one.error:.2g}"
+            print_message(f"  an error of {error}, {ratio} of the processor time, wanted {wanted}: {verdict}")
+            cells = (
+                f"{one.target.scene} {one.size or ''}",
+                f"{one.target.error:g}",
+                "" if one.reason else error,
+                one.method,
+            )
+            table.add_row(*cells, one.baseline, ratio, wanted, verdict)
     (folder / "accuracy").mkdir(exist_ok=True)
-    shared = {"kind": "goal", "sweep": asked.name, "threads": 1} | provenance()
+    shared = {"kind": "goal", "sweep": asked.name, "threads": 1} | build_provenance_columns()
     written = [
         shared
         | {
             "status": "failed" if one.reason else "ok",
             "reason": one.reason or one.note or None,
-            "scene": one.asked.scene,
+            "scene": one.target.scene,
         }
         | {"error": one.error}
-        | {"size": one.size, "vertices": one.vertices, "horizon": one.asked.goal.horizon, "asked": one.asked.error}
-        | {"solver": one.way, "estimated": one.estimated, "cpu_seconds": one.seconds, "against": one.other}
+        | {"size": one.size, "vertices": one.vertices, "horizon": one.target.target.horizon, "asked": one.target.error}
+        | {"solver": one.method, "estimated": one.error_estimated, "cpu_seconds": one.seconds, "against": one.baseline}
         | {
-            "against_error": one.other_error if isfinite(one.other_error) else None,
-            "against_seconds": one.other_seconds,
-            "wanted": one.asked.goal.wanted,
+            "against_error": one.baseline_error if isfinite(one.baseline_error) else None,
+            "against_seconds": one.baseline_seconds,
+            "wanted": one.target.target.wanted,
         }
         for one in found
     ]
-    rows.write(folder / "accuracy" / "goals.parquet", written, SCHEMA)
-    out().print(narrow(table))
-    say(f"rows are in {folder / 'accuracy'}")
-    raise typer.Exit(0 if all(one.holds for one in found) else 1)
+    rows.write_rows(folder / "accuracy" / "goals.parquet", written, ACCURACY_SCHEMA)
+    get_output_console().print(split_wide_table(table))
+    print_message(f"rows are in {folder / 'accuracy'}")
+    raise typer.Exit(0 if all(one.is_met for one in found) else 1)
 
 
-def _part(ratio: float, *, at_most: bool = False) -> str:
+def _format_ratio(ratio: float, *, is_upper_bound: bool = False) -> str:
     """Format a ratio of costs."""
     told = f"1/{1 / ratio:.3g}" if ratio < 1.0 else f"{ratio:.3g}"
-    return f"at most {told}" if at_most else told
+    return f"at most {told}" if is_upper_bound else told

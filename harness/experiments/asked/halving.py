@@ -16,15 +16,15 @@ from time import perf_counter
 import numpy as np
 
 from harness.scenes.bind import Scene
-from harness.simulation.step import prepare, simulate, start
-from solvers.methods.newton import Newton
+from harness.simulation.step import build_initial_state, prepare, simulate_scene
+from solvers.methods.newton import NewtonSolver
 from solvers.problem import Positions, StopRule
 
-_SOLVED = StopRule(50, 1e-6)
+_CONVERGED_STOP_RULE = StopRule(50, 1e-6)
 
 
 @dataclass(frozen=True, slots=True)
-class Halved:
+class StepDoublingEstimate:
     """Step-doubling estimate.
 
     Attributes:
@@ -32,16 +32,18 @@ class Halved:
         relative_change: change of the end positions by that, relative to the displacement; None if time ran out first.
     """
 
-    step: float
-    moved: float | None
+    time_step: float
+    relative_change: float | None
 
     def __str__(self) -> str:
-        if self.moved is None:
-            return f"steps of {self.step:.3g} s alone take longer than is spent on saying what can be had"
-        return f"what can be had: steps of {self.step:.3g} s end within {self.moved:.1g} of where steps half as long do"
+        if self.relative_change is None:
+            return f"steps of {self.time_step:.3g} s alone take longer than is spent on saying what can be had"
+        return f"what can be had: steps of {self.time_step:.3g} s end within {self.relative_change:.1g} of where steps half as long do"
 
 
-def halved(bound: Callable[[float, str], Scene], horizon: float, frames: int, *, seconds: float) -> Halved:
+def estimate_by_step_doubling(
+    build_scene: Callable[[float, str], Scene], t_end: float, frames: int, *, time_budget: float
+) -> StepDoublingEstimate:
     """Halve the step size within a time budget, and return the last change.
 
     Args:
@@ -50,24 +52,26 @@ def halved(bound: Callable[[float, str], Scene], horizon: float, frames: int, *,
         frames: number of steps to start with.
         time_budget: wall time [s].
     """
-    _end(bound(horizon / frames, "implicit-euler"), 1, inf)  # compiles
-    began, before, found = perf_counter(), None, Halved(horizon / frames, None)
+    _simulate_to_end(build_scene(t_end / frames, "implicit-euler"), 1, inf)  # compiles
+    began, before, found = perf_counter(), None, StepDoublingEstimate(t_end / frames, None)
     while True:
-        scene = bound(horizon / frames, "implicit-euler")
-        end = _end(scene, frames, began + seconds)
+        scene = build_scene(t_end / frames, "implicit-euler")
+        end = _simulate_to_end(scene, frames, began + time_budget)
         if end is None:
             return found
         if before is not None:
-            free, first = scene.system.free, start(scene).now.positions
+            free, first = scene.system.free_vertices, build_initial_state(scene).motion.positions
             away, moved = (float(np.linalg.norm((end - other)[free])) for other in (before, first))
-            found = Halved(2.0 * horizon / frames, away / moved if moved else 0.0)
+            found = StepDoublingEstimate(2.0 * t_end / frames, away / moved if moved else 0.0)
         before, frames = end, 2 * frames
 
 
-def _end(scene: Scene, frames: int, until: float) -> Positions | None:
+def _simulate_to_end(scene: Scene, frames: int, deadline: float) -> Positions | None:
     """Return the positions at the end of the motion; None after the deadline."""
-    for step in simulate(scene, prepare(scene, Newton()), _SOLVED, first_guess="current", frames=frames):
-        if perf_counter() > until:
+    for step in simulate_scene(
+        scene, prepare(scene, NewtonSolver()), _CONVERGED_STOP_RULE, initial_guess="current", frames=frames
+    ):
+        if perf_counter() > deadline:
             return None
         if step.index == frames:
             return step.positions

@@ -18,28 +18,28 @@ from time import thread_time
 import numpy as np
 
 from harness.base.errors import RunFailed
-from harness.config.goals import Goal, OneGoal
-from harness.experiments.asked.peers import peers
-from harness.experiments.asked.search import Answer
-from harness.experiments.asked.ways import Asked
-from harness.simulation.algebraic import Stop, stop_rule
-from harness.simulation.step import prepare, simulate
+from harness.config.goals import PerformanceTarget, TargetCase
+from harness.experiments.asked.peers import compare_third_party
+from harness.experiments.asked.search import SearchResult
+from harness.experiments.asked.ways import ErrorTarget
+from harness.simulation.algebraic import StopCriterion, build_stop_rule
+from harness.simulation.step import prepare, simulate_scene
 from solvers.problem import NotPositiveDefinite, Positions, Solver, Unsupported
-from solvers.registry import EVERY, about, load
+from solvers.registry import SOLVER_TABLE, find_solver_info, load_target
 
-LONGEST = 20.0
+MAX_SIMULATION_SECONDS = 20.0
 """CPU time limit of one simulation [s]."""
-_SHORTENED = 40
+_MAX_REFINEMENTS = 40
 """Largest number of divisions of the step size by sqrt(2), by a factor of 10^6 in total; the time limit comes first."""
-_PATIENCE = 1.5
+_TIME_FACTOR = 1.5
 """Time limit of a combination as a multiple of the cheapest time so far."""
 
-Error = Callable[[Positions], float]
+ErrorFunction = Callable[[Positions], float]
 """Function that returns the relative error of end positions (n, 3) [m]."""
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class TargetBaseline:
     """Baseline of a performance target.
 
     Attributes:
@@ -53,25 +53,31 @@ class Held:
     name: str
     error: float
     seconds: float
-    bound: bool = False
-    again: Callable[[], float] | None = None
+    is_lower_bound: bool = False
+    rerun_timed: Callable[[], float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class _Fixed:
+class _FixedSteps:
     """Simulation with a fixed step size."""
 
     integrator: str
     solver: str
-    stop: Stop
-    ended: str
+    stop_rule: StopCriterion
+    stop_description: str
     frames: int
 
     def __str__(self) -> str:
-        return f"{self.integrator} with {self.solver}, {self.frames} steps{self.ended}"
+        return f"{self.integrator} with {self.solver}, {self.frames} steps{self.stop_description}"
 
 
-def held(one: OneGoal, asked: Asked, answer: Answer, error: Error, say: Callable[[str], None]) -> Held:
+def find_baseline(
+    performance_target: TargetCase,
+    error_target: ErrorTarget,
+    search_result: SearchResult,
+    error: ErrorFunction,
+    print_message: Callable[[str], None],
+) -> TargetBaseline:
     """Measure the baseline of a performance target.
 
     Args:
@@ -84,86 +90,112 @@ def held(one: OneGoal, asked: Asked, answer: Answer, error: Error, say: Callable
     Raises:
         RunFailed: no baseline can be measured.
     """
-    return _peer(one, asked, answer) if one.goal.peer else _steps(one, asked, error, say)
+    return (
+        _measure_third_party(performance_target, error_target, search_result)
+        if performance_target.target.peer
+        else _find_fixed_steps(performance_target, error_target, error, print_message)
+    )
 
 
-def _peer(one: OneGoal, asked: Asked, answer: Answer) -> Held:
-    (peer,) = peers(asked, one.error, answer, [one.goal.peer or ""])
+def _measure_third_party(
+    performance_target: TargetCase, error_target: ErrorTarget, search_result: SearchResult
+) -> TargetBaseline:
+    (peer,) = compare_third_party(
+        error_target, performance_target.error, search_result, [performance_target.target.peer or ""]
+    )
     if peer.reason:
         raise RunFailed(f"{peer.name}: {peer.reason}")
-    return Held(peer.name, peer.estimated, peer.processor)
+    return TargetBaseline(peer.name, peer.error_estimated, peer.cpu_seconds)
 
 
-def _steps(one: OneGoal, asked: Asked, error: Error, say: Callable[[str], None]) -> Held:
+def _find_fixed_steps(
+    performance_target: TargetCase,
+    error_target: ErrorTarget,
+    error: ErrorFunction,
+    print_message: Callable[[str], None],
+) -> TargetBaseline:
     """Return the cheapest fixed step size for the error, or a lower bound.
 
     The bound is the smallest of those on the cost.
     """
-    best, again, bounds = Held("", inf, inf), None, list[Held]()
-    for integrator, solver, tolerance in _choices(one.goal):
-        limit = min(LONGEST, _PATIENCE * best.seconds)
-        stop = stop_rule(one.goal.iterations, tolerance)
-        ended = f", tolerance {tolerance:g}" if tolerance else f", {one.goal.iterations} iterations"
+    best, again, bounds = TargetBaseline("", inf, inf), None, list[TargetBaseline]()
+    for integrator, solver, tolerance in _list_combinations(performance_target.target):
+        limit = min(MAX_SIMULATION_SECONDS, _TIME_FACTOR * best.seconds)
+        stop = build_stop_rule(performance_target.target.iterations, tolerance)
+        ended = f", tolerance {tolerance:g}" if tolerance else f", {performance_target.target.iterations} iterations"
         ended = "" if integrator == "own" else ended
         nearest = None
-        for k in range(_SHORTENED):
-            fixed = _Fixed(integrator, solver, stop, ended, round(asked.frames * sqrt(2.0) ** k))
+        for k in range(_MAX_REFINEMENTS):
+            fixed = _FixedSteps(integrator, solver, stop, ended, round(error_target.num_frames * sqrt(2.0) ** k))
             try:
-                found = _run(asked, error, fixed, limit)
+                found = _simulate_fixed_steps(error_target, error, fixed, limit)
             except (RunFailed, Unsupported, NotPositiveDefinite):
                 break
-            if found.error <= one.error:
+            if found.error <= performance_target.error:
                 if found.seconds < best.seconds:
                     best, again = found, fixed
                 break
-            if found.bound and limit == LONGEST:
-                bounds.append(_bound(fixed, found, nearest))
-            if found.bound:
+            if found.is_lower_bound and limit == MAX_SIMULATION_SECONDS:
+                bounds.append(_build_lower_bound(fixed, found, nearest))
+            if found.is_lower_bound:
                 break
             nearest = found
     if again is None:
         if not bounds:
-            raise RunFailed(f"no steps of one length keep to the error within {LONGEST:g} s of processor time")
+            raise RunFailed(
+                f"no steps of one length keep to the error within {MAX_SIMULATION_SECONDS:g} s of processor time"
+            )
         least = min(bounds, key=lambda bound: bound.seconds)
-        say(f"  held against {least.name}")
+        print_message(f"  held against {least.name}")
         return least
-    say(f"  held against {best.name}")
-    return replace(best, again=lambda: _run(asked, error, again, inf).seconds)
+    print_message(f"  held against {best.name}")
+    return replace(best, rerun_timed=lambda: _simulate_fixed_steps(error_target, error, again, inf).seconds)
 
 
-def _choices(goal: Goal) -> list[tuple[str, str, float | None]]:
+def _list_combinations(performance_target: PerformanceTarget) -> list[tuple[str, str, float | None]]:
     """Return the combinations of integrators, solvers and tolerances.
 
     Solvers with their own integrator come first, since they are the quickest to run; they are listed once, as `own`.
     """
-    alone = {name: about(load(EVERY[name]), name).own_steps for name in goal.solver}
-    every = goal.integrator or ()
-    own = [("own", solver, None) for solver in goal.solver if alone[solver] and "own" in every]
+    alone = {
+        name: find_solver_info(load_target(SOLVER_TABLE[name]), name).is_substepping
+        for name in performance_target.solver
+    }
+    every = performance_target.integrator or ()
+    own = [("own", solver, None) for solver in performance_target.solver if alone[solver] and "own" in every]
     others = [name for name in every if name != "own"]
-    rest = product(others, (solver for solver in goal.solver if not alone[solver]), goal.tolerance)
+    rest = product(
+        others, (solver for solver in performance_target.solver if not alone[solver]), performance_target.tolerance
+    )
     return [*own, *rest]
 
 
-def _bound(fixed: _Fixed, found: Held, nearest: Held | None) -> Held:
+def _build_lower_bound(
+    fixed_steps: _FixedSteps, trial: TargetBaseline, nearest: TargetBaseline | None
+) -> TargetBaseline:
     """Build the lower bound from steps that were still too long at the time limit."""
     reached = f"; {nearest.name} err by {nearest.error:.2g}" if nearest else ""
-    name = f"{fixed}, given up after {found.seconds:.3g} s{reached}"
-    return Held(name, nearest.error if nearest else inf, found.seconds, bound=True)
+    name = f"{fixed_steps}, given up after {trial.seconds:.3g} s{reached}"
+    return TargetBaseline(name, nearest.error if nearest else inf, trial.seconds, is_lower_bound=True)
 
 
-def _run(asked: Asked, error: Error, fixed: _Fixed, limit: float) -> Held:
+def _simulate_fixed_steps(
+    error_target: ErrorTarget, error: ErrorFunction, fixed_steps: _FixedSteps, time_limit: float
+) -> TargetBaseline:
     """Simulate with a fixed step size; the simulation ends early beyond a time limit [s]."""
-    scene = asked.bound(asked.horizon / fixed.frames, fixed.integrator)
-    made: Solver = load(EVERY[fixed.solver])()
-    guess = asked.scene.guess(fixed.integrator)
-    warm = simulate(scene, prepare(scene, made), fixed.stop, first_guess=guess, frames=1)
+    scene = error_target.build_scene(error_target.t_end / fixed_steps.frames, fixed_steps.integrator)
+    made: Solver = load_target(SOLVER_TABLE[fixed_steps.solver])()
+    guess = error_target.scene.choose_initial_guess(fixed_steps.integrator)
+    warm = simulate_scene(scene, prepare(scene, made), fixed_steps.stop_rule, initial_guess=guess, frames=1)
     next(warm)  # compiles
-    began, p = thread_time(), scene.mesh.rest
-    for step in simulate(scene, prepare(scene, made), fixed.stop, first_guess=guess, frames=fixed.frames):
+    began, p = thread_time(), scene.mesh.rest_positions
+    for step in simulate_scene(
+        scene, prepare(scene, made), fixed_steps.stop_rule, initial_guess=guess, frames=fixed_steps.frames
+    ):
         p = step.positions
         if not np.isfinite(p).all():
             break
-        if thread_time() - began > limit and step.index < fixed.frames:
-            return Held(str(fixed), inf, thread_time() - began, bound=True)
+        if thread_time() - began > time_limit and step.index < fixed_steps.frames:
+            return TargetBaseline(str(fixed_steps), inf, thread_time() - began, is_lower_bound=True)
     found = error(p) if np.isfinite(p).all() else inf
-    return Held(str(fixed), found, thread_time() - began)
+    return TargetBaseline(str(fixed_steps), found, thread_time() - began)

@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 
 from harness.base.errors import RunFailed
-from harness.base.quantities import ms_per_step
-from harness.base.worker import Tick
+from harness.base.quantities import compute_ms_per_step
+from harness.base.worker import ProgressCallback
 from harness.config.sweep import RunSpec
-from harness.experiments.asked.search import Answer, foresee, search
-from harness.experiments.asked.ways import Asked, tried_by
+from harness.experiments.asked.search import SearchResult, compute_predictability_horizon, search_cheapest_method
+from harness.experiments.asked.ways import ErrorTarget, list_methods_of_solver
 from harness.scenes.bind import Scene
-from harness.simulation.controlled import Path
-from harness.simulation.measure import digest
-from harness.simulation.observe import intersections, strain_of
+from harness.simulation.controlled import Trajectory
+from harness.simulation.measure import hash_positions
+from harness.simulation.observe import compute_strain_columns, count_intersections
 from solvers.problem import Positions
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Kept:
+class ErrorControlledRun:
     """Result of an error-controlled run.
 
     Attributes:
@@ -36,52 +36,62 @@ class Kept:
     """
 
     scene: Scene
-    answer: Answer
-    asked: float
-    rounds: tuple[Path, ...]
-    said: list[str] = field(default_factory=list[str])
+    search_result: SearchResult
+    error_requested: float
+    timed_trajectories: tuple[Trajectory, ...]
+    messages: list[str] = field(default_factory=list[str])
 
     @property
     def positions(self) -> Positions:
         """Positions at the start and after each frame, (frames + 1, n, 3) [m]."""
-        return self.rounds[0].positions
+        return self.timed_trajectories[0].positions
 
     @property
     def ms_per_step(self) -> float:
         """Time per step [ms], where each frame counts as one step."""
-        return ms_per_step([seconds for path in self.rounds for seconds in path.frames])
+        return compute_ms_per_step([seconds for path in self.timed_trajectories for seconds in path.frame_seconds])
 
     def rows(self) -> list[dict[str, Any]]:
         """Build a row for each frame of each round."""
-        best, scene = self.answer.best, self.scene
+        best, scene = self.search_result.best_trial, self.scene
         shared = {
             "phase": "step",
             "status": "ok",
-            "reason": self.answer.note or None,
-            "vertices": scene.system.vertices,
-            "springs": len(scene.springs.edges),
+            "reason": self.search_result.note or None,
+            "vertices": scene.system.num_vertices,
+            "springs": len(scene.all_springs.edges),
             "max_iterations": None,
             "first_guess": None,
-            "asked": self.asked,
+            "asked": self.error_requested,
             **best.columns,
-            "estimate_seconds": self.answer.seconds,
-            "choice": "; ".join([f"{best.way} of {len(self.answer.tried)} ways", *self.said]),
+            "estimate_seconds": self.search_result.search_seconds,
+            "choice": "; ".join([f"{best.method} of {len(self.search_result.trials)} ways", *self.messages]),
         }
-        seen = [self._seen(k, p) for k, p in enumerate(self.positions) if k]
+        seen = [self._build_frame_columns(k, p) for k, p in enumerate(self.positions) if k]
         return [
             shared
             | columns
-            | {"round": number, "seconds": seconds, "pass_seconds": one.seconds, "summed_seconds": sum(one.frames)}
-            for number, one in enumerate(self.rounds)
-            for columns, seconds in zip(seen, one.frames, strict=True)
+            | {
+                "round": number,
+                "seconds": seconds,
+                "pass_seconds": one.wall_seconds,
+                "summed_seconds": sum(one.frame_seconds),
+            }
+            for number, one in enumerate(self.timed_trajectories)
+            for columns, seconds in zip(seen, one.frame_seconds, strict=True)
         ]
 
-    def _seen(self, frame: int, p: Positions) -> dict[str, Any]:
-        crossed = intersections(self.scene, p, self.scene.time(frame))
-        return {"frame": frame, **strain_of(self.scene, p), "intersections": crossed, "digest": digest(p)}
+    def _build_frame_columns(self, frame: int, p: Positions) -> dict[str, Any]:
+        crossed = count_intersections(self.scene, p, self.scene.compute_time(frame))
+        return {
+            "frame": frame,
+            **compute_strain_columns(self.scene, p),
+            "intersections": crossed,
+            "digest": hash_positions(p),
+        }
 
 
-def keep_to_error(run: RunSpec, error: float, tick: Tick) -> Kept:
+def run_error_controlled(run: RunSpec, error: float, tick: ProgressCallback) -> ErrorControlledRun:
     """Find the cheapest method of the run's solver, and repeat it.
 
     It is repeated for all rounds of the run.
@@ -95,16 +105,22 @@ def keep_to_error(run: RunSpec, error: float, tick: Tick) -> Kept:
         RunFailed: no setting reaches the error, or a round ends at positions that are not bitwise identical.
         Unsupported: the solver does not support error control. Errors of the solver are raised unchanged.
     """
-    pairs = tried_by(run.solver)
-    asked = Asked.of(run.scene, run.size, run.frames * run.scene.time_step)
+    pairs = list_methods_of_solver(run.solver)
+    asked = ErrorTarget.from_scene(run.scene, run.size, run.frames * run.scene.time_step)
     said = list[str]()
     tick("choosing steps")
-    answer = search(asked, error, foresee(asked, error, said.append), lambda line: tick("choosing steps"), pairs)
-    best, rounds = answer.best, list[Path]()
+    answer = search_cheapest_method(
+        asked,
+        error,
+        compute_predictability_horizon(asked, error, said.append),
+        lambda line: tick("choosing steps"),
+        pairs,
+    )
+    best, rounds = answer.best_trial, list[Trajectory]()
     for _ in range(run.rounds):
-        rounds.append(best.again())
-        if not np.array_equal(rounds[-1].positions, best.path.positions):
+        rounds.append(best.rerun_trial())
+        if not np.array_equal(rounds[-1].positions, best.trajectory.positions):
             raise RunFailed("a round ended at other positions than the one before")
         for _ in range(run.frames):
             tick("timed pass")
-    return Kept(asked.bound(asked.frame, "own"), answer, error, tuple(rounds), said)
+    return ErrorControlledRun(asked.build_scene(asked.frame_seconds, "own"), answer, error, tuple(rounds), said)

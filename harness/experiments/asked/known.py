@@ -13,37 +13,43 @@ from typing import Any
 
 from harness.base import machine, rows, shelf
 from harness.config.sweep import SolverSpec
-from harness.experiments.accuracy.accuracy_rows import SCHEMA
-from harness.experiments.asked.search import Answer
-from harness.experiments.asked.ways import Asked, tried
+from harness.experiments.accuracy.accuracy_rows import ACCURACY_SCHEMA
+from harness.experiments.asked.search import SearchResult
+from harness.experiments.asked.ways import ErrorTarget, list_candidate_methods
 
-Row = dict[str, Any]
+ResultRow = dict[str, Any]
 
-_FAR = 10.0
+_MAX_ERROR_RATIO = 10.0
 """Largest ratio of two errors for which a stored prediction is used; for others it has little value."""
-_DEAR = 2.0
+_MAX_COST_RATIO = 2.0
 """Largest ratio to the smallest predicted cost of a method that is run again; predictions are no more accurate than
 that.
 """
 
 
-def problem(asked: Asked) -> str:
+def format_problem_id(error_target: ErrorTarget) -> str:
     """Return an identifier of the simulated problem, including its frames."""
-    return f"{asked.scene.stepped(1.0).digest[:12]}-{asked.size}-{asked.horizon:.9g}-{asked.frames}"
+    return f"{error_target.scene.with_time_step(1.0).scene_digest[:12]}-{error_target.size}-{error_target.t_end:.9g}-{error_target.num_frames}"
 
 
-def known(folder: Path, asked: Asked) -> list[Row]:
+def read_stored_trials(folder: Path, error_target: ErrorTarget) -> list[ResultRow]:
     """Return the stored trials of this motion in a folder of rows.
 
     They are of the same source code and machine.
     """
-    here = {"problem": problem(asked), "machine": machine.describe().id, "code": machine.code_hash()}
-    units = [unit for unit in shelf.units(folder) if "-asked-" in unit.name]
-    found = rows.read(units, SCHEMA).to_pylist() if units else []
+    here = {
+        "problem": format_problem_id(error_target),
+        "machine": machine.describe_machine().machine_id,
+        "code": machine.hash_sources(),
+    }
+    units = [unit for unit in shelf.list_units(folder) if "-asked-" in unit.name]
+    found = rows.read_rows(units, ACCURACY_SCHEMA).to_pylist() if units else []
     return [row for row in found if row["kind"] == "way" and here.items() <= row.items()]
 
 
-def promising(found: Sequence[Row], error: float) -> tuple[float, list[tuple[str, SolverSpec]]]:
+def select_promising_methods(
+    stored_trials: Sequence[ResultRow], error: float
+) -> tuple[float, list[tuple[str, SolverSpec]]]:
     """Return the stored error nearest to `error`, and the methods cheap at it.
 
     Args:
@@ -52,16 +58,18 @@ def promising(found: Sequence[Row], error: float) -> tuple[float, list[tuple[str
 
     Returns: the nearest error, and integrators with solvers; none where no stored error is similar.
     """
-    nearest = min((row["asked"] for row in found), key=lambda asked: abs(log(asked / error)), default=0.0)
-    if not error / _FAR <= nearest <= error * _FAR:
+    nearest = min((row["asked"] for row in stored_trials), key=lambda asked: abs(log(asked / error)), default=0.0)
+    if not error / _MAX_ERROR_RATIO <= nearest <= error * _MAX_ERROR_RATIO:
         return nearest, []
-    there = [row for row in found if row["asked"] == nearest]
-    most = _DEAR * min(row["promised"] for row in there)
+    there = [row for row in stored_trials if row["asked"] == nearest]
+    most = _MAX_COST_RATIO * min(row["promised"] for row in there)
     cheap = {(row["integrator"], row["solver"]) for row in there if row["promised"] <= most}
-    return nearest, [(integrator, solver) for integrator, solver in tried() if (integrator, solver.name) in cheap]
+    return nearest, [
+        (integrator, solver) for integrator, solver in list_candidate_methods() if (integrator, solver.name) in cheap
+    ]
 
 
-def way_rows(answer: Answer, found: Iterable[Row], error: float) -> list[Row]:
+def build_trial_rows(search_result: SearchResult, stored_trials: Iterable[ResultRow], error: float) -> list[ResultRow]:
     """Build the rows of the trials of a search.
 
     Stored trials of the same error are added.
@@ -77,14 +85,14 @@ def way_rows(answer: Answer, found: Iterable[Row], error: float) -> list[Row]:
             "status": "ok",
             "parameters": "{}",
             "promised": promised,
-            "solver": one.way.solver,
+            "solver": one.method.solver,
             **one.columns,
-            "iterations_done": one.path.iterations,
-            "seconds": [one.path.seconds],
-            "cpu_seconds": one.path.processor,
+            "iterations_done": one.trajectory.num_iterations,
+            "seconds": [one.trajectory.wall_seconds],
+            "cpu_seconds": one.trajectory.cpu_seconds,
         }
-        for one, promised in answer.tried
+        for one, promised in search_result.trials
     ]
     again = {(row["integrator"], row["solver"]) for row in made}
-    kept = [row for row in found if row["asked"] == error and (row["integrator"], row["solver"]) not in again]
+    kept = [row for row in stored_trials if row["asked"] == error and (row["integrator"], row["solver"]) not in again]
     return [*made, *kept]

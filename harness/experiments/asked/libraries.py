@@ -18,11 +18,11 @@ from scipy.integrate import solve_ivp
 from scipy.sparse import block_array, csr_array, eye_array, kron
 
 from harness.base.errors import RunFailed
-from harness.reference.motion import State
+from harness.reference.motion import OdeState
 from harness.scenes.bind import Scene
-from solvers.problem import Start, is_lagged
+from solvers.problem import StepStart, is_lagged
 
-_STEPS = 10**8
+_MAX_CVODE_STEPS = 10**8
 """Largest number of steps of CVODE; in practice the time limit ends it first."""
 
 
@@ -38,16 +38,16 @@ class InitialValueProblem(NamedTuple):
         atol: absolute tolerance of y [m, m/s].
     """
 
-    field: Callable[[float, State], State]
-    start: State
+    vector_field: Callable[[float, OdeState], OdeState]
+    initial_state: OdeState
     scene: Scene
-    until: float
-    relative: float
-    absolute: float
+    t_end: float
+    rtol: float
+    atol: float
 
 
 @dataclass(frozen=True, slots=True)
-class Library:
+class ThirdPartyIntegrator:
     """Integrator of another library.
 
     Attributes:
@@ -59,25 +59,27 @@ class Library:
     """
 
     order: int
-    end: Callable[[InitialValueProblem], State]
-    compiled: bool = True
+    integrate_to_end: Callable[[InitialValueProblem], OdeState]
+    uses_compiled_forces: bool = True
     module: str = ""
-    extra: str = ""
+    pip_extra: str = ""
 
     @property
-    def missing(self) -> str:
+    def missing_reason(self) -> str:
         """How to install the module if it is missing; empty otherwise."""
         if not self.module or find_spec(self.module):
             return ""
-        return f"is not installed; `.venv/bin/pip install -e '.[{self.extra}]'` in the checkout installs it"
+        return f"is not installed; `.venv/bin/pip install -e '.[{self.pip_extra}]'` in the checkout installs it"
 
 
-def _scipy(method: str) -> Callable[[InitialValueProblem], State]:
-    def end(motion: InitialValueProblem) -> State:
+def _build_scipy_integrator(method: str) -> Callable[[InitialValueProblem], OdeState]:
+    def end(motion: InitialValueProblem) -> OdeState:
         solve: Any = solve_ivp  # its stubs say little of what it answers
-        more: dict[str, Any] = {"jac_sparsity": pattern(motion.scene)} if method in ("Radau", "BDF") else {}
-        more |= {"rtol": motion.relative, "atol": motion.absolute}
-        solved = solve(motion.field, (0.0, motion.until), motion.start, method, **more)
+        more: dict[str, Any] = (
+            {"jac_sparsity": build_jacobian_sparsity(motion.scene)} if method in ("Radau", "BDF") else {}
+        )
+        more |= {"rtol": motion.rtol, "atol": motion.atol}
+        solved = solve(motion.vector_field, (0.0, motion.t_end), motion.initial_state, method, **more)
         if not solved.success:
             raise RunFailed(str(solved.message))
         return solved.y[:, -1]
@@ -85,18 +87,18 @@ def _scipy(method: str) -> Callable[[InitialValueProblem], State]:
     return end
 
 
-def _cvode(method: str) -> Callable[[InitialValueProblem], State]:
-    def end(motion: InitialValueProblem) -> State:
-        def rate(t: float, y: State, out: State) -> None:
-            out[:] = motion.field(t, y)
+def _build_cvode_integrator(method: str) -> Callable[[InitialValueProblem], OdeState]:
+    def end(motion: InitialValueProblem) -> OdeState:
+        def rate(t: float, y: OdeState, out: OdeState) -> None:
+            out[:] = motion.vector_field(t, y)
 
         linear: dict[str, Any] = {"linsolver": "gmres"}
         if method == "BDF":
-            linear = {"linsolver": "sparse", "sparsity": pattern(motion.scene)}
+            linear = {"linsolver": "sparse", "sparsity": build_jacobian_sparsity(motion.scene)}
         made: Any = import_module("sksundae.cvode").CVODE(
-            rate, method=method, rtol=motion.relative, atol=motion.absolute, max_num_steps=_STEPS, **linear
+            rate, method=method, rtol=motion.rtol, atol=motion.atol, max_num_steps=_MAX_CVODE_STEPS, **linear
         )
-        solved = made.solve(np.array([0.0, motion.until]), motion.start)
+        solved = made.solve(np.array([0.0, motion.t_end]), motion.initial_state)
         if not solved.success:
             raise RunFailed(str(solved.message))
         return solved.y[-1]
@@ -104,32 +106,32 @@ def _cvode(method: str) -> Callable[[InitialValueProblem], State]:
     return end
 
 
-_SUNDIALS: dict[str, Any] = {"module": "sksundae", "extra": "sundials"}
-LIBRARIES = {
-    "scipy-dop853": Library(8, _scipy("DOP853")),
-    "scipy-dop853-numpy": Library(8, _scipy("DOP853"), compiled=False),
-    "scipy-rk45": Library(5, _scipy("RK45")),
-    "scipy-lsoda": Library(5, _scipy("LSODA")),
-    "scipy-bdf": Library(3, _scipy("BDF")),
-    "scipy-radau": Library(5, _scipy("Radau")),
-    "cvode-adams": Library(5, _cvode("Adams"), **_SUNDIALS),
-    "cvode-bdf": Library(3, _cvode("BDF"), **_SUNDIALS),
+_SUNDIALS_REQUIREMENT: dict[str, Any] = {"module": "sksundae", "extra": "sundials"}
+THIRD_PARTY_INTEGRATORS = {
+    "scipy-dop853": ThirdPartyIntegrator(8, _build_scipy_integrator("DOP853")),
+    "scipy-dop853-numpy": ThirdPartyIntegrator(8, _build_scipy_integrator("DOP853"), uses_compiled_forces=False),
+    "scipy-rk45": ThirdPartyIntegrator(5, _build_scipy_integrator("RK45")),
+    "scipy-lsoda": ThirdPartyIntegrator(5, _build_scipy_integrator("LSODA")),
+    "scipy-bdf": ThirdPartyIntegrator(3, _build_scipy_integrator("BDF")),
+    "scipy-radau": ThirdPartyIntegrator(5, _build_scipy_integrator("Radau")),
+    "cvode-adams": ThirdPartyIntegrator(5, _build_cvode_integrator("Adams"), **_SUNDIALS_REQUIREMENT),
+    "cvode-bdf": ThirdPartyIntegrator(3, _build_cvode_integrator("BDF"), **_SUNDIALS_REQUIREMENT),
 }
 """Third-party integrators by the names of their rows."""
 
 
-def pattern(scene: Scene) -> csr_array:
+def build_jacobian_sparsity(scene: Scene) -> csr_array:
     """Return the sparsity pattern of F's Jacobian, (6 f, 6 f).
 
     An entry is 1 where the Jacobian may differ from zero.
     """
-    system, p = scene.system, scene.mesh.rest
-    begun = Start(p, np.zeros_like(p), 0.0, p, system.rate, 0.0)
-    n = 3 * system.vertices
+    system, p = scene.system, scene.mesh.rest_positions
+    begun = StepStart(p, np.zeros_like(p), 0.0, p, system.velocity_rate, 0.0)
+    n = 3 * system.num_vertices
     begins = (energy.begin_step(begun) if is_lagged(energy) else energy for energy in system.energies)
     all_of_them = sum((abs(energy.hessian(p)) for energy in begins), csr_array((n, n)))
-    whole = kron(eye_array(system.vertices), np.ones((1, 3)))  # a vertex couples with all of its coordinates
-    vertices = csr_array(csr_array(whole @ all_of_them @ whole.T)[system.free])[:, system.free]
-    coupled = csr_array(kron(vertices + eye_array(len(system.free)), np.ones((3, 3))))
+    whole = kron(eye_array(system.num_vertices), np.ones((1, 3)))  # a vertex couples with all of its coordinates
+    vertices = csr_array(csr_array(whole @ all_of_them @ whole.T)[system.free_vertices])[:, system.free_vertices]
+    coupled = csr_array(kron(vertices + eye_array(len(system.free_vertices)), np.ones((3, 3))))
     coupled.data[:] = 1.0
     return csr_array(block_array([[None, eye_array(coupled.shape[0])], [coupled, coupled]]))

@@ -13,21 +13,21 @@ from math import inf
 from time import perf_counter, thread_time
 
 from harness.base.errors import RunFailed
-from harness.experiments.asked.libraries import LIBRARIES, InitialValueProblem
-from harness.experiments.asked.search import AIM, Answer
-from harness.experiments.asked.ways import Asked
-from harness.reference.motion import Field, State
+from harness.experiments.asked.libraries import THIRD_PARTY_INTEGRATORS, InitialValueProblem
+from harness.experiments.asked.search import ERROR_AIM, SearchResult
+from harness.experiments.asked.ways import ErrorTarget
+from harness.reference.motion import OdeField, OdeState
 from harness.scenes.bind import Scene
-from harness.simulation.controlled import TooSlow
+from harness.simulation.controlled import TimeBudgetExceeded
 
-MOST = 5.0
+MAX_INTEGRATION_SECONDS = 5.0
 """CPU time limit of an integrator for one motion [s]."""
-_TRIES, _NEAR = 5, 0.2
+_MAX_TOLERANCES, _MIN_ERROR_FRACTION = 5, 0.2
 """Largest number of tolerances per integrator; fraction of the target error that ends the adjustment."""
 
 
 @dataclass(frozen=True, slots=True)
-class Peer:
+class ThirdPartyResult:
     """Result of a third-party integrator.
 
     Attributes:
@@ -40,15 +40,17 @@ class Peer:
     """
 
     name: str
-    estimated: float
-    seconds: float
-    ratio: float
+    error_estimated: float
+    wall_seconds: float
+    cpu_time_ratio: float
     reason: str = ""
-    processor: float = inf
+    cpu_seconds: float = inf
     """CPU time [s]."""
 
 
-def peers(asked: Asked, error: float, answer: Answer, names: Iterable[str] = LIBRARIES) -> Iterator[Peer]:
+def compare_third_party(
+    error_target: ErrorTarget, error: float, search_result: SearchResult, names: Iterable[str] = THIRD_PARTY_INTEGRATORS
+) -> Iterator[ThirdPartyResult]:
     """Measure third-party integrators one after the other; a failure is reported as `reason`.
 
     Args:
@@ -60,78 +62,88 @@ def peers(asked: Asked, error: float, answer: Answer, names: Iterable[str] = LIB
     Raises:
         Unintegrable: the scene has no equations of motion.
     """
-    scene = asked.bound(asked.frame, "newmark")
-    fields = {compiled: Field(scene, compiled=compiled) for compiled in (True, False)}
-    fields[True].witness()  # compiles
+    scene = error_target.build_scene(error_target.frame_seconds, "newmark")
+    fields = {compiled: OdeField(scene, compiled=compiled) for compiled in (True, False)}
+    fields[True].evaluate_fingerprint()  # compiles
     began = thread_time()
-    answer.best.again()
-    beside = _Beside(asked, error, answer, scene, fields, thread_time() - began)
-    yield from map(beside.peer, names)
+    search_result.best_trial.rerun_trial()
+    beside = _ThirdPartyComparison(error_target, error, search_result, scene, fields, thread_time() - began)
+    yield from map(beside.measure_integrator, names)
 
 
 @dataclass(frozen=True, eq=False)
-class _Beside:
+class _ThirdPartyComparison:
     """Comparison of one search result; `own_cpu_seconds` is the CPU time of its best trial."""
 
-    asked: Asked
+    error_target: ErrorTarget
     error: float
-    answer: Answer
+    search_result: SearchResult
     scene: Scene
-    fields: dict[bool, Field]
-    ours: float
+    vector_fields: dict[bool, OdeField]
+    own_cpu_seconds: float
 
-    def peer(self, name: str) -> Peer:
+    def measure_integrator(self, name: str) -> ThirdPartyResult:
         """Measure one integrator.
 
         Its tolerance is adjusted until the error is below the target, but not far below.
 
         Where no tolerance does both, the cheapest one that meets the error counts.
         """
-        order, tolerance = LIBRARIES[name].order, 0.2 * self.answer.tolerance
-        if missing := LIBRARIES[name].missing:
-            return Peer(name, inf, inf, inf, missing)
-        found = Peer(name, inf, inf, inf, "its error does not come down to the one asked")
-        for _ in range(_TRIES):
-            one = self._tried(name, tolerance)
+        order, tolerance = THIRD_PARTY_INTEGRATORS[name].order, 0.2 * self.search_result.step_atol
+        if missing := THIRD_PARTY_INTEGRATORS[name].missing_reason:
+            return ThirdPartyResult(name, inf, inf, inf, missing)
+        found = ThirdPartyResult(name, inf, inf, inf, "its error does not come down to the one asked")
+        for _ in range(_MAX_TOLERANCES):
+            one = self._integrate_at_tolerance(name, tolerance)
             if one.reason:
                 return one if found.reason else found
-            if one.estimated <= self.error and one.ratio < found.ratio:
+            if one.error_estimated <= self.error and one.cpu_time_ratio < found.cpu_time_ratio:
                 found = one
-            if found.reason == "" and one.estimated >= _NEAR * self.error:
+            if found.reason == "" and one.error_estimated >= _MIN_ERROR_FRACTION * self.error:
                 return found
-            aim = AIM * self.error / max(one.estimated, 1e-15)
+            aim = ERROR_AIM * self.error / max(one.error_estimated, 1e-15)
             tolerance *= min(1e3, max(1e-3, aim ** ((order + 1.0) / order)))
         return found
 
-    def _tried(self, name: str, tolerance: float) -> Peer:
+    def _integrate_at_tolerance(self, name: str, step_atol: float) -> ThirdPartyResult:
         """Integrate at one tolerance [m]."""
-        library, free, size = LIBRARIES[name], self.scene.system.free, self.scene.mesh.size or 1.0
-        field = self.fields[library.compiled]
+        library, free, size = (
+            THIRD_PARTY_INTEGRATORS[name],
+            self.scene.system.free_vertices,
+            self.scene.mesh.bounding_box_diagonal or 1.0,
+        )
+        field = self.vector_fields[library.uses_compiled_forces]
         began, cpu = perf_counter(), thread_time()
-        limited = _limited(field, cpu + MOST)
+        limited = _limit_cpu_time(field, cpu + MAX_INTEGRATION_SECONDS)
         motion = InitialValueProblem(
-            limited, field.start, self.scene, self.asked.horizon, max(tolerance / size, 1e-13), tolerance
+            limited, field.initial_state, self.scene, self.error_target.t_end, max(step_atol / size, 1e-13), step_atol
         )
         try:
-            end = library.end(motion)
-        except TooSlow:
-            return Peer(name, inf, inf, inf, f"takes more than {MOST:g} s")
+            end = library.integrate_to_end(motion)
+        except TimeBudgetExceeded:
+            return ThirdPartyResult(name, inf, inf, inf, f"takes more than {MAX_INTEGRATION_SECONDS:g} s")
         except RunFailed as failed:
-            return Peer(name, inf, inf, inf, str(failed))
+            return ThirdPartyResult(name, inf, inf, inf, str(failed))
         seconds, processor = perf_counter() - began, thread_time() - cpu
-        p, _ = field.motion(self.asked.horizon, end)
-        return Peer(name, self.answer.error(p, free), seconds, processor / self.ours, processor=processor)
+        p, _ = field.unpack_state(self.error_target.t_end, end)
+        return ThirdPartyResult(
+            name,
+            self.search_result.compute_error(p, free),
+            seconds,
+            processor / self.own_cpu_seconds,
+            cpu_seconds=processor,
+        )
 
 
-def _limited(field: Field, until: float) -> Callable[[float, State], State]:
+def _limit_cpu_time(vector_field: OdeField, deadline: float) -> Callable[[float, OdeState], OdeState]:
     """Return the vector field with a deadline on the CPU clock [s].
 
     It raises TooSlow afterwards.
     """
 
-    def rate(t: float, y: State) -> State:
-        if thread_time() > until:
-            raise TooSlow
-        return field(t, y)
+    def rate(t: float, y: OdeState) -> OdeState:
+        if thread_time() > deadline:
+            raise TimeBudgetExceeded
+        return vector_field(t, y)
 
     return rate

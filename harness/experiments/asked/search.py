@@ -22,43 +22,43 @@ from numpy.typing import NDArray
 
 from harness.base.errors import RunFailed
 from harness.config.sweep import SolverSpec
-from harness.experiments.asked.ways import Asked, Way, ways
-from harness.reference.growth import Growth, growth
-from harness.simulation.controlled import Path, Stuck, TooSlow
+from harness.experiments.asked.ways import ErrorTarget, Method, prepare_candidate_methods
+from harness.reference.growth import PerturbationGrowth, estimate_growth
+from harness.simulation.controlled import StepSizeUnderflow, TimeBudgetExceeded, Trajectory
 from solvers.problem import Positions
 
-AIM = 0.65
+ERROR_AIM = 0.65
 """Fraction of the target error at which a setting aims, because estimates scatter."""
-_AIM_EVEN = 0.85
+_ERROR_AIM_FIXED_STEPS = 0.85
 """The same fraction for fixed step sizes, whose error follows their order."""
-WIDE = 1 / 3
+MIN_ERROR_FRACTION = 1 / 3
 """Smallest fraction of the target error that is accepted if a cheaper setting is stable.
 
 Estimated errors are compared with ESTIMATE_SAFETY times this fraction.
 """
-CLOSER = 1 / 50
+REFERENCE_ERROR_FRACTION = 1 / 50
 """Local error of the reference trial, as a fraction of that of the trial."""
-DOUBT = 1.25
+ESTIMATE_SAFETY = 1.25
 """Safety factor on error estimates, because the reference trial has an error too.
 
 That error is a tenth of the estimate. It is a sixth where stability limits the step size, so that the reference trial
 has hardly shorter steps.
 """
-_FINER = 10.0
+_MIN_REFERENCE_REFINEMENT = 10.0
 """Factor of accuracy, by order and number of steps, above which a trial may serve as reference."""
-_MOVES, _STALLS, _CLOSINGS = 6, 2, 3
-_SHORT = 0.05
+_MAX_SETTING_CHANGES, _MAX_STALLS, _MAX_REFERENCE_TRIALS = 6, 2, 3
+_MIN_TIMED_SECONDS = 0.05
 """CPU time below which a trial is run twice, and the smaller time counts [s]."""
-_AT_FIRST, _PATIENCE = 1.0, 4.0
+_INITIAL_TIME_LIMIT, _TIME_LIMIT_FACTOR = 1.0, 4.0
 """First time limit of a method [s of CPU time]; factor on the limit if no method finishes, and on the cheapest time."""
-_DEAR = 2.0
+_MAX_COST_RATIO = 2.0
 """Factor on the predicted cost of the next method, above which that method is tried first."""
-_LEAST_ORDER = 0.5
+_MIN_ORDER = 0.5
 """Lower bound of measured orders; a method whose error decreases more slowly is given up."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class Trial:
     """Run of a method at one setting.
 
     Attributes:
@@ -70,36 +70,36 @@ class Found:
             it.
     """
 
-    way: Way
+    method: Method
     setting: float
-    path: Path
-    estimated: float
+    trajectory: Trajectory
+    error_estimated: float
     order: float
 
     @property
-    def tolerance(self) -> float | None:
+    def step_atol(self) -> float | None:
         """Tolerance on the local error [m]; None for fixed step sizes."""
-        return None if self.way.follower.even else self.setting
+        return None if self.method.stepper.has_fixed_step else self.setting
 
     @property
     def columns(self) -> dict[str, Any]:
         """Columns of this trial, common to several tables."""
         return {
-            "integrator": self.way.integrator,
-            "estimated": self.estimated,
-            "local_tolerance_m": self.tolerance,
-            "accepted": self.path.accepted,
-            "rejected": self.path.rejected,
-            "factorisations": self.path.factorisations,
+            "integrator": self.method.integrator,
+            "estimated": self.error_estimated,
+            "local_tolerance_m": self.step_atol,
+            "accepted": self.trajectory.num_accepted_steps,
+            "rejected": self.trajectory.num_rejected_steps,
+            "factorisations": self.trajectory.num_factorisations,
         }
 
-    def again(self) -> Path:
+    def rerun_trial(self) -> Trajectory:
         """Run the method again at the same setting."""
-        return self.way.follower.follow(self.setting)
+        return self.method.stepper.integrate_motion(self.setting)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Answer:
+class SearchResult:
     """Result of a search.
 
     Attributes:
@@ -111,24 +111,26 @@ class Answer:
         note: why the best trial is much more accurate than requested; empty otherwise.
     """
 
-    best: Found
-    tried: tuple[tuple[Found, float], ...]
-    tolerance: float
-    closer: Found
-    seconds: float
+    best_trial: Trial
+    trials: tuple[tuple[Trial, float], ...]
+    step_atol: float
+    reference_trial: Trial
+    search_seconds: float
     note: str
 
-    def error(self, p: Positions, free: NDArray[np.int64]) -> float:
+    def compute_error(self, p: Positions, free_vertices: NDArray[np.int64]) -> float:
         """Return the error of end positions p (n, 3) [m] against the reference trial.
 
         The error is relative to the displacement and taken over the free vertices.
         """
-        q = self.closer.path.positions
-        away, moved = (float(np.linalg.norm((x - q[-1])[free])) for x in (p, q[0]))
+        q = self.reference_trial.trajectory.positions
+        away, moved = (float(np.linalg.norm((x - q[-1])[free_vertices])) for x in (p, q[0]))
         return away / moved
 
 
-def foresee(asked: Asked, error: float, say: Callable[[str], None]) -> Growth:
+def compute_predictability_horizon(
+    error_target: ErrorTarget, max_error: float, print_message: Callable[[str], None]
+) -> PerturbationGrowth:
     """Compute how far ahead the motion is predictable.
 
     The smallest error that can be reached is printed.
@@ -141,22 +143,22 @@ def foresee(asked: Asked, error: float, say: Callable[[str], None]) -> Growth:
     Raises:
         Unpredictable: the error cannot be reached at t_end (the message states one that can), or nothing moves.
     """
-    seen = growth(asked.scene, asked.size, asked.horizon)
-    seen.require(error)
-    say(
-        f"a perturbation of 1e-12 of the size grows to {seen.grown[-1]:.1e} of the displacement after "
-        f"{asked.horizon:g} s: an error of {error:g} can be reached there, of {seen.least:.0e} at the least"
+    seen = estimate_growth(error_target.scene, error_target.size, error_target.t_end)
+    seen.require_predictable(max_error)
+    print_message(
+        f"a perturbation of 1e-12 of the size grows to {seen.growth_factor[-1]:.1e} of the displacement after "
+        f"{error_target.t_end:g} s: an error of {max_error:g} can be reached there, of {seen.min_error:.0e} at the least"
     )
     return seen
 
 
-def search(
-    asked: Asked,
-    error: float,
-    seen: Growth,
-    say: Callable[[str], None],
-    pairs: Sequence[tuple[str, SolverSpec]] = (),
-) -> Answer:
+def search_cheapest_method(
+    error_target: ErrorTarget,
+    max_error: float,
+    growth: PerturbationGrowth,
+    print_message: Callable[[str], None],
+    candidates: Sequence[tuple[str, SolverSpec]] = (),
+) -> SearchResult:
     """Find the cheapest method whose relative error at t_end is at most `max_error`.
 
     Args:
@@ -169,214 +171,262 @@ def search(
     Raises:
         RunFailed: no method reaches the error.
     """
-    return _Search(asked, error, seen, say).answer(pairs)
+    return _MethodSearch(error_target, max_error, growth, print_message).find_cheapest(candidates)
 
 
-class _Search:
-    def __init__(self, asked: Asked, error: float, seen: Growth, say: Callable[[str], None]) -> None:
-        self._asked, self._error, self._seen, self._say = asked, error, seen, say
-        self._free = asked.bound(asked.frame, "own").system.free
+class _MethodSearch:
+    def __init__(
+        self, error_target: ErrorTarget, error: float, growth: PerturbationGrowth, print_message: Callable[[str], None]
+    ) -> None:
+        self._error_target, self._max_error, self._growth, self._print_message = (
+            error_target,
+            error,
+            growth,
+            print_message,
+        )
+        self._free_vertices = error_target.build_scene(error_target.frame_seconds, "own").system.free_vertices
 
-    def answer(self, pairs: Sequence[tuple[str, SolverSpec]]) -> Answer:
-        self._say("ways to the error:")
-        tolerance = 0.2 * self._error * self._seen.scale
-        known = ways(self._asked, self._say, pairs)
+    def find_cheapest(self, candidates: Sequence[tuple[str, SolverSpec]]) -> SearchResult:
+        self._print_message("ways to the error:")
+        tolerance = 0.2 * self._max_error * self._growth.scale
+        known = prepare_candidate_methods(self._error_target, self._print_message, candidates)
         began = perf_counter()
-        raced = self._race(known, tolerance)
-        closer = self._closer(raced)
-        graded = sorted((self._measured(one, closer) for one in raced), key=self._promise)
+        raced = self._run_first_trials(known, tolerance)
+        closer = self._find_reference_trial(raced)
+        graded = sorted((self._estimate_error_and_order(one, closer) for one in raced), key=self._predict_cost)
         for one in graded:
-            self._say(
-                f"  {one.way}: {self._promise(one):.3g} s predicted; {one.path.processor:.3g} s for an error of "
-                f"{one.estimated:.1e}, of order {one.order:.2g}"
+            self._print_message(
+                f"  {one.method}: {self._predict_cost(one):.3g} s predicted; {one.trajectory.cpu_seconds:.3g} s for an error of "
+                f"{one.error_estimated:.1e}, of order {one.order:.2g}"
             )
-        best, note = self._reached(graded, closer)
-        besides = perf_counter() - began - best.path.seconds
-        promised = tuple((one, self._promise(one)) for one in graded)
-        return Answer(best, promised, tolerance, closer, besides, note)
+        best, note = self._find_first_reaching(graded, closer)
+        besides = perf_counter() - began - best.trajectory.wall_seconds
+        promised = tuple((one, self._predict_cost(one)) for one in graded)
+        return SearchResult(best, promised, tolerance, closer, besides, note)
 
     @staticmethod
-    def _run(way: Way, setting: float, limit: float = inf) -> Found:
+    def _run_trial(method: Method, setting: float, time_limit: float = inf) -> Trial:
         """Run a method at a setting.
 
         The method is run twice where the first run is too short to be timed.
         """
-        paths = [way.follower.follow(setting, limit=limit)]
-        if paths[0].processor < _SHORT:
-            paths.append(way.follower.follow(setting, limit=limit))
-        return Found(way, setting, min(paths, key=lambda path: path.processor), inf, way.follower.order)
+        paths = [method.stepper.integrate_motion(setting, cpu_limit=time_limit)]
+        if paths[0].cpu_seconds < _MIN_TIMED_SECONDS:
+            paths.append(method.stepper.integrate_motion(setting, cpu_limit=time_limit))
+        return Trial(method, setting, min(paths, key=lambda path: path.cpu_seconds), inf, method.stepper.order)
 
-    def _race(self, ways: list[Way], tolerance: float) -> list[Found]:
+    def _run_first_trials(self, methods: list[Method], step_atol: float) -> list[Trial]:
         """Run all methods and return the trials that are fast enough.
 
         The time limit is a multiple of the fastest time.
         """
-        found, stuck, limit = list[Found](), list[Stuck](), _AT_FIRST
-        while ways and not found:
-            late = list[tuple[Way, float]]()
-            for way in ways:
+        found, stuck, limit = list[Trial](), list[StepSizeUnderflow](), _INITIAL_TIME_LIMIT
+        while methods and not found:
+            late = list[tuple[Method, float]]()
+            for way in methods:
                 try:
-                    found.append(self._run(way, way.follower.first(tolerance), limit))
-                    limit = max(_AT_FIRST, _PATIENCE * min(one.path.processor for one in found))
-                except Stuck as error:
+                    found.append(self._run_trial(way, way.stepper.initial_setting(step_atol), limit))
+                    limit = max(
+                        _INITIAL_TIME_LIMIT, _TIME_LIMIT_FACTOR * min(one.trajectory.cpu_seconds for one in found)
+                    )
+                except StepSizeUnderflow as error:
                     stuck.append(error)
-                except TooSlow:
+                except TimeBudgetExceeded:
                     late.append((way, limit))
-            ways, limit = [way for way, _ in late], _PATIENCE * limit
+            methods, limit = [way for way, _ in late], _TIME_LIMIT_FACTOR * limit
             for way, given in late if found else ():
-                self._say(f"  {way}: given up after {given:.3g} s, for it is slower than others")
+                self._print_message(f"  {way}: given up after {given:.3g} s, for it is slower than others")
         if not found:
             raise stuck[0]
         return found
 
-    def _closer(self, raced: list[Found]) -> Found:
+    def _find_reference_trial(self, trials: list[Trial]) -> Trial:
         """Run the reference trial: a motion whose error is much smaller than the target error.
 
         The method that is predicted to be the cheapest at that accuracy computes it; adaptive methods are preferred.
         """
-        best = min(raced, key=lambda one: (one.way.follower.even, self._cost(one, CLOSER)))
-        follower, found = best.way.follower, best
-        order = self._order(best) if follower.even else float(follower.order)
-        part = CLOSER ** (order / (order + 1.0))
-        for _ in range(_CLOSINGS):  # where frames or stability rule the steps, a closer tolerance may change nothing
-            found = self._run(best.way, follower.changed(found.setting, part, order))
-            if (found.path.accepted / best.path.accepted) ** order >= _FINER:
+        best = min(
+            trials,
+            key=lambda one: (
+                one.method.stepper.has_fixed_step,
+                self._predict_scaled_cost(one, REFERENCE_ERROR_FRACTION),
+            ),
+        )
+        follower, found = best.method.stepper, best
+        order = self._estimate_order(best) if follower.has_fixed_step else float(follower.order)
+        part = REFERENCE_ERROR_FRACTION ** (order / (order + 1.0))
+        for _ in range(
+            _MAX_REFERENCE_TRIALS
+        ):  # where frames or stability rule the steps, a closer tolerance may change nothing
+            found = self._run_trial(best.method, follower.scale_setting(found.setting, part, order))
+            if (
+                found.trajectory.num_accepted_steps / best.trajectory.num_accepted_steps
+            ) ** order >= _MIN_REFERENCE_REFINEMENT:
                 break
-        begun = self._graded(best, found)
-        if AIM * self._error < begun.estimated < inf:
-            found = self._run(best.way, follower.changed(found.setting, AIM * self._error / begun.estimated, order))
+        begun = self._estimate_error(best, found)
+        if ERROR_AIM * self._max_error < begun.error_estimated < inf:
+            found = self._run_trial(
+                best.method,
+                follower.scale_setting(found.setting, ERROR_AIM * self._max_error / begun.error_estimated, order),
+            )
         return found
 
-    def _order(self, one: Found) -> float:
+    def _estimate_order(self, trial: Trial) -> float:
         """Estimate the order of fixed step sizes by doubling the step twice (Richardson)."""
-        two, four = (self._run(one.way, parts * one.setting).path.positions[-1] for parts in (2.0, 4.0))
-        first, second = self._apart(one.path.positions[-1], two), self._apart(two, four)
+        two, four = (
+            self._run_trial(trial.method, parts * trial.setting).trajectory.positions[-1] for parts in (2.0, 4.0)
+        )
+        first, second = self._compute_distance(trial.trajectory.positions[-1], two), self._compute_distance(two, four)
         fell = log(first / second, 2.0) if 0.0 < first < inf and 0.0 < second < inf else inf
-        return min(float(one.way.follower.order), max(_LEAST_ORDER, fell))
+        return min(float(trial.method.stepper.order), max(_MIN_ORDER, fell))
 
     @staticmethod
-    def _cost(one: Found, part: float) -> float:
+    def _predict_scaled_cost(trial: Trial, error_fraction: float) -> float:
         """Predict the CPU seconds at a fraction of the local error; preparation counts once."""
-        stepping = min(one.path.seconds, one.path.processor)
-        return one.path.processor - stepping + stepping * part ** (-1.0 / one.order)
+        stepping = min(trial.trajectory.wall_seconds, trial.trajectory.cpu_seconds)
+        return trial.trajectory.cpu_seconds - stepping + stepping * error_fraction ** (-1.0 / trial.order)
 
-    def _graded(self, one: Found, closer: Found) -> Found:
-        p, q = one.path.positions, closer.path.positions
-        moved = self._apart(q[-1], q[0])
-        least = (closer.tolerance or 0.0) / self._seen.scale
-        estimated = max(DOUBT * self._apart(p[-1], q[-1]) / moved, least) if moved else inf
-        return replace(one, estimated=estimated if estimated < inf else inf)
+    def _estimate_error(self, trial: Trial, reference_trial: Trial) -> Trial:
+        p, q = trial.trajectory.positions, reference_trial.trajectory.positions
+        moved = self._compute_distance(q[-1], q[0])
+        least = (reference_trial.step_atol or 0.0) / self._growth.scale
+        estimated = max(ESTIMATE_SAFETY * self._compute_distance(p[-1], q[-1]) / moved, least) if moved else inf
+        return replace(trial, error_estimated=estimated if estimated < inf else inf)
 
-    def _measured(self, one: Found, closer: Found) -> Found:
+    def _estimate_error_and_order(self, trial: Trial, reference_trial: Trial) -> Trial:
         """Estimate the error of a trial, and its order where necessary.
 
         The order is measured where fixed steps are not accurate enough.
         """
-        one = self._graded(one, closer)
-        if not one.way.follower.even or one.estimated <= self._error:
-            return one
+        trial = self._estimate_error(trial, reference_trial)
+        if not trial.method.stepper.has_fixed_step or trial.error_estimated <= self._max_error:
+            return trial
         try:
-            return _of_order(one, self._graded(self._run(one.way, 2.0 * one.setting), closer))
-        except Stuck:
-            return one
+            return _update_order(
+                trial, self._estimate_error(self._run_trial(trial.method, 2.0 * trial.setting), reference_trial)
+            )
+        except StepSizeUnderflow:
+            return trial
 
-    def _apart(self, p: Positions, q: Positions) -> float:
-        return float(np.linalg.norm((p - q)[self._free]))
+    def _compute_distance(self, p: Positions, q: Positions) -> float:
+        return float(np.linalg.norm((p - q)[self._free_vertices]))
 
-    def _promise(self, one: Found) -> float:
+    def _predict_cost(self, trial: Trial) -> float:
         """Predict the CPU seconds of a trial's method at the target error.
 
         The measured time counts where the trial is more accurate, since explicit steps may have reached the stability
         limit.
         """
-        return self._cost(one, min(1.0, self._aim(one) / one.estimated)) if one.estimated < inf else inf
+        return (
+            self._predict_scaled_cost(trial, min(1.0, self._choose_error_aim(trial) / trial.error_estimated))
+            if trial.error_estimated < inf
+            else inf
+        )
 
-    def _aim(self, one: Found) -> float:
+    def _choose_error_aim(self, trial: Trial) -> float:
         """Return the error for which a setting is chosen."""
-        return (_AIM_EVEN if one.way.follower.even else AIM) * self._error
+        return (_ERROR_AIM_FIXED_STEPS if trial.method.stepper.has_fixed_step else ERROR_AIM) * self._max_error
 
-    def _reached(self, graded: list[Found], closer: Found) -> tuple[Found, str]:
+    def _find_first_reaching(self, trials: list[Trial], reference_trial: Trial) -> tuple[Trial, str]:
         """Return the first trial that reaches the error, and a note.
 
         The note states why the trial is much more accurate, if it is.
 
         A method that exceeds the predicted time of the next one by far is tried again after all others.
         """
-        nearest, times = list[Found](), _DEAR
-        while graded:
-            late = list[Found]()
-            for one, after in zip(graded, [*graded[1:], graded[-1]], strict=True):
-                limit = times * max(_SHORT, self._promise(one), self._promise(after))
+        nearest, times = list[Trial](), _MAX_COST_RATIO
+        while trials:
+            late = list[Trial]()
+            for one, after in zip(trials, [*trials[1:], trials[-1]], strict=True):
+                limit = times * max(_MIN_TIMED_SECONDS, self._predict_cost(one), self._predict_cost(after))
                 try:
-                    found, note = self._moved(one, closer, limit)
-                except TooSlow:
-                    self._say(f"  {one.way}: takes more than {limit:.3g} s")
+                    found, note = self._tune_setting(one, reference_trial, limit)
+                except TimeBudgetExceeded:
+                    self._print_message(f"  {one.method}: takes more than {limit:.3g} s")
                     late.append(one)
                     continue
-                if found.estimated <= self._error:
+                if found.error_estimated <= self._max_error:
                     return found, note
                 nearest.append(found)
-                self._say(f"  {one.way}: reaches {found.estimated:.1e}, and shorter steps come no nearer")
-            graded, times = late, _PATIENCE * times
-        raise self._nothing(min(nearest, key=lambda one: one.estimated))
+                self._print_message(
+                    f"  {one.method}: reaches {found.error_estimated:.1e}, and shorter steps come no nearer"
+                )
+            trials, times = late, _TIME_LIMIT_FACTOR * times
+        raise self._build_no_method_error(min(nearest, key=lambda one: one.error_estimated))
 
-    def _moved(self, one: Found, closer: Found, limit: float) -> tuple[Found, str]:
+    def _tune_setting(self, trial: Trial, reference_trial: Trial, time_limit: float) -> tuple[Trial, str]:
         """Tune the setting of a method towards the target error, and return the nearest trial.
 
         The second result says why the trial is much more accurate. Raises TooSlow beyond a limit of CPU seconds.
         """
-        best, above = None if one.estimated > self._error else one, None
-        nearest, stalled = one, 0
-        for _ in range(_MOVES):
-            if best and best.estimated >= DOUBT * WIDE * self._error:
+        best, above = None if trial.error_estimated > self._max_error else trial, None
+        nearest, stalled = trial, 0
+        for _ in range(_MAX_SETTING_CHANGES):
+            if best and best.error_estimated >= ESTIMATE_SAFETY * MIN_ERROR_FRACTION * self._max_error:
                 return best, ""
-            setting = self._next(one, best, above)
-            if setting == one.setting:
-                return one, _STABLE
-            before = one
+            setting = self._choose_next_setting(trial, best, above)
+            if setting == trial.setting:
+                return trial, _STABILITY_NOTE
+            before = trial
             try:
-                one = _of_order(before, self._graded(self._run(one.way, setting, limit), closer))
-            except Stuck:
+                trial = _update_order(
+                    before, self._estimate_error(self._run_trial(trial.method, setting, time_limit), reference_trial)
+                )
+            except StepSizeUnderflow:
                 break
-            nearest = min(nearest, one, key=lambda found: found.estimated)
-            if one.estimated > self._error:
-                shorter = setting < 0.1 * before.setting or one.path.accepted > 4 * before.path.accepted
-                stalled = stalled + 1 if best is None and one.estimated > 0.5 * before.estimated and shorter else 0
-                if stalled == _STALLS:
+            nearest = min(nearest, trial, key=lambda found: found.error_estimated)
+            if trial.error_estimated > self._max_error:
+                shorter = (
+                    setting < 0.1 * before.setting
+                    or trial.trajectory.num_accepted_steps > 4 * before.trajectory.num_accepted_steps
+                )
+                stalled = (
+                    stalled + 1
+                    if best is None and trial.error_estimated > 0.5 * before.error_estimated and shorter
+                    else 0
+                )
+                if stalled == _MAX_STALLS:
                     break
-                above = one
-            elif best and one.path.processor > 0.9 * best.path.processor:
-                return best, _STABLE
+                above = trial
+            elif best and trial.trajectory.cpu_seconds > 0.9 * best.trajectory.cpu_seconds:
+                return best, _STABILITY_NOTE
             else:
-                best = one
+                best = trial
         if best is None:
             return nearest, ""
-        return best, _STABLE if best.estimated < DOUBT * WIDE * self._error else ""
+        return (
+            best,
+            _STABILITY_NOTE if best.error_estimated < ESTIMATE_SAFETY * MIN_ERROR_FRACTION * self._max_error else "",
+        )
 
-    def _next(self, one: Found, best: Found | None, above: Found | None) -> float:
+    def _choose_next_setting(self, trial: Trial, best: Trial | None, above: Trial | None) -> float:
         """Return the next setting to try; between two settings where they bracket the error."""
         if best and above:
             return sqrt(best.setting * above.setting)
-        aim = self._aim(one)
-        ratio = aim / max(one.estimated, 1e-3 * aim)
-        return one.way.follower.changed(one.setting, min(30.0, max(1e-3, ratio)), one.order)
+        aim = self._choose_error_aim(trial)
+        ratio = aim / max(trial.error_estimated, 1e-3 * aim)
+        return trial.method.stepper.scale_setting(trial.setting, min(30.0, max(1e-3, ratio)), trial.order)
 
-    def _nothing(self, nearest: Found) -> RunFailed:
-        at = f" at {nearest.tolerance:.1e} m a step" if nearest.tolerance else f" with {nearest.path.accepted} steps"
+    def _build_no_method_error(self, nearest: Trial) -> RunFailed:
+        at = (
+            f" at {nearest.step_atol:.1e} m a step"
+            if nearest.step_atol
+            else f" with {nearest.trajectory.num_accepted_steps} steps"
+        )
         return RunFailed(
-            f"no steps keep to an error of {self._error:g}: {nearest.way} came nearest and reached "
-            f"{nearest.estimated:.1g}{at}, and shorter ones come no nearer; ask for a larger --error or a shorter "
+            f"no steps keep to an error of {self._max_error:g}: {nearest.method} came nearest and reached "
+            f"{nearest.error_estimated:.1g}{at}, and shorter ones come no nearer; ask for a larger --error or a shorter "
             "--horizon"
         )
 
 
-def _of_order(before: Found, after: Found) -> Found:
+def _update_order(before: Trial, after: Trial) -> Trial:
     """Return the second trial with the observed order, at most that of its method."""
-    shorter = log(after.path.accepted / before.path.accepted)
-    if not (0.0 < before.estimated < inf and 0.0 < after.estimated < inf and abs(shorter) > 0.1):
+    shorter = log(after.trajectory.num_accepted_steps / before.trajectory.num_accepted_steps)
+    if not (0.0 < before.error_estimated < inf and 0.0 < after.error_estimated < inf and abs(shorter) > 0.1):
         return after
-    fell = log(before.estimated / after.estimated) / shorter
-    return replace(after, order=min(float(after.way.follower.order), max(_LEAST_ORDER, fell)))
+    fell = log(before.error_estimated / after.error_estimated) / shorter
+    return replace(after, order=min(float(after.method.stepper.order), max(_MIN_ORDER, fell)))
 
 
-_STABLE = "longer steps are unstable, or cost as much"
+_STABILITY_NOTE = "longer steps are unstable, or cost as much"

@@ -6,32 +6,32 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from harness.base.errors import InputError, RunFailed
-from harness.config.load import misfits
+from harness.config.load import find_scene_mistakes
 from harness.config.sweep import SolverSpec
-from harness.experiments.asked.halving import halved
-from harness.reference.frozen import bind
+from harness.experiments.asked.halving import estimate_by_step_doubling
+from harness.reference.frozen import build_exact_scene
 from harness.scenes.bind import Scene
 from harness.scenes.spec import SceneSpec
-from harness.simulation.controlled import Follower, Implicit
-from harness.simulation.even_steps import ImplicitEven
-from harness.simulation.own_steps import Own, OwnEven
-from solvers.contact.touching import without_contact
-from solvers.integrators import INTEGRATORS, Integrator, RungeKutta, find
+from harness.simulation.controlled import AdaptiveImplicitStepper, Stepper
+from harness.simulation.even_steps import FixedImplicitStepper
+from harness.simulation.own_steps import AdaptiveSubstepper, FixedSubstepper
+from solvers.contact.touching import without_vertex_contact
+from solvers.integrators import INTEGRATORS, RungeKutta, SingleStageIntegrator, find_integrator
 from solvers.problem import NotPositiveDefinite, Unsupported
-from solvers.registry import EVERY, SOLVERS, about, load, minimises
+from solvers.registry import SOLVER_TABLE, SOLVERS, find_solver_info, is_minimiser, load_target
 
-_ONCE = 1e-2
+_WARMUP_TOLERANCE = 1e-2
 """Tolerance of the warm-up run, which only compiles, as a fraction of the mesh size."""
-_SPENT = 30.0
+_STEP_DOUBLING_SECONDS = 30.0
 """Wall time for the step-doubling estimate where error control is not possible [s]."""
-_CONTACT = (
+_CONTACT_MESSAGE = (
     "contact begins and ends within steps, where every method has order 1, so errors cannot be controlled; use a fixed "
     "step size (--integrator, --time-step), and halve it until the motion does not change"
 )
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class ErrorTarget:
     """Scene of one size up to an end time, split into frames.
 
     Dirichlet conditions are exact, as in the reference.
@@ -45,13 +45,13 @@ class Asked:
 
     scene: SceneSpec
     size: int
-    horizon: float
-    frames: int
+    t_end: float
+    num_frames: int
 
     @classmethod
-    def of(
-        cls, scene: SceneSpec, size: int | None, horizon: float | None, say: Callable[[str], None] | None = None
-    ) -> Asked:
+    def from_scene(
+        cls, scene: SceneSpec, size: int | None, t_end: float | None, print_message: Callable[[str], None] | None = None
+    ) -> ErrorTarget:
         """Return the target for a scene.
 
         A frame is about as long as the scene's time step.
@@ -66,48 +66,52 @@ class Asked:
             InputError: the size or the time step does not fit the scene.
             RunFailed: the scene has contact.
         """
-        scene.require_even_steps()
-        horizon = horizon or scene.frames * scene.time_step
+        scene.require_fixed_time_step()
+        t_end = t_end or scene.frames * scene.time_step
         size = size or scene.default_size or 0
-        frames = max(1, round(horizon / scene.time_step))
-        if mistakes := misfits(scene, [size]):
+        frames = max(1, round(t_end / scene.time_step))
+        if mistakes := find_scene_mistakes(scene, [size]):
             raise InputError(mistakes)
-        asked = cls(scene, size, horizon, frames)
-        system = asked.bound(asked.frame, "implicit-euler").system
-        if without_contact(system) is not system:
-            if say:
-                say(f"no error can be promised with contact; halving steps for {_SPENT:g} s to tell what can be had")
-            raise RunFailed(f"{_CONTACT}; {halved(asked.bound, horizon, frames, seconds=_SPENT)}")
+        asked = cls(scene, size, t_end, frames)
+        system = asked.build_scene(asked.frame_seconds, "implicit-euler").system
+        if without_vertex_contact(system) is not system:
+            if print_message:
+                print_message(
+                    f"no error can be promised with contact; halving steps for {_STEP_DOUBLING_SECONDS:g} s to tell what can be had"
+                )
+            raise RunFailed(
+                f"{_CONTACT_MESSAGE}; {estimate_by_step_doubling(asked.build_scene, t_end, frames, time_budget=_STEP_DOUBLING_SECONDS)}"
+            )
         return asked
 
-    def bound(self, time_step: float, integrator: str) -> Scene:
+    def build_scene(self, time_step: float, integrator: str) -> Scene:
         """Build the scene with a time step [s] and an integrator by name."""
-        return bind(self.scene.stepped(time_step), self.size, integrator, warns=False)
+        return build_exact_scene(self.scene.with_time_step(time_step), self.size, integrator, show_warnings=False)
 
     @property
-    def frame(self) -> float:
+    def frame_seconds(self) -> float:
         """Length of a frame [s]."""
-        return self.horizon / self.frames
+        return self.t_end / self.num_frames
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class Method:
     """Integrator and solver by name, and the stepper that combines them."""
 
     integrator: str
     solver: str
-    follower: Follower
+    stepper: Stepper
 
     def __str__(self) -> str:
-        return in_words(self.integrator, self.solver)
+        return format_method_name(self.integrator, self.solver)
 
 
-def in_words(integrator: str, solver: str) -> str:
+def format_method_name(integrator: str, solver: str) -> str:
     """Return the name of a method for messages."""
     return solver if integrator == "own" else f"{integrator} with {solver}"
 
 
-def tried() -> list[tuple[str, SolverSpec]]:
+def list_candidate_methods() -> list[tuple[str, SolverSpec]]:
     """Return the integrators (by name) and solvers that a search tries by default.
 
     Solvers with their own adaptive integrator come first. The others are solvers that minimise the step's objective.
@@ -116,31 +120,41 @@ def tried() -> list[tuple[str, SolverSpec]]:
     order.
     They are also combined with the one-step integrator of fixed step size that has the highest order.
     """
-    pairs = {name: one for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded}
-    best = max(pairs, key=lambda name: (pairs[name].order, pairs[name].starts))
-    told = {name: about(load(target), name) for name, target in SOLVERS.items()}
-    single = {name: one.order for name, one in INTEGRATORS.items() if isinstance(one, Integrator) and not one.history}
+    pairs = {name: one for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded_order}
+    best = max(pairs, key=lambda name: (pairs[name].order, pairs[name].needs_start_acceleration))
+    told = {name: find_solver_info(load_target(target), name) for name, target in SOLVERS.items()}
+    single = {
+        name: one.order
+        for name, one in INTEGRATORS.items()
+        if isinstance(one, SingleStageIntegrator) and not one.needs_history
+    }
     even = max((name for name in single if name != "own"), key=single.__getitem__)
-    tried = {name: ("own",) if one.own_steps else (best, even) for name, one in told.items() if one.to_error}
+    tried = {
+        name: ("own",) if one.is_substepping else (best, even)
+        for name, one in told.items()
+        if one.supports_error_control
+    }
     found = [(integrator, SolverSpec(name, {})) for name, several in tried.items() for integrator in several]
     return sorted(found, key=lambda pair: pair[0] != "own")
 
 
-def tried_by(solver: SolverSpec) -> list[tuple[str, SolverSpec]]:
+def list_methods_of_solver(solver: SolverSpec) -> list[tuple[str, SolverSpec]]:
     """Return all methods of one solver: its own integrator, or all embedded Runge-Kutta integrators.
 
     Raises:
         Unsupported: the solver has no error estimate and does not minimise the steps of an integrator.
     """
-    one = about(load(EVERY[solver.name]), solver.name)
-    if one.own_steps:
+    one = find_solver_info(load_target(SOLVER_TABLE[solver.name]), solver.name)
+    if one.is_substepping:
         return [("own", solver)]
-    if not minimises(load(EVERY[solver.name])):
+    if not is_minimiser(load_target(SOLVER_TABLE[solver.name])):
         raise Unsupported(f"{solver.name}: tells no error of its steps and does not minimise those of an integrator")
-    return [(name, solver) for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded]
+    return [(name, solver) for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded_order]
 
 
-def ways(asked: Asked, say: Callable[[str], None], pairs: Sequence[tuple[str, SolverSpec]] = ()) -> list[Way]:
+def prepare_candidate_methods(
+    error_target: ErrorTarget, print_message: Callable[[str], None], candidates: Sequence[tuple[str, SolverSpec]] = ()
+) -> list[Method]:
     """Return the methods that support the scene, warmed up so that timings exclude compilation.
 
     Args:
@@ -151,30 +165,39 @@ def ways(asked: Asked, say: Callable[[str], None], pairs: Sequence[tuple[str, So
     Raises:
         RunFailed: no method supports the scene.
     """
-    found, reasons = list[Way](), list[str]()
-    for integrator, solver in pairs or tried():
-        way = Way(integrator, solver.name, _follower(asked, integrator, solver))
+    found, reasons = list[Method](), list[str]()
+    for integrator, solver in candidates or list_candidate_methods():
+        way = Method(integrator, solver.name, _build_stepper(error_target, integrator, solver))
         try:
-            _warm(asked, integrator, solver)
+            _warm_up(error_target, integrator, solver)
             found.append(way)
         except (Unsupported, NotPositiveDefinite) as error:
             reasons.append(f"{way}: {str(error).removeprefix(f'{solver.name}: ')}")
-            say(f"  not by {reasons[-1]}")
+            print_message(f"  not by {reasons[-1]}")
     if not found:
         raise RunFailed(f"no method that keeps to an error knows this scene: {'; '.join(reasons)}")
     return found
 
 
-def _follower(asked: Asked, integrator: str, solver: SolverSpec, frames: int | None = None) -> Follower:
-    made, frames = load(EVERY[solver.name])(**solver.parameters), frames or asked.frames
+def _build_stepper(
+    error_target: ErrorTarget, integrator: str, solver: SolverSpec, frames: int | None = None
+) -> Stepper:
+    made, frames = load_target(SOLVER_TABLE[solver.name])(**solver.parameters), frames or error_target.num_frames
     if integrator == "own":
-        scene, even = asked.bound(asked.frame, integrator), about(load(EVERY[solver.name]), solver.name).even
-        return OwnEven(scene, made, frames, lambda h: asked.bound(h, integrator)) if even else Own(scene, made, frames)
-    way = Implicit if isinstance(find(integrator), RungeKutta) else ImplicitEven
-    return way(lambda h: asked.bound(h, integrator), made, asked.frame * frames, frames)
+        scene, even = (
+            error_target.build_scene(error_target.frame_seconds, integrator),
+            find_solver_info(load_target(SOLVER_TABLE[solver.name]), solver.name).has_fixed_step,
+        )
+        return (
+            FixedSubstepper(scene, made, frames, lambda h: error_target.build_scene(h, integrator))
+            if even
+            else AdaptiveSubstepper(scene, made, frames)
+        )
+    way = AdaptiveImplicitStepper if isinstance(find_integrator(integrator), RungeKutta) else FixedImplicitStepper
+    return way(lambda h: error_target.build_scene(h, integrator), made, error_target.frame_seconds * frames, frames)
 
 
-def _warm(asked: Asked, integrator: str, solver: SolverSpec) -> None:
-    size = asked.bound(asked.frame, "own").mesh.size or 1.0
-    once = _follower(asked, integrator, solver, 1)
-    once.follow(once.first(_ONCE * size))
+def _warm_up(error_target: ErrorTarget, integrator: str, solver: SolverSpec) -> None:
+    size = error_target.build_scene(error_target.frame_seconds, "own").mesh.bounding_box_diagonal or 1.0
+    once = _build_stepper(error_target, integrator, solver, 1)
+    once.integrate_motion(once.initial_setting(_WARMUP_TOLERANCE * size))

@@ -17,17 +17,17 @@ from random import sample
 from typing import Any
 
 from harness.base.errors import InputError
-from harness.experiments.gates.abba import CALL, Racers, Result, confirmed
-from harness.experiments.gates.agreement import difference
-from harness.experiments.gates.pair import HeldWork, RevisionProcess, Side, changes, workers
-from harness.experiments.gates.sequential import ALPHA, Rule, Verdict
+from harness.experiments.gates.abba import MIN_CALL_SECONDS, BenchmarkResult, ProgramPair, run_confirmed_benchmark
+from harness.experiments.gates.agreement import describe_difference
+from harness.experiments.gates.pair import GitRevision, PreparedWork, RevisionProcess, describe_changes, start_workers
+from harness.experiments.gates.sequential import DEFAULT_ALPHA, SequentialTest, SequentialVerdict
 
-LIMIT = 1.03
+DEFAULT_MAX_RATIO = 1.03
 """Default of the ratio of times from which a program counts as slower."""
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class WorkRequest:
     """Work that both revisions prepare.
 
     title: description in messages.
@@ -36,13 +36,13 @@ class Request:
     """
 
     title: str
-    do: str
+    command: str
     arguments: dict[str, Any]
     config: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class ComparisonOptions:
     """Options of a comparison.
 
     budget: seconds per test.
@@ -52,12 +52,12 @@ class Options:
     """
 
     budget: float
-    limit: float = LIMIT
-    alpha: float = ALPHA
+    max_ratio: float = DEFAULT_MAX_RATIO
+    alpha: float = DEFAULT_ALPHA
     clock: str | None = None
 
 
-def requests_of_config(sides: Sequence[Side], config: Path, asked: dict[str, Any]) -> list[Request]:
+def build_config_requests(revisions: Sequence[GitRevision], config: Path, options: dict[str, Any]) -> list[WorkRequest]:
     """Build a request for each run of a scene or sweep.
 
     Both revisions must list the same runs.
@@ -70,16 +70,19 @@ def requests_of_config(sides: Sequence[Side], config: Path, asked: dict[str, Any
         InputError: if a revision fails, or if the lists differ.
     """
     config = config.resolve()
-    with workers(*sides) as alive:
-        listed = [worker.ask("runs", config=str(worker.side.own(config)), asked=asked)["runs"] for worker in alive]
+    with start_workers(*revisions) as alive:
+        listed = [
+            worker.send_request("runs", config=str(worker.revision.resolve_file(config)), asked=options)["runs"]
+            for worker in alive
+        ]
     if listed[0] != listed[1]:
         raise InputError(
-            f"{config}: {sides[0].name} and {sides[1].name} read different runs out of it: {_first(listed)}"
+            f"{config}: {revisions[0].name} and {revisions[1].name} read different runs out of it: {_find_first_difference(listed)}"
         )
-    return [Request(title, "run", {"asked": asked, "index": i}, config) for i, title in enumerate(listed[0])]
+    return [WorkRequest(title, "run", {"asked": options, "index": i}, config) for i, title in enumerate(listed[0])]
 
 
-def requests_of_gates(sides: Sequence[Side], name: str) -> list[Request]:
+def build_test_requests(revisions: Sequence[GitRevision], name: str) -> list[WorkRequest]:
     """Build a request for each performance test of the checkout whose name contains `name`.
 
     Args:
@@ -88,20 +91,23 @@ def requests_of_gates(sides: Sequence[Side], name: str) -> list[Request]:
     Raises:
         InputError: if no test matches, or if one revision lacks it.
     """
-    with workers(*sides) as alive:
-        listed = [worker.ask("gates")["gates"] for worker in alive]
+    with start_workers(*revisions) as alive:
+        listed = [worker.send_request("gates")["gates"] for worker in alive]
     found = [[gate for gate in gates if name in gate] for gates in listed]
     if not any(found):
         raise InputError(f"-k {name}: neither has such a gate; they have {', '.join(listed[0])}")
-    for one, other, side in ((*found, sides[1]), (*found[::-1], sides[0])):
+    for one, other, side in ((*found, revisions[1]), (*found[::-1], revisions[0])):
         if missing := sorted(set(one) - set(other)):
             raise InputError(f"-k {name}: {side.name} has no gate {', '.join(missing)}; name others")
-    return [Request(gate, "gate", {"name": gate}) for gate in found[0]]
+    return [WorkRequest(gate, "gate", {"name": gate}) for gate in found[0]]
 
 
-def run_gates(
-    sides: tuple[Side, Side], requests: Sequence[Request], options: Options, say: Callable[[str], None]
-) -> list[tuple[Request, Result]]:
+def compare_revisions(
+    revisions: tuple[GitRevision, GitRevision],
+    requests: Sequence[WorkRequest],
+    options: ComparisonOptions,
+    print_message: Callable[[str], None],
+) -> list[tuple[WorkRequest, BenchmarkResult]]:
     """Benchmark this checkout against the revision, and print each result at once.
 
     Args:
@@ -112,25 +118,30 @@ def run_gates(
     Raises:
         InputError: if the work fails, or if the answers differ.
     """
-    rule = Rule(options.limit, options.alpha / len(requests))
-    found: list[tuple[Request, Result]] = []
-    told = cache(say)  # what differs is found at each start, and told once
+    rule = SequentialTest(options.max_ratio, options.alpha / len(requests))
+    found: list[tuple[WorkRequest, BenchmarkResult]] = []
+    told = cache(print_message)  # what differs is found at each start, and told once
     for request in requests:
-        result = confirmed(partial(started, sides, request, options, told), rule, budget=options.budget)
-        say(f"{request.title}: {result}")
+        result = run_confirmed_benchmark(
+            partial(start_revisions, revisions, request, options, told), rule, time_budget=options.budget
+        )
+        print_message(f"{request.title}: {result}")
         found.append((request, result))
     return found
 
 
-def exit_code(answers: Sequence[Verdict]) -> int:
+def choose_exit_code(verdicts: Sequence[SequentialVerdict]) -> int:
     """Return 1 for any failure, else 3 for any inconclusive verdict, else 0."""
-    return next((a.value for a in (Verdict.FAILS, Verdict.UNDECIDED) if a in answers), 0)
+    return next((a.value for a in (SequentialVerdict.FAIL, SequentialVerdict.INCONCLUSIVE) if a in verdicts), 0)
 
 
 @contextmanager
-def started(
-    sides: tuple[Side, Side], request: Request, options: Options, say: Callable[[str], None]
-) -> Generator[Racers]:
+def start_revisions(
+    revisions: tuple[GitRevision, GitRevision],
+    request: WorkRequest,
+    options: ComparisonOptions,
+    print_message: Callable[[str], None],
+) -> Generator[ProgramPair]:
     """Start both revisions, warm them up, and check that their answers agree.
 
     Each runs in its own process.
@@ -144,53 +155,57 @@ def started(
     Raises:
         InputError: if the work fails, or if the answers differ.
     """
-    with workers(*sides) as alive:
-        held = _held(alive, request, 1)
+    with start_workers(*revisions) as alive:
+        held = _prepare_work(alive, request, 1)
         clock = options.clock or held[0].clock
-        once = min(worker.seconds(1, clock) for worker in alive)
-        if request.config and once < CALL:
-            held = _held(alive, request, ceil(CALL / max(once, 1e-6)))
-            once = min(worker.seconds(1, clock) for worker in alive)
-        if said := difference(held[0].answer, held[1].answer):
-            named = f"{request.title}: {sides[0].name} and {sides[1].name}"
+        once = min(worker.time_calls(1, clock) for worker in alive)
+        if request.config and once < MIN_CALL_SECONDS:
+            held = _prepare_work(alive, request, ceil(MIN_CALL_SECONDS / max(once, 1e-6)))
+            once = min(worker.time_calls(1, clock) for worker in alive)
+        if said := describe_difference(held[0].answer, held[1].answer):
+            named = f"{request.title}: {revisions[0].name} and {revisions[1].name}"
             raise InputError(f"{named} answer differently: {said}; nothing was timed")
-        facts = [one.facts | _instructions(worker) for one, worker in zip(held, alive, strict=True)]
-        for change in changes(*facts):
-            say(f"{request.title}: {change}")
-        calls = max(1, ceil(CALL / max(once, 1e-6)))
-        a, b = (partial(worker.seconds, calls, clock) for worker in alive)
-        yield Racers(a, b, partial(_renew, alive))
+        facts = [one.stats | _count_instructions(worker) for one, worker in zip(held, alive, strict=True)]
+        for change in describe_changes(*facts):
+            print_message(f"{request.title}: {change}")
+        calls = max(1, ceil(MIN_CALL_SECONDS / max(once, 1e-6)))
+        a, b = (partial(worker.time_calls, calls, clock) for worker in alive)
+        yield ProgramPair(a, b, partial(_rebuild_work, alive))
 
 
-def _held(alive: Sequence[RevisionProcess], request: Request, frames: int) -> list[HeldWork]:
+def _prepare_work(processes: Sequence[RevisionProcess], request: WorkRequest, num_frames: int) -> list[PreparedWork]:
     """Prepare the request's work in both processes; for a run it has num_frames steps."""
-    held: list[HeldWork] = []
-    for worker in alive:
+    held: list[PreparedWork] = []
+    for worker in processes:
         more: dict[str, Any] = {}
         if request.config:
-            more = {"config": str(worker.side.own(request.config)), "frames": frames, "extra": worker.side.extra}
-        held.append(worker.hold(request.do, **request.arguments, **more))
+            more = {
+                "config": str(worker.revision.resolve_file(request.config)),
+                "frames": num_frames,
+                "extra": worker.revision.injected_slowdown,
+            }
+        held.append(worker.prepare_work(request.command, **request.arguments, **more))
     return held
 
 
-def _renew(alive: Sequence[RevisionProcess]) -> None:
+def _rebuild_work(processes: Sequence[RevisionProcess]) -> None:
     """Rebuild the work of both processes and run it once.
 
     The order is random because the last process to run has the warmest caches.
     """
-    chance = sample(alive, len(alive))
+    chance = sample(processes, len(processes))
     for worker in chance:
-        worker.renew()
+        worker.rebuild_work()
     for worker in chance:
-        worker.seconds(1, "cpu")
+        worker.time_calls(1, "cpu")
 
 
-def _instructions(worker: RevisionProcess) -> dict[str, int]:
-    counted = worker.instructions()
+def _count_instructions(worker: RevisionProcess) -> dict[str, int]:
+    counted = worker.count_instructions()
     return {} if counted is None else {"instructions": counted}
 
 
-def _first(listed: Sequence[Sequence[str]]) -> str:
+def _find_first_difference(run_titles: Sequence[Sequence[str]]) -> str:
     """Find the first run that only one of the revisions lists."""
-    pairs = zip(*listed, strict=False)
-    return next((f"{a} | {b}" for a, b in pairs if a != b), f"{len(listed[0])} and {len(listed[1])} of them")
+    pairs = zip(*run_titles, strict=False)
+    return next((f"{a} | {b}" for a, b in pairs if a != b), f"{len(run_titles[0])} and {len(run_titles[1])} of them")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-AGREEMENT = 1e-9
+DEFAULT_AGREEMENT_RTOL = 1e-9
 """Default tolerance of the difference of two answers, relative to their size. It covers round-off of some hundred
 iterations in another order.
 """
 
 
-def difference(new: ArrayLike, old: ArrayLike, tolerance: float = AGREEMENT) -> str:
+def describe_difference(new: ArrayLike, old: ArrayLike, rtol: float = DEFAULT_AGREEMENT_RTOL) -> str:
     """Describe the difference of two answers in words; empty if they agree.
 
     Args:
@@ -26,6 +26,6 @@ def difference(new: ArrayLike, old: ArrayLike, tolerance: float = AGREEMENT) -> 
     size = float(np.ptp(points, axis=0).max(initial=0.0)) if points.size else 0.0
     size = size or float(np.abs(was).max(initial=0.0)) or 1.0
     apart = float(np.abs(now - was).max(initial=0.0)) / size
-    if apart <= tolerance:  # NaN is not
+    if apart <= rtol:  # NaN is not
         return ""
-    return f"they lie {apart:.1e} of the answer's size apart, wanted {tolerance:g}"
+    return f"they lie {apart:.1e} of the answer's size apart, wanted {rtol:g}"

@@ -8,17 +8,19 @@ from typing import Annotated, Any
 
 import typer
 
-from harness.base.console import out, say
+from harness.base.console import get_output_console, print_message
 from harness.base.errors import InputError
 
 
-def gate(
-    what: Annotated[
+def regress(
+    paths: Annotated[
         list[Path] | None,
         typer.Argument(help="With --against a scene or a sweep; else a table of gates, or two stored results."),
     ] = None,
     against: Annotated[str | None, typer.Option(help="A git revision to be no slower than.")] = None,
-    name: Annotated[str, typer.Option("-k", help="With --against: the tree's own gates whose name holds this.")] = "",
+    pattern: Annotated[
+        str, typer.Option("-k", help="With --against: the tree's own gates whose name holds this.")
+    ] = "",
     budget: Annotated[float | None, typer.Option(help="Seconds that a gate may take; 240 if left out.")] = None,
     limit: Annotated[float | None, typer.Option(help="Ratio of times that counts as slower; 1.03 if left out.")] = None,
     clock: Annotated[str | None, typer.Option(help="cpu or wall; what suits the work if left out.")] = None,
@@ -31,23 +33,25 @@ def gate(
     tolerance: Annotated[float | None, typer.Option(help="For a scene: relative tolerance of a step.")] = None,
 ) -> None:
     """Find performance regressions. Exit code 1: a regression; 3: inconclusive; 0: all tests pass."""
-    files = what or []
+    files = paths or []
     chosen = {"--solver": solver, "--size": size, "--iterations": iterations, "--tolerance": tolerance}
     if against is not None:
         given = {"iterations": iterations, "tolerance": tolerance}
         stated = {name: value for name, value in given.items() if value is not None}
-        options = _options(budget, limit, clock)
+        options = _build_options(budget, limit, clock)
         raise typer.Exit(
-            _against(against, files, name, options, {"solvers": solver or [], "sizes": size or [], **stated})
+            _compare_with_revision(
+                against, files, pattern, options, {"solvers": solver or [], "sizes": size or [], **stated}
+            )
         )
     if len(files) == 1 and files[0].suffix.lower() in (".yaml", ".yml"):
-        for option, value in {**chosen, "--limit": limit, "--clock": clock, "-k": name}.items():
+        for option, value in {**chosen, "--limit": limit, "--clock": clock, "-k": pattern}.items():
             if value:
                 raise InputError(
                     f"{option}: a table of gates says so itself; change {files[0]}, or give --against REVISION"
                 )
-        raise typer.Exit(_table(files[0], _options(budget, limit, clock).budget))
-    if name:
+        raise typer.Exit(_run_table(files[0], _build_options(budget, limit, clock).budget))
+    if pattern:
         raise InputError("-k: chooses gates to compare with another revision; wanted --against REVISION beside it")
     for option, value in {"--budget": budget, "--limit": limit, "--clock": clock, **chosen}.items():
         if value:
@@ -55,10 +59,10 @@ def gate(
     if len(files) != 2:
         wanted = "wanted --against REVISION, a table of gates, or two stored results, the old one first"
         raise InputError(f"gate: came {len(files)} file{'s' * (len(files) != 1)}; {wanted}")
-    raise typer.Exit(_stored(files[0], files[1], yardstick))
+    raise typer.Exit(_compare_stored(files[0], files[1], yardstick))
 
 
-def _stored(old: Path, new: Path, yardstick: str | None) -> int:
+def _compare_stored(old: Path, new: Path, yardstick: str | None) -> int:
     from harness.report import gate as benchmarks
     from harness.report import stored
 
@@ -66,42 +70,49 @@ def _stored(old: Path, new: Path, yardstick: str | None) -> int:
     if ours[0] != ours[1]:
         raise InputError(f"{old} and {new} cannot be compared: one is of pytest-benchmark, the other is not")
     if all(ours):
-        return stored.compare(old, new, out(), yardstick)
+        return stored.compare_results(old, new, get_output_console(), yardstick)
     if yardstick:
         raise InputError("--yardstick: compares results of sweeps; a file of pytest-benchmark has its own ratios")
-    return benchmarks.compare(old, new, out())
+    return benchmarks.compare_benchmarks(old, new, get_output_console())
 
 
-def _table(path: Path, budget: float) -> int:
-    from harness.experiments.gates.against import exit_code
-    from harness.experiments.gates.listed import run_table
+def _run_table(path: Path, budget: float) -> int:
+    from harness.experiments.gates.against import choose_exit_code
+    from harness.experiments.gates.listed import run_regression_table
 
-    return exit_code([result.answer for _, result in run_table(path, budget, say)])
+    return choose_exit_code([result.verdict for _, result in run_regression_table(path, budget, print_message)])
 
 
-def _options(budget: float | None, limit: float | None, clock: str | None) -> Any:
-    from harness.experiments.gates.abba import BUDGET
-    from harness.experiments.gates.against import LIMIT, Options
-    from harness.experiments.gates.sequential import Rule
+def _build_options(budget: float | None, limit: float | None, clock: str | None) -> Any:
+    from harness.experiments.gates.abba import TIME_BUDGET
+    from harness.experiments.gates.against import DEFAULT_MAX_RATIO, ComparisonOptions
+    from harness.experiments.gates.sequential import SequentialTest
 
     if clock not in (None, "cpu", "wall"):
         raise InputError(f"--clock: came {clock}; wanted cpu or wall")
     if budget is not None and not budget > 0:
         raise InputError(f"--budget: came {budget}; wanted seconds")
     try:
-        Rule(limit or LIMIT)
+        SequentialTest(limit or DEFAULT_MAX_RATIO)
     except ValueError as error:
         raise InputError(f"--{error}") from error
-    return Options(budget or BUDGET, limit or LIMIT, clock=clock)
+    return ComparisonOptions(budget or TIME_BUDGET, limit or DEFAULT_MAX_RATIO, clock=clock)
 
 
-def _against(revision: str, files: list[Path], name: str, options: Any, asked: dict[str, Any]) -> int:
+def _compare_with_revision(
+    revision: str, files: list[Path], pattern: str, options: Any, run_options: dict[str, Any]
+) -> int:
     from harness.experiments.gates import revisions
-    from harness.experiments.gates.against import exit_code, requests_of_config, requests_of_gates, run_gates
+    from harness.experiments.gates.against import (
+        build_config_requests,
+        build_test_requests,
+        choose_exit_code,
+        compare_revisions,
+    )
 
-    if len(files) > 1 or (files and name):
+    if len(files) > 1 or (files and pattern):
         raise InputError("gate --against: wanted one scene, one sweep, or -k NAME; came several of them")
-    both = revisions.sides(revisions.root(Path.cwd()), revision)
-    requests = requests_of_config(both, files[0], asked) if files else requests_of_gates(both, name)
-    found = run_gates(both, requests, options, say)
-    return exit_code([result.answer for _, result in found])
+    both = revisions.open_revisions(revisions.find_checkout(Path.cwd()), revision)
+    requests = build_config_requests(both, files[0], run_options) if files else build_test_requests(both, pattern)
+    found = compare_revisions(both, requests, options, print_message)
+    return choose_exit_code([result.verdict for _, result in found])

@@ -7,15 +7,15 @@ from typing import Annotated
 
 import typer
 
-from harness.base.console import narrow, out, say
-from harness.base.errors import InputError, Mistake
+from harness.base.console import get_output_console, print_message, split_wide_table
+from harness.base.errors import InputError, InputMistake
 
-PLACES = (Path("results/bench"), Path(".benchmarks"))
+DEFAULT_FOLDERS = (Path("results/bench"), Path(".benchmarks"))
 """Default folders of stored results: those of this project, and those of pytest-benchmark."""
 
 
-def history(
-    places: Annotated[
+def regress_history(
+    folders: Annotated[
         list[Path] | None,
         typer.Argument(help="Folders and files of pytest-benchmark; results/bench and .benchmarks if left out."),
     ] = None,
@@ -24,28 +24,30 @@ def history(
     ),
 ) -> None:
     """Find performance changes in stored results by commit. Exit code 3: too few results."""
-    from harness.report.history import FEWEST, history_table, stored_files
-    from harness.report.history import history as tell
+    from harness.report.history import MIN_RESULTS, build_history_table, find_stored_files
+    from harness.report.history import read_histories as tell
     from harness.report.history_plot import draw_history
-    from harness.report.site import keep
-    from harness.report.site.folders import stored
+    from harness.report.site import refresh_results_page
+    from harness.report.site.folders import find_benchmark_files
 
     if output.suffix.lower() not in (".png", ".svg", ".pdf"):
-        raise InputError(Mistake("wanted a name that ends in .png, .svg or .pdf", output, key="--output"))
-    files = stored_files(places or [place for place in PLACES if place.exists()])
+        raise InputError(InputMistake("wanted a name that ends in .png, .svg or .pdf", output, key="--output"))
+    files = find_stored_files(folders or [place for place in DEFAULT_FOLDERS if place.exists()])
     hint = "`pytest tests/bench --benchmark-only` stores one, at each commit that you run it at"
     if not files:
-        where = ", ".join(map(str, places or PLACES))
+        where = ", ".join(map(str, folders or DEFAULT_FOLDERS))
         raise InputError(f"history: no stored results in {where}; {hint}")
     found = tell(files)
-    out().print(narrow(history_table(found)))
-    if not any(len(series.points) >= FEWEST for series in found):
+    get_output_console().print(split_wide_table(build_history_table(found)))
+    if not any(len(series.points) >= MIN_RESULTS for series in found):
         most = max((len(series.points) for series in found), default=0)
-        say(f"too little to tell changes from noise: at most {most} results of a gate, wanted {FEWEST}; {hint}")
+        print_message(
+            f"too little to tell changes from noise: at most {most} results of a gate, wanted {MIN_RESULTS}; {hint}"
+        )
         raise typer.Exit(3)
     output.parent.mkdir(parents=True, exist_ok=True)
     drawn = draw_history(found, output)
-    say(f"the picture of {drawn} gates is {output}")
-    for place in places or PLACES:
-        if stored(place) and (place.parent / "index.html").is_file():
-            keep(place.parent, place, say)
+    print_message(f"the picture of {drawn} gates is {output}")
+    for place in folders or DEFAULT_FOLDERS:
+        if find_benchmark_files(place) and (place.parent / "index.html").is_file():
+            refresh_results_page(place.parent, place, print_message)

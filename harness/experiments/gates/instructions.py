@@ -13,11 +13,11 @@ import platform
 import struct
 from collections.abc import Callable
 
-_CALL = {"x86_64": 298, "aarch64": 241}
+_SYSTEM_CALL_NUMBERS = {"x86_64": 298, "aarch64": 241}
 """Number of the system call, by architecture."""
-_SIZE = 128
+_ATTRIBUTE_BYTES = 128
 """Size of `perf_event_attr` [bytes]; fields not given here are zero."""
-_FLAGS = 1 << 5 | 1 << 6
+_EXCLUDE_FLAGS = 1 << 5 | 1 << 6
 """exclude_kernel, exclude_hv."""
 
 INSTRUCTIONS = (0, 1)
@@ -26,7 +26,7 @@ PAGE_FAULTS = (1, 2)
 """PERF_TYPE_SOFTWARE, PERF_COUNT_SW_PAGE_FAULTS: available even if a virtual machine hides the hardware counters."""
 
 
-def count(work: Callable[[], object], event: tuple[int, int] = INSTRUCTIONS) -> int | None:
+def count_events(work: Callable[[], object], event: tuple[int, int] = INSTRUCTIONS) -> int | None:
     """Count the occurrences of an event in this thread during some work.
 
     Args:
@@ -34,35 +34,35 @@ def count(work: Callable[[], object], event: tuple[int, int] = INSTRUCTIONS) -> 
         event: type and config of perf.
     Returns: the count, or None if the counter is unavailable.
     """
-    handle, _ = _opened(event)
+    handle, _ = _open_counter(event)
     if handle is None:
         return None
     try:
-        before = _read(handle)
+        before = _read_counter(handle)
         work()
-        return _read(handle) - before
+        return _read_counter(handle) - before
     finally:
         os.close(handle)
 
 
-def reason(event: tuple[int, int] = INSTRUCTIONS) -> str:
+def explain_unavailable(event: tuple[int, int] = INSTRUCTIONS) -> str:
     """Explain why an event cannot be counted here; empty if it can."""
-    handle, said = _opened(event)
+    handle, said = _open_counter(event)
     if handle is not None:
         os.close(handle)
     return said
 
 
-def _opened(event: tuple[int, int]) -> tuple[int | None, str]:
+def _open_counter(event: tuple[int, int]) -> tuple[int | None, str]:
     """Open a running counter; return its file descriptor, or None and the reason."""
-    number = _CALL.get(platform.machine())
+    number = _SYSTEM_CALL_NUMBERS.get(platform.machine())
     if platform.system() != "Linux" or number is None:
         return None, f"instructions cannot be counted on {platform.system()} {platform.machine()}"
-    attributes = bytearray(_SIZE)
-    struct.pack_into("=IIQ", attributes, 0, event[0], _SIZE, event[1])
-    struct.pack_into("=Q", attributes, 40, _FLAGS)
+    attributes = bytearray(_ATTRIBUTE_BYTES)
+    struct.pack_into("=IIQ", attributes, 0, event[0], _ATTRIBUTE_BYTES, event[1])
+    struct.pack_into("=Q", attributes, 40, _EXCLUDE_FLAGS)
     libc = ctypes.CDLL(None, use_errno=True)
-    given = (ctypes.c_char * _SIZE).from_buffer(attributes)
+    given = (ctypes.c_char * _ATTRIBUTE_BYTES).from_buffer(attributes)
     handle = libc.syscall(ctypes.c_long(number), given, 0, -1, ctypes.c_long(-1), ctypes.c_ulong(0))
     if handle >= 0:
         return handle, ""
@@ -70,5 +70,5 @@ def _opened(event: tuple[int, int]) -> tuple[int | None, str]:
     return None, f"instructions cannot be counted here: {error} (perf_event_open; a virtual machine may hide them)"
 
 
-def _read(handle: int) -> int:
+def _read_counter(handle: int) -> int:
     return struct.unpack("=Q", os.read(handle, 8))[0]

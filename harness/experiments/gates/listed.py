@@ -15,21 +15,21 @@ from typing import Any
 
 from pydantic import Field
 
-from harness.base.document import Document
-from harness.base.errors import InputError, Mistake
-from harness.base.machine import pinned_threads
-from harness.base.model import Model
+from harness.base.document import ConfigDocument
+from harness.base.errors import InputError, InputMistake
+from harness.base.machine import limit_threads
+from harness.base.model import ConfigModel
 from harness.base.yaml import read_yaml
-from harness.config.options import Iterations, Tolerance
-from harness.experiments.gates.abba import Clock, Racers, Result, confirmed
-from harness.experiments.gates.agreement import AGREEMENT, difference
-from harness.experiments.gates.scenes import calls_of, pair, timed
-from harness.experiments.gates.sequential import ALPHA, Rule
-from harness.scenes.spec import Frames, IntegratorName, Size
+from harness.config.options import IterationLimit, RelativeTolerance
+from harness.experiments.gates.abba import BenchmarkResult, ClockName, ProgramPair, run_confirmed_benchmark
+from harness.experiments.gates.agreement import DEFAULT_AGREEMENT_RTOL, describe_difference
+from harness.experiments.gates.scenes import build_timer, choose_num_calls, prepare_solver_pair
+from harness.experiments.gates.sequential import DEFAULT_ALPHA, SequentialTest
+from harness.scenes.spec import FrameCount, IntegratorName, MeshSize
 from solvers.problem import NotPositiveDefinite, Unsupported
 
 
-class Gate(Model):
+class RegressionTest(ConfigModel):
     """A performance test of a solver against a baseline on a scene's steps.
 
     The solver may take at most a given multiple of the baseline's time.
@@ -43,20 +43,20 @@ class Gate(Model):
     """The baseline, in the same form."""
     limit: float = Field(gt=0, le=1e6)
     """The largest ratio of times, the solver's over the baseline's."""
-    agree: float = Field(default=AGREEMENT, ge=0, le=1)
+    agree: float = Field(default=DEFAULT_AGREEMENT_RTOL, ge=0, le=1)
     """Tolerance of the difference of their positions, relative to the scene's size; nothing is timed if it is
     exceeded."""
-    size: Size | None = None
+    size: MeshSize | None = None
     """Mesh size; the scene's default if left out."""
-    iterations: Iterations = 50
+    iterations: IterationLimit = 50
     """Iteration limit of a step."""
-    tolerance: Tolerance = None
+    tolerance: RelativeTolerance = None
     """Relative tolerance of a step's iterations; null performs all of them."""
     integrator: IntegratorName = "implicit-euler"
     """Time integrator."""
-    frames: Frames | None = None
+    frames: FrameCount | None = None
     """Maximum number of steps; null uses the scene's."""
-    clock: Clock = "cpu"
+    clock: ClockName = "cpu"
     """cpu: CPU time, which other programs hardly affect; wall: elapsed time."""
     budget: float | None = Field(default=None, gt=0, le=86400)
     """Seconds until the test is inconclusive; null uses the command's."""
@@ -65,19 +65,21 @@ class Gate(Model):
     def title(self) -> str:
         """Description of the test."""
         size = f" {self.size}" if self.size else ""
-        return f"{Path(self.scene).stem}{size}, {_name(self.solver)} against {_name(self.against)}"
+        return f"{Path(self.scene).stem}{size}, {_format_solver(self.solver)} against {_format_solver(self.against)}"
 
 
-class ListedGates(Model):
+class RegressionTable(ConfigModel):
     """A table of performance tests."""
 
     description: str = Field(default="", max_length=1000)
     """One sentence about what the tests protect."""
-    gates: tuple[Gate, ...] = Field(min_length=1)
+    gates: tuple[RegressionTest, ...] = Field(min_length=1)
     """The tests."""
 
 
-def run_table(path: Path, budget: float, say: Callable[[str], None], alpha: float = ALPHA) -> list[tuple[Gate, Result]]:
+def run_regression_table(
+    path: Path, budget: float, print_message: Callable[[str], None], alpha: float = DEFAULT_ALPHA
+) -> list[tuple[RegressionTest, BenchmarkResult]]:
     """Run all tests of a table, and print each result at once.
 
     Args:
@@ -89,55 +91,59 @@ def run_table(path: Path, budget: float, say: Callable[[str], None], alpha: floa
         InputError: for a mistake in the table, or if the answers differ.
     """
     document = read_yaml(path)
-    table = document.check(ListedGates, document.data)
+    table = document.validate_data(RegressionTable, document.data)
     if table is None:
-        raise document.error()
+        raise document.build_error()
     for i, gate in enumerate(table.gates):
         if not (path.parent / gate.scene).is_file():
-            document.report(f"there is no file {path.parent / gate.scene}", ("gates", i, "scene"))
+            document.add_mistake(f"there is no file {path.parent / gate.scene}", ("gates", i, "scene"))
     if document.mistakes:
-        raise document.error()
-    found: list[tuple[Gate, Result]] = []
+        raise document.build_error()
+    found: list[tuple[RegressionTest, BenchmarkResult]] = []
     for i, gate in enumerate(table.gates):
-        rule = Rule(gate.limit, alpha / len(table.gates))
-        result = confirmed(partial(_started, document, i, gate), rule, budget=gate.budget or budget)
-        say(f"{gate.title}: {result}")
+        rule = SequentialTest(gate.limit, alpha / len(table.gates))
+        result = run_confirmed_benchmark(
+            partial(_start_solvers, document, i, gate), rule, time_budget=gate.budget or budget
+        )
+        print_message(f"{gate.title}: {result}")
         found.append((gate, result))
     return found
 
 
 @contextmanager
-def _started(document: Document, i: int, gate: Gate) -> Generator[Racers]:
+def _start_solvers(document: ConfigDocument, index: int, test: RegressionTest) -> Generator[ProgramPair]:
     """Prepare both solvers again, warm them up, and check that their answers agree."""
-    options = {key: getattr(gate, key) for key in ("iterations", "tolerance", "integrator", "frames")}
-    with pinned_threads(1):
+    options = {key: getattr(test, key) for key in ("iterations", "tolerance", "integrator", "frames")}
+    with limit_threads(1):
         try:
-            candidate, yardstick = pair(
-                document.path.parent / gate.scene, gate.solver, gate.against, size=gate.size, **options
+            candidate, yardstick = prepare_solver_pair(
+                document.path.parent / test.scene, test.solver, test.against, size=test.size, **options
             )
-            said = difference(candidate(), yardstick(), gate.agree)
+            said = describe_difference(candidate(), yardstick(), test.agree)
         except (Unsupported, NotPositiveDefinite) as error:
-            document.report(f"cannot be run: {error}", ("gates", i))
-            raise document.error() from error
+            document.add_mistake(f"cannot be run: {error}", ("gates", index))
+            raise document.build_error() from error
         except InputError as error:
             # Mistakes of a scene or a solver are reported at the line of the test that uses it.
-            line = document.lines.get(("gates", i))
-            raise InputError([_placed(mistake, document.path, line, i) for mistake in error.mistakes]) from error
+            line = document.lines.get(("gates", index))
+            raise InputError(
+                [_add_location(mistake, document.path, line, index) for mistake in error.mistakes]
+            ) from error
         if said:
-            document.report(f"the answers differ, so nothing was timed: {said}", ("gates", i))
-            raise document.error()
-        calls = calls_of(candidate, yardstick)
-        yield Racers(timed(candidate, calls, gate.clock), timed(yardstick, calls, gate.clock))
+            document.add_mistake(f"the answers differ, so nothing was timed: {said}", ("gates", index))
+            raise document.build_error()
+        calls = choose_num_calls(candidate, yardstick)
+        yield ProgramPair(build_timer(candidate, calls, test.clock), build_timer(yardstick, calls, test.clock))
 
 
-def _placed(mistake: Mistake, path: Path, line: int | None, i: int) -> Mistake:
+def _add_location(mistake: InputMistake, path: Path, line: int | None, index: int) -> InputMistake:
     if mistake.file and mistake.line:
         return mistake
-    return replace(mistake, file=path, line=line, key=f"gates[{i}]")
+    return replace(mistake, file=path, line=line, key=f"gates[{index}]")
 
 
-def _name(given: str | dict[str, Any]) -> str:
+def _format_solver(solver_input: str | dict[str, Any]) -> str:
     """Describe a solver by its name and parameters."""
-    if isinstance(given, str):
-        return given
-    return " ".join([str(given.get("name", "?")), *(f"{k}={v}" for k, v in given.items() if k != "name")])
+    if isinstance(solver_input, str):
+        return solver_input
+    return " ".join([str(solver_input.get("name", "?")), *(f"{k}={v}" for k, v in solver_input.items() if k != "name")])

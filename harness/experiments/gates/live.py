@@ -11,38 +11,38 @@ from typing import Any
 import pyarrow as pa
 
 from harness.base import columns, rows
-from harness.experiments.gates.abba import confirmed
-from harness.experiments.gates.against import Options, Request, started
-from harness.experiments.gates.pair import Side
-from harness.experiments.gates.sequential import Rule, Verdict
-from harness.experiments.gates.study import competing
+from harness.experiments.gates.abba import run_confirmed_benchmark
+from harness.experiments.gates.against import ComparisonOptions, WorkRequest, start_revisions
+from harness.experiments.gates.pair import GitRevision
+from harness.experiments.gates.sequential import SequentialTest, SequentialVerdict
+from harness.experiments.gates.study import run_background_load
 
-SCHEMA = columns.schema_of(
+LIVE_STUDY_SCHEMA = columns.build_schema(
     (
-        columns.Column("gate", pa.string(), "", "what takes turns"),
-        columns.Column("condition", pa.string(), "", "what was run beside it: nothing, busy or bursty"),
-        columns.Column("planted", pa.float64(), "", "extra work of the candidate, as a part of its iterations"),
-        columns.Column("limit", pa.float64(), "", "ratio of times from which on it counts as slower"),
-        columns.Column("answer", pa.string(), "", "holds, fails or undecided"),
-        columns.Column("ratio", pa.float64(), "", "median ratio of times over the turns"),
-        columns.Column("low", pa.float64(), "", "lower end of its confidence sequence"),
-        columns.Column("high", pa.float64(), "", "upper end"),
-        columns.Column("seconds", pa.float64(), "s", "until the answer"),
-        columns.Column("load", pa.float64(), "", "load average over a minute, at the end"),
+        columns.ColumnSpec("gate", pa.string(), "", "what takes turns"),
+        columns.ColumnSpec("condition", pa.string(), "", "what was run beside it: nothing, busy or bursty"),
+        columns.ColumnSpec("planted", pa.float64(), "", "extra work of the candidate, as a part of its iterations"),
+        columns.ColumnSpec("limit", pa.float64(), "", "ratio of times from which on it counts as slower"),
+        columns.ColumnSpec("answer", pa.string(), "", "holds, fails or undecided"),
+        columns.ColumnSpec("ratio", pa.float64(), "", "median ratio of times over the turns"),
+        columns.ColumnSpec("low", pa.float64(), "", "lower end of its confidence sequence"),
+        columns.ColumnSpec("high", pa.float64(), "", "upper end"),
+        columns.ColumnSpec("seconds", pa.float64(), "s", "until the answer"),
+        columns.ColumnSpec("load", pa.float64(), "", "load average over a minute, at the end"),
     )
 )
 
 
-def hold(
+def run_live_study(
     path: Path,
     checkout: Path,
-    requests: Sequence[Request],
-    condition: str,
-    options: Options,
+    requests: Sequence[WorkRequest],
+    background_load: str,
+    options: ComparisonOptions,
     *,
-    gates: int,
-    planted: float,
-    say: Callable[[str], None],
+    num_repeats: int,
+    injected_slowdown: float,
+    print_message: Callable[[str], None],
 ) -> None:
     """Run performance tests of each request, and store each result at once.
 
@@ -58,36 +58,44 @@ def hold(
         injected_slowdown: extra work of the candidate, as a fraction of its iterations.
         print_message: receives one line per result.
     """
-    found = rows.read([path], SCHEMA).to_pylist() if path.exists() else []
-    sides = Side("the one", checkout, extra=planted), Side("the other", checkout)
-    rule = Rule(options.limit, options.alpha)
-    told = cache(say)  # what differs is found at each start, and told once
-    with competing(condition):
-        for number in range(gates):
+    found = rows.read_rows([path], LIVE_STUDY_SCHEMA).to_pylist() if path.exists() else []
+    sides = GitRevision("the one", checkout, injected_slowdown=injected_slowdown), GitRevision("the other", checkout)
+    rule = SequentialTest(options.max_ratio, options.alpha)
+    told = cache(print_message)  # what differs is found at each start, and told once
+    with run_background_load(background_load):
+        for number in range(num_repeats):
             for request in requests:
-                result = confirmed(partial(started, sides, request, options, told), rule, budget=options.budget)
-                say(f"{number + 1} of {gates}, {request.title}: {result}")
-                held = {"gate": request.title, "condition": condition, "planted": planted, "limit": options.limit}
-                held |= {"answer": result.answer.name.lower(), "ratio": result.interval.ratio}
+                result = run_confirmed_benchmark(
+                    partial(start_revisions, sides, request, options, told), rule, time_budget=options.budget
+                )
+                print_message(f"{number + 1} of {num_repeats}, {request.title}: {result}")
+                held = {
+                    "gate": request.title,
+                    "condition": background_load,
+                    "planted": injected_slowdown,
+                    "limit": options.max_ratio,
+                }
+                held |= {"answer": result.verdict.name.lower(), "ratio": result.interval.ratio}
                 held |= {"low": result.interval.low, "high": result.interval.high}
-                found.append(held | {"seconds": result.elapsed, "load": result.load})
-                rows.write(path, found, SCHEMA)
+                found.append(held | {"seconds": result.elapsed_seconds, "load": result.load_average})
+                rows.write_rows(path, found, LIVE_STUDY_SCHEMA)
 
 
-def summary(path: Path) -> list[tuple[str, ...]]:
+def summarise_live_study(path: Path) -> list[tuple[str, ...]]:
     """Summarise the stored results by kind of test.
 
     A row has the conditions of the test, and the number of each verdict.
     """
     by: dict[tuple[str, str, float, float], list[dict[str, Any]]] = {}
-    for row in rows.read([path], SCHEMA).to_pylist():
+    for row in rows.read_rows([path], LIVE_STUDY_SCHEMA).to_pylist():
         by.setdefault((row["gate"], row["condition"], row["planted"], row["limit"]), []).append(row)
     table: list[tuple[str, ...]] = []
     for (gate, condition, planted, limit), held in by.items():
         load, seconds = (median(row[name] for row in held) for name in ("load", "seconds"))
         answers = [row["answer"] for row in held]
         counts = [
-            str(answers.count(answer.name.lower())) for answer in (Verdict.FAILS, Verdict.HOLDS, Verdict.UNDECIDED)
+            str(answers.count(answer.name.lower()))
+            for answer in (SequentialVerdict.FAIL, SequentialVerdict.PASS, SequentialVerdict.INCONCLUSIVE)
         ]
         cells = [f"{load:.1f}", f"{planted:.0%}", f"{limit - 1:.0%}", str(len(held)), *counts, f"{seconds:.1f}"]
         table.append((gate, condition, *cells))

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from harness.base.errors import InputError
 
-WORKER = Path(__file__).with_name("worker.py")
+WORKER_SCRIPT = Path(__file__).with_name("worker.py")
 
 
 @dataclass(frozen=True, slots=True)
-class Side:
+class GitRevision:
     """A git revision that can be run.
 
     name: name in messages.
@@ -35,24 +35,24 @@ class Side:
     """
 
     name: str
-    tree: Path
-    python: Path = field(default_factory=lambda: Path(sys.executable))
+    worktree: Path
+    interpreter: Path = field(default_factory=lambda: Path(sys.executable))
     checkout: Path | None = None
-    extra: float = 0.0
+    injected_slowdown: float = 0.0
 
-    def own(self, file: Path) -> Path:
+    def resolve_file(self, file: Path) -> Path:
         """Return the revision's version of a file of the checkout.
 
         Other and missing files are returned unchanged.
         """
         if self.checkout and file.is_relative_to(self.checkout):
-            there = self.tree / file.relative_to(self.checkout)
+            there = self.worktree / file.relative_to(self.checkout)
             return there if there.exists() else file
         return file
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeldWork:
+class PreparedWork:
     """Work that a process has prepared.
 
     answer: result of the work.
@@ -62,28 +62,28 @@ class HeldWork:
     """
 
     answer: NDArray[np.float64]
-    facts: dict[str, int]
+    stats: dict[str, int]
     clock: str
-    frames: int
+    num_frames: int
 
 
 class RevisionProcess:
     """A process that runs one revision's work; errors become InputErrors with the revision's own message."""
 
-    def __init__(self, side: Side, scratch: Path) -> None:
-        self.side, self._answer = side, scratch / f"{side.name.replace('/', '_')}.npy"
+    def __init__(self, revision: GitRevision, scratch: Path) -> None:
+        self.revision, self._answer_path = revision, scratch / f"{revision.name.replace('/', '_')}.npy"
         # The script's folder would come first on the path, and files next to it would shadow modules of other names.
-        environment = {**os.environ, "PYTHONPATH": _path(side), "PYTHONSAFEPATH": "1"}
-        command = [str(side.python), str(WORKER)]
+        environment = {**os.environ, "PYTHONPATH": _build_python_path(revision), "PYTHONSAFEPATH": "1"}
+        command = [str(revision.interpreter), str(WORKER_SCRIPT)]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(
-            command, cwd=side.tree, env=environment, text=True, stdin=pipe, stdout=pipe, stderr=pipe
+            command, cwd=revision.worktree, env=environment, text=True, stdin=pipe, stdout=pipe, stderr=pipe
         )
-        self._said: deque[str] = deque(maxlen=20)
-        self._listener = Thread(target=self._listen, daemon=True)
+        self._error_lines: deque[str] = deque(maxlen=20)
+        self._listener = Thread(target=self._read_errors, daemon=True)
         self._listener.start()
 
-    def ask(self, do: str, **asked: Any) -> dict[str, Any]:
+    def send_request(self, command: str, **arguments: Any) -> dict[str, Any]:
         """Send a request and return its answer.
 
         Args:
@@ -96,29 +96,29 @@ class RevisionProcess:
         assert process.stdin is not None
         assert process.stdout is not None
         with suppress(BrokenPipeError):
-            process.stdin.write(json.dumps({"do": do, **asked}) + "\n")
+            process.stdin.write(json.dumps({"do": command, **arguments}) + "\n")
             process.stdin.flush()
         line = process.stdout.readline()
         if not line:
             process.wait()
             self._listener.join()
-            last = self._said[-1] if self._said else f"its process ended with code {process.returncode}"
-            raise InputError(f"{self.side.name}: does not run: {last}")
+            last = self._error_lines[-1] if self._error_lines else f"its process ended with code {process.returncode}"
+            raise InputError(f"{self.revision.name}: does not run: {last}")
         answer = json.loads(line)
         if "error" in answer:
-            raise InputError(f"{self.side.name}: does not run: {answer['error']}")
+            raise InputError(f"{self.revision.name}: does not run: {answer['error']}")
         return answer
 
-    def hold(self, do: str, **asked: Any) -> HeldWork:
+    def prepare_work(self, command: str, **arguments: Any) -> PreparedWork:
         """Request the preparation of work; `revision_worker.py` lists the commands."""
-        told = self.ask(do, positions=str(self._answer), **asked)
-        return HeldWork(np.load(self._answer), told["facts"], told["clock"], told.get("frames", 0))
+        told = self.send_request(command, positions=str(self._answer_path), **arguments)
+        return PreparedWork(np.load(self._answer_path), told["facts"], told["clock"], told.get("frames", 0))
 
-    def instructions(self) -> int | None:
+    def count_instructions(self) -> int | None:
         """Count the instructions of one call of the work; None if the machine hides them."""
-        return self.ask("instructions")["instructions"]
+        return self.send_request("instructions")["instructions"]
 
-    def seconds(self, calls: int, clock: str) -> float:
+    def time_calls(self, num_calls: int, clock: str) -> float:
         """Time calls of the work together.
 
         Args:
@@ -126,11 +126,11 @@ class RevisionProcess:
             clock: cpu or wall.
         Returns: seconds.
         """
-        return self.ask("time", calls=calls, clock=clock)["seconds"]
+        return self.send_request("time", calls=num_calls, clock=clock)["seconds"]
 
-    def renew(self) -> None:
+    def rebuild_work(self) -> None:
         """Rebuild the prepared work at other addresses."""
-        self.ask("renew")
+        self.send_request("renew")
 
     def close(self) -> None:
         """Stop the process."""
@@ -145,34 +145,36 @@ class RevisionProcess:
             process.kill()
             process.wait()
 
-    def _listen(self) -> None:
+    def _read_errors(self) -> None:
         """Read standard error and store its last lines; a full pipe would block the process."""
         assert self._process.stderr is not None
         for line in self._process.stderr:
             if line.strip():
-                self._said.append(line.strip())
+                self._error_lines.append(line.strip())
 
 
-def _path(side: Side) -> str:
+def _build_python_path(revision: GitRevision) -> str:
     """Build the Python path of a revision.
 
     The worktree comes first, then existing entries, mapped from the checkout to the worktree.
     """
     given = [Path(entry).resolve() for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep) if entry]
     mapped = [
-        side.tree / entry.relative_to(side.checkout) if side.checkout and entry.is_relative_to(side.checkout) else entry
+        revision.worktree / entry.relative_to(revision.checkout)
+        if revision.checkout and entry.is_relative_to(revision.checkout)
+        else entry
         for entry in given
     ]
-    return os.pathsep.join(map(str, dict.fromkeys([side.tree, *mapped])))
+    return os.pathsep.join(map(str, dict.fromkeys([revision.worktree, *mapped])))
 
 
 @contextmanager
-def workers(*sides: Side) -> Generator[list[RevisionProcess]]:
+def start_workers(*revisions: GitRevision) -> Generator[list[RevisionProcess]]:
     """Start a worker process for each revision; all stop at the end of the block."""
     alive: list[RevisionProcess] = []
     with TemporaryDirectory(prefix="springbench-") as scratch:
         try:
-            for number, side in enumerate(sides):
+            for number, side in enumerate(revisions):
                 folder = Path(scratch) / str(number)
                 folder.mkdir()
                 alive.append(RevisionProcess(side, folder))
@@ -182,11 +184,11 @@ def workers(*sides: Side) -> Generator[list[RevisionProcess]]:
                 worker.close()
 
 
-SAME = 0.001
+INSTRUCTION_RTOL = 0.001
 """Relative tolerance of instruction counts, for internal work of the interpreter."""
 
 
-def changes(new: dict[str, int], old: dict[str, int]) -> list[str]:
+def describe_changes(new: dict[str, int], old: dict[str, int]) -> list[str]:
     """Describe the differences of deterministic counts: iterations, entries, bytes, flops, instructions.
 
     Args:
@@ -194,6 +196,6 @@ def changes(new: dict[str, int], old: dict[str, int]) -> list[str]:
         old: counts of the revision.
     Returns: one text per difference.
     """
-    allowed = {name: SAME * old[name] if name == "instructions" else 0 for name in old}
+    allowed = {name: INSTRUCTION_RTOL * old[name] if name == "instructions" else 0 for name in old}
     both = [name for name in old if name in new and abs(new[name] - old[name]) > allowed[name]]
     return [f"{name} {old[name]:,} -> {new[name]:,} ({new[name] / old[name] - 1:+.1%})" for name in both if old[name]]

@@ -24,20 +24,20 @@ import pytest
 if TYPE_CHECKING:
     from pytest_benchmark.fixture import BenchmarkFixture
 
-    from harness.experiments.gates.abba import Result
-    from harness.experiments.gates.scenes import Given, Work
+    from harness.experiments.gates.abba import BenchmarkResult
+    from harness.experiments.gates.scenes import SolverInput, WorkFunction
 
-UNDECIDED = pytest.StashKey[bool]()
-EXIT_UNDECIDED = 13
-MOST = 10**9
+INCONCLUSIVE_KEY = pytest.StashKey[bool]()
+EXIT_INCONCLUSIVE = 13
+MAX_ROUNDS = 10**9
 """Number of rounds requested from pytest-benchmark; the benchmark ends earlier."""
 
 
-class _Decided(BaseException):
+class _BenchmarkDecided(BaseException):
     """Ends the rounds of pytest-benchmark; an Exception would mark the benchmark as failed."""
 
 
-class Race:
+class PairedBenchmark:
     """Fixture that compares two programs, or two solvers on a scene; one comparison per test."""
 
     def __init__(self, benchmark: BenchmarkFixture, item: pytest.Item) -> None:
@@ -46,16 +46,16 @@ class Race:
 
     def __call__(
         self,
-        candidate: Work,
-        yardstick: Work,
+        candidate: WorkFunction,
+        baseline: WorkFunction,
         *,
-        limit: float,
+        max_ratio: float,
         clock: Literal["cpu", "wall"] = "cpu",
-        agree: float | None = 0.0,
+        agreement_rtol: float | None = 0.0,
         budget: float | None = None,
-        error: float | None = None,
-        **told: Any,
-    ) -> Result | None:
+        alpha: float | None = None,
+        **extra_info: Any,
+    ) -> BenchmarkResult | None:
         """Fail the test if the candidate is too slow compared with the baseline.
 
         It may take at most max_ratio times as long.
@@ -71,58 +71,58 @@ class Race:
             extra_info: stored in the benchmark's JSON.
         Returns: the result, or None if nothing is timed.
         """
-        from harness.experiments.gates.abba import playing
-        from harness.experiments.gates.agreement import difference
-        from harness.experiments.gates.scenes import calls_of, timed
-        from harness.experiments.gates.sequential import ALPHA, Rule, Verdict
+        from harness.experiments.gates.abba import iterate_paired_benchmark
+        from harness.experiments.gates.agreement import describe_difference
+        from harness.experiments.gates.scenes import build_timer, choose_num_calls
+        from harness.experiments.gates.sequential import DEFAULT_ALPHA, SequentialTest, SequentialVerdict
 
-        rule, benchmark = Rule(limit, error or ALPHA), cast(Any, self._benchmark)
+        rule, benchmark = SequentialTest(max_ratio, alpha or DEFAULT_ALPHA), cast(Any, self._benchmark)
         answer: Any = benchmark.pedantic(candidate) if benchmark.disabled else candidate()
-        if agree is not None:
-            said = difference(answer, yardstick(), agree)
+        if agreement_rtol is not None:
+            said = describe_difference(answer, baseline(), agreement_rtol)
             if said:
                 pytest.fail(f"the answers differ, so nothing was timed: {said}", pytrace=False)
         elif not benchmark.disabled:
-            yardstick()
+            baseline()
         if benchmark.disabled:
             return None
-        calls = calls_of(candidate, yardstick)
-        a, b = (timed(work, calls, clock) for work in (candidate, yardstick))
-        found: list[Result] = []
+        calls = choose_num_calls(candidate, baseline)
+        a, b = (build_timer(work, calls, clock) for work in (candidate, baseline))
+        found: list[BenchmarkResult] = []
         last: list[float] = []
-        game = playing(b, rule, budget=budget or self._budget)
+        game = iterate_paired_benchmark(b, rule, time_budget=budget or self._budget)
 
         def before() -> None:
             try:
                 game.send(last.pop()) if last else next(game)
             except StopIteration as done:
                 found.append(done.value)
-                raise _Decided from None
+                raise _BenchmarkDecided from None
 
-        with suppress(_Decided):
-            benchmark.pedantic(lambda: last.append(a()), setup=before, rounds=MOST)
+        with suppress(_BenchmarkDecided):
+            benchmark.pedantic(lambda: last.append(a()), setup=before, rounds=MAX_ROUNDS)
         (result,) = found
-        benchmark.extra_info |= told | _told(result, calls, clock)
-        if result.answer is Verdict.UNDECIDED:
-            self._item.stash[UNDECIDED] = True
+        benchmark.extra_info |= extra_info | _build_extra_info(result, calls, clock)
+        if result.verdict is SequentialVerdict.INCONCLUSIVE:
+            self._item.stash[INCONCLUSIVE_KEY] = True
             pytest.skip(str(result))
-        if result.answer is Verdict.FAILS:
+        if result.verdict is SequentialVerdict.FAIL:
             pytest.fail(str(result), pytrace=False)
         return result
 
-    def solvers(
+    def compare_solvers(
         self,
         scene: str | os.PathLike[str],
-        solver: Given,
-        against: Given,
+        solver: SolverInput,
+        baseline: SolverInput,
         *,
-        limit: float,
-        agree: float | None = 1e-9,
+        max_ratio: float,
+        agreement_rtol: float | None = 1e-9,
         clock: Literal["cpu", "wall"] = "cpu",
         budget: float | None = None,
         size: int | None = None,
         **options: Any,
-    ) -> Result | None:
+    ) -> BenchmarkResult | None:
         """Compare two solvers on a scene.
 
         Args:
@@ -137,36 +137,36 @@ class Race:
             options: options of a run: iterations, tolerance, frames, integrator, time_step, first_guess.
         Returns: the result, or None if nothing is timed.
         """
-        from harness.base.machine import pinned_threads
-        from harness.experiments.gates.scenes import pair
+        from harness.base.machine import limit_threads
+        from harness.experiments.gates.scenes import prepare_solver_pair
 
-        with pinned_threads(1):
-            both = pair(self._item.path.parent / Path(scene), solver, against, size=size, **options)
-            return self(*both, limit=limit, clock=clock, agree=agree, budget=budget)
+        with limit_threads(1):
+            both = prepare_solver_pair(self._item.path.parent / Path(scene), solver, baseline, size=size, **options)
+            return self(*both, max_ratio=max_ratio, clock=clock, agreement_rtol=agreement_rtol, budget=budget)
 
 
-def _told(result: Result, calls: int, clock: str) -> dict[str, Any]:
+def _build_extra_info(result: BenchmarkResult, num_calls: int, clock: str) -> dict[str, Any]:
     """Build the entries of the benchmark's `extra_info`."""
     found = result.interval
     return {
         "ratio": {"median": found.ratio, "low": max(found.low, 1e-300), "high": min(found.high, 1e300)},  # no inf
-        "limit": result.rule.limit,
-        "answer": result.answer.name.lower(),
-        "error": result.rule.alpha,
-        "turns": len(result.turns),
-        "calls": calls,
+        "limit": result.sequential_test.max_ratio,
+        "answer": result.verdict.name.lower(),
+        "error": result.sequential_test.alpha,
+        "turns": len(result.blocks),
+        "calls": num_calls,
         "clock": clock,
-        "load": round(result.load, 2),
+        "load": round(result.load_average, 2),
     }
 
 
 @pytest.fixture
-def race(benchmark: BenchmarkFixture, request: pytest.FixtureRequest) -> Race:
+def paired_benchmark(benchmark: BenchmarkFixture, request: pytest.FixtureRequest) -> PairedBenchmark:
     """Compare the times of two programs, or of two solvers on a scene.
 
     Their answers are checked first.
     """
-    return Race(benchmark, request.node)
+    return PairedBenchmark(benchmark, request.node)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -175,31 +175,31 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--race-budget", type=float, default=60.0, help="Seconds that a race may take; 60.")
 
 
-class _Count:
+class _InconclusiveCounter:
     """Counts inconclusive tests; with xdist in the process that reports."""
 
     def __init__(self) -> None:
-        self.undecided = 0
+        self.num_inconclusive = 0
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        self.undecided += getattr(report, "undecided", False)
+        self.num_inconclusive += getattr(report, "undecided", False)
 
     @pytest.hookimpl(trylast=True)
     def pytest_sessionfinish(self, session: pytest.Session, exitstatus: int) -> None:
-        if exitstatus == 0 and self.undecided:
-            session.exitstatus = EXIT_UNDECIDED
+        if exitstatus == 0 and self.num_inconclusive:
+            session.exitstatus = EXIT_INCONCLUSIVE
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Register the counter of inconclusive tests."""
-    config.pluginmanager.register(_Count(), "springbench-undecided")
+    config.pluginmanager.register(_InconclusiveCounter(), "springbench-undecided")
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Mark the report of an inconclusive test."""
     report = yield
-    if report.when == "call" and report.skipped and item.stash.get(UNDECIDED, False):
+    if report.when == "call" and report.skipped and item.stash.get(INCONCLUSIVE_KEY, False):
         report.undecided = True  # type: ignore[attr-defined]
     return report
 

@@ -13,41 +13,43 @@ from pathlib import Path
 from typing import Any
 
 from harness.base.errors import InputError
-from harness.config.load import load_any, require_stated
-from harness.config.options import DEFAULT_SOLVER, Chosen
+from harness.config.load import load_config, require_fixed_steps
+from harness.config.options import DEFAULT_SOLVER, RunOptions
 from harness.config.sweep import RunSpec
-from harness.experiments.gates.abba import CALL, Clock, Timed
-from harness.scenes.bind import build
-from harness.simulation.algebraic import stop_rule
-from harness.simulation.step import prepare, simulate
+from harness.experiments.gates.abba import MIN_CALL_SECONDS, ClockName, TimedCall
+from harness.scenes.bind import build_scene
+from harness.simulation.algebraic import build_stop_rule
+from harness.simulation.step import prepare, simulate_scene
 from solvers.problem import Positions, Solver
-from solvers.registry import SOLVERS, load
+from solvers.registry import SOLVERS, load_target
 
-CLOCKS: dict[Clock, Callable[[], float]] = {"cpu": time.process_time, "wall": time.perf_counter}
+CLOCK_FUNCTIONS: dict[ClockName, Callable[[], float]] = {"cpu": time.process_time, "wall": time.perf_counter}
 
-Given = str | Mapping[str, Any] | Solver
+SolverInput = str | Mapping[str, Any] | Solver
 """A solver: its name, a mapping of its name and parameters, or a solver object."""
 
-Work = Callable[[], Any]
+WorkFunction = Callable[[], Any]
 """Function that performs some work once and returns its answer."""
 
 
 @dataclass(frozen=True, slots=True)
-class Steps:
+class SceneSteps:
     """The first steps of a scene with a prepared solver.
 
     A call simulates them and returns the last positions [m].
     """
 
     run: RunSpec
-    frames: int
-    positions: Callable[[int], Positions]
+    num_frames: int
+    simulate_frames: Callable[[int], Positions]
 
     def __call__(self) -> Positions:
-        return self.positions(self.frames)
+        return self.simulate_frames(self.num_frames)
 
 
-def pair(scene: Path, solver: Given, against: Given, *, size: int | None = None, **options: Any) -> tuple[Steps, Steps]:
+def prepare_solver_pair(
+    scene: Path, solver: SolverInput, baseline: SolverInput, *, size: int | None = None, **options: Any
+) -> tuple[SceneSteps, SceneSteps]:
     """Prepare the same steps for two solvers, and run both once.
 
     The number of steps is chosen so that a call is long enough for a clock, at most the scene's.
@@ -60,39 +62,43 @@ def pair(scene: Path, solver: Given, against: Given, *, size: int | None = None,
         options: options of a run, such as iterations and tolerance.
     Raises: InputError, Unsupported, NotPositiveDefinite.
     """
-    both = [_steps(scene, given, size, options) for given in (solver, against)]
-    once = min(seconds_of(steps) for steps in both)
-    frames = min(both[0].run.frames, ceil(CALL / max(once, 1e-6)))
-    candidate, yardstick = (Steps(s.run, frames, s.positions) for s in both)
+    both = [_prepare_steps(scene, given, size, options) for given in (solver, baseline)]
+    once = min(measure_call_seconds(steps) for steps in both)
+    frames = min(both[0].run.frames, ceil(MIN_CALL_SECONDS / max(once, 1e-6)))
+    candidate, yardstick = (SceneSteps(s.run, frames, s.simulate_frames) for s in both)
     return candidate, yardstick
 
 
-def _steps(scene: Path, given: Given, size: int | None, options: dict[str, Any]) -> Steps:
+def _prepare_steps(scene: Path, solver_input: SolverInput, size: int | None, options: dict[str, Any]) -> SceneSteps:
     asked: list[Any] = [
-        dict(given) if isinstance(given, Mapping) else given if isinstance(given, str) else DEFAULT_SOLVER
+        dict(solver_input)
+        if isinstance(solver_input, Mapping)
+        else solver_input
+        if isinstance(solver_input, str)
+        else DEFAULT_SOLVER
     ]
-    stated = {name: Chosen.model_fields[name].default for name in ("iterations", "tolerance")}
+    stated = {name: RunOptions.model_fields[name].default for name in ("iterations", "tolerance")}
     more: dict[str, Any] = {"threads": 1} | stated | options
-    runs = load_any(scene, solvers=asked, sizes=[size] if size else [], **more).runs()
+    runs = load_config(scene, solvers=asked, sizes=[size] if size else [], **more).list_runs()
     if len(runs) != 1:
         raise InputError(f"{scene}: a gate is on one run; came {len(runs)}")
-    require_stated(runs)
+    require_fixed_steps(runs)
     (run,) = runs
-    named = isinstance(given, (str, Mapping))
-    solver: Solver = load(SOLVERS[run.solver.name])(**run.solver.parameters) if named else given
-    bound = build(run.scene, run.size, run.integrator)
-    prepared, stop = prepare(bound, solver), stop_rule(run.iterations, run.tolerance)
+    named = isinstance(solver_input, (str, Mapping))
+    solver: Solver = load_target(SOLVERS[run.solver.name])(**run.solver.parameters) if named else solver_input
+    bound = build_scene(run.scene, run.size, run.integrator)
+    prepared, stop = prepare(bound, solver), build_stop_rule(run.iterations, run.tolerance)
 
     def positions(frames: int) -> Positions:
-        p = bound.mesh.rest
-        for step in simulate(bound, prepared, stop, first_guess=run.first_guess, frames=frames):
+        p = bound.mesh.rest_positions
+        for step in simulate_scene(bound, prepared, stop, initial_guess=run.first_guess, frames=frames):
             p = step.positions
         return p
 
-    return Steps(run, 1, positions)
+    return SceneSteps(run, 1, positions)
 
 
-def timed(work: Work, calls: int, clock: Clock) -> Timed:
+def build_timer(work: WorkFunction, num_calls: int, clock: ClockName) -> TimedCall:
     """Build a function that returns the time [s] of a number of calls together.
 
     Args:
@@ -100,27 +106,27 @@ def timed(work: Work, calls: int, clock: Clock) -> Timed:
         num_calls: number of calls.
         clock: "cpu" or "wall".
     """
-    now = CLOCKS[clock]
+    now = CLOCK_FUNCTIONS[clock]
 
     def seconds() -> float:
         began = now()
-        for _ in range(calls):
+        for _ in range(num_calls):
             work()
         return now() - began
 
     return seconds
 
 
-def seconds_of(work: Work) -> float:
+def measure_call_seconds(work: WorkFunction) -> float:
     """Measure the CPU seconds of one call, after a warm-up call."""
     work()
-    return timed(work, 1, "cpu")()
+    return build_timer(work, 1, "cpu")()
 
 
-def calls_of(candidate: Work, yardstick: Work) -> int:
+def choose_num_calls(candidate: WorkFunction, baseline: WorkFunction) -> int:
     """Choose the number of calls that are timed together.
 
     Both programs are warm. The calls together are long enough for a clock.
     """
-    once = min(timed(work, 1, "wall")() for work in (candidate, yardstick))
-    return max(1, ceil(CALL / max(once, 1e-7)))
+    once = min(build_timer(work, 1, "wall")() for work in (candidate, baseline))
+    return max(1, ceil(MIN_CALL_SECONDS / max(once, 1e-7)))

@@ -30,24 +30,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import betaln
 
-ALPHA = 0.001
+DEFAULT_ALPHA = 0.001
 """Default error probability: the probability that the interval ever excludes the true ratio."""
 
-MIXTURE = 2.0
+MIXTURE_PARAMETER = 2.0
 """Parameter a of the mixture. Between 60 and 1000 blocks no other value from 1 to 15 makes an interval narrower by more
 than 5 %. With this value, 16 blocks that agree are sufficient for a decision.
 """
 
 
-class Verdict(Enum):
+class SequentialVerdict(Enum):
     """Decision of a test.
 
     The value is the exit code of a command that ends with it.
     """
 
-    HOLDS = 0
-    FAILS = 1
-    UNDECIDED = 3
+    PASS = 0
+    FAIL = 1
+    INCONCLUSIVE = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class RatioInterval:
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class SequentialTest:
     """Sequential test of whether a ratio of times exceeds a limit.
 
     It stops when the ratio lies entirely above `max_ratio` (fail) or below it (pass).
@@ -75,24 +75,28 @@ class Rule:
         ValueError: for an invalid max_ratio or alpha.
     """
 
-    limit: float
-    alpha: float = ALPHA
+    max_ratio: float
+    alpha: float = DEFAULT_ALPHA
 
     def __post_init__(self) -> None:
-        if not 0 < self.limit < float("inf"):
-            raise ValueError(f"limit: came {self.limit}; wanted a ratio of times, such as 1.03 for 3 % slower")
+        if not 0 < self.max_ratio < float("inf"):
+            raise ValueError(f"limit: came {self.max_ratio}; wanted a ratio of times, such as 1.03 for 3 % slower")
         if not 0 < self.alpha < 1:
-            raise ValueError(f"alpha: came {self.alpha}; wanted a probability between 0 and 1, such as {ALPHA}")
+            raise ValueError(f"alpha: came {self.alpha}; wanted a probability between 0 and 1, such as {DEFAULT_ALPHA}")
 
-    def judge(self, log_ratios: ArrayLike) -> Verdict:
+    def decide_verdict(self, log_ratios: ArrayLike) -> SequentialVerdict:
         """Decide after the blocks so far, given their log ratios (n,)."""
         x = np.asarray(log_ratios, float)
-        needed = critical(len(x), self.alpha)
-        if np.count_nonzero(x > log(self.limit)) >= needed:
-            return Verdict.FAILS
-        return Verdict.HOLDS if np.count_nonzero(x < log(self.limit)) >= needed else Verdict.UNDECIDED
+        needed = compute_critical_count(len(x), self.alpha)
+        if np.count_nonzero(x > log(self.max_ratio)) >= needed:
+            return SequentialVerdict.FAIL
+        return (
+            SequentialVerdict.PASS
+            if np.count_nonzero(x < log(self.max_ratio)) >= needed
+            else SequentialVerdict.INCONCLUSIVE
+        )
 
-    def first(self, log_ratios: ArrayLike) -> tuple[Verdict, int]:
+    def decide_first_verdict(self, log_ratios: ArrayLike) -> tuple[SequentialVerdict, int]:
         """Find the first decision when the test is evaluated after every block.
 
         It equals `decide_verdict` block by block, but takes one pass, for a replay of many recorded samples.
@@ -102,21 +106,21 @@ class Rule:
         Returns: the decision and its number of blocks, n if there is no decision.
         """
         x = np.asarray(log_ratios, float)
-        needed = _critical_up_to(len(x), self.alpha)
-        above, below = (np.cumsum(side) >= needed for side in (x > log(self.limit), x < log(self.limit)))
+        needed = _list_critical_counts(len(x), self.alpha)
+        above, below = (np.cumsum(side) >= needed for side in (x > log(self.max_ratio), x < log(self.max_ratio)))
         decided = np.flatnonzero(above | below)
         if not len(decided):
-            return Verdict.UNDECIDED, len(x)
+            return SequentialVerdict.INCONCLUSIVE, len(x)
         at = int(decided[0])
-        return (Verdict.FAILS if above[at] else Verdict.HOLDS), at + 1
+        return (SequentialVerdict.FAIL if above[at] else SequentialVerdict.PASS), at + 1
 
 
-def turn(a: Sequence[float], b: Sequence[float]) -> float:
+def compute_log_ratio(a: Sequence[float], b: Sequence[float]) -> float:
     """Compute the log ratio of a block's times [s]."""
     return log(sum(a) / sum(b))
 
 
-def interval(log_ratios: ArrayLike, alpha: float = ALPHA) -> RatioInterval:
+def compute_interval(log_ratios: ArrayLike, alpha: float = DEFAULT_ALPHA) -> RatioInterval:
     """Compute the median ratio of n >= 1 blocks, and the confidence sequence.
 
     Args:
@@ -124,7 +128,7 @@ def interval(log_ratios: ArrayLike, alpha: float = ALPHA) -> RatioInterval:
         alpha: error probability.
     """
     x = np.sort(np.asarray(log_ratios, float))
-    n, needed = len(x), critical(len(x), alpha)
+    n, needed = len(x), compute_critical_count(len(x), alpha)
     if needed > n:
         return RatioInterval(exp(float(np.median(x))), 0.0, float("inf"))
     # At least `needed` blocks lie above every m < x_(n - needed + 1), counted from 1: such m are rejected.
@@ -132,7 +136,7 @@ def interval(log_ratios: ArrayLike, alpha: float = ALPHA) -> RatioInterval:
 
 
 @lru_cache(maxsize=4096)
-def critical(n: int, alpha: float) -> int:
+def compute_critical_count(n: int, alpha: float) -> int:
     """Compute how many blocks on one side of m reject it.
 
     It is the least such number, or n + 1 if all n are too few.
@@ -142,15 +146,19 @@ def critical(n: int, alpha: float) -> int:
         alpha: error probability.
     """
     k = np.arange(n // 2, n + 1)
-    refused = n * log(2) + betaln(MIXTURE + k, MIXTURE + n - k) - betaln(MIXTURE, MIXTURE) >= -log(alpha)
+    refused = n * log(2) + betaln(MIXTURE_PARAMETER + k, MIXTURE_PARAMETER + n - k) - betaln(
+        MIXTURE_PARAMETER, MIXTURE_PARAMETER
+    ) >= -log(alpha)
     return n // 2 + int(np.argmax(refused)) if refused[-1] else n + 1
 
 
-def _critical_up_to(n: int, alpha: float) -> NDArray[np.int64]:
+def _list_critical_counts(n: int, alpha: float) -> NDArray[np.int64]:
     """List the critical counts of 1 to n blocks."""
-    return _criticals(1 << n.bit_length(), alpha)[:n]  # so that a replay, which asks for many n, makes a few tables
+    return _tabulate_critical_counts(1 << n.bit_length(), alpha)[
+        :n
+    ]  # so that a replay, which asks for many n, makes a few tables
 
 
 @lru_cache(maxsize=64)
-def _criticals(n: int, alpha: float) -> NDArray[np.int64]:
-    return np.array([critical(turns, alpha) for turns in range(1, n + 1)], np.int64)
+def _tabulate_critical_counts(n: int, alpha: float) -> NDArray[np.int64]:
+    return np.array([compute_critical_count(turns, alpha) for turns in range(1, n + 1)], np.int64)

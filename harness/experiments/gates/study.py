@@ -25,33 +25,33 @@ from scipy.stats import mannwhitneyu
 
 from harness.base import columns, rows
 from harness.base.errors import InputError
-from harness.base.worker import tie
-from harness.experiments.gates.abba import CONFIRMS, PAIR, Renewing, orders
-from harness.experiments.gates.against import Options, Request, started
-from harness.experiments.gates.pair import Side
-from harness.experiments.gates.sequential import Rule, Verdict
+from harness.base.worker import tie_to_parent
+from harness.experiments.gates.abba import CONFIRMATION_ALPHA, RESTART_SECONDS, LayoutRandomiser, draw_block_orders
+from harness.experiments.gates.against import ComparisonOptions, WorkRequest, start_revisions
+from harness.experiments.gates.pair import GitRevision
+from harness.experiments.gates.sequential import SequentialTest, SequentialVerdict
 
-COLUMNS = (
-    columns.Column("gate", pa.string(), "", "what takes turns"),
-    columns.Column("condition", pa.string(), "", "what was run beside it: nothing, busy or bursty"),
-    columns.Column("start", pa.int64(), "", "which pair of processes, from 0"),
-    columns.Column("order", pa.string(), "", "ABBA or BAAB"),
-    *(columns.Column(f"call_{k}", pa.float64(), "s", f"time of the turn's call {k}") for k in range(4)),
-    columns.Column("wall", pa.float64(), "s", "wall time of the whole turn, and of making the work anew after it"),
-    columns.Column("load", pa.float64(), "", "load average over a minute"),
-    columns.Column("planted", pa.float64(), "", "extra work of A, as a part of its iterations"),
+RECORD_COLUMNS = (
+    columns.ColumnSpec("gate", pa.string(), "", "what takes turns"),
+    columns.ColumnSpec("condition", pa.string(), "", "what was run beside it: nothing, busy or bursty"),
+    columns.ColumnSpec("start", pa.int64(), "", "which pair of processes, from 0"),
+    columns.ColumnSpec("order", pa.string(), "", "ABBA or BAAB"),
+    *(columns.ColumnSpec(f"call_{k}", pa.float64(), "s", f"time of the turn's call {k}") for k in range(4)),
+    columns.ColumnSpec("wall", pa.float64(), "s", "wall time of the whole turn, and of making the work anew after it"),
+    columns.ColumnSpec("load", pa.float64(), "", "load average over a minute"),
+    columns.ColumnSpec("planted", pa.float64(), "", "extra work of A, as a part of its iterations"),
 )
-SCHEMA = columns.schema_of(COLUMNS)
+RECORD_SCHEMA = columns.build_schema(RECORD_COLUMNS)
 
-CONDITIONS = ("nothing", "busy", "bursty")
-STRETCH = 25
+BACKGROUND_LOADS = ("nothing", "busy", "bursty")
+REPLAY_STRETCH = 25
 """Number of successive blocks of a stretch: some seconds, the duration of most bursts."""
 
-Array = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class PairTurns:
+class RecordedBlocks:
     """Recorded blocks of one process pair.
 
     log_ratios: (n,).
@@ -60,32 +60,32 @@ class PairTurns:
     load_average: median load average of the machine.
     """
 
-    log_ratios: Array
-    a: Array
-    b: Array
-    wall: float
-    load: float
+    log_ratios: FloatArray
+    a: FloatArray
+    b: FloatArray
+    wall_seconds: float
+    load_average: float
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class ReplayRates:
     """Rates of the three verdicts of many replays, and the median duration [s]."""
 
-    fails: float
-    holds: float
-    undecided: float
-    seconds: float
+    fail_rate: float
+    pass_rate: float
+    inconclusive_rate: float
+    median_seconds: float
 
 
-def record(
+def record_blocks(
     path: Path,
     checkout: Path,
-    requests: Sequence[Request],
-    condition: str,
+    requests: Sequence[WorkRequest],
+    background_load: str,
     *,
-    seconds: float,
-    starts: int,
-    planted: float = 0.0,
+    duration: float,
+    num_process_pairs: int,
+    injected_slowdown: float = 0.0,
 ) -> None:
     """Record blocks of the requests, alternating between them, under a background load.
 
@@ -100,44 +100,44 @@ def record(
         num_process_pairs: number of starts of both processes.
         injected_slowdown: extra work of A, as a fraction of its iterations.
     """
-    found = rows.read([path], SCHEMA).to_pylist() if path.exists() else []
+    found = rows.read_rows([path], RECORD_SCHEMA).to_pylist() if path.exists() else []
     first = max((row["start"] for row in found), default=-1) + 1
-    sides = Side("the one", checkout, extra=planted), Side("the other", checkout)
-    with competing(condition):
-        for start in range(first, first + starts):
+    sides = GitRevision("the one", checkout, injected_slowdown=injected_slowdown), GitRevision("the other", checkout)
+    with run_background_load(background_load):
+        for start in range(first, first + num_process_pairs):
             with ExitStack() as alive:
                 pairs = [
-                    alive.enter_context(started(sides, request, Options(seconds), lambda line: None))
+                    alive.enter_context(start_revisions(sides, request, ComparisonOptions(duration), lambda line: None))
                     for request in requests
                 ]
-                renewing = [Renewing(racers.renew) for racers in pairs]
-                until = perf_counter() + seconds / starts
-                for order in orders():
+                renewing = [LayoutRandomiser(racers.rebuild_work) for racers in pairs]
+                until = perf_counter() + duration / num_process_pairs
+                for order in draw_block_orders():
                     for request, racers, renewed in zip(requests, pairs, renewing, strict=True):
                         at = perf_counter()
                         calls = [{"A": racers.a, "B": racers.b}[who]() for who in order]
-                        renewed.after(perf_counter() - at)
-                        row = {"gate": request.title, "condition": condition, "start": start, "order": order}
+                        renewed.rebuild_after(perf_counter() - at)
+                        row = {"gate": request.title, "condition": background_load, "start": start, "order": order}
                         row |= {f"call_{k}": call for k, call in enumerate(calls)}
                         took = perf_counter() - at
-                        found.append(row | {"wall": took, "load": os.getloadavg()[0], "planted": planted})
+                        found.append(row | {"wall": took, "load": os.getloadavg()[0], "planted": injected_slowdown})
                     if perf_counter() > until:
                         break
-            rows.write(path, found, SCHEMA)
+            rows.write_rows(path, found, RECORD_SCHEMA)
 
 
 @contextmanager
-def competing(condition: str) -> Generator[None]:
+def run_background_load(background_load: str) -> Generator[None]:
     """Run a background load on each core inside the block.
 
     It is constant (busy), intermittent (bursty) or absent (nothing).
     """
-    if condition not in CONDITIONS:
-        raise InputError(f"--condition: came {condition}; wanted one of {', '.join(CONDITIONS)}")
+    if background_load not in BACKGROUND_LOADS:
+        raise InputError(f"--condition: came {background_load}; wanted one of {', '.join(BACKGROUND_LOADS)}")
     with ExitStack() as cleanup:
-        for core in os.sched_getaffinity(0) if condition != "nothing" else ():
+        for core in os.sched_getaffinity(0) if background_load != "nothing" else ():
             process = get_context("spawn").Process(
-                target=_compete, args=(condition == "bursty", core, os.getpid()), daemon=True
+                target=_generate_load, args=(background_load == "bursty", core, os.getpid()), daemon=True
             )
             process.start()
             cleanup.callback(process.join)
@@ -145,28 +145,28 @@ def competing(condition: str) -> Generator[None]:
         yield
 
 
-def _compete(bursts: bool, seed: int, parent: int) -> None:
+def _generate_load(is_bursty: bool, seed: int, parent_pid: int) -> None:
     """Sweep over 16 MB repeatedly.
 
     Bursts last 0.5 to 3 s, with pauses of 1 to 6 s.
     """
-    tie(parent)
+    tie_to_parent(parent_pid)
     rng, memory = Random(seed), np.ones(2**21)
     while True:
-        until = process_time() + (rng.uniform(0.5, 3.0) if bursts else 60.0)
+        until = process_time() + (rng.uniform(0.5, 3.0) if is_bursty else 60.0)
         while process_time() < until:
             memory *= 1.0
-        if bursts:
+        if is_bursty:
             sleep(rng.uniform(1.0, 6.0))
 
 
-def read(paths: Sequence[Path]) -> dict[tuple[str, str], list[PairTurns]]:
+def read_recorded_blocks(paths: Sequence[Path]) -> dict[tuple[str, str], list[RecordedBlocks]]:
     """Read the recorded process pairs by test and background load; raise InputError."""
-    table = rows.read(paths, SCHEMA).to_pylist()
+    table = rows.read_rows(paths, RECORD_SCHEMA).to_pylist()
     by: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for row in table:
         by.setdefault((row["gate"], row["condition"], row["start"]), []).append(row)
-    found: dict[tuple[str, str], list[PairTurns]] = {}
+    found: dict[tuple[str, str], list[RecordedBlocks]] = {}
     for (gate, condition, _), turns in by.items():
         times = np.array([[row[f"call_{k}"] for k in range(4)] for row in turns])
         abba = np.array([row["order"] == "ABBA" for row in turns])[:, None]
@@ -174,12 +174,19 @@ def read(paths: Sequence[Path]) -> dict[tuple[str, str], list[PairTurns]]:
         a, b = np.where(abba, outer, inner), np.where(abba, inner, outer)
         wall = float(np.mean([row["wall"] for row in turns]))
         load = float(np.median([row["load"] for row in turns]))
-        start = PairTurns(np.log(a.sum(axis=1) / b.sum(axis=1)), a, b, wall, load)
+        start = RecordedBlocks(np.log(a.sum(axis=1) / b.sum(axis=1)), a, b, wall, load)
         found.setdefault((gate, condition), []).append(start)
     return found
 
 
-def replay(starts: Sequence[PairTurns], slower: float, rule: Rule, budget: float, replays: int, seed: int = 0) -> Found:
+def replay_tests(
+    recorded_blocks: Sequence[RecordedBlocks],
+    slowdown: float,
+    sequential_test: SequentialTest,
+    budget: float,
+    num_replays: int,
+    seed: int = 0,
+) -> ReplayRates:
     """Replay tests with A slowed down by a factor.
 
     Args:
@@ -191,43 +198,57 @@ def replay(starts: Sequence[PairTurns], slower: float, rule: Rule, budget: float
         seed: seed of the random generator.
     Returns: rates of the verdicts.
     """
-    rng, answers, seconds = np.random.default_rng(seed), list[Verdict](), list[float]()
-    for _ in range(replays):
-        answer, spent = _race(rng, starts, slower, rule, budget)
-        if answer is Verdict.FAILS:  # which is believed when it comes twice
-            again, more = _race(rng, starts, slower, replace(rule, alpha=CONFIRMS), budget - spent)
-            answer, spent = (Verdict.FAILS if again is Verdict.FAILS else Verdict.UNDECIDED), spent + more
+    rng, answers, seconds = np.random.default_rng(seed), list[SequentialVerdict](), list[float]()
+    for _ in range(num_replays):
+        answer, spent = _replay_test(rng, recorded_blocks, slowdown, sequential_test, budget)
+        if answer is SequentialVerdict.FAIL:  # which is believed when it comes twice
+            again, more = _replay_test(
+                rng, recorded_blocks, slowdown, replace(sequential_test, alpha=CONFIRMATION_ALPHA), budget - spent
+            )
+            answer, spent = (
+                (SequentialVerdict.FAIL if again is SequentialVerdict.FAIL else SequentialVerdict.INCONCLUSIVE),
+                spent + more,
+            )
         answers.append(answer)
         seconds.append(spent)
-    fails, holds, undecided = (answers.count(a) / replays for a in (Verdict.FAILS, Verdict.HOLDS, Verdict.UNDECIDED))
-    return Found(fails, holds, undecided, float(np.median(seconds)))
+    fails, holds, undecided = (
+        answers.count(a) / num_replays
+        for a in (SequentialVerdict.FAIL, SequentialVerdict.PASS, SequentialVerdict.INCONCLUSIVE)
+    )
+    return ReplayRates(fails, holds, undecided, float(np.median(seconds)))
 
 
-def _race(
-    rng: np.random.Generator, starts: Sequence[PairTurns], slower: float, rule: Rule, budget: float
-) -> tuple[Verdict, float]:
+def _replay_test(
+    rng: np.random.Generator,
+    recorded_blocks: Sequence[RecordedBlocks],
+    slowdown: float,
+    sequential_test: SequentialTest,
+    budget: float,
+) -> tuple[SequentialVerdict, float]:
     """Replay one test, and return its verdict and its duration [s].
 
     It draws another process pair every RESTART_SECONDS.
     """
-    drawn, walls, left = list[Array](), list[Array](), budget
+    drawn, walls, left = list[FloatArray](), list[FloatArray](), budget
     while left > 0.0 or not drawn:
-        start = starts[int(rng.integers(len(starts)))]
-        turns = _stretches(rng, len(start.log_ratios), max(1, int(min(PAIR, left) / start.wall)))
+        start = recorded_blocks[int(rng.integers(len(recorded_blocks)))]
+        turns = _draw_stretches(
+            rng, len(start.log_ratios), max(1, int(min(RESTART_SECONDS, left) / start.wall_seconds))
+        )
         drawn.append(start.log_ratios[turns])
-        walls.append(np.full(len(turns), start.wall))
-        left -= PAIR
-    answer, used = rule.first(np.log(slower) + np.concatenate(drawn))
+        walls.append(np.full(len(turns), start.wall_seconds))
+        left -= RESTART_SECONDS
+    answer, used = sequential_test.decide_first_verdict(np.log(slowdown) + np.concatenate(drawn))
     return answer, float(np.concatenate(walls)[:used].sum())
 
 
-def _stretches(rng: np.random.Generator, length: int, turns: int) -> NDArray[np.int64]:
+def _draw_stretches(rng: np.random.Generator, length: int, num_blocks: int) -> NDArray[np.int64]:
     """Draw indices of stretches of successive blocks, num_blocks in total; a record is periodic."""
-    begins = rng.integers(length, size=max(1, -(-turns // STRETCH)))
-    return ((begins[:, None] + np.arange(STRETCH)) % length).ravel()[:turns]
+    begins = rng.integers(length, size=max(1, -(-num_blocks // REPLAY_STRETCH)))
+    return ((begins[:, None] + np.arange(REPLAY_STRETCH)) % length).ravel()[:num_blocks]
 
 
-def _asv(new: Array, old: Array) -> bool:
+def _is_slower_by_asv(new: FloatArray, old: FloatArray) -> bool:
     """Apply the rule of asv continuous with a factor of 1.05.
 
     The medians differ by that factor, and the Mann-Whitney test gives p < .002.
@@ -235,20 +256,20 @@ def _asv(new: Array, old: Array) -> bool:
     return float(np.median(new)) > 1.05 * float(np.median(old)) and float(mannwhitneyu(new, old).pvalue) < 0.002
 
 
-OTHERS: dict[str, Callable[[Array, Array], bool]] = {
+OTHER_COMPARISONS: dict[str, Callable[[FloatArray, FloatArray], bool]] = {
     "pytest-benchmark min:5%": lambda new, old: float(new.min()) > 1.05 * float(old.min()),
     "pytest-benchmark mean:5%": lambda new, old: float(new.mean()) > 1.05 * float(old.mean()),
-    "asv continuous 1.05": _asv,
+    "asv continuous 1.05": _is_slower_by_asv,
 }
 """Comparisons of two sessions that ran one after the other: whether the new one is classified as slower."""
 
 
-def replay_other(
-    slower_than: Callable[[Array, Array], bool],
-    starts: Sequence[PairTurns],
-    slower: float,
-    seconds: float,
-    replays: int,
+def replay_comparison(
+    is_slower: Callable[[FloatArray, FloatArray], bool],
+    recorded_blocks: Sequence[RecordedBlocks],
+    slowdown: float,
+    duration: float,
+    num_replays: int,
 ) -> float:
     """Compute the fraction of comparisons that classify A as slower.
 
@@ -262,10 +283,10 @@ def replay_other(
         num_replays: number of comparisons.
     """
     rng, said = np.random.default_rng(0), 0
-    for _ in range(replays):
-        start = starts[int(rng.integers(len(starts)))]
-        turns = max(1, min(int(seconds / start.wall), len(start.a) // 2))
+    for _ in range(num_replays):
+        start = recorded_blocks[int(rng.integers(len(recorded_blocks)))]
+        turns = max(1, min(int(duration / start.wall_seconds), len(start.a) // 2))
         at = int(rng.integers(len(start.a)))
         first, second = ((at + k * turns + np.arange(turns)) % len(start.a) for k in range(2))
-        said += slower_than(slower * start.a[first].ravel(), start.b[second].ravel())
-    return said / replays
+        said += is_slower(slowdown * start.a[first].ravel(), start.b[second].ravel())
+    return said / num_replays

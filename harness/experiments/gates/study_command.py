@@ -11,84 +11,97 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from harness.base.console import narrow, out, say
+from harness.base.console import get_output_console, print_message, split_wide_table
 from harness.base.errors import InputError
 
 if TYPE_CHECKING:
-    from harness.experiments.gates.against import Request
+    from harness.experiments.gates.against import WorkRequest
 
-study = typer.Typer(help="How often gates are wrong, and what they find.", no_args_is_help=True)
+regress_study = typer.Typer(help="How often gates are wrong, and what they find.", no_args_is_help=True)
 
-CASES = ((1.0, 1.03), (1.1, 1.03), (1.05, 1.03), (1.02, 1.01))
+SLOWDOWN_CASES = ((1.0, 1.03), (1.1, 1.03), (1.05, 1.03), (1.02, 1.01))
 """Slowdowns, the first of none, and the limits of the tests that should detect them."""
 
 
-Config = Annotated[Path, typer.Argument(help="A scene or a sweep, whose runs take turns with themselves.")]
-Condition = Annotated[str, typer.Option(help="What is to run beside it: nothing, busy, bursty.")]
-Sizes = Annotated[list[int] | None, typer.Option("--size", help="For a scene: mesh sizes; repeatable.")]
-Solvers = Annotated[list[str] | None, typer.Option("--solver", help="For a scene: solvers; repeatable.")]
-Planted = Annotated[float, typer.Option(help="Extra work of one of the two, as a part of its iterations.")]
+StudyConfigArgument = Annotated[Path, typer.Argument(help="A scene or a sweep, whose runs take turns with themselves.")]
+BackgroundLoad = Annotated[str, typer.Option(help="What is to run beside it: nothing, busy, bursty.")]
+MeshSizes = Annotated[list[int] | None, typer.Option("--size", help="For a scene: mesh sizes; repeatable.")]
+SolverNames = Annotated[list[str] | None, typer.Option("--solver", help="For a scene: solvers; repeatable.")]
+InjectedSlowdown = Annotated[float, typer.Option(help="Extra work of one of the two, as a part of its iterations.")]
 
 
-def _asked(config: Path, sizes: list[int] | None, solvers: list[str] | None) -> tuple[Path, Sequence[Request]]:
+def _build_requests(
+    config: Path, sizes: list[int] | None, solvers: list[str] | None
+) -> tuple[Path, Sequence[WorkRequest]]:
     """Return the checkout, and a request for each of the config's runs; raise InputError."""
     from harness.experiments.gates import revisions
-    from harness.experiments.gates.against import requests_of_config
-    from harness.experiments.gates.pair import Side
+    from harness.experiments.gates.against import build_config_requests
+    from harness.experiments.gates.pair import GitRevision
 
-    checkout = revisions.root(Path.cwd())
-    sides = Side("the one", checkout), Side("the other", checkout)
-    return checkout, requests_of_config(sides, config, {"solvers": solvers or [], "sizes": sizes or []})
+    checkout = revisions.find_checkout(Path.cwd())
+    sides = GitRevision("the one", checkout), GitRevision("the other", checkout)
+    return checkout, build_config_requests(sides, config, {"solvers": solvers or [], "sizes": sizes or []})
 
 
-@study.command()
+@regress_study.command()
 def record(
     samples: Annotated[Path, typer.Argument(help="Where to store the turns (.parquet); those there are kept.")],
-    config: Config,
-    condition: Condition = "nothing",
+    config: StudyConfigArgument,
+    condition: BackgroundLoad = "nothing",
     seconds: Annotated[float, typer.Option(help="For all runs together, which take turns.")] = 1800.0,
     starts: Annotated[int, typer.Option(help="Pairs of processes for each run.")] = 10,
-    sizes: Sizes = None,
-    solvers: Solvers = None,
-    planted: Planted = 0.0,
+    sizes: MeshSizes = None,
+    solvers: SolverNames = None,
+    planted: InjectedSlowdown = 0.0,
 ) -> None:
     """Record the times of two processes of this checkout in interleaved blocks."""
-    from harness.experiments.gates.study import record as record_turns
+    from harness.experiments.gates.study import record_blocks as record_turns
 
-    checkout, requests = _asked(config, sizes, solvers)
-    record_turns(samples, checkout, requests, condition, seconds=seconds, starts=starts, planted=planted)
-    say(f"turns are in {samples}")
+    checkout, requests = _build_requests(config, sizes, solvers)
+    record_turns(
+        samples, checkout, requests, condition, duration=seconds, num_process_pairs=starts, injected_slowdown=planted
+    )
+    print_message(f"turns are in {samples}")
 
 
-@study.command()
+@regress_study.command()
 def live(
-    found: Annotated[Path, typer.Argument(help="Where the answers are stored (.parquet); those there are kept.")],
-    config: Config,
+    output: Annotated[Path, typer.Argument(help="Where the answers are stored (.parquet); those there are kept.")],
+    config: StudyConfigArgument,
     gates: Annotated[int, typer.Option(help="How many gates are held of each run.")] = 100,
-    condition: Condition = "nothing",
+    condition: BackgroundLoad = "nothing",
     limit: Annotated[float, typer.Option(help="The ratio of times from which on something counts as slower.")] = 1.03,
     budget: Annotated[float, typer.Option(help="Seconds of a gate.")] = 240.0,
-    sizes: Sizes = None,
-    solvers: Solvers = None,
-    planted: Planted = 0.0,
+    sizes: MeshSizes = None,
+    solvers: SolverNames = None,
+    planted: InjectedSlowdown = 0.0,
 ) -> None:
     """Run real tests with restarted processes, and print how many passed, failed and were inconclusive."""
     from rich.table import Table
 
-    from harness.experiments.gates.against import Options
-    from harness.experiments.gates.live import hold, summary
+    from harness.experiments.gates.against import ComparisonOptions
+    from harness.experiments.gates.live import run_live_study, summarise_live_study
 
-    checkout, requests = _asked(config, sizes, solvers)
-    hold(found, checkout, requests, condition, Options(budget, limit), gates=gates, planted=planted, say=say)
+    checkout, requests = _build_requests(config, sizes, solvers)
+    run_live_study(
+        output,
+        checkout,
+        requests,
+        condition,
+        ComparisonOptions(budget, limit),
+        num_repeats=gates,
+        injected_slowdown=planted,
+        print_message=print_message,
+    )
     told = "beside it", "load", "planted", "limit", "gates", "fails", "holds", "cannot tell", "median s"
-    for gate, rows in groupby(sorted(summary(found), key=itemgetter(0)), key=itemgetter(0)):
+    for gate, rows in groupby(sorted(summarise_live_study(output), key=itemgetter(0)), key=itemgetter(0)):
         table = Table(*told, title=gate)
         for _, *cells in rows:
             table.add_row(*cells)
-        out().print(narrow(table))
+        get_output_console().print(split_wide_table(table))
 
 
-@study.command()
+@regress_study.command()
 def replay(
     samples: Annotated[list[Path], typer.Argument(help="Recorded turns (.parquet).")],
     replays: Annotated[int, typer.Option(help="Comparisons of each kind.")] = 10_000,
@@ -98,19 +111,22 @@ def replay(
     from rich.table import Table
 
     from harness.experiments.gates import study as of
-    from harness.experiments.gates.sequential import Rule
+    from harness.experiments.gates.sequential import SequentialTest
 
     if missing := [str(path) for path in samples if not path.is_file()]:
         raise InputError(f"{', '.join(missing)}: no such file; `springbench gate-study record` makes one")
-    told = "slower", "limit", "fails", "holds", "cannot tell", "median s", *of.OTHERS
-    for (gate, condition), starts in of.read(samples).items():
-        load = f"{median(start.load for start in starts):.1f}"
+    told = "slower", "limit", "fails", "holds", "cannot tell", "median s", *of.OTHER_COMPARISONS
+    for (gate, condition), starts in of.read_recorded_blocks(samples).items():
+        load = f"{median(start.load_average for start in starts):.1f}"
         table = Table(*told, title=f"{gate}\nbeside it: {condition}; load {load}")
-        for slower, limit in CASES:
+        for slower, limit in SLOWDOWN_CASES:
             room = max(budget, 300.0) if limit < 1.02 else budget
-            found = of.replay(starts, slower, Rule(limit), room, replays)
-            others = [of.replay_other(rule, starts, slower, room / 2, replays // 10) for rule in of.OTHERS.values()]
-            parts = [f"{part:.2%}" for part in (found.fails, found.holds, found.undecided)]
-            cells = [f"{slower - 1:.0%}", f"{limit - 1:.0%}", *parts, f"{found.seconds:.1f}"]
+            found = of.replay_tests(starts, slower, SequentialTest(limit), room, replays)
+            others = [
+                of.replay_comparison(rule, starts, slower, room / 2, replays // 10)
+                for rule in of.OTHER_COMPARISONS.values()
+            ]
+            parts = [f"{part:.2%}" for part in (found.fail_rate, found.pass_rate, found.inconclusive_rate)]
+            cells = [f"{slower - 1:.0%}", f"{limit - 1:.0%}", *parts, f"{found.median_seconds:.1f}"]
             table.add_row(*cells, *(f"{part:.1%}" for part in others))
-        out().print(narrow(table))
+        get_output_console().print(split_wide_table(table))

@@ -27,27 +27,33 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
-CLOCKS = {"cpu": time.process_time, "wall": time.perf_counter}
+CLOCK_FUNCTIONS = {"cpu": time.process_time, "wall": time.perf_counter}
 
-ROOM = 2**20
+MAX_OFFSET_BYTES = 2**20
 """Maximum number of bytes by which rebuilt work is shifted in memory."""
 
 
-class Worker:
+class RevisionWorker:
     """Handler of the requests, with the prepared work as its state."""
 
     def __init__(self) -> None:
-        self._make: Callable[[], Callable[[], Any]] | None = None
+        self._build_work: Callable[[], Callable[[], Any]] | None = None
         self._work: Callable[[], Any] | None = None
-        self._room = bytearray()
+        self._offset_buffer = bytearray()
         self._threads = ExitStack()
 
-    def runs(self, config: str, asked: dict[str, Any]) -> dict[str, Any]:
+    def list_runs(self, config: str, run_options: dict[str, Any]) -> dict[str, Any]:
         """List the runs of a scene or a sweep by their titles."""
-        return {"runs": [_title(run) for run in _sweep(config, asked)]}
+        return {"runs": [_format_title(run) for run in _load_runs(config, run_options)]}
 
-    def run(
-        self, config: str, asked: dict[str, Any], index: int, frames: int, extra: float, positions: str
+    def prepare_run(
+        self,
+        config: str,
+        run_options: dict[str, Any],
+        index: int,
+        num_frames: int,
+        injected_slowdown: float,
+        positions: str,
     ) -> dict[str, Any]:
         """Prepare the first steps of a run, and store its last positions [m].
 
@@ -60,51 +66,51 @@ class Worker:
             positions: path of the file.
         Returns: deterministic counts, suitable clock and number of steps.
         """
-        run = _sweep(config, asked)[index]
+        run = _load_runs(config, run_options)[index]
         threads = 1 if run.threads == "auto" else run.threads  # idle cores now are not idle cores later
-        self._pin(threads)
-        frames = min(frames, run.frames)
-        steps = self._held(lambda: _Steps(run, frames, extra), positions)
-        return {"facts": steps.facts(), "clock": "cpu" if threads == 1 else "wall", "frames": frames}
+        self._pin_threads(threads)
+        num_frames = min(num_frames, run.frames)
+        steps = self._prepare_work(lambda: _RevisionSteps(run, num_frames, injected_slowdown), positions)
+        return {"facts": steps.facts(), "clock": "cpu" if threads == 1 else "wall", "frames": num_frames}
 
-    def gates(self) -> dict[str, Any]:
+    def list_tests(self) -> dict[str, Any]:
         """List the names of the worktree's own performance tests."""
-        return {"gates": sorted(_gates())}
+        return {"gates": sorted(_load_tests())}
 
-    def gate(self, name: str, positions: str) -> dict[str, Any]:
+    def prepare_test(self, name: str, positions: str) -> dict[str, Any]:
         """Prepare the candidate of one of the worktree's own performance tests.
 
         Args:
             name: name of the test.
             positions: path of the file that receives the answer.
         """
-        self._pin(1)
-        gate = _gates()[name]
-        self._held(gate.candidate, positions)
+        self._pin_threads(1)
+        gate = _load_tests()[name]
+        self._prepare_work(gate.candidate, positions)
         return {"facts": {}, "clock": gate.clock}
 
-    def renew(self) -> dict[str, Any]:
+    def rebuild_work(self) -> dict[str, Any]:
         """Rebuild the work behind a random offset, while the old work still occupies its memory."""
-        assert self._make is not None
-        self._room = bytearray(random.randrange(ROOM))
-        self._work = self._make()
+        assert self._build_work is not None
+        self._offset_buffer = bytearray(random.randrange(MAX_OFFSET_BYTES))
+        self._work = self._build_work()
         return {}
 
-    def time(self, calls: int, clock: str) -> dict[str, Any]:
+    def time_calls(self, num_calls: int, clock: str) -> dict[str, Any]:
         """Time a number of calls together.
 
         Args:
             num_calls: number of calls.
             clock: cpu or wall.
         """
-        now, work = CLOCKS[clock], self._work
+        now, work = CLOCK_FUNCTIONS[clock], self._work
         assert work is not None
         began = now()
-        for _ in range(calls):
+        for _ in range(num_calls):
             work()
         return {"seconds": now() - began}
 
-    def instructions(self) -> dict[str, Any]:
+    def count_instructions(self) -> dict[str, Any]:
         """Count the instructions of one call.
 
         The counter is the module next to this script, not the worktree's.
@@ -117,75 +123,77 @@ class Worker:
         place.loader.exec_module(counter)
         return {"instructions": counter.count(self._work)}
 
-    def _held(self, make: Callable[[], Any], positions: str) -> Any:
+    def _prepare_work(self, build_work: Callable[[], Any], positions: str) -> Any:
         """Build the work, run it once, and write its answer to a file."""
         import numpy as np
 
-        work = make()
-        self._make, self._work = make, work
+        work = build_work()
+        self._build_work, self._work = build_work, work
         np.save(positions, np.asarray(work(), float))
         return work
 
-    def _pin(self, threads: int) -> None:
+    def _pin_threads(self, threads: int) -> None:
         from harness.base import machine
 
         self._threads.close()
-        self._threads.enter_context(machine.pinned_threads(threads))
+        self._threads.enter_context(machine.limit_threads(threads))
 
 
-class _Steps:
+class _RevisionSteps:
     """The first steps of a run, simulated again by each call."""
 
-    def __init__(self, run: Any, frames: int, extra: float) -> None:
-        from harness.scenes.bind import build
+    def __init__(self, run: Any, frames: int, injected_slowdown: float) -> None:
+        from harness.scenes.bind import build_scene
         from harness.simulation.step import prepare
-        from solvers.registry import SOLVERS, load
+        from solvers.registry import SOLVERS, load_target
 
-        self._run, self._frames, self._extra, self._iterations = run, frames, extra, 0
-        self._scene = build(run.scene, run.size, run.integrator)
-        self._prepared = prepare(self._scene, load(SOLVERS[run.solver.name])(**run.solver.parameters))
-        self._stop = _stop(run)
+        self._run, self._num_frames, self._injected_slowdown, self._iterations = run, frames, injected_slowdown, 0
+        self._scene = build_scene(run.scene, run.size, run.integrator)
+        self._prepared = prepare(self._scene, load_target(SOLVERS[run.solver.name])(**run.solver.parameters))
+        self._stop = _build_stop_rule(run)
 
     def __call__(self) -> Any:
-        from harness.simulation.step import simulate
+        from harness.simulation.step import simulate_scene
         from solvers.problem import StopRule
 
         self._iterations, step, first_guess = 0, None, self._run.first_guess
-        for step in simulate(self._scene, self._prepared, self._stop, first_guess=first_guess, frames=self._frames):
-            self._iterations += _iterations(step)
+        for step in simulate_scene(
+            self._scene, self._prepared, self._stop, initial_guess=first_guess, frames=self._num_frames
+        ):
+            self._iterations += _count_iterations(step)
         assert step is not None
-        if self._extra:
-            self._prepared.solve(step.problem, StopRule(max(1, round(self._extra * self._iterations))))
+        if self._injected_slowdown:
+            self._prepared.solve(step.problem, StopRule(max(1, round(self._injected_slowdown * self._iterations))))
         return step.positions
 
-    def facts(self) -> dict[str, int]:
+    def collect_stats(self) -> dict[str, int]:
         """Collect the solver's counts, and those of the last call."""
-        counts = {name: int(value) for name, value in self._prepared.facts.items()}
-        return counts | {"iterations": self._iterations, "steps": self._frames}
+        counts = {name: int(value) for name, value in self._prepared.stats.items()}
+        return counts | {"iterations": self._iterations, "steps": self._num_frames}
 
 
-def _stop(run: Any) -> Any:
+def _build_stop_rule(run: Any) -> Any:
     from solvers.problem import StopRule
 
     if isinstance(run.tolerance, str):  # `auto`, which older revisions do not know
-        from harness.simulation.algebraic import stop_rule
+        from harness.simulation.algebraic import build_stop_rule
 
-        return stop_rule(run.iterations, run.tolerance)
+        return build_stop_rule(run.iterations, run.tolerance)
     return StopRule(run.iterations, run.tolerance)
 
 
-def _sweep(config: str, asked: dict[str, Any]) -> list[Any]:
-    from harness.config.load import load_any
+def _load_runs(config: str, run_options: dict[str, Any]) -> list[Any]:
+    from harness.config.load import load_config
 
-    return load_any(Path(config), **asked).runs()
+    return load_config(Path(config), **run_options).list_runs()
 
 
-def _iterations(step: Any) -> int:
+def _count_iterations(step: Any) -> int:
     """Count the iterations of a step; older revisions report them only in the solution."""
-    return step.iterations if hasattr(step, "iterations") else step.solution.iterations
+    return step.num_iterations if hasattr(step, "iterations") else step.solution.iterations
 
 
-def _title(run: Any) -> str:
+def _format_title(run: Any) -> str:
     """Format the description of a run, which is the same in both worktrees."""
     given = [run.solver.name, f"{run.iterations} iterations", run.integrator, f"dt {run.scene.time_step:.4g}"]
     size = [f"size {run.size}"] if run.size else []
@@ -193,7 +201,7 @@ def _title(run: Any) -> str:
     return ", ".join([run.scene_name, *size, *given, *threads])
 
 
-def _gates() -> dict[str, Any]:
+def _load_tests() -> dict[str, Any]:
     import tests.bench.test_gates as listed
 
     groups: list[tuple[Any, ...]] = [value for value in vars(listed).values() if isinstance(value, tuple)]
@@ -204,7 +212,7 @@ def main() -> None:
     """Answer requests until standard input ends."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # what the work prints must not look like an answer
-    worker = Worker()
+    worker = RevisionWorker()
     for line in sys.stdin:
         asked = json.loads(line)
         try:

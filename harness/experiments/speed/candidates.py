@@ -17,30 +17,30 @@ import numba
 from harness.config.options import AUTO
 from harness.config.sweep import RunSpec
 from harness.experiments.speed import limits
-from harness.experiments.speed.rest import Rest, apart, precision
-from harness.experiments.speed.yardstick import Yardstick
-from harness.report.speed.counts import Counted, count
+from harness.experiments.speed.rest import ConvergedProblem, compute_precision_error, read_precision
+from harness.experiments.speed.yardstick import CppBaseline
+from harness.report.speed.counts import OperationCount, count_operations
 from harness.scenes.bind import Scene
-from harness.simulation.clock import Watch, measured_again, working
-from solvers.problem import Positions, Prepared, StepProblem, StopRule
-from solvers.registry import EVERY, load
+from harness.simulation.clock import PhaseWatch, check_phases, retry_on_mismatch
+from solvers.problem import Positions, PreparedSolver, StepProblem, StopRule
+from solvers.registry import SOLVER_TABLE, load_target
 
-LEAST = 0.02
+MIN_PHASE_SECONDS = 0.02
 """Time for which a phase is repeated in each round [s].
 
 The overhead of a clock is then negligible, and a first call with cold caches is one of many.
 """
 
 
-class Reading(NamedTuple):
+class CandidateTiming(NamedTuple):
     """Timing of one phase: seconds per call, and other columns of its row."""
 
     phase: str
-    seconds: float
+    call_seconds: float
     columns: dict[str, Any]
 
 
-class Candidate(Protocol):
+class BenchmarkCandidate(Protocol):
     """Subject of a measurement; `columns` are common to all its rows."""
 
     run: RunSpec
@@ -50,7 +50,7 @@ class Candidate(Protocol):
         """Prepare, or repeat the preparation; returns its seconds, None if there is nothing to repeat."""
         ...
 
-    def turn(self) -> list[Reading]:
+    def time_phases(self) -> list[CandidateTiming]:
         """Time every phase once."""
         ...
 
@@ -70,42 +70,47 @@ class SolverCandidate:
     """
 
     def __init__(
-        self, run: RunSpec, scene: Scene, problem: StepProblem, prepared: dict[str, Prepared], rest: Rest | None = None
+        self,
+        run: RunSpec,
+        scene: Scene,
+        problem: StepProblem,
+        prepared: dict[str, PreparedSolver],
+        converged: ConvergedProblem | None = None,
     ) -> None:
-        self.run, self._shared, self._rest = run, prepared, rest
+        self.run, self._shared_prepared, self._converged_problem = run, prepared, converged
         self.columns: dict[str, Any] = {}
         self._scene, self._problem = scene, problem
-        self._solver = load(EVERY[run.solver.name])(**run.solver.parameters)
-        self._prepared: Prepared | None = None
+        self._solver = load_target(SOLVER_TABLE[run.solver.name])(**run.solver.parameters)
+        self._prepared: PreparedSolver | None = None
         self._positions: Positions | None = None
-        self._work: dict[str, Counted] = {}
+        self._phase_counts: dict[str, OperationCount] = {}
 
-    @measured_again
+    @retry_on_mismatch
     def prepare(self) -> float:
         """Prepare the solver and return the wall seconds. Raises Unsupported, NotPositiveDefinite, MemoryError."""
-        watch = Watch(numba.get_num_threads())
+        watch = PhaseWatch(numba.get_num_threads())
         with watch:
             began = perf_counter()
             prepared = self._solver.prepare(self._scene.system)
             seconds = perf_counter() - began
-        watch.columns("prepare", [seconds])
+        watch.build_columns("prepare", [seconds])
         if self._prepared is None:
-            self._prepared = prepared = self._shared.setdefault(str(self._solver), prepared)
-            counts = self._scene.system.vertices, len(self._scene.springs.edges)
-            self._work = count(prepared.facts, *counts, precision(self.run))
-            self.columns = {name: int(value) for name, value in prepared.facts.items()}
-            self.columns["choice"] = prepared.choice
-            if self._rest and precision(self.run) != "float64":
-                self.columns["apart"] = apart(self._rest, prepared)
+            self._prepared = prepared = self._shared_prepared.setdefault(str(self._solver), prepared)
+            counts = self._scene.system.num_vertices, len(self._scene.all_springs.edges)
+            self._phase_counts = count_operations(prepared.stats, *counts, read_precision(self.run))
+            self.columns = {name: int(value) for name, value in prepared.stats.items()}
+            self.columns["choice"] = prepared.description
+            if self._converged_problem and read_precision(self.run) != "float64":
+                self.columns["apart"] = compute_precision_error(self._converged_problem, prepared)
         return seconds
 
-    def turn(self) -> list[Reading]:
+    def time_phases(self) -> list[CandidateTiming]:
         """Time a step and the phases of an iteration."""
         prepared = self._prepared
         assert prepared is not None
-        readings = [reading("step", self._step, self._columns("iteration", self.run.iterations))]
-        for phase, call in working(prepared, self._problem).items():
-            readings.append(reading(phase, call, self._columns(phase, 1)))
+        readings = [time_phase("step", self._solve_step, self._build_columns("iteration", self.run.iterations))]
+        for phase, call in check_phases(prepared, self._problem).items():
+            readings.append(time_phase(phase, call, self._build_columns(phase, 1)))
         return readings
 
     def close(self) -> Positions | None:
@@ -113,64 +118,66 @@ class SolverCandidate:
         self._prepared = None
         return self._positions
 
-    def _step(self) -> None:
+    def _solve_step(self) -> None:
         assert self._prepared is not None
         tolerance = self.run.tolerance
         assert tolerance != AUTO, "the command refuses it: a step alone has no error of its own"
         self._positions = self._prepared.solve(self._problem, StopRule(self.run.iterations, tolerance)).positions
 
-    def _columns(self, phase: str, times: int) -> dict[str, Any]:
-        done = {"iterations": times}
-        if phase not in self._work:
+    def _build_columns(self, phase: str, num_repeats: int) -> dict[str, Any]:
+        done = {"iterations": num_repeats}
+        if phase not in self._phase_counts:
             return done
-        counted = self._work[phase]
+        counted = self._phase_counts[phase]
         return done | {
-            "bytes": times * counted.bytes,
-            "flops": times * counted.flops,
-            "working_set": counted.working_set,
+            "bytes": num_repeats * counted.bytes_moved,
+            "flops": num_repeats * counted.flop_count,
+            "working_set": counted.working_set_bytes,
         }
 
 
-class YardstickCandidate:
+class CppCandidate:
     """C++ baseline program, which computes the same step."""
 
     def __init__(
         self, run: RunSpec, scene: Scene, problem: StepProblem, program: Callable[[], Path], tunables: str
     ) -> None:
         self.run, self.columns = run, {}
-        self._scene, self._problem, self._program, self._tunables = scene, problem, program, tunables
+        self._scene, self._problem, self._build_program, self._tunables = scene, problem, program, tunables
         self._folder = TemporaryDirectory()
-        self._running: Yardstick | None = None
+        self._process: CppBaseline | None = None
 
     def prepare(self) -> float | None:
         """Start the program, once, and return the seconds of its preparation. Raises Unsupported, RunFailed."""
-        if self._running:
+        if self._process:
             return None
         folder = Path(self._folder.name)
-        self._running = Yardstick(self._program(), self._problem, self._scene.springs, folder, self._tunables)
-        return self._running.prepare_seconds
+        self._process = CppBaseline(
+            self._build_program(), self._problem, self._scene.all_springs, folder, self._tunables
+        )
+        return self._process.prepare_seconds
 
-    def turn(self) -> list[Reading]:
+    def time_phases(self) -> list[CandidateTiming]:
         """Time a step, its local steps and its global steps."""
-        running, iterations = self._running, self.run.iterations
+        running, iterations = self._process, self.run.iterations
         assert running is not None
         once = running.step(iterations)
-        number = _repeats(once[0])
+        number = _choose_num_repeats(once[0])
         answers = [running.step(iterations) for _ in range(number)] if number > 1 else [once]
         step, local, global_ = (sum(column) / len(answers) for column in zip(*answers, strict=True))
         return [
-            Reading("step", step, {"iterations": iterations}),
-            Reading("local", local / iterations, {"iterations": 1}),
-            Reading("global", global_ / iterations, {"iterations": 1}),
+            CandidateTiming("step", step, {"iterations": iterations}),
+            CandidateTiming("local", local / iterations, {"iterations": 1}),
+            CandidateTiming("global", global_ / iterations, {"iterations": 1}),
         ]
 
     def close(self) -> Positions | None:
         """End the program and remove its files; returns the positions of its last step."""
         try:
-            return self._running.close() if self._running else None
+            return self._process.close() if self._process else None
         finally:
-            if self._running:
-                self._running.kill()
+            if self._process:
+                self._process.kill()
             self._folder.cleanup()
 
 
@@ -182,45 +189,47 @@ class MachineCandidate:
 
     def prepare(self) -> None:
         """Compile the kernels, which is not timed."""
-        for probe in limits.probes(limits.WORKING_SETS[:1]):
+        for probe in limits.build_probes(limits.WORKING_SETS[:1]):
             probe.call()
 
-    def turn(self) -> list[Reading]:
+    def time_phases(self) -> list[CandidateTiming]:
         """Time every kernel once."""
         return [
-            reading(
+            time_phase(
                 probe.name,
                 probe.call,
-                {"bytes": probe.bytes, "flops": probe.flops, "working_set": probe.working_set},
+                {"bytes": probe.bytes_moved, "flops": probe.flops, "working_set": probe.working_set_bytes},
                 0.0,
             )
-            for probe in limits.probes()
+            for probe in limits.build_probes()
         ]
 
     def close(self) -> None:
         """Do nothing: no resources to release."""
 
 
-class Repeated:
+class RepeatedCall:
     """Timed repetition of a call; `preempted` states whether any repetition was preempted."""
 
     def __init__(self, call: Callable[[], object]) -> None:
-        self._call, self.interrupted = call, False
+        self._call, self.preempted = call, False
 
-    @measured_again
-    def __call__(self, number: int) -> float:
+    @retry_on_mismatch
+    def __call__(self, num_calls: int) -> float:
         """Return the wall seconds of a number of calls. Raises ClocksDisagree."""
-        watch = Watch(numba.get_num_threads())
+        watch = PhaseWatch(numba.get_num_threads())
         with watch:
             began = perf_counter()
-            for _ in range(number):
+            for _ in range(num_calls):
                 self._call()
             found = perf_counter() - began
-        self.interrupted |= watch.columns("calls", [found])["interrupted"]
+        self.preempted |= watch.build_columns("calls", [found])["interrupted"]
         return found
 
 
-def reading(phase: str, call: Callable[[], object], columns: dict[str, Any], least: float = LEAST) -> Reading:
+def time_phase(
+    phase: str, call: Callable[[], object], columns: dict[str, Any], min_seconds: float = MIN_PHASE_SECONDS
+) -> CandidateTiming:
     """Time a phase and return the seconds per call. Raises RunFailed where another clock disagrees.
 
     Args:
@@ -229,19 +238,21 @@ def reading(phase: str, call: Callable[[], object], columns: dict[str, Any], lea
         columns: further columns of its row.
         min_seconds: time for which to repeat the call [s].
     """
-    seconds = Repeated(call)
-    return Reading(phase, average(seconds, least), columns | {"interrupted": seconds.interrupted})
+    seconds = RepeatedCall(call)
+    return CandidateTiming(
+        phase, compute_call_seconds(seconds, min_seconds), columns | {"interrupted": seconds.preempted}
+    )
 
 
-def average(seconds: Callable[[int], float], least: float = LEAST) -> float:
+def compute_call_seconds(seconds: Callable[[int], float], min_seconds: float = MIN_PHASE_SECONDS) -> float:
     """Return the seconds per call.
 
     This is one call, or the mean of enough calls to last `min_seconds` after a first one.
     """
     once = seconds(1)
-    number = _repeats(once, least)
+    number = _choose_num_repeats(once, min_seconds)
     return seconds(number) / number if number > 1 else once
 
 
-def _repeats(once: float, least: float = LEAST) -> int:
-    return ceil(least / max(once, 1e-9))
+def _choose_num_repeats(once: float, min_seconds: float = MIN_PHASE_SECONDS) -> int:
+    return ceil(min_seconds / max(once, 1e-9))

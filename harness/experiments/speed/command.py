@@ -8,43 +8,45 @@ from typing import Annotated
 
 import typer
 
-from harness.base.commands import Again, Changed, InThisProcess, Results
-from harness.base.console import err, narrow, out, say
-from harness.base.errors import InputError, Mistake
+from harness.base.commands import InProcessOption, RerunOption, RerunStaleOption, ResultsOption
+from harness.base.console import get_error_console, get_output_console, print_message, split_wide_table
+from harness.base.errors import InputError, InputMistake
 
 
-def speed(
+def roofline(
     config: Annotated[Path, typer.Argument(help="A sweep (YAML).")],
-    results: Results = Path("results"),
+    results: ResultsOption = Path("results"),
     budget: Annotated[float, typer.Option(help="Seconds that a candidate may take at a size.")] = 210.0,
-    again: Again = False,
-    changed: Changed = False,
-    here: InThisProcess = False,
+    rerun: RerunOption = False,
+    rerun_stale: RerunStaleOption = False,
+    in_process: InProcessOption = False,
 ) -> None:
     """Time a sweep's solvers interleaved, with a C++ baseline and roofline microbenchmarks."""
-    from harness.base.claim import claimed
-    from harness.base.progress import display
-    from harness.config.load import load_sweep, require_stated
+    from harness.base.claim import claim_folder
+    from harness.base.progress import create_display
+    from harness.config.load import load_sweep, require_fixed_steps
     from harness.config.options import AUTO
-    from harness.experiments.speed.comparison import run_speed
-    from harness.report.site import keep
-    from harness.report.speed.figures import figures
-    from harness.report.speed.pictures import draw
-    from harness.report.speed.speed_table import remarks, speed_table
+    from harness.experiments.speed.comparison import run_roofline
+    from harness.report.site import refresh_results_page
+    from harness.report.speed.figures import compute_speed_figures
+    from harness.report.speed.pictures import draw_speed_plots
+    from harness.report.speed.speed_table import build_speed_table, describe_speed
 
     if not 0.0 < budget < math.inf:
-        raise InputError(Mistake(f"came {budget:g}; wanted a number of seconds above 0", key="--budget"))
+        raise InputError(InputMistake(f"came {budget:g}; wanted a number of seconds above 0", key="--budget"))
     sweep = load_sweep(config)
-    require_stated(sweep.runs())
-    if any(run.tolerance == AUTO for run in sweep.runs()):
-        raise InputError(Mistake("needs the steps before; give a number, or null", config, key="tolerance"))
-    folder = claimed(results / sweep.name, config)
-    how = {"again": again, "changed": changed, "isolated": not here}
-    found = figures(run_speed(sweep, folder, display(err()), say, budget=budget, **how))
-    out().print(narrow(speed_table(found), beside=2))
-    for line in remarks(found):
-        say(line)
-    draw(found, folder / "pictures")
-    say(f"rows and pictures are in {folder}")
-    keep(results, folder, say)
+    require_fixed_steps(sweep.list_runs())
+    if any(run.tolerance == AUTO for run in sweep.list_runs()):
+        raise InputError(InputMistake("needs the steps before; give a number, or null", config, key="tolerance"))
+    folder = claim_folder(results / sweep.name, config)
+    how = {"again": rerun, "changed": rerun_stale, "isolated": not in_process}
+    found = compute_speed_figures(
+        run_roofline(sweep, folder, create_display(get_error_console()), print_message, budget=budget, **how)
+    )
+    get_output_console().print(split_wide_table(build_speed_table(found), key_columns=2))
+    for line in describe_speed(found):
+        print_message(line)
+    draw_speed_plots(found, folder / "pictures")
+    print_message(f"rows and pictures are in {folder}")
+    refresh_results_page(results, folder, print_message)
     raise typer.Exit(1 if any(f.status in ("failed", "diverged") for f in found) else 0)

@@ -16,35 +16,40 @@ from typing import Any
 import pyarrow as pa
 
 from harness.base import holding, machine, rows
-from harness.base.columns import SCHEMA
-from harness.base.progress import Display, Effort
-from harness.base.workers import Limits, Lost, Tick
-from harness.config.load import Sweep
+from harness.base.columns import RUN_SCHEMA
+from harness.base.progress import ProgressDisplay, RunCost
+from harness.base.workers import ProgressCallback, TaskFailure, TaskLimits
+from harness.config.load import SweepPlan
 from harness.config.sweep import RunSpec, SolverSpec
-from harness.experiments.core import do_all, require_threads
-from harness.experiments.plan import Files
-from harness.experiments.provenance import common
-from harness.experiments.resume import MISSING, Standing, standings, wanted
+from harness.experiments.core import execute_units, require_threads
+from harness.experiments.plan import RunFiles
+from harness.experiments.provenance import build_run_columns
+from harness.experiments.resume import NOT_STARTED, CompletionStatus, read_completion_statuses, select_missing_units
 from harness.experiments.speed import yardstick
-from harness.experiments.speed.candidates import Candidate, MachineCandidate, SolverCandidate, YardstickCandidate
-from harness.experiments.speed.rest import precision, rest_of
-from harness.experiments.speed.round_robin import PREPARES, Past, measure, name
-from harness.report.speed.figures import MACHINE, YARDSTICK
-from harness.scenes.bind import build
-from harness.simulation.step import problem, start
-from solvers.problem import Prepared
+from harness.experiments.speed.candidates import BenchmarkCandidate, CppCandidate, MachineCandidate, SolverCandidate
+from harness.experiments.speed.rest import find_converged_problem, read_precision
+from harness.experiments.speed.round_robin import (
+    NUM_PREPARATIONS,
+    PastTiming,
+    format_candidate_name,
+    measure_round_robin,
+)
+from harness.report.speed.figures import CPP_BASELINE, MACHINE_SOLVER
+from harness.scenes.bind import build_scene
+from harness.simulation.step import build_initial_state, build_problem
+from solvers.problem import PreparedSolver
 
-TEMPORARIES = {"default": "", "cheap": yardstick.CHEAP_TEMPORARIES}
+MALLOC_SETTINGS = {"default": "", "cheap": yardstick.MALLOC_TUNABLES}
 """Memory settings of the C++ baseline: the defaults, or those that make temporaries cheapest."""
 
 
-PATIENCE = 3600.0
+EXTRA_WALL_SECONDS = 3600.0
 """Wall time of a size in addition to four times the budget of each candidate, for compiling, preparing, checking [s].
 """
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class RooflineUnit:
     """Runs of one scene and size with their baselines (`harness.experiments.experiment_units.ExperimentUnit`).
 
     Attributes:
@@ -54,71 +59,73 @@ class Comparison:
         budget: time limit of a candidate, as predicted from its smaller sizes [s].
     """
 
-    members: tuple[RunSpec, ...]
+    candidate_runs: tuple[RunSpec, ...]
     folder: Path
-    smaller: tuple[tuple[str, Path], ...]
+    smaller_rows: tuple[tuple[str, Path], ...]
     budget: float
 
     @property
-    def files(self) -> list[Path]:
+    def rows_paths(self) -> list[Path]:
         """Files of the rows of each candidate."""
-        return [Files.of(run, self.folder).rows for run in self.members]
+        return [RunFiles.for_run(run, self.folder).rows_path for run in self.candidate_runs]
 
     @property
     def title(self) -> str:
         """Title of the unit, for messages."""
-        first = self.members[0]
-        return f"{first.scene_name} {first.size}: {len(self.members)} candidates take turns"
+        first = self.candidate_runs[0]
+        return f"{first.scene_name} {first.size}: {len(self.candidate_runs)} candidates take turns"
 
     @property
-    def ticks(self) -> int:
+    def num_progress_steps(self) -> int:
         """Number of rounds of preparation and of timing."""
-        return PREPARES + max(run.rounds for run in self.members)
+        return NUM_PREPARATIONS + max(run.rounds for run in self.candidate_runs)
 
     @property
-    def effort(self) -> Effort:
+    def cost_estimate(self) -> RunCost:
         """Estimated cost, proportional to the number of vertices."""
-        return Effort(amount=float(self.members[0].size or 32) ** 2)
+        return RunCost(amount=float(self.candidate_runs[0].size or 32) ** 2)
 
     @property
-    def limits(self) -> Limits:
+    def task_limits(self) -> TaskLimits:
         """Wall-time limit, from the budget of all candidates."""
-        return Limits(PATIENCE + 4.0 * self.budget * len(self.members))
+        return TaskLimits(EXTRA_WALL_SECONDS + 4.0 * self.budget * len(self.candidate_runs))
 
     @property
-    def standing(self) -> Standing:
+    def completion_status(self) -> CompletionStatus:
         """Completion status: completed if the rows of all candidates exist."""
-        found = list(standings(dict.fromkeys(self.files, lambda row: True), (), SCHEMA).values())
-        missing = next((one for one in found if one.state == MISSING), None)
-        return missing or found[0]._replace(older=any(one.older for one in found))
+        found = list(
+            read_completion_statuses(dict.fromkeys(self.rows_paths, lambda row: True), (), RUN_SCHEMA).values()
+        )
+        missing = next((one for one in found if one.status == NOT_STARTED), None)
+        return missing or found[0]._replace(is_stale=any(one.is_stale for one in found))
 
-    def do(self, tick: Tick) -> str:
+    def execute_unit(self, tick: ProgressCallback) -> str:
         """Time all candidates, write their rows and return the outcome as text."""
-        past: dict[str, list[Past]] = {}
-        for candidate, path in self.smaller:
-            past.setdefault(candidate, []).extend(_past(rows.read([path]).to_pylist()))
-        return self._written(_measured(self.members, self.folder, past, self.budget, tick))
+        past: dict[str, list[PastTiming]] = {}
+        for candidate, path in self.smaller_rows:
+            past.setdefault(candidate, []).extend(_read_past_timings(rows.read_rows([path]).to_pylist()))
+        return self._write_rows(_measure_rows(self.candidate_runs, self.folder, past, self.budget, tick))
 
-    def lost(self, lost: Lost) -> str:
+    def write_lost_rows(self, task_loss: TaskFailure) -> str:
         """Write a row for each candidate of a lost unit, and return a message."""
-        why = {"phase": "run", "status": lost.status, "reason": str(lost)}
-        return self._written([[common(run) | why] for run in self.members])
+        why = {"phase": "run", "status": task_loss.status, "reason": str(task_loss)}
+        return self._write_rows([[build_run_columns(run) | why] for run in self.candidate_runs])
 
-    def _written(self, measured: Sequence[list[dict[str, Any]]]) -> str:
-        for path, found in zip(self.files, measured, strict=True):
-            rows.write(path, found)
+    def _write_rows(self, measured: Sequence[list[dict[str, Any]]]) -> str:
+        for path, found in zip(self.rows_paths, measured, strict=True):
+            rows.write_rows(path, found)
         bad = [found[0]["solver"] for found in measured if found[0]["status"] not in ("ok", "skipped", "unsupported")]
         return f"{', '.join(dict.fromkeys(bad))} failed" if bad else "ok"
 
 
-def run_speed(
-    sweep: Sweep,
+def run_roofline(
+    sweep: SweepPlan,
     folder: Path,
-    display: Display,
-    say: Callable[[str], None],
+    display: ProgressDisplay,
+    print_message: Callable[[str], None],
     *,
-    again: bool = False,
-    changed: bool = False,
+    rerun: bool = False,
+    rerun_stale: bool = False,
     budget: float = 210.0,
     isolated: bool = True,
 ) -> pa.Table:
@@ -137,20 +144,24 @@ def run_speed(
     Raises:
         InputError: an option is invalid.
     """
-    runs = [run.but(threads=machine.threads(run.threads).number) for run in sweep.runs()]
-    require_threads({machine.threads(run.threads).number for run in runs})
+    runs = [run.replace_options(threads=machine.choose_threads(run.threads).count) for run in sweep.list_runs()]
+    require_threads({machine.choose_threads(run.threads).count for run in runs})
     (folder / "rows").mkdir(parents=True, exist_ok=True)
-    with holding.alone(folder):
-        planned: list[Comparison] = []
+    with holding.lock_folder_exclusive(folder):
+        planned: list[RooflineUnit] = []
         smaller: list[tuple[str, Path]] = []
-        for group in _groups(runs):
-            planned.append(Comparison((*group, *_beside(group)), folder, tuple(smaller), budget))
-            smaller += zip(map(name, planned[-1].members), planned[-1].files, strict=True)
-        do_all(wanted(planned, "sizes", say, again=again, changed=changed), display, isolated=isolated)
-        return rows.read(path for size in planned for path in size.files)
+        for group in _group_runs(runs):
+            planned.append(RooflineUnit((*group, *_build_baseline_runs(group)), folder, tuple(smaller), budget))
+            smaller += zip(map(format_candidate_name, planned[-1].candidate_runs), planned[-1].rows_paths, strict=True)
+        execute_units(
+            select_missing_units(planned, "sizes", print_message, rerun=rerun, rerun_stale=rerun_stale),
+            display,
+            isolated=isolated,
+        )
+        return rows.read_rows(path for size in planned for path in size.rows_paths)
 
 
-def _groups(runs: Sequence[RunSpec]) -> list[list[RunSpec]]:
+def _group_runs(runs: Sequence[RunSpec]) -> list[list[RunSpec]]:
     """Group the runs by scene and size, smaller sizes first."""
     groups: dict[tuple[str, int], list[RunSpec]] = {}
     for run in sorted(runs, key=lambda run: run.size):
@@ -158,39 +169,46 @@ def _groups(runs: Sequence[RunSpec]) -> list[list[RunSpec]]:
     return list(groups.values())
 
 
-def _beside(group: Sequence[RunSpec]) -> list[RunSpec]:
+def _build_baseline_runs(group: Sequence[RunSpec]) -> list[RunSpec]:
     """Build the baseline runs of a size.
 
     These are the C++ baseline on one thread, and the machine on as many threads as the runs use.
     """
     first = group[0]
-    eigen = [first.but(threads=1, solver=SolverSpec(YARDSTICK, {"temporaries": setting})) for setting in TEMPORARIES]
+    eigen = [
+        first.replace_options(threads=1, solver=SolverSpec(CPP_BASELINE, {"temporaries": setting}))
+        for setting in MALLOC_SETTINGS
+    ]
     threads = sorted({run.threads for run in group})
-    return eigen + [first.but(threads=t, solver=SolverSpec(MACHINE, {})) for t in threads]
+    return eigen + [first.replace_options(threads=t, solver=SolverSpec(MACHINE_SOLVER, {})) for t in threads]
 
 
-def _measured(
-    runs: Sequence[RunSpec], folder: Path, past: dict[str, list[Past]], budget: float, tick: Tick
+def _measure_rows(
+    runs: Sequence[RunSpec],
+    folder: Path,
+    past_timings: dict[str, list[PastTiming]],
+    budget: float,
+    tick: ProgressCallback,
 ) -> list[list[dict[str, Any]]]:
     """Measure all runs of one scene and size, and return the rows of each."""
-    scene = build(runs[0].scene, runs[0].size)
-    stated = problem(scene, start(scene), runs[0].first_guess)
-    program = partial(yardstick.build, folder / "build")
-    prepared: dict[str, Prepared] = {}
-    rest = rest_of(stated) if any(precision(run) != "float64" for run in runs) else None
+    scene = build_scene(runs[0].scene, runs[0].size)
+    stated = build_problem(scene, build_initial_state(scene), runs[0].first_guess)
+    program = partial(yardstick.compile_baseline, folder / "build")
+    prepared: dict[str, PreparedSolver] = {}
+    rest = find_converged_problem(stated) if any(read_precision(run) != "float64" for run in runs) else None
 
-    def candidate(run: RunSpec) -> Candidate:
-        if run.solver.name == MACHINE:
+    def candidate(run: RunSpec) -> BenchmarkCandidate:
+        if run.solver.name == MACHINE_SOLVER:
             return MachineCandidate(run)
-        if run.solver.name == YARDSTICK:
-            return YardstickCandidate(run, scene, stated, program, TEMPORARIES[run.solver.parameters["temporaries"]])
+        if run.solver.name == CPP_BASELINE:
+            return CppCandidate(run, scene, stated, program, MALLOC_SETTINGS[run.solver.parameters["temporaries"]])
         return SolverCandidate(run, scene, stated, prepared, rest)
 
-    counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
-    return measure([candidate(run) for run in runs], counts, past, budget, tick)
+    counts = {"vertices": len(scene.mesh.rest_positions), "springs": len(scene.all_springs.edges)}
+    return measure_round_robin([candidate(run) for run in runs], counts, past_timings, budget, tick)
 
 
-def _past(found: Sequence[dict[str, Any]]) -> list[Past]:
+def _read_past_timings(found: Sequence[dict[str, Any]]) -> list[PastTiming]:
     """Return the timing that predicts larger sizes from a run's rows.
 
     The result is empty if it failed or has no steps.
@@ -199,4 +217,4 @@ def _past(found: Sequence[dict[str, Any]]) -> list[Past]:
     iteration = [row["seconds"] / row["iterations"] for row in found if row["phase"] == "step"]
     if not (prepare and iteration):
         return []
-    return [Past(found[0]["vertices"], median(prepare), median(iteration))]
+    return [PastTiming(found[0]["vertices"], median(prepare), median(iteration))]

@@ -24,19 +24,19 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from solvers.compiling import kept
+from solvers.compiling import cached_njit
 
 WORKING_SETS = tuple(int(2.0**k) for k in np.arange(14, 29.5, 0.5))
 """Bytes of all threads together: from 16 KiB, in the first-level cache, to 512 MiB, in memory."""
 
-_CALL_BYTES = 1 << 27
-_CHAINS, _VECTOR_BYTES = 12, 64
-_REPEATS = 1 << 18
-_FAST = {"contract", "reassoc", "nsz"}
+_BYTES_PER_CALL = 1 << 27
+_NUM_CHAINS, _VECTOR_BYTES = 12, 64
+_NUM_REPEATS = 1 << 18
+_FAST_MATH_FLAGS = {"contract", "reassoc", "nsz"}
 
 
 @dataclass(frozen=True, slots=True)
-class Probe:
+class RooflineProbe:
     """Kernel that is ready to be timed.
 
     Attributes:
@@ -48,42 +48,44 @@ class Probe:
     """
 
     name: str
-    working_set: int
-    bytes: int
+    working_set_bytes: int
+    bytes_moved: int
     flops: int
     call: Callable[[], Any]
 
 
-def probes(sets: tuple[int, ...] = WORKING_SETS) -> Iterator[Probe]:
+def build_probes(working_sets: tuple[int, ...] = WORKING_SETS) -> Iterator[RooflineProbe]:
     """Build all kernels for Numba's current number of threads."""
     threads = numba.get_num_threads()
-    room = np.ones(max(sets) // 8)
-    for size in sets:
+    room = np.ones(max(working_sets) // 8)
+    for size in working_sets:
         a = room[: size // 8]
         # Short sets are traversed many times in a call; otherwise the start of the threads would dominate.
-        repeats = max(1, _CALL_BYTES // size)
-        yield Probe("read", size, 8 * len(a) * repeats, len(a) * repeats, lambda a=a, r=repeats: _read(a, threads, r))
+        repeats = max(1, _BYTES_PER_CALL // size)
+        yield RooflineProbe(
+            "read", size, 8 * len(a) * repeats, len(a) * repeats, lambda a=a, r=repeats: _read_sum(a, threads, r)
+        )
         b, c, d = np.split(a[: len(a) // 3 * 3], 3)
         moved, flops = 24 * len(b) * repeats, 2 * len(b) * repeats
-        yield Probe("triad", size, moved, flops, lambda b=b, c=c, d=d, r=repeats: _triad(b, c, d, threads, r))
+        yield RooflineProbe("triad", size, moved, flops, lambda b=b, c=c, d=d, r=repeats: _triad(b, c, d, threads, r))
     for name, kind in (("fma float64", np.float64), ("fma float32", np.float32)):
         start = np.ones(1, kind)
         lanes = _VECTOR_BYTES // start.itemsize
-        flops = 2 * _CHAINS * lanes * _REPEATS * threads
-        yield Probe(name, 0, 0, flops, lambda start=start: _fused(start, threads))
+        flops = 2 * _NUM_CHAINS * lanes * _NUM_REPEATS * threads
+        yield RooflineProbe(name, 0, 0, flops, lambda start=start: _run_multiply_adds(start, threads))
 
 
-@kept(parallel=True, fastmath=_FAST)
-def _read(a: NDArray[Any], threads: int, repeats: int) -> float:
+@cached_njit(parallel=True, fastmath=_FAST_MATH_FLAGS)
+def _read_sum(a: NDArray[Any], threads: int, repeats: int) -> float:
     total = 0.0
     for t in prange(threads):
         first, last = len(a) * t // threads, len(a) * (t + 1) // threads
-        total += _sum(a[first:last], repeats)
+        total += _sum_repeatedly(a[first:last], repeats)
     return total
 
 
-@kept(fastmath=_FAST)
-def _sum(a: NDArray[Any], repeats: int) -> float:
+@cached_njit(fastmath=_FAST_MATH_FLAGS)
+def _sum_repeatedly(a: NDArray[Any], repeats: int) -> float:
     total = 0.0
     for k in range(repeats):
         part = 0.0
@@ -94,7 +96,7 @@ def _sum(a: NDArray[Any], repeats: int) -> float:
     return total
 
 
-@kept(parallel=True, fastmath=_FAST)
+@cached_njit(parallel=True, fastmath=_FAST_MATH_FLAGS)
 def _triad(a: NDArray[Any], b: NDArray[Any], c: NDArray[Any], threads: int, repeats: int) -> None:
     for t in prange(threads):
         first, last = len(a) * t // threads, len(a) * (t + 1) // threads
@@ -102,17 +104,17 @@ def _triad(a: NDArray[Any], b: NDArray[Any], c: NDArray[Any], threads: int, repe
             _add_scaled(a[first:last], b[first:last], c[first:last])
 
 
-@kept(fastmath=_FAST)
+@cached_njit(fastmath=_FAST_MATH_FLAGS)
 def _add_scaled(a: NDArray[Any], b: NDArray[Any], c: NDArray[Any]) -> None:
     for i in range(len(a)):
         a[i] = b[i] + 3.0 * c[i]
 
 
-@kept(parallel=True)
-def _fused(start: NDArray[Any], threads: int) -> float:
+@cached_njit(parallel=True)
+def _run_multiply_adds(start: NDArray[Any], threads: int) -> float:
     total = 0.0
     for _ in prange(threads):
-        total += _chains(start, _REPEATS)
+        total += _multiply_add_chains(start, _NUM_REPEATS)
     return total
 
 
@@ -128,7 +130,7 @@ def _multiply_adds(typingctx: Any, start: Any, repeats: Any) -> tuple[Any, Calla
         spread = ir.Constant(vector, [0.0] * lanes)
         for lane in range(lanes):
             spread = builder.insert_element(spread, x, ir.Constant(ir.IntType(32), lane))
-        chains = [cgutils.alloca_once(builder, vector) for _ in range(_CHAINS)]
+        chains = [cgutils.alloca_once(builder, vector) for _ in range(_NUM_CHAINS)]
         for k, chain in enumerate(chains):
             builder.store(ir.Constant(vector, [float(k)] * lanes), chain)
         with cgutils.for_range(builder, count):
@@ -143,4 +145,6 @@ def _multiply_adds(typingctx: Any, start: Any, repeats: Any) -> tuple[Any, Calla
     return start.dtype(start, types.intp), generate
 
 
-_chains: Any = intrinsic(_multiply_adds)  # Numba passes the first argument itself, which type checkers do not know
+_multiply_add_chains: Any = intrinsic(
+    _multiply_adds
+)  # Numba passes the first argument itself, which type checkers do not know

@@ -14,16 +14,16 @@ import numpy as np
 
 from harness.config.sweep import RunSpec
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.methods.newton import Newton
-from solvers.problem import Positions, Prepared, StepProblem, StopRule, Unsupported
+from solvers.methods.newton import NewtonSolver
+from solvers.problem import Positions, PreparedSolver, StepProblem, StopRule, Unsupported
 
-_FROM_MINIMUM = StopRule(50)
-_TO_MINIMUM = StopRule(200, 1e-12)
-_LARGEST = 10_000
+_STOP_FROM_MINIMUM = StopRule(50)
+_STOP_AT_MINIMUM = StopRule(200, 1e-12)
+_MAX_VERTICES = 10_000
 """Largest number of vertices for which a minimum is computed: 1 s for 64 a side, 30 s for 128."""
 
 
-class Rest(NamedTuple):
+class ConvergedProblem(NamedTuple):
     """Step problem that starts at its minimum, and float64's final positions from there.
 
     The positions are (n, 3) [m].
@@ -33,30 +33,32 @@ class Rest(NamedTuple):
     positions: Positions
 
 
-def precision(run: RunSpec) -> str:
+def read_precision(run: RunSpec) -> str:
     """Return the precision of a run's factor."""
     return run.solver.parameters.get("precision", "float64")
 
 
-def rest_of(problem: StepProblem) -> Rest | None:
+def find_converged_problem(problem: StepProblem) -> ConvergedProblem | None:
     """Find the minimum of a step problem.
 
     The result is None for a large one, or one that Newton's method does not support.
     """
-    if problem.system.vertices > _LARGEST:
+    if problem.system.num_vertices > _MAX_VERTICES:
         return None
     try:
-        found = Newton().prepare(problem.system).solve(problem, _TO_MINIMUM)
+        found = NewtonSolver().prepare(problem.system).solve(problem, _STOP_AT_MINIMUM)
     except Unsupported:
         return None
-    there = replace(problem, first_guess=found.positions)
-    return Rest(there, CompiledLocalGlobal().prepare(problem.system).solve(there, _FROM_MINIMUM).positions)
+    there = replace(problem, initial_guess=found.positions)
+    return ConvergedProblem(
+        there, CompiledLocalGlobal().prepare(problem.system).solve(there, _STOP_FROM_MINIMUM).positions
+    )
 
 
-def apart(rest: Rest, prepared: Prepared) -> float:
+def compute_precision_error(converged: ConvergedProblem, prepared: PreparedSolver) -> float:
     """Return the largest distance of a solver's positions from float64's.
 
     It is relative to the scene's size.
     """
-    found = prepared.solve(rest.problem, _FROM_MINIMUM).positions
-    return float(np.abs(found - rest.positions).max()) / float(np.ptp(rest.positions, axis=0).max())
+    found = prepared.solve(converged.problem, _STOP_FROM_MINIMUM).positions
+    return float(np.abs(found - converged.positions).max()) / float(np.ptp(converged.positions, axis=0).max())

@@ -19,45 +19,45 @@ import numpy as np
 
 from harness.base import machine
 from harness.base.errors import RunFailed
-from harness.base.worker import Tick
+from harness.base.worker import ProgressCallback
 from harness.config.sweep import RunSpec
-from harness.experiments.failure import failure
-from harness.experiments.provenance import common
-from harness.experiments.speed.candidates import Candidate, Reading
-from harness.simulation.measure import digest
+from harness.experiments.failure import build_failure_columns
+from harness.experiments.provenance import build_run_columns
+from harness.experiments.speed.candidates import BenchmarkCandidate, CandidateTiming
+from harness.simulation.measure import hash_positions
 from solvers.problem import Positions
 
-PREPARES = 3
+NUM_PREPARATIONS = 3
 """Number of preparations of each candidate, including the first."""
 
-LONG = 3.0
+MAX_REPEATED_SECONDS = 3.0
 """Duration above which a preparation is not repeated [s]: for a large mesh, cold caches do not matter any more."""
 
-AGREEMENT = {"float64": 1e-9, "float32": 1e-5, "float16": 1e-2}
+POSITION_RTOL = {"float64": 1e-9, "float32": 1e-5, "float16": 1e-2}
 """Largest difference of final positions, relative to the scene's size, by precision.
 
 float64: round-off of 50 iterations, with stiffness ratios of 1e10 : 1. Below float64 the iterates differ by the
 precision of the factor until they converge.
 """
 
-Row = dict[str, Any]
+ResultRow = dict[str, Any]
 
 
-class Past(NamedTuple):
+class PastTiming(NamedTuple):
     """Timing of a candidate at a smaller size: warm preparation [s], and one iteration [s]."""
 
-    vertices: int
-    prepare: float
-    iteration: float
+    num_vertices: int
+    prepare_seconds: float
+    iteration_seconds: float
 
 
-def measure(
-    candidates: Sequence[Candidate],
-    counts: Row,
-    past: Mapping[str, list[Past]],
+def measure_round_robin(
+    candidates: Sequence[BenchmarkCandidate],
+    counts: ResultRow,
+    past_timings: Mapping[str, list[PastTiming]],
     budget: float,
-    tick: Tick = lambda phase: None,
-) -> list[list[Row]]:
+    tick: ProgressCallback = lambda phase: None,
+) -> list[list[ResultRow]]:
     """Measure the candidates in turn and return the rows of each.
 
     Args:
@@ -67,44 +67,46 @@ def measure(
         budget: time limit of a candidate [s].
         tick: called after each round with the phase.
     """
-    rows: dict[Candidate, list[Row]] = {}
-    alive: list[Candidate] = []
+    rows: dict[BenchmarkCandidate, list[ResultRow]] = {}
+    alive: list[BenchmarkCandidate] = []
     with ExitStack() as cleanup:
         for candidate in candidates:
-            cleanup.callback(_closed, candidate)
+            cleanup.callback(_release_quietly, candidate)
             rows[candidate] = []
-            wanted = predicted(past.get(name(candidate.run), ()), counts["vertices"], candidate.run)
+            wanted = predict_seconds(
+                past_timings.get(format_candidate_name(candidate.run), ()), counts["vertices"], candidate.run
+            )
             if wanted > budget:
                 said = f"would take {wanted:.0f} s by its smaller sizes; the budget of each candidate is {budget:.0f} s"
                 rows[candidate].append({"phase": "run", "status": "skipped", "reason": said})
             else:
                 alive.append(candidate)
-        for round in range(PREPARES):
+        for round in range(NUM_PREPARATIONS):
             for candidate in list(alive):
-                if rows[candidate] and rows[candidate][-1]["seconds"] > LONG:
+                if rows[candidate] and rows[candidate][-1]["seconds"] > MAX_REPEATED_SECONDS:
                     continue
-                with _guarded(candidate, rows[candidate], alive):
+                with _catch_failure(candidate, rows[candidate], alive):
                     seconds = candidate.prepare()
                     if seconds is not None:
-                        rows[candidate].append(_row(Reading("prepare", seconds, {}), round))
+                        rows[candidate].append(_build_row(CandidateTiming("prepare", seconds, {}), round))
             tick("prepare")
         for round in range(max((candidate.run.rounds for candidate in alive), default=0)):
             for candidate in list(alive):
-                with _guarded(candidate, rows[candidate], alive):
-                    rows[candidate] += [_row(reading, round) for reading in candidate.turn()]
+                with _catch_failure(candidate, rows[candidate], alive):
+                    rows[candidate] += [_build_row(reading, round) for reading in candidate.time_phases()]
             tick("turns")
-        _compare(rows, alive)
+        _compare_positions(rows, alive)
         for candidate in alive:
             rows[candidate] = [candidate.columns | {"status": "ok"} | row for row in rows[candidate]]
-        return [[common(candidate.run) | counts | row for row in found] for candidate, found in rows.items()]
+        return [[build_run_columns(candidate.run) | counts | row for row in found] for candidate, found in rows.items()]
 
 
-def name(run: RunSpec) -> str:
+def format_candidate_name(run: RunSpec) -> str:
     """Return the name of a run that is common to all mesh sizes."""
     return f"{run.scene_name} {run.solver.name} {sorted(run.solver.parameters.items())} {run.threads}"
 
 
-def predicted(past: Sequence[Past], vertices: int, run: RunSpec) -> float:
+def predict_seconds(past_timings: Sequence[PastTiming], vertices: int, run: RunSpec) -> float:
     """Predict the seconds of a run from its smaller sizes; 0 without any.
 
     A power law passes through the last two of them.
@@ -114,61 +116,63 @@ def predicted(past: Sequence[Past], vertices: int, run: RunSpec) -> float:
         vertices: number of vertices of the run.
         run: the run.
     """
-    known = [p for p in past if p.vertices < vertices]
+    known = [p for p in past_timings if p.num_vertices < vertices]
     if not known:
         return 0.0
 
     def at(field: str) -> float:
         last = getattr(known[-1], field)
         if len(known) == 1:
-            return last * vertices / known[-1].vertices
-        grown = log(known[-1].vertices / known[-2].vertices)
+            return last * vertices / known[-1].num_vertices
+        grown = log(known[-1].num_vertices / known[-2].num_vertices)
         power = max(1.0, log(last / getattr(known[-2], field)) / grown)
-        return last * exp(power * log(vertices / known[-1].vertices))
+        return last * exp(power * log(vertices / known[-1].num_vertices))
 
-    return PREPARES * at("prepare") + run.rounds * run.iterations * at("iteration")
+    return NUM_PREPARATIONS * at("prepare") + run.rounds * run.iterations * at("iteration")
 
 
 @contextmanager
-def _guarded(candidate: Candidate, rows: list[Row], alive: list[Candidate]) -> Generator[None]:
+def _catch_failure(
+    candidate: BenchmarkCandidate, rows: list[ResultRow], alive: list[BenchmarkCandidate]
+) -> Generator[None]:
     """Run a block with the candidate's threads.
 
     An error becomes its only row and excludes the candidate.
     """
     try:
-        with machine.pinned_threads(machine.threads(candidate.run.threads).number):
+        with machine.limit_threads(machine.choose_threads(candidate.run.threads).count):
             yield
     except Exception as error:  # whatever one of them raises, the others go on
-        rows[:] = [failure(error)]
+        rows[:] = [build_failure_columns(error)]
         alive.remove(candidate)
 
 
-def _row(reading: Reading, round: int) -> Row:
-    found = {"phase": reading.phase, "seconds": reading.seconds, "round": round, "load": os.getloadavg()[0]}
+def _build_row(reading: CandidateTiming, round: int) -> ResultRow:
+    found = {"phase": reading.phase, "seconds": reading.call_seconds, "round": round, "load": os.getloadavg()[0]}
     if reading.phase == "step":
         found["frame"] = 1
     return found | reading.columns
 
 
-def _compare(rows: dict[Candidate, list[Row]], alive: list[Candidate]) -> None:
+def _compare_positions(rows: dict[BenchmarkCandidate, list[ResultRow]], alive: list[BenchmarkCandidate]) -> None:
     """Close all candidates, exclude those whose positions differ from the first, and store digests."""
     reference: Positions | None = None
     for candidate in list(alive):
-        with _guarded(candidate, rows[candidate], alive):
+        with _catch_failure(candidate, rows[candidate], alive):
             p = candidate.close()
             if p is None:
                 continue
             reference = p if reference is None else reference
             apart = float(np.abs(p - reference).max()) / float(np.ptp(reference, axis=0).max())
-            limit = AGREEMENT[candidate.run.solver.parameters.get("precision", "float64")]
+            limit = POSITION_RTOL[candidate.run.solver.parameters.get("precision", "float64")]
             if not apart <= limit:
                 raise RunFailed(f"its positions lie {apart:.1e} of the scene's size from the others'; wanted {limit}")
             for row in rows[candidate]:
                 if row["phase"] == "step":
-                    row["digest"] = digest(p)
+                    row["digest"] = hash_positions(p)
 
 
-def _closed(candidate: Candidate) -> None:
+def _release_quietly(candidate: BenchmarkCandidate) -> None:
     """Close a candidate that may be closed already, or does not respond any more."""
     with suppress(RunFailed, OSError):
         candidate.close()

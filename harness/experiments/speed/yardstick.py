@@ -17,29 +17,29 @@ import numpy as np
 from harness.base.errors import RunFailed
 from solvers.core.native import compile_cpp
 from solvers.energies.springs import Springs
-from solvers.methods.eigen import NEEDS
+from solvers.methods.eigen import EIGEN_REQUIREMENTS
 from solvers.problem import Positions, StepProblem, Unsupported
 
-SOURCE = Path(__file__).with_name("yardstick.cpp")
+CPP_SOURCE = Path(__file__).with_name("yardstick.cpp")
 
-CHEAP_TEMPORARIES = ":".join(
+MALLOC_TUNABLES = ":".join(
     f"glibc.malloc.{setting}"
     for setting in ("hugetlb=1", "mmap_threshold=1073741824", "trim_threshold=4294967296", "top_pad=67108864")
 )
 """Settings of the GNU C library for cheap temporaries: transparent huge pages, and freed memory is not returned."""
 
-MALFORMED = {2: "wanted a scene and a file for positions", 3: "the scene's file is too short", 4: "Q has no factor"}
+EXIT_MESSAGES = {2: "wanted a scene and a file for positions", 3: "the scene's file is too short", 4: "Q has no factor"}
 
 
-def build(folder: Path) -> Path:
+def compile_baseline(folder: Path) -> Path:
     """Compile the baseline in `folder`; again if its source has changed.
 
     Raises Unsupported with the reason.
     """
-    return compile_cpp(SOURCE, folder, NEEDS)
+    return compile_cpp(CPP_SOURCE, folder, EIGEN_REQUIREMENTS)
 
 
-class Yardstick:
+class CppBaseline:
     """Running baseline program with one step problem of springs."""
 
     def __init__(self, program: Path, problem: StepProblem, springs: Springs, folder: Path, tunables: str) -> None:
@@ -56,11 +56,11 @@ class Yardstick:
             Unsupported: a pin is not a penalty.
             RunFailed: the program ended.
         """
-        if problem.system.pins.exact.any():
+        if problem.system.pins.exact_mask.any():
             raise Unsupported("the yardstick knows pins by penalty only")
         scene, self._positions = folder / "scene.bin", folder / "positions.bin"
-        write(scene, problem, springs)
-        self._shape = problem.target.shape
+        write_problem(scene, problem, springs)
+        self._shape = problem.inertial_target.shape
         self._process = subprocess.Popen(
             [program, scene, self._positions],
             env={**os.environ, "GLIBC_TUNABLES": tunables},
@@ -68,7 +68,7 @@ class Yardstick:
             stdout=subprocess.PIPE,
             text=True,
         )
-        self.prepare_seconds = self._answer()[0]
+        self.prepare_seconds = self._read_answer()[0]
         scene.unlink()
 
     def step(self, iterations: int) -> list[float]:
@@ -82,7 +82,7 @@ class Yardstick:
             self._process.stdin.flush()
         except OSError:  # it has ended; its exit code says why
             pass
-        return self._answer()
+        return self._read_answer()
 
     def close(self) -> Positions:
         """End the program and return the positions (n, 3) [m] of its last step.
@@ -92,7 +92,7 @@ class Yardstick:
         assert self._process.stdin is not None
         self._process.stdin.close()
         if self._process.wait():
-            raise self._failed()
+            raise self._build_error()
         p = np.fromfile(self._positions).reshape(self._shape)
         self._positions.unlink()
         return p
@@ -102,29 +102,29 @@ class Yardstick:
         self._process.kill()
         self._process.wait()
 
-    def _answer(self) -> list[float]:
+    def _read_answer(self) -> list[float]:
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
             self._process.wait()
-            raise self._failed()
+            raise self._build_error()
         return [float(word) for word in line.split()]
 
-    def _failed(self) -> RunFailed:
+    def _build_error(self) -> RunFailed:
         code = self._process.returncode
-        return RunFailed(f"the yardstick ended with {code}: {MALFORMED.get(code, 'out of memory or killed')}")
+        return RunFailed(f"the yardstick ended with {code}: {EXIT_MESSAGES.get(code, 'out of memory or killed')}")
 
 
-def write(path: Path, problem: StepProblem, springs: Springs) -> None:
+def write_problem(path: Path, problem: StepProblem, springs: Springs) -> None:
     """Write a step problem of springs in the format of the program."""
     system = problem.system
     parts = [
-        np.array([system.vertices, len(springs.edges), len(system.pins.vertices)], np.int64),
+        np.array([system.num_vertices, len(springs.edges), len(system.pins.vertices)], np.int64),
         np.array([system.time_step]),
         springs.edges.astype(np.int64),
         system.pins.vertices.astype(np.int64),
         *(springs.stiffness, springs.rest_length, system.mass, system.pins.weight),
-        *(problem.target, problem.force, problem.first_guess, problem.pin_targets),
+        *(problem.inertial_target, problem.external_force, problem.initial_guess, problem.pin_targets),
     ]
     with path.open("wb") as file:
         for part in parts:

@@ -6,19 +6,19 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from harness.report.accuracy.convergence import draw_convergence
-from harness.report.accuracy.findings import failures, findings, write_findings, write_summary
-from harness.report.accuracy.growth import draw_growth
-from harness.report.accuracy.measured import without_short
-from harness.report.accuracy.paper import draw_paper
-from harness.report.accuracy.pictures import draw_meshes
+from harness.report.accuracy.findings import list_failures, summarise_findings, write_findings, write_summary
+from harness.report.accuracy.growth import draw_scalings
+from harness.report.accuracy.measured import without_short_curves
+from harness.report.accuracy.paper import draw_liu2013
+from harness.report.accuracy.pictures import draw_snapshot_meshes
 from harness.report.accuracy.profiles import draw_profiles
-from harness.report.accuracy.reading import read
-from harness.report.accuracy.time_plot import draw_times
-from harness.report.accuracy.work_plot import draw_work
+from harness.report.accuracy.reading import read_accuracy
+from harness.report.accuracy.time_plot import draw_times_to_accuracy
+from harness.report.accuracy.work_plot import draw_work_precision
 from harness.report.references import write_bibtex
 
 
-def draw(folder: Path, files: Iterable[Path] | None = None) -> list[Path]:
+def draw_accuracy_report(folder: Path, files: Iterable[Path] | None = None) -> list[Path]:
     """Draw the report on the rows under `folder`/accuracy to `folder`/report, and return the files.
 
     Args:
@@ -27,21 +27,25 @@ def draw(folder: Path, files: Iterable[Path] | None = None) -> list[Path]:
     Raises:
         InputError: if there are no rows.
     """
-    everything = read(folder, files)
-    table, out = without_short(everything), folder / "report"
+    everything = read_accuracy(folder, files)
+    table, out = without_short_curves(everything), folder / "report"
     out.mkdir(parents=True, exist_ok=True)
-    title, failed, chapters = f"What accuracy costs: {folder.name}", failures(everything), findings(everything)
+    title, failed, chapters = (
+        f"What accuracy costs: {folder.name}",
+        list_failures(everything),
+        summarise_findings(everything),
+    )
     pictures = [
         *draw_convergence(table, out / "convergence"),
-        *draw_times(table, out / "times"),
-        *draw_work(table, out / "work"),
+        *draw_times_to_accuracy(table, out / "times"),
+        *draw_work_precision(table, out / "work"),
         *draw_profiles(table, out / "profiles"),
-        *draw_growth(table, out / "growth"),
-        *draw_paper(everything, out / "liu2013"),
-        *draw_meshes(table, folder, out / "meshes").values(),
+        *draw_scalings(table, out / "growth"),
+        *draw_liu2013(everything, out / "liu2013"),
+        *draw_snapshot_meshes(table, folder, out / "meshes").values(),
     ]
     words, numbers = out / "findings.md", out / "summary.json"
     write_findings(words, title, chapters, failed)
     write_summary(numbers, everything)
-    books = write_bibtex(out / "references.bib", [each.reference for each in (*table.curves, *table.works)])
+    books = write_bibtex(out / "references.bib", [each.citation for each in (*table.curves, *table.work_points)])
     return [*pictures, words, numbers, books]

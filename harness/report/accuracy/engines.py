@@ -13,124 +13,135 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from harness.report.accuracy.measured import WorkPoint
-from harness.report.accuracy.times import duration, power
-from harness.report.accuracy.work_plot import front
-from harness.report.page import factor
-from harness.report.style import INK, Mark, numbered
-from solvers.about import ENGINE
+from harness.report.accuracy.times import format_duration, format_gap
+from harness.report.accuracy.work_plot import pareto_front
+from harness.report.page import format_factor
+from harness.report.style import TEXT_COLOUR, SeriesStyle, indexed_style
+from solvers.about import ENGINE_FAMILY
 
-OURS = "springbench"
-ERRORS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
+OWN_PROGRAM = "springbench"
+ERROR_TARGETS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
 """Relative errors of the positions at the end time."""
-WILD = 1.0
+MAX_MEANINGFUL_ERROR = 1.0
 """Relative errors from here on do not represent a motion: nothing moved, or it exploded."""
 
 
-class Standing(NamedTuple):
+class EngineComparison(NamedTuple):
     """For one error on one mesh, the cheapest simulation of each program that reaches it."""
 
     mesh: str
     error: float
-    best: dict[str, WorkPoint]
+    fastest_by_program: dict[str, WorkPoint]
 
-    def ratio(self, engine: str) -> float | None:
+    def time_ratio(self, engine: str) -> float | None:
         """Return the engine's time divided by the own time.
 
         The result is None if either does not reach the error.
         """
-        if engine not in self.best or OURS not in self.best:
+        if engine not in self.fastest_by_program or OWN_PROGRAM not in self.fastest_by_program:
             return None
-        return self.best[engine].seconds / self.best[OURS].seconds
+        return (
+            self.fastest_by_program[engine].seconds_per_simulated_second
+            / self.fastest_by_program[OWN_PROGRAM].seconds_per_simulated_second
+        )
 
 
-def program(work: WorkPoint) -> str:
+def program_name(work: WorkPoint) -> str:
     """Return the program of a simulation: an engine's name, or OWN_PROGRAM."""
-    return work.solver if work.family == ENGINE else OURS
+    return work.solver if work.family == ENGINE_FAMILY else OWN_PROGRAM
 
 
-def met(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
+def meshes_with_engines(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
     """Return simulations by mesh, for the meshes with runs of both engines and own methods."""
     meshes: dict[str, list[WorkPoint]] = {}
     for work in works:
-        meshes.setdefault(work.mesh, []).append(work)
-    return {mesh: here for mesh, here in meshes.items() if {OURS} < {program(work) for work in here}}
+        meshes.setdefault(work.mesh_label, []).append(work)
+    return {mesh: here for mesh, here in meshes.items() if {OWN_PROGRAM} < {program_name(work) for work in here}}
 
 
-def fronts(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
+def pareto_fronts(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
     """Return the Pareto front of each program's settings in time and error.
 
     The cheapest setting comes first, and so do the own methods.
     """
-    by_program: dict[str, list[WorkPoint]] = {OURS: []}
+    by_program: dict[str, list[WorkPoint]] = {OWN_PROGRAM: []}
     for work in works:
-        by_program.setdefault(program(work), []).append(work)
-    names = [OURS, *sorted(set(by_program) - {OURS})]
-    return {name: [work for work in front(by_program[name]) if work.error < WILD] for name in names}
+        by_program.setdefault(program_name(work), []).append(work)
+    names = [OWN_PROGRAM, *sorted(set(by_program) - {OWN_PROGRAM})]
+    return {
+        name: [work for work in pareto_front(by_program[name]) if work.error < MAX_MEANINGFUL_ERROR] for name in names
+    }
 
 
-def standings(works: Iterable[WorkPoint], errors: Sequence[float] = ERRORS) -> list[Standing]:
+def compare_engines(works: Iterable[WorkPoint], errors: Sequence[float] = ERROR_TARGETS) -> list[EngineComparison]:
     """Compare the programs by mesh and error, the largest error first.
 
     Args:
         works: simulations.
         errors: relative errors.
     """
-    found = list[Standing]()
-    for mesh, here in met(works).items():
-        by_program = fronts(here)
+    found = list[EngineComparison]()
+    for mesh, here in meshes_with_engines(works).items():
+        by_program = pareto_fronts(here)
         for error in errors:
             within = {name: [work for work in best if work.error <= error] for name, best in by_program.items()}
-            found.append(Standing(mesh, error, {name: kept[0] for name, kept in within.items() if kept}))
+            found.append(EngineComparison(mesh, error, {name: kept[0] for name, kept in within.items() if kept}))
     return found
 
 
-def engines(works: Iterable[WorkPoint]) -> list[str]:
+def engine_names(works: Iterable[WorkPoint]) -> list[str]:
     """Return the sorted names of the engines that were measured."""
-    return sorted({program(work) for work in works} - {OURS})
+    return sorted({program_name(work) for work in works} - {OWN_PROGRAM})
 
 
-def marks(works: Iterable[WorkPoint]) -> dict[str, Mark]:
+def assign_program_styles(works: Iterable[WorkPoint]) -> dict[str, SeriesStyle]:
     """Assign a style to each program; the own methods are drawn in the text colour."""
-    return {OURS: Mark(INK, "o")} | {name: numbered(k)._replace(dash="-") for k, name in enumerate(engines(works))}
+    return {OWN_PROGRAM: SeriesStyle(TEXT_COLOUR, "o")} | {
+        name: indexed_style(k)._replace(dash="-") for k, name in enumerate(engine_names(works))
+    }
 
 
-def table(works: Sequence[WorkPoint]) -> Iterator[str]:
+def format_markdown_table(works: Sequence[WorkPoint]) -> Iterator[str]:
     """Format the time ratios as a Markdown table.
 
     There is one row per mesh and error, one column per engine, and a column with the best own setting.
     """
-    names = engines(works)
+    names = engine_names(works)
     if not names:
         return
     yield f"| mesh | error | {' | '.join(names)} | ours, a simulated second |"
     yield "|---|---|" + "---|" * (len(names) + 1)
-    refused = {mesh: _refused(here) for mesh, here in met(works).items()}
-    for one in standings(works):
-        if one.best:
-            cells = (_cell(one, name, refused[one.mesh]) for name in names)
-            ours = one.best.get(OURS)
-            told = f"{ours.setting}: {duration(ours.seconds)}" if ours else "does not get there"
-            yield f"| {one.mesh} | {power(one.error)} | {' | '.join(cells)} | {told} |"
+    refused = {mesh: _find_unsupported(here) for mesh, here in meshes_with_engines(works).items()}
+    for one in compare_engines(works):
+        if one.fastest_by_program:
+            cells = (_format_cell(one, name, refused[one.mesh]) for name in names)
+            ours = one.fastest_by_program.get(OWN_PROGRAM)
+            told = (
+                f"{ours.setting_label}: {format_duration(ours.seconds_per_simulated_second)}"
+                if ours
+                else "does not get there"
+            )
+            yield f"| {one.mesh} | {format_gap(one.error)} | {' | '.join(cells)} | {told} |"
 
 
-def settings(works: Iterable[WorkPoint]) -> Iterator[str]:
+def describe_best_settings(works: Iterable[WorkPoint]) -> Iterator[str]:
     """Describe the fastest setting of each engine in sentences."""
-    for one in standings(works):
-        for name, best in one.best.items():
-            if name != OURS:
-                yield f"{one.mesh} to {power(one.error)}, {name}: {best.setting}."
+    for one in compare_engines(works):
+        for name, best in one.fastest_by_program.items():
+            if name != OWN_PROGRAM:
+                yield f"{one.mesh} to {format_gap(one.error)}, {name}: {best.setting_label}."
 
 
-def _refused(works: Iterable[WorkPoint]) -> set[str]:
+def _find_unsupported(works: Iterable[WorkPoint]) -> set[str]:
     """Find the programs that do not support the mesh's spring network, or are not installed."""
     by_program: dict[str, set[str]] = {}
     for work in works:
-        by_program.setdefault(program(work), set()).add(work.status)
+        by_program.setdefault(program_name(work), set()).add(work.status)
     return {name for name, statuses in by_program.items() if statuses == {"unsupported"}}
 
 
-def _cell(one: Standing, engine: str, refused: set[str]) -> str:
+def _format_cell(one: EngineComparison, engine: str, refused: set[str]) -> str:
     if engine in refused:
         return "refused"
-    ratio = one.ratio(engine)
-    return factor(ratio) if ratio else "alone" if engine in one.best else "–"
+    ratio = one.time_ratio(engine)
+    return format_factor(ratio) if ratio else "alone" if engine in one.fastest_by_program else "–"

@@ -10,56 +10,90 @@ from typing import Any
 import numpy as np
 
 from harness.report.accuracy import engines, work_plot
-from harness.report.accuracy.convergence import GUESSES, remarks
-from harness.report.accuracy.growth import TARGET, growths
-from harness.report.accuracy.measured import Curve, Measurements, Values, by_self_converged, without_short
-from harness.report.accuracy.paper import FAR, FIGURE_2, ITERATIONS, PaperComparison, comparisons
-from harness.report.accuracy.profiles import least_ratios
-from harness.report.accuracy.times import STEPS, TARGETS, crossings, power, races, reach, seconds_to
-from harness.report.page import factor
-from harness.report.references import cited
+from harness.report.accuracy.convergence import INITIAL_GUESS_LABELS, describe_failures
+from harness.report.accuracy.growth import GAP_TARGET, fit_scalings
+from harness.report.accuracy.measured import (
+    AccuracyData,
+    ConvergenceCurve,
+    FloatArray,
+    describe_self_converged,
+    without_short_curves,
+)
+from harness.report.accuracy.paper import (
+    LIU2013_FIGURE_2,
+    LIU2013_ITERATIONS,
+    MAX_ERROR_RATIO,
+    PaperComparison,
+    compare_with_paper,
+)
+from harness.report.accuracy.profiles import performance_ratios
+from harness.report.accuracy.times import (
+    AMORTISATION_STEPS,
+    GAP_TARGETS,
+    amortised_seconds,
+    describe_crossings,
+    find_time_to_accuracy,
+    format_gap,
+    group_by_start,
+)
+from harness.report.page import format_factor
+from harness.report.references import format_citation
 
-Chapters = dict[str, list[str]]
+FindingChapters = dict[str, list[str]]
 
 
-def findings(table: Measurements) -> Chapters:
+def summarise_findings(table: AccuracyData) -> FindingChapters:
     """Summarise the findings as sentences by chapter title; chapters without sentences are omitted."""
-    compared = without_short(table)
+    compared = without_short_curves(table)
     chapters = {
-        "Over all steps": list(_profiles(compared)),
-        "Time to accuracy": list(_times(compared)),
-        "Work and precision": list(_works(table)),
-        "Outside engines: times as long as ours, by the best setting of each": list(engines.table(table.works)),
-        "Best settings of outside engines": list(engines.settings(table.works)),
-        "Growth with size": list(_growth(compared)),
-        "Liu et al. 2013": list(_paper(table)),
-        "References that are not certified": [f"{p.name}: {p.doubt}" for p in table.problems if p.doubt],
-        "Other minima": [f"{c.problem.name}: {words}" for c in table.curves if c.branch for words in remarks([c])],
+        "Over all steps": list(_describe_profiles(compared)),
+        "Time to accuracy": list(_describe_times(compared)),
+        "Work and precision": list(_describe_work_precision(table)),
+        "Outside engines: times as long as ours, by the best setting of each": list(
+            engines.format_markdown_table(table.work_points)
+        ),
+        "Best settings of outside engines": list(engines.describe_best_settings(table.work_points)),
+        "Growth with size": list(_describe_scaling(compared)),
+        "Liu et al. 2013": list(_describe_liu2013(table)),
+        "References that are not certified": [
+            f"{p.problem_label}: {p.uncertified_reason}" for p in table.problems if p.uncertified_reason
+        ],
+        "Other minima": [
+            f"{c.problem.problem_label}: {words}"
+            for c in table.curves
+            if c.minimum_index
+            for words in describe_failures([c])
+        ],
     }
-    chapters["Methods"] = list(_methods(table))
+    chapters["Methods"] = list(_describe_methods(table))
     return {title: sentences for title, sentences in chapters.items() if sentences}
 
 
-def failures(table: Measurements) -> list[dict[str, str]]:
+def list_failures(table: AccuracyData) -> list[dict[str, str]]:
     """List the runs whose status is not ok, with status and reason."""
     curves = [
-        (f"{c.problem.name}, {GUESSES.get(c.first_guess, c.first_guess)}", c.label, c.status, c.reason)
+        (
+            f"{c.problem.problem_label}, {INITIAL_GUESS_LABELS.get(c.initial_guess, c.initial_guess)}",
+            c.label,
+            c.status,
+            c.reason,
+        )
         for c in table.curves
     ]
-    works = [(w.mesh, w.setting, w.status, w.reason) for w in table.works]
+    works = [(w.mesh_label, w.setting_label, w.status, w.reason) for w in table.work_points]
     keys = ("where", "solver", "status", "reason")
     return [dict(zip(keys, row, strict=True)) for row in dict.fromkeys(curves + works) if row[2] != "ok"]
 
 
-def summary(table: Measurements) -> list[dict[str, Any]]:
+def build_curve_summary(table: AccuracyData) -> list[dict[str, Any]]:
     """Build a summary entry for each curve.
 
     It has the identification, the result, and the seconds to each accuracy (null if not reached).
     """
-    return [_entry(curve) for curve in table.curves]
+    return [_build_entry(curve) for curve in table.curves]
 
 
-def write_findings(path: Path, title: str, chapters: Chapters, failed: list[dict[str, str]]) -> None:
+def write_findings(path: Path, title: str, chapters: FindingChapters, failed: list[dict[str, str]]) -> None:
     """Write the chapters and the failures as Markdown.
 
     Args:
@@ -80,117 +114,124 @@ def write_findings(path: Path, title: str, chapters: Chapters, failed: list[dict
     path.write_text("\n".join(lines), encoding="utf-8")
 
 
-def write_summary(path: Path, table: Measurements) -> None:
+def write_summary(path: Path, table: AccuracyData) -> None:
     """Write the summary as JSON."""
-    path.write_text(json.dumps(summary(table), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(build_curve_summary(table), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _entry(curve: Curve) -> dict[str, Any]:
+def _build_entry(curve: ConvergenceCurve) -> dict[str, Any]:
     problem = curve.problem
-    found = {power(target): reach(curve, target) for target in TARGETS}
+    found = {format_gap(target): find_time_to_accuracy(curve, target) for target in GAP_TARGETS}
     ended = np.flatnonzero(np.isfinite(curve.gap))
     return {
         "scene": problem.scene,
         "size": problem.size,
         "vertices": problem.vertices,
-        "moment": problem.moment,
-        "problem": problem.digest,
-        "certified": not problem.doubt,
+        "moment": problem.snapshot,
+        "problem": problem.problem_digest,
+        "certified": not problem.uncertified_reason,
         "integrator": problem.integrator,
         "time_step": problem.time_step,
         "solver": curve.solver,
         "parameters": json.loads(curve.parameters),
         "threads": curve.threads,
-        "first_guess": curve.first_guess,
+        "first_guess": curve.initial_guess,
         "status": curve.status,
         "reason": curve.reason,
-        "minimum": curve.branch,
+        "minimum": curve.minimum_index,
         "iterations": int(curve.iterations[-1]) if len(curve.iterations) else None,
         "gap": float(curve.gap[ended[-1]]) if len(ended) else None,
-        "set_up_seconds": _finite(curve.warm),
-        "set_up_cold_seconds": _finite(curve.cold),
+        "set_up_seconds": _finite_or_none(curve.warm_seconds),
+        "set_up_cold_seconds": _finite_or_none(curve.cold_seconds),
         "to_gap": {
             name: reached
             and {"iterations": reached.iteration, "seconds": reached.seconds}
             | {"lower_quartile": reached.lower, "upper_quartile": reached.upper}
-            | {f"with_set_up_over_{n}": _finite(seconds_to(curve, float(name), n)) for n in STEPS}
+            | {
+                f"with_set_up_over_{n}": _finite_or_none(amortised_seconds(curve, float(name), n))
+                for n in AMORTISATION_STEPS
+            }
             for name, reached in found.items()
         },
     }
 
 
-def _finite(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _methods(table: Measurements) -> Iterator[str]:
+def _describe_methods(table: AccuracyData) -> Iterator[str]:
     """Yield the citation of each solver."""
-    references = {each.solver: each.reference for each in (*table.curves, *table.works)}
+    references = {each.solver: each.citation for each in (*table.curves, *table.work_points)}
     for solver, reference in references.items():
         if reference:
-            yield f"{solver}: {cited(reference)}."
+            yield f"{solver}: {format_citation(reference)}."
 
 
-def _times(table: Measurements) -> Iterator[str]:
-    for (_, guess), race in races(table).items():
+def _describe_times(table: AccuracyData) -> Iterator[str]:
+    for (_, guess), race in group_by_start(table).items():
         problem = race[0].problem
-        sentences = crossings(race)
+        sentences = describe_crossings(race)
         if sentences:
-            doubt = " (reference not certified)" if problem.doubt else ""
-            yield f"{problem.name}, {GUESSES.get(guess, guess)}{doubt}: {'; '.join(sentences)}."
+            doubt = " (reference not certified)" if problem.uncertified_reason else ""
+            yield f"{problem.problem_label}, {INITIAL_GUESS_LABELS.get(guess, guess)}{doubt}: {'; '.join(sentences)}."
 
 
-def _profiles(table: Measurements) -> Iterator[str]:
-    for target in TARGETS:
-        found = {label: values for label, values in least_ratios(table, target).items() if len(values)}
+def _describe_profiles(table: AccuracyData) -> Iterator[str]:
+    for target in GAP_TARGETS:
+        found = {label: values for label, values in performance_ratios(table, target).items() if len(values)}
         if found:
             wins = {label: int(np.sum(values <= 1.0)) for label, values in found.items()}
             count = len(next(iter(found.values())))
             first = sorted(wins, key=lambda label: -wins[label])[:3]
-            told = ", ".join(f"{label} on {wins[label]} ({_times_of(found[label])})" for label in first if wins[label])
-            yield f"To {power(target)}, of {count} problems: fastest is {told}."
+            told = ", ".join(
+                f"{label} on {wins[label]} ({_format_factor(found[label])})" for label in first if wins[label]
+            )
+            yield f"To {format_gap(target)}, of {count} problems: fastest is {told}."
 
 
-def _times_of(values: Values) -> str:
+def _format_factor(values: FloatArray) -> str:
     worst = float(np.max(values))
-    return f"at worst {factor(worst)} times the fastest" if np.isfinite(worst) else "and not there on all"
+    return f"at worst {format_factor(worst)} times the fastest" if np.isfinite(worst) else "and not there on all"
 
 
-def _works(table: Measurements) -> Iterator[str]:
-    for mesh in dict.fromkeys(work.mesh for work in table.works):
-        for sentence in work_plot.findings([work for work in table.works if work.mesh == mesh]):
+def _describe_work_precision(table: AccuracyData) -> Iterator[str]:
+    for mesh in dict.fromkeys(work.mesh_label for work in table.work_points):
+        for sentence in work_plot.describe_cheapest_settings(
+            [work for work in table.work_points if work.mesh_label == mesh]
+        ):
             yield f"{mesh}: {sentence}."
-    yield from by_self_converged(table.works)
+    yield from describe_self_converged(table.work_points)
 
 
-def _growth(table: Measurements) -> Iterator[str]:
-    for g in growths(table):
+def _describe_scaling(table: AccuracyData) -> Iterator[str]:
+    for g in fit_scalings(table):
         if np.isfinite(g.exponent):
             sizes = f"{g.vertices[0]} to {g.vertices[-1]} vertices"
-            where = f"{g.scene}, {GUESSES[g.first_guess]}"
-            yield f"{where}: {g.label} grows as n^{g.exponent:.2f} to {power(TARGET)} ({sizes})."
+            where = f"{g.scene}, {INITIAL_GUESS_LABELS[g.initial_guess]}"
+            yield f"{where}: {g.label} grows as n^{g.exponent:.2f} to {format_gap(GAP_TARGET)} ({sizes})."
 
 
-def _paper(table: Measurements) -> Iterator[str]:
+def _describe_liu2013(table: AccuracyData) -> Iterator[str]:
     """Yield a Markdown table with one row per curve of both figures.
 
     Cells show own error / the paper's error, bold where they differ strongly.
     """
     by_curve: dict[str, dict[int, PaperComparison]] = {}
-    for found in comparisons(table):
+    for found in compare_with_paper(table):
         by_curve.setdefault(found.curve, {})[found.iterations] = found
     if not by_curve:
         return
-    counts = sorted({*FIGURE_2, *ITERATIONS})
+    counts = sorted({*LIU2013_FIGURE_2, *LIU2013_ITERATIONS})
     yield "| curve | frames | " + " | ".join(f"after {n}" for n in counts) + " |"
     yield "|---|---|" + "---|" * len(counts)
     for curve, points in by_curve.items():
         frames = next(iter(points.values())).frames
-        cells = (_cell(points[n]) if n in points else "" for n in counts)
+        cells = (_format_comparison(points[n]) if n in points else "" for n in counts)
         yield f"| {curve} | {frames} | " + " | ".join(cells) + " |"
 
 
-def _cell(found: PaperComparison) -> str:
+def _format_comparison(comparison: PaperComparison) -> str:
     """Format the own error, the paper's error and their ratio."""
-    far = "**" if max(found.ratio, 1 / found.ratio) > FAR else ""
-    return f"{found.ours:.2g} / {found.theirs:.2g} = {far}{found.ratio:.2g}{far}"
+    far = "**" if max(comparison.error_ratio, 1 / comparison.error_ratio) > MAX_ERROR_RATIO else ""
+    return f"{comparison.own_error:.2g} / {comparison.published_error:.2g} = {far}{comparison.error_ratio:.2g}{far}"

@@ -15,33 +15,37 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.ticker import FixedLocator
 
-from harness.report.accuracy.convergence import GUESSES
-from harness.report.accuracy.measured import Curve, Measurements, older
+from harness.report.accuracy.convergence import INITIAL_GUESS_LABELS
+from harness.report.accuracy.measured import AccuracyData, ConvergenceCurve, is_stale
 from harness.report.accuracy.sheet import (
-    LEFT,
-    RIGHT,
-    TOP,
-    files,
-    foot,
-    legend,
-    limits,
-    line,
-    log_axis,
-    notes,
-    panel,
-    sheet,
+    PANEL_LEFT,
+    PANEL_RIGHT,
+    PANEL_TOP,
+    add_panel,
+    draw_legend,
+    draw_line,
+    draw_notes,
+    format_log_axis,
+    log_limits,
+    notes_top,
+    plot_sheet,
+    sheet_paths,
 )
-from harness.report.accuracy.time_plot import middle
-from harness.report.accuracy.times import left_out, power
-from harness.report.labels import direct_labels
-from harness.report.style import OLDER, looks
+from harness.report.accuracy.time_plot import median_time
+from harness.report.accuracy.times import describe_excluded_steps, format_gap
+from harness.report.labels import draw_direct_labels
+from harness.report.style import STALE_NOTE, assign_label_styles
 
-TARGET = 1e-3
+GAP_TARGET = 1e-3
 
-_FITTED, _COLUMNS, _ABREAST = 3, 4, 3  # sizes that a fit needs; scenes in a row; panels that stay in one row
+_MIN_FIT_SIZES, _MAX_SCENES, _MAX_COLUMNS = (
+    3,
+    4,
+    3,
+)  # sizes that a fit needs; scenes in a row; panels that stay in one row
 
 
-class SizeGrowth(NamedTuple):
+class SizeScaling(NamedTuple):
     """A solver's times to GAP_TARGET on the sizes of a scene where it reached it.
 
     Attributes:
@@ -53,97 +57,101 @@ class SizeGrowth(NamedTuple):
     """
 
     scene: str
-    first_guess: str
+    initial_guess: str
     label: str
     vertices: list[int]
     seconds: list[float]
     exponent: float
-    lost: list[int]
-    older: list[bool]
+    unsolved_sizes: list[int]
+    stale: list[bool]
 
 
-def growths(table: Measurements, other: Callable[[Curve], bool] = older) -> list[SizeGrowth]:
+def fit_scalings(
+    table: AccuracyData, is_stale_curve: Callable[[ConvergenceCurve], bool] = is_stale
+) -> list[SizeScaling]:
     """Fit the scaling of each solver on each scene with two sizes or more.
 
     Args:
         table: data of an accuracy measurement.
         is_stale_curve: returns whether other code measured a curve.
     """
-    groups: dict[tuple[str, str, str], dict[int, list[Curve]]] = {}
+    groups: dict[tuple[str, str, str], dict[int, list[ConvergenceCurve]]] = {}
     for curve in table.curves:
-        sizes = groups.setdefault((curve.problem.scene, curve.first_guess, curve.label), {})
+        sizes = groups.setdefault((curve.problem.scene, curve.initial_guess, curve.label), {})
         sizes.setdefault(curve.problem.vertices, []).append(curve)
-    found: list[SizeGrowth] = []
+    found: list[SizeScaling] = []
     for (scene, guess, label), sizes in groups.items():
-        times = {n: middle(curves, TARGET) for n, curves in sorted(sizes.items())}
+        times = {n: median_time(curves, GAP_TARGET) for n, curves in sorted(sizes.items())}
         reached = {n: t for n, t in times.items() if np.isfinite(t) and t > 0.0}
         if len(times) > 1:
             lost = [n for n, t in times.items() if t == np.inf]
-            hollow = [any(map(other, sizes[n])) for n in reached]
-            exponent = _exponent(reached)
-            found.append(SizeGrowth(scene, guess, label, [*reached], [*reached.values()], exponent, lost, hollow))
+            hollow = [any(map(is_stale_curve, sizes[n])) for n in reached]
+            exponent = _fit_exponent(reached)
+            found.append(SizeScaling(scene, guess, label, [*reached], [*reached.values()], exponent, lost, hollow))
     return found
 
 
-def _exponent(times: dict[int, float]) -> float:
-    if len(times) < _FITTED:
+def _fit_exponent(times: dict[int, float]) -> float:
+    if len(times) < _MIN_FIT_SIZES:
         return np.nan
     return float(np.polyfit(np.log([*times]), np.log([*times.values()]), 1)[0])
 
 
-def draw_growth(table: Measurements, stem: Path) -> list[Path]:
+def draw_scalings(table: AccuracyData, stem: Path) -> list[Path]:
     """Draw the scaling of all scenes with several sizes, and return the files.
 
     There is a column for each scene and a row for each initial guess.
     """
-    found = growths(table)
-    scenes = list(dict.fromkeys(growth.scene for growth in found))[:_COLUMNS]
+    found = fit_scalings(table)
+    scenes = list(dict.fromkeys(growth.scene for growth in found))[:_MAX_SCENES]
     if not scenes:
         return []
-    marked = looks((curve.label, curve.solver) for curve in table.curves)
-    guesses = [guess for guess in GUESSES if any(growth.first_guess == guess for growth in found)]
+    marked = assign_label_styles((curve.label, curve.solver) for curve in table.curves)
+    guesses = [guess for guess in INITIAL_GUESS_LABELS if any(growth.initial_guess == guess for growth in found)]
     words = [
         "Median over the steps of a mesh, set-up apart. Powers are fitted to three sizes or more.",
-        *left_out(problem for problem in table.problems if problem.scene in scenes),
+        *describe_excluded_steps(problem for problem in table.problems if problem.scene in scenes),
         *(
-            f"× {g.label} on {g.scene}, {GUESSES[g.first_guess]}, did not get there at {_listed(g.lost)} vertices"
+            f"× {g.label} on {g.scene}, {INITIAL_GUESS_LABELS[g.initial_guess]}, did not get there at {_join_numbers(g.unsolved_sizes)} vertices"
             for g in found
-            if g.lost
+            if g.unsolved_sizes
         ),
-        *([OLDER] if any(any(growth.older) for growth in found) else []),
+        *([STALE_NOTE] if any(any(growth.stale) for growth in found) else []),
     ]
-    with sheet(stem, f"Growth with size: time to a gap of {power(TARGET)}", table.machine) as page:
+    with plot_sheet(stem, f"Growth with size: time to a gap of {format_gap(GAP_TARGET)}", table.machine_words) as page:
         places = [(guess, scene) for guess in guesses for scene in scenes]
-        columns = len(places) if len(places) <= _ABREAST else len(scenes)
-        width = (RIGHT - LEFT - 56) / columns - 24
-        height = (foot(words) - TOP) / ceil(len(places) / columns) - 82
-        low, high = limits([t for growth in found for t in growth.seconds], margin=1.6)
+        columns = len(places) if len(places) <= _MAX_COLUMNS else len(scenes)
+        width = (PANEL_RIGHT - PANEL_LEFT - 56) / columns - 24
+        height = (notes_top(words) - PANEL_TOP) / ceil(len(places) / columns) - 82
+        low, high = log_limits([t for growth in found for t in growth.seconds], margin=1.6)
         for k, (guess, scene) in enumerate(places):
             row, column = divmod(k, columns)
-            left, top = LEFT + 56 + column * (width + 24), TOP + 22 + row * (height + 78)
-            ax = panel(page, left, top, width, height, f"{scene}, {GUESSES[guess]}")
-            here = [g for g in found if (g.scene, g.first_guess) == (scene, guess)]
-            sizes = sorted({n for g in here for n in (*g.vertices, *g.lost)}) or [1, 10]
+            left, top = PANEL_LEFT + 56 + column * (width + 24), PANEL_TOP + 22 + row * (height + 78)
+            ax = add_panel(page, left, top, width, height, f"{scene}, {INITIAL_GUESS_LABELS[guess]}")
+            here = [g for g in found if (g.scene, g.initial_guess) == (scene, guess)]
+            sizes = sorted({n for g in here for n in (*g.vertices, *g.unsolved_sizes)}) or [1, 10]
             # Space at the right for the labels of lines with a fitted exponent.
             room = 1 / max(width / 170 - 1, 1) if any(np.isfinite(g.exponent) for g in here) else 0.0
-            log_axis(ax.xaxis, sizes[0] / 1.2, 1.2 * sizes[-1] * (sizes[-1] / sizes[0]) ** room, unit="plain")
+            format_log_axis(ax.xaxis, sizes[0] / 1.2, 1.2 * sizes[-1] * (sizes[-1] / sizes[0]) ** room, unit="plain")
             ax.xaxis.set_major_locator(FixedLocator(sizes[:: ceil(len(sizes) / 5)]))
-            log_axis(ax.yaxis, low, high, unit="time")
+            format_log_axis(ax.yaxis, low, high, unit="time")
             ax.tick_params(labelleft=column == 0)
             for growth in here:
-                line(ax, growth.vertices, growth.seconds, marked[growth.label], spaced=False, older=growth.older)
+                draw_line(
+                    ax, growth.vertices, growth.seconds, marked[growth.label], spaced_markers=False, stale=growth.stale
+                )
             ends = [
                 (g.vertices[-1], g.seconds[-1], f"{g.label}  $n^{{{g.exponent:.2f}}}$", marked[g.label].color)
                 for g in here
                 if np.isfinite(g.exponent)
             ]
-            direct_labels(ax, ends)
+            draw_direct_labels(ax, ends)
             ax.set_xlabel("vertices", fontsize=9, loc="left")
         used = {growth.label for growth in found}
-        legend(page, {label: mark for label, mark in marked.items() if label in used})
-        notes(page, words)
-    return files(stem)
+        draw_legend(page, {label: mark for label, mark in marked.items() if label in used})
+        draw_notes(page, words)
+    return sheet_paths(stem)
 
 
-def _listed(numbers: list[int]) -> str:
+def _join_numbers(numbers: list[int]) -> str:
     return ", ".join(map(str, numbers))

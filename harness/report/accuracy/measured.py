@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.base import machine
-from harness.report.page import step_words
+from harness.report.page import format_time_step
 
-Values = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class SnapshotProblem:
     """A step snapshot.
 
     Attributes:
@@ -33,63 +33,63 @@ class Problem:
         is_liu2013: whether it belongs to the reproduction of Liu et al. 2013.
     """
 
-    digest: str
+    problem_digest: str
     scene: str
     size: int
     vertices: int
-    moment: str
+    snapshot: str
     frame: int
     integrator: str
     time_step: float
     stiffness_ratio: float
     mean_rest_length: float
-    magnitude: float
-    g0: float
+    objective_magnitude: float
+    objective_initial: float
     minima: tuple[float, ...]
-    names: tuple[str, ...]
-    doubt: str
-    paper: bool
+    minimum_ids: tuple[str, ...]
+    uncertified_reason: str
+    is_liu2013: bool
 
     @property
-    def best(self) -> float:
+    def objective_lowest(self) -> float:
         """g* [J]; nan if no minimum is known."""
         return self.minima[0] if self.minima else np.nan
 
     @property
-    def mesh(self) -> str:
+    def mesh_label(self) -> str:
         """The scene and its size."""
         return f"{self.scene} {self.size}" if self.size else self.scene
 
     @property
-    def name(self) -> str:
+    def problem_label(self) -> str:
         """Mesh, snapshot and, if not implicit Euler, the integrator.
 
         Problems that differ otherwise share the label.
         """
-        frame = "" if self.moment.startswith("frame") else f" (frame {self.frame})"
+        frame = "" if self.snapshot.startswith("frame") else f" (frame {self.frame})"
         euler = "" if self.integrator == "implicit-euler" else f", {self.integrator}"
-        return f"{self.mesh}, {self.moment}{frame}{euler}"
+        return f"{self.mesh_label}, {self.snapshot}{frame}{euler}"
 
     @property
-    def round_off(self) -> float:
+    def roundoff_gap(self) -> float:
         """The gap below which energies are round-off; infinite if the step starts at its minimum."""
-        scale = self.g0 - self.best
-        return float(np.finfo(np.float64).eps) * self.magnitude / scale if scale > 0 else np.inf
+        scale = self.objective_initial - self.objective_lowest
+        return float(np.finfo(np.float64).eps) * self.objective_magnitude / scale if scale > 0 else np.inf
 
-    def gap(self, g: Values) -> Values:
+    def compute_gap(self, g: FloatArray) -> FloatArray:
         """Compute the gaps of energies [J]."""
-        return (g - self.best) / (self.g0 - self.best)
+        return (g - self.objective_lowest) / (self.objective_initial - self.objective_lowest)
 
-    def branch(self, name: str | None) -> int | None:
+    def minimum_index(self, name: str | None) -> int | None:
         """Return the index of a minimum by its name.
 
         The lowest has index 0; None if the name is unknown.
         """
-        return self.names.index(name) if name in self.names else None
+        return self.minimum_ids.index(name) if name in self.minimum_ids else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Curve:
+class ConvergenceCurve:
     """The convergence of one solver to the minimum of one problem.
 
     Attributes:
@@ -104,26 +104,26 @@ class Curve:
         source_fingerprint: code that the curve was measured by.
     """
 
-    problem: Problem
+    problem: SnapshotProblem
     solver: str
     family: str
-    reference: str
+    citation: str
     label: str
     parameters: str
-    first_guess: str
+    initial_guess: str
     threads: int
-    iterations: Values
-    gap: Values
-    largest: Values
-    stationarity: Values
-    seconds: Values
-    warm: float
-    cold: float
-    branch: int | None
+    iterations: FloatArray
+    gap: FloatArray
+    max_vertex_error: FloatArray
+    stationarity: FloatArray
+    seconds: FloatArray
+    warm_seconds: float
+    cold_seconds: float
+    minimum_index: int | None
     status: str
     reason: str
-    recording: str
-    code: str
+    recording_path: str
+    source_fingerprint: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,50 +143,50 @@ class WorkPoint:
     size: int
     solver: str
     family: str
-    reference: str
-    minimises: bool
-    own_steps: bool
+    citation: str
+    is_minimiser: bool
+    is_substepping: bool
     label: str
     parameters: str
     integrator: str
     time_step: float
-    tolerance: float | None
-    iterations: int
-    first_guess: str
-    horizon: float
+    residual_rtol: float | None
+    max_iterations: int
+    initial_guess: str
+    t_end: float
     error: float
-    truth: str
-    error_rms: float
-    seconds: float
-    cpu: float
+    reference_kind: str
+    end_error_rms: float
+    seconds_per_simulated_second: float
+    cpu_seconds_per_simulated_second: float
     vertices: int
     stiffness: float
     status: str
     reason: str
-    code: str
+    source_fingerprint: str
 
     @property
-    def mesh(self) -> str:
+    def mesh_label(self) -> str:
         """The scene and its size."""
         return f"{self.scene} {self.size}" if self.size else self.scene
 
     @property
-    def setting(self) -> str:
+    def setting_label(self) -> str:
         """The solver, the integrator, the time step and the stop rule in words."""
-        stop = stop_words(self.tolerance, self.iterations)
-        steps = "" if self.own_steps else f"{self.integrator}, "
-        return f"{self.label}, {steps}dt {step_words(self.time_step)}, {stop}"
+        stop = format_stop_rule(self.residual_rtol, self.max_iterations)
+        steps = "" if self.is_substepping else f"{self.integrator}, "
+        return f"{self.label}, {steps}dt {format_time_step(self.time_step)}, {stop}"
 
 
-def stop_words(tolerance: float | None, iterations: int) -> str:
+def format_stop_rule(residual_rtol: float | None, max_iterations: int) -> str:
     """Format the stop rule of a step's iterations."""
-    if tolerance is None:
-        return f"{iterations} iterations"
-    return f"tolerance {tolerance:g}" if tolerance else "tolerance auto"
+    if residual_rtol is None:
+        return f"{max_iterations} iterations"
+    return f"tolerance {residual_rtol:g}" if residual_rtol else "tolerance auto"
 
 
 @dataclass(frozen=True, slots=True)
-class Measurements:
+class AccuracyData:
     """All data of the rows, in their order.
 
     Attributes:
@@ -194,22 +194,24 @@ class Measurements:
         newest_fingerprint: source fingerprint of the latest rows.
     """
 
-    problems: tuple[Problem, ...]
-    curves: tuple[Curve, ...]
-    works: tuple[WorkPoint, ...]
-    machine: tuple[str, ...]
-    newest: str
+    problems: tuple[SnapshotProblem, ...]
+    curves: tuple[ConvergenceCurve, ...]
+    work_points: tuple[WorkPoint, ...]
+    machine_words: tuple[str, ...]
+    newest_fingerprint: str
 
 
-def older(one: Curve | WorkPoint) -> bool:
+def is_stale(one: ConvergenceCurve | WorkPoint) -> bool:
     """Return whether other code than the current version measured it.
 
     Rows without a fingerprint count as current.
     """
-    return one.code not in ("", machine.code_hash())
+    return one.source_fingerprint not in ("", machine.hash_sources())
 
 
-def by_other_code(measured: Iterable[Curve | WorkPoint], newest: str | None = None) -> list[str]:
+def describe_stale_results(
+    measured: Iterable[ConvergenceCurve | WorkPoint], newest_fingerprint: str | None = None
+) -> list[str]:
     """Describe which results were measured by other code, in at most one sentence.
 
     For charts that have no marks of their own for stale results.
@@ -218,26 +220,36 @@ def by_other_code(measured: Iterable[Curve | WorkPoint], newest: str | None = No
         measured: curves or simulations.
         newest_fingerprint: source fingerprint to compare with; None for the current version.
     """
-    names = sorted({one.label for one in measured if (older(one) if newest is None else one.code != newest)})
-    than = "today's" if newest is None else "that of the newest rows"
+    names = sorted(
+        {
+            one.label
+            for one in measured
+            if (is_stale(one) if newest_fingerprint is None else one.source_fingerprint != newest_fingerprint)
+        }
+    )
+    than = "today's" if newest_fingerprint is None else "that of the newest rows"
     return [f"Measured by other code than {than}, in whole or in part: {', '.join(names)}."] if names else []
 
 
-def by_self_converged(works: Iterable[WorkPoint]) -> list[str]:
+def describe_self_converged(works: Iterable[WorkPoint]) -> list[str]:
     """Describe which meshes have errors relative to a self-converged motion, in at most one sentence."""
-    names = sorted({work.mesh for work in works if work.truth == "self-converged"})
+    names = sorted({work.mesh_label for work in works if work.reference_kind == "self-converged"})
     return [f"Errors by a self-converged reference, for there is contact: {', '.join(names)}."] if names else []
 
 
-LONG = 500
+LONG_CURVE_ITERATIONS = 500
 """Iterations from which on a curve of the reproduction gets a picture of its own: Figure 2 of the paper has 1000."""
 
 
-def without_short(table: Measurements) -> Measurements:
+def without_short_curves(table: AccuracyData) -> AccuracyData:
     """Return the data without the short curves of the reproduction.
 
     From these many curves only means for the paper's Figure 3 are taken.
     """
-    long = {c.problem.digest for c in table.curves if not c.problem.paper or c.iterations.max(initial=0.0) >= LONG}
-    problems = tuple(p for p in table.problems if p.digest in long)
-    return replace(table, problems=problems, curves=tuple(c for c in table.curves if c.problem.digest in long))
+    long = {
+        c.problem.problem_digest
+        for c in table.curves
+        if not c.problem.is_liu2013 or c.iterations.max(initial=0.0) >= LONG_CURVE_ITERATIONS
+    }
+    problems = tuple(p for p in table.problems if p.problem_digest in long)
+    return replace(table, problems=problems, curves=tuple(c for c in table.curves if c.problem.problem_digest in long))

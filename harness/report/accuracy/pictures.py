@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from harness.report import opengl
-from harness.report.accuracy.measured import Curve, Measurements, Problem
+from harness.report.accuracy.measured import AccuracyData, ConvergenceCurve, SnapshotProblem
 
 
-def draw_meshes(table: Measurements, results: Path, folder: Path) -> dict[str, Path]:
+def draw_snapshot_meshes(table: AccuracyData, results: Path, folder: Path) -> dict[str, Path]:
     """Draw the mesh of each problem from its closest recorded solve.
 
     This is the solve that came closest to the minimum.
@@ -19,27 +19,27 @@ def draw_meshes(table: Measurements, results: Path, folder: Path) -> dict[str, P
         folder: folder that the pictures are written to.
     Returns: the pictures by the digest of their problem; empty if the system cannot draw or nothing was recorded.
     """
-    if opengl.problem() is not None:
+    if opengl.find_opengl_problem() is not None:
         return {}
     from harness.record.reader import read_replay  # slow to load, and most results hold no recordings
-    from harness.report.run_picture import draw_run
+    from harness.report.run_picture import draw_run_picture
 
     drawn: dict[str, Path] = {}
     for problem in table.problems:
-        if best := nearest(table, problem, results):
-            path = place(problem, folder)
+        if best := find_closest_solve(table, problem, results):
+            path = snapshot_picture_path(problem, folder)
             path.parent.mkdir(parents=True, exist_ok=True)
-            draw_run(read_replay(results / best.recording, [-1]), path)
-            drawn[problem.digest] = path
+            draw_run_picture(read_replay(results / best.recording_path, [-1]), path)
+            drawn[problem.problem_digest] = path
     return drawn
 
 
-def place(problem: Problem, folder: Path) -> Path:
+def snapshot_picture_path(problem: SnapshotProblem, folder: Path) -> Path:
     """Return the path of the picture of a problem's mesh."""
-    return folder / f"{problem.scene}-{problem.size}-{problem.moment}-{problem.digest}.png"
+    return folder / f"{problem.scene}-{problem.size}-{problem.snapshot}-{problem.problem_digest}.png"
 
 
-def nearest(table: Measurements, problem: Problem, results: Path) -> Curve | None:
+def find_closest_solve(table: AccuracyData, problem: SnapshotProblem, results: Path) -> ConvergenceCurve | None:
     """Find the recorded solve of a problem closest to the lowest minimum.
 
     The result is None if no solve was recorded.
@@ -49,5 +49,7 @@ def nearest(table: Measurements, problem: Problem, results: Path) -> Curve | Non
         problem: step snapshot.
         results: folder of the results, which contains the recordings.
     """
-    recorded = [c for c in table.curves if c.problem is problem and c.recording and (results / c.recording).is_file()]
+    recorded = [
+        c for c in table.curves if c.problem is problem and c.recording_path and (results / c.recording_path).is_file()
+    ]
     return min(recorded, key=lambda curve: (curve.status != "ok", curve.gap[-1]), default=None)

@@ -13,20 +13,20 @@ from dataclasses import dataclass
 from math import inf, isfinite
 
 from harness.report.accuracy.measured import WorkPoint
-from harness.report.style import Mark, numbered
+from harness.report.style import SeriesStyle, indexed_style
 from solvers.integrators import INTEGRATORS
 
-FRAME = 1.0 / 30.0
+FRAME_SECONDS = 1.0 / 30.0
 """Seconds."""
-ERRORS = tuple(10.0**-k for k in range(1, 9))
+ERROR_TARGETS = tuple(10.0**-k for k in range(1, 9))
 """Relative errors of the positions at the end time."""
-NOBODY = "none that was tried"
-CLOSE = 1.25
+NO_WINNER = "none that was tried"
+SIMILAR_COST_RATIO = 1.25
 """Cost ratio below which two families count as equal."""
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class WinnerCell:
     """One error on one mesh, with the cheapest simulation of each family that reaches it.
 
     Costs are processor seconds per simulated second.
@@ -34,34 +34,38 @@ class Cell:
 
     scene: str
     vertices: int
-    number: float
+    stiffness_number: float
     error: float
-    prices: dict[str, WorkPoint]
+    cheapest_by_family: dict[str, WorkPoint]
 
     @property
     def winner(self) -> str:
         """The family of the cheapest simulation."""
-        return min(self.prices, key=lambda name: self.prices[name].cpu, default=NOBODY)
+        return min(
+            self.cheapest_by_family,
+            key=lambda name: self.cheapest_by_family[name].cpu_seconds_per_simulated_second,
+            default=NO_WINNER,
+        )
 
     @property
-    def ahead(self) -> float:
+    def lead_ratio(self) -> float:
         """The cost of the second cheapest family divided by the cheapest.
 
         It is infinite without a second family.
         """
-        order = sorted(work.cpu for work in self.prices.values())
+        order = sorted(work.cpu_seconds_per_simulated_second for work in self.cheapest_by_family.values())
         return order[1] / order[0] if len(order) > 1 else inf
 
 
-def family(work: WorkPoint) -> str:
+def method_family(work: WorkPoint) -> str:
     """Return the family of a simulation's method."""
-    if not work.minimises:
+    if not work.is_minimiser:
         return work.family
     shipped = INTEGRATORS.get(work.integrator)
     return f"implicit, order {shipped.order}" if shipped else work.integrator
 
 
-def cells(works: Iterable[WorkPoint], errors: Sequence[float] = ERRORS) -> list[Cell]:
+def build_winner_cells(works: Iterable[WorkPoint], errors: Sequence[float] = ERROR_TARGETS) -> list[WinnerCell]:
     """Build a cell for each mesh and error.
 
     Cells are ordered by vertices, stiffness and error; meshes without springs have none.
@@ -70,20 +74,26 @@ def cells(works: Iterable[WorkPoint], errors: Sequence[float] = ERRORS) -> list[
     for work in works:
         if isfinite(work.stiffness) and work.vertices:
             meshes.setdefault((work.scene, work.vertices, work.stiffness), []).append(work)
-    found = list[Cell]()
+    found = list[WinnerCell]()
     for (scene, vertices, stiffness), members in meshes.items():
-        done = [work for work in members if work.status == "ok" and isfinite(work.cpu) and work.cpu > 0.0]
+        done = [
+            work
+            for work in members
+            if work.status == "ok"
+            and isfinite(work.cpu_seconds_per_simulated_second)
+            and work.cpu_seconds_per_simulated_second > 0.0
+        ]
         for error in errors:
             best: dict[str, WorkPoint] = {}
             for work in done:
                 if work.error <= error:
-                    name = family(work)
-                    best[name] = min(best.get(name, work), work, key=lambda one: one.cpu)
-            found.append(Cell(scene, vertices, stiffness * FRAME**2, error, best))
-    return sorted(found, key=lambda cell: (cell.vertices, cell.number, -cell.error))
+                    name = method_family(work)
+                    best[name] = min(best.get(name, work), work, key=lambda one: one.cpu_seconds_per_simulated_second)
+            found.append(WinnerCell(scene, vertices, stiffness * FRAME_SECONDS**2, error, best))
+    return sorted(found, key=lambda cell: (cell.vertices, cell.stiffness_number, -cell.error))
 
 
-def families(found: Sequence[Cell]) -> dict[str, Mark]:
+def assign_family_styles(cells: Sequence[WinnerCell]) -> dict[str, SeriesStyle]:
     """Assign a style to each family; equal sets of names get equal styles."""
-    names = sorted({name for cell in found for name in cell.prices})
-    return {name: numbered(k) for k, name in enumerate(names)}
+    names = sorted({name for cell in cells for name in cell.cheapest_by_family})
+    return {name: indexed_style(k) for k, name in enumerate(names)}

@@ -14,17 +14,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.text import Annotation, Text
 
-from harness.report.figures.asked import Asked
-from harness.report.figures.panel import Panel, Plot, Series
-from harness.report.figures.scales import in_points
+from harness.report.figures.asked import FigureOptions
+from harness.report.figures.panel import CurvePlot, CurveSeries, FigurePanel
+from harness.report.figures.scales import frame_size_points
 
-_MOST, _SHARE = 9, 0.3
+_MAX_LABELS, _MAX_WIDTH_SHARE = 9, 0.3
 """Maximum number of labels of a frame, and maximum share of the width for them."""
-_BESIDE = 7.0
+_LABEL_DISTANCE = 7.0
 """Distance from the frame to the labels [points]."""
 
 
-def label_directly(axes: Sequence[Axes], panels: Sequence[Panel], asked: Asked) -> bool:
+def add_direct_labels(axes: Sequence[Axes], panels: Sequence[FigurePanel], options: FigureOptions) -> bool:
     """Add labels to curve ends or points; return whether they make a legend unnecessary.
 
     Args:
@@ -33,69 +33,71 @@ def label_directly(axes: Sequence[Axes], panels: Sequence[Panel], asked: Asked) 
         options: options of the figure.
     """
     panel = panels[0]
-    if len(panels) > 1 or not isinstance(panel, Plot):
+    if len(panels) > 1 or not isinstance(panel, CurvePlot):
         return False
-    if panel.y.kind == "names":
+    if panel.y.division == "names":
         return True
-    known = [series for series in panel.series if len(_end(series))]
+    known = [series for series in panel.series if len(_end_point(series))]
     letters = max((len(series.label) for series in known), default=0)
-    wide = 0.6 * asked.small * letters + _BESIDE
-    tall = asked.width / 25.4 * 72.0 * panel.aspect * 0.8
-    named = any(series.named for series in panel.series)
-    fits = len(known) * 1.3 * asked.small <= tall and wide <= _SHARE * asked.width / 25.4 * 72.0
+    wide = 0.6 * options.small_font_size * letters + _LABEL_DISTANCE
+    tall = options.width_mm / 25.4 * 72.0 * panel.aspect * 0.8
+    named = any(series.labels_points for series in panel.series)
+    fits = (
+        len(known) * 1.3 * options.small_font_size <= tall and wide <= _MAX_WIDTH_SHARE * options.width_mm / 25.4 * 72.0
+    )
     if named and not fits:
-        _name_points(axes[0], panel.series, asked)
+        _label_points(axes[0], panel.series, options)
         return True
-    if not fits or not known or (not named and (panel.bands or len(known) > _MOST)):
+    if not fits or not known or (not named and (panel.bands or len(known) > _MAX_LABELS)):
         return False
-    _Names(axes[0], known, asked)
+    _EndLabels(axes[0], known, options)
     return True
 
 
-def _end(series: Series) -> list[float]:
+def _end_point(series: CurveSeries) -> list[float]:
     known = np.isfinite(series.x) & np.isfinite(series.y)
     return [float(series.x[known][-1]), float(series.y[known][-1])] if known.any() else []
 
 
-class _Names:
+class _EndLabels:
     """Labels at the curve ends of one frame.
 
     They are created before the layout, which reserves space for them, and positioned after it.
     """
 
-    def __init__(self, ax: Axes, known: Sequence[Series], asked: Asked) -> None:
-        self._ax, self._gap = ax, 1.25 * asked.small
-        self._ends = [_end(series) for series in known]
+    def __init__(self, ax: Axes, known: Sequence[CurveSeries], options: FigureOptions) -> None:
+        self._ax, self._gap = ax, 1.25 * options.small_font_size
+        self._ends = [_end_point(series) for series in known]
         self._names: list[Text] = []
         for series, (x, y) in zip(known, self._ends, strict=True):
-            line = {"arrowstyle": "-", "color": series.look.color, "alpha": 0.5, "linewidth": 0.5, "shrinkA": 0}
+            line = {"arrowstyle": "-", "color": series.style.color, "alpha": 0.5, "linewidth": 0.5, "shrinkA": 0}
             name = ax.annotate(
-                series.label, (x, y), (1.0, 0.5), textcoords="axes fraction", va="center", fontsize=asked.small,
-                color=_dark(series.look.color), arrowprops=line | {"shrinkB": 2.5, "relpos": (0.0, 0.5)},
+                series.label, (x, y), (1.0, 0.5), textcoords="axes fraction", va="center", fontsize=options.small_font_size,
+                color=_darken_colour(series.style.color), arrowprops=line | {"shrinkB": 2.5, "relpos": (0.0, 0.5)},
                 annotation_clip=False,
             )  # fmt: skip
-            name.set_position((self._beside(), 0.5))
+            name.set_position((self._label_position(), 0.5))
             self._names.append(name)
-        setattr(self._names[0], "settle", self.settle)  # noqa: B010 no attribute of Text: done after the layout
+        setattr(self._names[0], "settle", self.place_labels)  # noqa: B010 no attribute of Text: done after the layout
 
-    def _beside(self) -> float:
+    def _label_position(self) -> float:
         """Return the x position of the labels, in units of the frame's width."""
-        width, _ = in_points(self._ax)
-        return 1.0 + _BESIDE / width
+        width, _ = frame_size_points(self._ax)
+        return 1.0 + _LABEL_DISTANCE / width
 
-    def settle(self) -> None:
+    def place_labels(self) -> None:
         """Move the labels to the heights of their curve ends, and apart."""
         ax = self._ax
-        _, points = in_points(ax)
+        _, points = frame_size_points(ax)
         wanted = [ax.transAxes.inverted().transform(ax.transData.transform(end))[1] * points for end in self._ends]
         order = np.argsort(wanted)
-        at = apart([wanted[k] for k in order], self._gap, points)
-        beside = self._beside()
+        at = spread_positions([wanted[k] for k in order], self._gap, points)
+        beside = self._label_position()
         for k, height in zip(order, at, strict=True):
             self._names[k].set_position((beside, height / points))
 
 
-def apart(wanted: Sequence[float], gap: float, top: float) -> list[float]:
+def spread_positions(targets: Sequence[float], gap: float, top: float) -> list[float]:
     """Spread sorted heights to be at least `gap` apart, with small displacements.
 
     Args:
@@ -103,7 +105,7 @@ def apart(wanted: Sequence[float], gap: float, top: float) -> list[float]:
         gap: minimum distance.
         top: upper limit, exceeded only if the space from 0 is too small.
     """
-    at = list(wanted)
+    at = list(targets)
     for _ in range(60):
         for k in range(1, len(at)):
             short = gap - (at[k] - at[k - 1])
@@ -116,18 +118,18 @@ def apart(wanted: Sequence[float], gap: float, top: float) -> list[float]:
     return at
 
 
-def _dark(color: str) -> str:
+def _darken_colour(color: str) -> str:
     """Darken a colour until small text in it is readable on white."""
     from matplotlib.colors import to_rgb
 
-    from harness.report.style import shade
+    from harness.report.style import shade_colour
 
     while sum(w * part for w, part in zip((0.3, 0.6, 0.1), to_rgb(color), strict=True)) > 0.5:
-        color = shade(color, -0.12)
+        color = shade_colour(color, -0.12)
     return color
 
 
-def _name_points(ax: Axes, series: Sequence[Series], asked: Asked) -> None:
+def _label_points(ax: Axes, series: Sequence[CurveSeries], options: FigureOptions) -> None:
     """Label single points without overlap.
 
     A label is on a side of its point where it overlaps no other label and no other point.
@@ -135,13 +137,13 @@ def _name_points(ax: Axes, series: Sequence[Series], asked: Asked) -> None:
     for one in series:
         for x, y in zip(one.x, one.y, strict=True):
             name = ax.annotate(
-                one.label, (x, y), (5, 0), textcoords="offset points", va="center", fontsize=asked.small,
+                one.label, (x, y), (5, 0), textcoords="offset points", va="center", fontsize=options.small_font_size,
                 annotation_clip=False,
             )  # fmt: skip
-            setattr(name, "settle", lambda name=name: _place(ax, name))  # noqa: B010 as above
+            setattr(name, "settle", lambda name=name: _place_label(ax, name))  # noqa: B010 as above
 
 
-_SIDES: tuple[tuple[float, float, Any], ...] = tuple(
+_LABEL_OFFSETS: tuple[tuple[float, float, Any], ...] = tuple(
     (dx * far, dy * far, ha)
     for far in (1.0, 2.0, 3.0)
     for dx, dy, ha in (
@@ -155,7 +157,7 @@ _SIDES: tuple[tuple[float, float, Any], ...] = tuple(
 )
 
 
-def _place(ax: Axes, name: Annotation) -> None:
+def _place_label(ax: Axes, name: Annotation) -> None:
     """Place a label on the first side without overlap.
 
     There it is inside the frame and overlaps no earlier label or point.
@@ -164,7 +166,7 @@ def _place(ax: Axes, name: Annotation) -> None:
     taken = [other.get_window_extent() for other in before]
     points = [ax.transData.transform(line.get_xydata()) for line in ax.lines if line.get_marker() not in ("None", "")]
     marks = np.concatenate([np.zeros((0, 2)), *points])
-    for dx, dy, ha in _SIDES:
+    for dx, dy, ha in _LABEL_OFFSETS:
         name.set_position((dx, dy))
         name.set_horizontalalignment(ha)
         box = name.get_window_extent()

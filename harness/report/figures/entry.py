@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from harness.base.errors import InputError, Mistake
-from harness.report.figures.panel import Panel
+from harness.base.errors import InputError, InputMistake
+from harness.report.figures.panel import FigurePanel
 
-MOST = 12
+MAX_PANELS = 12
 """Maximum number of panels of a figure."""
-_TOLD = 12
+_MAX_LISTED = 12
 """Maximum number of names that a message lists."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Entry:
+class PanelEntry:
     """A panel that can be drawn.
 
     Attributes:
@@ -23,22 +23,22 @@ class Entry:
         build_panel: returns the panel.
     """
 
-    of: tuple[str, ...]
+    group: tuple[str, ...]
     name: tuple[str, ...]
-    make: Callable[[], Panel]
+    build_panel: Callable[[], FigurePanel]
 
     @property
-    def parts(self) -> tuple[str, ...]:
+    def name_parts(self) -> tuple[str, ...]:
         """All parts of the name."""
-        return (*self.of, *self.name)
+        return (*self.group, *self.name)
 
 
-def ready(panels: Iterable[Panel]) -> list[Entry]:
+def entries_from_panels(panels: Iterable[FigurePanel]) -> list[PanelEntry]:
     """Wrap panels that are already built as entries."""
-    return [Entry(panel.of, panel.name, lambda panel=panel: panel) for panel in panels]
+    return [PanelEntry(panel.group, panel.name, lambda panel=panel: panel) for panel in panels]
 
 
-def chosen(entries: Sequence[Entry], selectors: Sequence[tuple[str, ...]]) -> list[Entry]:
+def select_entries(entries: Sequence[PanelEntry], selectors: Sequence[tuple[str, ...]]) -> list[PanelEntry]:
     """Select the entries that match the selectors, in their order.
 
     A selector matches each panel whose name has all of its parts. If no part of a selector names a group, only the
@@ -50,23 +50,25 @@ def chosen(entries: Sequence[Entry], selectors: Sequence[tuple[str, ...]]) -> li
     Raises:
         InputError: if a selector matches nothing, or if there are too many panels for a figure.
     """
-    found: list[Entry] = []
+    found: list[PanelEntry] = []
     for selector in selectors or ((),):
-        named = [entry for entry in entries if set(selector) <= set(entry.parts)]
+        named = [entry for entry in entries if set(selector) <= set(entry.name_parts)]
         if not named:
             raise InputError(
-                Mistake(f"came {':'.join(selector)!r}; wanted parts of {_listed(entries)}", key="--panels")
+                InputMistake(f"came {':'.join(selector)!r}; wanted parts of {_join_names(entries)}", key="--panels")
             )
-        if not any(part in entry.of for part in selector for entry in named):
-            named = [entry for entry in named if entry.of == named[0].of]
+        if not any(part in entry.group for part in selector for entry in named):
+            named = [entry for entry in named if entry.group == named[0].group]
         found += [entry for entry in named if entry not in found]
-    if len(found) > MOST:
-        wanted = f"came the names of {len(found)} panels; wanted at most {MOST}, as parts of {_listed(entries)}"
-        raise InputError(Mistake(wanted, key="--panels"))
+    if len(found) > MAX_PANELS:
+        wanted = (
+            f"came the names of {len(found)} panels; wanted at most {MAX_PANELS}, as parts of {_join_names(entries)}"
+        )
+        raise InputError(InputMistake(wanted, key="--panels"))
     return found
 
 
-def _listed(entries: Sequence[Entry]) -> str:
-    names = [":".join(entry.parts) for entry in entries]
-    more = f" and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
-    return ", ".join(names[:_TOLD]) + more
+def _join_names(entries: Sequence[PanelEntry]) -> str:
+    names = [":".join(entry.name_parts) for entry in entries]
+    more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
+    return ", ".join(names[:_MAX_LISTED]) + more

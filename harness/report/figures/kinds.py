@@ -8,8 +8,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from harness.base.errors import InputError, Mistake, RunFailed, SpringbenchError, did_you_mean
-from harness.config.sweep import EVERY_REPORT
+from harness.base.errors import InputError, InputMistake, RunFailed, SpringbenchError, suggest_name
+from harness.config.sweep import REPORT_TABLE
 from harness.report.figures import (
     of_accuracy,
     of_effects,
@@ -20,12 +20,12 @@ from harness.report.figures import (
     of_runs,
     of_winners,
 )
-from harness.report.figures.entry import Entry, ready
-from harness.report.figures.panel import CellMap, Panel, Picture
-from solvers.plugins import load
+from harness.report.figures.entry import PanelEntry, entries_from_panels
+from harness.report.figures.panel import CellMap, FigurePanel, MeshPicture
+from solvers.plugins import load_target
 
 
-class Kind(NamedTuple):
+class FigureKind(NamedTuple):
     """A kind of figure.
 
     Attributes:
@@ -37,69 +37,113 @@ class Kind(NamedTuple):
     """
 
     title: str
-    wanted: str
-    panels: Callable[[Path, of_runs.Older], list[Entry]]
-    usual: tuple[tuple[str, ...], ...] = ((),)
-    draw: Callable[[Sequence[Entry]], list[Panel]] = lambda entries: [entry.make() for entry in entries]
+    required_rows: str
+    list_panels: Callable[[Path, of_runs.StaleFinder], list[PanelEntry]]
+    default_panels: tuple[tuple[str, ...], ...] = ((),)
+    prepare_panels: Callable[[Sequence[PanelEntry]], list[FigurePanel]] = lambda entries: [
+        entry.build_panel() for entry in entries
+    ]
 
 
-def _meshes(entries: Sequence[Entry]) -> list[Panel]:
-    pictures = [panel for panel in (entry.make() for entry in entries) if isinstance(panel, Picture)]
-    return [one for _, of in groupby(pictures, lambda picture: picture.subject) for one in of_meshes.alike(list(of))]
+def _align_mesh_pictures(entries: Sequence[PanelEntry]) -> list[FigurePanel]:
+    pictures = [panel for panel in (entry.build_panel() for entry in entries) if isinstance(panel, MeshPicture)]
+    return [
+        one
+        for _, of in groupby(pictures, lambda picture: picture.subject)
+        for one in of_meshes.align_pictures(list(of))
+    ]
 
 
-def _sheet(entries: Sequence[Entry]) -> list[Panel]:
-    return [*of_meshes.sheet([panel for panel in (e.make() for e in entries) if isinstance(panel, Picture)])]
+def _prepare_scene_sheet(entries: Sequence[PanelEntry]) -> list[FigurePanel]:
+    return [
+        *of_meshes.build_scene_sheet(
+            [panel for panel in (e.build_panel() for e in entries) if isinstance(panel, MeshPicture)]
+        )
+    ]
 
 
-def _maps(entries: Sequence[Entry]) -> list[Panel]:
+def _merge_cell_maps(entries: Sequence[PanelEntry]) -> list[FigurePanel]:
     """Merge the families of hard cases into one map."""
-    panels = [entry.make() for entry in entries]
+    panels = [entry.build_panel() for entry in entries]
     grids = [panel for panel in panels if isinstance(panel, CellMap)]
     rest = [panel for panel in panels if not isinstance(panel, CellMap)]
-    return [*rest, *([of_hard.together(grids)] if grids else [])]
+    return [*rest, *([of_hard.merge_cell_maps(grids)] if grids else [])]
 
 
-def _rows_alone(panels: Callable[[Path], list[Entry]]) -> Callable[[Path, of_runs.Older], list[Entry]]:
-    def read(folder: Path, older: of_runs.Older) -> list[Entry]:
+def _without_stale(
+    panels: Callable[[Path], list[PanelEntry]],
+) -> Callable[[Path, of_runs.StaleFinder], list[PanelEntry]]:
+    def read(folder: Path, older: of_runs.StaleFinder) -> list[PanelEntry]:
         return panels(folder)
 
     return read
 
 
-_ACCURACY, _SWEEP = of_accuracy.WANTED, "rows of `springbench run CONFIG`"
-_BOTH = (("gap", "time"), ("gap", "iterations"))
-_PROFILES = tuple(("performance", gap) for gap in ("1e-1", "1e-3", "1e-6"))
+_ACCURACY_ROWS, _SWEEP_ROWS = of_accuracy.REQUIRED_ROWS, "rows of `springbench run CONFIG`"
+_GAP_PANELS = (("gap", "time"), ("gap", "iterations"))
+_PROFILE_PANELS = tuple(("performance", gap) for gap in ("1e-1", "1e-3", "1e-6"))
 
-KINDS: dict[str, Kind] = {
-    "convergence": Kind("Convergence", _ACCURACY, _rows_alone(of_accuracy.convergence), _BOTH),
-    "times": Kind("Time to accuracy", _ACCURACY, _rows_alone(of_accuracy.times), (("alone",), ("over-1",))),
-    "winners": Kind("The cheapest way to an error", _ACCURACY, _rows_alone(of_winners.winners)),
-    "engines": Kind("Outside engines beside ours", f"{_ACCURACY}, with engines", _rows_alone(of_engines.engines)),
-    "work": Kind("Work and precision", _ACCURACY, _rows_alone(of_accuracy.work)),
-    "profiles": Kind("Profiles", _ACCURACY, _rows_alone(of_accuracy.profiles), _PROFILES),
-    "growth": Kind("Growth with size", _ACCURACY, _rows_alone(of_accuracy.growth)),
-    "liu2013": Kind("Liu et al. 2013, reproduced", f"{_ACCURACY}, of liu2013.yaml", _rows_alone(of_accuracy.paper)),
-    "timing": Kind("Time a step", _SWEEP, of_runs.timing, (("step",), ("prepare",))),
-    "hard": Kind("Hard cases", f"{_SWEEP} with `judge: true`", of_hard.hard, (("shares",),), _maps),
-    "ablation": Kind("What effects cost", "rows of `springbench ablate SCENE`", _rows_alone(of_effects.effects)),
-    "prices": Kind(
+FIGURE_KINDS: dict[str, FigureKind] = {
+    "convergence": FigureKind(
+        "Convergence", _ACCURACY_ROWS, _without_stale(of_accuracy.convergence_panels), _GAP_PANELS
+    ),
+    "times": FigureKind(
+        "Time to accuracy",
+        _ACCURACY_ROWS,
+        _without_stale(of_accuracy.time_to_accuracy_panels),
+        (("alone",), ("over-1",)),
+    ),
+    "winners": FigureKind("The cheapest way to an error", _ACCURACY_ROWS, _without_stale(of_winners.winner_panels)),
+    "engines": FigureKind(
+        "Outside engines beside ours", f"{_ACCURACY_ROWS}, with engines", _without_stale(of_engines.engine_panels)
+    ),
+    "work": FigureKind("Work and precision", _ACCURACY_ROWS, _without_stale(of_accuracy.work_precision_panels)),
+    "profiles": FigureKind("Profiles", _ACCURACY_ROWS, _without_stale(of_accuracy.profile_panels), _PROFILE_PANELS),
+    "growth": FigureKind("Growth with size", _ACCURACY_ROWS, _without_stale(of_accuracy.scaling_panels)),
+    "liu2013": FigureKind(
+        "Liu et al. 2013, reproduced", f"{_ACCURACY_ROWS}, of liu2013.yaml", _without_stale(of_accuracy.liu2013_panels)
+    ),
+    "timing": FigureKind("Time a step", _SWEEP_ROWS, of_runs.timing_panels, (("step",), ("prepare",))),
+    "hard": FigureKind(
+        "Hard cases", f"{_SWEEP_ROWS} with `judge: true`", of_hard.robustness_panels, (("shares",),), _merge_cell_maps
+    ),
+    "ablation": FigureKind(
+        "What effects cost", "rows of `springbench ablate SCENE`", _without_stale(of_effects.effect_cost_panels)
+    ),
+    "prices": FigureKind(
         "The price of effects",
         "rows of `springbench ablate SCENE --all-solvers`",
-        _rows_alone(of_effects.prices),
+        _without_stale(of_effects.overhead_panels),
         (("map",),),
     ),
-    "speed": Kind("Speed", "rows of `springbench speed CONFIG`", _rows_alone(of_runs.speed), (("step",), ("global",))),
-    "run": Kind("The mesh at the end", f"{_SWEEP} with recordings", _rows_alone(of_meshes.run), draw=_meshes),
-    "comparison": Kind(
-        "Solvers side by side", f"{_SWEEP} with recordings", _rows_alone(of_meshes.comparison), draw=_meshes
+    "speed": FigureKind(
+        "Speed", "rows of `springbench speed CONFIG`", _without_stale(of_runs.speed_panels), (("step",), ("global",))
     ),
-    "scenes": Kind("Scenes at their end", f"{_SWEEP} with recordings", _rows_alone(of_meshes.scenes), draw=_sheet),
-    "history": Kind("Results of a gate, by commit", of_gates.WANTED, _rows_alone(of_gates.gates)),
+    "run": FigureKind(
+        "The mesh at the end",
+        f"{_SWEEP_ROWS} with recordings",
+        _without_stale(of_meshes.last_frame_panels),
+        prepare_panels=_align_mesh_pictures,
+    ),
+    "comparison": FigureKind(
+        "Solvers side by side",
+        f"{_SWEEP_ROWS} with recordings",
+        _without_stale(of_meshes.solver_comparison_panels),
+        prepare_panels=_align_mesh_pictures,
+    ),
+    "scenes": FigureKind(
+        "Scenes at their end",
+        f"{_SWEEP_ROWS} with recordings",
+        _without_stale(of_meshes.scene_panels),
+        prepare_panels=_prepare_scene_sheet,
+    ),
+    "history": FigureKind(
+        "Results of a gate, by commit", of_gates.REQUIRED_RESULTS, _without_stale(of_gates.benchmark_panels)
+    ),
 }
 
 
-def kind(name: str) -> Kind:
+def find_figure_kind(name: str) -> FigureKind:
     """Find the kind of figure with this name.
 
     An installed report with a `panels` attribute is a kind too.
@@ -107,23 +151,23 @@ def kind(name: str) -> Kind:
     Raises:
         InputError: if there is no such kind.
     """
-    if name in KINDS:
-        return KINDS[name]
-    known = {*KINDS, *(other for other in EVERY_REPORT if other not in EVERY_REPORT.shipped[0])}
+    if name in FIGURE_KINDS:
+        return FIGURE_KINDS[name]
+    known = {*FIGURE_KINDS, *(other for other in REPORT_TABLE if other not in REPORT_TABLE.builtin_tables[0])}
     if name not in known:
-        raise InputError(Mistake(f"came {name!r}; wanted {did_you_mean(name, known)}", key="KIND"))
-    report: Any = load(EVERY_REPORT[name])
+        raise InputError(InputMistake(f"came {name!r}; wanted {suggest_name(name, known)}", key="KIND"))
+    report: Any = load_target(REPORT_TABLE[name])
     if not callable(getattr(report, "panels", None)):
         why = f"the report {name!r} draws no figure; wanted one that has `panels(rows)`, which returns panels"
-        raise InputError(Mistake(why, key="KIND"))
-    return Kind(name, _SWEEP, _rows_alone(partial(_own, name, report)))
+        raise InputError(InputMistake(why, key="KIND"))
+    return FigureKind(name, _SWEEP_ROWS, _without_stale(partial(_plugin_entries, name, report)))
 
 
-def _own(name: str, report: Any, folder: Path) -> list[Entry]:
-    table = of_runs.sweep_rows(folder)
+def _plugin_entries(name: str, report: Any, folder: Path) -> list[PanelEntry]:
+    table = of_runs.read_sweep_rows(folder)
     try:
-        panels: Iterable[Panel] = report.panels(table)
-        return ready(panels)
+        panels: Iterable[FigurePanel] = report.panels(table)
+        return entries_from_panels(panels)
     except (SpringbenchError, OSError):
         raise
     except Exception as error:  # it is somebody's own

@@ -5,19 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from harness.base.errors import InputError, Mistake
+from harness.base.errors import InputError, InputMistake
 from harness.report.figures import entry, writing
-from harness.report.figures.asked import Asked
-from harness.report.figures.canvas import compose
-from harness.report.figures.faults import faults
-from harness.report.figures.kinds import Kind
-from harness.report.figures.of_runs import Older
+from harness.report.figures.asked import FigureOptions
+from harness.report.figures.canvas import compose_figure
+from harness.report.figures.faults import find_layout_faults
+from harness.report.figures.kinds import FigureKind
+from harness.report.figures.of_runs import StaleFinder
 
-_TOLD = 3
+_MAX_LISTED = 3
 """Maximum number of faults that a message lists."""
 
 
-class Made(NamedTuple):
+class FigureResult(NamedTuple):
     """A figure that was written.
 
     Attributes:
@@ -29,13 +29,15 @@ class Made(NamedTuple):
     """
 
     paths: list[Path]
-    panels: list[str]
-    millimetres: tuple[float, float]
-    others: int
-    example: str
+    panel_names: list[str]
+    size_mm: tuple[float, float]
+    other_panel_count: int
+    other_panel_example: str
 
 
-def make(name: str, kind: Kind, results: Path, older: Older, folder: Path, asked: Asked) -> Made:
+def make_figure(
+    name: str, kind: FigureKind, results: Path, find_stale: StaleFinder, folder: Path, options: FigureOptions
+) -> FigureResult:
     """Write the figure of a kind to files.
 
     Args:
@@ -49,26 +51,26 @@ def make(name: str, kind: Kind, results: Path, older: Older, folder: Path, asked
         InputError: if the results contain nothing of the kind, if no panel matches a selector, if curves and maps are
             selected together, or if the text does not fit the width.
     """
-    entries = kind.panels(results, older)
+    entries = kind.list_panels(results, find_stale)
     if not entries:
-        raise InputError(Mistake(f"holds nothing to draw as {name}; wanted {kind.wanted}", results))
-    usual = [one for one in kind.usual if any(set(one) <= set(known.parts) for known in entries)]
-    picked = entry.chosen(entries, asked.selectors or usual)
-    panels = kind.draw(picked)
+        raise InputError(InputMistake(f"holds nothing to draw as {name}; wanted {kind.required_rows}", results))
+    usual = [one for one in kind.default_panels if any(set(one) <= set(known.name_parts) for known in entries)]
+    picked = entry.select_entries(entries, options.selectors or usual)
+    panels = kind.prepare_panels(picked)
     if len({type(panel) for panel in panels}) > 1:
-        parts = ", ".join(":".join(one.parts) for one in picked)
+        parts = ", ".join(":".join(one.name_parts) for one in picked)
         why = f"came {parts}, of which some are curves and some are maps; wanted one of both: their data differ"
-        raise InputError(Mistake(f"{why}; draw the others as a figure of their own", key="--panels"))
-    figure = compose(panels, kind.title, asked)
-    wrong = faults(figure)
+        raise InputError(InputMistake(f"{why}; draw the others as a figure of their own", key="--panels"))
+    figure = compose_figure(panels, kind.title, options)
+    wrong = find_layout_faults(figure)
     if wrong:
-        more = f" and {len(wrong) - _TOLD} more" if len(wrong) > _TOLD else ""
-        why = f"came {asked.width:g} mm for type of {asked.size:g} points, in which {'; '.join(wrong[:_TOLD])}{more}"
-        raise InputError(Mistake(f"{why}; wanted a wider figure, smaller type or fewer panels", key="--width"))
-    parts = [part for selector in asked.selectors for part in selector]
+        more = f" and {len(wrong) - _MAX_LISTED} more" if len(wrong) > _MAX_LISTED else ""
+        why = f"came {options.width_mm:g} mm for type of {options.font_size:g} points, in which {'; '.join(wrong[:_MAX_LISTED])}{more}"
+        raise InputError(InputMistake(f"{why}; wanted a wider figure, smaller type or fewer panels", key="--width"))
+    parts = [part for selector in options.selectors for part in selector]
     stem = folder / "-".join(dict.fromkeys([name, *parts]))
-    paths = writing.write(figure, panels, stem, kind.title, asked)
+    paths = writing.write_figure(figure, panels, stem, kind.title, options)
     rest = [one for one in entries if one not in picked]
-    example = ":".join(rest[0].parts) if rest else ""
-    shown = [":".join(one.parts) for one in picked]
-    return Made(paths, shown, writing.millimetres(figure), len(rest), example)
+    example = ":".join(rest[0].name_parts) if rest else ""
+    shown = [":".join(one.name_parts) for one in picked]
+    return FigureResult(paths, shown, writing.figure_size_mm(figure), len(rest), example)

@@ -14,18 +14,28 @@ from typing import Any
 import numpy as np
 
 from harness.base import machine, shelf
-from harness.base.errors import InputError, Mistake
+from harness.base.errors import InputError, InputMistake
 from harness.report import ablation
-from harness.report.ablation import Row
-from harness.report.figures.entry import Entry, ready
-from harness.report.figures.panel import Band, Cell, CellMap, Line, Panel, Plot, Scale, Series, dotted
-from harness.report.origin import measured_on
-from harness.report.style import OLDER, Mark, looks, numbered
+from harness.report.ablation import ResultRow
+from harness.report.figures.entry import PanelEntry, entries_from_panels
+from harness.report.figures.panel import (
+    AxisScale,
+    CellMap,
+    CurvePlot,
+    CurveSeries,
+    FigurePanel,
+    MapCell,
+    MarkedValue,
+    ShadedBand,
+    describe_stale_cells,
+)
+from harness.report.origin import describe_provenance
+from harness.report.style import STALE_NOTE, SeriesStyle, assign_label_styles, indexed_style
 
-_ERRORS = {"solver": "error of the solver", "time-step": "error of the time step"}
+_ERROR_LABELS = {"solver": "error of the solver", "time-step": "error of the time step"}
 
-_NOTHING = ("cannot be told from 1", "#efece6")
-_CLASSES = (
+_INDISTINGUISHABLE = ("cannot be told from 1", "#efece6")
+_OVERHEAD_CLASSES = (
     (1.0, "below 1", "#a8d5b9"),
     (1.1, "to 1.1", "#dfeaf3"),
     (1.5, "1.1 to 1.5", "#aacbe4"),
@@ -34,87 +44,100 @@ _CLASSES = (
     (np.inf, "above 3", "#0f3f70"),
 )
 """Upper limits of the overhead classes, their labels and colours."""
-_REFUSED, _BROKEN = "#bcb8b0", "#dd8f88"
+_UNSUPPORTED_COLOUR, _FAILED_COLOUR = "#bcb8b0", "#dd8f88"
 """Colours of what a solver does not support, and of other cases without an overhead."""
-_READ = (
+_OVERHEAD_NOTE = (
     "CPU time of an iteration with the effect over one without, the median over rounds; of those whose interval of "
     "95 % holds 1 nothing can be told."
 )
-_ALL = "all"
+_ALL_EFFECTS = "all"
 """Name of the overhead of all effects together in the rows."""
 
 
-def _ablations(folder: Path, kind: str) -> Iterator[tuple[str, Sequence[Row]]]:
+def _read_ablations(folder: Path, kind: str) -> Iterator[tuple[str, Sequence[ResultRow]]]:
     """Yield the rows of each ablation with rows of a kind, by file name.
 
     Raises:
         InputError: if there are none.
     """
-    found = [(path.stem, ablation.read(path)) for path in shelf.units(folder / "ablation")]
-    found = [(stem, table) for stem, table in found if ablation.of_kind(table, kind)]
+    found = [(path.stem, ablation.read_ablation(path)) for path in shelf.list_units(folder / "ablation")]
+    found = [(stem, table) for stem, table in found if ablation.select_kind(table, kind)]
     if not found:
         command = "springbench ablate SCENE" + (" --all-solvers" if kind == "price" else "")
-        raise InputError(Mistake(f"holds nothing of that kind; wanted the rows of `{command}`", folder))
+        raise InputError(InputMistake(f"holds nothing of that kind; wanted the rows of `{command}`", folder))
     yield from found
 
 
-def effects(folder: Path) -> list[Entry]:
+def effect_cost_panels(folder: Path) -> list[PanelEntry]:
     """Build panels of the cost of each effect and the changes without it."""
-    plots: list[Plot] = []
-    for stem, table in _ablations(folder, "without"):
-        (whole,) = ablation.of_kind(table, "whole")
-        points = [row for row in ablation.of_kind(table, "without") if row["status"] == "ok"]
+    plots: list[CurvePlot] = []
+    for stem, table in _read_ablations(folder, "without"):
+        (whole,) = ablation.select_kind(table, "whole")
+        points = [row for row in ablation.select_kind(table, "without") if row["status"] == "ok"]
         if whole["status"] != "ok" or not points:
             continue
-        other = _other(whole)
-        series = [_effect(k, row, whole["seconds"], older=other) for k, row in enumerate(points)]
-        known = [row for row in ablation.of_kind(table, "error") if row["status"] == "ok"]
-        error, whose = ablation.known_error(table)
-        gone = [row["name"] for row in ablation.of_kind(table, "without") if row["status"] != "ok"]
+        other = _is_stale(whole)
+        series = [_build_effect_series(k, row, whole["seconds"], is_stale=other) for k, row in enumerate(points)]
+        known = [row for row in ablation.select_kind(table, "error") if row["status"] == "ok"]
+        error, whose = ablation.largest_known_error(table)
+        gone = [row["name"] for row in ablation.select_kind(table, "without") if row["status"] != "ok"]
         below = [f"Shaded: less than {whose}, so not called for."] if whose else []
-        dashed = [f"{_ERRORS[row['name']]}, {row['largest']:.2g}" for row in known]
+        dashed = [f"{_ERROR_LABELS[row['name']]}, {row['largest']:.2g}" for row in known]
         below += [f"Dashed: {'; '.join(dashed)}."] if dashed else []
         below += [f"Impossible without {', '.join(gone)}."] if gone else []
         plots.append(
-            Plot(
+            CurvePlot(
                 *((whole["scene"], str(whole["size"])), (stem,), f"{whole['scene']}, {whole['vertices']} vertices", ""),
-                Scale("cost [% of a step, with the 95 % interval]", "linear", "percent"),
-                Scale("largest displacement without it [mean rest lengths]", "log", "power"),
+                AxisScale("cost [% of a step, with the 95 % interval]", "linear", "percent"),
+                AxisScale("largest displacement without it [mean rest lengths]", "log", "power"),
                 series,
-                bands=[Band(0.0, error, "")] if np.isfinite(error) else [],
-                lines=[Line(max(row["largest"], 1e-6), "") for row in known],
-                notes=[*below, *([OLDER] if other else [])],
-                machine=measured_on(table),
+                bands=[ShadedBand(0.0, error, "")] if np.isfinite(error) else [],
+                lines=[MarkedValue(max(row["largest"], 1e-6), "") for row in known],
+                notes=[*below, *([STALE_NOTE] if other else [])],
+                machine_words=describe_provenance(table),
             )
         )
-    return ready(plots)
+    return entries_from_panels(plots)
 
 
-def _effect(k: int, row: Row, whole: float, *, older: bool) -> Series:
-    x, low, high = (np.array([row[key] / whole]) for key in ("cost", "cost_low", "cost_high"))
+def _build_effect_series(k: int, row: ResultRow, full_run: float, *, is_stale: bool) -> CurveSeries:
+    x, low, high = (np.array([row[key] / full_run]) for key in ("cost", "cost_low", "cost_high"))
     y = np.array([max(row["largest"], 1e-6)])
-    return Series(row["name"], numbered(k), x, y, low, high, True, np.array([older]), joined=False, named=True)
+    return CurveSeries(
+        row["name"],
+        indexed_style(k),
+        x,
+        y,
+        low,
+        high,
+        True,
+        np.array([is_stale]),
+        is_connected=False,
+        labels_points=True,
+    )
 
 
-def prices(folder: Path) -> list[Entry]:
+def overhead_panels(folder: Path) -> list[PanelEntry]:
     """Build panels of the overhead per iteration.
 
     These are a map of all solvers, and intervals for each solver.
     """
-    found = _labelled([row for _, table in _ablations(folder, "price") for row in ablation.of_kind(table, "price")])
-    marked = looks((row["label"], row["solver"]) for row in found)
-    panels: list[Panel] = []
+    found = _label_rows(
+        [row for _, table in _read_ablations(folder, "price") for row in ablation.select_kind(table, "price")]
+    )
+    marked = assign_label_styles((row["label"], row["solver"]) for row in found)
+    panels: list[FigurePanel] = []
     for scene in dict.fromkeys((row["scene"], row["size"]) for row in found):
         here = [row for row in found if (row["scene"], row["size"]) == scene]
         of, subject = (scene[0], str(scene[1])), f"{scene[0]}, size {scene[1]}"
-        panels.append(_map(of, subject, here))
+        panels.append(_build_overhead_map(of, subject, here))
         for label in dict.fromkeys(row["label"] for row in here):
             mine = [row for row in here if row["label"] == label and row["status"] == "ok"]
-            panels += [_intervals(of, subject, marked[label], mine)] if mine else []
-    return ready(panels)
+            panels += [_build_interval_plot(of, subject, marked[label], mine)] if mine else []
+    return entries_from_panels(panels)
 
 
-def _labelled(rows: Sequence[Row]) -> list[Row]:
+def _label_rows(rows: Sequence[ResultRow]) -> list[ResultRow]:
     """Add a `label` to rows: the solver, with its parameters if they vary."""
     settings: dict[str, set[str]] = {row["solver"]: set() for row in rows}
     for row in rows:
@@ -126,53 +149,64 @@ def _labelled(rows: Sequence[Row]) -> list[Row]:
     return [{**row, "label": label} for row, label in zip(rows, labels, strict=True)]
 
 
-def _other(row: Row) -> bool:
-    return row["code"] not in (None, machine.code_hash())
+def _is_stale(row: ResultRow) -> bool:
+    return row["code"] not in (None, machine.hash_sources())
 
 
-def _map(of: tuple[str, ...], subject: str, here: Sequence[Row]) -> CellMap:
+def _build_overhead_map(group: tuple[str, ...], subject: str, here: Sequence[ResultRow]) -> CellMap:
     """Build the overhead map with effects in rows and solvers in columns.
 
     The most expensive effect comes first, and all effects together come last.
     """
     known = [row for row in here if row["status"] == "ok"]
     paid = {row["name"]: [r["price"] for r in known if r["name"] == row["name"]] for row in here}
-    order = sorted(paid, key=lambda name: (name == _ALL, -median(paid[name] or [0.0])))
-    cells = [_cell(row) for row in sorted(here, key=lambda row: order.index(row["name"]))]
+    order = sorted(paid, key=lambda name: (name == _ALL_EFFECTS, -median(paid[name] or [0.0])))
+    cells = [_build_cell(row) for row in sorted(here, key=lambda row: order.index(row["name"]))]
     refused = dict.fromkeys(row["status"] for row in here if row["status"] != "ok")
     classes = [
-        _NOTHING,
-        *((words, color) for _, words, color in _CLASSES),
-        *((words, _unpriced(words)) for words in refused),
+        _INDISTINGUISHABLE,
+        *((words, color) for _, words, color in _OVERHEAD_CLASSES),
+        *((words, _describe_missing_overhead(words)) for words in refused),
     ]
-    return CellMap(of, ("map",), subject, "", cells, classes, [_READ, *dotted(cells)], measured_on(here))
+    return CellMap(
+        group,
+        ("map",),
+        subject,
+        "",
+        cells,
+        classes,
+        [_OVERHEAD_NOTE, *describe_stale_cells(cells)],
+        describe_provenance(here),
+    )
 
 
-def _cell(row: Row) -> Cell:
+def _build_cell(row: ResultRow) -> MapCell:
     at = row["name"], row["label"]
     if row["status"] != "ok":
-        return Cell(*at, row["status"], _unpriced(row["status"]), "–", _other(row))
+        return MapCell(*at, row["status"], _describe_missing_overhead(row["status"]), "–", _is_stale(row))
     price = row["price"]
-    class_ = next((words, color) for most, words, color in _CLASSES if price <= most)
-    told = _NOTHING if row["price_low"] <= 1.0 <= row["price_high"] else class_
-    return Cell(*at, *told, f"{price:.2f}" if price < 9.995 else f"{price:.0f}", _other(row))
+    class_ = next((words, color) for most, words, color in _OVERHEAD_CLASSES if price <= most)
+    told = _INDISTINGUISHABLE if row["price_low"] <= 1.0 <= row["price_high"] else class_
+    return MapCell(*at, *told, f"{price:.2f}" if price < 9.995 else f"{price:.0f}", _is_stale(row))
 
 
-def _unpriced(status: str) -> str:
-    return _REFUSED if status == "unsupported" else _BROKEN
+def _describe_missing_overhead(status: str) -> str:
+    return _UNSUPPORTED_COLOUR if status == "unsupported" else _FAILED_COLOUR
 
 
-def _intervals(of: tuple[str, ...], subject: str, look: Mark, rows: Sequence[Row]) -> Plot:
+def _build_interval_plot(
+    group: tuple[str, ...], subject: str, style: SeriesStyle, rows: Sequence[ResultRow]
+) -> CurvePlot:
     """Build a plot of a solver's overheads with their intervals, the most expensive effect first."""
     mine, label = sorted(rows, key=lambda row: -row["price"]), rows[0]["label"]
-    older = np.array([_other(row) for row in mine])
+    older = np.array([_is_stale(row) for row in mine])
     x, low, high = (np.array([row[key] for row in mine], float) for key in ("price", "price_low", "price_high"))
     y, names = np.arange(len(mine), dtype=float), tuple(row["name"] for row in mine)
-    return Plot(
-        *(of, (label,), subject, label),
-        Scale("an iteration with the effect over one without", "log", "plain"),
-        Scale("", "names", names=names),
-        [Series(label, look, x, y, low, high, True, older, joined=False)],
-        notes=[OLDER] if older.any() else [],
-        machine=measured_on(mine),
+    return CurvePlot(
+        *(group, (label,), subject, label),
+        AxisScale("an iteration with the effect over one without", "log", "plain"),
+        AxisScale("", "names", place_names=names),
+        [CurveSeries(label, style, x, y, low, high, True, older, is_connected=False)],
+        notes=[STALE_NOTE] if older.any() else [],
+        machine_words=describe_provenance(mine),
     )

@@ -9,44 +9,44 @@ from pathlib import Path
 
 import numpy as np
 
-from harness.report.accuracy.engines import OURS, fronts, marks, met
-from harness.report.accuracy.measured import WorkPoint, by_self_converged, older
-from harness.report.accuracy.reading import read
-from harness.report.figures.entry import Entry, ready
-from harness.report.figures.panel import Plot, Scale, Series
-from harness.report.page import quantity
-from harness.report.style import OLDER, Mark
+from harness.report.accuracy.engines import OWN_PROGRAM, assign_program_styles, meshes_with_engines, pareto_fronts
+from harness.report.accuracy.measured import WorkPoint, describe_self_converged, is_stale
+from harness.report.accuracy.reading import read_accuracy
+from harness.report.figures.entry import PanelEntry, entries_from_panels
+from harness.report.figures.panel import AxisScale, CurvePlot, CurveSeries
+from harness.report.page import format_quantity
+from harness.report.style import STALE_NOTE, SeriesStyle
 
-_NOTE = (
+_FRONT_NOTE = (
     "Each line is what no other setting of the same program beats in both time and error; "
-    f"{OURS}: of all its methods that were tried. Errors are of positions, relative to the "
+    f"{OWN_PROGRAM}: of all its methods that were tried. Errors are of positions, relative to the "
     "way from the start; those of 100 % and more are left out."
 )
 
 
-def engines(folder: Path) -> list[Entry]:
+def engine_panels(folder: Path) -> list[PanelEntry]:
     """Build a panel for each mesh with runs of both engines and own methods."""
-    table = read(folder)
-    looks = marks(table.works)
-    plots: list[Plot] = []
-    for mesh, here in met(table.works).items():
+    table = read_accuracy(folder)
+    looks = assign_program_styles(table.work_points)
+    plots: list[CurvePlot] = []
+    for mesh, here in meshes_with_engines(table.work_points).items():
         one = here[0]
-        best = fronts(here)
-        hollow = [OLDER] if any(older(work) for front in best.values() for work in front) else []
+        best = pareto_fronts(here)
+        hollow = [STALE_NOTE] if any(is_stale(work) for front in best.values() for work in front) else []
         plots.append(
-            Plot(
-                *(("engines",), (one.scene, str(one.size)), "", f"{mesh}, {quantity(one.horizon)} s"),
-                Scale("wall time a simulated second", "log", "time"),
-                Scale("error at the end", "log", "percent"),
-                [_series(name, looks[name], front) for name, front in best.items() if front],
-                notes=[_NOTE, *by_self_converged(here), *hollow],
-                machine=", ".join(table.machine),
+            CurvePlot(
+                *(("engines",), (one.scene, str(one.size)), "", f"{mesh}, {format_quantity(one.t_end)} s"),
+                AxisScale("wall time a simulated second", "log", "time"),
+                AxisScale("error at the end", "log", "percent"),
+                [_build_series(name, looks[name], front) for name, front in best.items() if front],
+                notes=[_FRONT_NOTE, *describe_self_converged(here), *hollow],
+                machine_words=", ".join(table.machine_words),
             )
         )
-    return ready(plots)
+    return entries_from_panels(plots)
 
 
-def _series(name: str, look: Mark, front: list[WorkPoint]) -> Series:
-    x, y = np.array([work.seconds for work in front]), np.array([work.error for work in front])
-    setting = "; ".join(work.setting for work in front)
-    return Series(name, look, x, y, older=np.array([older(work) for work in front]), setting=setting)
+def _build_series(name: str, style: SeriesStyle, front: list[WorkPoint]) -> CurveSeries:
+    x, y = np.array([work.seconds_per_simulated_second for work in front]), np.array([work.error for work in front])
+    setting = "; ".join(work.setting_label for work in front)
+    return CurveSeries(name, style, x, y, stale=np.array([is_stale(work) for work in front]), setting=setting)

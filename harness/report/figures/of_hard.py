@@ -11,39 +11,47 @@ from pathlib import Path
 
 import numpy as np
 
-from harness.report.figures.entry import Entry, ready
-from harness.report.figures.of_runs import Older, sweep_rows
-from harness.report.figures.panel import Cell, CellMap, Panel, Plot, Scale, Series, dotted
-from harness.report.origin import NEEDED, measured_on
-from harness.report.robustness import OUTCOMES, RIGHT, Judged, read_cells, scores
-from harness.report.style import OLDER, Mark, marks
+from harness.report.figures.entry import PanelEntry, entries_from_panels
+from harness.report.figures.of_runs import StaleFinder, read_sweep_rows
+from harness.report.figures.panel import (
+    AxisScale,
+    CellMap,
+    CurvePlot,
+    CurveSeries,
+    FigurePanel,
+    MapCell,
+    describe_stale_cells,
+)
+from harness.report.origin import PROVENANCE_COLUMNS, describe_provenance
+from harness.report.robustness import CORRECT, RUN_OUTCOMES, VerifiedRun, read_verified_runs, score_solvers
+from harness.report.style import STALE_NOTE, SeriesStyle, assign_solver_styles
 
 
-def hard(folder: Path, older: Older) -> list[Entry]:
+def robustness_panels(folder: Path, find_stale: StaleFinder) -> list[PanelEntry]:
     """Build the panel of each solver's correct and finite shares, then one map per family.
 
     Args:
         folder: folder of a sweep's results.
         find_stale: returns the ids of stale runs in a table of rows.
     """
-    table = sweep_rows(folder)
-    cells, other = read_cells(folder), older(table)
-    told = measured_on(table.select(NEEDED).to_pylist())
-    panels: list[Panel] = [_shares(cells, other, told)]
+    table = read_sweep_rows(folder)
+    cells, other = read_verified_runs(folder), find_stale(table)
+    told = describe_provenance(table.build_query(PROVENANCE_COLUMNS).to_pylist())
+    panels: list[FigurePanel] = [_build_share_plot(cells, other, told)]
     for family in dict.fromkeys(cell.case.partition("-")[0] for cell in cells):
         mine = [cell for cell in cells if cell.case.partition("-")[0] == family]
-        drawn = [_cell(cell, older=cell.run_id in other) for cell in mine]
-        outcomes = [(outcome.words, outcome.color) for outcome in OUTCOMES]
-        panels.append(CellMap(("map",), (family,), "", family, drawn, outcomes, dotted(drawn), told))
-    return ready(panels)
+        drawn = [_build_cell(cell, is_stale=cell.run_id in other) for cell in mine]
+        outcomes = [(outcome.label, outcome.color) for outcome in RUN_OUTCOMES]
+        panels.append(CellMap(("map",), (family,), "", family, drawn, outcomes, describe_stale_cells(drawn), told))
+    return entries_from_panels(panels)
 
 
-def _cell(cell: Judged, *, older: bool) -> Cell:
+def _build_cell(cell: VerifiedRun, *, is_stale: bool) -> MapCell:
     row = cell.case.partition("-")[2] or cell.case
-    return Cell(row, cell.solver, cell.outcome.words, cell.outcome.color, cell.figure, older)
+    return MapCell(row, cell.solver, cell.outcome.label, cell.outcome.color, cell.error_text, is_stale)
 
 
-def together(grids: Sequence[CellMap]) -> CellMap:
+def merge_cell_maps(grids: Sequence[CellMap]) -> CellMap:
     """Merge the maps of several families into one.
 
     The names of its rows include the family.
@@ -52,25 +60,30 @@ def together(grids: Sequence[CellMap]) -> CellMap:
         return grids[0]
     cells = [cell._replace(row=f"{grid.title}: {cell.row}") for grid in grids for cell in grid.cells]
     names = tuple(grid.name[0] for grid in grids)
-    return replace(grids[0], name=names, title="", cells=cells, notes=dotted(cells))
+    return replace(grids[0], name=names, title="", cells=cells, notes=describe_stale_cells(cells))
 
 
-def _shares(cells: Sequence[Judged], other: Collection[str], told: str) -> Plot:
-    found = sorted(scores(cells), key=lambda score: -(score.right or 0.0))
-    looks = marks(score.worst.name for score in found)
+def _build_share_plot(cells: Sequence[VerifiedRun], other: Collection[str], machine_words: str) -> CurvePlot:
+    found = sorted(score_solvers(cells), key=lambda score: -(score.correct_share or 0.0))
+    looks = assign_solver_styles(score.worst_run.solver_name for score in found)
     mixed = {cell.solver for cell in cells if cell.run_id in other}
-    series: list[Series] = []
+    series: list[CurveSeries] = []
     for k, score in enumerate(found):
-        look, y, older = looks[score.worst.name], np.array([float(k)]), np.array([score.solver in mixed])
-        right, finite = (np.array([np.nan if s is None else s]) for s in (score.right, score.finite))
-        series.append(Series(score.solver, look, right, y, right, finite, True, older, joined=False, setting="right"))
-        ring = Mark(look.color, "|")
-        series.append(Series(score.solver, ring, finite, y, older=older, joined=False, setting="finite"))
-    notes = [f"Marks: runs that are {RIGHT.words}; lines reach to the share that stayed finite. Of runs not refused."]
-    return Plot(
+        look, y, older = looks[score.worst_run.solver_name], np.array([float(k)]), np.array([score.solver in mixed])
+        right, finite = (np.array([np.nan if s is None else s]) for s in (score.correct_share, score.finite_share))
+        series.append(
+            CurveSeries(score.solver, look, right, y, right, finite, True, older, is_connected=False, setting="right")
+        )
+        ring = SeriesStyle(look.color, "|")
+        series.append(CurveSeries(score.solver, ring, finite, y, stale=older, is_connected=False, setting="finite"))
+    notes = [f"Marks: runs that are {CORRECT.label}; lines reach to the share that stayed finite. Of runs not refused."]
+    return CurvePlot(
         *(("shares",), ("right",), f"{len({cell.case for cell in cells})} of them", ""),
-        *(Scale("share of the cases", "linear", "percent"), Scale("", "names", names=tuple(s.solver for s in found))),
+        *(
+            AxisScale("share of the cases", "linear", "percent"),
+            AxisScale("", "names", place_names=tuple(s.solver for s in found)),
+        ),
         series,
-        notes=[*notes, *([OLDER] if mixed else [])],
-        machine=told,
+        notes=[*notes, *([STALE_NOTE] if mixed else [])],
+        machine_words=machine_words,
     )

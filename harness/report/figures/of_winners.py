@@ -7,50 +7,59 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from harness.report.accuracy.measured import by_self_converged
-from harness.report.accuracy.reading import read
-from harness.report.accuracy.winners import NOBODY, cells, families
-from harness.report.figures.entry import Entry, ready
-from harness.report.figures.panel import Cell, CellMap
-from harness.report.page import count, quantity
+from harness.report.accuracy.measured import describe_self_converged
+from harness.report.accuracy.reading import read_accuracy
+from harness.report.accuracy.winners import NO_WINNER, assign_family_styles, build_winner_cells
+from harness.report.figures.entry import PanelEntry, entries_from_panels
+from harness.report.figures.panel import CellMap, MapCell
+from harness.report.page import format_count, format_quantity
 
-_NOTE = (
+_WINNER_NOTE = (
     "Columns: k dt²/m at dt = 1/30 s; rows: error of the positions at the end, relative to the way from the start. "
     "Figures: how many times as much processor time the next family takes; · where it reaches no such error."
 )
-_DOTTED = "Dot: measured by other code than the others."
-_NONE = "#e9e7e2"
+_STALE_NOTE = "Dot: measured by other code than the others."
+_NO_WINNER_COLOUR = "#e9e7e2"
 
 
-def winners(folder: Path) -> list[Entry]:
+def winner_panels(folder: Path) -> list[PanelEntry]:
     """Build a map for each number of vertices."""
-    table = read(folder)
-    found = cells(table.works)
-    looks = families(found)
-    colors = {name: look.color for name, look in looks.items()} | {NOBODY: _NONE}
-    dotted = any(work.code != table.newest for cell in found for work in cell.prices.values())
+    table = read_accuracy(folder)
+    found = build_winner_cells(table.work_points)
+    looks = assign_family_styles(found)
+    colors = {name: look.color for name, look in looks.items()} | {NO_WINNER: _NO_WINNER_COLOUR}
+    dotted = any(
+        work.source_fingerprint != table.newest_fingerprint
+        for cell in found
+        for work in cell.cheapest_by_family.values()
+    )
     panels: list[CellMap] = []
     for vertices in dict.fromkeys(cell.vertices for cell in found):
         mine = [cell for cell in found if cell.vertices == vertices]
         panels.append(
             CellMap(
-                *(("winners",), (str(vertices),), "", f"{count(vertices)} vertices"),
+                *(("winners",), (str(vertices),), "", f"{format_count(vertices)} vertices"),
                 [
-                    Cell(
-                        *(f"{cell.error:.0e}".replace("e-0", "e-"), f"{quantity(cell.number)}", cell.winner),
+                    MapCell(
+                        *(
+                            f"{cell.error:.0e}".replace("e-0", "e-"),
+                            f"{format_quantity(cell.stiffness_number)}",
+                            cell.winner,
+                        ),
                         colors[cell.winner],
-                        _ahead(cell.ahead) if cell.prices else "",
-                        bool(cell.prices) and cell.prices[cell.winner].code != table.newest,
+                        _format_lead(cell.lead_ratio) if cell.cheapest_by_family else "",
+                        bool(cell.cheapest_by_family)
+                        and cell.cheapest_by_family[cell.winner].source_fingerprint != table.newest_fingerprint,
                     )
                     for cell in mine
                 ],
                 list(colors.items()),
-                notes=[_NOTE, *by_self_converged(table.works), *([_DOTTED] if dotted else [])],
-                machine=", ".join(table.machine),
+                notes=[_WINNER_NOTE, *describe_self_converged(table.work_points), *([_STALE_NOTE] if dotted else [])],
+                machine_words=", ".join(table.machine_words),
             )
         )
-    return ready(panels)
+    return entries_from_panels(panels)
 
 
-def _ahead(times: float) -> str:
+def _format_lead(times: float) -> str:
     return "·" if times == float("inf") else f"{times:.1f}" if times < 9.95 else f"{times:.0f}"

@@ -12,13 +12,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.report.style import Mark
+from harness.report.style import SeriesStyle
 
-Values = NDArray[np.float64]
-Row = dict[str, str | float | int | bool]
+FloatArray = NDArray[np.float64]
+CsvRow = dict[str, str | float | int | bool]
 
 
-class Scale(NamedTuple):
+class AxisScale(NamedTuple):
     """An axis.
 
     Attributes:
@@ -28,14 +28,14 @@ class Scale(NamedTuple):
         place_names: names of the positions 0, 1, ... if `division` is `names`.
     """
 
-    words: str
-    kind: Literal["log", "sizes", "linear", "iterations", "names"] = "log"
-    unit: Literal["power", "time", "plain", "percent", "strain"] = "plain"
-    names: tuple[str, ...] = ()
+    label: str
+    division: Literal["log", "sizes", "linear", "iterations", "names"] = "log"
+    tick_format: Literal["power", "time", "plain", "percent", "strain"] = "plain"
+    place_names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Series:
+class CurveSeries:
     """One curve: ordered points x, y (k,); nan is a gap.
 
     Attributes:
@@ -49,37 +49,37 @@ class Series:
     """
 
     label: str
-    look: Mark
-    x: Values
-    y: Values
-    low: Values | None = None
-    high: Values | None = None
-    across: bool = False
-    older: NDArray[np.bool_] | None = None
-    steps: bool = False
-    joined: bool = True
-    named: bool = False
+    style: SeriesStyle
+    x: FloatArray
+    y: FloatArray
+    lower: FloatArray | None = None
+    upper: FloatArray | None = None
+    is_horizontal: bool = False
+    stale: NDArray[np.bool_] | None = None
+    is_stepped: bool = False
+    is_connected: bool = True
+    labels_points: bool = False
     setting: str = ""
-    grown: float = 1.0
+    marker_scale: float = 1.0
 
 
-class Band(NamedTuple):
+class ShadedBand(NamedTuple):
     """A shaded range of y, and its meaning."""
 
     low: float
     high: float
-    words: str
+    label: str
 
 
-class Line(NamedTuple):
+class MarkedValue(NamedTuple):
     """A value of y that a line marks, and its meaning."""
 
     y: float
-    words: str
+    label: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plot:
+class CurvePlot:
     """Curves in one frame.
 
     Attributes:
@@ -90,26 +90,26 @@ class Plot:
         machine_words: provenance of the data.
     """
 
-    of: tuple[str, ...]
+    group: tuple[str, ...]
     name: tuple[str, ...]
     subject: str
     title: str
-    x: Scale
-    y: Scale
-    series: Sequence[Series]
-    bands: Sequence[Band] = ()
-    lines: Sequence[Line] = ()
+    x: AxisScale
+    y: AxisScale
+    series: Sequence[CurveSeries]
+    bands: Sequence[ShadedBand] = ()
+    lines: Sequence[MarkedValue] = ()
     notes: Sequence[str] = ()
-    machine: str = ""
+    machine_words: str = ""
     aspect: float = 0.72
     """Height / width of the frame."""
 
-    def rows(self) -> list[Row]:
+    def csv_rows(self) -> list[CsvRow]:
         """Return the data as rows of a CSV file, all with the same keys."""
-        return [row for series in self.series for row in _points(":".join((*self.of, *self.name)), series)]
+        return [row for series in self.series for row in _series_rows(":".join((*self.group, *self.name)), series)]
 
 
-class Cell(NamedTuple):
+class MapCell(NamedTuple):
     """One cell of a map: row, column, outcome, colour and value.
 
     `is_stale` states whether other code measured it.
@@ -119,15 +119,15 @@ class Cell(NamedTuple):
     column: str
     outcome: str
     color: str
-    figure: str
-    older: bool = False
+    value_text: str
+    is_stale: bool = False
 
 
-def dotted(cells: Sequence[Cell]) -> list[str]:
+def describe_stale_cells(cells: Sequence[MapCell]) -> list[str]:
     """Describe the dots in cells; there are no dots if other code measured all cells."""
-    if cells and all(cell.older for cell in cells):
+    if cells and all(cell.is_stale for cell in cells):
         return ["Measured by other code than today's."]
-    return ["Dot: measured by other code than today's."] if any(cell.older for cell in cells) else []
+    return ["Dot: measured by other code than today's."] if any(cell.is_stale for cell in cells) else []
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,22 +137,22 @@ class CellMap:
     `outcomes` are pairs of meaning and colour, in the order of the legend.
     """
 
-    of: tuple[str, ...]
+    group: tuple[str, ...]
     name: tuple[str, ...]
     subject: str
     title: str
-    cells: Sequence[Cell]
+    cells: Sequence[MapCell]
     outcomes: Sequence[tuple[str, str]]
     notes: Sequence[str] = ()
-    machine: str = ""
+    machine_words: str = ""
 
-    def rows(self) -> list[Row]:
+    def csv_rows(self) -> list[CsvRow]:
         """Return the data as rows of a CSV file."""
-        return [{"panel": ":".join((*self.of, *self.name)), **cell._asdict()} for cell in self.cells]
+        return [{"panel": ":".join((*self.group, *self.name)), **cell._asdict()} for cell in self.cells]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Picture:
+class MeshPicture:
     """A rendered mesh.
 
     Attributes:
@@ -165,31 +165,31 @@ class Picture:
         render: returns the pixels, given width [pixels] and background.
     """
 
-    of: tuple[str, ...]
+    group: tuple[str, ...]
     name: tuple[str, ...]
     subject: str
     title: str
-    p: Values
+    p: FloatArray
     springs: NDArray[np.int64]
     triangles: NDArray[np.int64]
-    strain: Values
-    limit: float
+    strain: FloatArray
+    strain_limit: float
     aspect: float
-    render: Renderer
+    render: MeshRenderer
     facts: Sequence[str] = ()
-    look: Mark | None = None
+    style: SeriesStyle | None = None
     notes: Sequence[str] = ()
-    machine: str = ""
+    machine_words: str = ""
     mesh: str = field(default="")
 
-    def rows(self) -> list[Row]:
+    def csv_rows(self) -> list[CsvRow]:
         """Return the vertices as rows of a CSV file."""
-        panel = ":".join((*self.of, *self.name))
+        panel = ":".join((*self.group, *self.name))
         table = zip(*self.p.T.tolist(), self.strain.tolist(), strict=True)
         return [{"panel": panel, "x": x, "y": y, "z": z, "strain": e} for x, y, z, e in table]
 
 
-class Renderer:
+class MeshRenderer:
     """Draws a picture at a width [pixels] on a background colour, or transparently for None."""
 
     def __call__(self, width: int, background: str | None) -> NDArray[np.uint8]:
@@ -197,13 +197,13 @@ class Renderer:
         raise NotImplementedError
 
 
-Panel = Plot | CellMap | Picture
+FigurePanel = CurvePlot | CellMap | MeshPicture
 
 
-def _points(panel: str, series: Series) -> list[Row]:
+def _series_rows(panel: str, series: CurveSeries) -> list[CsvRow]:
     nothing = np.full(len(series.x), np.nan)
-    low, high = (nothing if end is None else end for end in (series.low, series.high))
-    older = np.zeros(len(series.x), bool) if series.older is None else series.older
+    low, high = (nothing if end is None else end for end in (series.lower, series.upper))
+    older = np.zeros(len(series.x), bool) if series.stale is None else series.stale
     table = zip(series.x, series.y, low, high, older, strict=True)
     return [
         {

@@ -3,7 +3,7 @@
 These are a common head, and the code for curves, cells and meshes.
 """
 
-HEAD = '''"""Draws {name} again from {name}.csv, for you to change; needs Python with matplotlib alone."""
+SCRIPT_HEADER = '''"""Draws {name} again from {name}.csv, for you to change; needs Python with matplotlib alone."""
 
 import csv
 from pathlib import Path
@@ -24,7 +24,7 @@ plt.rcParams.update({{"axes.titlesize": {small}, "axes.labelsize": {small}, "leg
 plt.rcParams.update({{"pdf.fonttype": 42, "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.5}})
 '''
 
-PLOT = """
+CURVE_TEMPLATE = """
 # Colour, marker and line style of each curve.
 LOOKS = {looks}
 PANELS = {panels}
@@ -61,7 +61,7 @@ figure.legend(handles, labels, loc="outside lower left", ncols=3, frameon=False)
 figure.savefig(HERE / "{name}-again.pdf")
 """
 
-GRID = """
+CELL_MAP_TEMPLATE = """
 OUTCOMES = {outcomes}
 
 data = rows("{name}.csv")
@@ -85,7 +85,7 @@ figure.legend(handles=patches, loc="outside lower left", ncols=3, frameon=False)
 figure.savefig(HERE / "{name}-again.pdf")
 """
 
-PICTURE = """
+MESH_TEMPLATE = """
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection  # noqa: E402
 
 TITLES = {titles}

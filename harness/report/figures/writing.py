@@ -16,15 +16,17 @@ from typing import Any
 import matplotlib
 from matplotlib.figure import Figure
 
-from harness.base.files import replacing
+from harness.base.files import atomic_write
 from harness.report.figures import scripts
-from harness.report.figures.asked import Asked
-from harness.report.figures.canvas import INCH, RC
-from harness.report.figures.drawing import DOTS
-from harness.report.figures.panel import CellMap, Panel, Picture, Plot, Row
+from harness.report.figures.asked import FigureOptions
+from harness.report.figures.canvas import FIGURE_RC, MILLIMETRES_PER_INCH
+from harness.report.figures.drawing import RASTER_DPI
+from harness.report.figures.panel import CellMap, CsvRow, CurvePlot, FigurePanel, MeshPicture
 
 
-def write(figure: Figure, panels: Sequence[Panel], stem: Path, title: str, asked: Asked) -> list[Path]:
+def write_figure(
+    figure: Figure, panels: Sequence[FigurePanel], stem: Path, title: str, options: FigureOptions
+) -> list[Path]:
     """Write a figure, its data as CSV and its script, and return the files.
 
     Args:
@@ -37,25 +39,27 @@ def write(figure: Figure, panels: Sequence[Panel], stem: Path, title: str, asked
         CannotWrite: if a file cannot be written.
     """
     stem.parent.mkdir(parents=True, exist_ok=True)
-    about = "; ".join(dict.fromkeys(words for panel in panels for words in (panel.subject, panel.machine) if words))
+    about = "; ".join(
+        dict.fromkeys(words for panel in panels for words in (panel.subject, panel.machine_words) if words)
+    )
     paths: list[Path] = []
-    for kind in asked.formats:
+    for kind in options.formats:
         paths.append(stem.with_name(f"{stem.name}.{kind}"))
-        with matplotlib.rc_context(RC), replacing(paths[-1]) as partial:
-            figure.savefig(partial, format=kind, dpi=DOTS, metadata=_metadata(kind, title, about))
+        with matplotlib.rc_context(FIGURE_RC), atomic_write(paths[-1]) as partial:
+            figure.savefig(partial, format=kind, dpi=RASTER_DPI, metadata=_build_metadata(kind, title, about))
     paths.append(stem.with_name(f"{stem.name}.csv"))
-    _table(paths[-1], [row for panel in panels for row in panel.rows()], [title, about])
-    if isinstance(panels[0], Picture):
+    _write_csv(paths[-1], [row for panel in panels for row in panel.csv_rows()], [title, about])
+    if isinstance(panels[0], MeshPicture):
         paths.append(stem.with_name(f"{stem.name}-mesh.csv"))
-        meshes = [panel for panel in panels if isinstance(panel, Picture)]
-        _table(paths[-1], [row for panel in meshes for row in _mesh(panel)], [title, about])
+        meshes = [panel for panel in panels if isinstance(panel, MeshPicture)]
+        _write_csv(paths[-1], [row for panel in meshes for row in _mesh_rows(panel)], [title, about])
     paths.append(stem.with_name(f"{stem.name}.py"))
-    with replacing(paths[-1]) as partial:
-        partial.write_text(script(figure, panels, stem.name, asked), encoding="utf-8")
+    with atomic_write(paths[-1]) as partial:
+        partial.write_text(build_script(figure, panels, stem.name, options), encoding="utf-8")
     return paths
 
 
-def _metadata(kind: str, title: str, about: str) -> dict[str, Any]:
+def _build_metadata(kind: str, title: str, about: str) -> dict[str, Any]:
     """Build the metadata of a file, without a date.
 
     Equal data thus gives equal files.
@@ -67,9 +71,9 @@ def _metadata(kind: str, title: str, about: str) -> dict[str, Any]:
     return {"Title": title, "Description": about, "Software": "springbench"}
 
 
-def _table(path: Path, rows: Sequence[Row], about: Sequence[str]) -> None:
+def _write_csv(path: Path, rows: Sequence[CsvRow], about: Sequence[str]) -> None:
     """Write rows as CSV, below comments that describe them."""
-    with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+    with atomic_write(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         for words in filter(None, about):
             file.write("# " + " ".join(words.split()) + "\n")
         table = csv.DictWriter(file, rows[0].keys() if rows else ("panel",), lineterminator="\n")
@@ -77,57 +81,59 @@ def _table(path: Path, rows: Sequence[Row], about: Sequence[str]) -> None:
         table.writerows(rows)
 
 
-def _mesh(panel: Picture) -> list[Row]:
-    name = ":".join((*panel.of, *panel.name))
+def _mesh_rows(panel: MeshPicture) -> list[CsvRow]:
+    name = ":".join((*panel.group, *panel.name))
     if len(panel.triangles):
         return [{"panel": name, "a": a, "b": b, "c": c} for a, b, c in panel.triangles.tolist()]
     return [{"panel": name, "a": a, "b": b} for a, b in panel.springs.tolist()]
 
 
-def script(figure: Figure, panels: Sequence[Panel], name: str, asked: Asked) -> str:
+def build_script(figure: Figure, panels: Sequence[FigurePanel], name: str, options: FigureOptions) -> str:
     """Build a script that needs only Matplotlib and the CSV file next to it."""
     kind = type(panels[0])
-    said = {"name": name, "width": asked.width, "size": asked.size, "small": asked.small}
+    said = {"name": name, "width": options.width_mm, "size": options.font_size, "small": options.small_font_size}
     inches = tuple(round(float(side), 3) for side in figure.get_size_inches())
     places = [spec for ax in figure.axes[: len(panels)] if (spec := ax.get_subplotspec())]
     columns = max(spec.get_topmost_subplotspec().colspan.stop for spec in places)
     shared: dict[str, Any] = said | {"inches": inches, "columns": columns, "rows": -(-len(panels) // columns)}
-    head = scripts.HEAD.format(**shared)
-    if kind is Plot:
-        plots = [panel for panel in panels if isinstance(panel, Plot)]
-        looks = {s.label: (s.look.color, s.look.marker, s.look.dash) for panel in plots for s in panel.series}
-        return head + scripts.PLOT.format(looks=_told(looks), panels=_told(dict(map(_stated, plots))), **shared)
+    head = scripts.SCRIPT_HEADER.format(**shared)
+    if kind is CurvePlot:
+        plots = [panel for panel in panels if isinstance(panel, CurvePlot)]
+        looks = {s.label: (s.style.color, s.style.marker, s.style.dash) for panel in plots for s in panel.series}
+        return head + scripts.CURVE_TEMPLATE.format(
+            looks=_format_literal(looks), panels=_format_literal(dict(map(_describe_panel, plots))), **shared
+        )
     if kind is CellMap:
         grids = [panel for panel in panels if isinstance(panel, CellMap)]
         outcomes = dict(grids[0].outcomes)
-        return head + scripts.GRID.format(outcomes=_told(outcomes), **shared)
-    pictures = [panel for panel in panels if isinstance(panel, Picture)]
-    titles = {":".join((*panel.of, *panel.name)): panel.title for panel in pictures}
-    return head + scripts.PICTURE.format(titles=_told(titles), limit=pictures[0].limit, **shared)
+        return head + scripts.CELL_MAP_TEMPLATE.format(outcomes=_format_literal(outcomes), **shared)
+    pictures = [panel for panel in panels if isinstance(panel, MeshPicture)]
+    titles = {":".join((*panel.group, *panel.name)): panel.title for panel in pictures}
+    return head + scripts.MESH_TEMPLATE.format(titles=_format_literal(titles), limit=pictures[0].strain_limit, **shared)
 
 
-def _stated(panel: Plot) -> tuple[str, dict[str, Any]]:
+def _describe_panel(panel: CurvePlot) -> tuple[str, dict[str, Any]]:
     """Describe the properties of a panel that a script needs, except its points."""
     axes = {
-        key: {"words": scale.words, "scale": _SCALES[scale.kind], "names": list(scale.names)}
+        key: {"words": scale.label, "scale": _MATPLOTLIB_SCALES[scale.division], "names": list(scale.place_names)}
         for key, scale in (("x", panel.x), ("y", panel.y))
     }
     first = panel.series[0] if panel.series else None
-    how = {"steps": bool(first and first.steps), "joined": bool(first is None or first.joined)}
-    lines = [(line.y, line.words) for line in panel.lines]
+    how = {"steps": bool(first and first.is_stepped), "joined": bool(first is None or first.is_connected)}
+    lines = [(line.y, line.label) for line in panel.lines]
     whole = " ".join(filter(None, (panel.subject, panel.title)))
-    across = bool(first and first.across)
-    return ":".join((*panel.of, *panel.name)), {"title": whole, **axes, **how, "across": across, "lines": lines}
+    across = bool(first and first.is_horizontal)
+    return ":".join((*panel.group, *panel.name)), {"title": whole, **axes, **how, "across": across, "lines": lines}
 
 
-_SCALES = {"log": "log", "sizes": "log", "linear": "linear", "iterations": "symlog", "names": "linear"}
+_MATPLOTLIB_SCALES = {"log": "log", "sizes": "log", "linear": "linear", "iterations": "symlog", "names": "linear"}
 
 
-def _told(what: object) -> str:
+def _format_literal(what: object) -> str:
     return pformat(what, width=110, sort_dicts=False)
 
 
-def millimetres(figure: Figure) -> tuple[float, float]:
+def figure_size_mm(figure: Figure) -> tuple[float, float]:
     """Return width and height [mm]."""
     across, up = figure.get_size_inches()
-    return float(across) * INCH, float(up) * INCH
+    return float(across) * MILLIMETRES_PER_INCH, float(up) * MILLIMETRES_PER_INCH

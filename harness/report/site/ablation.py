@@ -5,58 +5,63 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from harness.report.ablation import Row, of_kind, sentences
-from harness.report.site.marks import LOG, axis, drawn
-from harness.report.site.runs import references
-from harness.report.site.script import number
-from harness.report.style import looks
+from harness.report.ablation import ResultRow, select_kind, summarise_ablation
+from harness.report.site.marks import LOG_AXIS, axis_choice, plotly_style
+from harness.report.site.runs import format_references
+from harness.report.site.script import round_number
+from harness.report.style import assign_label_styles
 
-_PERCENT = {"ticksuffix": " %", "zeroline": True}
-_COMMANDS = {
+_PERCENT_AXIS = {"ticksuffix": " %", "zeroline": True}
+_CHART_COMMANDS = {
     "ablation": "springbench ablate CONFIG --again",
     "prices": "springbench ablate CONFIG --all-solvers --again",
 }
-_NAMES = {"type": "category", "autorange": "reversed"}
+_NAME_AXIS = {"type": "category", "autorange": "reversed"}
 
 
-def charts(rows: Sequence[Row]) -> tuple[dict[str, dict[str, Any]], list[str]]:
+def build_ablation_charts(rows: Sequence[ResultRow]) -> tuple[dict[str, dict[str, Any]], list[str]]:
     """Build the charts by their ids, and the verdicts in sentences.
 
     The rows may belong to several scenes.
     """
-    made = {"ablation": _effects(rows), "prices": _prices(rows)}
-    by_whole = [_of(whole, rows) for whole in of_kind(rows, "whole") if whole["status"] == "ok"]
-    words = [f"{some[0]['scene']}: {said}" for some in by_whole for said in sentences(some)]
-    return {name: chart | {"command": _COMMANDS[name]} for name, chart in made.items() if chart["items"]}, words
+    made = {"ablation": _build_effect_chart(rows), "prices": _build_overhead_chart(rows)}
+    by_whole = [_select_unit_rows(whole, rows) for whole in select_kind(rows, "whole") if whole["status"] == "ok"]
+    words = [f"{some[0]['scene']}: {said}" for some in by_whole for said in summarise_ablation(some)]
+    return {name: chart | {"command": _CHART_COMMANDS[name]} for name, chart in made.items() if chart["items"]}, words
 
 
-def _of(whole: Row, rows: Sequence[Row]) -> list[Row]:
+def _select_unit_rows(full_run: ResultRow, rows: Sequence[ResultRow]) -> list[ResultRow]:
     """Select the rows that belong to one full run: those of its unit."""
-    return [whole, *(row for row in rows if row is not whole and row["file"] == whole["file"])]
+    return [full_run, *(row for row in rows if row is not full_run and row["file"] == full_run["file"])]
 
 
-def _effects(rows: Sequence[Row]) -> dict[str, Any]:
-    items = [_item(_of(whole, rows)) for whole in of_kind(rows, "whole") if whole["status"] == "ok"]
+def _build_effect_chart(rows: Sequence[ResultRow]) -> dict[str, Any]:
+    items = [
+        _build_item(_select_unit_rows(whole, rows)) for whole in select_kind(rows, "whole") if whole["status"] == "ok"
+    ]
     return {
         "title": "What each effect costs and changes",
         "note": "CPU time of a step that goes where the effect is left out, with its 95 % interval, and how far that "
         "moves some vertex. An effect is called for where it moves more than the scene is wrong by anyway.",
         "filters": ["scene"],
         "shape": "points",
-        "x": [axis("share", "percent of a step", _PERCENT), axis("largest", "mean rest lengths moved")],
-        "y": [axis("effect", "", _NAMES)],
+        "x": [
+            axis_choice("share", "percent of a step", _PERCENT_AXIS),
+            axis_choice("largest", "mean rest lengths moved"),
+        ],
+        "y": [axis_choice("effect", "", _NAME_AXIS)],
         "hover": [["effect", "without"], ["share", "percent of a step"], ["largest", "mean rest lengths moved"]],
         "items": [item for item in items if item["effect"]],
-        "marks": _marks(rows),
-        "references": _references(rows),
+        "marks": _build_styles(rows),
+        "references": _build_references(rows),
     }
 
 
-def _item(some: Sequence[Row]) -> dict[str, Any]:
-    whole, without = some[0], [row for row in of_kind(some, "without") if row["status"] == "ok"]
+def _build_item(some: Sequence[ResultRow]) -> dict[str, Any]:
+    whole, without = some[0], [row for row in select_kind(some, "without") if row["status"] == "ok"]
     size = f" {whole['size']}" if whole["size"] else ""
     shares = {
-        name: [number(100 * row[column] / whole["seconds"]) for row in without]
+        name: [round_number(100 * row[column] / whole["seconds"]) for row in without]
         for name, column in (("share", "cost"), ("share_low", "cost_low"), ("share_high", "cost_high"))
     }
     return {
@@ -66,14 +71,14 @@ def _item(some: Sequence[Row]) -> dict[str, Any]:
         "panel": f"{whole['scene']}{size}",
         "parameters": whole["parameters"],
         "effect": [row["name"] for row in without],
-        "largest": [number(row["largest"] or None) for row in without],
+        "largest": [round_number(row["largest"] or None) for row in without],
         **shares,
     }
 
 
-def _prices(rows: Sequence[Row]) -> dict[str, Any]:
-    priced: dict[tuple[str, str], list[Row]] = {}
-    for row in of_kind(rows, "price"):
+def _build_overhead_chart(rows: Sequence[ResultRow]) -> dict[str, Any]:
+    priced: dict[tuple[str, str], list[ResultRow]] = {}
+    for row in select_kind(rows, "price"):
         if row["status"] == "ok":
             priced.setdefault((row["scene"], row["solver"]), []).append(row)
     items = [
@@ -84,10 +89,10 @@ def _prices(rows: Sequence[Row]) -> dict[str, Any]:
             "panel": scene,
             "parameters": some[0]["parameters"],
             "effect": [row["name"] for row in some],
-            "price": [number(row["price"]) for row in some],
-            "price_low": [number(row["price_low"]) for row in some],
-            "price_high": [number(row["price_high"]) for row in some],
-            "bound": [number(row["price_bound"]) for row in some],
+            "price": [round_number(row["price"]) for row in some],
+            "price_low": [round_number(row["price_low"]) for row in some],
+            "price_high": [round_number(row["price_high"]) for row in some],
+            "bound": [round_number(row["price_bound"]) for row in some],
         }
         for (scene, solver), some in priced.items()
     ]
@@ -96,18 +101,21 @@ def _prices(rows: Sequence[Row]) -> dict[str, Any]:
         "note": "CPU time of an iteration with the effect over one without, with its 95 % interval.",
         "filters": ["scene"],
         "shape": "points",
-        "x": [axis("price", "times as long", LOG)],
-        "y": [axis("effect", "", _NAMES)],
+        "x": [axis_choice("price", "times as long", LOG_AXIS)],
+        "y": [axis_choice("effect", "", _NAME_AXIS)],
         "hover": [["effect", "effect"], ["price", "times as long"], ["bound", "least that reading its numbers allows"]],
         "items": items,
-        "marks": _marks(rows),
-        "references": _references(rows),
+        "marks": _build_styles(rows),
+        "references": _build_references(rows),
     }
 
 
-def _marks(rows: Sequence[Row]) -> dict[str, Any]:
-    return {label: drawn(mark) for label, mark in looks((row["solver"], row["solver"]) for row in rows).items()}
+def _build_styles(rows: Sequence[ResultRow]) -> dict[str, Any]:
+    return {
+        label: plotly_style(mark)
+        for label, mark in assign_label_styles((row["solver"], row["solver"]) for row in rows).items()
+    }
 
 
-def _references(rows: Sequence[Row]) -> dict[str, Any]:
-    return references((row["solver"], row["reference"]) for row in rows)
+def _build_references(rows: Sequence[ResultRow]) -> dict[str, Any]:
+    return format_references((row["solver"], row["reference"]) for row in rows)

@@ -13,93 +13,116 @@ from typing import Any
 
 import numpy as np
 
-from harness.report.accuracy.convergence import GUESSES
-from harness.report.accuracy.growth import TARGET, growths
+from harness.report.accuracy.convergence import INITIAL_GUESS_LABELS
+from harness.report.accuracy.growth import GAP_TARGET, fit_scalings
 from harness.report.accuracy.measured import (
-    Curve,
-    Measurements,
+    AccuracyData,
+    ConvergenceCurve,
     WorkPoint,
-    by_other_code,
-    by_self_converged,
-    stop_words,
-    without_short,
+    describe_self_converged,
+    describe_stale_results,
+    format_stop_rule,
+    without_short_curves,
 )
-from harness.report.accuracy.pictures import nearest, place
-from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not_shown, share
-from harness.report.accuracy.times import STEPS, TARGETS, power, reach, seconds_to
-from harness.report.page import step_words
+from harness.report.accuracy.pictures import find_closest_solve, snapshot_picture_path
+from harness.report.accuracy.profiles import (
+    cumulative_share,
+    data_profile_ratios,
+    describe_omitted_solvers,
+    performance_ratios,
+)
+from harness.report.accuracy.times import (
+    AMORTISATION_STEPS,
+    GAP_TARGETS,
+    amortised_seconds,
+    find_time_to_accuracy,
+    format_gap,
+)
+from harness.report.page import format_time_step
 from harness.report.site import engines, paper, winners
-from harness.report.site.marks import axis, drawn
-from harness.report.site.runs import references
-from harness.report.site.script import numbers as _numbers
-from harness.report.style import looks
+from harness.report.site.marks import axis_choice, plotly_style
+from harness.report.site.runs import format_references
+from harness.report.site.script import round_numbers as _numbers
+from harness.report.style import assign_label_styles
 
-Item = dict[str, Any]
+ChartItem = dict[str, Any]
 
-_COMMAND = "springbench accuracy CONFIG --again"
-_SHARES = {"range": [-0.02, 1.05], "tickformat": ".0%"}
+_ACCURACY_COMMAND = "springbench accuracy CONFIG --again"
+_SHARE_AXIS = {"range": [-0.02, 1.05], "tickformat": ".0%"}
 
 
-def charts(everything: Measurements, folder: Path) -> dict[str, Item]:
+def build_accuracy_charts(all_data: AccuracyData, folder: Path) -> dict[str, ChartItem]:
     """Build the charts with data in the rows, by their ids.
 
     Args:
         all_data: data of an accuracy measurement.
         folder: folder of the sweep's results.
     """
-    table = without_short(everything)
-    pictures: dict[str, Item] = {}
+    table = without_short_curves(all_data)
+    pictures: dict[str, ChartItem] = {}
     for problem in table.problems:
-        path, best = place(problem, Path("report/meshes")), nearest(table, problem, folder)
+        path, best = snapshot_picture_path(problem, Path("report/meshes")), find_closest_solve(table, problem, folder)
         if best and (folder / path).is_file():
-            pictures[problem.digest] = {"path": path.as_posix(), "of": best.label, "recording": best.recording}
+            pictures[problem.problem_digest] = {
+                "path": path.as_posix(),
+                "of": best.label,
+                "recording": best.recording_path,
+            }
     made = {
-        "convergence": _convergence(table, pictures, folder),
-        "times": _times(table, pictures),
-        "work": _work(table),
-        "profiles": _profiles(table),
-        "growth": _growth(table),
+        "convergence": _build_convergence_chart(table, pictures, folder),
+        "times": _build_time_chart(table, pictures),
+        "work": _build_work_precision_chart(table),
+        "profiles": _build_profile_chart(table),
+        "growth": _build_scaling_chart(table),
     }
-    everyone = (*table.curves, *table.works)
-    marks = {label: drawn(mark) for label, mark in looks((each.label, each.solver) for each in everyone).items()}
-    shared = {"marks": marks, "references": references((each.label, each.reference) for each in everyone)}
+    everyone = (*table.curves, *table.work_points)
+    marks = {
+        label: plotly_style(mark)
+        for label, mark in assign_label_styles((each.label, each.solver) for each in everyone).items()
+    }
+    shared = {"marks": marks, "references": format_references((each.label, each.citation) for each in everyone)}
     made = {name: chart | shared for name, chart in made.items()}
-    made |= {"winners": winners.chart(table), "engines": engines.chart(table), "liu2013": paper.chart(everything)}
-    return {name: chart | {"command": _COMMAND} for name, chart in made.items() if chart["items"]}
+    made |= {
+        "winners": winners.build_winner_chart(table),
+        "engines": engines.build_engine_chart(table),
+        "liu2013": paper.build_liu2013_chart(all_data),
+    }
+    return {name: chart | {"command": _ACCURACY_COMMAND} for name, chart in made.items() if chart["items"]}
 
 
-def _run(table: Measurements, curve: Curve, pictures: Mapping[str, Item]) -> Item:
+def _build_curve_item(table: AccuracyData, curve: ConvergenceCurve, pictures: Mapping[str, ChartItem]) -> ChartItem:
     """Build the fields that all items of a curve share."""
     return {
         "label": curve.label,
-        "what": f"{curve.problem.name}, {GUESSES.get(curve.first_guess, curve.first_guess)}",
-        "problem": curve.problem.name + (" (reference not certified)" if curve.problem.doubt else ""),
+        "what": f"{curve.problem.problem_label}, {INITIAL_GUESS_LABELS.get(curve.initial_guess, curve.initial_guess)}",
+        "problem": curve.problem.problem_label
+        + (" (reference not certified)" if curve.problem.uncertified_reason else ""),
         "parameters": curve.parameters,
-        "panel": GUESSES.get(curve.first_guess, curve.first_guess),
-        "picture": pictures.get(curve.problem.digest),
-        "recording": curve.recording,
-        "older": curve.code != table.newest,
+        "panel": INITIAL_GUESS_LABELS.get(curve.initial_guess, curve.initial_guess),
+        "picture": pictures.get(curve.problem.problem_digest),
+        "recording": curve.recording_path,
+        "older": curve.source_fingerprint != table.newest_fingerprint,
     }
 
 
-def _convergence(table: Measurements, pictures: Mapping[str, Item], folder: Path) -> Item:
-    items: list[Item] = []
+def _build_convergence_chart(table: AccuracyData, pictures: Mapping[str, ChartItem], folder: Path) -> ChartItem:
+    items: list[ChartItem] = []
     for curve in table.curves:
-        run = _run(table, curve, pictures)
+        run = _build_curve_item(table, curve, pictures)
         if run["recording"] and not (folder / run["recording"]).is_file():
             run["recording"] = ""
         columns = {
             "iteration": curve.iterations,
             "seconds": np.median(curve.seconds, axis=0),
             "gap": np.where(curve.gap > 0, curve.gap, np.nan),
-            "largest": curve.largest,
-            "metres": curve.largest * curve.problem.mean_rest_length,
+            "largest": curve.max_vertex_error,
+            "metres": curve.max_vertex_error * curve.problem.mean_rest_length,
             "stationarity": curve.stationarity,
         }
-        branch = "none" if curve.branch is None else str(curve.branch)
+        branch = "none" if curve.minimum_index is None else str(curve.minimum_index)
         numbers = {name: _numbers(values) for name, values in columns.items()}
         items.append(
-            {**run, **numbers, "minimum": branch, "status": curve.status, "round_off": curve.problem.round_off}
+            {**run, **numbers, "minimum": branch, "status": curve.status, "round_off": curve.problem.roundoff_gap}
         )
     hover = [["iteration", "iteration"], ["gap", "gap"], ["largest", "largest error, rest lengths"]]
     hover += [["metres", "largest error, m"], ["stationarity", "stationarity"], ["seconds", "seconds"]]
@@ -108,57 +131,64 @@ def _convergence(table: Measurements, pictures: Mapping[str, Item], folder: Path
         "note": "Energy gap (g − g*)/(g0 − g*) against the lowest minimum known; vertex errors against the minimum "
         "that was reached. A cross ends a curve that failed or met a limit.",
         "filters": ["problem"],
-        "x": [axis("iteration", "iterations"), axis("seconds", "wall seconds")],
+        "x": [axis_choice("iteration", "iterations"), axis_choice("seconds", "wall seconds")],
         "y": [
-            axis("gap", "energy gap"),
-            axis("largest", "largest vertex error, mean rest lengths"),
-            axis("metres", "largest vertex error, m"),
-            axis("stationarity", "stationarity"),
+            axis_choice("gap", "energy gap"),
+            axis_choice("largest", "largest vertex error, mean rest lengths"),
+            axis_choice("metres", "largest vertex error, m"),
+            axis_choice("stationarity", "stationarity"),
         ],
         "hover": [*hover, ["minimum", "minimum reached"], ["status", "status"]],
         "items": items,
     }
 
 
-def _times(table: Measurements, pictures: Mapping[str, Item]) -> Item:
-    items: list[Item] = []
+def _build_time_chart(table: AccuracyData, pictures: Mapping[str, ChartItem]) -> ChartItem:
+    items: list[ChartItem] = []
     for curve in table.curves:
-        found = [reach(curve, target) for target in TARGETS]
+        found = [find_time_to_accuracy(curve, target) for target in GAP_TARGETS]
         if not any(found):
             continue
-        columns = {f"over {steps}": _numbers(seconds_to(curve, t, steps) for t in TARGETS) for steps in STEPS}
+        columns = {
+            f"over {steps}": _numbers(amortised_seconds(curve, t, steps) for t in GAP_TARGETS)
+            for steps in AMORTISATION_STEPS
+        }
         items.append(
-            _run(table, curve, pictures)
+            _build_curve_item(table, curve, pictures)
             | columns
             | {
-                "target": [power(target) for target in TARGETS],
+                "target": [format_gap(target) for target in GAP_TARGETS],
                 "alone": _numbers(r.seconds if r and r.seconds > 0 else np.nan for r in found),
                 "iteration": _numbers(r.iteration if r else np.nan for r in found),
-                "set_up": curve.warm if np.isfinite(curve.warm) else None,
+                "set_up": curve.warm_seconds if np.isfinite(curve.warm_seconds) else None,
             }
         )
-    shown = [axis("alone", "seconds, the step alone")]
-    shown += [axis(f"over {n}", f"seconds, set-up over {n} step{'s' if n > 1 else ''}") for n in STEPS]
+    shown = [axis_choice("alone", "seconds, the step alone")]
+    shown += [
+        axis_choice(f"over {n}", f"seconds, set-up over {n} step{'s' if n > 1 else ''}") for n in AMORTISATION_STEPS
+    ]
     return {
         "title": "Time to accuracy",
         "note": "Median over the rounds; where a line ends the solver goes no further.",
         "filters": ["problem"],
-        "x": [axis("target", "energy gap", {"type": "category"})],
+        "x": [axis_choice("target", "energy gap", {"type": "category"})],
         "y": shown,
         "hover": [["target", "gap"], ["iteration", "iterations"], ["alone", "seconds alone"], ["set_up", "set-up, s"]],
         "items": items,
     }
 
 
-def _work(table: Measurements) -> Item:
+def _build_work_precision_chart(table: AccuracyData) -> ChartItem:
     chains: dict[tuple[Any, ...], list[WorkPoint]] = {}
-    for w in table.works:
+    for w in table.work_points:
         if w.status == "ok":
-            chains.setdefault((w.mesh, w.label, w.integrator, w.tolerance, w.iterations, w.first_guess), []).append(w)
-    items: list[Item] = []
+            chains.setdefault(
+                (w.mesh_label, w.label, w.integrator, w.residual_rtol, w.max_iterations, w.initial_guess), []
+            ).append(w)
+    items: list[ChartItem] = []
     for (mesh, label, integrator, tolerance, iterations, _), members in chains.items():
         members.sort(key=lambda work: work.time_step)
-        stop = stop_words(tolerance, iterations)
+        stop = format_stop_rule(tolerance, iterations)
         items.append(
             {
                 "label": label,
@@ -167,77 +197,77 @@ def _work(table: Measurements) -> Item:
                 "parameters": members[0].parameters,
                 "panel": integrator,
                 "small": tolerance is None,
-                "older": [work.code != table.newest for work in members],
-                "seconds": _numbers(work.seconds for work in members),
+                "older": [work.source_fingerprint != table.newest_fingerprint for work in members],
+                "seconds": _numbers(work.seconds_per_simulated_second for work in members),
                 "error": _numbers(work.error for work in members),
-                "step": [step_words(work.time_step) for work in members],
+                "step": [format_time_step(work.time_step) for work in members],
             }
         )
     return {
         "title": "Work and precision",
         "note": "Total error of the positions at the horizon against wall time; a line joins time steps, small marks "
-        f"do a fixed number of iterations. {' '.join(by_self_converged(table.works))}",
+        f"do a fixed number of iterations. {' '.join(describe_self_converged(table.work_points))}",
         "filters": ["scene"],
-        "x": [axis("seconds", "wall seconds a simulated second")],
-        "y": [axis("error", "relative error")],
+        "x": [axis_choice("seconds", "wall seconds a simulated second")],
+        "y": [axis_choice("error", "relative error")],
         "hover": [["step", "time step"], ["error", "relative error"], ["seconds", "seconds a simulated second"]],
         "items": items,
     }
 
 
-def _profiles(table: Measurements) -> Item:
-    kinds = {"performance profile": least_ratios, "data profile": iteration_ratios}
-    items: list[Item] = []
+def _build_profile_chart(table: AccuracyData) -> ChartItem:
+    kinds = {"performance profile": performance_ratios, "data profile": data_profile_ratios}
+    items: list[ChartItem] = []
     for kind, ratios in kinds.items():
-        for target in TARGETS:
+        for target in GAP_TARGETS:
             for label, values in ratios(table, target).items():
                 finite = np.unique(values[np.isfinite(values)])
                 items.append(
                     {
                         "label": label,
-                        "what": f"{len(values)} problems, to a gap of {power(target)}",
+                        "what": f"{len(values)} problems, to a gap of {format_gap(target)}",
                         "parameters": "{}",
-                        "gap": power(target),
+                        "gap": format_gap(target),
                         "panel": kind,
                         "ratio": _numbers(finite),
-                        "share": _numbers(share(values, finite)),
+                        "share": _numbers(cumulative_share(values, finite)),
                     }
                 )
-    more = [*not_shown(table), *by_other_code(table.curves, table.newest)]
+    more = [*describe_omitted_solvers(table), *describe_stale_results(table.curves, table.newest_fingerprint)]
     return {
         "title": "Performance and data profiles",
         "note": "The share of the problems solved within a multiple of the fastest solver's time, and of the time of "
         f"one plain local-global iteration. What failed is never solved. {' '.join(more)}",
         "filters": ["gap"],
-        "x": [axis("ratio", "multiple")],
-        "y": [axis("share", "share of the problems solved", _SHARES)],
+        "x": [axis_choice("ratio", "multiple")],
+        "y": [axis_choice("share", "share of the problems solved", _SHARE_AXIS)],
         "hover": [["ratio", "multiple"], ["share", "share"]],
         "shape": "hv",
         "items": items,
     }
 
 
-def _growth(table: Measurements) -> Item:
+def _build_scaling_chart(table: AccuracyData) -> ChartItem:
     items = [
         {
             "label": growth.label,
-            "what": f"{growth.scene}, {GUESSES[growth.first_guess]}",
+            "what": f"{growth.scene}, {INITIAL_GUESS_LABELS[growth.initial_guess]}",
             "parameters": "{}",
             "scene": growth.scene,
-            "panel": GUESSES[growth.first_guess],
+            "panel": INITIAL_GUESS_LABELS[growth.initial_guess],
             "vertices": growth.vertices,
             "seconds": _numbers(growth.seconds),
-            "older": growth.older,
+            "older": growth.stale,
             "exponent": "too few sizes" if np.isnan(growth.exponent) else f"{growth.exponent:.2f}",
         }
-        for growth in growths(table, lambda curve: curve.code != table.newest)
+        for growth in fit_scalings(table, lambda curve: curve.source_fingerprint != table.newest_fingerprint)
     ]
     return {
-        "title": f"Growth with size: time to a gap of {power(TARGET)}",
+        "title": f"Growth with size: time to a gap of {format_gap(GAP_TARGET)}",
         "note": "Median over the steps of a mesh, set-up apart.",
         "filters": ["scene"],
-        "x": [axis("vertices", "vertices")],
-        "y": [axis("seconds", "seconds")],
+        "x": [axis_choice("vertices", "vertices")],
+        "y": [axis_choice("seconds", "seconds")],
         "hover": [["vertices", "vertices"], ["seconds", "seconds"], ["exponent", "fitted power"]],
         "items": items,
     }

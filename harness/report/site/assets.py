@@ -11,43 +11,43 @@ from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
 
-from harness.base.files import replacing
+from harness.base.files import atomic_write
 
-_HERE = Path(__file__).parent
-_STATIC = _HERE / "static"
+_SITE_FOLDER = Path(__file__).parent
+_STATIC_FOLDER = _SITE_FOLDER / "static"
 
 
 @cache
-def version() -> str:
+def page_version() -> str:
     """Return a version: 12 hexadecimal digits of SHA-256 over the files that determine a page."""
-    parts = sorted(path for path in _HERE.rglob("*") if path.suffix in (".py", ".js", ".css", ".html"))
+    parts = sorted(path for path in _SITE_FOLDER.rglob("*") if path.suffix in (".py", ".js", ".css", ".html"))
     return sha256(b"".join(path.read_bytes() for path in parts)).hexdigest()[:12]
 
 
-def place(results: Path) -> str:
+def install_assets(results: Path) -> str:
     """Install the page next to the folders of results, and return its version.
 
     Files that are up to date are not written again.
     """
     site, stamp = results / "site", results / "site" / "version.txt"
-    if stamp.is_file() and stamp.read_text() == version() and (results / "index.html").is_file():
-        return version()
+    if stamp.is_file() and stamp.read_text() == page_version() and (results / "index.html").is_file():
+        return page_version()
     site.mkdir(exist_ok=True)
-    for path in _STATIC.iterdir():
-        _copy(path, results / path.name if path.name == "index.html" else site / path.name)
-    _copy(plotly(), site / "plotly.js")
-    with replacing(stamp) as partial:
-        partial.write_text(version())
-    return version()
+    for path in _STATIC_FOLDER.iterdir():
+        _copy_file(path, results / path.name if path.name == "index.html" else site / path.name)
+    _copy_file(plotly_path(), site / "plotly.js")
+    with atomic_write(stamp) as partial:
+        partial.write_text(page_version())
+    return page_version()
 
 
-def plotly() -> Path:
+def plotly_path() -> Path:
     """Return the path of Plotly's script, without importing the package."""
     found = find_spec("plotly")
     (home,) = (found.submodule_search_locations if found else None) or (None,)
     return Path(str(home)) / "package_data" / "plotly.min.js"
 
 
-def _copy(path: Path, target: Path) -> None:
-    with replacing(target) as partial:
+def _copy_file(path: Path, target: Path) -> None:
+    with atomic_write(target) as partial:
         shutil.copyfile(path, partial)

@@ -11,23 +11,23 @@ from typing import Any
 
 from harness.base import shelf
 from harness.base.errors import InputError
-from harness.base.files import replacing
+from harness.base.files import atomic_write
 from harness.report.site import script
-from harness.report.site.assets import place
-from harness.report.site.folders import KINDS, Folder, folder_of, folders, stored
-from harness.report.site.overview import Overview, overview
+from harness.report.site.assets import install_assets
+from harness.report.site.folders import ROW_FOLDERS, SweepFolder, find_benchmark_files, find_folders, locate_folder
+from harness.report.site.overview import SweepOverview, build_overview
 
-SUMMARY = "summary.json"
+SUMMARY_FILE = "summary.json"
 """File with a sweep's entry in the index, stored next to its data."""
 
 
-def update(
+def update_page(
     results: Path,
     *,
-    only: Collection[Path] | None = None,
-    recorded: bool = False,
-    viewer: bool = False,
-    say: Callable[[str], None] = lambda words: None,
+    changed_folders: Collection[Path] | None = None,
+    with_recordings: bool = False,
+    with_viewer: bool = False,
+    print_message: Callable[[str], None] = lambda words: None,
 ) -> Path:
     """Update the results page, and return the path of `index.html`.
 
@@ -41,22 +41,31 @@ def update(
         InputError: if there are no rows.
         CannotWrite: if a file cannot be written.
     """
-    found = folders(results) if only is None else [folder_of(path, results) for path in only]
-    data, code = results / "site" / "data", place(results)
+    found = (
+        find_folders(results) if changed_folders is None else [locate_folder(path, results) for path in changed_folders]
+    )
+    data, code = results / "site" / "data", install_assets(results)
     for folder in found:
         home = data / folder.slug
-        state = _state(folder, code, recorded)
-        if _known(home).get("state") != state:
-            _write(home, folder, overview(folder, home, recorded=recorded, say=say), state)
-    if viewer and any(True for folder in found for _ in (data / folder.slug / "recordings").glob("*.js")):
+        state = _sweep_state(folder, code, with_recordings)
+        if _read_summary(home).get("state") != state:
+            _write_sweep(
+                home,
+                folder,
+                build_overview(folder, home, with_recordings=with_recordings, print_message=print_message),
+                state,
+            )
+    if with_viewer and any(True for folder in found for _ in (data / folder.slug / "recordings").glob("*.js")):
         from harness.report.site.viewer import write_viewer
 
         write_viewer(results / "site")
-    _index(results, data)
+    _write_index(results, data)
     return results / "index.html"
 
 
-def keep(results: Path, folder: Path, say: Callable[[str], None], *, quiet: bool = False) -> None:
+def refresh_results_page(
+    results: Path, folder: Path, print_message: Callable[[str], None], *, is_quiet: bool = False
+) -> None:
     """Update the page of all results with the new data of a sweep.
 
     It prints the path of the page unless `is_quiet`. If rows are damaged, it prints a remark instead of raising: the
@@ -69,54 +78,54 @@ def keep(results: Path, folder: Path, say: Callable[[str], None], *, quiet: bool
         is_quiet: whether to omit the path of the page.
     """
     try:
-        page = update(results, only=[folder])
-        if not quiet:
-            say(f"all results are on one page: {page}")
+        page = update_page(results, changed_folders=[folder])
+        if not is_quiet:
+            print_message(f"all results are on one page: {page}")
     except InputError as error:
-        say(f"the page of all results stays as it was: {error}")
+        print_message(f"the page of all results stays as it was: {error}")
 
 
-def _write(home: Path, folder: Folder, found: Overview, state: str) -> None:
-    for name, value in found.scripts.items():
-        script.write(home / f"{name}.js", f"{folder.slug}/{name}", value)
-    for old in home.glob("*.js"):
-        if old.stem not in found.scripts:
+def _write_sweep(data_folder: Path, folder: SweepFolder, content: SweepOverview, state: str) -> None:
+    for name, value in content.scripts.items():
+        script.write_script(data_folder / f"{name}.js", f"{folder.slug}/{name}", value)
+    for old in data_folder.glob("*.js"):
+        if old.stem not in content.scripts:
             old.unlink()
-    home.mkdir(parents=True, exist_ok=True)
-    with replacing(home / SUMMARY) as partial:
-        partial.write_text(json.dumps(found.summary | {"state": state}, allow_nan=False), encoding="utf-8")
+    data_folder.mkdir(parents=True, exist_ok=True)
+    with atomic_write(data_folder / SUMMARY_FILE) as partial:
+        partial.write_text(json.dumps(content.summary | {"state": state}, allow_nan=False), encoding="utf-8")
 
 
-def _known(home: Path) -> dict[str, Any]:
+def _read_summary(data_folder: Path) -> dict[str, Any]:
     """Read the summary written by the last update of a sweep.
 
     It is empty if the file is missing or incomplete.
     """
     try:
-        return json.loads((home / SUMMARY).read_text(encoding="utf-8"))
+        return json.loads((data_folder / SUMMARY_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
 
 
-def _state(folder: Folder, code: str, recorded: bool) -> str:
+def _sweep_state(folder: SweepFolder, code: str, with_recordings: bool) -> str:
     """Return a hash of the state of a sweep's data.
 
     It changes with new data, or if this program would present them differently.
     """
-    told: list[Any] = [code, recorded]
-    for kind in KINDS:
+    told: list[Any] = [code, with_recordings]
+    for kind in ROW_FOLDERS:
         home = folder.path / kind
-        own = [(home / f"{unit}.parquet").stat().st_mtime_ns for unit in shelf.own_files(home)]
-        packed = shelf.packed_file(home)
+        own = [(home / f"{unit}.parquet").stat().st_mtime_ns for unit in shelf.list_unit_files(home)]
+        packed = shelf.packed_path(home)
         told += [len(own), max(own, default=0), packed.stat().st_mtime_ns if packed.exists() else 0]
-    of_gates = [path.stat().st_mtime_ns for path in stored(folder.path)]
+    of_gates = [path.stat().st_mtime_ns for path in find_benchmark_files(folder.path)]
     told += [len(of_gates), max(of_gates, default=0)]
     for part in ("pictures", "recordings", "report"):
         told.append(sum(1 for _ in (folder.path / part).glob("*")))
     return sha256(repr(told).encode()).hexdigest()[:16]
 
 
-def _called(results: Path) -> str:
+def _command_path(results: Path) -> str:
     """Return the folder's path relative to the current directory.
 
     If the folder is elsewhere, only its name is returned.
@@ -125,19 +134,19 @@ def _called(results: Path) -> str:
     return there.relative_to(here).as_posix() if there.is_relative_to(here) else there.name
 
 
-def _index(results: Path, data: Path) -> None:
+def _write_index(results: Path, data: Path) -> None:
     """Write the index of all existing sweeps with a summary.
 
     The others are listed as absent.
     """
-    there = {folder.slug: folder for folder in folders(results)}
-    known = {slug: _known(data / slug) for slug in there}
+    there = {folder.slug: folder for folder in find_folders(results)}
+    known = {slug: _read_summary(data / slug) for slug in there}
     told = sorted((summary for summary in known.values() if summary), key=lambda s: s["to"] or "", reverse=True)
     value = {
         "title": results.resolve().name,
-        "place": _called(results),
+        "place": _command_path(results),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
         "sweeps": [{key: part for key, part in summary.items() if key != "state"} for summary in told],
         "absent": [there[slug].name for slug, summary in known.items() if not summary],
     }
-    script.write(data / "index.js", "index", value)
+    script.write_script(data / "index.js", "index", value)

@@ -7,47 +7,47 @@ from __future__ import annotations
 
 from typing import Any
 
-from harness.report.accuracy.engines import OURS, fronts, marks, met
-from harness.report.accuracy.measured import Measurements, WorkPoint, by_self_converged
-from harness.report.site.marks import axis, drawn
-from harness.report.site.script import numbers
+from harness.report.accuracy.engines import OWN_PROGRAM, assign_program_styles, meshes_with_engines, pareto_fronts
+from harness.report.accuracy.measured import AccuracyData, WorkPoint, describe_self_converged
+from harness.report.site.marks import axis_choice, plotly_style
+from harness.report.site.script import round_numbers
 
-_NOTE = (
+_CHART_NOTE = (
     "Each line is the Pareto front of a program's settings in time and error; "
-    f"{OURS}: of all of its methods that were tried. Errors are those of the positions at the end, relative to the way "
+    f"{OWN_PROGRAM}: of all of its methods that were tried. Errors are those of the positions at the end, relative to the way "
     "from the start. springbench repeat CONFIG prints a script that repeats an engine's point without us."
 )
 
 
-def chart(table: Measurements) -> dict[str, Any]:
+def build_engine_chart(table: AccuracyData) -> dict[str, Any]:
     """Build the chart; it has no items if no engine was measured."""
     items = [
-        _item(table, mesh, name, front)
-        for mesh, here in met(table.works).items()
-        for name, front in fronts(here).items()
+        _build_item(table, mesh, name, front)
+        for mesh, here in meshes_with_engines(table.work_points).items()
+        for name, front in pareto_fronts(here).items()
         if front
     ]
     return {
         "title": "Outside engines beside ours",
-        "note": " ".join([_NOTE, *by_self_converged(table.works)]),
+        "note": " ".join([_CHART_NOTE, *describe_self_converged(table.work_points)]),
         "filters": ["scene"],
-        "x": [axis("seconds", "wall seconds a simulated second")],
-        "y": [axis("error", "relative error")],
+        "x": [axis_choice("seconds", "wall seconds a simulated second")],
+        "y": [axis_choice("error", "relative error")],
         "hover": [["setting", "setting"], ["error", "relative error"], ["seconds", "seconds a simulated second"]],
-        "marks": {name: drawn(mark) for name, mark in marks(table.works).items()},
+        "marks": {name: plotly_style(mark) for name, mark in assign_program_styles(table.work_points).items()},
         "items": items,
     }
 
 
-def _item(table: Measurements, mesh: str, name: str, front: list[WorkPoint]) -> dict[str, Any]:
+def _build_item(table: AccuracyData, mesh: str, name: str, front: list[WorkPoint]) -> dict[str, Any]:
     return {
         "label": name,
         "what": mesh,
         "scene": mesh,
         "parameters": "{}",
         "panel": mesh,
-        "seconds": numbers(work.seconds for work in front),
-        "error": numbers(work.error for work in front),
-        "setting": [work.setting for work in front],
-        "older": [work.code != table.newest for work in front],
+        "seconds": round_numbers(work.seconds_per_simulated_second for work in front),
+        "error": round_numbers(work.error for work in front),
+        "setting": [work.setting_label for work in front],
+        "older": [work.source_fingerprint != table.newest_fingerprint for work in front],
     }

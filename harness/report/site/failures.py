@@ -7,32 +7,32 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-_NUMBER = re.compile(r"[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?", re.IGNORECASE)
+_NUMBER_PATTERN = re.compile(r"[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?", re.IGNORECASE)
 
-MOST = 200
+MAX_CAUSES = 200
 """Maximum number of causes: more would not be an overview."""
 
 
-class Failed(NamedTuple):
+class FailedRun(NamedTuple):
     """One failed run: scene, solver, status, reason and, if known, its id."""
 
-    where: str
+    scene_label: str
     solver: str
     status: str
     reason: str
-    run: str = ""
+    run_id: str = ""
 
 
-def causes(failed: Iterable[Failed]) -> list[dict[str, Any]]:
+def group_failures(failed: Iterable[FailedRun]) -> list[dict[str, Any]]:
     """Group failed runs by cause, the most frequent first.
 
     Reasons that differ only in numbers, or in the names of their scene and solver, are one cause, described in the
     words of its first run.
     """
-    groups: dict[tuple[str, str], list[Failed]] = {}
+    groups: dict[tuple[str, str], list[FailedRun]] = {}
     for one in failed:
-        groups.setdefault((one.status, _cause(one)), []).append(one)
-    found = sorted(groups.values(), key=len, reverse=True)[:MOST]
+        groups.setdefault((one.status, _normalise_reason(one)), []).append(one)
+    found = sorted(groups.values(), key=len, reverse=True)[:MAX_CAUSES]
     return [
         {
             "status": group[0].status,
@@ -40,15 +40,17 @@ def causes(failed: Iterable[Failed]) -> list[dict[str, Any]]:
             "count": len(group),
             "varied": len({one.reason for one in group}) > 1,
             "solvers": Counter(one.solver for one in group).most_common(),
-            "where": Counter(one.where for one in group).most_common(),
-            "run": group[0].run,
+            "where": Counter(one.scene_label for one in group).most_common(),
+            "run": group[0].run_id,
         }
         for group in found
     ]
 
 
-def _cause(one: Failed) -> str:
+def _normalise_reason(one: FailedRun) -> str:
     words = one.reason
-    for name in sorted({one.where, one.solver, *one.where.split(), one.solver.split(",")[0]}, key=len, reverse=True):
+    for name in sorted(
+        {one.scene_label, one.solver, *one.scene_label.split(), one.solver.split(",")[0]}, key=len, reverse=True
+    ):
         words = words.replace(name, "…") if len(name) > 2 else words
-    return _NUMBER.sub("#", words)
+    return _NUMBER_PATTERN.sub("#", words)

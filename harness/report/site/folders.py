@@ -10,17 +10,17 @@ from typing import NamedTuple
 from urllib.parse import quote
 
 from harness.base import shelf
-from harness.base.errors import InputError, Mistake
-from harness.base.files import safe_name
+from harness.base.errors import InputError, InputMistake
+from harness.base.files import sanitise_name
 
-KINDS = ("rows", "accuracy", "ablation")
+ROW_FOLDERS = ("rows", "accuracy", "ablation")
 """Subfolders for rows in a sweep's folder, by the command that produces them."""
 
-_STORED = "*bit/[0-9][0-9][0-9][0-9]_*.json"
+_BENCHMARK_GLOB = "*bit/[0-9][0-9][0-9][0-9]_*.json"
 """Benchmark files as pytest-benchmark names them: numbered, in a folder for the system and the Python version."""
 
 
-class Folder(NamedTuple):
+class SweepFolder(NamedTuple):
     """The folder of a sweep's results.
 
     Attributes:
@@ -33,23 +33,23 @@ class Folder(NamedTuple):
     path: Path
     name: str
     slug: str
-    up: str
+    relative_url: str
 
 
-def stored(folder: Path) -> list[Path]:
+def find_benchmark_files(folder: Path) -> list[Path]:
     """Find the stored benchmark results in a folder."""
-    return sorted(folder.glob(_STORED))
+    return sorted(folder.glob(_BENCHMARK_GLOB))
 
 
-def folder_of(path: Path, results: Path) -> Folder:
+def locate_folder(path: Path, results: Path) -> SweepFolder:
     """Return a sweep's folder as the page in `results` refers to it."""
     parts = path.relative_to(results).parts
     up = "".join(f"{quote(os.fsencode(part), safe='')}/" for part in parts)
     name = os.fsencode("/".join(parts) or path.resolve().name).decode(errors="replace")
-    return Folder(path, name, _slug(parts), f"./{up}")
+    return SweepFolder(path, name, _make_slug(parts), f"./{up}")
 
 
-def _slug(parts: tuple[str, ...]) -> str:
+def _make_slug(parts: tuple[str, ...]) -> str:
     """Make a unique name for a folder.
 
     It consists of its parts joined by ~, or of a hash if that is unsafe or ambiguous.
@@ -58,20 +58,25 @@ def _slug(parts: tuple[str, ...]) -> str:
     unique = joined.count("~") == max(len(parts) - 1, 0) and parts != ("this",)
     if unique and re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._~-]{0,99}", joined):
         return joined
-    return f"{safe_name(joined)[:80]}~~{sha256(os.fsencode('/'.join(parts))).hexdigest()[:12]}"
+    return f"{sanitise_name(joined)[:80]}~~{sha256(os.fsencode('/'.join(parts))).hexdigest()[:12]}"
 
 
-def folders(results: Path) -> list[Folder]:
+def find_folders(results: Path) -> list[SweepFolder]:
     """Find all sweep folders in a folder of results, or the folder of one sweep.
 
     Raises:
         InputError: if there is none.
     """
     if not results.is_dir():
-        raise InputError(Mistake("is no folder; wanted a folder of results, or that of one sweep", results))
-    found = {folder.parent for kind in KINDS for folder in shelf.folders(results, kind) if shelf.units(folder)}
-    found |= {path.parent.parent for depth in ("", "*/") for path in results.glob(depth + _STORED)}
+        raise InputError(InputMistake("is no folder; wanted a folder of results, or that of one sweep", results))
+    found = {
+        folder.parent
+        for kind in ROW_FOLDERS
+        for folder in shelf.find_row_folders(results, kind)
+        if shelf.list_units(folder)
+    }
+    found |= {path.parent.parent for depth in ("", "*/") for path in results.glob(depth + _BENCHMARK_GLOB)}
     seen = [path for path in found if not any(part.startswith(".") for part in path.relative_to(results).parts)]
     if not seen:
-        raise InputError(Mistake("holds no rows; run a sweep first, or name a folder of results", results))
-    return [folder_of(path, results) for path in sorted(seen)]
+        raise InputError(InputMistake("holds no rows; run a sweep first, or name a folder of results", results))
+    return [locate_folder(path, results) for path in sorted(seen)]

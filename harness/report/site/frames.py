@@ -11,10 +11,10 @@ from pathlib import Path
 import pyarrow as pa
 
 from harness.report.site import script
-from harness.report.site.folders import Folder
-from harness.report.sql import answer
+from harness.report.site.folders import SweepFolder
+from harness.report.sql import query_table
 
-_FIGURES = {
+_FRAME_COLUMNS = {
     "ms": "1e3 * median(seconds)",
     "least": "1e3 * min(seconds)",
     "lower": "1e3 * quantile_cont(seconds, 0.25)",
@@ -28,11 +28,11 @@ _FIGURES = {
 }
 """Columns of a run's script, each as SQL over the rounds of a frame."""
 
-_MOST = "3e38"
+_FLOAT32_MAX = "3e38"
 """Largest finite number in single precision, rounded down."""
 
 
-def write(folder: Folder, table: pa.Table, data: Path, wanted: Collection[str]) -> None:
+def write_frame_scripts(folder: SweepFolder, table: pa.Table, data: Path, run_ids: Collection[str]) -> None:
     """Write the scripts of these runs.
 
     Args:
@@ -41,20 +41,20 @@ def write(folder: Folder, table: pa.Table, data: Path, wanted: Collection[str]) 
         data: folder of the page's data of this sweep.
         run_ids: runs to write.
     """
-    if not wanted:
+    if not run_ids:
         return
-    inner = ", ".join(f"{sql} as {name}" for name, sql in _FIGURES.items())
+    inner = ", ".join(f"{sql} as {name}" for name, sql in _FRAME_COLUMNS.items())
     # Single precision, whose shortest decimals to_json writes, is more accurate than the display. Values outside its
     # range are so large that only their order of magnitude matters.
     outer = ", ".join(
-        f"'{name}': list(case when isfinite({name}) then least(greatest({name}, -{_MOST}), {_MOST})::float end "
+        f"'{name}': list(case when isfinite({name}) then least(greatest({name}, -{_FLOAT32_MAX}), {_FLOAT32_MAX})::float end "
         "order by frame)"
-        for name in _FIGURES
+        for name in _FRAME_COLUMNS
     )
     sql = f"""
         with steps as (
             select run_id, frame, {inner} from rows_of
             where phase = 'step' and frame is not null and run_id in (select unnest($wanted)) group by run_id, frame
         ) select run_id, to_json({{'frame': list(frame order by frame), {outer}}}) from steps group by run_id"""
-    for run, value in answer(sql, table, {"wanted": list(wanted)}):
-        script.write_text(script.below(data / "runs", run), f"{folder.slug}/runs/{run}", value)
+    for run, value in query_table(sql, table, {"wanted": list(run_ids)}):
+        script.write_json_script(script.script_path(data / "runs", run), f"{folder.slug}/runs/{run}", value)

@@ -6,45 +6,49 @@ from collections.abc import Mapping
 from typing import Any
 
 from harness.report.style import (
-    ARROWHEAD,
-    BARS,
-    BOWTIE,
-    CHEVRON,
-    CORNERS,
-    DASH_DOTTED,
-    DASHED,
-    DOTTED,
-    HOURGLASS,
-    LOZENGE,
-    SPEARHEADS,
-    STARS,
-    Mark,
+    ARROW_BAR_MARKERS,
+    ARROWHEAD_MARKER,
+    BOWTIE_MARKER,
+    CHEVRON_MARKER,
+    CORNER_MARKERS,
+    DASH_DOTTED_LINE,
+    DASHED_LINE,
+    DOTTED_LINE,
+    HOURGLASS_MARKER,
+    LOZENGE_MARKER,
+    SPEARHEAD_MARKERS,
+    STAR_MARKERS,
+    SeriesStyle,
 )
 
-_SYMBOLS: dict[Any, str] = {
+_PLOTLY_SYMBOLS: dict[Any, str] = {
     "o": "circle", "s": "square", "^": "triangle-up", "v": "triangle-down", "<": "triangle-left",
     ">": "triangle-right", "D": "diamond", "d": "diamond-tall", "P": "cross", "X": "x", "p": "pentagon",
     "h": "hexagon", "*": "star", "H": "hexagon2", "8": "octagon",
-    STARS[0]: "star-diamond", STARS[1]: "hexagram", STARS[2]: "star-triangle-up", STARS[3]: "star-square",
-    STARS[4]: "star-triangle-down", CORNERS[0]: "triangle-nw", CORNERS[1]: "triangle-ne", CORNERS[2]: "triangle-sw",
-    CORNERS[3]: "triangle-se", HOURGLASS: "hourglass", BOWTIE: "bowtie", LOZENGE: "diamond-wide",
-    ARROWHEAD: "arrow", BARS[0]: "arrow-bar-up", BARS[1]: "arrow-bar-down", CHEVRON: "arrow-wide",
-    SPEARHEADS[0]: "arrow-right", SPEARHEADS[1]: "arrow-left", SPEARHEADS[2]: "arrow-down",
-    SPEARHEADS[3]: "arrow-up",
+    STAR_MARKERS[0]: "star-diamond", STAR_MARKERS[1]: "hexagram", STAR_MARKERS[2]: "star-triangle-up", STAR_MARKERS[3]: "star-square",
+    STAR_MARKERS[4]: "star-triangle-down", CORNER_MARKERS[0]: "triangle-nw", CORNER_MARKERS[1]: "triangle-ne", CORNER_MARKERS[2]: "triangle-sw",
+    CORNER_MARKERS[3]: "triangle-se", HOURGLASS_MARKER: "hourglass", BOWTIE_MARKER: "bowtie", LOZENGE_MARKER: "diamond-wide",
+    ARROWHEAD_MARKER: "arrow", ARROW_BAR_MARKERS[0]: "arrow-bar-up", ARROW_BAR_MARKERS[1]: "arrow-bar-down", CHEVRON_MARKER: "arrow-wide",
+    SPEARHEAD_MARKERS[0]: "arrow-right", SPEARHEAD_MARKERS[1]: "arrow-left", SPEARHEAD_MARKERS[2]: "arrow-down",
+    SPEARHEAD_MARKERS[3]: "arrow-up",
 }  # fmt: skip
-_DASHES: dict[Any, str] = {"-": "solid", DASHED: "dash", DOTTED: "dot", DASH_DOTTED: "dashdot"}
+_PLOTLY_DASHES: dict[Any, str] = {"-": "solid", DASHED_LINE: "dash", DOTTED_LINE: "dot", DASH_DOTTED_LINE: "dashdot"}
 
-LOG = {"type": "log"}
+LOG_AXIS = {"type": "log"}
 
 
-def drawn(mark: Mark) -> dict[str, str]:
+def plotly_style(mark: SeriesStyle) -> dict[str, str]:
     """Return a style in Plotly's terms."""
-    return {"color": mark.color, "symbol": _SYMBOLS[mark.marker], "dash": _DASHES.get(mark.dash, "longdash")}
+    return {
+        "color": mark.color,
+        "symbol": _PLOTLY_SYMBOLS[mark.marker],
+        "dash": _PLOTLY_DASHES.get(mark.dash, "longdash"),
+    }
 
 
-def axis(column: str, title: str, how: Mapping[str, Any] = LOG) -> dict[str, Any]:
+def axis_choice(column: str, title: str, layout: Mapping[str, Any] = LOG_AXIS) -> dict[str, Any]:
     """Return a possible axis of a chart.
 
     It has a column of the items, a title, and the layout for Plotly.
     """
-    return {"column": column, "title": title, "axis": how}
+    return {"column": column, "title": title, "axis": layout}

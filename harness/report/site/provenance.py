@@ -7,33 +7,33 @@ from typing import Any
 
 import pyarrow as pa
 
-from harness.base.claim import NAME as CLAIM
-from harness.report.sql import answer
+from harness.base.claim import OWNER_FILE as CLAIM
+from harness.report.sql import query_table
 
-_COLUMNS = ("machine", "cpu", "cores", "memory_gib", "system", "commit")
+_MACHINE_COLUMNS = ("machine", "cpu", "cores", "memory_gib", "system", "commit")
 
-_MADE = f"""
-select {", ".join(f'"{name}"' for name in _COLUMNS)}, list(distinct code order by code), min(started), max(started),
+_PROVENANCE_QUERY = f"""
+select {", ".join(f'"{name}"' for name in _MACHINE_COLUMNS)}, list(distinct code order by code), min(started), max(started),
     count(distinct {{unit}})
 from rows_of where machine is not null group by all order by max(started) desc
 """
 
 
-def made(table: pa.Table, unit: str) -> list[dict[str, Any]]:
+def collect_provenance(table: pa.Table, unit: str) -> list[dict[str, Any]]:
     """Collect machines and commits of rows, the newest first.
 
     Args:
         table: rows.
         unit: column whose distinct values are counted.
     """
-    lacking = [name for name in (*_COLUMNS, "code", "started", unit) if name not in table.column_names]
+    lacking = [name for name in (*_MACHINE_COLUMNS, "code", "started", unit) if name not in table.column_names]
     for name in lacking:
         table = table.append_column(name, pa.nulls(len(table), pa.string()))
-    names = (*_COLUMNS, "codes", "from", "to", "count")
-    return [dict(zip(names, row, strict=True)) for row in answer(_MADE.format(unit=unit), table)]
+    names = (*_MACHINE_COLUMNS, "codes", "from", "to", "count")
+    return [dict(zip(names, row, strict=True)) for row in query_table(_PROVENANCE_QUERY.format(unit=unit), table)]
 
 
-def config_of(folder: Path) -> str:
+def find_config(folder: Path) -> str:
     """Find the config of a sweep's folder, as a path for a command line.
 
     It is "" if the config is unknown or deleted.
@@ -50,14 +50,14 @@ def config_of(folder: Path) -> str:
     return there.name
 
 
-def scenes_of(folder: Path) -> dict[str, str]:
+def find_scene_files(folder: Path) -> dict[str, str]:
     """Find the scene files that a sweep's config lists, by scene name.
 
     Paths are relative to the same folder as that of the config.
     """
     from harness.base.yaml import read_yaml
 
-    called = config_of(folder)
+    called = find_config(folder)
     if not called:
         return {}
     data = read_yaml(folder / (folder / CLAIM).read_text().strip()).data

@@ -11,24 +11,24 @@ from typing import Any
 import pyarrow as pa
 
 from harness.base import rows, shelf
-from harness.base.errors import Mistake
-from harness.report.references import bibtex, cited
-from harness.report.site.folders import Folder
-from harness.report.site.marks import drawn
-from harness.report.site.script import column
-from harness.report.sql import answers
-from harness.report.style import looks
-from harness.report.timing_table import labels, runs
-from solvers.registry import OPTIONAL, SOLVERS, load
+from harness.base.errors import InputMistake
+from harness.report.references import format_bibtex, format_citation
+from harness.report.site.folders import SweepFolder
+from harness.report.site.marks import plotly_style
+from harness.report.site.script import encode_column
+from harness.report.sql import query_records
+from harness.report.style import assign_label_styles
+from harness.report.timing_table import label_runs, read_run_times
+from solvers.registry import OPTIONAL_SOLVERS, SOLVERS, load_target
 
-Run = dict[str, Any]
+RunRecord = dict[str, Any]
 
-MACHINE = "machine"
+MACHINE_SOLVER = "machine"
 """Solver column of rows that belong to no solver: the limits of the machine itself, in a speed report."""
 
-_NEEDED = ("run_id", "scene", "size", "solver", "phase", "status")
+_REQUIRED_COLUMNS = ("run_id", "scene", "size", "solver", "phase", "status")
 
-_MORE = """
+_RUN_QUERY = """
 select run_id, any_value(file) as unit, any_value(family) as family, any_value(reference) as reference,
     any_value(integrator) as integrator, any_value(time_step) as time_step, any_value(first_guess) as first_guess,
     any_value(max_iterations) as max_iterations, any_value(tolerance) as tolerance,
@@ -44,7 +44,7 @@ from rows_of group by run_id
 """
 
 
-def read(folder: Folder, left_out: Callable[[Mistake], None]) -> pa.Table:
+def read_run_rows(folder: SweepFolder, on_invalid: Callable[[InputMistake], None]) -> pa.Table:
     """Read the rows of a sweep, with the name of each row's unit.
 
     Args:
@@ -53,10 +53,15 @@ def read(folder: Folder, left_out: Callable[[Mistake], None]) -> pa.Table:
     Raises:
         InputError: if rows are damaged.
     """
-    return rows.read(shelf.units(folder.path / "rows"), needed=_NEEDED, named=True, left_out=left_out)
+    return rows.read_rows(
+        shelf.list_units(folder.path / "rows"),
+        required_columns=_REQUIRED_COLUMNS,
+        with_unit_names=True,
+        on_invalid=on_invalid,
+    )
 
 
-def table_of(folder: Folder, table: pa.Table) -> list[Run]:
+def build_run_table(folder: SweepFolder, table: pa.Table) -> list[RunRecord]:
     """Build records of the runs, ordered by scene, size and solver.
 
     A record has the identification, the status, and the times [ms].
@@ -66,25 +71,27 @@ def table_of(folder: Folder, table: pa.Table) -> list[Run]:
         table: rows of the sweep.
     """
     there = {
-        part: _files(folder.path / part, suffix) for part, suffix in (("pictures", ".png"), ("recordings", ".rrd"))
+        part: _file_stems(folder.path / part, suffix) for part, suffix in (("pictures", ".png"), ("recordings", ".rrd"))
     }
-    timed = [run for run in runs(table) if run.solver != MACHINE]
-    names, more = labels(timed), _more(table)
-    found: list[Run] = []
+    timed = [run for run in read_run_times(table) if run.solver != MACHINE_SOLVER]
+    names, more = label_runs(timed), _query_run_details(table)
+    found: list[RunRecord] = []
     for run in timed:
-        told: Run = {**run._asdict(), **more[run.run_id], "label": names[run.run_id]}
+        told: RunRecord = {**run._asdict(), **more[run.run_id], "label": names[run.run_id]}
         told["global"] = told.pop("global_")
-        told["plain"] = int(_is_plain(run.solver, run.parameters))
+        told["plain"] = int(_has_default_parameters(run.solver, run.parameters_json))
         told["options"] = names[run.run_id].removeprefix(run.solver).removeprefix(", ")
         told |= {part[:-1]: int(told["unit"] in files) for part, files in there.items()}
         found.append(told)
     found.sort(key=lambda run: (run["scene"], run["size"] or 0, run["label"]))
-    for run, how in zip(found, _other_code(found), strict=True):
+    for run, how in zip(found, _classify_staleness(found), strict=True):
         run["by"] = how
     return found
 
 
-def as_script(folder: Folder, found: Sequence[Run], outcomes: Mapping[str, Any]) -> dict[str, Any]:
+def build_run_script(
+    folder: SweepFolder, run_records: Sequence[RunRecord], outcomes: Mapping[str, Any]
+) -> dict[str, Any]:
     """Build the table of runs as columns.
 
     Args:
@@ -92,32 +99,36 @@ def as_script(folder: Folder, found: Sequence[Run], outcomes: Mapping[str, Any])
         run_records: records of the runs.
         outcomes: outcome and reason of verified runs by their ids.
     """
-    columns = {name: [run[name] for run in found] for name in _SHOWN if found and name in found[0]}
-    columns["parameters"] = [run["parameters"] or "{}" for run in found]
+    columns = {
+        name: [run[name] for run in run_records] for name in _PAGE_COLUMNS if run_records and name in run_records[0]
+    }
+    columns["parameters"] = [run["parameters"] or "{}" for run in run_records]
     if outcomes:
-        columns["outcome"] = [outcomes.get(run["run_id"], {}).get("words") for run in found]
-    marks = looks((run["label"], run["solver"]) for run in found)
-    exact = {name: [run[name] for run in found] for name in _EXACT}
+        columns["outcome"] = [outcomes.get(run["run_id"], {}).get("words") for run in run_records]
+    marks = assign_label_styles((run["label"], run["solver"]) for run in run_records)
+    exact = {name: [run[name] for run in run_records] for name in _EXACT_COLUMNS}
     return {
         "slug": folder.slug,
-        "up": folder.up,
-        "n": len(found),
-        "columns": {name: column(values) for name, values in columns.items()} | exact,
-        "marks": {label: drawn(mark) for label, mark in marks.items()},
-        "references": references((run["solver"], run["reference"]) for run in found),
+        "up": folder.relative_url,
+        "n": len(run_records),
+        "columns": {name: encode_column(values) for name, values in columns.items()} | exact,
+        "marks": {label: plotly_style(mark) for label, mark in marks.items()},
+        "references": format_references((run["solver"], run["reference"]) for run in run_records),
     }
 
 
-def references(pairs: Any) -> dict[str, dict[str, str]]:
+def format_references(pairs: Any) -> dict[str, dict[str, str]]:
     """Format references by solver, as a line and as BibTeX."""
     known = {solver: reference for solver, reference in pairs if reference}
-    return {s: {"cited": cited(reference), "bibtex": bibtex([reference])} for s, reference in known.items()}
+    return {
+        s: {"cited": format_citation(reference), "bibtex": format_bibtex([reference])} for s, reference in known.items()
+    }
 
 
-_EXACT = ("time_step", "tolerance", "asked")
+_EXACT_COLUMNS = ("time_step", "tolerance", "asked")
 """Columns that commands need to the last digit."""
 
-_SHOWN = (
+_PAGE_COLUMNS = (
     *("run_id", "unit", "scene", "size", "solver", "label", "options", "plain", "family", "vertices", "springs"),
     *(
         "integrator",
@@ -151,38 +162,38 @@ _SHOWN = (
 )
 
 
-def _more(table: pa.Table) -> dict[str, Run]:
+def _query_run_details(table: pa.Table) -> dict[str, RunRecord]:
     """Query further details of runs, by run id.
 
     The table at the end of a sweep does not include them.
     """
-    return {run.pop("run_id"): run for run in answers(_MORE, table)}
+    return {run.pop("run_id"): run for run in query_records(_RUN_QUERY, table)}
 
 
-def _is_plain(solver: str, parameters: str | None) -> bool:
+def _has_default_parameters(solver: str, parameters: str | None) -> bool:
     """Return whether a solver has default parameters, so that its name alone identifies it.
 
     This is known only for solvers of the package, because a report does not import plug-in code.
     """
-    given, shipped = json.loads(parameters or "{}"), SOLVERS | OPTIONAL
+    given, shipped = json.loads(parameters or "{}"), SOLVERS | OPTIONAL_SOLVERS
     if solver not in shipped or not given:
         return not given
-    usual = {f.name: f.default for f in fields(load(shipped[solver])) if f.default is not MISSING}
+    usual = {f.name: f.default for f in fields(load_target(shipped[solver])) if f.default is not MISSING}
     return all(name in usual and usual[name] == value for name, value in given.items())
 
 
-def _files(folder: Path, suffix: str) -> set[str]:
+def _file_stems(folder: Path, suffix: str) -> set[str]:
     return {path.stem for path in folder.glob(f"*{suffix}")} if folder.is_dir() else set()
 
 
-def _other_code(found: Sequence[Run]) -> list[str]:
+def _classify_staleness(run_records: Sequence[RunRecord]) -> list[str]:
     """Classify each run as `other code`, `earlier commit` or current ("").
 
     `other code` is relative to the newest run of its scene and solver, `earlier commit` relative to the newest run of
     all.
     """
-    newest: dict[Any, Run] = {}
-    for run in sorted(found, key=lambda run: run["started"] or ""):
+    newest: dict[Any, RunRecord] = {}
+    for run in sorted(run_records, key=lambda run: run["started"] or ""):
         newest[run["scene"], run["solver"]] = newest[None] = run
     return [
         "other code"
@@ -190,5 +201,5 @@ def _other_code(found: Sequence[Run]) -> list[str]:
         else "earlier commit"
         if run["commit"] != newest[None]["commit"]
         else ""
-        for run in found
+        for run in run_records
     ]

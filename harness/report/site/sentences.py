@@ -8,27 +8,27 @@ from typing import Any
 from harness.report import equal_accuracy
 from harness.report.timing_table import RunTimes
 
-Run = dict[str, Any]
+RunRecord = dict[str, Any]
 
 
-def sentences(found: Sequence[Run]) -> list[dict[str, Any]]:
+def describe_runs(run_records: Sequence[RunRecord]) -> list[dict[str, Any]]:
     """Describe runs in sentences, each with the ids of its runs (`equal_accuracy`)."""
-    names = {run["run_id"]: run["label"] for run in found}
+    names = {run["run_id"]: run["label"] for run in run_records}
     told = [
         {"words": words, "runs": runs}
-        for compared in equal_accuracy.comparisons(map(_times, found))
-        for words, runs in equal_accuracy.sentences(compared, names)
+        for compared in equal_accuracy.compare_runs(map(_to_run_times, run_records))
+        for words, runs in equal_accuracy.describe_comparison(compared, names)
     ]
-    return told + list(_unconverged(found))
+    return told + list(_describe_unconverged(run_records))
 
 
-def _times(run: Run) -> RunTimes:
+def _to_run_times(run: RunRecord) -> RunTimes:
     return RunTimes(*(run["global" if name == "global_" else name] for name in RunTimes._fields))
 
 
-def _unconverged(found: Sequence[Run]) -> Iterator[dict[str, Any]]:
+def _describe_unconverged(run_records: Sequence[RunRecord]) -> Iterator[dict[str, Any]]:
     """Describe how many runs ended a step at the iteration limit."""
-    done = [run for run in found if run["status"] == "ok" and run["stopped"]]
+    done = [run for run in run_records if run["status"] == "ok" and run["stopped"]]
     short = [run for run in done if run["stopped"] == "iterations"]
     if short:
         words = f"{len(short)} of {len(done)} runs ended a step at the limit of iterations: look at residuals."

@@ -9,40 +9,40 @@ from typing import Any
 
 import pyarrow as pa
 
-from harness.report.site.marks import LOG, axis, drawn
-from harness.report.site.runs import MACHINE, references
-from harness.report.site.script import number
-from harness.report.speed.figures import Figures, figures
-from harness.report.speed.speed_table import remarks
-from harness.report.style import looks
+from harness.report.site.marks import LOG_AXIS, axis_choice, plotly_style
+from harness.report.site.runs import MACHINE_SOLVER, format_references
+from harness.report.site.script import round_number
+from harness.report.speed.figures import SpeedFigures, compute_speed_figures
+from harness.report.speed.speed_table import describe_speed
+from harness.report.style import assign_label_styles
 
-_LINEAR = {"rangemode": "tozero"}
-_SHARE = {"rangemode": "tozero", "tickformat": ".0%"}
-_COLUMNS = {
-    "step": axis("step", "ms, a step of 50 iterations"),
-    "global_": axis("global_", "ms, a global step"),
-    "local": axis("local", "ms, a local step"),
-    "warm": axis("warm", "ms, to prepare, warm"),
-    "touched": axis("touched", "bytes a second that an iteration touches", LOG),
-    "reached": axis("reached", "of the limit that binds", _SHARE),
-    "faster": axis("faster", "times faster than the yardstick in C++", _LINEAR),
+_LINEAR_AXIS = {"rangemode": "tozero"}
+_SHARE_AXIS = {"rangemode": "tozero", "tickformat": ".0%"}
+_AXIS_CHOICES = {
+    "step": axis_choice("step", "ms, a step of 50 iterations"),
+    "global_": axis_choice("global_", "ms, a global step"),
+    "local": axis_choice("local", "ms, a local step"),
+    "warm": axis_choice("warm", "ms, to prepare, warm"),
+    "touched": axis_choice("touched", "bytes a second that an iteration touches", LOG_AXIS),
+    "reached": axis_choice("reached", "of the limit that binds", _SHARE_AXIS),
+    "faster": axis_choice("faster", "times faster than the yardstick in C++", _LINEAR_AXIS),
 }
 
 
-def is_speed(table: pa.Table) -> bool:
+def has_machine_limits(table: pa.Table) -> bool:
     """Return whether rows belong to a speed report, which contains the machine's own limits."""
-    return MACHINE in table["solver"].unique().to_pylist()
+    return MACHINE_SOLVER in table["solver"].unique().to_pylist()
 
 
-def chart(table: pa.Table) -> tuple[dict[str, Any], list[str]]:
+def build_speed_chart(table: pa.Table) -> tuple[dict[str, Any], list[str]]:
     """Build the chart, and remarks in sentences."""
-    found = figures(table)
+    found = compute_speed_figures(table)
     timed = [f for f in found if f.status == "ok"]
     reference = dict(zip(*(table[name].to_pylist() for name in ("solver", "reference")), strict=True))
-    lines: dict[tuple[str, str], list[Figures]] = {}
+    lines: dict[tuple[str, str], list[SpeedFigures]] = {}
     for f in sorted(timed, key=lambda f: f.vertices):
         lines.setdefault((f.scene, f.label), []).append(f)
-    marks = looks((f.label, f.solver) for f in timed)
+    marks = assign_label_styles((f.label, f.solver) for f in timed)
     dated = zip(*(table[name].to_pylist() for name in ("started", "code")), strict=True)
     newest = max(((started or "", code or "") for started, code in dated), default=("", ""))[1]
     hover = [["vertices", "vertices"], ["step", "ms a step"], ["global_", "ms a global step"]]
@@ -51,21 +51,29 @@ def chart(table: pa.Table) -> tuple[dict[str, Any], list[str]]:
         "note": "Medians over the rounds. A limit is what the machine reads or computes at most, measured beside the "
         "solvers; the yardstick is the same method in C++ with Eigen.",
         "filters": ["scene"],
-        "x": [axis("vertices", "vertices")],
-        "y": list(_COLUMNS.values()),
+        "x": [axis_choice("vertices", "vertices")],
+        "y": list(_AXIS_CHOICES.values()),
         "hover": [*hover, ["binds", "limit that binds"], ["reached", "share of that limit reached"]],
-        "items": [_item(scene, label, some, newest) for (scene, label), some in lines.items()],
-        "marks": {label: drawn(mark) for label, mark in marks.items()},
-        "references": references((f.label, reference.get(f.solver)) for f in timed),
+        "items": [_build_item(scene, label, some, newest) for (scene, label), some in lines.items()],
+        "marks": {label: plotly_style(mark) for label, mark in marks.items()},
+        "references": format_references((f.label, reference.get(f.solver)) for f in timed),
         "command": "springbench speed CONFIG --again",
-    }, remarks(found)
+    }, describe_speed(found)
 
 
-def _item(scene: str, label: str, some: list[Figures], newest: str) -> dict[str, Any]:
-    names = ("vertices", *(name for name in _COLUMNS if name != "faster"))
-    columns = {name: [number(getattr(f, name)) for f in some] for name in names}
-    columns["faster"] = [number(f.faster and f.faster.middle) for f in some]
-    ends = {f"faster_{end}": [number(getattr(f.faster, end, None)) for f in some] for end in ("low", "high")}
+def _build_item(scene: str, label: str, some: list[SpeedFigures], newest_fingerprint: str) -> dict[str, Any]:
+    names = ("vertices", *(name for name in _AXIS_CHOICES if name != "faster"))
+    columns = {name: [round_number(getattr(f, name)) for f in some] for name in names}
+    columns["faster"] = [round_number(f.speedup and f.speedup.estimate) for f in some]
+    ends = {f"faster_{end}": [round_number(getattr(f.speedup, end, None)) for f in some] for end in ("low", "high")}
     threads = f"{some[0].threads} thread{'s' if some[0].threads > 1 else ''}"
     told = {"label": label, "what": f"{scene}, {threads}", "scene": scene, "panel": scene, "parameters": "{}"}
-    return told | columns | ends | {"binds": [f.binds for f in some], "older": [f.code != newest for f in some]}
+    return (
+        told
+        | columns
+        | ends
+        | {
+            "binds": [f.binding_limit for f in some],
+            "older": [f.source_fingerprint != newest_fingerprint for f in some],
+        }
+    )

@@ -28,29 +28,29 @@ from pathlib import Path
 import rerun_cli  # pyright: ignore[reportMissingTypeStubs]
 
 from harness.base.errors import RunFailed
-from harness.base.files import replacing
+from harness.base.files import atomic_write
 
-VERSION = "0.41.0"
+RERUN_VERSION = "0.41.0"
 """Version of rerun-sdk; a test fails if another one is installed, and then recordings have to be checked in it."""
 
-VIEWER = "viewer.js"
+VIEWER_SCRIPT = "viewer.js"
 """File name of the viewer's script, which is stored next to `replay.js`."""
 
-_SCRIPT, _WASM = "re_viewer.js", "re_viewer_bg.wasm"
-_HEADER, _END, _STORE, _DATA, _LAID_OUT = 12, 0, 1, 2, 3
+_RERUN_SCRIPT, _RERUN_WASM = "re_viewer.js", "re_viewer_bg.wasm"
+_HEADER_BYTES, _END_MESSAGE, _STORE_MESSAGE, _DATA_MESSAGE, _LAYOUT_MESSAGE = 12, 0, 1, 2, 3
 """Format of a recording: a header, then messages with 8 bytes each for kind and length, and their data.
 
 The kinds are: end, store (of a recording or of a layout), data of a store, and completion of a layout.
 """
 
-_PATIENCE = 30.0
+_SERVER_TIMEOUT = 30.0
 """Timeout of the viewer's server [s]."""
 
-_HEAD = "// Rerun's web viewer {version}, https://rerun.io, MIT or Apache-2.0; packed by springbench, {how}\n"
-_TAKEN = "springbench.taken = {};\n"
+_SCRIPT_HEADER = "// Rerun's web viewer {version}, https://rerun.io, MIT or Apache-2.0; packed by springbench, {how}\n"
+_HANDOVER_TEMPLATE = "springbench.taken = {};\n"
 """Statement by which a script passes its content; `replay.js` loads one script at a time."""
 
-_QUIET = """{{"wasm": {wasm}, "start": ((console, fetch) => {{
+_VIEWER_TEMPLATE = """{{"wasm": {wasm}, "start": ((console, fetch) => {{
 {script}
 return wasm_bindgen;
 }})(
@@ -60,7 +60,7 @@ return wasm_bindgen;
 """Wrapper that suppresses the viewer's thousands of console messages and its usage reports to its authors."""
 
 
-def binary() -> Path:
+def rerun_binary() -> Path:
     """Return the path of Rerun's executable from the wheel.
 
     Its wrapper script would leave a process behind when killed.
@@ -75,14 +75,14 @@ def write_viewer(folder: Path) -> Path:
         RunFailed: if the viewer is not installed or does not answer.
         CannotWrite: if the file cannot be written.
     """
-    how = sha256(_QUIET.encode()).hexdigest()[:8]
-    path, head = folder / VIEWER, _HEAD.format(version=version("rerun-sdk"), how=how)
-    if not _begins(path, head):
-        script, wasm = _served()
+    how = sha256(_VIEWER_TEMPLATE.encode()).hexdigest()[:8]
+    path, head = folder / VIEWER_SCRIPT, _SCRIPT_HEADER.format(version=version("rerun-sdk"), how=how)
+    if not _starts_with(path, head):
+        script, wasm = _fetch_viewer_files()
         folder.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as partial:
-            value = _QUIET.format(wasm=json.dumps(_packed(wasm)), script=script)
-            partial.write_text(head + _TAKEN.format(value), encoding="utf-8")
+        with atomic_write(path) as partial:
+            value = _VIEWER_TEMPLATE.format(wasm=json.dumps(_encode_gzip(wasm)), script=script)
+            partial.write_text(head + _HANDOVER_TEMPLATE.format(value), encoding="utf-8")
     return path
 
 
@@ -102,61 +102,70 @@ def write_recording(recording: Path, script: Path, title: str) -> Path:
     made = recording.stat().st_mtime_ns
     if not script.is_file() or script.stat().st_mtime_ns < made:
         script.parent.mkdir(parents=True, exist_ok=True)
-        value = {"title": title, "rrd": _packed(layout_first(recording.read_bytes()))}
-        with replacing(script) as partial:
-            partial.write_text(_TAKEN.format(json.dumps(value)), encoding="utf-8")
+        value = {"title": title, "rrd": _encode_gzip(move_layout_first(recording.read_bytes()))}
+        with atomic_write(script) as partial:
+            partial.write_text(_HANDOVER_TEMPLATE.format(json.dumps(value)), encoding="utf-8")
     return script
 
 
-def layout_first(data: bytes) -> bytes:
+def move_layout_first(data: bytes) -> bytes:
     """Move the messages of a recording's layout before the others.
 
     The viewer then opens with it immediately. The index at the end of the file, up to half of its size, is omitted,
     because a stream needs no lookup.
     """
-    messages, place = list[tuple[int, bytes]](), _HEADER
+    messages, place = list[tuple[int, bytes]](), _HEADER_BYTES
     while place + 16 <= len(data):
         kind, length = struct.unpack_from("<QQ", data, place)
-        if kind == _END:
+        if kind == _END_MESSAGE:
             break
         messages.append((kind, data[place : place + 16 + length]))
         place += 16 + length
     kinds = [kind for kind, _ in messages]
-    if _LAID_OUT not in kinds:
+    if _LAYOUT_MESSAGE not in kinds:
         return data
-    last = len(kinds) - kinds[::-1].index(_LAID_OUT)
-    first = next((k for k in range(1, last) if kinds[k - 1] == _DATA and kinds[k] == _STORE), 0)
+    last = len(kinds) - kinds[::-1].index(_LAYOUT_MESSAGE)
+    first = next((k for k in range(1, last) if kinds[k - 1] == _DATA_MESSAGE and kinds[k] == _STORE_MESSAGE), 0)
     order = [*messages[first:last], *messages[:first], *messages[last:]]
-    return data[:_HEADER] + b"".join(message for _, message in order)
+    return data[:_HEADER_BYTES] + b"".join(message for _, message in order)
 
 
-def _begins(path: Path, head: str) -> bool:
+def _starts_with(path: Path, head: str) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as file:
         return file.read(len(head.encode())) == head.encode()
 
 
-def _packed(data: bytes) -> str:
+def _encode_gzip(data: bytes) -> str:
     return b64encode(gzip.compress(data, 6, mtime=0)).decode()
 
 
-def _served() -> tuple[str, bytes]:
+def _fetch_viewer_files() -> tuple[str, bytes]:
     """Fetch the viewer's script and WebAssembly module from its own server.
 
     The server listens only on the loopback interface.
     """
-    with _serving() as address:
-        script, wasm = (_fetched(f"{address}/{name}") for name in (_SCRIPT, _WASM))
+    with _run_viewer_server() as address:
+        script, wasm = (_fetch_with_retries(f"{address}/{name}") for name in (_RERUN_SCRIPT, _RERUN_WASM))
     return script.decode().replace("arg0.fetch(", "fetch("), wasm  # that of the window, else
 
 
 @contextmanager
-def _serving() -> Generator[str]:
-    if not binary().is_file():
-        raise RunFailed(f"the viewer is not installed: {binary()} is missing; install rerun-sdk again")
-    port, other = _free_ports(2)
-    command = [binary(), "--serve-web", "--bind", "127.0.0.1", "--port", str(other), "--web-viewer-port", str(port)]
+def _run_viewer_server() -> Generator[str]:
+    if not rerun_binary().is_file():
+        raise RunFailed(f"the viewer is not installed: {rerun_binary()} is missing; install rerun-sdk again")
+    port, other = _find_free_ports(2)
+    command = [
+        rerun_binary(),
+        "--serve-web",
+        "--bind",
+        "127.0.0.1",
+        "--port",
+        str(other),
+        "--web-viewer-port",
+        str(port),
+    ]
     none, own = subprocess.DEVNULL, os.environ | {"TELEMETRY_ENABLED": "false"}
     server = subprocess.Popen(command, env=own, stdin=none, stdout=none, stderr=none)
     try:
@@ -166,17 +175,17 @@ def _serving() -> Generator[str]:
         server.wait()
 
 
-def _fetched(url: str) -> bytes:
+def _fetch_with_retries(url: str) -> bytes:
     """Fetch the content of an address, with retries.
 
     Raises:
         RunFailed: if there is no answer in time.
     """
     direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-    until = time.monotonic() + _PATIENCE
+    until = time.monotonic() + _SERVER_TIMEOUT
     while True:
         try:
-            with direct.open(url, timeout=_PATIENCE) as answer:
+            with direct.open(url, timeout=_SERVER_TIMEOUT) as answer:
                 return answer.read()
         except (urllib.error.URLError, ConnectionError) as error:
             if time.monotonic() > until:
@@ -186,7 +195,7 @@ def _fetched(url: str) -> bytes:
             time.sleep(0.05)
 
 
-def _free_ports(count: int) -> list[int]:
+def _find_free_ports(count: int) -> list[int]:
     sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
     ports = [one.getsockname()[1] for one in sockets]
     for one in sockets:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-_ENTRY = {"float64": 8, "float32": 4, "float16": 2}
+_ENTRY_BYTES = {"float64": 8, "float32": 4, "float16": 2}
 """Bytes of an entry of the factor, by the solver's `precision`."""
 
 _SPRING_BYTES, _SPRING_FLOPS = 16, 19
@@ -23,19 +23,21 @@ _LOCAL_BYTES, _GLOBAL_BYTES = 72, 176
 Local: p and y read, b written. Global: b read, p written, and a work vector of 4 numbers read and written in each pass.
 """
 
-_VECTORS = 80
+_VECTOR_BYTES = 80
 """Bytes of the stored vectors per vertex: b and p, or in an iteration y and p, and the work vector."""
 
 
-class Counted(NamedTuple):
+class OperationCount(NamedTuple):
     """Bytes moved, flops, and the bytes that are accessed repeatedly."""
 
-    bytes: float
-    flops: float
-    working_set: float
+    bytes_moved: float
+    flop_count: float
+    working_set_bytes: float
 
 
-def count(facts: Mapping[str, float], vertices: int, springs: int, precision: str = "float64") -> dict[str, Counted]:
+def count_operations(
+    stats: Mapping[str, float], vertices: int, springs: int, precision: str = "float64"
+) -> dict[str, OperationCount]:
     """Count the work of a local step, a global step and an iteration.
 
     An iteration is both steps. Unknown counts are omitted.
@@ -47,12 +49,16 @@ def count(facts: Mapping[str, float], vertices: int, springs: int, precision: st
         precision: number format of the factor.
     """
     moved = _SPRING_BYTES * springs + _LOCAL_BYTES * vertices
-    local = Counted(moved, _SPRING_FLOPS * springs, moved)
-    if "nnz_factor" not in facts:
+    local = OperationCount(moved, _SPRING_FLOPS * springs, moved)
+    if "nnz_factor" not in stats:
         return {"local": local}
-    entry = _ENTRY[precision]
-    flops = facts.get("flops_per_solve", 12 * facts["nnz_factor"])
-    stored = facts.get("panel_bytes", entry * facts["nnz_factor"])
-    whole = Counted(flops / 6 * entry + _GLOBAL_BYTES * vertices, flops, stored + _VECTORS * vertices)
-    both = Counted(local.bytes + whole.bytes, local.flops + flops, whole.working_set + _SPRING_BYTES * springs)
+    entry = _ENTRY_BYTES[precision]
+    flops = stats.get("flops_per_solve", 12 * stats["nnz_factor"])
+    stored = stats.get("panel_bytes", entry * stats["nnz_factor"])
+    whole = OperationCount(flops / 6 * entry + _GLOBAL_BYTES * vertices, flops, stored + _VECTOR_BYTES * vertices)
+    both = OperationCount(
+        local.bytes_moved + whole.bytes_moved,
+        local.flop_count + flops,
+        whole.working_set_bytes + _SPRING_BYTES * springs,
+    )
     return {"local": local, "global": whole, "iteration": both}

@@ -15,29 +15,29 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from harness.base import machine
-from harness.base.statistics import Interval, ratio
-from harness.report.speed.counts import Counted, count
+from harness.base.statistics import ConfidenceInterval, estimate_ratio
+from harness.report.speed.counts import OperationCount, count_operations
 
-MACHINE, YARDSTICK = "machine", "eigen"
+MACHINE_SOLVER, CPP_BASELINE = "machine", "eigen"
 """Solver column of rows of candidates that are not solvers."""
 
-CAREFUL = "cholmod"
+OPTIMISED_BASELINE = "cholmod"
 """The solver that represents carefully written C++."""
 
-STEP = 50
+STEP_ITERATIONS = 50
 """Number of iterations to which all step times are scaled, whatever their actual number."""
 
-Row = dict[str, Any]
+ResultRow = dict[str, Any]
 
 
-class Limit(NamedTuple):
+class RooflineLimit(NamedTuple):
     """The binding resource, `bandwidth` or `arithmetic`, and the minimum time of some work [s]."""
 
-    binds: str
+    resource: str
     seconds: float
 
 
-class Figures(NamedTuple):
+class SpeedFigures(NamedTuple):
     """One candidate at one size.
 
     Times are medians over the rounds [ms]; None: not measured or unknown.
@@ -65,38 +65,38 @@ class Figures(NamedTuple):
     threads: int
     status: str
     reason: str | None
-    choice: str | None
+    solver_description: str | None
     iterations: int | None = None
     cold: float | None = None
     warm: float | None = None
     local: float | None = None
     global_: float | None = None
     step: float | None = None
-    entries: int | None = None
-    bytes: float | None = None
-    touched: float | None = None
-    binds: str | None = None
-    reached: float | None = None
-    passes: float | None = None
-    faster: Interval | None = None
-    cheap_faster: Interval | None = None
-    careful_faster: Interval | None = None
-    solves_faster: Interval | None = None
-    apart: float | None = None
-    load: float | None = None
+    factor_entries: int | None = None
+    bytes_moved: float | None = None
+    achieved_bandwidth: float | None = None
+    binding_limit: str | None = None
+    roofline_fraction: float | None = None
+    two_pass_fraction: float | None = None
+    speedup: ConfidenceInterval | None = None
+    speedup_over_cheap: ConfidenceInterval | None = None
+    speedup_over_cholmod: ConfidenceInterval | None = None
+    solve_speedup_over_cholespy: ConfidenceInterval | None = None
+    precision_error: float | None = None
+    load_average: float | None = None
     solver: str = ""
-    code: str = ""
+    source_fingerprint: str = ""
     cpu: str = ""
     cores: int | None = None
     commit: str = ""
 
     @property
-    def older(self) -> bool:
+    def is_stale(self) -> bool:
         """Whether other code than the current version measured it.
 
         Rows without a fingerprint count as current.
         """
-        return self.code not in ("", machine.code_hash())
+        return self.source_fingerprint not in ("", machine.hash_sources())
 
 
 class MachineLimits:
@@ -105,7 +105,7 @@ class MachineLimits:
     These are bandwidth by working set, and flops, each by number of threads.
     """
 
-    def __init__(self, rows: Sequence[Row]) -> None:
+    def __init__(self, rows: Sequence[ResultRow]) -> None:
         best: dict[tuple[int, str], dict[float, float]] = defaultdict(dict)
         for row in rows:
             rate = (row["bytes"] or row["flops"]) / row["seconds"]
@@ -113,7 +113,7 @@ class MachineLimits:
             at[row["working_set"]] = max(rate, at.get(row["working_set"], 0.0))
         self._best = best
 
-    def bandwidth(self, threads: int, working_set: float, kernel: str = "read") -> float:
+    def measured_bandwidth(self, threads: int, working_set: float, kernel: str = "read") -> float:
         """Return the bandwidth for a working set, interpolated on logarithmic scales.
 
         Args:
@@ -126,63 +126,63 @@ class MachineLimits:
         known, rates = np.log(np.array(at)).T
         return float(np.exp(cast(float, np.interp(np.log(working_set), known, rates))))
 
-    def flops(self, threads: int, precision: str) -> float:
+    def measured_flops(self, threads: int, precision: str) -> float:
         """Return flops per second; precisions below float32 compute in float32."""
         kind = "float64" if precision == "float64" else "float32"
         return self._best[threads, f"fma {kind}"][0.0]
 
-    def limit(self, counted: Counted, threads: int, precision: str) -> Limit:
+    def compute_limit(self, operations: OperationCount, threads: int, precision: str) -> RooflineLimit:
         """Compute the lower bound of the time for any order of access.
 
         Each byte is loaded once from the location of the working set, and repeated accesses come from the fastest
         cache.
         """
-        again = (counted.bytes - counted.working_set) / max(self._best[threads, "read"].values())
-        far = counted.working_set / self.bandwidth(threads, counted.working_set)
-        return self._binding(far + again, counted, threads, precision)
+        again = (operations.bytes_moved - operations.working_set_bytes) / max(self._best[threads, "read"].values())
+        far = operations.working_set_bytes / self.measured_bandwidth(threads, operations.working_set_bytes)
+        return self._binding_limit(far + again, operations, threads, precision)
 
-    def passes(self, counted: Counted, threads: int, precision: str) -> Limit:
+    def compute_pass_limit(self, operations: OperationCount, threads: int, precision: str) -> RooflineLimit:
         """Compute the time if all moved bytes are loaded from the working set.
 
         Each access is then as slow as the location of the working set.
         """
-        far = counted.bytes / self.bandwidth(threads, counted.working_set)
-        return self._binding(far, counted, threads, precision)
+        far = operations.bytes_moved / self.measured_bandwidth(threads, operations.working_set_bytes)
+        return self._binding_limit(far, operations, threads, precision)
 
-    def _binding(self, moving: float, counted: Counted, threads: int, precision: str) -> Limit:
-        seconds = {"bandwidth": moving, "arithmetic": counted.flops / self.flops(threads, precision)}
+    def _binding_limit(self, moving: float, operations: OperationCount, threads: int, precision: str) -> RooflineLimit:
+        seconds = {"bandwidth": moving, "arithmetic": operations.flop_count / self.measured_flops(threads, precision)}
         binds = max(seconds, key=seconds.__getitem__)
-        return Limit(binds, seconds[binds])
+        return RooflineLimit(binds, seconds[binds])
 
 
-def figures(table: pa.Table) -> list[Figures]:
+def compute_speed_figures(table: pa.Table) -> list[SpeedFigures]:
     """Compute the figures of all candidates in the rows, in their order.
 
     They are relative to the machine's own rows.
     """
-    runs: dict[str, list[Row]] = defaultdict(list)
+    runs: dict[str, list[ResultRow]] = defaultdict(list)
     for row in table.to_pylist():
         runs[row["run_id"]].append(row)
-    labels = _labels([found[0] for found in runs.values()])
-    groups: dict[tuple[str, int], dict[str, list[Row]]] = defaultdict(dict)
+    labels = _label_candidates([found[0] for found in runs.values()])
+    groups: dict[tuple[str, int], dict[str, list[ResultRow]]] = defaultdict(dict)
     for found in runs.values():
         groups[found[0]["scene"], found[0]["size"]][labels[found[0]["run_id"]]] = found
-    out: list[Figures] = []
+    out: list[SpeedFigures] = []
     for group in groups.values():
-        limits = MachineLimits([row for found in group.values() for row in found if row["solver"] == MACHINE])
+        limits = MachineLimits([row for found in group.values() for row in found if row["solver"] == MACHINE_SOLVER])
         for label, found in group.items():
-            if found[0]["solver"] != MACHINE:
-                out.append(_figures(label, found, group, limits))
+            if found[0]["solver"] != MACHINE_SOLVER:
+                out.append(_compute_candidate(label, found, group, limits))
     return out
 
 
-def _labels(firsts: Sequence[Row]) -> dict[str, str]:
+def _label_candidates(first_rows: Sequence[ResultRow]) -> dict[str, str]:
     """Label candidates by run id.
 
     A label has the solver, its varying parameters, and its threads if several.
     """
     values: dict[tuple[str, str], set[str]] = defaultdict(set)
-    for row in firsts:
+    for row in first_rows:
         for key, value in json.loads(row["parameters"]).items():
             values[row["solver"], key].add(str(value))
     return {
@@ -191,80 +191,86 @@ def _labels(firsts: Sequence[Row]) -> dict[str, str]:
             + [str(v) for key, v in json.loads(row["parameters"]).items() if len(values[row["solver"], key]) > 1]
             + ([f"x{row['threads']}"] if row["threads"] > 1 else [])
         )
-        for row in firsts
+        for row in first_rows
     }
 
 
-def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], limits: MachineLimits) -> Figures:
-    first = found[0]
-    known = Figures(
+def _compute_candidate(
+    label: str, run_rows: Sequence[ResultRow], group: Mapping[str, list[ResultRow]], limits: MachineLimits
+) -> SpeedFigures:
+    first = run_rows[0]
+    known = SpeedFigures(
         *(first["scene"], first["size"], first["vertices"], label, first["threads"]),
         *(first["status"], first["reason"], first["choice"]),
         solver=first["solver"],
-        code=first["code"] or "",
+        source_fingerprint=first["code"] or "",
         cpu=first["cpu"] or "",
         cores=first["cores"],
         commit=first["commit"] or "",
     )
     if first["status"] != "ok":
         return known
-    times = {phase: _times(found, phase) for phase in ("prepare", "local", "global", "step")}
+    times = {phase: _phase_seconds(run_rows, phase) for phase in ("prepare", "local", "global", "step")}
     known = known._replace(
-        iterations=next(row["iterations"] for row in found if row["phase"] == "step"),
+        iterations=next(row["iterations"] for row in run_rows if row["phase"] == "step"),
         cold=1e3 * times["prepare"][0],
         warm=1e3 * float(np.median(times["prepare"][1:])) if len(times["prepare"]) > 1 else None,
         local=1e3 * float(np.median(times["local"])),
         global_=1e3 * float(np.median(times["global"])),
-        step=1e3 * STEP * float(np.median(times["step"])),
-        faster=_against(group, f"{YARDSTICK} default", "step", times),
-        cheap_faster=_against(group, f"{YARDSTICK} cheap", "step", times),
-        careful_faster=_against(group, _on_one(group, lambda row: row["solver"] == CAREFUL), "step", times),
-        solves_faster=_against(group, _on_one(group, _by_cholespy), "global", times),
-        apart=first["apart"],
-        load=max(row["load"] for row in found),
+        step=1e3 * STEP_ITERATIONS * float(np.median(times["step"])),
+        speedup=_compute_speedup(group, f"{CPP_BASELINE} default", "step", times),
+        speedup_over_cheap=_compute_speedup(group, f"{CPP_BASELINE} cheap", "step", times),
+        speedup_over_cholmod=_compute_speedup(
+            group, _single_thread_label(group, lambda row: row["solver"] == OPTIMISED_BASELINE), "step", times
+        ),
+        solve_speedup_over_cholespy=_compute_speedup(
+            group, _single_thread_label(group, _uses_cholespy), "global", times
+        ),
+        precision_error=first["apart"],
+        load_average=max(row["load"] for row in run_rows),
     )
     facts = {name: first[name] for name in ("nnz_factor", "panel_bytes", "flops_per_solve") if first[name] is not None}
     if "nnz_factor" not in facts:
         return known
     precision = json.loads(first["parameters"]).get("precision", "float64")
     counts, how = (first["vertices"], first["springs"], precision), (first["threads"], precision)
-    touched = count(facts, *counts)["iteration"]
-    bare = count({"nnz_factor": facts["nnz_factor"]}, *counts)["iteration"]
-    limit, seconds = limits.limit(touched, *how), float(np.median(times["step"]))
+    touched = count_operations(facts, *counts)["iteration"]
+    bare = count_operations({"nnz_factor": facts["nnz_factor"]}, *counts)["iteration"]
+    limit, seconds = limits.compute_limit(touched, *how), float(np.median(times["step"]))
     return known._replace(
-        entries=facts["nnz_factor"],
-        bytes=touched.bytes,
-        touched=touched.bytes / seconds,
-        binds=limit.binds,
-        reached=limit.seconds / seconds,
-        passes=limits.passes(bare, *how).seconds / seconds,
+        factor_entries=facts["nnz_factor"],
+        bytes_moved=touched.bytes_moved,
+        achieved_bandwidth=touched.bytes_moved / seconds,
+        binding_limit=limit.resource,
+        roofline_fraction=limit.seconds / seconds,
+        two_pass_fraction=limits.compute_pass_limit(bare, *how).seconds / seconds,
     )
 
 
-def _times(found: Sequence[Row], phase: str) -> NDArray[np.float64]:
+def _phase_seconds(run_rows: Sequence[ResultRow], phase: str) -> NDArray[np.float64]:
     """Return the seconds of a phase by round; for a step, those of one iteration."""
     return np.array(
-        [row["seconds"] / (row["iterations"] if phase == "step" else 1) for row in found if row["phase"] == phase]
+        [row["seconds"] / (row["iterations"] if phase == "step" else 1) for row in run_rows if row["phase"] == phase]
     )
 
 
-def _on_one(group: Mapping[str, list[Row]], those: Callable[[Row], bool]) -> str:
+def _single_thread_label(group: Mapping[str, list[ResultRow]], predicate: Callable[[ResultRow], bool]) -> str:
     """Return the label of the single-threaded candidate whose rows satisfy the predicate."""
-    return next((label for label, found in group.items() if found[0]["threads"] == 1 and those(found[0])), "")
+    return next((label for label, found in group.items() if found[0]["threads"] == 1 and predicate(found[0])), "")
 
 
-def _by_cholespy(row: Row) -> bool:
+def _uses_cholespy(row: ResultRow) -> bool:
     """Return whether a candidate solves with cholespy."""
     return json.loads(row["parameters"]).get("linear") == "cholespy"
 
 
-def _against(
-    group: Mapping[str, list[Row]], yardstick: str, phase: str, times: Mapping[str, NDArray[np.float64]]
-) -> Interval | None:
+def _compute_speedup(
+    group: Mapping[str, list[ResultRow]], baseline: str, phase: str, times: Mapping[str, NDArray[np.float64]]
+) -> ConfidenceInterval | None:
     """Compute the speedup over a baseline in the same rounds.
 
     The result is None if the baseline has no times.
     """
-    theirs = _times(group.get(yardstick, ()), phase)
+    theirs = _phase_seconds(group.get(baseline, ()), phase)
     rounds = min(len(theirs), len(times[phase]))
-    return ratio(theirs[:rounds], times[phase][:rounds]) if rounds else None
+    return estimate_ratio(theirs[:rounds], times[phase][:rounds]) if rounds else None

@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from harness.base.statistics import Interval
-from harness.report.page import count, quantity
-from harness.report.speed.figures import STEP, Figures
+from harness.base.statistics import ConfidenceInterval
+from harness.report.page import format_count, format_quantity
+from harness.report.speed.figures import STEP_ITERATIONS, SpeedFigures
 
-_NUMBERS = (
+_NUMBER_HEADINGS = (
     "prepare\ncold ms",
     "\nwarm ms",
     "local\nms",
     "global\nms",
-    f"step of\n{STEP} ms",
+    f"step of\n{STEP_ITERATIONS} ms",
     "an iteration\ntouches MB",
     "\nGB/s",
     "what\nbinds",
@@ -39,7 +39,7 @@ _NUMBERS = (
 )
 
 
-def speed_table(found: Sequence[Figures]) -> Table:
+def build_speed_table(candidates: Sequence[SpeedFigures]) -> Table:
     """Build a table with a line for each candidate at each size.
 
     Speedups have their 95 % intervals.
@@ -48,82 +48,87 @@ def speed_table(found: Sequence[Figures]) -> Table:
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     table.add_column("scene", justify="right")
     table.add_column("candidate", no_wrap=True)
-    for words in _NUMBERS:
+    for words in _NUMBER_HEADINGS:
         table.add_column(words, justify="right", no_wrap=True)
-    where = _places(found)
-    for _, group in groupby(found, key=lambda f: (f.scene, f.size)):
+    where = _build_scene_labels(candidates)
+    for _, group in groupby(candidates, key=lambda f: (f.scene, f.size)):
         for f in group:
             if f.status == "ok":
-                table.add_row(where(f), _named(f), *_cells(f))
+                table.add_row(where(f), _format_label(f), *_format_cells(f))
             else:
                 table.add_row(where(f), f.label, f"[yellow]{f.status}[/]")
         table.add_section()
     return table
 
 
-def _places(found: Sequence[Figures]) -> Callable[[Figures], str]:
+def _build_scene_labels(candidates: Sequence[SpeedFigures]) -> Callable[[SpeedFigures], str]:
     """Return a function that labels a candidate's scene.
 
     If there is one scene, the label is the size only.
     """
-    if len({f.scene for f in found}) == 1:
-        return lambda f: count(f.size)
-    return lambda f: f"{f.scene} {count(f.size)}"
+    if len({f.scene for f in candidates}) == 1:
+        return lambda f: format_count(f.size)
+    return lambda f: f"{f.scene} {format_count(f.size)}"
 
 
-def _named(f: Figures) -> str:
-    said = [f"{f.iterations} of {STEP}"] if f.iterations != STEP else []
-    said += ["by other code"] if f.older else []
+def _format_label(f: SpeedFigures) -> str:
+    said = [f"{f.iterations} of {STEP_ITERATIONS}"] if f.iterations != STEP_ITERATIONS else []
+    said += ["by other code"] if f.is_stale else []
     return f"{f.label} ({', '.join(said)})" if said else f.label
 
 
-def _cells(f: Figures) -> list[str]:
+def _format_cells(f: SpeedFigures) -> list[str]:
     return [
-        *(_number(value) for value in (f.cold, f.warm, f.local, f.global_, f.step)),
-        _number(f.bytes and f.bytes / 1e6),
-        _number(f.touched and f.touched / 1e9),
-        f.binds or "–",
-        _share(f.reached),
-        _share(f.passes),
-        *(_ratio(interval) for interval in (f.faster, f.cheap_faster, f.careful_faster, f.solves_faster)),
-        "–" if f.apart is None else f"{f.apart:.0e}",
-        _number(f.load),
+        *(_format_number(value) for value in (f.cold, f.warm, f.local, f.global_, f.step)),
+        _format_number(f.bytes_moved and f.bytes_moved / 1e6),
+        _format_number(f.achieved_bandwidth and f.achieved_bandwidth / 1e9),
+        f.binding_limit or "–",
+        _format_share(f.roofline_fraction),
+        _format_share(f.two_pass_fraction),
+        *(
+            _format_ratio(interval)
+            for interval in (f.speedup, f.speedup_over_cheap, f.speedup_over_cholmod, f.solve_speedup_over_cholespy)
+        ),
+        "–" if f.precision_error is None else f"{f.precision_error:.0e}",
+        _format_number(f.load_average),
     ]
 
 
-def _number(value: float | None) -> str:
-    return "–" if value is None else quantity(value)
+def _format_number(value: float | None) -> str:
+    return "–" if value is None else format_quantity(value)
 
 
-def _share(value: float | None) -> str:
+def _format_share(value: float | None) -> str:
     return "–" if value is None else f"{100 * value:.0f} %"
 
 
-def _ratio(interval: Interval | None) -> str:
-    return "–" if interval is None else f"{interval.middle:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
+def _format_ratio(interval: ConfidenceInterval | None) -> str:
+    return "–" if interval is None else f"{interval.estimate:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
 
 
-def remarks(found: Sequence[Figures]) -> list[str]:
+def describe_speed(candidates: Sequence[SpeedFigures]) -> list[str]:
     """Describe failures, choices of the solvers, and the scaling of a solve.
 
     Failed and omitted candidates are listed with their reasons.
     """
-    where = _places(found)
+    where = _build_scene_labels(candidates)
     told: dict[str, list[str]] = defaultdict(list)
-    for f in sorted(found, key=lambda f: f.status == "ok"):
+    for f in sorted(candidates, key=lambda f: f.status == "ok"):
         if f.status != "ok":
             told[f"{f.label}: {f.status}: {f.reason}"].append(where(f))
-        elif f.choice and "auto" in f.label.split():
-            told[f"{f.label} chose {f.choice}"].append(where(f))
+        elif f.solver_description and "auto" in f.label.split():
+            told[f"{f.label} chose {f.solver_description}"].append(where(f))
     said = [f"{words} (at {', '.join(sizes)})" for words, sizes in told.items()]
-    entries = exponents(found, "entries")
-    for (scene, label), exponent in exponents(found).items():
+    entries = fit_exponents(candidates, "entries")
+    for (scene, label), exponent in fit_exponents(candidates).items():
         factor = f", its factor has n^{entries[scene, label]:.2f} entries" if (scene, label) in entries else ""
         said.append(f"{label}: from 10,000 vertices of {scene} on a solve costs n^{exponent:.2f}{factor}")
     return said
 
 
-def exponents(found: Sequence[Figures], figure: str = "global_", least: int = 10_000) -> dict[tuple[str, str], float]:
+def fit_exponents(
+    candidates: Sequence[SpeedFigures], figure: str = "global_", min_vertices: int = 10_000
+) -> dict[tuple[str, str], float]:
     """Fit exponents of a figure's growth with size, by scene and label.
 
     Args:
@@ -132,9 +137,9 @@ def exponents(found: Sequence[Figures], figure: str = "global_", least: int = 10
         min_vertices: smallest size that is included.
     """
     by_label: dict[tuple[str, str], list[tuple[int, float]]] = defaultdict(list)
-    for f in found:
+    for f in candidates:
         value = getattr(f, figure)
-        if value and f.vertices >= least:
+        if value and f.vertices >= min_vertices:
             by_label[f.scene, f.label].append((f.vertices, value))
     logarithms = {label: np.log(np.array(points)).T for label, points in by_label.items() if len(points) > 1}
     return {

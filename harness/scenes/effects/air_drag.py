@@ -14,22 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import NonNegativeFloat
 
-from harness.base.model import Model
-from harness.scenes.effects.base import Contribution, Force, Seen
+from harness.base.model import ConfigModel
+from harness.scenes.effects.base import EffectContribution, ForceFunction, ObservedMotion
 from harness.scenes.mesh.base import Mesh
 from solvers.energies.quadratic import AirDrag as Energy
 from solvers.filters import QuadraticDrag
 from solvers.problem import Positions
 
-ALIVE = 0.1
+MIN_ENERGY_FRACTION = 0.1
 """Ratio of kinetic energy to its maximum: a larger average over the last quarter means that the scene does not rest."""
 
 
-class AirDrag(Model):
+class AirDragEffect(ConfigModel):
     """Air drag on the vertices, distributed like the mass."""
 
-    exact_to: ClassVar[float] = inf
-    damps: ClassVar[bool] = True
+    max_convergence_order: ClassVar[float] = inf
+    is_dissipative: ClassVar[bool] = True
 
     kind: Literal["air-drag"] = "air-drag"
     law: Literal["linear", "quadratic"] = "linear"
@@ -38,39 +38,39 @@ class AirDrag(Model):
     """Drag of the whole mesh at a speed of 1 m/s [N]: c [N s/m] if linear; if quadratic, half of the air density times
     area times drag coefficient [kg/m]."""
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the drag as an energy or a filter; empty for a zero coefficient."""
-        c = self.coefficient * mesh.shares
+        c = self.coefficient * mesh.mass_fractions
         if not c.any():
-            return Contribution()
+            return EffectContribution()
         if self.law == "linear":
-            return Contribution(energies=(Energy.of_vertices(c),))
+            return EffectContribution(energies=(Energy.from_vertices(c),))
 
-        def force() -> Contribution:
-            return Contribution(forces=(_force(c, mass / time_step),))
+        def force() -> EffectContribution:
+            return EffectContribution(forces=(_quadratic_drag_force(c, mass / time_step),))
 
-        return Contribution(filters=(QuadraticDrag(mass, c * time_step),), continuous=(force,))
+        return EffectContribution(velocity_filters=(QuadraticDrag(mass, c * time_step),), continuous_forms=(force,))
 
     @classmethod
-    def called_for(cls, seen: Seen) -> str:
+    def find_evidence(cls, observed: ObservedMotion) -> str:
         """Return evidence for drag: motion without driving forces that does not end."""
-        mass, v = seen.mass, seen.velocities
-        if seen.driven or seen.damped or len(v) < 8:
+        mass, v = observed.mass, observed.velocities
+        if observed.is_driven or observed.is_damped or len(v) < 8:
             return ""
-        most = float(_kinetic(mass, v).max())
-        if not seen.held:  # what nothing holds may fly, fall or slide on as a whole
+        most = float(_compute_kinetic_energy(mass, v).max())
+        if not observed.has_pins:  # what nothing holds may fly, fall or slide on as a whole
             v = v - np.einsum("i,fix->fx", mass / mass.sum(), v)[:, None]
-        late = float(_kinetic(mass, v[-len(v) // 4 :]).mean())
-        if not most or late <= ALIVE * most:
+        late = float(_compute_kinetic_energy(mass, v[-len(v) // 4 :]).mean())
+        if not most or late <= MIN_ENERGY_FRACTION * most:
             return ""
         return (
-            f"nothing drives the motion or damps it; in the last quarter of {seen.time(len(v) - 1):.2f} s it still "
+            f"nothing drives the motion or damps it; in the last quarter of {observed.compute_frame_time(len(v) - 1):.2f} s it still "
             f"has {100 * late / most:.0f} % of its largest kinetic energy, and only the time integrator's own "
             "damping, which depends on the time step, would ever bring it to rest"
         )
 
 
-def _force(c: NDArray[np.float64], limit: NDArray[np.float64]) -> Force:
+def _quadratic_drag_force(c: NDArray[np.float64], limit: NDArray[np.float64]) -> ForceFunction:
     """Build the force for c (n,) [kg/m], limited to `limit` (n,) [kg/s] times the velocity."""
 
     def drag(p: Positions, v: Positions, t: float) -> Positions:
@@ -79,6 +79,6 @@ def _force(c: NDArray[np.float64], limit: NDArray[np.float64]) -> Force:
     return drag
 
 
-def _kinetic(mass: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+def _compute_kinetic_energy(mass: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
     """Compute the kinetic energy of each frame [J]."""
     return 0.5 * np.einsum("i,fix,fix->f", mass, v, v)

@@ -8,45 +8,45 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeFloat
 
 from harness.base.errors import InputError
-from harness.base.model import Vector
-from harness.scenes.effects.base import Contribution
+from harness.base.model import Vector3
+from harness.scenes.effects.base import EffectContribution
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.motion import KeyedMotion
-from harness.scenes.selection import Selection
+from harness.scenes.motion import KeyFrameMotion
+from harness.scenes.selection import VertexSelection
 from solvers.energies.attachments import Attachments as Energy
 from solvers.problem import Positions
 
 
-class Attachments(Selection):
+class AttachmentsEffect(VertexSelection):
     """Attaches each selected vertex to its own anchor by a spring; softer than pins."""
 
-    exact_to: ClassVar[float] = inf
+    max_convergence_order: ClassVar[float] = inf
 
     kind: Literal["attachments"] = "attachments"
     stiffness: NonNegativeFloat
     """Total stiffness of the springs [N/m], divided equally, so that it is independent of the mesh size."""
-    to: tuple[Vector, ...] | None = None
+    to: tuple[Vector3, ...] | None = None
     """Anchors [m]: one for all vertices, or one for each in their order; by default their rest positions."""
-    motion: KeyedMotion | None = None
+    motion: KeyFrameMotion | None = None
     """Key frames of the motion of all anchors."""
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the springs as one energy, empty for zero stiffness.
 
         Raise InputError if they do not fit the mesh.
         """
-        vertices = self.chosen(mesh, self.kind)
+        vertices = self.select_vertices(mesh, self.kind)
         if self.to and len(self.to) not in (1, len(vertices)):
             raise InputError(
                 f"attachments: to: came {len(self.to)} points for {len(vertices)} vertices; give one or all"
             )
         if not self.stiffness:
-            return Contribution()
-        fixed = np.broadcast_to(self.to, (len(vertices), 3)) if self.to else mesh.rest[vertices]
+            return EffectContribution()
+        fixed = np.broadcast_to(self.to, (len(vertices), 3)) if self.to else mesh.rest_positions[vertices]
         motion = self.motion
 
         def points(time: float) -> Positions:
-            return motion.moved(fixed, time) if motion else fixed
+            return motion.transform_points(fixed, time) if motion else fixed
 
         k = np.full(len(vertices), self.stiffness / len(vertices))
-        return Contribution(energies=(Energy.of(vertices, k, points, len(mesh.rest)),))
+        return EffectContribution(energies=(Energy.from_vertices(vertices, k, points, len(mesh.rest_positions)),))

@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 
 from harness.base.errors import InputError
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.motion import KeyedMotion
+from harness.scenes.motion import KeyFrameMotion
 from solvers import integrators
 from solvers.energies.springs import Springs
-from solvers.held import Lengths
-from solvers.integrators import splits
+from solvers.held import LengthConstraints
+from solvers.integrators import has_split_filters
 from solvers.problem import Energy, Positions
 
 if TYPE_CHECKING:  # for those who have any
-    from harness.scenes.intersections import Apart
+    from harness.scenes.intersections import IntersectionCheck
 
 
-class Force(Protocol):
+class ForceFunction(Protocol):
     """External force, added to the right-hand side once per step."""
 
     def __call__(self, p: Positions, v: Positions, t: float) -> Positions:
@@ -50,7 +50,7 @@ class VelocityFilter(Protocol):
         ...
 
 
-class Derived(Protocol):
+class DerivedEnergies(Protocol):
     """Energies that depend on the energies of the scene's other effects."""
 
     def __call__(self, energies: Sequence[Energy]) -> tuple[Energy, ...]:
@@ -59,7 +59,7 @@ class Derived(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pin:
+class PinGroup:
     """Vertices (q,) pinned to targets (q, 3) [m] with a penalty weight [N/m]; an infinite weight is exact.
 
     Attributes:
@@ -69,48 +69,55 @@ class Pin:
     vertices: NDArray[np.int64]
     targets: Positions
     weight: float
-    motion: KeyedMotion | None = None
+    motion: KeyFrameMotion | None = None
 
 
-class Check(Protocol):
+class SceneCheck(Protocol):
     """Requirement of an effect on the other parts of a scene."""
 
-    def __call__(self, start: Positions, pins: Sequence[Pin]) -> None:
+    def __call__(self, start: Positions, pins: Sequence[PinGroup]) -> None:
         """Raise InputError if the effect is incompatible with the start (n, 3) [m] or the pins."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Contribution:
+class EffectContribution:
     """Contributions of an effect to the step problem, by kind of term."""
 
     energies: tuple[Energy, ...] = field(default=())
-    forces: tuple[Force, ...] = field(default=())
-    pins: tuple[Pin, ...] = field(default=())
-    filters: tuple[VelocityFilter, ...] = field(default=())
-    derived: tuple[Derived, ...] = field(default=())
-    lengths: tuple[Lengths, ...] = field(default=())
-    checks: tuple[Check, ...] = field(default=())
-    once: tuple[str, ...] = field(default=())
+    forces: tuple[ForceFunction, ...] = field(default=())
+    pins: tuple[PinGroup, ...] = field(default=())
+    velocity_filters: tuple[VelocityFilter, ...] = field(default=())
+    derived_energies: tuple[DerivedEnergies, ...] = field(default=())
+    length_constraints: tuple[LengthConstraints, ...] = field(default=())
+    scene_checks: tuple[SceneCheck, ...] = field(default=())
+    exclusive_features: tuple[str, ...] = field(default=())
     """Features that a scene can have only once, in words; a second one would be added to the first."""
-    apart: tuple[Apart, ...] = ()
+    intersection_checks: tuple[IntersectionCheck, ...] = ()
     """Primitives that must not intersect, for verification."""
-    ends: tuple[str, ...] = ()
+    end_of_step_reasons: tuple[str, ...] = ()
     """Reasons why each stage has to lie at the end of a step, in words."""
-    continuous: tuple[Callable[[], Contribution], ...] = field(default=())
+    continuous_forms: tuple[Callable[[], EffectContribution], ...] = field(default=())
     """Builds an equivalent form with forces and energies only, for integrators that evaluate forces at their stages."""
 
-    def by(self, method: integrators.AnyIntegrator) -> Contribution:
+    def adapt_to_integrator(self, integrator: integrators.AnyIntegrator) -> EffectContribution:
         """Return the form of the contribution that an integrator supports."""
-        return self.continuous[0]() if self.continuous and not splits(method) else self
+        return self.continuous_forms[0]() if self.continuous_forms and not has_split_filters(integrator) else self
 
     @property
-    def empty(self) -> bool:
+    def is_empty(self) -> bool:
         """Whether the contribution has no terms."""
-        return not (self.energies or self.forces or self.pins or self.filters or self.derived or self.lengths)
+        return not (
+            self.energies
+            or self.forces
+            or self.pins
+            or self.velocity_filters
+            or self.derived_energies
+            or self.length_constraints
+        )
 
 
-class Effect(Protocol):
+class SceneEffect(Protocol):
     """A pydantic model with a literal `kind`.
 
     Its class states `max_convergence_order`, a class variable: the order of the error in the step size up to which
@@ -126,7 +133,7 @@ class Effect(Protocol):
         """Name of the effect in `harness.scenes.effects.effect_table`."""
         ...
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Build the contribution of the effect, once per scene.
 
         Args:
@@ -141,7 +148,7 @@ class Effect(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class ObservedMotion:
     """Observed motion of a scene, for the detection of missing effects.
 
     Attributes:
@@ -157,27 +164,27 @@ class Seen:
 
     mesh: Mesh
     springs: Springs
-    length: float
+    mean_spring_length: float
     mass: NDArray[np.float64]
     time_step: float
-    held: bool
-    driven: bool
-    damped: bool
+    has_pins: bool
+    is_driven: bool
+    is_damped: bool
     positions: NDArray[np.float64]
     velocities: NDArray[np.float64]
 
-    def time(self, frame: int) -> float:
+    def compute_frame_time(self, frame: int) -> float:
         """Return the time [s] of the end of a frame; frames count from 0."""
         return (frame + 1) * self.time_step
 
 
-FEW = 0.01
+NEGLIGIBLE_FRACTION = 0.01
 """Fraction of springs or edges that is negligible: the corners next to a pin, where strain and curvature grow without
 bound under mesh refinement."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Steady:
+class ConstantForceField:
     """A constant force field (n, 3) [N]; a scene adds all of them once."""
 
     force: Positions
@@ -187,7 +194,9 @@ class Steady:
         return self.force
 
 
-def kept(mesh: Mesh, springs: NDArray[np.int64], shortest: float, longest: float) -> Contribution:
+def build_length_constraints(
+    mesh: Mesh, springs: NDArray[np.int64], min_ratio: float, max_ratio: float
+) -> EffectContribution:
     """Build length constraints of springs, empty for no springs.
 
     Args:
@@ -200,18 +209,20 @@ def kept(mesh: Mesh, springs: NDArray[np.int64], shortest: float, longest: float
         InputError: for a spring of zero length.
     """
     if not len(springs):
-        return Contribution()
-    rest = Springs.at_rest(mesh.rest, springs, np.ones(len(springs)))
+        return EffectContribution()
+    rest = Springs.from_rest_shape(mesh.rest_positions, springs, np.ones(len(springs)))
     r = rest.rest_length
     if len(none := np.flatnonzero(r == 0.0)):
         i, j = springs[none[0]]
         problem = f"the spring {i}-{j} has no length at rest, and none that could be kept; give a stiffness in figures"
         raise InputError(problem)
-    lengths = Lengths(rest.edges, shortest * r, longest * r, rest.rest_direction)
-    return Contribution(lengths=(lengths,), ends=("keeps lengths as they are at the end of a step",))
+    lengths = LengthConstraints(rest.edges, min_ratio * r, max_ratio * r, rest.rest_direction)
+    return EffectContribution(
+        length_constraints=(lengths,), end_of_step_reasons=("keeps lengths as they are at the end of a step",)
+    )
 
 
-def steady(force: Positions) -> tuple[Steady, ...]:
+def build_constant_force(force: Positions) -> tuple[ConstantForceField, ...]:
     """Wrap a constant force (n, 3) [N]; empty if it is zero everywhere."""
     force.flags.writeable = False
-    return (Steady(force),) if force.any() else ()
+    return (ConstantForceField(force),) if force.any() else ()

@@ -8,70 +8,76 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeFloat
 
 from harness.base.errors import InputError
-from harness.base.model import Model
-from harness.scenes.effects.base import FEW, Contribution, Seen
+from harness.base.model import ConfigModel
+from harness.scenes.effects.base import NEGLIGIBLE_FRACTION, EffectContribution, ObservedMotion
 from harness.scenes.mesh.base import Mesh
 from solvers.energies import bending
 
-SHARP = np.deg2rad(60.0)
+SHARP_ANGLE = np.deg2rad(60.0)
 """Dihedral angle above which a mesh shows its edges."""
 
 
-class Bending(Model):
+class BendingEffect(ConfigModel):
     """Bending stiffness of the triangles.
 
     The rest state is flat, whatever the shape of the mesh: a tube opens.
     """
 
-    exact_to: ClassVar[float] = inf
+    max_convergence_order: ClassVar[float] = inf
 
     kind: Literal["bending"] = "bending"
     stiffness: NonNegativeFloat
     """Flexural rigidity B [N m]: the moment per metre of width for a curvature of 1/m, at every mesh size."""
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the energy, empty for zero stiffness; raise InputError if the mesh is no surface."""
         if not self.stiffness:
-            return Contribution()
+            return EffectContribution()
         triangles = mesh.triangles
         if not len(triangles):
             raise InputError("bending: needs triangles, and this mesh has none; take them out, or another mesh")
-        a, b, c = (mesh.rest[corner] for corner in triangles.T)
+        a, b, c = (mesh.rest_positions[corner] for corner in triangles.T)
         sides = np.linalg.norm([b - a, c - b, a - c], axis=2).max(axis=0)
         flat = np.flatnonzero(np.linalg.norm(np.cross(b - a, c - a), axis=1) <= 1e-9 * sides**2)
         if len(flat):
             corners = triangles[flat[0]].tolist()
-            raise InputError(f"bending: the triangle {corners} has no area{mesh.in_file(*corners)}; repair the mesh")
+            raise InputError(
+                f"bending: the triangle {corners} has no area{mesh.format_file_numbers(*corners)}; repair the mesh"
+            )
         edges = np.sort(np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
         shared, count = np.unique(edges, axis=0, return_counts=True)
         if (count > 2).any():
             ends = shared[count > 2][0].tolist()
             raise InputError(
-                f"bending: more than two triangles meet at the edge {ends}{mesh.in_file(*ends)}; repair the mesh"
+                f"bending: more than two triangles meet at the edge {ends}{mesh.format_file_numbers(*ends)}; repair the mesh"
             )
-        return Contribution(energies=(bending.Bending.of(mesh.rest, triangles, self.stiffness),))
+        return EffectContribution(
+            energies=(bending.Bending.from_rest_shape(mesh.rest_positions, triangles, self.stiffness),)
+        )
 
     @classmethod
-    def called_for(cls, seen: Seen) -> str:
+    def find_evidence(cls, observed: ObservedMotion) -> str:
         """Return evidence for bending stiffness: folds as sharp as the mesh."""
-        mesh = seen.mesh
-        hinges = _hinges(mesh.triangles)
+        mesh = observed.mesh
+        hinges = _find_hinges(mesh.triangles)
         if mesh.dimension != 2 or not len(hinges):
             return ""
-        flat = _angles(mesh.rest, hinges)
-        turned = np.array([np.abs(_angles(p, hinges) - flat) for p in seen.positions[-len(seen.positions) // 4 :]])
+        flat = _dihedral_angles(mesh.rest_positions, hinges)
+        turned = np.array(
+            [np.abs(_dihedral_angles(p, hinges) - flat) for p in observed.positions[-len(observed.positions) // 4 :]]
+        )
         turned = np.minimum(turned, 2.0 * np.pi - turned)
-        share = float((turned > SHARP).mean())
-        if share <= FEW:
+        share = float((turned > SHARP_ANGLE).mean())
+        if share <= NEGLIGIBLE_FRACTION:
             return ""
         return (
             f"over the last quarter of the motion {100 * share:.1f} % of the edges between triangles are bent by more "
-            f"than {np.rad2deg(SHARP):.0f} degrees, the sharpest by {np.rad2deg(turned.max()):.0f}: folds as sharp as "
+            f"than {np.rad2deg(SHARP_ANGLE):.0f} degrees, the sharpest by {np.rad2deg(turned.max()):.0f}: folds as sharp as "
             "the mesh"
         )
 
 
-def _hinges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+def _find_hinges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
     """Find the edges shared by two triangles, with the two opposite corners: (k, 4)."""
     if not len(triangles):
         return np.empty((0, 4), np.int64)
@@ -84,7 +90,7 @@ def _hinges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.column_stack([first, second[:, 2]])
 
 
-def _angles(p: NDArray[np.float64], hinges: NDArray[np.int64]) -> NDArray[np.float64]:
+def _dihedral_angles(p: NDArray[np.float64], hinges: NDArray[np.int64]) -> NDArray[np.float64]:
     """Compute the signed angle between the second triangle and the plane of the first [rad], (k,)."""
     a, b, c, d = (p[corner] for corner in hinges.T)
     edge = b - a

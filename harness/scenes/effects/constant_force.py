@@ -6,20 +6,20 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.base.model import Model, Vector
-from harness.scenes.effects.base import Contribution, steady
+from harness.base.model import ConfigModel, Vector3
+from harness.scenes.effects.base import EffectContribution, build_constant_force
 from harness.scenes.mesh.base import Mesh
 
 
-class ConstantForce(Model):
+class ConstantForceEffect(ConfigModel):
     """One force on every vertex. It equals gravity only if all vertices have the same mass."""
 
-    exact_to: ClassVar[float] = inf
+    max_convergence_order: ClassVar[float] = inf
 
     kind: Literal["constant-force"] = "constant-force"
-    force: Vector
+    force: Vector3
     """Force on each vertex [N]."""
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the force on every vertex."""
-        return Contribution(forces=steady(np.tile(np.array(self.force), (len(mass), 1))))
+        return EffectContribution(forces=build_constant_force(np.tile(np.array(self.force), (len(mass), 1))))

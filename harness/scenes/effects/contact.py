@@ -11,33 +11,33 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from harness.base.errors import InputError
-from harness.base.model import Model
-from harness.scenes.effects.base import Contribution, Pin
+from harness.base.model import ConfigModel
+from harness.scenes.effects.base import EffectContribution, PinGroup
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.obstacles import AnyObstacle
-from harness.scenes.room import gap, looks, nearest
-from solvers.contact.energy import Contact as Energy
-from solvers.contact.friction_rounds import ROUNDS
-from solvers.matrices import assemble
+from harness.scenes.room import find_first_violation, largest_gap_radius, sample_times
+from solvers.contact.energy import HalfSpaceContact as Energy
+from solvers.contact.friction_rounds import MAX_FRICTION_ITERATIONS
+from solvers.matrices import assemble_system_matrix
+from solvers.problem import DirichletPins, Positions, ProjectiveEnergy, System
 from solvers.problem import Energy as AnyEnergy
-from solvers.problem import Pins, Positions, ProjectiveEnergy, System
 
-_SAFETY = 4.0
+_STIFFNESS_SAFETY = 4.0
 """Safety factor of the contact stiffness relative to one collision at full speed: neighbours that are stopped in turn
 exert a force as well."""
 
-_MARGIN = 0.1
+_MARGIN_FRACTION = 0.1
 """Largest displacement of a vertex by forces in one step, as a fraction of the mesh's size."""
 
 
-class Contact(Model):
+class ContactEffect(ConfigModel):
     """Keeps the vertices of the mesh outside of obstacles; thin obstacles cannot be tunnelled within a step.
 
     The stiffness k of contact follows from the penetration tolerance. A vertex that arrives with the speed v ends at
     most v dt Q_ii / k deep, where Q_ii is the resistance of inertia and springs: k_i = 4 Q_ii max(1, v dt / tolerance).
     """
 
-    exact_to: ClassVar[float] = 1.0
+    max_convergence_order: ClassVar[float] = 1.0
 
     kind: Literal["contact"] = "contact"
     obstacles: tuple[AnyObstacle, ...] = Field(min_length=1)
@@ -52,22 +52,22 @@ class Contact(Model):
     """Largest speed [m/s] at which the penetration tolerance is met."""
     creep: PositiveFloat = 1e-5
     """Tangential speed [m/s] below which vertices count as sticking, and creep."""
-    friction_rounds: PositiveInt = ROUNDS
+    friction_rounds: PositiveInt = MAX_FRICTION_ITERATIONS
     """Maximum number of solves per step until friction converges, each with the normal forces of the previous one; 1
     uses those of the step's start, which is of order 1 and misses the first step of contact."""
 
     @model_validator(mode="after")
-    def _within(self) -> Contact:
-        if not self.depth < self.thickness:
-            raise ValueError(f"the tolerance of {self.depth:g} m should be less than the thickness")
+    def _check_tolerance(self) -> ContactEffect:
+        if not self.max_penetration < self.thickness:
+            raise ValueError(f"the tolerance of {self.max_penetration:g} m should be less than the thickness")
         return self
 
     @property
-    def depth(self) -> float:
+    def max_penetration(self) -> float:
         """Penetration tolerance [m]."""
         return self.thickness / 10.0 if self.tolerance is None else self.tolerance
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the contact as one energy, with a stiffness from the other effects.
 
         Raises:
@@ -79,47 +79,51 @@ class Contact(Model):
                 f"contact: came a thickness of {self.thickness:g} m, which is not below the shortest of the springs "
                 f"at rest, {lengths.min():.3g} m; take a smaller thickness, or a coarser mesh"
             )
-        obstacles = tuple(one.obstacle() for one in self.obstacles)
+        obstacles = tuple(one.build_obstacle() for one in self.obstacles)
 
         def derived(energies: Sequence[AnyEnergy]) -> tuple[AnyEnergy, ...]:
             projective = [energy for energy in energies if isinstance(energy, ProjectiveEnergy)]
             everything = np.arange(len(mass))
-            held = System(mass, time_step, pins=Pins(everything, np.full(len(mass), np.inf)))
-            resists = np.asarray(assemble(held, projective).diagonal(), np.float64)
-            stiffness = _SAFETY * max(1.0, self.speed * time_step / self.depth) * resists
-            rubs = self.creep, _MARGIN * mesh.size, time_step, self.friction_rounds
+            held = System(mass, time_step, pins=DirichletPins(everything, np.full(len(mass), np.inf)))
+            resists = np.asarray(assemble_system_matrix(held, projective).diagonal(), np.float64)
+            stiffness = _STIFFNESS_SAFETY * max(1.0, self.speed * time_step / self.max_penetration) * resists
+            rubs = self.creep, _MARGIN_FRACTION * mesh.bounding_box_diagonal, time_step, self.friction_rounds
             return (Energy(obstacles, self.thickness, self.friction, stiffness, *rubs),)
 
-        return Contribution(derived=(derived,), checks=(partial(self._check, mesh),))
+        return EffectContribution(derived_energies=(derived,), scene_checks=(partial(self._check_start, mesh),))
 
-    def _check(self, mesh: Mesh, start: Positions, pins: Sequence[Pin]) -> None:
+    def _check_start(self, mesh: Mesh, start: Positions, pins: Sequence[PinGroup]) -> None:
         """Raise InputError for pins or a start (n, 3) [m] inside an obstacle.
 
         Also raise it for planes without a gap between them.
         """
-        limit = self.thickness - self.depth
+        limit = self.thickness - self.max_penetration
         for k, given in enumerate(self.obstacles):
-            obstacle = given.obstacle()
+            obstacle = given.build_obstacle()
             for pin in pins:
-                if met := nearest(obstacle, given.motion, pin.targets, pin.motion, limit):
+                if met := find_first_violation(obstacle, given.motion, pin.targets, pin.motion, limit):
                     time, distance = met
-                    self._refuse(mesh, f"pins hold vertex {{}} at {time:g} s", k, distance, pin.vertices)
-            self._refuse(mesh, "vertex {} starts", k, obstacle.distance(start, 0.0), np.arange(len(start)))
+                    self._raise_penetration(mesh, f"pins hold vertex {{}} at {time:g} s", k, distance, pin.vertices)
+            self._raise_penetration(
+                mesh, "vertex {} starts", k, obstacle.signed_distance(start, 0.0), np.arange(len(start))
+            )
         planes = [one for one in self.obstacles if one.kind == "plane"]
         if len(planes) > 1 and any(one.motion for one in planes):  # others leave the room that the start is in
-            solid = [one.obstacle() for one in planes]
-            for time in looks([one.motion for one in planes]):
-                if (radius := gap(solid, time)) < limit:
+            solid = [one.build_obstacle() for one in planes]
+            for time in sample_times([one.motion for one in planes]):
+                if (radius := largest_gap_radius(solid, time)) < limit:
                     raise InputError(
                         f"contact: the planes leave no room at {time:g} s: {max(2.0 * radius, 0.0):.3g} m at most lie "
                         f"between them, and vertices stay {self.thickness:g} m away from each; move them less"
                     )
 
-    def _refuse(self, mesh: Mesh, who: str, k: int, distance: NDArray[np.float64], vertices: NDArray[np.int64]) -> None:
-        near = np.flatnonzero(distance < self.thickness - self.depth)
+    def _raise_penetration(
+        self, mesh: Mesh, who: str, k: int, distance: NDArray[np.float64], vertices: NDArray[np.int64]
+    ) -> None:
+        near = np.flatnonzero(distance < self.thickness - self.max_penetration)
         if len(near):
             worst = near[distance[near].argmin()]
-            vertex = f"{vertices[worst]}{mesh.in_file(int(vertices[worst]))}"
+            vertex = f"{vertices[worst]}{mesh.format_file_numbers(int(vertices[worst]))}"
             raise InputError(
                 f"contact: {who.format(vertex)} {distance[worst]:.3g} m from the surface of obstacles[{k}] "
                 f"({self.obstacles[k].kind}), which is nearer than the thickness of {self.thickness:g} m; move one of "

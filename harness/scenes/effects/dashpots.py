@@ -7,18 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import NonNegativeFloat, PositiveInt
 
-from harness.base.model import Model
-from harness.scenes.effects.base import Contribution
-from harness.scenes.material import spring_stiffness
+from harness.base.model import ConfigModel
+from harness.scenes.effects.base import EffectContribution
+from harness.scenes.material import compute_spring_stiffness
 from harness.scenes.mesh.base import Mesh
 from solvers.energies import dashpots
 
 
-class Dashpots(Model):
+class DashpotsEffect(ConfigModel):
     """Damping of the rate of change of spring lengths; rigid motion of the mesh is not damped."""
 
-    exact_to: ClassVar[float] = inf
-    damps: ClassVar[bool] = True
+    max_convergence_order: ClassVar[float] = inf
+    is_dissipative: ClassVar[bool] = True
 
     kind: Literal["dashpots"] = "dashpots"
     rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
@@ -30,13 +30,15 @@ class Dashpots(Model):
     reference: PositiveInt | None = None
     """liu2013: the mesh size for which the coefficients above are given."""
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the dashpots as one energy; empty if no spring is damped."""
         shear = self.stretch if self.shear is None else self.shear
-        c = spring_stiffness(
-            mesh, rule=self.rule, stretch=self.stretch, shear=shear, bend=0.0, reference=self.reference
+        c = compute_spring_stiffness(
+            mesh, scaling_rule=self.rule, stretch=self.stretch, shear=shear, bend=0.0, reference_size=self.reference
         )
         damped = np.flatnonzero(c)
         if not len(damped):
-            return Contribution()
-        return Contribution(energies=(dashpots.Dashpots.along(mesh.rest, mesh.springs[damped], c[damped]),))
+            return EffectContribution()
+        return EffectContribution(
+            energies=(dashpots.Dashpots.from_rest_shape(mesh.rest_positions, mesh.springs[damped], c[damped]),)
+        )

@@ -1,8 +1,8 @@
 """Table of the effects by name; a scene imports only the effects that it names."""
 
-from solvers.plugins import Table
+from solvers.plugins import PluginTable
 
-EFFECTS = {
+EFFECT_CLASSES = {
     "air-drag": "harness.scenes.effects.air_drag:AirDrag",
     "attachments": "harness.scenes.effects.attachments:Attachments",
     "bending": "harness.scenes.effects.bending:Bending",
@@ -22,5 +22,5 @@ EFFECTS = {
     "wind": "harness.scenes.effects.wind:Wind",
 }
 
-EVERY = Table("springbench.effects", EFFECTS)
+EFFECT_TABLE = PluginTable("springbench.effects", EFFECT_CLASSES)
 """All effects by name."""

@@ -11,30 +11,32 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import NonNegativeFloat
 
-from harness.base.model import Model
-from harness.scenes.effects.base import Contribution
+from harness.base.model import ConfigModel
+from harness.scenes.effects.base import EffectContribution
 from harness.scenes.mesh.base import Mesh
 from solvers.energies.quadratic import EtherDrag as Energy
-from solvers.filters import Decay
+from solvers.filters import ExponentialDecay
 
 
-class EtherDrag(Model):
+class EtherDragEffect(ConfigModel):
     """Damping of the absolute velocity, independent of the time step."""
 
-    exact_to: ClassVar[float] = inf
-    damps: ClassVar[bool] = True
-    plain: ClassVar[bool] = True
+    max_convergence_order: ClassVar[float] = inf
+    is_dissipative: ClassVar[bool] = True
+    is_baseline_effect: ClassVar[bool] = True
 
     kind: Literal["ether-drag"] = "ether-drag"
     rate: NonNegativeFloat
     """Decay rate c [1/s]; the paper's factor per step is exp(-c dt)."""
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return a filter that scales the velocity; empty for a zero rate."""
         if self.rate == 0.0:
-            return Contribution()
+            return EffectContribution()
 
-        def drag() -> Contribution:
-            return Contribution(energies=(Energy.of_vertices(self.rate * mass),))
+        def drag() -> EffectContribution:
+            return EffectContribution(energies=(Energy.from_vertices(self.rate * mass),))
 
-        return Contribution(filters=(Decay(exp(-self.rate * time_step)),), continuous=(drag,))
+        return EffectContribution(
+            velocity_filters=(ExponentialDecay(exp(-self.rate * time_step)),), continuous_forms=(drag,)
+        )

@@ -6,22 +6,22 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.base.model import Model, Vector
-from harness.scenes.effects.base import Contribution, steady
+from harness.base.model import ConfigModel, Vector3
+from harness.scenes.effects.base import EffectContribution, build_constant_force
 from harness.scenes.mesh.base import Mesh
 
 
-class Gravity(Model):
+class GravityEffect(ConfigModel):
     """Gravity on every vertex: its mass times one acceleration."""
 
-    exact_to: ClassVar[float] = inf
-    plain: ClassVar[bool] = True
+    max_convergence_order: ClassVar[float] = inf
+    is_baseline_effect: ClassVar[bool] = True
 
     kind: Literal["gravity"] = "gravity"
-    acceleration: Vector = (0.0, -9.81, 0.0)
+    acceleration: Vector3 = (0.0, -9.81, 0.0)
     """Acceleration of gravity [m/s^2]."""
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the force m g on every vertex."""
-        forces = steady(mass[:, None] * np.array(self.acceleration))
-        return Contribution(forces=forces, once=("gravity",) if forces else ())
+        forces = build_constant_force(mass[:, None] * np.array(self.acceleration))
+        return EffectContribution(forces=forces, exclusive_features=("gravity",) if forces else ())

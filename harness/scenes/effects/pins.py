@@ -7,26 +7,26 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 
-from harness.scenes.effects.base import Contribution, Pin
+from harness.scenes.effects.base import EffectContribution, PinGroup
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.motion import KeyedMotion
-from harness.scenes.selection import Selection
+from harness.scenes.motion import KeyFrameMotion
+from harness.scenes.selection import VertexSelection
 
 
-class Pins(Selection):
+class PinsEffect(VertexSelection):
     """Pins each selected vertex."""
 
-    exact_to: ClassVar[float] = inf
-    plain: ClassVar[bool] = True
+    max_convergence_order: ClassVar[float] = inf
+    is_baseline_effect: ClassVar[bool] = True
 
     kind: Literal["pins"] = "pins"
     weight: PositiveFloat | Literal["exact"] = Field(default=1e10)
     """Penalty weight w [N/m], or `exact`: the degrees of freedom of the vertices are eliminated."""
-    motion: KeyedMotion | None = None
+    motion: KeyFrameMotion | None = None
     """Key frames of the motion of all pinned vertices."""
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the selected vertices at rest; raise InputError for parts and vertices that the mesh lacks."""
-        vertices = self.chosen(mesh, self.kind)
+        vertices = self.select_vertices(mesh, self.kind)
         weight = inf if self.weight == "exact" else float(self.weight)
-        return Contribution(pins=(Pin(vertices, mesh.rest[vertices], weight, self.motion),))
+        return EffectContribution(pins=(PinGroup(vertices, mesh.rest_positions[vertices], weight, self.motion),))

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import NonNegativeFloat
 
-from harness.base.model import Model
-from harness.scenes.effects.base import Contribution
+from harness.base.model import ConfigModel
+from harness.scenes.effects.base import EffectContribution
 from harness.scenes.mesh.base import Mesh
 from solvers.energies.dashpots import RayleighDashpots
 from solvers.energies.quadratic import Quadratic, RayleighDamping
@@ -22,11 +22,11 @@ from solvers.energies.springs import Springs
 from solvers.problem import Energy, is_lagged
 
 
-class Rayleigh(Model):
+class RayleighEffect(ConfigModel):
     """Damping proportional to mass and to stiffness."""
 
-    exact_to: ClassVar[float] = inf
-    damps: ClassVar[bool] = True
+    max_convergence_order: ClassVar[float] = inf
+    is_dissipative: ClassVar[bool] = True
 
     kind: Literal["rayleigh"] = "rayleigh"
     mass: NonNegativeFloat = 0.0
@@ -34,19 +34,19 @@ class Rayleigh(Model):
     stiffness: NonNegativeFloat = 0.0
     """Stiffness coefficient b [s]: damps fast modes."""
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the mass damping as an energy, and the damping derived from the other effects' energies."""
         damping = self.mass * mass
-        return Contribution(
-            energies=(RayleighDamping.of_vertices(damping),) if damping.any() else (),
-            derived=(self._of,) if self.stiffness else (),
+        return EffectContribution(
+            energies=(RayleighDamping.from_vertices(damping),) if damping.any() else (),
+            derived_energies=(self._damp_energies,) if self.stiffness else (),
         )
 
-    def _of(self, energies: Sequence[Energy]) -> tuple[Energy, ...]:
+    def _damp_energies(self, energies: Sequence[Energy]) -> tuple[Energy, ...]:
         b = self.stiffness
         springs = [energy for energy in energies if isinstance(energy, Springs)]
         constant = [e for e in energies if isinstance(e, Quadratic) and not is_lagged(e)]
         return (
             *(RayleighDashpots(s.edges, b * s.stiffness, s.rest_direction, np.zeros(len(s.edges))) for s in springs),
-            *(RayleighDamping.of(energy.A, b * energy.weight) for energy in constant),
+            *(RayleighDamping.from_operator(energy.A, b * energy.weight) for energy in constant),
         )

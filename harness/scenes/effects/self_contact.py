@@ -10,24 +10,31 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from harness.base.errors import InputError
-from harness.base.model import Model
-from harness.scenes.effects.base import Contribution, Pin, Seen
-from harness.scenes.intersections import Apart, crossings
+from harness.base.model import ConfigModel
+from harness.scenes.effects.base import EffectContribution, ObservedMotion, PinGroup
+from harness.scenes.intersections import IntersectionCheck, find_edge_triangle_intersections
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.touching import ENDS, outline, require_open, require_still, resisting, told
-from solvers.contact.friction_rounds import ROUNDS
+from harness.scenes.touching import (
+    END_OF_STEP_REASON,
+    collision_primitives,
+    compute_barrier_stiffness,
+    describe_intersections,
+    require_fixed_exact_pins,
+    require_intersection_free,
+)
+from solvers.contact.friction_rounds import MAX_FRICTION_ITERATIONS
 from solvers.contact.self_contact import SelfContact as Energy
-from solvers.contact.surface import Surface
+from solvers.contact.surface import CollisionMesh
 from solvers.problem import Energy as AnyEnergy
 from solvers.problem import Positions
 
-NEAR = 0.5
+MIN_DISTANCE_FRACTION = 0.5
 """Distance relative to the mean rest length below which vertices practically coincide."""
-LOOKS = 30
+NUM_SAMPLED_FRAMES = 30
 """Number of frames, evenly spaced, that are searched for close vertices."""
 
 
-class SelfContact(Model):
+class SelfContactEffect(ConfigModel):
     """Separates points from triangles and edges from edges of the mesh by a barrier that diverges as their gap closes.
 
     Formulas: `solvers.contact.potentials.barrier`. All intermediate positions are intersection-free. Pairs that share a
@@ -35,7 +42,7 @@ class SelfContact(Model):
     their rest distance, so the mesh may be arbitrarily fine. Vertices in no edge and no triangle do not collide.
     """
 
-    exact_to: ClassVar[float] = 1.0
+    max_convergence_order: ClassVar[float] = 1.0
 
     kind: Literal["self-contact"] = "self-contact"
     thickness: Annotated[PositiveFloat, Field(le=1e9)] = 0.002
@@ -49,55 +56,65 @@ class SelfContact(Model):
     """Coulomb's friction coefficient mu, both static and kinetic."""
     creep: PositiveFloat = 1e-3
     """Tangential speed [m/s] below which pairs count as sticking, and creep."""
-    friction_rounds: PositiveInt = ROUNDS
+    friction_rounds: PositiveInt = MAX_FRICTION_ITERATIONS
     """Maximum number of solves per step until friction converges, each with the normal forces of the previous one; 1
     uses those of the step's start, which is of order 1 and misses the first step of contact."""
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the barrier as one energy, with a stiffness from the other effects.
 
         Raises:
             InputError: if the mesh intersects itself at rest.
         """
-        (edges, faces), rest = outline(mesh), mesh.rest
+        (edges, faces), rest = collision_primitives(mesh), mesh.rest_positions
         if not len(edges):
-            return Contribution()
+            return EffectContribution()
         reach = self.thickness if self.range is None else self.range
-        if crossed := crossings(rest, edges, mesh.triangles):
-            raise InputError(f"self-contact: the mesh passes through itself at rest, {told(crossed, mesh)}; repair it")
+        if crossed := find_edge_triangle_intersections(rest, edges, mesh.triangles):
+            raise InputError(
+                f"self-contact: the mesh passes through itself at rest, {describe_intersections(crossed, mesh)}; repair it"
+            )
 
         def energy(stiffness: NDArray[np.float64]) -> Energy:
-            surface = Surface.of(rest, edges, faces, stiffness, self.thickness, reach)
-            if (surface.near[1] <= 0.0).any():
+            surface = CollisionMesh.from_rest_shape(rest, edges, faces, stiffness, self.thickness, reach)
+            if (surface.rest_close_pairs[1] <= 0.0).any():
                 raise InputError("self-contact: the mesh touches itself at rest; move what touches apart, or join it")
             return Energy(surface, self.friction, self.creep, self.friction_rounds)
 
         def derived(energies: Sequence[AnyEnergy]) -> tuple[AnyEnergy, ...]:
-            return (energy(resisting(self.stiffness, mass, time_step, energies)),)
+            return (energy(compute_barrier_stiffness(self.stiffness, mass, time_step, energies)),)
 
-        def check(start: Positions, pins: Sequence[Pin]) -> None:
+        def check(start: Positions, pins: Sequence[PinGroup]) -> None:
             """Raise InputError for exact pins that move, and for a start (n, 3) [m] with intersections."""
-            require_still("self-contact", start, pins)
-            if crossed := crossings(start, edges, mesh.triangles):
+            require_fixed_exact_pins("self-contact", start, pins)
+            if crossed := find_edge_triangle_intersections(start, edges, mesh.triangles):
                 raise InputError(
-                    f"self-contact: the start passes through itself, {told(crossed, mesh)}; move them apart"
+                    f"self-contact: the start passes through itself, {describe_intersections(crossed, mesh)}; move them apart"
                 )
-            require_open("self-contact", energy(np.ones(len(mass))), start, self.thickness, mesh)
+            require_intersection_free("self-contact", energy(np.ones(len(mass))), start, self.thickness, mesh)
 
-        apart = (Apart(((edges, mesh.triangles),)),)
-        return Contribution(derived=(derived,), checks=(check,), once=("self-contact",), ends=ENDS, apart=apart)
+        apart = (IntersectionCheck(((edges, mesh.triangles),)),)
+        return EffectContribution(
+            derived_energies=(derived,),
+            scene_checks=(check,),
+            exclusive_features=("self-contact",),
+            end_of_step_reasons=END_OF_STEP_REASON,
+            intersection_checks=apart,
+        )
 
     @classmethod
-    def called_for(cls, seen: Seen) -> str:
+    def find_evidence(cls, observed: ObservedMotion) -> str:
         """Return evidence for self-contact: vertices that practically coincide."""
-        frames, n = len(seen.positions), len(seen.mesh.rest)
-        reach = NEAR * seen.length
-        known = _codes(np.concatenate([seen.mesh.springs, _pairs(seen.mesh.rest, reach)]), n)
+        frames, n = len(observed.positions), len(observed.mesh.rest_positions)
+        reach = MIN_DISTANCE_FRACTION * observed.mean_spring_length
+        known = _encode_pairs(
+            np.concatenate([observed.mesh.springs, _find_close_pairs(observed.mesh.rest_positions, reach)]), n
+        )
         most, closest, at = 0, np.inf, 0
-        for frame in np.unique(np.linspace(0, frames - 1, LOOKS).astype(int)):
-            p = seen.positions[frame]
-            pairs = _pairs(p, reach)
-            pairs = pairs[~np.isin(_codes(pairs, n), known)]
+        for frame in np.unique(np.linspace(0, frames - 1, NUM_SAMPLED_FRAMES).astype(int)):
+            p = observed.positions[frame]
+            pairs = _find_close_pairs(p, reach)
+            pairs = pairs[~np.isin(_encode_pairs(pairs, n), known)]
             if len(pairs) > most:
                 most, at = len(pairs), int(frame)
             if len(pairs):
@@ -105,19 +122,19 @@ class SelfContact(Model):
         if not most:
             return ""
         return (
-            f"{most} pairs of vertices without a spring between them are closer than {NEAR:g} mean rest lengths at "
-            f"{seen.time(at):.2f} s, two come as close as {closest / seen.length:.2g}; contact with obstacles "
+            f"{most} pairs of vertices without a spring between them are closer than {MIN_DISTANCE_FRACTION:g} mean rest lengths at "
+            f"{observed.compute_frame_time(at):.2f} s, two come as close as {closest / observed.mean_spring_length:.2g}; contact with obstacles "
             "does not keep them apart"
         )
 
 
-def _pairs(p: NDArray[np.float64], reach: float) -> NDArray[np.int64]:
+def _find_close_pairs(p: NDArray[np.float64], reach: float) -> NDArray[np.int64]:
     """Find pairs of vertices (k, 2) closer than `reach` [m]."""
     from scipy.spatial import KDTree  # for those who look
 
     return KDTree(p).query_pairs(reach, output_type="ndarray").astype(np.int64)
 
 
-def _codes(pairs: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+def _encode_pairs(pairs: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     """Encode each pair as one number, independent of the order of its ends."""
     return pairs.min(axis=1) * n + pairs.max(axis=1)

@@ -7,28 +7,28 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeFloat, model_validator
 
 from harness.base.errors import InputError
-from harness.base.model import Model
-from harness.scenes.effects.base import Contribution
+from harness.base.model import ConfigModel
+from harness.scenes.effects.base import EffectContribution
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.selection import Selection
+from harness.scenes.selection import VertexSelection
 from solvers.energies.sewing import Sewing as Energy
 
-Indices = NDArray[np.int64]
+IndexArray = NDArray[np.int64]
 
 
-class Sewing(Model):
+class SewingEffect(ConfigModel):
     """Threads between each vertex of one row and the nearest vertex at rest of the other row, in both directions.
 
     A thread pulls if it is longer than its current limit, which decreases linearly from `begin` to `end`; it never
     pushes.
     """
 
-    exact_to: ClassVar[float] = 1.0
+    max_convergence_order: ClassVar[float] = 1.0
 
     kind: Literal["sewing"] = "sewing"
-    first: Selection
+    first: VertexSelection
     """First row: a vertex selection as for pins."""
-    second: Selection
+    second: VertexSelection
     """Second row."""
     stiffness: NonNegativeFloat
     """Total stiffness of the threads [N/m], divided equally, so that it is independent of the mesh size."""
@@ -40,22 +40,25 @@ class Sewing(Model):
     """Final length [m]; with self-contact at least its thickness plus range, or contact forces oppose it."""
 
     @model_validator(mode="after")
-    def _in_order(self) -> "Sewing":
+    def _check_times(self) -> "SewingEffect":
         if self.end < self.begin:
             raise ValueError(f"end at {self.end:g} s, before they begin at {self.begin:g} s")
         return self
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the threads as one energy, empty for zero stiffness; raise InputError if the rows overlap."""
-        rows = self.first.chosen(mesh, f"{self.kind}: first"), self.second.chosen(mesh, f"{self.kind}: second")
+        rows = (
+            self.first.select_vertices(mesh, f"{self.kind}: first"),
+            self.second.select_vertices(mesh, f"{self.kind}: second"),
+        )
         if len(both := np.intersect1d(*rows)):
             raise InputError(
-                f"{self.kind}: vertex {both[0]}{mesh.in_file(both[0])} is in both rows; each should be in one of them"
+                f"{self.kind}: vertex {both[0]}{mesh.format_file_numbers(both[0])} is in both rows; each should be in one of them"
             )
         if not self.stiffness:
-            return Contribution()
-        pairs = _matched(mesh, *rows)
-        at_rest = np.linalg.norm(mesh.rest[pairs[:, 0]] - mesh.rest[pairs[:, 1]], axis=1)
+            return EffectContribution()
+        pairs = _match_rows(mesh, *rows)
+        at_rest = np.linalg.norm(mesh.rest_positions[pairs[:, 0]] - mesh.rest_positions[pairs[:, 1]], axis=1)
         drawn = np.minimum(at_rest, self.gap)
 
         def longest(time: float) -> NDArray[np.float64]:
@@ -64,17 +67,17 @@ class Sewing(Model):
             return at_rest + done * (drawn - at_rest)
 
         k = np.full(len(pairs), self.stiffness / len(pairs))
-        return Contribution(energies=(Energy.of(mesh.rest, pairs, k, longest),))
+        return EffectContribution(energies=(Energy.from_rest_shape(mesh.rest_positions, pairs, k, longest),))
 
 
-def _matched(mesh: Mesh, first: Indices, second: Indices) -> Indices:
+def _match_rows(mesh: Mesh, first: IndexArray, second: IndexArray) -> IndexArray:
     """Match each vertex with the nearest one of the other row, (m, 2).
 
     Each pair occurs once.
     """
     from scipy.spatial import cKDTree  # for those who sew
 
-    one = np.asarray(cKDTree(mesh.rest[second]).query(mesh.rest[first])[1], np.int64)
-    other = np.asarray(cKDTree(mesh.rest[first]).query(mesh.rest[second])[1], np.int64)
+    one = np.asarray(cKDTree(mesh.rest_positions[second]).query(mesh.rest_positions[first])[1], np.int64)
+    other = np.asarray(cKDTree(mesh.rest_positions[first]).query(mesh.rest_positions[second])[1], np.int64)
     pairs = [np.column_stack([first, second[one]]), np.column_stack([first[other], second])]
     return np.unique(np.concatenate(pairs), axis=0)

@@ -11,29 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import NonNegativeFloat, PositiveInt
 
-from harness.base.model import Model
-from harness.scenes.effects.base import Contribution, kept
-from harness.scenes.material import spring_stiffness
+from harness.base.model import ConfigModel
+from harness.scenes.effects.base import EffectContribution, build_length_constraints
+from harness.scenes.material import compute_spring_stiffness
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.weave import Weave
+from harness.scenes.weave import OrthotropicStiffness
 from solvers.energies import springs
 
 
-class Springs(Model):
+class SpringsEffect(ConfigModel):
     """Springs k/2 (length - rest length)^2 along the mesh's edges.
 
     Springs of zero stiffness are omitted; springs of infinite stiffness are length constraints.
     """
 
-    exact_to: ClassVar[float] = inf
-    plain: ClassVar[bool] = True
+    max_convergence_order: ClassVar[float] = inf
+    is_baseline_effect: ClassVar[bool] = True
 
     kind: Literal["springs"] = "springs"
     rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
     """Scaling rule of the values below with the mesh size. `continuum`: the material is independent of the mesh;
     `fixed`: each spring has the given stiffness [N/m]; `liu2013`: stiffness proportional to the resolution,
     given at the size `reference`."""
-    stretch: NonNegativeFloat | Literal["exact"] | Weave
+    stretch: NonNegativeFloat | Literal["exact"] | OrthotropicStiffness
     """Along the mesh's lines. Continuum: EA [N] for chains and trusses, [N/m] for cloth, [Pa] for solids; or one value
     each for warp, weft and bias of a woven cloth; or `exact`: length constraints, supported by `avbd` only."""
     shear: NonNegativeFloat | Literal["exact"] | None = None
@@ -43,15 +43,17 @@ class Springs(Model):
     reference: PositiveInt | None = None
     """liu2013: the mesh size for which the stiffnesses above are given."""
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the springs as one energy, empty without stiffness, and the length constraints."""
         given = self.stretch if self.shear is None else self.shear
         stretch, shear = (inf if x == "exact" else x for x in (self.stretch, given))
-        k = spring_stiffness(
-            mesh, rule=self.rule, stretch=stretch, shear=shear, bend=self.bend, reference=self.reference
+        k = compute_spring_stiffness(
+            mesh, scaling_rule=self.rule, stretch=stretch, shear=shear, bend=self.bend, reference_size=self.reference
         )
         stiff, exact = np.flatnonzero((k > 0.0) & (k < inf)), mesh.springs[k == inf]
-        found = kept(mesh, exact, 1.0, 1.0)
+        found = build_length_constraints(mesh, exact, 1.0, 1.0)
         if not len(stiff):
             return found
-        return replace(found, energies=(springs.Springs.at_rest(mesh.rest, mesh.springs[stiff], k[stiff]),))
+        return replace(
+            found, energies=(springs.Springs.from_rest_shape(mesh.rest_positions, mesh.springs[stiff], k[stiff]),)
+        )

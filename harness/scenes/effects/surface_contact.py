@@ -11,22 +11,29 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from harness.base.errors import InputError
-from harness.base.model import Model
-from harness.scenes.effects.base import Contribution, Pin
-from harness.scenes.intersections import Apart
+from harness.base.model import ConfigModel
+from harness.scenes.effects.base import EffectContribution, PinGroup
+from harness.scenes.intersections import IntersectionCheck
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.shapes import AnySurface, Shape, deforming, placed, shape
-from harness.scenes.touching import ENDS, outline, require_open, require_still, resisting, told
-from solvers.contact.friction_rounds import ROUNDS
-from solvers.contact.obstacles import Against, Side
+from harness.scenes.shapes import AnySurface, SurfaceMesh, build_obstacle_surface, is_deforming, place_obstacle_points
+from harness.scenes.touching import (
+    END_OF_STEP_REASON,
+    collision_primitives,
+    compute_barrier_stiffness,
+    describe_intersections,
+    require_fixed_exact_pins,
+    require_intersection_free,
+)
+from solvers.contact.friction_rounds import MAX_FRICTION_ITERATIONS
+from solvers.contact.obstacles import MeshPrimitives, ObstacleCollisionMesh
 from solvers.contact.self_contact import ObstacleContact
 from solvers.problem import Energy, Positions
 
-_SAG = 0.1
+_MAX_SAG_FRACTION = 0.1
 """Largest inward deviation of the triangles of round obstacles, relative to the thickness."""
 
 
-class SurfaceContact(Model):
+class SurfaceContactEffect(ConfigModel):
     """Separates points, edges and triangles of the mesh from those of obstacles by a barrier.
 
     The barrier acts on either side and diverges as the gap closes (formulas: `solvers.contact.potentials.barrier`). All
@@ -35,7 +42,7 @@ class SurfaceContact(Model):
     a tenth of the thickness inside.
     """
 
-    exact_to: ClassVar[float] = 1.0
+    max_convergence_order: ClassVar[float] = 1.0
 
     kind: Literal["surface-contact"] = "surface-contact"
     obstacles: tuple[AnySurface, ...] = Field(min_length=1)
@@ -50,68 +57,86 @@ class SurfaceContact(Model):
     """Coulomb's friction coefficient mu, both static and kinetic."""
     creep: PositiveFloat = 1e-3
     """Tangential speed [m/s] below which pairs count as sticking, and creep."""
-    friction_rounds: PositiveInt = ROUNDS
+    friction_rounds: PositiveInt = MAX_FRICTION_ITERATIONS
     """Maximum number of solves per step until friction converges, each with the normal forces of the previous one; 1
     uses those of the step's start, which is of order 1 and misses the first step of contact."""
 
     @property
-    def reach(self) -> float:
+    def resolved_dhat(self) -> float:
         """Barrier activation distance beyond the thickness [m], with its default resolved."""
         return self.thickness if self.range is None else self.range
 
-    def shapes(self, rest: Positions) -> list[Shape]:
+    def build_obstacle_surfaces(self, rest_positions: Positions) -> list[SurfaceMesh]:
         """Build the surfaces of the obstacles in their declared poses; `rest_positions` (n, 3) [m] of the mesh."""
-        return [shape(one, _SAG * self.thickness, rest) for one in self.obstacles]
+        return [
+            build_obstacle_surface(one, _MAX_SAG_FRACTION * self.thickness, rest_positions) for one in self.obstacles
+        ]
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the barrier as one energy, with a stiffness from the other effects.
 
         Raises:
             InputError: if an obstacle is invalid.
         """
-        (edges, faces), n, shapes = outline(mesh), len(mesh.rest), self.shapes(mesh.rest)
+        (edges, faces), n, shapes = (
+            collision_primitives(mesh),
+            len(mesh.rest_positions),
+            self.build_obstacle_surfaces(mesh.rest_positions),
+        )
         if not len(edges):
-            return Contribution()
+            return EffectContribution()
         sizes = np.cumsum([0, *(len(points) for points, _ in shapes)]).tolist()
         points = np.concatenate([points for points, _ in shapes])
         triangles = np.concatenate([first + faces for first, (_, faces) in zip(sizes, shapes, strict=False)])
         sides = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
         ends = np.unique(np.sort(sides, axis=1), axis=0)
-        moving = any(one.motion or deforming(one) for one in self.obstacles)
+        moving = any(one.motion or is_deforming(one) for one in self.obstacles)
 
         @lru_cache(maxsize=2)  # a step's end is the start of the next one
         def moved(time: float) -> Positions:
             parts = zip(shapes, self.obstacles, strict=True)
-            return np.concatenate([placed(one, x, time) for (x, _), one in parts])
+            return np.concatenate([place_obstacle_points(one, x, time) for (x, _), one in parts])
 
         def place(time: float) -> Positions:
             return moved(time) if moving else points
 
         def carry(begin: float, end: float, p: Positions) -> list[Positions]:
-            rigid = [one.motion for one in self.obstacles if one.motion is not None and not deforming(one)]
-            ways = [motion.moved(motion.back(p, begin), end) for motion in rigid]
+            rigid = [one.motion for one in self.obstacles if one.motion is not None and not is_deforming(one)]
+            ways = [motion.transform_points(motion.invert_points(p, begin), end) for motion in rigid]
             for (x, _), one in zip(shapes, self.obstacles, strict=True):
-                if deforming(one):  # as it does on the whole
-                    ways.append(p + (placed(one, x, end) - placed(one, x, begin)).mean(axis=0))
+                if is_deforming(one):  # as it does on the whole
+                    ways.append(
+                        p + (place_obstacle_points(one, x, end) - place_obstacle_points(one, x, begin)).mean(axis=0)
+                    )
             return ways
 
         def energy(stiffness: NDArray[np.float64]) -> ObstacleContact:
-            own, others = Side.of(mesh.rest, edges, faces), Side.of(points, ends, triangles, n)
-            against = Against(own, others, stiffness, self.thickness, self.reach)
-            return ObstacleContact.of(against, place, carry, self.friction, self.creep, self.friction_rounds)
+            own, others = (
+                MeshPrimitives.from_rest_shape(mesh.rest_positions, edges, faces),
+                MeshPrimitives.from_rest_shape(points, ends, triangles, n),
+            )
+            against = ObstacleCollisionMesh(own, others, stiffness, self.thickness, self.resolved_dhat)
+            return ObstacleContact.from_collision_mesh(
+                against, place, carry, self.friction, self.creep, self.friction_rounds
+            )
 
         def derived(energies: Sequence[Energy]) -> tuple[Energy, ...]:
-            return (energy(resisting(self.stiffness, mass, time_step, energies)),)
+            return (energy(compute_barrier_stiffness(self.stiffness, mass, time_step, energies)),)
 
-        apart = Apart(((edges, n + triangles), (n + ends, mesh.triangles)), place)
+        apart = IntersectionCheck(((edges, n + triangles), (n + ends, mesh.triangles)), place)
 
-        def check(start: Positions, pins: Sequence[Pin]) -> None:
+        def check(start: Positions, pins: Sequence[PinGroup]) -> None:
             """Raise InputError for exact pins that move, and for a start (n, 3) [m] with intersections."""
-            require_still(self.kind, start, pins)
-            if crossed := apart.crossings(start, 0.0):
+            require_fixed_exact_pins(self.kind, start, pins)
+            if crossed := apart.find_intersections(start, 0.0):
                 raise InputError(
-                    f"{self.kind}: the start passes through obstacles, {told(crossed, mesh)}; move them apart"
+                    f"{self.kind}: the start passes through obstacles, {describe_intersections(crossed, mesh)}; move them apart"
                 )
-            require_open(self.kind, energy(np.ones(n)), start, self.thickness, mesh)
+            require_intersection_free(self.kind, energy(np.ones(n)), start, self.thickness, mesh)
 
-        return Contribution(derived=(derived,), checks=(check,), ends=ENDS, apart=(apart,))
+        return EffectContribution(
+            derived_energies=(derived,),
+            scene_checks=(check,),
+            end_of_step_reasons=END_OF_STEP_REASON,
+            intersection_checks=(apart,),
+        )

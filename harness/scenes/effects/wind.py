@@ -30,21 +30,21 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, model_validator
 
 from harness.base.errors import InputError
-from harness.base.model import Model, Vector
-from harness.scenes.effects.base import Contribution, Force, steady
+from harness.base.model import ConfigModel, Vector3
+from harness.scenes.effects.base import EffectContribution, ForceFunction, build_constant_force
 from harness.scenes.mesh.base import Mesh
 from solvers.problem import Positions
 
-Field = Callable[[Positions, float], Positions]
+WindField = Callable[[Positions, float], Positions]
 """(points (k, 3) [m], time [s]) -> the field there, (k, 3) or (3,)."""
 
-_WAVES = 16
+_GUST_WAVES = 16
 
 
-class Wind(Model):
+class WindEffect(ConfigModel):
     """Wind on the mesh."""
 
-    exact_to: ClassVar[float] = inf
+    max_convergence_order: ClassVar[float] = inf
 
     kind: Literal["wind"] = "wind"
     field: Literal["constant", "gusts", "assignment"] = "constant"
@@ -53,9 +53,9 @@ class Wind(Model):
     """Target of the field. `vertex`: the force acts on every vertex, as in the assignment, so the total grows with the
     mesh size; `share`: the field is the total force, distributed like the mass, independent of the mesh size;
     `triangle`: the field is the velocity of the air, with drag and lift on triangles."""
-    force: Vector = (1.0, 0.0, 0.0)
+    force: Vector3 = (1.0, 0.0, 0.0)
     """Constant field, or mean of the gusts, on vertices [N]."""
-    velocity: Vector = (1.0, 0.0, 0.0)
+    velocity: Vector3 = (1.0, 0.0, 0.0)
     """Constant field, or mean of the gusts, on triangles [m/s]; zero is still air, which causes drag."""
     strength: float = 1.0
     """Factor of the field; zero disables the wind, including its drag."""
@@ -73,7 +73,7 @@ class Wind(Model):
     """triangle: lift coefficient C_L."""
 
     @model_validator(mode="after")
-    def _fits(self) -> "Wind":
+    def _check_options(self) -> "WindEffect":
         unused = {"triangle": {"force"}}.get(self.per, {"velocity", "density", "drag", "lift"})
         if self.field != "gusts":
             unused = unused | {"gustiness", "frequency", "seed"}
@@ -84,25 +84,25 @@ class Wind(Model):
         return self
 
     @property
-    def mean(self) -> NDArray[np.float64]:
+    def mean_field(self) -> NDArray[np.float64]:
         """Constant field or mean of the gusts, (3,) [N] or [m/s], including the strength."""
         return self.strength * np.array(self.velocity if self.per == "triangle" else self.force)
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the field as one force, empty for zero strength; raise InputError if triangles are missing."""
         if not self.strength:
-            return Contribution()
+            return EffectContribution()
         if self.per == "triangle":
-            return Contribution(forces=_on_triangles(self, mesh, mass, time_step))
-        weight = np.ones(len(mass)) if self.per == "vertex" else mesh.shares
-        return Contribution(forces=_on_vertices(self, mesh, weight[:, None]))
+            return EffectContribution(forces=_triangle_wind(self, mesh, mass, time_step))
+        weight = np.ones(len(mass)) if self.per == "vertex" else mesh.mass_fractions
+        return EffectContribution(forces=_vertex_wind(self, mesh, weight[:, None]))
 
 
-def _on_vertices(wind: Wind, mesh: Mesh, weight: NDArray[np.float64]) -> tuple[Force, ...]:
+def _vertex_wind(wind: WindEffect, mesh: Mesh, weight: NDArray[np.float64]) -> tuple[ForceFunction, ...]:
     """Return the field times weights (n, 1) as a force on vertices."""
-    if wind.field == "constant" or (wind.field == "gusts" and not wind.mean.any()):
-        return steady(weight * wind.mean)
-    field = _FIELDS[wind.field](wind, mesh)
+    if wind.field == "constant" or (wind.field == "gusts" and not wind.mean_field.any()):
+        return build_constant_force(weight * wind.mean_field)
+    field = _FIELD_BUILDERS[wind.field](wind, mesh)
 
     def force(p: Positions, v: Positions, t: float) -> Positions:
         return weight * field(p, t)
@@ -110,13 +110,13 @@ def _on_vertices(wind: Wind, mesh: Mesh, weight: NDArray[np.float64]) -> tuple[F
     return (force,)
 
 
-def _on_triangles(wind: Wind, mesh: Mesh, mass: NDArray[np.float64], dt: float) -> tuple[Force, ...]:
-    triangles, field = mesh.triangles, _FIELDS[wind.field](wind, mesh)
+def _triangle_wind(wind: WindEffect, mesh: Mesh, mass: NDArray[np.float64], dt: float) -> tuple[ForceFunction, ...]:
+    triangles, field = mesh.triangles, _FIELD_BUILDERS[wind.field](wind, mesh)
     if not len(triangles):
         raise InputError("wind: per: triangle needs triangles, and this mesh has none; let it act per share")
     if not wind.density or not (wind.drag or wind.lift):
         return ()
-    limit = _masses(mesh, mass) / dt
+    limit = _lump_triangle_masses(mesh, mass) / dt
 
     def force(p: Positions, v: Positions, t: float) -> Positions:
         a, b, c = (p[corner] for corner in triangles.T)
@@ -139,37 +139,37 @@ def _on_triangles(wind: Wind, mesh: Mesh, mass: NDArray[np.float64], dt: float) 
     return (force,)
 
 
-def _masses(mesh: Mesh, mass: NDArray[np.float64]) -> NDArray[np.float64]:
+def _lump_triangle_masses(mesh: Mesh, mass: NDArray[np.float64]) -> NDArray[np.float64]:
     """Compute the mass that moves with each triangle, (f,) [kg]: vertex masses divided by rest areas."""
-    a, b, c = (mesh.rest[corner] for corner in mesh.triangles.T)
+    a, b, c = (mesh.rest_positions[corner] for corner in mesh.triangles.T)
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     around = np.bincount(mesh.triangles.ravel(), np.repeat(area, 3), minlength=len(mass))
     dealt = np.divide(mass, around, out=np.zeros_like(mass), where=around > 0.0)
     return area * dealt[mesh.triangles].sum(axis=1)
 
 
-def _constant(wind: Wind, mesh: Mesh) -> Field:
-    return lambda x, t: wind.mean
+def _constant_field(wind: WindEffect, mesh: Mesh) -> WindField:
+    return lambda x, t: wind.mean_field
 
 
-def _gusts(wind: Wind, mesh: Mesh) -> Field:
-    rng, mean = np.random.default_rng(wind.seed), wind.mean
+def _gust_field(wind: WindEffect, mesh: Mesh) -> WindField:
+    rng, mean = np.random.default_rng(wind.seed), wind.mean_field
     size = float(np.linalg.norm(mean))
-    turns = 2.0 * np.pi * wind.frequency * np.exp(rng.uniform(np.log(0.25), np.log(4.0), _WAVES))
-    phase = rng.uniform(0.0, 2.0 * np.pi, (_WAVES, 3))
-    height = wind.gustiness * size * (2.0 / _WAVES) ** 0.5  # a cosine's mean square is 1/2
+    turns = 2.0 * np.pi * wind.frequency * np.exp(rng.uniform(np.log(0.25), np.log(4.0), _GUST_WAVES))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (_GUST_WAVES, 3))
+    height = wind.gustiness * size * (2.0 / _GUST_WAVES) ** 0.5  # a cosine's mean square is 1/2
     # Moving air advects its gusts. A force field has no speed; its waves cross the mesh in a second.
-    carried = mean / size**2 if wind.per == "triangle" else mean / size / (mesh.size or 1.0)
+    carried = mean / size**2 if wind.per == "triangle" else mean / size / (mesh.bounding_box_diagonal or 1.0)
 
     def field(x: Positions, t: float) -> Positions:
         late = (t - x @ carried)[:, None]
         return mean + height * sum(np.cos(w * late + phi) for w, phi in zip(turns, phase, strict=True))
 
-    return field if size else _constant(wind, mesh)
+    return field if size else _constant_field(wind, mesh)
 
 
-def _assignment(wind: Wind, mesh: Mesh) -> Field:
-    diagonal = mesh.size or 1.0
+def _assignment_field(wind: WindEffect, mesh: Mesh) -> WindField:
+    diagonal = mesh.bounding_box_diagonal or 1.0
 
     def field(x: Positions, t: float) -> Positions:
         phi = x[:, 0] / diagonal + t
@@ -179,8 +179,8 @@ def _assignment(wind: Wind, mesh: Mesh) -> Field:
     return field
 
 
-_FIELDS: dict[str, Callable[[Wind, Mesh], Field]] = {
-    "assignment": _assignment,
-    "constant": _constant,
-    "gusts": _gusts,
+_FIELD_BUILDERS: dict[str, Callable[[WindEffect, Mesh], WindField]] = {
+    "assignment": _assignment_field,
+    "constant": _constant_field,
+    "gusts": _gust_field,
 }

@@ -32,32 +32,32 @@ class Mesh:
         first_vertex: number of the first vertex in the mesh's file.
     """
 
-    rest: NDArray[np.float64]
+    rest_positions: NDArray[np.float64]
     springs: NDArray[np.int64]
-    families: Mapping[str, NDArray[np.int64]]
+    spring_families: Mapping[str, NDArray[np.int64]]
     triangles: NDArray[np.int64]
-    shares: NDArray[np.float64]
+    mass_fractions: NDArray[np.float64]
     dimension: int
     spacing: float
     resolution: int = 0
     parts: Mapping[str, NDArray[np.int64]] = field(default_factory=dict[str, NDArray[np.int64]])
     mass: NDArray[np.float64] | None = None
     attributes: Mapping[str, NDArray[np.float64]] = field(default_factory=dict[str, NDArray[np.float64]])
-    areas: NDArray[np.float64] | None = None
+    vertex_areas: NDArray[np.float64] | None = None
     first_vertex: int = 0
 
     def __post_init__(self) -> None:
-        arrays = [self.rest, self.springs, self.triangles, self.shares, self.mass, self.areas]
-        for array in [*arrays, *self.families.values(), *self.parts.values(), *self.attributes.values()]:
+        arrays = [self.rest_positions, self.springs, self.triangles, self.mass_fractions, self.mass, self.vertex_areas]
+        for array in [*arrays, *self.spring_families.values(), *self.parts.values(), *self.attributes.values()]:
             if array is not None:
                 array.flags.writeable = False
 
     @property
-    def size(self) -> float:
+    def bounding_box_diagonal(self) -> float:
         """Diagonal of the bounding box of the rest shape [m]."""
-        return float(np.linalg.norm(np.ptp(self.rest, axis=0))) if len(self.rest) else 0.0
+        return float(np.linalg.norm(np.ptp(self.rest_positions, axis=0))) if len(self.rest_positions) else 0.0
 
-    def in_file(self, *vertices: int) -> str:
+    def format_file_numbers(self, *vertices: int) -> str:
         """Format the file numbers of zero-based vertices for a message; empty if they are equal."""
         numbers = ", ".join(str(vertex + self.first_vertex) for vertex in vertices)
         return f" ({numbers} in the file)" if self.first_vertex else ""
@@ -66,10 +66,10 @@ class Mesh:
     def rest_lengths(self) -> NDArray[np.float64]:
         """Rest length of each spring [m], shape (m,)."""
         i, j = self.springs.T
-        return np.linalg.norm(self.rest[i] - self.rest[j], axis=1)
+        return np.linalg.norm(self.rest_positions[i] - self.rest_positions[j], axis=1)
 
 
-def distinct(vertices: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+def sort_unique_vertices(vertices: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     """Return the sorted unique vertices of n.
 
     `np.unique` would load `numpy.ma`, a tenth of the time of the command `list`.

@@ -7,10 +7,16 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from harness.scenes.mesh.base import SHEAR, STRETCH, Mesh
-from harness.scenes.mesh.generator import Generator, Metres, cells
-from harness.scenes.mesh.topology import Points, assemble, by_area, closed_by_points, offset_pairs
+from harness.scenes.mesh.generator import LengthMetres, MeshGenerator, count_cells
+from harness.scenes.mesh.topology import (
+    PointArray,
+    assemble_mesh,
+    build_capped_triangles,
+    build_offset_pairs,
+    lump_areas,
+)
 
-_OUTLINE = np.array(
+_HORIZONTAL_OUTLINE = np.array(
     [
         (1.0, 0.0, 0.0),
         (0.985, 0.041, 0.052),
@@ -36,7 +42,7 @@ _OUTLINE = np.array(
 """Height, half width and half depth from the crown down, relative to the height of the form."""
 
 
-class Body(Generator):
+class BodyMesh(MeshGenerator):
     """A closed surface that stands on y = 0 and looks along +z: head, neck, shoulders, waist and hips.
 
     `size` vertices around, ring by ring from the crown, which is one vertex, down to the last one, in the middle of the
@@ -46,22 +52,24 @@ class Body(Generator):
     """
 
     kind: Literal["body"] = "body"
-    height: Metres = 0.9
+    height: LengthMetres = 0.9
     """Height from the base to the crown [m]."""
 
-    SMALLEST: ClassVar[int] = 4
-    COUNTS: ClassVar[str] = "vertices around"
-    SPRINGS: ClassVar[int] = 4
+    MIN_SIZE: ClassVar[int] = 4
+    SIZE_MEANING: ClassVar[str] = "vertices around"
+    SPRINGS_PER_VERTEX: ClassVar[int] = 4
 
-    def count(self, size: int) -> int:
+    def count_vertices(self, size: int) -> int:
         """Return the number of vertices of a mesh of this size."""
-        return size * (_rows(size) - 1) + 2
+        return size * (_count_rows(size) - 1) + 2
 
-    def generate(self, size: int) -> Mesh:
+    def generate_mesh(self, size: int) -> Mesh:
         """Generate the mesh of a valid size."""
-        along: Points = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(_OUTLINE, axis=0), axis=1))])
-        places: Points = np.linspace(0.0, float(along[-1]), _rows(size) + 1)
-        y, across, deep = (self.height * _between(places, along, column) for column in _OUTLINE.T)
+        along: PointArray = np.concatenate(
+            [[0.0], np.cumsum(np.linalg.norm(np.diff(_HORIZONTAL_OUTLINE, axis=0), axis=1))]
+        )
+        places: PointArray = np.linspace(0.0, float(along[-1]), _count_rows(size) + 1)
+        y, across, deep = (self.height * _interpolate_rows(places, along, column) for column in _HORIZONTAL_OUTLINE.T)
         inner = np.arange(1, len(places) - 1)
         angle = np.linspace(0, 2 * np.pi, size, endpoint=False)
         x, z = np.outer(across[inner], np.cos(angle)), -np.outer(deep[inner], np.sin(angle))
@@ -69,27 +77,27 @@ class Body(Generator):
         rest = np.concatenate([[[0.0, y[0], 0.0]], rings, [[0.0, y[-1], 0.0]]])
         index = 1 + np.arange(len(rings)).reshape(-1, size)
         closed, first, last = np.column_stack([index, index[:, 0]]), 0, len(rest) - 1
-        triangles = closed_by_points(closed, first, last)
-        down = [triangles[:size, :2], offset_pairs(index, (1, 0)), triangles[-size:, [2, 0]]]
-        return assemble(
-            rest=rest,
+        triangles = build_capped_triangles(closed, first, last)
+        down = [triangles[:size, :2], build_offset_pairs(index, (1, 0)), triangles[-size:, [2, 0]]]
+        return assemble_mesh(
+            rest_positions=rest,
             springs={
-                STRETCH: np.concatenate([offset_pairs(closed, (0, 1)), *down]),
-                SHEAR: offset_pairs(closed, (1, 1), (1, -1)),
+                STRETCH: np.concatenate([build_offset_pairs(closed, (0, 1)), *down]),
+                SHEAR: build_offset_pairs(closed, (1, 1), (1, -1)),
             },
             triangles=triangles,
-            weights=by_area(rest, triangles),
+            vertex_weights=lump_areas(rest, triangles),
             dimension=2,
             resolution=size,
             parts={"crown": [first], "base": [last]},
         )
 
 
-def _between(places: Points, along: Points, values: Points) -> Points:
+def _interpolate_rows(places: PointArray, along: PointArray, values: PointArray) -> PointArray:
     return np.asarray(np.interp(places, along, values), np.float64)
 
 
-def _rows(size: int) -> int:
+def _count_rows(size: int) -> int:
     """Return the number of cells from crown to base along the outline."""
-    length = float(np.linalg.norm(np.diff(_OUTLINE, axis=0), axis=1).sum())
-    return max(8, cells(length, 2 * np.pi * 0.127 / size))
+    length = float(np.linalg.norm(np.diff(_HORIZONTAL_OUTLINE, axis=0), axis=1).sum())
+    return max(8, count_cells(length, 2 * np.pi * 0.127 / size))

@@ -10,28 +10,28 @@ from typing import Literal
 import numpy as np
 
 from harness.base import child
-from harness.base.errors import InputError, Mistake
-from harness.base.model import Model
+from harness.base.errors import InputError, InputMistake
+from harness.base.model import ConfigModel
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.mesh.cells import MAX_COORDINATE, Cells, SpringRule, check_file, network
-from harness.scenes.mesh.foreign import FACES, Found, read
+from harness.scenes.mesh.cells import MAX_COORDINATE, MeshCells, SpringRule, build_spring_network, check_mesh_file
+from harness.scenes.mesh.foreign import FACE_KINDS, MeshFileContent, read_mesh_file
 from harness.scenes.mesh.obj import read_obj
-from harness.scenes.mesh.scene_json import read_scene_json
-from harness.scenes.mesh.topology import NO_PAIRS, Indices
+from harness.scenes.mesh.scene_json import read_assignment_json
+from harness.scenes.mesh.topology import NO_PAIRS, IndexArray
 
-_KINDS = ("line", *FACES, "tetra")
+_CELL_KINDS = ("line", *FACE_KINDS, "tetra")
 """Kinds of cells that yield springs; the kind `vertex` is ignored."""
 
-_MOST_NAMED = 3
+_MAX_NAMED_POINTS = 3
 _LOG = logging.getLogger("springbench")
 
-SECONDS, BYTES_PER_SECOND = 5.0, 1e6
+MIN_READ_SECONDS, READ_BYTES_PER_SECOND = 5.0, 1e6
 """Time limit of reading: meshio reads text at 1 MB/s or more, and does not terminate on some broken files."""
-MEMORY, MEMORY_PER_BYTE = 2**29, 20
+MIN_READ_MEMORY, READ_MEMORY_PER_BYTE = 2**29, 20
 """Memory limit of reading [bytes]: Python lists, with numbers of two characters in the worst case."""
 
 
-class File(Model):
+class FileMesh(ConfigModel):
     """A mesh from a file, of fixed size.
 
     Parts: the sides of its bounding box, and the groups named in the file. Attributes: point data of the file.
@@ -44,7 +44,7 @@ class File(Model):
     """Springs along `edges` of faces only, or between all corners of a face (`face_pairs`); by default face_pairs for
     JSON scenes, and edges for all other files."""
 
-    def build(self, size: int = 0) -> Mesh:
+    def build_mesh(self, size: int = 0) -> Mesh:
         """Build the file's mesh, ignoring the size; `mesh.spring_network` defines springs and masses.
 
         Raises:
@@ -53,62 +53,64 @@ class File(Model):
         path, suffix = self.path, self.path.suffix.lower()
         rule = self.springs or ("face_pairs" if suffix == ".json" else "edges")
         if suffix == ".json":
-            path = path.parent / read_scene_json(path).obj
+            path = path.parent / read_assignment_json(path).obj
             suffix = path.suffix.lower()
-        return network(read_obj(path) if suffix == ".obj" else _read_meshio(path), rule, path)
+        return build_spring_network(read_obj(path) if suffix == ".obj" else _read_cells(path), rule, path)
 
 
-def _read_meshio(path: Path) -> Cells:
+def _read_cells(path: Path) -> MeshCells:
     """Read cells with meshio in a subprocess; raise InputError on any failure."""
-    check_file(path)
+    check_mesh_file(path)
     state = path.stat()
-    found = _read(path, state.st_mtime_ns, state.st_size)
-    points, blocks = found.points, found.blocks
-    problem = _problem(points, blocks) or _problem_of_groups(found)
+    found = _read_cached(path, state.st_mtime_ns, state.st_size)
+    points, blocks = found.points, found.cell_blocks
+    problem = _find_cell_problem(points, blocks) or _find_group_problem(found)
     if problem:
-        raise InputError(Mistake(problem, path))
-    if len(found.left_out):
-        where = ", ".join(f"({x:g}, {y:g}, {z:g})" for x, y, z in found.left_out[:_MOST_NAMED].tolist())
-        more = ", ..." if len(found.left_out) > _MOST_NAMED else ""
-        problem = f"{len(found.left_out):,} points belong to no cell and are left out: at {where}{more} m"
-        _LOG.warning("%s", Mistake(problem, path))
-    polygons: dict[int, list[Indices]] = {}
-    places: dict[int, list[Indices]] = {}
-    for (kind, data), numbers in zip(blocks, found.places, strict=True):
-        if kind in FACES:
+        raise InputError(InputMistake(problem, path))
+    if len(found.unused_points):
+        where = ", ".join(f"({x:g}, {y:g}, {z:g})" for x, y, z in found.unused_points[:_MAX_NAMED_POINTS].tolist())
+        more = ", ..." if len(found.unused_points) > _MAX_NAMED_POINTS else ""
+        problem = f"{len(found.unused_points):,} points belong to no cell and are left out: at {where}{more} m"
+        _LOG.warning("%s", InputMistake(problem, path))
+    polygons: dict[int, list[IndexArray]] = {}
+    places: dict[int, list[IndexArray]] = {}
+    for (kind, data), numbers in zip(blocks, found.face_locations, strict=True):
+        if kind in FACE_KINDS:
             polygons.setdefault(data.shape[1], []).append(data)
             places.setdefault(data.shape[1], []).append(numbers)
-    return Cells(
+    return MeshCells(
         points=np.pad(points, ((0, 0), (0, 3 - points.shape[1]))),
         polygons={corners: np.concatenate(polygons[corners]) for corners in sorted(polygons)},
-        places={corners: np.concatenate(places[corners]) for corners in sorted(places)},
-        counted=found.counted,
+        polygon_locations={corners: np.concatenate(places[corners]) for corners in sorted(places)},
+        location_unit=found.location_unit,
         segments=np.concatenate([NO_PAIRS, *(data for kind, data in blocks if kind == "line")]),
         tetrahedra=np.concatenate([np.empty((0, 4), np.int64), *(data for kind, data in blocks if kind == "tetra")]),
-        groups=found.groups,
+        vertex_groups=found.vertex_groups,
         attributes=found.attributes,
     )
 
 
 @lru_cache(maxsize=2)  # a scene builds its mesh several times, and a child takes a while to start
-def _read(path: Path, changed: int, size: int) -> Found:
+def _read_cached(path: Path, mtime_ns: int, size: int) -> MeshFileContent:
     """Read a mesh file, cached by path, modification time [ns] and size [bytes]."""
-    limits = child.Allowance(SECONDS + size / BYTES_PER_SECOND, MEMORY + MEMORY_PER_BYTE * size)
+    limits = child.CallLimits(
+        MIN_READ_SECONDS + size / READ_BYTES_PER_SECOND, MIN_READ_MEMORY + READ_MEMORY_PER_BYTE * size
+    )
     try:
-        return child.call(read, path, limits=limits)
-    except child.NoAnswer as error:
-        raise InputError(Mistake(f"cannot be read as a mesh: {error}", path)) from None
+        return child.call_in_sandbox(read_mesh_file, path, limits=limits)
+    except child.SandboxError as error:
+        raise InputError(InputMistake(f"cannot be read as a mesh: {error}", path)) from None
 
 
-def _problem_of_groups(found: Found) -> str:
+def _find_group_problem(found: MeshFileContent) -> str:
     """Describe what is wrong with the groups; empty if they are valid."""
-    for name, group in found.groups.items():
+    for name, group in found.vertex_groups.items():
         if group[0] < 0 or group[-1] >= len(found.points):
             return f"its group {name[:40]!r} names the point {group[-1]}; wanted 0 to {len(found.points) - 1}"
     return ""
 
 
-def _problem(points: np.ndarray, blocks: list[tuple[str, Indices]]) -> str:
+def _find_cell_problem(points: np.ndarray, blocks: list[tuple[str, IndexArray]]) -> str:
     """Describe what is wrong with meshio's points and cells; empty if they are valid."""
     if points.ndim != 2 or not 1 <= points.shape[1] <= 3:
         return f"has points of shape {points.shape}; wanted 1 to 3 coordinates each"
@@ -116,8 +118,8 @@ def _problem(points: np.ndarray, blocks: list[tuple[str, Indices]]) -> str:
         row = int(np.flatnonzero(~np.all(np.abs(points) <= MAX_COORDINATE, axis=1))[0])
         return f"point {row} (from 0) is {points[row]}; wanted finite numbers up to {MAX_COORDINATE:g} m"
     for kind, data in blocks:
-        if kind not in _KINDS:
-            return f"has cells of type {kind}; wanted {', '.join(_KINDS)}"
+        if kind not in _CELL_KINDS:
+            return f"has cells of type {kind}; wanted {', '.join(_CELL_KINDS)}"
         if data.ndim != 2 or data.shape[1] < 2:
             return f"has a {kind} of fewer than 2 points"
         ordered = np.sort(data, axis=1)

@@ -8,23 +8,31 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
-from harness.scenes.mesh.generator import Generator, Metres, cells
-from harness.scenes.mesh.topology import Indices, Points, assemble, by_area, by_length, lattice_triangles, offset_pairs
+from harness.scenes.mesh.generator import LengthMetres, MeshGenerator, count_cells
+from harness.scenes.mesh.topology import (
+    IndexArray,
+    PointArray,
+    assemble_mesh,
+    build_lattice_triangles,
+    build_offset_pairs,
+    lump_areas,
+    lump_lengths,
+)
 
-_DIAGONALS: dict[str, tuple[tuple[int, int], ...]] = {"none": (), "one": ((1, 1),), "both": ((1, 1), (1, -1))}
+_DIAGONAL_OFFSETS: dict[str, tuple[tuple[int, int], ...]] = {"none": (), "one": ((1, 1),), "both": ((1, 1), (1, -1))}
 
 
-class _Sheet(Generator):
+class _SheetMesh(MeshGenerator):
     """A rectangle, centred on the vertical axis x = z = 0; row 0 is its top."""
 
-    width: Metres = 1.0
+    width: LengthMetres = 1.0
     """Width along x [m]."""
-    height: Metres = 1.0
+    height: LengthMetres = 1.0
     """Height from the top row to the bottom row [m]."""
     plane: Literal["horizontal", "vertical"] = "horizontal"
     """Horizontal at y = 0 with the top towards -z, or hanging from y = 0 in the plane z = 0."""
 
-    def _place(self, across: Points, down: Points) -> Points:
+    def _place_vertices(self, across: PointArray, down: PointArray) -> PointArray:
         """Compute positions (n, 3) [m] from fractions of the width and of the height, (n,) each."""
         x, zero = self.width * (across - 0.5), np.zeros_like(across)
         if self.plane == "vertical":
@@ -32,7 +40,7 @@ class _Sheet(Generator):
         return np.stack([x, zero, self.height * (down - 0.5)], axis=1)
 
 
-def _parts(top: Indices, bottom: Indices, left: Indices, right: Indices) -> dict[str, Indices]:
+def _name_sides(top: IndexArray, bottom: IndexArray, left: IndexArray, right: IndexArray) -> dict[str, IndexArray]:
     """Name the sides of a sheet, each in order along it, and their unions."""
     return {
         "top": top,
@@ -45,7 +53,7 @@ def _parts(top: Indices, bottom: Indices, left: Indices, right: Indices) -> dict
     }
 
 
-class Grid(_Sheet):
+class GridMesh(_SheetMesh):
     """A cloth of near-square cells, `size` vertices along its width, numbered row by row from the top.
 
     Springs: along rows, along columns (STRETCH); the diagonals down to the right, then down to the left
@@ -60,40 +68,40 @@ class Grid(_Sheet):
     skip_one: bool = False
     """Springs from a vertex to the next but one, against bending."""
 
-    COUNTS: ClassVar[str] = "vertices along its width"
-    SPRINGS: ClassVar[int] = 4
+    SIZE_MEANING: ClassVar[str] = "vertices along its width"
+    SPRINGS_PER_VERTEX: ClassVar[int] = 4
 
-    def count(self, size: int) -> int:
+    def count_vertices(self, size: int) -> int:
         """Return the number of vertices of a mesh of this size."""
-        return size * self._rows(size)
+        return size * self._count_rows(size)
 
-    def _rows(self, size: int) -> int:
-        return cells(self.height, self.width / (size - 1)) + 1
+    def _count_rows(self, size: int) -> int:
+        return count_cells(self.height, self.width / (size - 1)) + 1
 
-    def generate(self, size: int) -> Mesh:
+    def generate_mesh(self, size: int) -> Mesh:
         """Generate the mesh of a valid size."""
-        rows = self._rows(size)
+        rows = self._count_rows(size)
         index = np.arange(rows * size).reshape(rows, size)
         down, across = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, size), indexing="ij")
-        rest = self._place(across.ravel(), down.ravel())
-        triangles = lattice_triangles(index)
-        return assemble(
-            rest=rest,
+        rest = self._place_vertices(across.ravel(), down.ravel())
+        triangles = build_lattice_triangles(index)
+        return assemble_mesh(
+            rest_positions=rest,
             springs={
-                STRETCH: offset_pairs(index, (0, 1), (1, 0)),
-                SHEAR: offset_pairs(index, *_DIAGONALS[self.diagonals]),
-                BEND: offset_pairs(index, *(((0, 2), (2, 0)) if self.skip_one else ())),
+                STRETCH: build_offset_pairs(index, (0, 1), (1, 0)),
+                SHEAR: build_offset_pairs(index, *_DIAGONAL_OFFSETS[self.diagonals]),
+                BEND: build_offset_pairs(index, *(((0, 2), (2, 0)) if self.skip_one else ())),
             },
             triangles=triangles,
-            weights=by_area(rest, triangles),
+            vertex_weights=lump_areas(rest, triangles),
             dimension=2,
             spacing=math.sqrt(self.width / (size - 1) * self.height / (rows - 1)),
             resolution=size,
-            parts=_parts(index[0], index[-1], index[:, 0], index[:, -1]),
+            parts=_name_sides(index[0], index[-1], index[:, 0], index[:, -1]),
         )
 
 
-class Net(_Sheet):
+class NetMesh(_SheetMesh):
     """A net of ropes: square meshes that stand on a corner, and a rope along the boundary; no triangles.
 
     `size` knots along its top. Rows of `size` knots alternate with rows of `size - 1` knots half a mesh
@@ -105,37 +113,37 @@ class Net(_Sheet):
 
     kind: Literal["net"] = "net"
 
-    COUNTS: ClassVar[str] = "knots along its top"
-    SPRINGS: ClassVar[int] = 2
+    SIZE_MEANING: ClassVar[str] = "knots along its top"
+    SPRINGS_PER_VERTEX: ClassVar[int] = 2
 
-    def count(self, size: int) -> int:
+    def count_vertices(self, size: int) -> int:
         """Return the number of vertices of a mesh of this size."""
-        meshes = self._meshes(size)
+        meshes = self._count_mesh_rows(size)
         return size * (meshes + 1) + (size - 1) * meshes
 
-    def _meshes(self, size: int) -> int:
+    def _count_mesh_rows(self, size: int) -> int:
         """Return the number of mesh rows from top to bottom."""
-        return cells(self.height, self.width / (size - 1))
+        return count_cells(self.height, self.width / (size - 1))
 
-    def generate(self, size: int) -> Mesh:
+    def generate_mesh(self, size: int) -> Mesh:
         """Generate the mesh of a valid size."""
-        meshes, period = self._meshes(size), 2 * size - 1
+        meshes, period = self._count_mesh_rows(size), 2 * size - 1
         full = period * np.arange(meshes + 1)[:, None] + np.arange(size)
         short = period * np.arange(meshes)[:, None] + np.arange(size, period)
-        rest = np.empty((self.count(size), 3))
+        rest = np.empty((self.count_vertices(size), 3))
         for knots, shift in ((full, 0.0), (short, 0.5)):
             down, across = np.indices(knots.shape) + shift
-            rest[knots.ravel()] = self._place(across.ravel() / (size - 1), down.ravel() / meshes)
+            rest[knots.ravel()] = self._place_vertices(across.ravel() / (size - 1), down.ravel() / meshes)
         ends = (full[:-1, :-1], full[:-1, 1:], full[1:, :-1], full[1:, 1:])
         ropes = np.concatenate([np.stack([short.ravel(), end.ravel()], axis=1) for end in ends])
         around = [full[0], full[-1], full[:, 0], full[:, -1]]
-        pairs = np.concatenate([ropes, *(offset_pairs(side, (1,)) for side in around)])
-        return assemble(
-            rest=rest,
+        pairs = np.concatenate([ropes, *(build_offset_pairs(side, (1,)) for side in around)])
+        return assemble_mesh(
+            rest_positions=rest,
             springs={STRETCH: pairs},
-            weights=by_length(rest, pairs),
+            vertex_weights=lump_lengths(rest, pairs),
             dimension=2,
             spacing=0.5 * math.hypot(self.width / (size - 1), self.height / meshes),
             resolution=size,
-            parts=_parts(*around),
+            parts=_name_sides(*around),
         )

@@ -1,8 +1,8 @@
 """Table of the mesh types as `module:Class`; a run imports only the type that it uses."""
 
-from solvers.plugins import Table
+from solvers.plugins import PluginTable
 
-MESHES: dict[str, str] = {
+MESH_CLASSES: dict[str, str] = {
     "chain": "harness.scenes.mesh.chain:Chain",
     "rope": "harness.scenes.mesh.chain:Rope",
     "grid": "harness.scenes.mesh.grid:Grid",
@@ -18,5 +18,5 @@ MESHES: dict[str, str] = {
     "file": "harness.scenes.mesh.files:File",
 }
 
-EVERY = Table("springbench.meshes", MESHES)
+MESH_TABLE = PluginTable("springbench.meshes", MESH_CLASSES)
 """All mesh types by name."""

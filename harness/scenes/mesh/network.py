@@ -8,33 +8,33 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, ValidationInfo, field_validator
 
-from harness.base.model import Model
+from harness.base.model import ConfigModel
 from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
 from harness.scenes.mesh.cells import MAX_COORDINATE
 from harness.scenes.mesh.topology import NO_TRIANGLES
 
-Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
-Pairs = tuple[tuple[NonNegativeInt, NonNegativeInt], ...]
+CoordinateValue = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
+VertexPairs = tuple[tuple[NonNegativeInt, NonNegativeInt], ...]
 
 
-class Network(Model):
+class NetworkMesh(ConfigModel):
     """Vertices, and springs between pairs of them; multiple springs per pair are allowed. Dimension 1."""
 
     kind: Literal["network"] = "network"
-    positions: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = Field(min_length=1)
+    positions: tuple[tuple[CoordinateValue, CoordinateValue, CoordinateValue], ...] = Field(min_length=1)
     """Rest position of each vertex [m]."""
-    springs: Pairs = ()
+    springs: VertexPairs = ()
     """Springs along the lines (stretch), as pairs of zero-based vertices."""
-    shear: Pairs = ()
+    shear: VertexPairs = ()
     """Springs across cells."""
-    bend: Pairs = ()
+    bend: VertexPairs = ()
     """Springs from a vertex to the next but one."""
     mass: tuple[NonNegativeFloat, ...] | None = None
     """Mass of each vertex [kg]; by default equal shares of the scene's mass."""
 
     @field_validator("springs", "shear", "bend")
     @classmethod
-    def _join_vertices(cls, pairs: Pairs, info: ValidationInfo) -> Pairs:
+    def _check_pairs(cls, pairs: VertexPairs, info: ValidationInfo) -> VertexPairs:
         n = len(info.data.get("positions", ())) or np.inf  # refused positions are told of by themselves
         for k, (i, j) in enumerate(pairs):
             if i == j:
@@ -45,7 +45,7 @@ class Network(Model):
 
     @field_validator("mass")
     @classmethod
-    def _one_each(cls, mass: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
+    def _check_mass_count(cls, mass: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
         n = len(info.data.get("positions", ()))
         if mass is not None and n and len(mass) != n:
             raise ValueError(f"has {len(mass)} masses for {n} vertices; give each vertex one")
@@ -53,7 +53,7 @@ class Network(Model):
             raise ValueError("is zero at every vertex; give some vertex a mass")
         return mass
 
-    def build(self, size: int = 0) -> Mesh:
+    def build_mesh(self, size: int = 0) -> Mesh:
         """Build the network, ignoring the size."""
         rest = np.array(self.positions, float)
         mass = None if self.mass is None else np.array(self.mass, float)
@@ -63,11 +63,11 @@ class Network(Model):
         i, j = springs.T
         lengths = np.linalg.norm(rest[i] - rest[j], axis=1)
         return Mesh(
-            rest=rest,
+            rest_positions=rest,
             springs=springs,
-            families={name: np.arange(a, b) for name, (a, b) in zip(families, pairwise(ends), strict=True)},
+            spring_families={name: np.arange(a, b) for name, (a, b) in zip(families, pairwise(ends), strict=True)},
             triangles=NO_TRIANGLES,
-            shares=np.full(len(rest), 1.0 / len(rest)) if mass is None else mass / mass.sum(),
+            mass_fractions=np.full(len(rest), 1.0 / len(rest)) if mass is None else mass / mass.sum(),
             dimension=1,
             spacing=float(np.median(lengths[lengths > 0.0])) if lengths.any() else 1.0,
             mass=mass,

@@ -16,40 +16,51 @@ from pathlib import Path
 
 import numpy as np
 
-from harness.base.errors import InputError, Mistake
-from harness.scenes.mesh.cells import MAX_COORDINATE, Cells, check_file
+from harness.base.errors import InputError, InputMistake
+from harness.scenes.mesh.cells import MAX_COORDINATE, MeshCells, check_mesh_file
 from harness.scenes.mesh.generator import MAX_VERTICES
 from harness.scenes.mesh.topology import NO_PAIRS
 
-_RENDERING = {"bevel", "c_interp", "d_interp", "shadow_obj", "trace_obj", "mtllib", "usemtl", "maplib", "usemap", "lod"}
-_PASSED_OVER = _RENDERING | {"vt", "vn", "vp", "p", "s", "mg"}
-_TOKEN = re.compile(r"([+-]?[0-9]+)(/[+-]?[0-9]*(/[+-]?[0-9]*)?)?")
-_MOST_MISTAKES = 20
+_RENDERING_KEYWORDS = {
+    "bevel",
+    "c_interp",
+    "d_interp",
+    "shadow_obj",
+    "trace_obj",
+    "mtllib",
+    "usemtl",
+    "maplib",
+    "usemap",
+    "lod",
+}
+_IGNORED_KEYWORDS = _RENDERING_KEYWORDS | {"vt", "vn", "vp", "p", "s", "mg"}
+_CORNER_TOKEN = re.compile(r"([+-]?[0-9]+)(/[+-]?[0-9]*(/[+-]?[0-9]*)?)?")
+_MAX_MISTAKES = 20
 
 
-def read_obj(path: Path) -> Cells:
+def read_obj(path: Path) -> MeshCells:
     """Read the points, polygons (`f`) and segments (`l`) of an OBJ file, in file order.
 
     Raises:
         InputError: with the lines, for unreadable statements, numbers that are not finite, indices out of range,
             repeated vertices of a face, and empty or oversized files.
     """
-    check_file(path)
-    reader = _Reader(path)
+    check_mesh_file(path)
+    reader = _ObjReader(path)
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
-            for number, text in _statements(file):
-                reader.read(number, text)
-                if len(reader.mistakes) >= _MOST_MISTAKES:
+            for number, text in _split_statements(file):
+                reader.read_statement(number, text)
+                if len(reader.mistakes) >= _MAX_MISTAKES:
                     break
                 if len(reader.points) > MAX_VERTICES:
-                    raise InputError(Mistake(f"has more than {MAX_VERTICES:,} vertices", path, number))
+                    raise InputError(InputMistake(f"has more than {MAX_VERTICES:,} vertices", path, number))
     except OSError as error:
-        raise InputError(Mistake(f"cannot be read ({error.strerror})", path)) from None
-    return reader.cells()
+        raise InputError(InputMistake(f"cannot be read ({error.strerror})", path)) from None
+    return reader.build_cells()
 
 
-def _statements(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
+def _split_statements(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
     """Yield statements without comments, each with the number of its first line."""
     begun, parts = 0, list[str]()
     for number, line in enumerate(lines, 1):
@@ -64,7 +75,7 @@ def _statements(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
         yield begun, " ".join(parts)
 
 
-class _Reader:
+class _ObjReader:
     """Collects statements; all mistakes are reported together at the end."""
 
     def __init__(self, path: Path) -> None:
@@ -76,49 +87,49 @@ class _Reader:
         self.segment_lines: list[int] = []
         self.colours: list[tuple[float, ...]] = []
         self.groups: dict[str, set[int]] = defaultdict(set)
-        self.named: list[str] = []
-        self.mistakes: list[Mistake] = []
+        self.current_groups: list[str] = []
+        self.mistakes: list[InputMistake] = []
 
-    def read(self, number: int, text: str) -> None:
+    def read_statement(self, number: int, text: str) -> None:
         """Read one statement that starts in line `number`."""
         keyword, *words = text.split() or [""]
         try:
             if keyword == "v":
-                self.points.append(_point(words))
-                self.colours += [_colour(words[3:])] if len(words) == 6 else []
+                self.points.append(_parse_point(words))
+                self.colours += [_parse_colour(words[3:])] if len(words) == 6 else []
             elif keyword in ("g", "o"):
-                self.named = words
+                self.current_groups = words
             elif keyword == "f":
-                corners = self._corners(words)
+                corners = self._parse_corners(words)
                 if len(set(corners)) < len(corners):
                     raise ValueError("a face names a vertex twice; each corner must be another vertex")
                 self.polygons[len(corners)].append(corners)
                 self.lines[len(corners)].append(number)
-                self._belong(corners)
+                self._add_to_groups(corners)
             elif keyword == "l":
-                corners = self._corners(words)
+                corners = self._parse_corners(words)
                 segments = [[a, b] for a, b in pairwise(corners)]
                 if any(a == b for a, b in segments):
                     raise ValueError("a line joins a vertex to itself; its ends must differ")
                 self.segments += segments
                 self.segment_lines += [number] * len(segments)
-                self._belong(corners)
-            elif keyword and keyword not in _PASSED_OVER:
+                self._add_to_groups(corners)
+            elif keyword and keyword not in _IGNORED_KEYWORDS:
                 raise ValueError(f"unknown keyword {keyword[:40]!r}; wanted v, f, l or what OBJ files may carry")
         except ValueError as error:
-            self.mistakes.append(Mistake(str(error), self.path, number))
+            self.mistakes.append(InputMistake(str(error), self.path, number))
 
-    def _belong(self, corners: list[int]) -> None:
-        for name in self.named:
+    def _add_to_groups(self, corners: list[int]) -> None:
+        for name in self.current_groups:
             self.groups[name].update(corners)
 
-    def _corners(self, words: list[str]) -> list[int]:
+    def _parse_corners(self, words: list[str]) -> list[int]:
         """Parse zero-based vertices; their existence is checked at the end of the file."""
         if len(words) < 2:
             raise ValueError(f"a face or line needs at least 2 vertices, came {len(words)}")
         corners: list[int] = []
         for word in words:
-            match = _TOKEN.fullmatch(word)
+            match = _CORNER_TOKEN.fullmatch(word)
             index = int(match[1][:20]) if match else 0
             if not index:
                 raise ValueError(f"{word[:40]!r} is no vertex; wanted v, v/vt, v//vn or v/vt/vn, counted from 1")
@@ -127,24 +138,24 @@ class _Reader:
                 raise ValueError(f"vertex {index} lies before the first; only {len(self.points)} came so far")
         return corners
 
-    def cells(self) -> Cells:
+    def build_cells(self) -> MeshCells:
         """Return the cells; raise InputError with all mistakes."""
         if not self.mistakes and not self.points:
-            self.mistakes.append(Mistake("has no vertices (v lines)", self.path))
+            self.mistakes.append(InputMistake("has no vertices (v lines)", self.path))
         if not self.mistakes:
             for corners, polygons in self.polygons.items():
                 self._check_range(polygons, self.lines[corners])
             self._check_range(self.segments, self.segment_lines)
         if self.mistakes:
-            raise InputError(sorted(self.mistakes, key=lambda m: m.line or 0)[:_MOST_MISTAKES])
+            raise InputError(sorted(self.mistakes, key=lambda m: m.line or 0)[:_MAX_MISTAKES])
         colours = self.colours if len(self.colours) == len(self.points) else []
-        return Cells(
-            groups={name: np.array(sorted(group), np.int64) for name, group in self.groups.items()},
+        return MeshCells(
+            vertex_groups={name: np.array(sorted(group), np.int64) for name, group in self.groups.items()},
             attributes=dict(zip(("red", "green", "blue"), np.array(colours).T.copy(), strict=False)),
             points=np.array(self.points, np.float64),
             polygons={k: np.array(self.polygons[k], np.int64) for k in sorted(self.polygons)},
-            places={k: np.array(lines, np.int64) for k, lines in self.lines.items()},
-            counted="line",
+            polygon_locations={k: np.array(lines, np.int64) for k, lines in self.lines.items()},
+            location_unit="line",
             first_vertex=1,
             segments=np.array(self.segments, np.int64) if self.segments else NO_PAIRS,
         )
@@ -154,22 +165,22 @@ class _Reader:
         for corners, line in zip(groups, lines, strict=True):
             if max(corners) >= n:
                 problem = f"vertex {max(corners) + 1} does not exist; the file has {n} vertices, counted from 1"
-                self.mistakes.append(Mistake(problem, self.path, line))
+                self.mistakes.append(InputMistake(problem, self.path, line))
 
 
-def _point(words: list[str]) -> tuple[float, float, float]:
+def _parse_point(words: list[str]) -> tuple[float, float, float]:
     """Parse the position of a `v` line, optionally followed by a weight or a colour."""
     if not 3 <= len(words) <= 7:
         raise ValueError(f"a vertex needs 3 coordinates (and at most a weight and a colour), came {len(words)}")
-    x, y, z = map(_coordinate, words[:3])
+    x, y, z = map(_parse_coordinate, words[:3])
     return x, y, z
 
 
-def _colour(words: list[str]) -> tuple[float, ...]:
-    return tuple(map(_coordinate, words))
+def _parse_colour(words: list[str]) -> tuple[float, ...]:
+    return tuple(map(_parse_coordinate, words))
 
 
-def _coordinate(word: str) -> float:
+def _parse_coordinate(word: str) -> float:
     try:
         value = float(word.replace("_", "?"))  # Python would read 1_0 as ten
     except ValueError:

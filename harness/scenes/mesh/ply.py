@@ -13,40 +13,40 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
 
-_SIZES = {"char": 1, "short": 2, "int": 4}
-_TYPES = {
-    **{f"{sign}{name}": f"{sign or 'i'}{size}" for name, size in _SIZES.items() for sign in ("", "u")},
+_TYPE_SIZES = {"char": 1, "short": 2, "int": 4}
+_NUMPY_TYPES = {
+    **{f"{sign}{name}": f"{sign or 'i'}{size}" for name, size in _TYPE_SIZES.items() for sign in ("", "u")},
     **{f"{sign}int{8 * size}": f"{sign or 'i'}{size}" for size in (1, 2, 4, 8) for sign in ("", "u")},
     "float": "f4",
     "float32": "f4",
     "double": "f8",
     "float64": "f8",
 }
-_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
-_CORNERS = ("vertex_indices", "vertex_index")
-_MOST_OF_HEAD = 2**20
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+_CORNER_PROPERTIES = ("vertex_indices", "vertex_index")
+_MAX_HEADER_BYTES = 2**20
 
 
-class Property(NamedTuple):
+class PlyProperty(NamedTuple):
     """A scalar property, or a list if `length_type` is set, the type of its length."""
 
     name: str
     type: str
-    length: str = ""
+    length_type: str = ""
 
 
-class Element(NamedTuple):
+class PlyElement(NamedTuple):
     """An element of the header, with its number of rows."""
 
     name: str
-    rows: int
-    properties: list[Property]
+    num_rows: int
+    properties: list[PlyProperty]
 
 
-class Ply(NamedTuple):
+class PlyContent(NamedTuple):
     """Contents of a PLY file.
 
     Attributes:
@@ -56,40 +56,42 @@ class Ply(NamedTuple):
         first_face_line: line of the first face if each face has its own line, else 0.
     """
 
-    points: Array
-    numbers: dict[str, Array]
-    faces: dict[int, tuple[Indices, Indices]]
-    first_line: int
+    points: FloatArray
+    vertex_attributes: dict[str, FloatArray]
+    faces: dict[int, tuple[IndexArray, IndexArray]]
+    first_face_line: int
 
 
-def read(content: bytes) -> Ply:
+def read_ply(content: bytes) -> PlyContent:
     """Read the contents of a PLY file; raise ValueError for a broken one."""
-    form, elements, start = _head(content)
-    rows_of: Callable[[Element, str], _Rows] = (
-        _Text(content[start:]).rows if form == "ascii" else _Binary(content, start, _ORDERS[form]).rows
+    form, elements, start = _parse_header(content)
+    rows_of: Callable[[PlyElement, str], _ElementRows] = (
+        _TextBody(content[start:]).read_rows
+        if form == "ascii"
+        else _BinaryBody(content, start, _BYTE_ORDERS[form]).read_rows
     )
-    columns, faces = dict[str, Array](), dict[int, tuple[Indices, Indices]]()
+    columns, faces = dict[str, FloatArray](), dict[int, tuple[IndexArray, IndexArray]]()
     for element in elements:
-        wanted = _list_of_corners(element) if element.name == "face" else ""
+        wanted = _find_corner_property(element) if element.name == "face" else ""
         found = rows_of(element, wanted)
         if element.name == "vertex":
             columns = found.columns
         elif wanted:
-            faces = _by_corners(found.lists)
+            faces = _group_by_corner_count(found.lists)
     if missing := [axis for axis in "xyz" if axis not in columns]:
         raise ValueError(f"its vertices have no {', '.join(missing)}")
     if not faces and any(element.name == "tristrips" for element in elements):
         raise ValueError("it holds triangle strips (tristrips); save it with faces instead")
     points = np.column_stack([columns.pop(axis) for axis in "xyz"])
-    return Ply(points, columns, faces, _first_line(content, start, elements) if form == "ascii" else 0)
+    return PlyContent(points, columns, faces, _find_first_face_line(content, start, elements) if form == "ascii" else 0)
 
 
-def _head(content: bytes) -> tuple[str, list[Element], int]:
+def _parse_header(content: bytes) -> tuple[str, list[PlyElement], int]:
     """Parse the header: the format, the elements, and the end of the header."""
-    end = re.search(rb"^end_header[ \t]*\r?\n?", content[:_MOST_OF_HEAD], re.M)
+    end = re.search(rb"^end_header[ \t]*\r?\n?", content[:_MAX_HEADER_BYTES], re.M)
     if not re.match(rb"ply[ \t]*\r?\n", content) or not end:
         raise ValueError("it has no head from `ply` to `end_header`")
-    form, elements = "", list[Element]()
+    form, elements = "", list[PlyElement]()
     for line in content[: end.start()].decode("latin-1").splitlines()[1:]:
         words = line.split()
         if not words or words[0] in ("comment", "obj_info"):
@@ -98,11 +100,11 @@ def _head(content: bytes) -> tuple[str, list[Element], int]:
             case ["format", ("ascii" | "binary_little_endian" | "binary_big_endian") as form, _]:
                 pass
             case ["element", name, rows] if re.fullmatch("[0-9]{1,15}", rows):
-                elements.append(Element(name, int(rows), []))
-            case ["property", "list", count, kind, name] if elements and {count, kind} <= set(_TYPES):
-                elements[-1].properties.append(Property(name, _TYPES[kind], _TYPES[count]))
-            case ["property", kind, name] if elements and kind in _TYPES:
-                elements[-1].properties.append(Property(name, _TYPES[kind]))
+                elements.append(PlyElement(name, int(rows), []))
+            case ["property", "list", count, kind, name] if elements and {count, kind} <= set(_NUMPY_TYPES):
+                elements[-1].properties.append(PlyProperty(name, _NUMPY_TYPES[kind], _NUMPY_TYPES[count]))
+            case ["property", kind, name] if elements and kind in _NUMPY_TYPES:
+                elements[-1].properties.append(PlyProperty(name, _NUMPY_TYPES[kind]))
             case _:
                 raise ValueError(f"its head has the line {line[:60]!r}; wanted format, element or property of PLY 1.0")
     if not form:
@@ -110,25 +112,26 @@ def _head(content: bytes) -> tuple[str, list[Element], int]:
     return form, elements, end.end()
 
 
-def _list_of_corners(element: Element) -> str:
-    names = [one.name for one in element.properties if one.length and one.name in _CORNERS]
-    if not names and element.rows:
-        raise ValueError(f"its faces have no list {' or '.join(_CORNERS)}")
+def _find_corner_property(element: PlyElement) -> str:
+    names = [one.name for one in element.properties if one.length_type and one.name in _CORNER_PROPERTIES]
+    if not names and element.num_rows:
+        raise ValueError(f"its faces have no list {' or '.join(_CORNER_PROPERTIES)}")
     return names[0] if names else ""
 
 
-def _by_corners(lists: list[Array] | Array) -> dict[int, tuple[Indices, Indices]]:
+def _group_by_corner_count(lists: list[FloatArray] | FloatArray) -> dict[int, tuple[IndexArray, IndexArray]]:
     """Group faces by their number of corners; raise ValueError for corners that are not integers."""
     if isinstance(lists, np.ndarray):
-        return {lists.shape[1]: (_whole(lists), np.arange(len(lists)))} if len(lists) else {}
+        return {lists.shape[1]: (_to_integers(lists), np.arange(len(lists)))} if len(lists) else {}
     length = np.array([len(one) for one in lists], np.int64)
     numbers = {int(k): np.flatnonzero(length == k) for k in np.unique(length)}
     return {
-        k: (_whole(np.array([lists[i] for i in which.tolist()]).reshape(-1, k)), which) for k, which in numbers.items()
+        k: (_to_integers(np.array([lists[i] for i in which.tolist()]).reshape(-1, k)), which)
+        for k, which in numbers.items()
     }
 
 
-def _whole(values: NDArray[np.generic]) -> Indices:
+def _to_integers(values: NDArray[np.generic]) -> IndexArray:
     numbers = np.asarray(values, np.float64)
     wrong = ~(np.abs(numbers) < 2.0**53) | (numbers != np.trunc(numbers))
     if wrong.any():
@@ -136,28 +139,30 @@ def _whole(values: NDArray[np.generic]) -> Indices:
     return numbers.astype(np.int64)
 
 
-def _first_line(content: bytes, start: int, elements: list[Element]) -> int:
-    if content[start:].rstrip().count(b"\n") + 1 != sum(element.rows for element in elements):
+def _find_first_face_line(content: bytes, start: int, elements: list[PlyElement]) -> int:
+    if content[start:].rstrip().count(b"\n") + 1 != sum(element.num_rows for element in elements):
         return 0
     before = next((i for i, element in enumerate(elements) if element.name == "face"), 0)
-    return content[:start].count(b"\n") + 1 + sum(element.rows for element in elements[:before])
+    return content[:start].count(b"\n") + 1 + sum(element.num_rows for element in elements[:before])
 
 
-class _Rows(NamedTuple):
+class _ElementRows(NamedTuple):
     """Rows of an element: scalar columns by name (n,) and the requested list.
 
     The list is an array (n, k) if all lengths are equal.
     """
 
-    columns: dict[str, Array]
-    lists: list[Array] | Array
+    columns: dict[str, FloatArray]
+    lists: list[FloatArray] | FloatArray
 
 
-def _short(element: Element) -> ValueError:
-    return ValueError(f"its head promises {element.rows:,} rows of {element.name}, and fewer follow; the file was cut")
+def _make_truncation_error(element: PlyElement) -> ValueError:
+    return ValueError(
+        f"its head promises {element.num_rows:,} rows of {element.name}, and fewer follow; the file was cut"
+    )
 
 
-class _Text:
+class _TextBody:
     """Numbers of a text body."""
 
     def __init__(self, body: bytes) -> None:
@@ -167,125 +172,135 @@ class _Text:
                 self._values = np.fromstring(body, np.float64, sep=" ") if body.strip() else np.empty(0)
             except (DeprecationWarning, ValueError):
                 raise ValueError("something behind its head is no number") from None
-        self._at = 0
+        self._position = 0
 
-    def rows(self, element: Element, wanted: str) -> _Rows:
+    def read_rows(self, element: PlyElement, wanted: str) -> _ElementRows:
         """Read the next rows; raise ValueError on failure."""
-        n, properties, begun = element.rows, element.properties, self._at
+        n, properties, begun = element.num_rows, element.properties, self._position
         if not n or not properties:
-            return _Rows({one.name: np.empty(0) for one in properties}, [])
+            return _ElementRows({one.name: np.empty(0) for one in properties}, [])
         if len(self._values) - begun < n * len(properties):
-            raise _short(element)
-        places, self._at = self._widths(element)
-        width = self._at - begun
+            raise _make_truncation_error(element)
+        places, self._position = self._locate_properties(element)
+        width = self._position - begun
         table = self._values[begun : begun + n * width]
         if len(table) == n * width:
             table = table.reshape(n, width)
             if all(
-                (table[:, places[one.name]] == table[0, places[one.name]]).all() for one in properties if one.length
+                (table[:, places[one.name]] == table[0, places[one.name]]).all()
+                for one in properties
+                if one.length_type
             ):
-                self._at = begun + n * width
-                columns = {one.name: table[:, places[one.name]] for one in properties if not one.length}
+                self._position = begun + n * width
+                columns = {one.name: table[:, places[one.name]] for one in properties if not one.length_type}
                 first = places.get(wanted, 0)
-                return _Rows(columns, table[:, first + 1 : first + 1 + int(table[0, first])] if wanted else [])
-        return self._unequal(element, wanted, begun)
+                return _ElementRows(columns, table[:, first + 1 : first + 1 + int(table[0, first])] if wanted else [])
+        return self._read_unequal_rows(element, wanted, begun)
 
-    def _widths(self, element: Element) -> tuple[dict[str, int], int]:
+    def _locate_properties(self, element: PlyElement) -> tuple[dict[str, int], int]:
         """Locate the properties of the row that starts here, and the end of the row."""
-        places, at, begun = dict[str, int](), self._at, self._at
+        places, at, begun = dict[str, int](), self._position, self._position
         for one in element.properties:
             places.setdefault(one.name, at - begun)
-            at += 1 + (self._length(element, at) if one.length else 0)
+            at += 1 + (self._parse_length(element, at) if one.length_type else 0)
         if at > len(self._values):
-            raise _short(element)
+            raise _make_truncation_error(element)
         return places, at
 
-    def _length(self, element: Element, at: int) -> int:
+    def _parse_length(self, element: PlyElement, at: int) -> int:
         if at >= len(self._values):
-            raise _short(element)
+            raise _make_truncation_error(element)
         value = float(self._values[at])
         if not 0 <= value < 2**32 or value != int(value):
             raise ValueError(f"a list of its {element.name} has the length {value:g}; wanted a whole number")
         return int(value)
 
-    def _unequal(self, element: Element, wanted: str, begun: int) -> _Rows:
-        lists, columns = list[Array](), {one.name: list[float]() for one in element.properties if not one.length}
-        self._at = begun
-        for _ in range(element.rows):
-            places, end = self._widths(element)
+    def _read_unequal_rows(self, element: PlyElement, wanted: str, begun: int) -> _ElementRows:
+        lists, columns = (
+            list[FloatArray](),
+            {one.name: list[float]() for one in element.properties if not one.length_type},
+        )
+        self._position = begun
+        for _ in range(element.num_rows):
+            places, end = self._locate_properties(element)
             for name, column in columns.items():
-                column.append(float(self._values[self._at + places[name]]))
+                column.append(float(self._values[self._position + places[name]]))
             if wanted:
-                first = self._at + places[wanted]
+                first = self._position + places[wanted]
                 lists.append(self._values[first + 1 : first + 1 + int(self._values[first])])
-            self._at = end
-        return _Rows({name: np.array(column) for name, column in columns.items()}, lists)
+            self._position = end
+        return _ElementRows({name: np.array(column) for name, column in columns.items()}, lists)
 
 
-class _Binary:
+class _BinaryBody:
     """Bytes of a binary body."""
 
     def __init__(self, content: bytes, start: int, order: str) -> None:
-        self._content, self._at, self._order = content, start, order
+        self._content, self._position, self._order = content, start, order
 
-    def rows(self, element: Element, wanted: str) -> _Rows:
+    def read_rows(self, element: PlyElement, wanted: str) -> _ElementRows:
         """Read the next rows; raise ValueError on failure."""
-        n, properties, begun = element.rows, element.properties, self._at
+        n, properties, begun = element.num_rows, element.properties, self._position
         if not n or not properties:
-            return _Rows({one.name: np.empty(0) for one in properties}, [])
-        least = sum(np.dtype(one.length or one.type).itemsize for one in properties)
+            return _ElementRows({one.name: np.empty(0) for one in properties}, [])
+        least = sum(np.dtype(one.length_type or one.type).itemsize for one in properties)
         if len(self._content) - begun < n * least:
-            raise _short(element)
+            raise _make_truncation_error(element)
         fields = list[tuple[str, str, tuple[int, ...]]]()
         for i, one in enumerate(properties):
-            if one.length:
-                fields.append((f"count {i}", self._order + one.length, ()))
-                length = self._length(element, one)
-                self._at += length * np.dtype(one.type).itemsize
+            if one.length_type:
+                fields.append((f"count {i}", self._order + one.length_type, ()))
+                length = self._parse_length(element, one)
+                self._position += length * np.dtype(one.type).itemsize
                 fields.append((f"{i}", self._order + one.type, (length,)))
             else:
                 fields.append((f"{i}", self._order + one.type, ()))
-                self._at += np.dtype(one.type).itemsize
+                self._position += np.dtype(one.type).itemsize
         row = np.dtype(fields)
         if len(self._content) - begun >= n * row.itemsize:
             table = np.frombuffer(self._content, row, n, begun)
-            counts = [f"count {i}" for i, one in enumerate(properties) if one.length]
+            counts = [f"count {i}" for i, one in enumerate(properties) if one.length_type]
             if all((table[name] == table[name][0]).all() for name in counts):
-                self._at = begun + n * row.itemsize
-                columns = {one.name: _numbers(table[f"{i}"]) for i, one in enumerate(properties) if not one.length}
-                lists = [_numbers(table[f"{i}"]) for i, one in enumerate(properties) if wanted and one.name == wanted]
-                return _Rows(columns, lists[0] if lists else [])
-        return self._unequal(element, wanted, begun)
+                self._position = begun + n * row.itemsize
+                columns = {
+                    one.name: _to_floats(table[f"{i}"]) for i, one in enumerate(properties) if not one.length_type
+                }
+                lists = [_to_floats(table[f"{i}"]) for i, one in enumerate(properties) if wanted and one.name == wanted]
+                return _ElementRows(columns, lists[0] if lists else [])
+        return self._read_unequal_rows(element, wanted, begun)
 
-    def _length(self, element: Element, one: Property) -> int:
+    def _parse_length(self, element: PlyElement, one: PlyProperty) -> int:
         """Read the length of the list that starts here, and advance past it."""
-        (value,) = self._taken(element, one.length, 1).tolist()
+        (value,) = self._read_values(element, one.length_type, 1).tolist()
         if not 0 <= value < 2**32 or value != int(value):
             raise ValueError(f"a list of its {element.name} has the length {value:g}; wanted a whole number")
-        if len(self._content) - self._at < int(value) * np.dtype(one.type).itemsize:
-            raise _short(element)
+        if len(self._content) - self._position < int(value) * np.dtype(one.type).itemsize:
+            raise _make_truncation_error(element)
         return int(value)
 
-    def _taken(self, element: Element, kind: str, count: int) -> NDArray[np.generic]:
+    def _read_values(self, element: PlyElement, kind: str, count: int) -> NDArray[np.generic]:
         dtype = np.dtype(self._order + kind)
-        begun, self._at = self._at, self._at + count * dtype.itemsize
-        if self._at > len(self._content):
-            raise _short(element)
+        begun, self._position = self._position, self._position + count * dtype.itemsize
+        if self._position > len(self._content):
+            raise _make_truncation_error(element)
         return np.frombuffer(self._content, dtype, count, begun)
 
-    def _unequal(self, element: Element, wanted: str, begun: int) -> _Rows:
-        lists, columns = list[Array](), {one.name: list[float]() for one in element.properties if not one.length}
-        self._at = begun
-        for _ in range(element.rows):
+    def _read_unequal_rows(self, element: PlyElement, wanted: str, begun: int) -> _ElementRows:
+        lists, columns = (
+            list[FloatArray](),
+            {one.name: list[float]() for one in element.properties if not one.length_type},
+        )
+        self._position = begun
+        for _ in range(element.num_rows):
             for one in element.properties:
-                if not one.length:
-                    columns[one.name].append(float(self._taken(element, one.type, 1)[0]))
+                if not one.length_type:
+                    columns[one.name].append(float(self._read_values(element, one.type, 1)[0]))
                     continue
-                values = self._taken(element, one.type, self._length(element, one))
+                values = self._read_values(element, one.type, self._parse_length(element, one))
                 if one.name == wanted:
-                    lists.append(_numbers(values))
-        return _Rows({name: np.array(column) for name, column in columns.items()}, lists)
+                    lists.append(_to_floats(values))
+        return _ElementRows({name: np.array(column) for name, column in columns.items()}, lists)
 
 
-def _numbers(values: NDArray[np.generic]) -> Array:
+def _to_floats(values: NDArray[np.generic]) -> FloatArray:
     return np.ascontiguousarray(values, np.float64)

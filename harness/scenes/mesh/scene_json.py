@@ -9,15 +9,15 @@ from typing import Annotated, Any
 
 from pydantic import FailFast, Field, ValidationError
 
-from harness.base.errors import InputError, Mistake, did_you_mean
-from harness.base.model import Model, meanings
-from harness.scenes.mesh.cells import check_file
+from harness.base.errors import InputError, InputMistake, suggest_name
+from harness.base.model import ConfigModel, read_field_descriptions
+from harness.scenes.mesh.cells import check_mesh_file
 
-MAX_BYTES = 2**22
+MAX_SCENE_BYTES = 2**22
 """Maximum size of a scene file: it names a mesh, and at most half a million pins."""
 
 
-class SceneJson(Model):
+class AssignmentJson(ConfigModel):
     """Keys of a scene. `b` counts vertices from 1."""
 
     obj: str = Field(min_length=1)
@@ -32,32 +32,32 @@ class SceneJson(Model):
     """A texture, for viewers."""
 
 
-def read_scene_json(path: Path) -> SceneJson:
+def read_assignment_json(path: Path) -> AssignmentJson:
     """Read a scene from a JSON file; raise InputError with file, line and key of each mistake."""
-    check_file(path, most=MAX_BYTES)
+    check_mesh_file(path, max_bytes=MAX_SCENE_BYTES)
     try:
-        data = json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_once)
+        data = json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_reject_repeated_keys)
     except json.JSONDecodeError as error:
-        raise InputError(Mistake(f"is no JSON: {error.msg}", path, error.lineno)) from None
+        raise InputError(InputMistake(f"is no JSON: {error.msg}", path, error.lineno)) from None
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(Mistake(f"cannot be read as JSON: {error}", path)) from None
+        raise InputError(InputMistake(f"cannot be read as JSON: {error}", path)) from None
     if not isinstance(data, dict):
         problem = f"a scene is a JSON object with the keys obj, k and b, came a {type(data).__name__}"
-        raise InputError(Mistake(problem, path))
+        raise InputError(InputMistake(problem, path))
     try:
-        return SceneJson.model_validate(data, strict=True)
+        return AssignmentJson.model_validate(data, strict=True)
     except ValidationError as error:
-        raise InputError([_mistake(path, detail) for detail in error.errors()[:20]]) from None
+        raise InputError([_convert_error(path, detail) for detail in error.errors()[:20]]) from None
 
 
-def line_of(path: Path, key: str) -> int | None:
+def find_key_line(path: Path, key: str) -> int | None:
     """Return the line of a key in a file with one flat JSON object, for messages."""
     text = path.read_text(encoding="utf-8-sig")
     match = re.search(rf'"{re.escape(key)}"\s*:', text)
     return text.count("\n", 0, match.start()) + 1 if match else None
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _reject_repeated_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Build a JSON object; reject repeated keys."""
     result = dict(pairs)
     if len(result) < len(pairs):
@@ -66,12 +66,12 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return result
 
 
-def _mistake(path: Path, detail: Any) -> Mistake:
+def _convert_error(path: Path, detail: Any) -> InputMistake:
     """Convert a pydantic error to a mistake."""
     key = str(detail["loc"][0])[:80]
     problem = f"{detail['msg']}, came {str(detail['input'])[:80]!r}"
     if detail["type"] == "extra_forbidden":
-        problem = f"unknown key; wanted {did_you_mean(key, SceneJson.model_fields)}"
+        problem = f"unknown key; wanted {suggest_name(key, AssignmentJson.model_fields)}"
     elif detail["type"] == "missing":
-        problem = f"is missing: {meanings(SceneJson)[key]}"
-    return Mistake(problem, path, line_of(path, key), ".".join(map(str, detail["loc"]))[:80])
+        problem = f"is missing: {read_field_descriptions(AssignmentJson)[key]}"
+    return InputMistake(problem, path, find_key_line(path, key), ".".join(map(str, detail["loc"]))[:80])

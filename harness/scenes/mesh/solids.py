@@ -9,11 +9,18 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from harness.scenes.mesh.base import SHEAR, STRETCH, Mesh
-from harness.scenes.mesh.generator import Generator, Metres, cells
-from harness.scenes.mesh.topology import Points, assemble, box_parts, by_length, lattice_triangles, offset_pairs
+from harness.scenes.mesh.generator import LengthMetres, MeshGenerator, count_cells
+from harness.scenes.mesh.topology import (
+    PointArray,
+    assemble_mesh,
+    build_lattice_triangles,
+    build_offset_pairs,
+    find_box_parts,
+    lump_lengths,
+)
 
 
-class Tower(Generator):
+class TowerMesh(MeshGenerator):
     """A truss tower of square, tapering cross-section on the ground y = 0, `size` storeys high.
 
     Vertices are numbered ring by ring from the base, four per ring, counter-clockwise as viewed from above.
@@ -23,22 +30,22 @@ class Tower(Generator):
     """
 
     kind: Literal["tower"] = "tower"
-    height: Metres = 3.0
+    height: LengthMetres = 3.0
     """Height from the base to the top [m]."""
-    base_width: Metres = 1.0
+    base_width: LengthMetres = 1.0
     """Side length of the base [m]."""
-    top_width: Metres = 0.4
+    top_width: LengthMetres = 0.4
     """Side length of the top [m]."""
 
-    SMALLEST: ClassVar[int] = 1
-    COUNTS: ClassVar[str] = "storeys"
-    SPRINGS: ClassVar[int] = 4
+    MIN_SIZE: ClassVar[int] = 1
+    SIZE_MEANING: ClassVar[str] = "storeys"
+    SPRINGS_PER_VERTEX: ClassVar[int] = 4
 
-    def count(self, size: int) -> int:
+    def count_vertices(self, size: int) -> int:
         """Return the number of vertices of a mesh of this size."""
         return 4 * (size + 1)
 
-    def generate(self, size: int) -> Mesh:
+    def generate_mesh(self, size: int) -> Mesh:
         """Generate the mesh of a valid size."""
         index = np.arange(4 * (size + 1)).reshape(size + 1, 4)
         closed = np.column_stack([index, index[:, 0]])
@@ -47,14 +54,14 @@ class Tower(Generator):
         x, y, z = np.broadcast_arrays(half * [1, 1, -1, -1], self.height * up, half * [1, -1, -1, 1])
         rest = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
         springs = {
-            STRETCH: np.concatenate([offset_pairs(closed, (0, 1)), offset_pairs(index, (1, 0))]),
-            SHEAR: np.concatenate([offset_pairs(closed, (1, 1), (1, -1)), index[:, [0, 2]]]),
+            STRETCH: np.concatenate([build_offset_pairs(closed, (0, 1)), build_offset_pairs(index, (1, 0))]),
+            SHEAR: np.concatenate([build_offset_pairs(closed, (1, 1), (1, -1)), index[:, [0, 2]]]),
         }
         members = np.concatenate([*springs.values()])
-        return assemble(
-            rest=rest,
+        return assemble_mesh(
+            rest_positions=rest,
             springs=springs,
-            weights=by_length(rest, members),
+            vertex_weights=lump_lengths(rest, members),
             dimension=1,
             spacing=float(np.linalg.norm(rest[members[:, 0]] - rest[members[:, 1]], axis=1).mean()),
             resolution=size,
@@ -62,14 +69,14 @@ class Tower(Generator):
         )
 
 
-_FACES = ((1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1), (0, 1, 1), (0, 1, -1))
-_DIAGONALS: dict[str, tuple[tuple[int, int, int], ...]] = {
-    "one": _FACES[::2],
-    "all": (*_FACES, (1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)),
+_FACE_OFFSETS = ((1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1), (0, 1, 1), (0, 1, -1))
+_DIAGONAL_OFFSETS: dict[str, tuple[tuple[int, int, int], ...]] = {
+    "one": _FACE_OFFSETS[::2],
+    "all": (*_FACE_OFFSETS, (1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)),
 }
 
 
-class Block(Generator):
+class BlockMesh(MeshGenerator):
     """A soft block of near-cubic cells on the ground y = 0, `size` vertices along its longest side.
 
     Vertices are numbered with z fastest and x slowest. Springs: along x, y, z (STRETCH); the diagonals of
@@ -79,56 +86,56 @@ class Block(Generator):
     """
 
     kind: Literal["block"] = "block"
-    length: Metres = 1.0
+    length: LengthMetres = 1.0
     """Extent along x [m]."""
-    height: Metres = 0.5
+    height: LengthMetres = 0.5
     """Extent along y [m]."""
-    depth: Metres = 0.5
+    depth: LengthMetres = 0.5
     """Extent along z [m]."""
     diagonals: Literal["one", "all"] = "all"
     """Diagonal springs: one per face, which is just enough for rigidity, or all on faces and through cells."""
 
-    COUNTS: ClassVar[str] = "vertices along its longest side"
-    SPRINGS: ClassVar[int] = 12
+    SIZE_MEANING: ClassVar[str] = "vertices along its longest side"
+    SPRINGS_PER_VERTEX: ClassVar[int] = 12
 
-    def count(self, size: int) -> int:
+    def count_vertices(self, size: int) -> int:
         """Return the number of vertices of a mesh of this size."""
-        return math.prod(self._shape(size))
+        return math.prod(self._lattice_shape(size))
 
-    def _sides(self) -> tuple[float, float, float]:
+    def _side_lengths(self) -> tuple[float, float, float]:
         return self.length, self.height, self.depth
 
-    def _shape(self, size: int) -> tuple[int, int, int]:
+    def _lattice_shape(self, size: int) -> tuple[int, int, int]:
         """Return the number of vertices along x, y and z."""
-        spacing = max(self._sides()) / (size - 1)
-        x, y, z = (cells(side, spacing) + 1 for side in self._sides())
+        spacing = max(self._side_lengths()) / (size - 1)
+        x, y, z = (count_cells(side, spacing) + 1 for side in self._side_lengths())
         return x, y, z
 
-    def generate(self, size: int) -> Mesh:
+    def generate_mesh(self, size: int) -> Mesh:
         """Generate the mesh of a valid size."""
-        shape = self._shape(size)
+        shape = self._lattice_shape(size)
         index = np.arange(math.prod(shape)).reshape(shape)
         along = [np.linspace(0, 1, n) for n in shape]
-        x, y, z = (side * axis for side, axis in zip(self._sides(), along, strict=True))
+        x, y, z = (side * axis for side, axis in zip(self._side_lengths(), along, strict=True))
         grid = np.meshgrid(x - self.length / 2, y, z - self.depth / 2, indexing="ij")
         rest = np.stack([axis.ravel() for axis in grid], axis=1)
         surface = (index[0].T, index[-1], index[:, 0], index[:, -1].T, index[:, :, 0].T, index[:, :, -1])
-        return assemble(
-            rest=rest,
+        return assemble_mesh(
+            rest_positions=rest,
             springs={
-                STRETCH: offset_pairs(index, (1, 0, 0), (0, 1, 0), (0, 0, 1)),
-                SHEAR: offset_pairs(index, *_DIAGONALS[self.diagonals]),
+                STRETCH: build_offset_pairs(index, (1, 0, 0), (0, 1, 0), (0, 0, 1)),
+                SHEAR: build_offset_pairs(index, *_DIAGONAL_OFFSETS[self.diagonals]),
             },
-            triangles=np.concatenate([lattice_triangles(side) for side in surface]),
-            weights=reduce(np.multiply.outer, map(_owned, shape)).ravel(),
+            triangles=np.concatenate([build_lattice_triangles(side) for side in surface]),
+            vertex_weights=reduce(np.multiply.outer, map(_lumped_lengths, shape)).ravel(),
             dimension=3,
-            spacing=math.prod(side / (n - 1) for side, n in zip(self._sides(), shape, strict=True)) ** (1 / 3),
+            spacing=math.prod(side / (n - 1) for side, n in zip(self._side_lengths(), shape, strict=True)) ** (1 / 3),
             resolution=size,
-            parts={**box_parts(rest), "corners": index[:: 1 - shape[0], :: 1 - shape[1], :: 1 - shape[2]]},
+            parts={**find_box_parts(rest), "corners": index[:: 1 - shape[0], :: 1 - shape[1], :: 1 - shape[2]]},
         )
 
 
-def _owned(n: int) -> Points:
+def _lumped_lengths(n: int) -> PointArray:
     """Return the share of the adjacent cells of each vertex on a line.
 
     The product over the axes is the volume of a vertex.

@@ -8,11 +8,11 @@ import numpy as np
 from pydantic import Field
 
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.mesh.topology import Indices, Points, assemble
+from harness.scenes.mesh.grid import GridMesh
+from harness.scenes.mesh.topology import IndexArray, PointArray, assemble_mesh
 
 
-class Stack(Grid):
+class StackMesh(GridMesh):
     """Unconnected layers of a grid, from the lowest to the highest, each numbered like a grid.
 
     `size` vertices along the width of each. Springs: those of all layers, by family. Parts: those of a grid in
@@ -27,33 +27,33 @@ class Stack(Grid):
     turn: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
     """Rotation of each layer in its plane relative to the one below [degrees]."""
 
-    COUNTS: ClassVar[str] = "vertices along the width of each layer"
+    SIZE_MEANING: ClassVar[str] = "vertices along the width of each layer"
 
-    def count(self, size: int) -> int:
+    def count_vertices(self, size: int) -> int:
         """Return the number of vertices of a mesh of this size."""
-        return self.layers * super().count(size)
+        return self.layers * super().count_vertices(size)
 
-    def generate(self, size: int) -> Mesh:
+    def generate_mesh(self, size: int) -> Mesh:
         """Generate the mesh of a valid size."""
-        one = super().generate(size)
-        n, middle = len(one.rest), one.rest.mean(axis=0)
+        one = super().generate_mesh(size)
+        n, middle = len(one.rest_positions), one.rest_positions.mean(axis=0)
         normal = np.array([0.0, 1.0, 0.0] if self.plane == "horizontal" else [0.0, 0.0, 1.0])
         first = n * np.arange(self.layers)[:, None, None]
-        arm, layers = one.rest - middle, list[Points]()
+        arm, layers = one.rest_positions - middle, list[PointArray]()
         for k in range(self.layers):
             angle = np.deg2rad(k * self.turn)
             turned = np.cos(angle) * arm + np.sin(angle) * np.cross(normal, arm) if self.turn else arm
             layers.append(middle + turned + k * self.apart * normal)
 
-        def in_all(rows: Indices) -> Indices:
+        def in_all(rows: IndexArray) -> IndexArray:
             return (rows + first).reshape(-1, rows.shape[1])
 
         parts = {name: (part + first[:, 0]).ravel() for name, part in one.parts.items()}
-        return assemble(
-            rest=np.concatenate(layers),
-            springs={family: in_all(one.springs[rows]) for family, rows in one.families.items()},
+        return assemble_mesh(
+            rest_positions=np.concatenate(layers),
+            springs={family: in_all(one.springs[rows]) for family, rows in one.spring_families.items()},
             triangles=in_all(one.triangles),
-            weights=np.tile(one.shares, self.layers),
+            vertex_weights=np.tile(one.mass_fractions, self.layers),
             dimension=2,
             spacing=one.spacing,
             resolution=size,

@@ -8,20 +8,20 @@ from typing import ClassVar, Literal, cast
 import numpy as np
 
 from harness.scenes.mesh.base import SHEAR, STRETCH, Mesh
-from harness.scenes.mesh.generator import Generator, Metres, cells
+from harness.scenes.mesh.generator import LengthMetres, MeshGenerator, count_cells
 from harness.scenes.mesh.topology import (
-    Indices,
-    Points,
-    assemble,
-    by_area,
-    lattice_triangles,
-    offset_pairs,
-    sides,
-    unique_pairs,
+    IndexArray,
+    PointArray,
+    assemble_mesh,
+    build_lattice_triangles,
+    build_offset_pairs,
+    lump_areas,
+    polygon_sides,
+    sort_unique_pairs,
 )
 
 
-class Skirt(Generator):
+class SkirtMesh(MeshGenerator):
     """A truncated cone that hangs from y = 0, `size` vertices around, numbered ring by ring from the waist.
 
     Rings run counter-clockwise as viewed from above. Springs: along rings, down (STRETCH), then the diagonals down
@@ -30,31 +30,31 @@ class Skirt(Generator):
     """
 
     kind: Literal["skirt"] = "skirt"
-    top_radius: Metres = 0.15
+    top_radius: LengthMetres = 0.15
     """Radius of the waist [m]."""
-    bottom_radius: Metres = 0.5
+    bottom_radius: LengthMetres = 0.5
     """Radius of the hem [m]."""
-    height: Metres = 0.6
+    height: LengthMetres = 0.6
     """Height from the waist down to the hem [m]."""
 
-    SMALLEST: ClassVar[int] = 3
-    COUNTS: ClassVar[str] = "vertices around"
-    SPRINGS: ClassVar[int] = 4
+    MIN_SIZE: ClassVar[int] = 3
+    SIZE_MEANING: ClassVar[str] = "vertices around"
+    SPRINGS_PER_VERTEX: ClassVar[int] = 4
 
-    def count(self, size: int) -> int:
+    def count_vertices(self, size: int) -> int:
         """Return the number of vertices of a mesh of this size."""
-        return size * (self._cells(size)[0] + 1)
+        return size * (self._measure_cells(size)[0] + 1)
 
-    def _cells(self, size: int) -> tuple[int, float]:
+    def _measure_cells(self, size: int) -> tuple[int, float]:
         """Return the number of cells from waist to hem, and their typical side [m]."""
         slant = math.hypot(self.height, self.bottom_radius - self.top_radius)
         around = math.pi * (self.top_radius + self.bottom_radius) / size
-        rows = cells(slant, around)
+        rows = count_cells(slant, around)
         return rows, math.sqrt(around * slant / rows)
 
-    def generate(self, size: int) -> Mesh:
+    def generate_mesh(self, size: int) -> Mesh:
         """Generate the mesh of a valid size."""
-        rows, spacing = self._cells(size)
+        rows, spacing = self._measure_cells(size)
         index = np.arange((rows + 1) * size).reshape(rows + 1, size)
         closed = np.column_stack([index, index[:, 0]])
         down = np.linspace(0, 1, rows + 1)[:, None]
@@ -62,15 +62,15 @@ class Skirt(Generator):
         radius = self.top_radius + (self.bottom_radius - self.top_radius) * down
         x, y, z = np.broadcast_arrays(radius * np.cos(angle), -self.height * down, -radius * np.sin(angle))
         rest = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
-        triangles = lattice_triangles(closed)
-        return assemble(
-            rest=rest,
+        triangles = build_lattice_triangles(closed)
+        return assemble_mesh(
+            rest_positions=rest,
             springs={
-                STRETCH: np.concatenate([offset_pairs(closed, (0, 1)), offset_pairs(index, (1, 0))]),
-                SHEAR: offset_pairs(closed, (1, 1), (1, -1)),
+                STRETCH: np.concatenate([build_offset_pairs(closed, (0, 1)), build_offset_pairs(index, (1, 0))]),
+                SHEAR: build_offset_pairs(closed, (1, 1), (1, -1)),
             },
             triangles=triangles,
-            weights=by_area(rest, triangles),
+            vertex_weights=lump_areas(rest, triangles),
             dimension=2,
             spacing=spacing,
             resolution=size,
@@ -78,7 +78,7 @@ class Skirt(Generator):
         )
 
 
-class Balloon(Generator):
+class BalloonMesh(MeshGenerator):
     """A geodesic sphere around the origin: an icosahedron whose edges are divided into `size` parts.
 
     10 size^2 + 2 vertices: the icosahedron's corners from top to bottom, then those on its edges, then those
@@ -87,31 +87,31 @@ class Balloon(Generator):
     """
 
     kind: Literal["balloon"] = "balloon"
-    radius: Metres = 0.5
+    radius: LengthMetres = 0.5
     """Radius [m]."""
 
-    SMALLEST: ClassVar[int] = 1
-    COUNTS: ClassVar[str] = "springs along an edge of the icosahedron"
-    SPRINGS: ClassVar[int] = 3
+    MIN_SIZE: ClassVar[int] = 1
+    SIZE_MEANING: ClassVar[str] = "springs along an edge of the icosahedron"
+    SPRINGS_PER_VERTEX: ClassVar[int] = 3
 
-    def count(self, size: int) -> int:
+    def count_vertices(self, size: int) -> int:
         """Return the number of vertices of a mesh of this size."""
         return 10 * size**2 + 2
 
-    def generate(self, size: int) -> Mesh:
+    def generate_mesh(self, size: int) -> Mesh:
         """Generate the mesh of a valid size."""
-        corners, faces = _icosahedron()
-        index, weights, cells_of_face = _geodesic(faces, size)
-        rest = np.empty((self.count(size), 3))
+        corners, faces = _build_icosahedron()
+        index, weights, cells_of_face = _divide_faces(faces, size)
+        rest = np.empty((self.count_vertices(size), 3))
         rest[index] = np.einsum("tc,fcx->ftx", weights / size, corners[faces])
         rest *= self.radius / np.linalg.norm(rest, axis=1, keepdims=True)
         triangles = index[:, cells_of_face].reshape(-1, 3)
-        pairs = unique_pairs(sides(triangles))
-        return assemble(
-            rest=rest,
+        pairs = sort_unique_pairs(polygon_sides(triangles))
+        return assemble_mesh(
+            rest_positions=rest,
             springs={STRETCH: pairs},
             triangles=triangles,
-            weights=by_area(rest, triangles),
+            vertex_weights=lump_areas(rest, triangles),
             dimension=2,
             spacing=float(np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1).mean()),
             resolution=size,
@@ -119,7 +119,7 @@ class Balloon(Generator):
         )
 
 
-def _icosahedron() -> tuple[Points, Indices]:
+def _build_icosahedron() -> tuple[PointArray, IndexArray]:
     """Build corners (12, 3) on the unit sphere: pole, two rings, pole; and faces (20, 3), outwards."""
     k = np.arange(5)
     angle = 2 * np.pi / 5 * np.concatenate([k, k + 0.5])
@@ -137,7 +137,7 @@ def _icosahedron() -> tuple[Points, Indices]:
     return corners, np.concatenate([np.stack(group, axis=1) for group in groups])
 
 
-def _geodesic(faces: Indices, size: int) -> tuple[Indices, Indices, Indices]:
+def _divide_faces(faces: IndexArray, size: int) -> tuple[IndexArray, IndexArray, IndexArray]:
     """Subdivide faces into points in the order of (i, j), i + j <= size, i towards corner 1, j towards corner 2.
 
     Returns:
@@ -146,7 +146,7 @@ def _geodesic(faces: Indices, size: int) -> tuple[Indices, Indices, Indices]:
     """
     i, j = np.nonzero(np.tri(size + 1, dtype=bool)[::-1])
     weights = np.stack([size - i - j, i, j], axis=1)
-    edges = unique_pairs(sides(faces))
+    edges = sort_unique_pairs(polygon_sides(faces))
     edge_of = np.zeros((12, 12), np.int64)
     edge_of[edges[:, 0], edges[:, 1]] = edge_of[edges[:, 1], edges[:, 0]] = np.arange(len(edges))
 
@@ -159,7 +159,7 @@ def _geodesic(faces: Indices, size: int) -> tuple[Indices, Indices, Indices]:
         index[:, weights[:, corner] == size] = faces[:, [corner]]
         on_edge = np.flatnonzero((weights[:, corner] == 0) & (weights[:, p] > 0) & (weights[:, q] > 0))
         start, end = faces[:, [p]], faces[:, [q]]
-        along = cast(Indices, np.where(start < end, weights[on_edge, q], weights[on_edge, p]))
+        along = cast(IndexArray, np.where(start < end, weights[on_edge, q], weights[on_edge, p]))
         index[:, on_edge] = 12 + edge_of[start, end] * (size - 1) + along - 1
 
     point = np.zeros((size + 1, size + 1), np.int64)

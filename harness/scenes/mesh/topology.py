@@ -10,16 +10,16 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh, distinct
+from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh, sort_unique_vertices
 
-Points = NDArray[np.float64]
-Indices = NDArray[np.int64]
+PointArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
 
-NO_PAIRS: Indices = np.empty((0, 2), np.int64)
-NO_TRIANGLES: Indices = np.empty((0, 3), np.int64)
+NO_PAIRS: IndexArray = np.empty((0, 2), np.int64)
+NO_TRIANGLES: IndexArray = np.empty((0, 3), np.int64)
 
 
-def offset_pairs(index: Indices, *offsets: tuple[int, ...]) -> Indices:
+def build_offset_pairs(index: IndexArray, *offsets: tuple[int, ...]) -> IndexArray:
     """Build the pairs (v, v + offset) of a lattice, (k, 2).
 
     They are ordered by offset, then by v.
@@ -33,7 +33,7 @@ def offset_pairs(index: Indices, *offsets: tuple[int, ...]) -> Indices:
     return np.concatenate(pairs)
 
 
-def lattice_triangles(index: Indices) -> Indices:
+def build_lattice_triangles(index: IndexArray) -> IndexArray:
     """Build two triangles per cell of a lattice, (f, 3).
 
     Cells are split from [r, c] to [r+1, c+1]; the normals are rows x columns.
@@ -42,32 +42,32 @@ def lattice_triangles(index: Indices) -> Indices:
     return np.stack([a, c, d, a, d, b], axis=1).reshape(-1, 3)
 
 
-def closed_by_points(rings: Indices, first: int, last: int) -> Indices:
+def build_capped_triangles(rings: IndexArray, first: int, last: int) -> IndexArray:
     """Build the triangles of a lattice of rings (r, k) with two end points.
 
     The last column of the rings equals the first.
     """
     begin = np.column_stack([np.full(rings.shape[1] - 1, first), rings[0, :-1], rings[0, 1:]])
     end = np.column_stack([np.full(rings.shape[1] - 1, last), rings[-1, 1:], rings[-1, :-1]])
-    return np.concatenate([begin, lattice_triangles(rings), end])
+    return np.concatenate([begin, build_lattice_triangles(rings), end])
 
 
-def unique_pairs(pairs: Indices) -> Indices:
+def sort_unique_pairs(pairs: IndexArray) -> IndexArray:
     """Sort unordered pairs, each once, the lower vertex first, in lexicographic order, (k, 2)."""
     if not len(pairs):
         return NO_PAIRS
     i, j = pairs.T
     base = int(pairs.max()) + 1
-    codes: Indices = np.sort(np.minimum(i, j) * base + np.maximum(i, j))  # np.unique hashes them, ten times slower
+    codes: IndexArray = np.sort(np.minimum(i, j) * base + np.maximum(i, j))  # np.unique hashes them, ten times slower
     return np.stack(np.divmod(codes[np.diff(codes, prepend=-1) > 0], base), axis=1)
 
 
-def sides(polygons: Indices) -> Indices:
+def polygon_sides(polygons: IndexArray) -> IndexArray:
     """Return the sides of polygons of k corners, (f, k), as pairs (f k, 2), with repetitions."""
     return np.stack([polygons, np.roll(polygons, -1, axis=1)], axis=2).reshape(-1, 2)
 
 
-def corner_pairs(polygons: Indices) -> Indices:
+def polygon_corner_pairs(polygons: IndexArray) -> IndexArray:
     """Return all pairs of corners of polygons (f, k).
 
     Shape (f k (k-1)/2, 2), with repetitions.
@@ -76,7 +76,7 @@ def corner_pairs(polygons: Indices) -> Indices:
     return np.stack([polygons[:, i], polygons[:, j]], axis=2).reshape(-1, 2)
 
 
-def fan(polygons: Indices) -> Indices:
+def fan_triangles(polygons: IndexArray) -> IndexArray:
     """Split polygons (f, k) into fans of triangles from their first corner.
 
     Shape (f (k-2), 3).
@@ -86,60 +86,60 @@ def fan(polygons: Indices) -> Indices:
     return np.stack([first, polygons[:, k], polygons[:, k + 1]], axis=2).reshape(-1, 3)
 
 
-def lump(cells: Indices, measure: Points, n: int) -> Points:
+def lump_to_vertices(cells: IndexArray, measure: PointArray, n: int) -> PointArray:
     """Distribute each cell's measure, (f,), equally to its corners, (f, k): vertex weights, (n,)."""
     corners = cells.shape[1]
     weights = np.bincount(cells.ravel(), np.repeat(measure / corners, corners), minlength=n)
     return weights.astype(np.float64, copy=False)
 
 
-def by_length(rest: Points, pairs: Indices) -> Points:
+def lump_lengths(rest: PointArray, pairs: IndexArray) -> PointArray:
     """Lump half the length of each spring to its vertices, (n,) [m]."""
-    return lump(pairs, np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1), len(rest))
+    return lump_to_vertices(pairs, np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1), len(rest))
 
 
-def by_area(rest: Points, triangles: Indices) -> Points:
+def lump_areas(rest: PointArray, triangles: IndexArray) -> PointArray:
     """Lump a third of the area of each triangle to its vertices (barycentric lumping), (n,) [m^2]."""
     a, b, c = (rest[triangles[:, k]] for k in range(3))
-    return lump(triangles, np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2, len(rest))
+    return lump_to_vertices(triangles, np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2, len(rest))
 
 
-def by_volume(rest: Points, tetrahedra: Indices) -> Points:
+def lump_volumes(rest: PointArray, tetrahedra: IndexArray) -> PointArray:
     """Lump a quarter of the volume of each tetrahedron to its vertices, (n,) [m^3]."""
-    return lump(tetrahedra, np.abs(signed_volumes(rest, tetrahedra)), len(rest))
+    return lump_to_vertices(tetrahedra, np.abs(compute_signed_volumes(rest, tetrahedra)), len(rest))
 
 
-def signed_volumes(rest: Points, tetrahedra: Indices) -> Points:
+def compute_signed_volumes(rest: PointArray, tetrahedra: IndexArray) -> PointArray:
     """Compute the volume of each tetrahedron, (t,) [m^3], positive if corner 3 sees 0, 1, 2 counter-clockwise."""
     a, b, c, d = (rest[tetrahedra[:, k]] for k in range(4))
     return np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6
 
 
-def box_parts(rest: Points) -> dict[str, Indices]:
+def find_box_parts(rest: PointArray) -> dict[str, IndexArray]:
     """Find the vertices on the sides of the bounding box, within a millionth of its diagonal."""
     low, high = rest.min(axis=0), rest.max(axis=0)
     near = 1e-6 * np.linalg.norm(high - low)
     names = (("left", "right"), ("bottom", "top"), ("back", "front"))
-    parts: dict[str, Indices] = {}
+    parts: dict[str, IndexArray] = {}
     for axis, (lower, upper) in enumerate(names):
         parts[lower] = np.flatnonzero(rest[:, axis] <= low[axis] + near)
         parts[upper] = np.flatnonzero(rest[:, axis] >= high[axis] - near)
     return parts
 
 
-def assemble(
+def assemble_mesh(
     *,
-    rest: Points,
-    springs: Mapping[str, Indices],
-    triangles: Indices = NO_TRIANGLES,
-    weights: Points | None = None,
+    rest_positions: PointArray,
+    springs: Mapping[str, IndexArray],
+    triangles: IndexArray = NO_TRIANGLES,
+    vertex_weights: PointArray | None = None,
     dimension: int = 1,
     spacing: float | None = None,
     resolution: int = 0,
     parts: Mapping[str, ArrayLike] | None = None,
-    areas: Points | None = None,
+    vertex_areas: PointArray | None = None,
     first_vertex: int = 0,
-    attributes: Mapping[str, Points] | None = None,
+    attributes: Mapping[str, PointArray] | None = None,
 ) -> Mesh:
     """Assemble a mesh from springs by family, (k, 2) each: first all STRETCH, then all SHEAR, then all BEND.
 
@@ -151,21 +151,24 @@ def assemble(
     """
     blocks = [springs.get(family, NO_PAIRS) for family in (STRETCH, SHEAR, BEND)]
     pairs = np.concatenate(blocks)
-    weights = by_length(rest, pairs) if weights is None else weights
+    vertex_weights = lump_lengths(rest_positions, pairs) if vertex_weights is None else vertex_weights
     if spacing is None:
-        spacing = float(np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1).mean())
+        spacing = float(np.linalg.norm(rest_positions[pairs[:, 0]] - rest_positions[pairs[:, 1]], axis=1).mean())
     ends: list[int] = np.cumsum([0, *map(len, blocks)]).tolist()
     return Mesh(
-        rest=np.ascontiguousarray(rest, np.float64),
+        rest_positions=np.ascontiguousarray(rest_positions, np.float64),
         springs=pairs,
-        families={f: np.arange(ends[k], ends[k + 1]) for k, f in enumerate((STRETCH, SHEAR, BEND))},
+        spring_families={f: np.arange(ends[k], ends[k + 1]) for k, f in enumerate((STRETCH, SHEAR, BEND))},
         triangles=triangles.copy(),
-        shares=weights / weights.sum(),
+        mass_fractions=vertex_weights / vertex_weights.sum(),
         dimension=dimension,
         spacing=spacing,
         resolution=resolution,
-        parts={name: distinct(np.asarray(part, np.int64), len(rest)) for name, part in (parts or {}).items()},
-        areas=areas,
+        parts={
+            name: sort_unique_vertices(np.asarray(part, np.int64), len(rest_positions))
+            for name, part in (parts or {}).items()
+        },
+        vertex_areas=vertex_areas,
         first_vertex=first_vertex,
         attributes=dict(attributes or {}),
     )

@@ -13,26 +13,32 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from harness.simulation.opinion.declared import Array
-from harness.simulation.opinion.derivatives import EPS, ROUNDINGS, Told, tell, wide
-from harness.simulation.opinion.motion import blur
-from harness.simulation.opinion.outside import own_slope
-from harness.simulation.opinion.sides import Side
-from harness.simulation.opinion.steps import Stated
+from harness.simulation.opinion.derivatives import (
+    EPS,
+    ROUNDOFF_MULTIPLE,
+    DirectionalDerivatives,
+    differentiate_along,
+    to_extended,
+)
+from harness.simulation.opinion.motion import bound_roundoff
+from harness.simulation.opinion.outside import check_own_gradient
+from harness.simulation.opinion.sides import SceneTerms
+from harness.simulation.opinion.steps import ReferenceStep
 from solvers.problem import Energy, StepProblem
 
-_SETTLED = 1e-3
+_SETTLED_SLOPE_SHARE = 1e-3
 """Relative change of a slope allowed by friction's normal forces once the friction rounds have ended."""
 
 
-class Finding(NamedTuple):
+class TermMismatch(NamedTuple):
     """Name of a term that differs, and the difference relative to the reference value."""
 
     name: str
-    by: float
+    relative_difference: float
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class ComparisonPoint:
     """A point of comparison.
 
     Attributes:
@@ -43,38 +49,46 @@ class Place:
       direction: direction of the derivatives (n, 3).
     """
 
-    side: Side
-    stated: Stated
+    scene_terms: SceneTerms
+    reference_step: ReferenceStep
     problem: StepProblem
     x: Array
     direction: Array
 
     @property
-    def reach(self) -> float:
+    def coordinate_scale(self) -> float:
         """The largest coordinate [m] that the step depends on."""
-        m = self.stated.moment
-        parts = (self.x, m.p, m.origin, m.time_step * m.v, self.stated.target)
+        m = self.reference_step.step_moment
+        parts = (self.x, m.p, m.velocity_origin, m.time_step * m.v, self.reference_step.inertial_target)
         return max(float(np.abs(part).max(initial=0.0)) for part in parts)
 
     @property
-    def aim(self) -> float:
+    def pin_target_scale(self) -> float:
         """The size [m] whose product with eps is the round-off of the pins' targets."""
-        size = self.reach + sum(opinion.reach for opinion in self.side.opinions)
-        moves = [motion for effect in self.side.declared.effects if (motion := getattr(effect, "motion", None))]
-        end = self.stated.moment.time + self.stated.moment.time_step
-        held = float(np.abs(self.stated.held).max(initial=0.0))  # where the mesh is all in one point, they are not
-        return max([size, held, *(blur(motion, size, end) / EPS for motion in moves)])
+        size = self.coordinate_scale + sum(opinion.coordinate_scale for opinion in self.scene_terms.effect_terms)
+        moves = [
+            motion for effect in self.scene_terms.declaration.effects if (motion := getattr(effect, "motion", None))
+        ]
+        end = self.reference_step.step_moment.time + self.reference_step.step_moment.time_step
+        held = float(
+            np.abs(self.reference_step.pin_targets).max(initial=0.0)
+        )  # where the mesh is all in one point, they are not
+        return max([size, held, *(bound_roundoff(motion, size, end) / EPS for motion in moves)])
 
 
-def pressed(stated: Stated, problem: StepProblem, x: Array) -> Stated:
+def with_friction_at(stated: ReferenceStep, problem: StepProblem, x: Array) -> ReferenceStep:
     """Return the step with friction's normal forces at its solution x (n, 3) [m].
 
     It is unchanged unless the harness has a further friction round.
     """
-    return stated if problem.start.pressed is None else replace(stated, moment=replace(stated.moment, pressed=wide(x)))
+    return (
+        stated
+        if problem.step_start.normal_force_positions is None
+        else replace(stated, step_moment=replace(stated.step_moment, normal_force_positions=to_extended(x)))
+    )
 
 
-def differ(name: str, ours: Any, theirs: Any, size: float) -> Iterator[Finding]:
+def compare_arrays(name: str, ours: Any, theirs: Any, size: float) -> Iterator[TermMismatch]:
     """Compare arrays and yield a mismatch if they differ by more than round-off.
 
     Args:
@@ -83,110 +97,148 @@ def differ(name: str, ours: Any, theirs: Any, size: float) -> Iterator[Finding]:
       theirs: array of the reference implementation.
       size: magnitude [unit of the arrays] of the numbers that determine the round-off.
     """
-    ours, theirs = wide(ours), wide(theirs)
+    ours, theirs = to_extended(ours), to_extended(theirs)
     if ours.shape != theirs.shape:
-        yield Finding(f"{name} (number)", 1.0)
+        yield TermMismatch(f"{name} (number)", 1.0)
         return
     away = float(np.where(ours == theirs, 0.0, np.abs(ours - theirs)).max(initial=0.0))
-    if not away <= ROUNDINGS * EPS * size:
-        yield Finding(name, _part(away, float(np.abs(theirs).max(initial=0.0))))
+    if not away <= ROUNDOFF_MULTIPLE * EPS * size:
+        yield TermMismatch(name, _relative_size(away, float(np.abs(theirs).max(initial=0.0))))
 
 
-def _part(away: float, size: float) -> float:
+def _relative_size(away: float, size: float) -> float:
     return away / max(size, np.finfo(float).tiny)
 
 
-def steps(at: Place) -> Iterator[Finding]:
+def compare_steps(at: ComparisonPoint) -> Iterator[TermMismatch]:
     """Compare masses, inertia, forces and pins."""
-    system, problem, stated = at.problem.system, at.problem, at.stated
-    m, start, mass, reach = stated.moment, at.problem.start, at.side.declared.mass, at.reach
+    system, problem, stated = at.problem.system, at.problem, at.reference_step
+    m, start, mass, reach = (
+        stated.step_moment,
+        at.problem.step_start,
+        at.scene_terms.declaration.mass,
+        at.coordinate_scale,
+    )
     dt, most = m.time_step, float(np.abs(mass).max(initial=0.0))
-    yield from differ("masses", system.mass, mass, most)
-    yield from differ("inertia", system.inertia, stated.c * mass / dt**2, stated.c * most / dt**2)
-    yield from differ("inertial target", problem.target, stated.target, reach)
-    yield from differ("the step's start", start.positions, m.p, reach)
-    yield from differ("filtered velocities", start.velocity, m.v, reach / dt)
-    yield from differ("origin of velocities", start.origin, m.origin, reach)
-    yield from differ("rate of velocities", [start.rate, system.rate], [m.rate, m.rate], m.rate)
-    if start.pressed is not None:
-        yield from differ("where friction is pressed", start.pressed, m.pressed, reach)
-    yield from differ("times", [start.time, start.until], [m.time, m.until], max(m.until, dt))
-    yield from differ("forces", problem.force, stated.force, stated.force_size * (1.0 + reach / at.side.shortest()))
+    yield from compare_arrays("masses", system.mass, mass, most)
+    yield from compare_arrays("inertia", system.inertia_diagonal, stated.c * mass / dt**2, stated.c * most / dt**2)
+    yield from compare_arrays("inertial target", problem.inertial_target, stated.inertial_target, reach)
+    yield from compare_arrays("the step's start", start.positions, m.p, reach)
+    yield from compare_arrays("filtered velocities", start.velocity, m.v, reach / dt)
+    yield from compare_arrays("origin of velocities", start.velocity_origin, m.velocity_origin, reach)
+    yield from compare_arrays(
+        "rate of velocities",
+        [start.velocity_rate, system.velocity_rate],
+        [m.velocity_rate, m.velocity_rate],
+        m.velocity_rate,
+    )
+    if start.normal_force_positions is not None:
+        yield from compare_arrays(
+            "where friction is pressed", start.normal_force_positions, m.normal_force_positions, reach
+        )
+    yield from compare_arrays("times", [start.time, start.stage_time], [m.time, m.stage_time], max(m.stage_time, dt))
+    yield from compare_arrays(
+        "forces",
+        problem.external_force,
+        stated.external_force,
+        stated.force_size * (1.0 + reach / at.scene_terms.min_length()),
+    )
     if system.pins.vertices.tolist() != stated.vertices:
-        yield Finding("pinned vertices", 1.0)
+        yield TermMismatch("pinned vertices", 1.0)
         return
     soft = max((w for w in stated.weights if np.isfinite(w)), default=0.0)
     found = sorted(
         (*edge, low, high)
-        for one in system.lengths
-        for edge, low, high in zip(one.edges.tolist(), one.low.tolist(), one.high.tolist(), strict=True)
+        for one in system.length_constraints
+        for edge, low, high in zip(one.edges.tolist(), one.min_length.tolist(), one.max_length.tolist(), strict=True)
     )
-    wanted = sorted((*edge, *kept) for one in at.side.opinions for edge, kept in one.exact.items())
-    yield from differ("exact lengths", np.reshape(found, (-1, 4)), np.reshape(wanted, (-1, 4)), reach)
-    yield from differ("weights of pins", system.pins.weight, stated.weights, soft)
-    yield from differ("targets of pins", problem.pin_targets, stated.held, at.aim)
+    wanted = sorted((*edge, *kept) for one in at.scene_terms.effect_terms for edge, kept in one.exact_lengths.items())
+    yield from compare_arrays("exact lengths", np.reshape(found, (-1, 4)), np.reshape(wanted, (-1, 4)), reach)
+    yield from compare_arrays("weights of pins", system.pins.weight, stated.weights, soft)
+    yield from compare_arrays("targets of pins", problem.pin_targets, stated.pin_targets, at.pin_target_scale)
 
 
-def energies(at: Place) -> Iterator[Finding]:
+def compare_energies(at: ComparisonPoint) -> Iterator[TermMismatch]:
     """Compare the energies of each effect, and the objective, their sum."""
-    side, stated, reach = at.side, at.stated, at.reach
+    side, stated, reach = at.scene_terms, at.reference_step, at.coordinate_scale
     free = at.direction.copy()
     free[[i for i, w in zip(stated.vertices, stated.weights, strict=True) if np.isinf(w)]] = 0.0
-    x, d = wide(at.x), wide(free)
-    parts = [_others(at, x, d)]
-    for k, begin in enumerate(side.begins):
-        own = [at.problem.energies[i] for i in side.owned[k]]
+    x, d = to_extended(at.x), to_extended(free)
+    parts = [_evaluate_other_terms(at, x, d)]
+    for k, begin in enumerate(side.energy_builders):
+        own = [at.problem.energies[i] for i in side.energy_indices[k]]
         if begin is None:
-            told, wrong = own_slope(own, at.x, free, reach, side.shortest())
+            told, wrong = check_own_gradient(own, at.x, free, reach, side.min_length())
             if wrong is not None:
-                yield Finding(f"{side.name(k)} (gradient against its own value)", wrong)
+                yield TermMismatch(f"{side.format_effect_name(k)} (gradient against its own value)", wrong)
         else:
-            told = tell(begin(stated.moment), x, d, _reach_of(at, k), side.shortest(k))
-            yield from _unsettled(at, k, told, x, d)
+            told = differentiate_along(begin(stated.step_moment), x, d, _effect_scale(at, k), side.min_length(k))
+            yield from _compare_lagged_friction(at, k, told, x, d)
             if np.isfinite(told.value) or any(np.isfinite(energy.value(at.x)) for energy in own):
-                yield from _against(side.name(k), told, own, at.x, free)
+                yield from _compare_effect(side.format_effect_name(k), told, own, at.x, free)
         parts.append(told)
     if not all(np.isfinite(part.value) for part in parts):
         return
     # Forces are computed in float64, with a separate sum for each vertex.
-    pulled = ROUNDINGS * EPS * float(np.abs(d).sum()) * stated.force_size
-    room = [sum(part.allowed[k] for part in parts) for k in range(2)]
+    pulled = ROUNDOFF_MULTIPLE * EPS * float(np.abs(d).sum()) * stated.force_size
+    room = [sum(part.tolerances[k] for part in parts) for k in range(2)]
     value, slope = at.problem.value(at.x), float((at.problem.gradient(at.x) * free).sum())
-    yield from _told("objective (value)", value, sum(part.value for part in parts), room[0] + reach * pulled)
-    yield from _told("objective (gradient)", slope, sum(part.slope for part in parts), room[1] + pulled)
+    yield from _compare_values("objective (value)", value, sum(part.value for part in parts), room[0] + reach * pulled)
+    yield from _compare_values("objective (gradient)", slope, sum(part.slope for part in parts), room[1] + pulled)
 
 
-def _unsettled(at: Place, k: int, told: Told, x: Any, d: Any) -> Iterator[Finding]:
+def _compare_lagged_friction(
+    at: ComparisonPoint, k: int, told: DirectionalDerivatives, x: Any, d: Any
+) -> Iterator[TermMismatch]:
     """Compare friction of effect k with normal forces at the step's start and at x."""
-    effect, m, begin = at.side.declared.effects[k], at.stated.moment, at.side.begins[k]
-    if m.pressed is not None or not getattr(effect, "friction", 0.0) or effect.friction_rounds == 1:
+    effect, m, begin = (
+        at.scene_terms.declaration.effects[k],
+        at.reference_step.step_moment,
+        at.scene_terms.energy_builders[k],
+    )
+    if m.normal_force_positions is not None or not getattr(effect, "friction", 0.0) or effect.friction_rounds == 1:
         return
     assert begin
-    own = tell(begin(replace(m, pressed=x)), x, d, _reach_of(at, k), at.side.shortest(k))
-    if not abs(own.slope - told.slope) <= _SETTLED * abs(own.slope) + own.allowed[1] + told.allowed[1]:
-        yield Finding(f"{at.side.name(k)} (friction's pressure)", _part(abs(own.slope - told.slope), abs(own.slope)))
+    own = differentiate_along(
+        begin(replace(m, normal_force_positions=x)), x, d, _effect_scale(at, k), at.scene_terms.min_length(k)
+    )
+    if (
+        not abs(own.slope - told.slope)
+        <= _SETTLED_SLOPE_SHARE * abs(own.slope) + own.tolerances[1] + told.tolerances[1]
+    ):
+        yield TermMismatch(
+            f"{at.scene_terms.format_effect_name(k)} (friction's pressure)",
+            _relative_size(abs(own.slope - told.slope), abs(own.slope)),
+        )
 
 
-def _reach_of(at: Place, k: int) -> float:
+def _effect_scale(at: ComparisonPoint, k: int) -> float:
     """Return the largest coordinate [m] that effect k depends on, including moving parts."""
-    effect, reach = at.side.declared.effects[k], at.reach + at.side.opinions[k].reach
+    effect, reach = (
+        at.scene_terms.declaration.effects[k],
+        at.coordinate_scale + at.scene_terms.effect_terms[k].coordinate_scale,
+    )
     moving = [effect, *getattr(effect, "obstacles", ())]
-    late = at.stated.moment.time + at.stated.moment.time_step
-    return max([reach, *(blur(getattr(one, "motion", None), reach, late) / EPS for one in moving)])
+    late = at.reference_step.step_moment.time + at.reference_step.step_moment.time_step
+    return max([reach, *(bound_roundoff(getattr(one, "motion", None), reach, late) / EPS for one in moving)])
 
 
-def _against(name: str, told: Told, own: Sequence[Energy], x: Array, d: Array) -> Iterator[Finding]:
+def _compare_effect(
+    name: str, told: DirectionalDerivatives, own: Sequence[Energy], x: Array, d: Array
+) -> Iterator[TermMismatch]:
     """Compare the energies of one effect with its reference derivatives."""
     gradient = np.zeros_like(x)
     for energy in own:
         energy.add_gradient(x, gradient)
-    yield from _told(f"{name} (value)", sum(energy.value(x) for energy in own), told.value, told.allowed[0])
-    yield from _told(f"{name} (gradient)", float((gradient * d).sum()), told.slope, told.allowed[1])
-    bend = sum(_bend(energy, x, d) for energy in own)
-    yield from _told(f"{name} (Hessian)", bend, told.bend, told.allowed[2])
+    yield from _compare_values(
+        f"{name} (value)", sum(energy.value(x) for energy in own), told.value, told.tolerances[0]
+    )
+    yield from _compare_values(f"{name} (gradient)", float((gradient * d).sum()), told.slope, told.tolerances[1])
+    bend = sum(_second_derivative(energy, x, d) for energy in own)
+    yield from _compare_values(f"{name} (Hessian)", bend, told.curvature, told.tolerances[2])
 
 
-def _bend(energy: Any, x: Array, d: Array) -> float:
+def _second_derivative(energy: Any, x: Array, d: Array) -> float:
     """Return the second derivative along d by an energy's Hessian.
 
     The Hessian may be split into a sparse part and columns.
@@ -194,25 +246,25 @@ def _bend(energy: Any, x: Array, d: Array) -> float:
     flat = d.ravel()
     if not hasattr(energy, "columns"):
         return float(flat @ (energy.hessian(x) @ flat))
-    dense = np.einsum("nik,ni->k", energy.columns(x), d)
+    dense = np.einsum("nik,ni->k", energy.low_rank_columns(x), d)
     return float(flat @ (energy.sparse_hessian(x) @ flat) + dense @ dense)
 
 
-def _told(name: str, ours: float, theirs: float, room: float) -> Iterator[Finding]:
+def _compare_values(name: str, ours: float, theirs: float, room: float) -> Iterator[TermMismatch]:
     if not abs(ours - theirs) <= room:
-        yield Finding(name, _part(abs(ours - theirs), abs(theirs)))
+        yield TermMismatch(name, _relative_size(abs(ours - theirs), abs(theirs)))
 
 
-def _others(at: Place, x: Any, d: Any) -> Told:
+def _evaluate_other_terms(at: ComparisonPoint, x: Any, d: Any) -> DirectionalDerivatives:
     """Evaluate inertia, the pins' penalties and the forces."""
-    stated = at.stated
+    stated = at.reference_step
     soft = [i for i, w in enumerate(stated.weights) if np.isfinite(w)]
-    held, weight = [stated.vertices[i] for i in soft], wide([stated.weights[i] for i in soft])
-    inertia = wide(stated.c * at.side.declared.mass / stated.moment.time_step**2)
+    held, weight = [stated.vertices[i] for i in soft], to_extended([stated.weights[i] for i in soft])
+    inertia = to_extended(stated.c * at.scene_terms.declaration.mass / stated.step_moment.time_step**2)
 
     def values(y: Any) -> Any:
-        away, sag = y - wide(stated.target), y[held] - stated.held[soft]
+        away, sag = y - to_extended(stated.inertial_target), y[held] - stated.pin_targets[soft]
         squares = [inertia / 2 * (away**2).sum(axis=1), weight / 2 * (sag**2).sum(axis=1)]
-        return np.concatenate([*squares, -(y * stated.force).sum(axis=1)])
+        return np.concatenate([*squares, -(y * stated.external_force).sum(axis=1)])
 
-    return tell(values, x, d, max(at.reach, at.aim), at.reach or 1.0)
+    return differentiate_along(values, x, d, max(at.coordinate_scale, at.pin_target_scale), at.coordinate_scale or 1.0)

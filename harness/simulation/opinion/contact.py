@@ -18,49 +18,51 @@ from typing import Any
 
 import numpy as np
 
-from harness.simulation.opinion.declared import Array, Begin, Declared, Moment, Opinion
-from harness.simulation.opinion.derivatives import Values, Wide, length, wide
-from harness.simulation.opinion.motion import place
+from harness.simulation.opinion.declared import Array, BeginFunction, EffectTerms, SceneDeclaration, StepMoment
+from harness.simulation.opinion.derivatives import ExtendedArray, ValueFunction, row_norms, to_extended
+from harness.simulation.opinion.motion import place_at
 
-_ITERATIONS = 40
-_THERE = 1e-6
+_MAX_NEWTON_ITERATIONS = 40
+_CONTACT_RTOL = 1e-6
 """Relative to R: distance within which a point is on the surface."""
 
 
-def contact(effect: Any, declared: Declared) -> Opinion:
+def build_contact_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build contact with every obstacle, with stiffness from the diagonal of Q."""
     depth = effect.thickness / 10 if effect.tolerance is None else effect.tolerance
 
-    def needs(resists: Array) -> Begin:
-        k = 4 * wide(resists) * max(1.0, effect.speed * declared.time_step / depth)
+    def needs(resists: Array) -> BeginFunction:
+        k = 4 * to_extended(resists) * max(1.0, effect.speed * declared.time_step / depth)
 
-        def begin(moment: Moment) -> Values:
-            parts = [_of_obstacle(effect, one, k, moment) for one in effect.obstacles]
+        def begin(moment: StepMoment) -> ValueFunction:
+            parts = [_build_obstacle_energy(effect, one, k, moment) for one in effect.obstacles]
             return lambda x: np.concatenate([values(x) for values in parts])
 
         return begin
 
-    return Opinion(needs=needs, shortest=depth, reach=max(map(_reach, effect.obstacles)))
+    return EffectTerms(
+        build_from_diagonal=needs, min_length=depth, coordinate_scale=max(map(_obstacle_scale, effect.obstacles))
+    )
 
 
-def _of_obstacle(effect: Any, one: Any, k: Wide, moment: Moment) -> Values:
-    R, slip = radius(one) + effect.thickness, float(effect.creep) * (moment.until - moment.time)
-    begun, ended = (place(one.motion, moment.time + dt) for dt in (0.0, moment.time_step))
-    a, b = begun.back(moment.p), ended.back(moment.p + moment.time_step * moment.v)
-    touched, out = _half_space(one, a, b, R)
-    n = out @ ended.turn.T
-    d = (n * ended.there(touched + R * out)).sum(axis=1)
-    carried = ended.there(a)
+def _build_obstacle_energy(effect: Any, one: Any, k: ExtendedArray, moment: StepMoment) -> ValueFunction:
+    R, slip = obstacle_radius(one) + effect.thickness, float(effect.creep) * (moment.stage_time - moment.time)
+    begun, ended = (place_at(one.motion, moment.time + dt) for dt in (0.0, moment.time_step))
+    a, b = begun.inverse_transform(moment.p), ended.inverse_transform(moment.p + moment.time_step * moment.v)
+    touched, out = _locate_half_space(one, a, b, R)
+    n = out @ ended.rotation.T
+    d = (n * ended.transform(touched + R * out)).sum(axis=1)
+    carried = ended.transform(a)
     # The half-space is that of the step's end; where x is at an earlier time, it is interpolated from the start.
-    w, started = moment.when, (n * moment.p).sum(axis=1)
+    w, started = moment.stage_fraction, (n * moment.p).sum(axis=1)
     offset, anchor = started + w * (d - started), moment.p + w * (carried - moment.p)
     depth = w * (d - (n * carried).sum(axis=1))
-    if moment.pressed is not None:
-        depth = offset - (n * moment.pressed).sum(axis=1)
+    if moment.normal_force_positions is not None:
+        depth = offset - (n * moment.normal_force_positions).sum(axis=1)
     grip = effect.friction * k * np.maximum(0, depth)
     grips = grip > 0
 
-    def values(x: Wide) -> Wide:
+    def values(x: ExtendedArray) -> ExtendedArray:
         gap = (n * x).sum(axis=1) - offset
         pressed = k / 2 * np.where(gap.real < 0, gap, 0) ** 2
         away, normal = (x - anchor)[grips], n[grips]
@@ -73,22 +75,22 @@ def _of_obstacle(effect: Any, one: Any, k: Wide, moment: Moment) -> Values:
     return values
 
 
-def _half_space(one: Any, a: Wide, b: Wide, R: float) -> tuple[Wide, Wide]:
+def _locate_half_space(one: Any, a: ExtendedArray, b: ExtendedArray, R: float) -> tuple[ExtendedArray, ExtendedArray]:
     """Find the nearest points of the obstacle and the normals there, (n, 3) each.
 
     They are those where Newton's method ends on the segments from a to b (n, 3).
     """
-    begin, end = wide(np.zeros(len(a))), wide(np.full(len(a), np.inf))
-    far, touched, out = nearest(one, a)
+    begin, end = to_extended(np.zeros(len(a))), to_extended(np.full(len(a), np.inf))
+    far, touched, out = find_nearest(one, a)
     slope = (out * (b - a)).sum(axis=1)
-    for _ in range(_ITERATIONS):
-        left = np.flatnonzero((far > (1 + _THERE) * R) & (slope < 0))
+    for _ in range(_MAX_NEWTON_ITERATIONS):
+        left = np.flatnonzero((far > (1 + _CONTACT_RTOL) * R) & (slope < 0))
         s = begin[left] - (far[left] - R) / slope[left]
         left, s = left[s < 1], s[s < 1]
         if not len(left):
             break
         s = np.where(s >= end[left], (begin[left] + end[left]) / 2, s)
-        there, at, normal = nearest(one, a[left] + s[:, None] * (b - a)[left])
+        there, at, normal = find_nearest(one, a[left] + s[:, None] * (b - a)[left])
         steep = (normal * (b - a)[left]).sum(axis=1)
         falls = steep < 0
         on = left[falls]
@@ -97,12 +99,12 @@ def _half_space(one: Any, a: Wide, b: Wide, R: float) -> tuple[Wide, Wide]:
     return touched, out
 
 
-def radius(one: Any) -> float:
+def obstacle_radius(one: Any) -> float:
     """Return the radius [m] around the shape whose distance `find_nearest` returns."""
     return one.radius if one.kind in ("sphere", "capsule") else 0.0
 
 
-def nearest(one: Any, x: Wide) -> tuple[Wide, Wide, Wide]:
+def find_nearest(one: Any, x: ExtendedArray) -> tuple[ExtendedArray, ExtendedArray, ExtendedArray]:
     """Find the nearest points of an obstacle as declared, excluding its radius.
 
     Args:
@@ -112,26 +114,28 @@ def nearest(one: Any, x: Wide) -> tuple[Wide, Wide, Wide]:
     Returns: distances (m,) [m], negative inside; nearest points of the surface and the normals there, (m, 3) each.
     """
     if one.kind == "plane":
-        n = wide(one.normal)
+        n = to_extended(one.normal)
         out = np.tile(n / np.sqrt(n @ n), (len(x), 1))
-        far = ((x - wide(one.point)) * out).sum(axis=1)
+        far = ((x - to_extended(one.point)) * out).sum(axis=1)
         return far, x - far[:, None] * out, out
     if one.kind == "sphere":
-        touched = np.tile(wide(one.center), (len(x), 1))
+        touched = np.tile(to_extended(one.center), (len(x), 1))
     elif one.kind == "capsule":
-        first, last = wide(one.ends)
+        first, last = to_extended(one.ends)
         way = last - first
         part = np.clip((x - first) @ way / (way @ way), 0, 1)
         touched = first + part[:, None] * way
     else:
-        return _nearest_of_box(wide(one.low), wide(one.high), x)
-    far = length(x - touched)
+        return _find_nearest_box(to_extended(one.low), to_extended(one.high), x)
+    far = row_norms(x - touched)
     return far, touched, (x - touched) / far[:, None]
 
 
-def _nearest_of_box(low: Wide, high: Wide, x: Wide) -> tuple[Wide, Wide, Wide]:
+def _find_nearest_box(
+    low: ExtendedArray, high: ExtendedArray, x: ExtendedArray
+) -> tuple[ExtendedArray, ExtendedArray, ExtendedArray]:
     touched = np.clip(x, low, high)
-    far, out = length(x - touched), x - touched
+    far, out = row_norms(x - touched), x - touched
     for k, point in enumerate(x):
         if far[k] > 0:
             out[k] /= far[k]
@@ -144,11 +148,16 @@ def _nearest_of_box(low: Wide, high: Wide, x: Wide) -> tuple[Wide, Wide, Wide]:
     return far, touched, out
 
 
-def _reach(one: Any) -> float:
+def _obstacle_scale(one: Any) -> float:
     """Return the largest declared coordinate [m] of an obstacle; of planes, that of their point."""
-    sizes = [np.abs(getattr(one, name)).max() for name in _SIZES[one.kind]]
+    sizes = [np.abs(getattr(one, name)).max() for name in _SIZE_FIELDS[one.kind]]
     moves = [np.abs(key.offset).max() for key in one.motion.keys] if one.motion else [0.0]
     return float(max(sizes) + max(moves))
 
 
-_SIZES = {"plane": ("point",), "sphere": ("center", "radius"), "capsule": ("ends", "radius"), "box": ("low", "high")}
+_SIZE_FIELDS = {
+    "plane": ("point",),
+    "sphere": ("center", "radius"),
+    "capsule": ("ends", "radius"),
+    "box": ("low", "high"),
+}

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.scenes.mesh.base import Mesh
-from harness.simulation.opinion.derivatives import Values, Wide, wide
+from harness.simulation.opinion.derivatives import ExtendedArray, ValueFunction, to_extended
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class StepMoment:
     """Data of one step.
 
     Attributes:
@@ -33,19 +33,19 @@ class Moment:
     """
 
     time_step: float
-    rate: float
-    when: float
+    velocity_rate: float
+    stage_fraction: float
     time: float
-    until: float
-    p: Wide
-    v: Wide
-    expected: Wide
-    origin: Wide
-    pressed: Wide | None = None
+    stage_time: float
+    p: ExtendedArray
+    v: ExtendedArray
+    lagged_positions: ExtendedArray
+    velocity_origin: ExtendedArray
+    normal_force_positions: ExtendedArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class Declared:
+class SceneDeclaration:
     """Declaration of a scene.
 
     Attributes:
@@ -60,20 +60,20 @@ class Declared:
     mass: Array
     time_step: float
     effects: tuple[Any, ...]
-    staged: bool = False
+    has_stages: bool = False
 
     @property
-    def rest(self) -> Wide:
+    def rest(self) -> ExtendedArray:
         """The rest positions (n, 3) [m]."""
-        return wide(self.mesh.rest)
+        return to_extended(self.mesh.rest_positions)
 
-    def of_kind(self, kind: str) -> list[Any]:
+    def select_effects(self, kind: str) -> list[Any]:
         """Return the effects of a kind, in order."""
         return [effect for effect in self.effects if effect.kind == kind]
 
 
-Begin = Callable[[Moment], Values]
-Force = Callable[[Array, Array, float], tuple[Array, float]]
+BeginFunction = Callable[[StepMoment], ValueFunction]
+ReferenceForce = Callable[[Array, Array, float], tuple[Array, float]]
 """Maps positions (n, 3) [m], velocities (n, 3) [m/s] and time [s] to the force (n, 3) [N], and to the size [N] whose
 product with eps is its round-off."""
 
@@ -88,12 +88,12 @@ class PinnedVertex(NamedTuple):
     """
 
     weight: float
-    place: Callable[[float], Wide]
-    speed: Callable[[float], Wide]
+    position: Callable[[float], ExtendedArray]
+    velocity: Callable[[float], ExtendedArray]
 
 
 @dataclass(frozen=True)
-class Opinion:
+class EffectTerms:
     """Reference terms of one effect.
 
     Attributes:
@@ -109,20 +109,20 @@ class Opinion:
       exact_lengths: shortest and longest length [m] allowed for each inextensible edge (i, j).
     """
 
-    begin: Begin | None = None
-    resists: Array | None = None
-    needs: Callable[[Array], Begin] | None = None
-    force: Force | None = None
-    decay: Callable[[Array], Array] | None = None
-    pins: dict[int, PinnedVertex] = field(default_factory=dict[int, PinnedVertex])
-    shortest: float = np.inf
-    reach: float = 0.0
-    exact: dict[tuple[int, int], tuple[float, float]] = field(
+    build_energy: BeginFunction | None = None
+    diagonal: Array | None = None
+    build_from_diagonal: Callable[[Array], BeginFunction] | None = None
+    evaluate_force: ReferenceForce | None = None
+    filter_velocity: Callable[[Array], Array] | None = None
+    pinned_vertices: dict[int, PinnedVertex] = field(default_factory=dict[int, PinnedVertex])
+    min_length: float = np.inf
+    coordinate_scale: float = 0.0
+    exact_lengths: dict[tuple[int, int], tuple[float, float]] = field(
         default_factory=dict[tuple[int, int], tuple[float, float]]
     )
 
 
-def counts(edges: NDArray[np.int64], weight: Array, n: int) -> Array:
+def sum_edge_weights(edges: NDArray[np.int64], weight: Array, n: int) -> Array:
     """Sum the weights of the edges at each vertex, without loops.
 
     Args:

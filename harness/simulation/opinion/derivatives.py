@@ -25,39 +25,41 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Wide = NDArray[Any]
+ExtendedArray = NDArray[Any]
 """Extended precision (`numpy.longdouble`), real or complex; shapes are stated where it is used."""
-Values = Callable[[Wide], Wide]
+ValueFunction = Callable[[ExtendedArray], ExtendedArray]
 """Maps positions (n, 3) [m], real or complex, to the energies (e,) [J] of elements."""
 
 EPS = float(np.finfo(float).eps)
-ROUNDINGS = 200.0
+ROUNDOFF_MULTIPLE = 200.0
 """C: number of roundings in an element's energy, with a margin for sums of thousands of elements."""
-_TINY = np.longdouble(1e-100)
-_STEP = 1e-6
+_COMPLEX_STEP = np.longdouble(1e-100)
+_DIFFERENCE_STEP = 1e-6
 """s, relative to the smallest length."""
 
 
-def wide(x: Any) -> Wide:
+def to_extended(x: Any) -> ExtendedArray:
     """Convert to an array in extended precision."""
     return np.asarray(x, np.longdouble)
 
 
-def length(v: Wide) -> Wide:
+def row_norms(v: ExtendedArray) -> ExtendedArray:
     """Return the norms (m,) of rows (m, 3), analytic for complex rows."""
     return np.sqrt((v * v).sum(axis=1))
 
 
-class Told(NamedTuple):
+class DirectionalDerivatives(NamedTuple):
     """Value [J] and derivatives [N] and [N/m] along a direction, and the tolerance of each."""
 
     value: float
     slope: float
-    bend: float
-    allowed: tuple[float, float, float]
+    curvature: float
+    tolerances: tuple[float, float, float]
 
 
-def tell(values: Values, x: Wide, d: Wide, reach: float, shortest: float) -> Told:
+def differentiate_along(
+    values: ValueFunction, x: ExtendedArray, d: ExtendedArray, coordinate_scale: float, min_length: float
+) -> DirectionalDerivatives:
     """Differentiate an energy at x along d.
 
     Args:
@@ -68,15 +70,20 @@ def tell(values: Values, x: Wide, d: Wide, reach: float, shortest: float) -> Tol
       min_length: l [m].
     """
 
-    def slopes(at: Wide) -> Wide:
-        return np.imag(values(at + 1j * _TINY * d)) / _TINY
+    def slopes(at: ExtendedArray) -> ExtendedArray:
+        return np.imag(values(at + 1j * _COMPLEX_STEP * d)) / _COMPLEX_STEP
 
-    s = np.longdouble(_STEP * shortest)
+    s = np.longdouble(_DIFFERENCE_STEP * min_length)
     here, first, ahead, behind = values(x), slopes(x), slopes(x + s * d), slopes(x - s * d)
     second = (ahead - behind) / (2 * s)
     corner = float(np.abs(ahead - 2 * first + behind).sum() / s)
     sums = [float(np.abs(part).sum()) for part in (here, first, second)]
     sums.append(corner / float(s))
-    room = [ROUNDINGS * EPS * ((1.0 + reach / shortest) * sums[k] + reach * sums[k + 1]) for k in range(3)]
+    room = [
+        ROUNDOFF_MULTIPLE * EPS * ((1.0 + coordinate_scale / min_length) * sums[k] + coordinate_scale * sums[k + 1])
+        for k in range(3)
+    ]
     room[2] += corner + room[1] / EPS * float(np.finfo(np.longdouble).eps / s)
-    return Told(float(here.sum()), float(first.sum()), float(second.sum()), (room[0], room[1], room[2]))
+    return DirectionalDerivatives(
+        float(here.sum()), float(first.sum()), float(second.sum()), (room[0], room[1], room[2])
+    )

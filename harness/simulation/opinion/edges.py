@@ -15,12 +15,19 @@ from typing import Any
 import numpy as np
 
 from harness.scenes.mesh.base import Mesh
-from harness.simulation.opinion.declared import Array, Begin, Declared, Moment, Opinion, counts
-from harness.simulation.opinion.derivatives import Values, Wide, length, wide
-from harness.simulation.opinion.selected import chosen
+from harness.simulation.opinion.declared import (
+    Array,
+    BeginFunction,
+    EffectTerms,
+    SceneDeclaration,
+    StepMoment,
+    sum_edge_weights,
+)
+from harness.simulation.opinion.derivatives import ExtendedArray, ValueFunction, row_norms, to_extended
+from harness.simulation.opinion.selected import select_vertices
 
 
-def stiffness(mesh: Mesh, effect: Any, stretch: Any, shear: Any, bend: float) -> Array:
+def compute_edge_stiffness(mesh: Mesh, effect: Any, stretch: Any, shear: Any, bend: float) -> Array:
     """Compute the stiffness (m,) [N/m] of each spring by the effect's rule.
 
     The rules are those of `harness.scenes.material`.
@@ -34,8 +41,8 @@ def stiffness(mesh: Mesh, effect: Any, stretch: Any, shear: Any, bend: float) ->
     """
     k, h = np.zeros(len(mesh.springs)), mesh.spacing
     for family, given in {"stretch": stretch, "shear": shear, "bend": bend}.items():
-        for e in mesh.families[family]:
-            constant = given if isinstance(given, float) else _woven(mesh, given, *mesh.springs[e].tolist())
+        for e in mesh.spring_families[family]:
+            constant = given if isinstance(given, float) else _woven_stiffness(mesh, given, *mesh.springs[e].tolist())
             if effect.rule == "fixed":
                 k[e] = constant
             elif effect.rule == "liu2013":
@@ -44,34 +51,36 @@ def stiffness(mesh: Mesh, effect: Any, stretch: Any, shear: Any, bend: float) ->
                 k[e] = 16 * constant / h**2
             elif mesh.dimension == 1:
                 i, j = mesh.springs[e]
-                k[e] = constant / np.linalg.norm(mesh.rest[i] - mesh.rest[j])
+                k[e] = constant / np.linalg.norm(mesh.rest_positions[i] - mesh.rest_positions[j])
             else:
                 k[e] = constant * {2: 1.0, 3: h}[mesh.dimension]
     if effect.rule == "continuum" and bend:
-        _relieve(mesh, k)
+        _subtract_skip_springs(mesh, k)
     return k
 
 
-def _woven(mesh: Mesh, weave: Any, i: int, j: int) -> float:
+def _woven_stiffness(mesh: Mesh, weave: Any, i: int, j: int) -> float:
     """Return the constant of a woven cloth's spring from its angle to the warp."""
     normal = np.zeros(3)
     for a, b, c in mesh.triangles:
-        area = np.cross(mesh.rest[b] - mesh.rest[a], mesh.rest[c] - mesh.rest[a])
+        area = np.cross(
+            mesh.rest_positions[b] - mesh.rest_positions[a], mesh.rest_positions[c] - mesh.rest_positions[a]
+        )
         normal += sum(k in (i, j) for k in (a, b, c)) * area
-    edge, warp = mesh.rest[j] - mesh.rest[i], np.array(weave.direction)
+    edge, warp = mesh.rest_positions[j] - mesh.rest_positions[i], np.array(weave.direction)
     across = np.cross(normal, warp)
     angle = np.arctan2(edge @ across * np.linalg.norm(normal), edge @ np.cross(across, normal))
     straight = np.cos(2 * angle) ** 2
     return float((weave.warp if np.cos(2 * angle) >= 0 else weave.weft) * straight + weave.bias * (1 - straight))
 
 
-def _relieve(mesh: Mesh, k: Array) -> None:
+def _subtract_skip_springs(mesh: Mesh, k: Array) -> None:
     """Subtract twice the stiffness of every skip-one spring from the springs along the same line."""
     joined: dict[int, dict[int, int]] = {}
-    for e in mesh.families["stretch"].tolist():
+    for e in mesh.spring_families["stretch"].tolist():
         i, j = mesh.springs[e].tolist()
         joined.setdefault(i, {})[j] = joined.setdefault(j, {})[i] = e
-    bends = mesh.families["bend"].tolist()
+    bends = mesh.spring_families["bend"].tolist()
     most = max((k[e] for e in bends), default=0.0)
     for a, b in mesh.springs[bends].tolist():
         for middle in joined.get(a, {}).keys() & joined.get(b, {}).keys():
@@ -79,109 +88,114 @@ def _relieve(mesh: Mesh, k: Array) -> None:
             k[joined[b][middle]] -= 2 * most
 
 
-def springs(effect: Any, declared: Declared) -> Opinion:
+def build_springs_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build springs along all edges that have stiffness."""
-    k = of_springs(effect, declared)
-    exact, k = _exact(declared, k, 1.0, 1.0), finite(k)
+    k = compute_reference_stiffness(effect, declared)
+    exact, k = _select_exact_lengths(declared, k, 1.0, 1.0), select_finite(k)
     edges, n = declared.mesh.springs, len(declared.mass)
-    r = _lengths(declared.rest, edges)
+    r = _edge_lengths(declared.rest, edges)
 
-    def begin(moment: Moment) -> Values:
-        return lambda x: wide(k) / 2 * (_lengths(x, edges) - r) ** 2
+    def begin(moment: StepMoment) -> ValueFunction:
+        return lambda x: to_extended(k) / 2 * (_edge_lengths(x, edges) - r) ** 2
 
-    return Opinion(begin, counts(edges, k, n), exact=exact)
+    return EffectTerms(begin, sum_edge_weights(edges, k, n), exact_lengths=exact)
 
 
-def of_springs(effect: Any, declared: Declared) -> Array:
+def compute_reference_stiffness(effect: Any, declared: SceneDeclaration) -> Array:
     """Compute the stiffness (m,) [N/m] of an effect `springs`."""
     given = effect.stretch, effect.stretch if effect.shear is None else effect.shear
     stretch, shear = (np.inf if x == "exact" else x for x in given)
-    return stiffness(declared.mesh, effect, stretch, shear, effect.bend)
+    return compute_edge_stiffness(declared.mesh, effect, stretch, shear, effect.bend)
 
 
-def finite(k: Array) -> Array:
+def select_finite(k: Array) -> Array:
     """Return the stiffnesses (m,) [N/m] with those of exact lengths set to zero."""
     return np.where(np.isinf(k), 0.0, k)
 
 
-def _exact(declared: Declared, k: Array, low: float, high: float) -> dict[tuple[int, int], tuple[float, float]]:
+def _select_exact_lengths(
+    declared: SceneDeclaration, k: Array, low: float, high: float
+) -> dict[tuple[int, int], tuple[float, float]]:
     """Return the edges with infinite stiffness (m,), with their allowed lengths [m].
 
     These are `low` and `high` times the rest length.
     """
     edges = declared.mesh.springs
-    r = _lengths(declared.rest, edges)
+    r = _edge_lengths(declared.rest, edges)
     return {(*edges[e].tolist(),): (low * float(r[e]), high * float(r[e])) for e in np.flatnonzero(np.isinf(k))}
 
 
-def strain_limits(effect: Any, declared: Declared) -> Opinion:
+def build_strain_limits_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build edges that resist strains beyond their limits."""
     given = np.inf if effect.stiffness == "exact" else effect.stiffness
-    k = stiffness(declared.mesh, effect, given, given, 0.0)
-    exact, k = _exact(declared, k, effect.shortest, effect.longest), finite(k)
-    edges, r = declared.mesh.springs, _lengths(declared.rest, declared.mesh.springs)
+    k = compute_edge_stiffness(declared.mesh, effect, given, given, 0.0)
+    exact, k = _select_exact_lengths(declared, k, effect.shortest, effect.longest), select_finite(k)
+    edges, r = declared.mesh.springs, _edge_lengths(declared.rest, declared.mesh.springs)
     low, high = effect.shortest * r, effect.longest * r
 
-    def values(x: Wide) -> Wide:
-        l = _lengths(x, edges)
+    def values(x: ExtendedArray) -> ExtendedArray:
+        l = _edge_lengths(x, edges)
         allowed = np.where(np.real(l) < low, low, np.where(np.real(l) > high, high, l))
-        return wide(k) / 2 * (l - allowed) ** 2
+        return to_extended(k) / 2 * (l - allowed) ** 2
 
-    return Opinion(lambda moment: values, counts(edges, k, len(declared.mass)), exact=exact)
+    return EffectTerms(lambda moment: values, sum_edge_weights(edges, k, len(declared.mass)), exact_lengths=exact)
 
 
-def sewing(effect: Any, declared: Declared) -> Opinion:
+def build_sewing_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build threads between the vertices that are nearest at rest."""
-    rest, rows = declared.mesh.rest, (chosen(declared, effect.first), chosen(declared, effect.second))
+    rest, rows = (
+        declared.mesh.rest_positions,
+        (select_vertices(declared, effect.first), select_vertices(declared, effect.second)),
+    )
     pairs = {(i, min(rows[1], key=lambda j: float(np.linalg.norm(rest[i] - rest[j])))) for i in rows[0]}
     pairs |= {(min(rows[0], key=lambda i: float(np.linalg.norm(rest[i] - rest[j]))), j) for j in rows[1]}
     edges = np.array(sorted(pairs), np.int64)
-    r, k = _lengths(declared.rest, edges), np.full(len(edges), effect.stiffness / len(edges))
+    r, k = _edge_lengths(declared.rest, edges), np.full(len(edges), effect.stiffness / len(edges))
 
-    def begin(moment: Moment) -> Values:
-        since, whole = moment.until - effect.begin, effect.end - effect.begin
+    def begin(moment: StepMoment) -> ValueFunction:
+        since, whole = moment.stage_time - effect.begin, effect.end - effect.begin
         done = (1.0 if since >= 0 else 0.0) if whole == 0 else min(max(since / whole, 0.0), 1.0)
         longest = np.where(r < effect.gap, r, r + done * (effect.gap - r))
 
-        def values(x: Wide) -> Wide:
-            l = _lengths(x, edges)
-            return wide(k) / 2 * np.where(np.real(l) > longest, l - longest, 0 * l) ** 2
+        def values(x: ExtendedArray) -> ExtendedArray:
+            l = _edge_lengths(x, edges)
+            return to_extended(k) / 2 * np.where(np.real(l) > longest, l - longest, 0 * l) ** 2
 
         return values
 
-    return Opinion(begin, counts(edges, k, len(declared.mass)))
+    return EffectTerms(begin, sum_edge_weights(edges, k, len(declared.mass)))
 
 
-def dashpots(effect: Any, declared: Declared) -> Opinion:
+def build_dashpots_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build damping along the edges."""
     shear = effect.stretch if effect.shear is None else effect.shear
-    c = stiffness(declared.mesh, effect, effect.stretch, shear, 0.0)
-    resists = counts(declared.mesh.springs, c / declared.time_step, len(declared.mass))
-    return Opinion(along_edges(declared, c), resists)
+    c = compute_edge_stiffness(declared.mesh, effect, effect.stretch, shear, 0.0)
+    resists = sum_edge_weights(declared.mesh.springs, c / declared.time_step, len(declared.mass))
+    return EffectTerms(build_edge_damping(declared, c), resists)
 
 
-def along_edges(declared: Declared, c: Array) -> Begin:
+def build_edge_damping(declared: SceneDeclaration, c: Array) -> BeginFunction:
     """Build the energy of dashpots with coefficients c (m,) [N s/m]."""
     i, j = declared.mesh.springs.T
     at_rest = declared.rest[i] - declared.rest[j]
 
-    def begin(moment: Moment) -> Values:
-        v = moment.expected[i] - moment.expected[j]
-        n = np.array([_unit(u, r) for u, r in zip(v, at_rest, strict=True)], np.longdouble).reshape(-1, 3)
-        o = moment.origin[i] - moment.origin[j]
-        return lambda x: wide(c) * moment.rate / 2 * (n * (x[i] - x[j] - o)).sum(axis=1) ** 2
+    def begin(moment: StepMoment) -> ValueFunction:
+        v = moment.lagged_positions[i] - moment.lagged_positions[j]
+        n = np.array([_unit_direction(u, r) for u, r in zip(v, at_rest, strict=True)], np.longdouble).reshape(-1, 3)
+        o = moment.velocity_origin[i] - moment.velocity_origin[j]
+        return lambda x: to_extended(c) * moment.velocity_rate / 2 * (n * (x[i] - x[j] - o)).sum(axis=1) ** 2
 
     return begin
 
 
-def _unit(v: Wide, otherwise: Wide) -> Wide:
+def _unit_direction(v: ExtendedArray, otherwise: ExtendedArray) -> ExtendedArray:
     """Return the direction of v, or the direction at rest, or the first unit vector."""
     for u in (v, otherwise):
         if u.any():
             return u / np.sqrt(u @ u)
-    return wide([1.0, 0.0, 0.0])
+    return to_extended([1.0, 0.0, 0.0])
 
 
-def _lengths(x: Wide, edges: Any) -> Wide:
+def _edge_lengths(x: ExtendedArray, edges: Any) -> ExtendedArray:
     i, j = edges.T
-    return length(x[i] - x[j])
+    return row_norms(x[i] - x[j])

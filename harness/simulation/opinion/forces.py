@@ -15,36 +15,36 @@ from typing import Any
 
 import numpy as np
 
-from harness.simulation.opinion.declared import Array, Declared, Opinion
-from harness.simulation.opinion.surfaces import triangle_areas
+from harness.simulation.opinion.declared import Array, EffectTerms, SceneDeclaration
+from harness.simulation.opinion.surfaces import compute_triangle_areas
 
-Field = Callable[[Array, float], Array]
+FieldFunction = Callable[[Array, float], Array]
 
 
-def gravity(effect: Any, declared: Declared) -> Opinion:
+def build_gravity_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build the weight."""
     weight = declared.mass[:, None] * np.array(effect.acceleration)
-    return Opinion(force=lambda p, v, t: (weight, float(np.abs(weight).max())))
+    return EffectTerms(evaluate_force=lambda p, v, t: (weight, float(np.abs(weight).max())))
 
 
-def constant_force(effect: Any, declared: Declared) -> Opinion:
+def build_constant_force_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build the same force on every vertex."""
     force = np.ones((len(declared.mass), 1)) * np.array(effect.force)
-    return Opinion(force=lambda p, v, t: (force, float(np.abs(force).max())))
+    return EffectTerms(evaluate_force=lambda p, v, t: (force, float(np.abs(force).max())))
 
 
-def wind(effect: Any, declared: Declared) -> Opinion:
+def build_wind_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build the wind field on vertices or triangles."""
     field, phase = _FIELDS[effect.field](effect, declared)
 
     def on_vertices(p: Array, v: Array, t: float) -> tuple[Array, float]:
-        share = np.ones(len(p)) if effect.per == "vertex" else declared.mesh.shares
+        share = np.ones(len(p)) if effect.per == "vertex" else declared.mesh.mass_fractions
         force = share[:, None] * field(p, t)
-        return force, float(share.max() * np.abs(_most(effect)).max() * (1.0 + phase(p, t)))
+        return force, float(share.max() * np.abs(_max_field(effect)).max() * (1.0 + phase(p, t)))
 
     def on_triangles(p: Array, v: Array, t: float) -> tuple[Array, float]:
-        triangles, areas = declared.mesh.triangles, triangle_areas(p, declared.mesh.triangles)
-        at_rest = triangle_areas(declared.mesh.rest, triangles)
+        triangles, areas = declared.mesh.triangles, compute_triangle_areas(p, declared.mesh.triangles)
+        at_rest = compute_triangle_areas(declared.mesh.rest_positions, triangles)
         around = np.zeros(len(p))
         for triangle, area in zip(triangles, at_rest, strict=True):
             around[triangle] += area
@@ -67,24 +67,24 @@ def wind(effect: Any, declared: Declared) -> Opinion:
             size += min(asked, most) * (1 + (np.abs(air).max() + np.abs(v[triangle]).max()) / speed)
         return total, size * (1.0 + phase(p, t))
 
-    return Opinion(force=on_triangles if effect.per == "triangle" else on_vertices)
+    return EffectTerms(evaluate_force=on_triangles if effect.per == "triangle" else on_vertices)
 
 
-def _mean(effect: Any) -> Array:
+def _mean_field(effect: Any) -> Array:
     return effect.strength * np.array(effect.velocity if effect.per == "triangle" else effect.force)
 
 
-def _most(effect: Any) -> Array:
+def _max_field(effect: Any) -> Array:
     """Return the approximate maximum of the field."""
-    return effect.strength * np.array([6.0, 2.0, 1.0]) if effect.field == "assignment" else 3.0 * _mean(effect)
+    return effect.strength * np.array([6.0, 2.0, 1.0]) if effect.field == "assignment" else 3.0 * _mean_field(effect)
 
 
-def _constant(effect: Any, declared: Declared) -> tuple[Field, Callable[[Array, float], float]]:
-    return lambda x, t: np.ones((len(x), 1)) * _mean(effect), lambda x, t: 0.0
+def _constant_field(effect: Any, declared: SceneDeclaration) -> tuple[FieldFunction, Callable[[Array, float], float]]:
+    return lambda x, t: np.ones((len(x), 1)) * _mean_field(effect), lambda x, t: 0.0
 
 
-def _assignment(effect: Any, declared: Declared) -> tuple[Field, Callable[[Array, float], float]]:
-    low, high = declared.mesh.rest.min(axis=0), declared.mesh.rest.max(axis=0)
+def _assignment_field(effect: Any, declared: SceneDeclaration) -> tuple[FieldFunction, Callable[[Array, float], float]]:
+    low, high = declared.mesh.rest_positions.min(axis=0), declared.mesh.rest_positions.max(axis=0)
     diagonal = float(np.sqrt(((high - low) ** 2).sum())) or 1.0
 
     def field(x: Array, t: float) -> Array:
@@ -96,20 +96,20 @@ def _assignment(effect: Any, declared: Declared) -> tuple[Field, Callable[[Array
     return field, lambda x, t: 5 * (float(np.abs(x).max()) / diagonal + abs(t))
 
 
-def _gusts(effect: Any, declared: Declared) -> tuple[Field, Callable[[Array, float], float]]:
+def _gust_field(effect: Any, declared: SceneDeclaration) -> tuple[FieldFunction, Callable[[Array, float], float]]:
     """Build a field of sixteen waves with random frequencies and phases.
 
     The logarithms of the frequencies are uniform between a quarter of and four times the central frequency. The random
     numbers are drawn in this order from NumPy's generator with the given seed.
     """
-    mean, waves = _mean(effect), 16
+    mean, waves = _mean_field(effect), 16
     speed = float(np.sqrt((mean**2).sum()))
     if not speed:
-        return _constant(effect, declared)
+        return _constant_field(effect, declared)
     draws = np.random.default_rng(effect.seed)
     octaves = draws.uniform(np.log(0.25), np.log(4), waves)
     phases = draws.uniform(0, 2 * np.pi, (waves, 3))
-    ways = declared.mesh.rest.max(axis=0) - declared.mesh.rest.min(axis=0)
+    ways = declared.mesh.rest_positions.max(axis=0) - declared.mesh.rest_positions.min(axis=0)
     size = float(np.sqrt((ways**2).sum())) or 1.0
     slow = mean / speed**2 if effect.per == "triangle" else mean / (speed * size)
 
@@ -124,8 +124,8 @@ def _gusts(effect: Any, declared: Declared) -> tuple[Field, Callable[[Array, flo
     return field, lambda x, t: (1 + effect.gustiness) * (1 + fastest * (abs(t) + float(np.abs(x @ slow).max())))
 
 
-_FIELDS: dict[str, Callable[..., tuple[Field, Callable[[Array, float], float]]]] = {
-    "assignment": _assignment,
-    "constant": _constant,
-    "gusts": _gusts,
+_FIELDS: dict[str, Callable[..., tuple[FieldFunction, Callable[[Array, float], float]]]] = {
+    "assignment": _assignment_field,
+    "constant": _constant_field,
+    "gusts": _gust_field,
 }

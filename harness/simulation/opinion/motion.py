@@ -13,12 +13,12 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from harness.simulation.opinion.derivatives import EPS, Wide, wide
+from harness.simulation.opinion.derivatives import EPS, ExtendedArray, to_extended
 
 _PI = 4 * np.arctan(np.longdouble(1))
 
 
-class Place(NamedTuple):
+class RigidPlacement(NamedTuple):
     """A rigid motion at one time.
 
     Attributes:
@@ -27,37 +27,37 @@ class Place(NamedTuple):
       offset: translation (3,) [m].
     """
 
-    turn: Wide
-    about: Wide
-    offset: Wide
+    rotation: ExtendedArray
+    axis_point: ExtendedArray
+    offset: ExtendedArray
 
-    def there(self, q: Wide) -> Wide:
+    def transform(self, q: ExtendedArray) -> ExtendedArray:
         """Transform points declared at q (m, 3) [m] to their present positions."""
-        return self.about + (q - self.about) @ self.turn.T + self.offset
+        return self.axis_point + (q - self.axis_point) @ self.rotation.T + self.offset
 
-    def back(self, x: Wide) -> Wide:
+    def inverse_transform(self, x: ExtendedArray) -> ExtendedArray:
         """Transform points at x (m, 3) [m] to their declared positions."""
-        return self.about + (x - self.offset - self.about) @ self.turn
+        return self.axis_point + (x - self.offset - self.axis_point) @ self.rotation
 
 
-_STILL = Place(wide(np.eye(3)), wide(np.zeros(3)), wide(np.zeros(3)))
+_IDENTITY = RigidPlacement(to_extended(np.eye(3)), to_extended(np.zeros(3)), to_extended(np.zeros(3)))
 
 
-def place(motion: Any, time: float) -> Place:
+def place_at(motion: Any, time: float) -> RigidPlacement:
     """Evaluate a motion (None: none) at a time [s]."""
     if motion is None:
-        return _STILL
-    times = wide([key.time for key in motion.keys])
-    values = wide([(*key.offset, key.turn) for key in motion.keys])
-    *offset, turn = _between(times, values, min(max(wide(time), times[0]), times[-1]), motion.between)
-    k, angle = wide(motion.axis), np.remainder(turn, 360) * _PI / 180
+        return _IDENTITY
+    times = to_extended([key.time for key in motion.keys])
+    values = to_extended([(*key.offset, key.turn) for key in motion.keys])
+    *offset, turn = _interpolate_keys(times, values, min(max(to_extended(time), times[0]), times[-1]), motion.between)
+    k, angle = to_extended(motion.axis), np.remainder(turn, 360) * _PI / 180
     k = k / np.sqrt(k @ k)
     cos, sin = np.cos(angle), np.sin(angle)
     columns = [e * cos + np.cross(k, e) * sin + k * (k @ e) * (1 - cos) for e in np.eye(3)]
-    return Place(np.stack(columns, axis=1), wide(motion.about), wide(offset))
+    return RigidPlacement(np.stack(columns, axis=1), to_extended(motion.about), to_extended(offset))
 
 
-def speed(motion: Any, q: Wide, time: float) -> Wide:
+def velocity_at(motion: Any, q: ExtendedArray, time: float) -> ExtendedArray:
     """Return the velocity (3,) [m/s] of a point; right-sided at a key.
 
     Args:
@@ -65,23 +65,23 @@ def speed(motion: Any, q: Wide, time: float) -> Wide:
       q: declared point (3,) [m].
       time: time [s].
     """
-    times = wide([key.time for key in motion.keys]) if motion else wide([0])
+    times = to_extended([key.time for key in motion.keys]) if motion else to_extended([0])
     if len(times) == 1 or not times[0] <= time < times[-1]:
-        return wide([0, 0, 0])
-    values, t = wide([(*key.offset, key.turn) for key in motion.keys]), wide(time)
+        return to_extended([0, 0, 0])
+    values, t = to_extended([(*key.offset, key.turn) for key in motion.keys]), to_extended(time)
     k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
     h = times[k + 1] - times[k]
     steep = (values[k + 1] - values[k]) / h
     if motion.between == "smooth":
         s = (t - times[k]) / h
-        a, b = (np.array([_slope(times, column, j) for column in values.T]) for j in (k, k + 1))
+        a, b = (np.array([_cubic_slope(times, column, j) for column in values.T]) for j in (k, k + 1))
         steep = 6 * s * (1 - s) * steep + a * (1 - s) * (1 - 3 * s) + b * s * (3 * s - 2)
-    axis = wide(motion.axis)
-    arm = place(motion, time).turn @ (q - wide(motion.about))
+    axis = to_extended(motion.axis)
+    arm = place_at(motion, time).rotation @ (q - to_extended(motion.about))
     return steep[:3] + steep[3] * _PI / 180 * np.cross(axis / np.sqrt(axis @ axis), arm)
 
 
-def blur(motion: Any, size: float, time: float) -> float:
+def bound_roundoff(motion: Any, size: float, time: float) -> float:
     """Bound the round-off [m] of moved points.
 
     Args:
@@ -100,7 +100,7 @@ def blur(motion: Any, size: float, time: float) -> float:
     return EPS * (far + max(time, *times) * (steep[:3].max() + arm * steep[3]))
 
 
-def _between(times: Wide, values: Wide, t: Any, how: str) -> Wide:
+def _interpolate_keys(times: ExtendedArray, values: ExtendedArray, t: Any, how: str) -> ExtendedArray:
     """Interpolate offset [m] and rotation angle [degrees] at t, (4,)."""
     if len(times) == 1:
         return values[0]
@@ -109,12 +109,12 @@ def _between(times: Wide, values: Wide, t: Any, how: str) -> Wide:
     s = (t - times[k]) / h
     if how == "linear":
         return values[k] + s * (values[k + 1] - values[k])
-    a, b = (np.array([_slope(times, column, j) for column in values.T]) * h for j in (k, k + 1))
+    a, b = (np.array([_cubic_slope(times, column, j) for column in values.T]) * h for j in (k, k + 1))
     ease = s * s * (3 - 2 * s)
     return values[k] * (1 - ease) + values[k + 1] * ease + a * s * (1 - s) ** 2 - b * s * s * (1 - s)
 
 
-def _slope(times: Wide, y: Wide, j: int) -> Any:
+def _cubic_slope(times: ExtendedArray, y: ExtendedArray, j: int) -> Any:
     """Return the cubics' slope at key j: a weighted harmonic mean, zero at an extremum."""
     h, last = np.diff(times), len(times) - 1
     rise = np.diff(y) / h

@@ -13,16 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from harness.scenes.effects.base import Contribution, Pin
+from harness.scenes.effects.base import EffectContribution, PinGroup
 from harness.simulation.opinion import vertices
-from harness.simulation.opinion.declared import Array, Opinion
-from harness.simulation.opinion.derivatives import EPS, ROUNDINGS, Told, wide
-from solvers.problem import Energy, ProjectiveEnergy, Start, is_lagged
+from harness.simulation.opinion.declared import Array, EffectTerms
+from harness.simulation.opinion.derivatives import EPS, ROUNDOFF_MULTIPLE, DirectionalDerivatives, to_extended
+from solvers.problem import Energy, ProjectiveEnergy, StepStart, is_lagged
 
-_TINY = 1e-100
+_COMPLEX_STEP = 1e-100
 
 
-def from_outside(bound: Contribution) -> Opinion:
+def build_external_effect(bound: EffectContribution) -> EffectTerms:
     """Build the terms of an effect from its own forces, filters and pins."""
 
     def force(p: Array, v: Array, t: float) -> tuple[Array, float]:
@@ -30,19 +30,23 @@ def from_outside(bound: Contribution) -> Opinion:
         return sum(parts, np.zeros_like(p)), sum(float(np.abs(part).max()) for part in parts)
 
     def decay(v: Array) -> Array:
-        for one in bound.filters:
+        for one in bound.velocity_filters:
             v = one(v)
         return v
 
-    held = {i: vertices.pin(pin.weight, pin.motion, q) for pin in bound.pins for i, q in _each(pin)}
-    return Opinion(force=force if bound.forces else None, decay=decay if bound.filters else None, pins=held)
+    held = {i: vertices.build_pin(pin.weight, pin.motion, q) for pin in bound.pins for i, q in _list_pins(pin)}
+    return EffectTerms(
+        evaluate_force=force if bound.forces else None,
+        filter_velocity=decay if bound.velocity_filters else None,
+        pinned_vertices=held,
+    )
 
 
-def _each(pin: Pin) -> list[tuple[int, Any]]:
-    return list(zip(pin.vertices.tolist(), wide(pin.targets), strict=True))
+def _list_pins(pin: PinGroup) -> list[tuple[int, Any]]:
+    return list(zip(pin.vertices.tolist(), to_extended(pin.targets), strict=True))
 
 
-def resistance(energies: Sequence[Energy], n: int, time_step: float) -> Array:
+def sum_diagonals(energies: Sequence[Energy], n: int, time_step: float) -> Array:
     """Sum the energies' shares of the diagonal of Q (n,) [N/m].
 
     Args:
@@ -51,7 +55,7 @@ def resistance(energies: Sequence[Energy], n: int, time_step: float) -> Array:
       time_step: step size dt [s]; the shares are those at the rate 1/dt.
     """
     zero, total = np.zeros((n, 3)), np.zeros(n)
-    start = Start(zero, zero, 0.0, zero, 1.0 / time_step, 0.0)
+    start = StepStart(zero, zero, 0.0, zero, 1.0 / time_step, 0.0)
     for energy in energies:
         begun = energy.begin_step(start) if is_lagged(energy) else energy
         if isinstance(begun, ProjectiveEnergy):
@@ -59,7 +63,9 @@ def resistance(energies: Sequence[Energy], n: int, time_step: float) -> Array:
     return total
 
 
-def own_slope(own: Sequence[Energy], x: Array, d: Array, reach: float, shortest: float) -> tuple[Told, float | None]:
+def check_own_gradient(
+    own: Sequence[Energy], x: Array, d: Array, reach: float, shortest: float
+) -> tuple[DirectionalDerivatives, float | None]:
     """Compare the gradients of energies along d with derivatives of their own values.
 
     Args:
@@ -78,30 +84,30 @@ def own_slope(own: Sequence[Energy], x: Array, d: Array, reach: float, shortest:
         energy.add_gradient(x, gradient)
         value, slope = float(energy.value(x)), float((gradient * d).sum())
         size = float(np.abs(gradient * d).sum())
-        if not (_by_complex_steps(energy, x, d, slope, size, reach / shortest) or not np.isfinite(value)):
-            found, room = _by_differences(energy, x, d, 1e-4 * shortest, reach)
-            if not abs(found - slope) <= room + ROUNDINGS * EPS * (1.0 + reach / shortest) * size:
+        if not (_matches_complex_step(energy, x, d, slope, size, reach / shortest) or not np.isfinite(value)):
+            found, room = _difference_derivative(energy, x, d, 1e-4 * shortest, reach)
+            if not abs(found - slope) <= room + ROUNDOFF_MULTIPLE * EPS * (1.0 + reach / shortest) * size:
                 wrong = max(wrong or 0.0, abs(found - slope) / max(abs(found), size, np.finfo(float).tiny))
         values.append(value)
         slopes.append(slope)
-    rounded = ROUNDINGS * EPS
+    rounded = ROUNDOFF_MULTIPLE * EPS
     room = rounded * sum(map(abs, values)), rounded * sum(map(abs, slopes)), 0.0
-    return Told(sum(values), sum(slopes), 0.0, room), wrong
+    return DirectionalDerivatives(sum(values), sum(slopes), 0.0, room), wrong
 
 
-def _by_complex_steps(energy: Any, x: Array, d: Array, slope: float, size: float, far: float) -> bool:
+def _matches_complex_step(energy: Any, x: Array, d: Array, slope: float, size: float, far: float) -> bool:
     """Return whether the derivative of the energy's value by a complex step equals the slope."""
     try:
         with warnings.catch_warnings(action="error", category=np.exceptions.ComplexWarning):
-            found = complex(energy.value(x + 1j * _TINY * d)).imag / _TINY
+            found = complex(energy.value(x + 1j * _COMPLEX_STEP * d)).imag / _COMPLEX_STEP
     except Exception:  # it is made for real numbers, and may say so in any way
         return False
-    return bool(abs(found - slope) <= ROUNDINGS * EPS * (1.0 + far) * size)
+    return bool(abs(found - slope) <= ROUNDOFF_MULTIPLE * EPS * (1.0 + far) * size)
 
 
-def _by_differences(energy: Any, x: Array, d: Array, h: float, reach: float) -> tuple[float, float]:
+def _difference_derivative(energy: Any, x: Array, d: Array, h: float, reach: float) -> tuple[float, float]:
     """Return the derivative by Richardson-extrapolated central differences of step h [m], and its error bound."""
     values = [float(energy.value(x + s * h * d)) for s in (-1.0, -0.5, 0.5, 1.0)]
     rough, fine = (values[3] - values[0]) / (2 * h), (values[2] - values[1]) / h
-    room = abs(rough - fine) + ROUNDINGS * EPS * (max(map(abs, values)) / h + reach / h * abs(fine))
+    room = abs(rough - fine) + ROUNDOFF_MULTIPLE * EPS * (max(map(abs, values)) / h + reach / h * abs(fine))
     return (4 * fine - rough) / 3, room

@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 
 from harness.scenes.bind import Scene
-from harness.simulation.opinion.contact import nearest, radius
-from harness.simulation.opinion.declared import Array, Declared
-from harness.simulation.opinion.derivatives import wide
-from harness.simulation.opinion.motion import place
-from harness.simulation.opinion.self_contact import gathered
-from harness.simulation.opinion.surface_contact import against, met
-from harness.simulation.step import State, start
+from harness.simulation.opinion.contact import find_nearest, obstacle_radius
+from harness.simulation.opinion.declared import Array, SceneDeclaration
+from harness.simulation.opinion.derivatives import to_extended
+from harness.simulation.opinion.motion import place_at
+from harness.simulation.opinion.self_contact import contract_to_contact
+from harness.simulation.opinion.surface_contact import build_obstacle_pairs, sample_contact_positions
+from harness.simulation.step import MotionState, build_initial_state
 
-POINTS = 20
-FRACTIONS = (1e-3, 1e-2, 0.1, 0.5)
+NUM_POINTS = 20
+SPACING_FRACTIONS = (1e-3, 1e-2, 0.1, 0.5)
 """Deviations relative to the mesh spacing."""
 
 
@@ -37,12 +37,12 @@ class SamplePoint:
       direction: direction of derivatives (n, 3).
     """
 
-    state: State
+    state: MotionState
     shift: Array
     direction: Array
 
 
-def points(scene: Scene, declared: Declared, frames: int) -> Iterator[SamplePoint]:
+def sample_points(scene: Scene, declared: SceneDeclaration, frames: int) -> Iterator[SamplePoint]:
     """Sample the points of a scene, with a fixed seed.
 
     Steps are any of the scene's frames, and every fifth is the first.
@@ -52,41 +52,50 @@ def points(scene: Scene, declared: Declared, frames: int) -> Iterator[SamplePoin
       declared: its declaration.
       frames: number of frames.
     """
-    rng, rest = np.random.default_rng(0), scene.mesh.rest
-    begun = start(scene).now
-    touching = [(effect, one) for effect in declared.of_kind("contact") for one in effect.obstacles]
-    apart = declared.of_kind("self-contact")
-    beside = [(effect, one) for effect in declared.of_kind("surface-contact") for one in against(effect, declared)]
+    rng, rest = np.random.default_rng(0), scene.mesh.rest_positions
+    begun = build_initial_state(scene).motion
+    touching = [(effect, one) for effect in declared.select_effects("contact") for one in effect.obstacles]
+    apart = declared.select_effects("self-contact")
+    beside = [
+        (effect, one)
+        for effect in declared.select_effects("surface-contact")
+        for one in build_obstacle_pairs(effect, declared)
+    ]
     # Where there are obstacles, the displacement by forces in a step is limited
     # (`margin` of `solvers.contact.half_space.half_space_potential`).
-    limit = 0.05 * scene.mesh.size if touching else np.inf
-    for k in range(POINTS):
+    limit = 0.05 * scene.mesh.bounding_box_diagonal if touching else np.inf
+    for k in range(NUM_POINTS):
         index = 0 if k % 5 == 0 else int(rng.integers(1, max(2, frames)))
-        of = scene.at(index)
-        dt, some = of.system.time_step, FRACTIONS[k % len(FRACTIONS)] * scene.mesh.spacing
-        p = (begun.positions if k // len(FRACTIONS) % 2 == 0 else rest) + some * rng.normal(size=rest.shape)
+        of = scene.scene_of_step(index)
+        dt, some = of.system.time_step, SPACING_FRACTIONS[k % len(SPACING_FRACTIONS)] * scene.mesh.spacing
+        p = (begun.positions if k // len(SPACING_FRACTIONS) % 2 == 0 else rest) + some * rng.normal(size=rest.shape)
         if apart:
-            p = gathered(apart[0], declared, p)
+            p = contract_to_contact(apart[0], declared, p)
         v = begun.velocity + some / dt * rng.normal(size=rest.shape)
         if touching:
             effect, one = touching[k % len(touching)]
-            p = _brought(effect, one, p, scene.time(index), rng)
+            p = _move_to_obstacle(effect, one, p, scene.compute_time(index), rng)
         if beside:  # where the obstacle is at the step's start; of four points, it takes the mesh along at two
-            times = scene.time(index), scene.time(index) + dt
-            p, end = met(beside, k, p, scene.mesh.spacing, times, rng)
+            times = scene.compute_time(index), scene.compute_time(index) + dt
+            p, end = sample_contact_positions(beside, k, p, scene.mesh.spacing, times, rng)
             v = v + (k // 2 % 2) * (end - p) / dt
         before = p - dt * v + some * rng.normal(size=rest.shape), v + some / dt * rng.normal(size=rest.shape)
         shift = some * rng.normal(size=rest.shape)
         far = np.linalg.norm(shift, axis=1).max()
         shift *= min(1.0, limit / far) if far else 1.0
         yield SamplePoint(
-            State(type(begun)(p, v), type(begun)(*before) if index else None, index, led(k, some / dt**2, rest)),
+            MotionState(
+                type(begun)(p, v),
+                type(begun)(*before) if index else None,
+                index,
+                random_acceleration(k, some / dt**2, rest),
+            ),
             shift,
             rng.normal(size=rest.shape),
         )
 
 
-def led(k: int, size: float, rest: Array) -> Array:
+def random_acceleration(k: int, size: float, rest: Array) -> Array:
     """Return the random acceleration (n, 3) [m/s^2] of point k.
 
     Args:
@@ -97,10 +106,10 @@ def led(k: int, size: float, rest: Array) -> Array:
     return size * np.random.default_rng(k).normal(size=rest.shape)
 
 
-def _brought(effect: Any, one: Any, p: Array, time: float, rng: np.random.Generator) -> Array:
+def _move_to_obstacle(effect: Any, one: Any, p: Array, time: float, rng: np.random.Generator) -> Array:
     """Translate positions (n, 3) [m] so that a random vertex is within the contact thickness."""
-    at = place(one.motion, time)
+    at = place_at(one.motion, time)
     which = int(rng.integers(len(p)))
-    far, _, out = nearest(one, at.back(wide(p[which : which + 1])))
-    wanted = radius(one) + effect.thickness * rng.uniform()
-    return p + np.asarray((wanted - far[0]) * (out @ at.turn.T)[0], float)
+    far, _, out = find_nearest(one, at.inverse_transform(to_extended(p[which : which + 1])))
+    wanted = obstacle_radius(one) + effect.thickness * rng.uniform()
+    return p + np.asarray((wanted - far[0]) * (out @ at.rotation.T)[0], float)

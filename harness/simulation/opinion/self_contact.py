@@ -25,57 +25,59 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from harness.simulation.opinion.declared import Array, Begin, Declared, Moment, Opinion
-from harness.simulation.opinion.derivatives import Values, Wide, length, wide
+from harness.simulation.opinion.declared import Array, BeginFunction, EffectTerms, SceneDeclaration, StepMoment
+from harness.simulation.opinion.derivatives import ExtendedArray, ValueFunction, row_norms, to_extended
 
-Indices = NDArray[np.int64]
-Grip = tuple[Indices, Wide, Wide, Wide, Wide]
-_SIDES = ((1, 2), (1, 3), (2, 3))
+IndexArray = NDArray[np.int64]
+FrictionPairs = tuple[IndexArray, ExtendedArray, ExtendedArray, ExtendedArray, ExtendedArray]
+_TRIANGLE_SIDES = ((1, 2), (1, 3), (2, 3))
 
 
-def self_contact(effect: Any, declared: Declared) -> Opinion:
+def build_self_contact_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build the barrier of all pairs without a common vertex."""
-    return barriers(effect, [Touching(declared)])
+    return build_barriers(effect, [ContactPairs(declared)])
 
 
-def barriers(effect: Any, parts: Sequence[Touching]) -> Opinion:
+def build_barriers(effect: Any, parts: Sequence[ContactPairs]) -> EffectTerms:
     """Build the barriers of an effect for all pairs of its parts, and their friction."""
     t, r = effect.thickness, effect.thickness if effect.range is None else effect.range
 
-    def needs(resists: Array) -> Begin:
+    def needs(resists: Array) -> BeginFunction:
         k = np.full(len(resists), effect.stiffness) if effect.stiffness else 0.1 * np.asarray(resists, float)
 
-        def begin(moment: Moment) -> Values:
-            found, slip = list[Values](), effect.creep * (moment.until - moment.time)
+        def begin(moment: StepMoment) -> ValueFunction:
+            found, slip = list[ValueFunction](), effect.creep * (moment.stage_time - moment.time)
             for part in parts:
-                found.append(part.values(t, r, k, moment.until))
+                found.append(part.build_barrier_energy(t, r, k, moment.stage_time))
                 if effect.friction:
-                    begun = at = part.whole(moment.p, moment.time)
-                    if moment.pressed is not None:
-                        at = part.whole(moment.pressed, moment.until)
-                    grips = [part.grip(at, begun, t, r, k, edges) for edges in (False, True)]
-                    found += [part.rubs(effect.friction, grip, slip, moment.until) for grip in grips]
+                    begun = at = part.all_positions(moment.p, moment.time)
+                    if moment.normal_force_positions is not None:
+                        at = part.all_positions(moment.normal_force_positions, moment.stage_time)
+                    grips = [part.find_friction_pairs(at, begun, t, r, k, edges) for edges in (False, True)]
+                    found += [
+                        part.build_friction_energy(effect.friction, grip, slip, moment.stage_time) for grip in grips
+                    ]
             return lambda x: np.concatenate([values(x) for values in found])
 
         return begin
 
-    return Opinion(needs=needs, shortest=r)
+    return EffectTerms(build_from_diagonal=needs, min_length=r)
 
 
-class Touching:
+class ContactPairs:
     """Points, edges and triangles of a mesh.
 
     `rest_positions` (n, 3) [m] are those from which rest lengths are computed.
     """
 
-    def __init__(self, declared: Declared) -> None:
+    def __init__(self, declared: SceneDeclaration) -> None:
         mesh = declared.mesh
-        self.rest: Array = np.asarray(mesh.rest, float)
+        self.rest_positions: Array = np.asarray(mesh.rest_positions, float)
         covered = set(mesh.triangles.ravel().tolist())
         found = {tuple(sorted(pair)) for t in mesh.triangles.tolist() for pair in combinations(t, 2)}
         ropes = {
             (min(i, j), max(i, j))
-            for i, j in mesh.springs[mesh.families["stretch"]].tolist()
+            for i, j in mesh.springs[mesh.spring_families["stretch"]].tolist()
             if i != j and not (i in covered and j in covered)
         }
         found |= ropes
@@ -84,7 +86,7 @@ class Touching:
         self.edges = np.array(sorted(found), int).reshape(-1, 2)
         self.points = np.unique(np.append(self.edges, self.triangles))[:, None]
 
-    def whole(self, x: Wide, time: float) -> Wide:
+    def all_positions(self, x: ExtendedArray, time: float) -> ExtendedArray:
         """Return the positions of all vertices of pairs, those of the mesh first.
 
         Args:
@@ -93,20 +95,22 @@ class Touching:
         """
         return x
 
-    def near(self, x: Array, reach: float) -> tuple[Indices, Indices]:
+    def find_near_pairs(self, x: Array, reach: float) -> tuple[IndexArray, IndexArray]:
         """Find point-triangle and edge-edge pairs, (k, 4) each, closer than `reach` [m]."""
-        return near(x, self.points, self.triangles, reach), near(x, self.edges, self.edges, reach)
+        return find_near_primitives(x, self.points, self.triangles, reach), find_near_primitives(
+            x, self.edges, self.edges, reach
+        )
 
-    def apart(self, rows: Indices, edges: bool) -> Wide:
+    def rest_distance(self, rows: IndexArray, edges: bool) -> ExtendedArray:
         """Return the distances of pairs at rest (k,) [m]."""
-        return length(_between(rows, wide(self.rest), edges))
+        return row_norms(_distance_vectors(rows, to_extended(self.rest_positions), edges))
 
-    def nearest(self, x: Array, reach: float) -> float:
+    def min_distance(self, x: Array, reach: float) -> float:
         """Return the minimum distance of pairs at x (N, 3) [m], at most `reach`."""
-        least = [length(_between(rows, x, k == 1)) for k, rows in enumerate(self.near(x, reach))]
+        least = [row_norms(_distance_vectors(rows, x, k == 1)) for k, rows in enumerate(self.find_near_pairs(x, reach))]
         return float(np.concatenate(least).min(initial=reach))
 
-    def values(self, t: float, r: float, k: Array, time: float) -> Values:
+    def build_barrier_energy(self, t: float, r: float, k: Array, time: float) -> ValueFunction:
         """Build the barrier energies [J] at a time [s].
 
         Args:
@@ -116,38 +120,42 @@ class Touching:
           time: time [s].
         """
 
-        def of(x: Wide) -> Wide:
-            x = self.whole(x, time)
+        def of(x: ExtendedArray) -> ExtendedArray:
+            x = self.all_positions(x, time)
             real = np.asarray(np.real(x), float)
             if not np.isfinite(real).all():
-                return wide([np.inf])
+                return to_extended([np.inf])
             parts = [
-                self._pairs(rows, x, t, r, k, edges)
-                for rows, edges in zip(self.near(real, t + r), (False, True), strict=True)
+                self._pair_energies(rows, x, t, r, k, edges)
+                for rows, edges in zip(self.find_near_pairs(real, t + r), (False, True), strict=True)
             ]
             return np.concatenate(parts)
 
         return of
 
-    def _pairs(self, rows: Indices, x: Wide, t: float, r: float, k: Array, edges: bool) -> Wide:
-        d = length(_between(rows, x, edges))
-        scale, m, stiff = self._of(rows, x, t, r, k, edges)
+    def _pair_energies(
+        self, rows: IndexArray, x: ExtendedArray, t: float, r: float, k: Array, edges: bool
+    ) -> ExtendedArray:
+        d = row_norms(_distance_vectors(rows, x, edges))
+        scale, m, stiff = self._pair_parameters(rows, x, t, r, k, edges)
         at = (d / scale - t) / r
         feels, closed = at.real < 1, at.real <= 0
         b = -((1 - at) ** 2) * np.log(np.where(closed, 1, at))
         return np.where(closed, np.inf, m * np.where(feels, stiff * (scale * r) ** 2 * b, 0))
 
-    def _of(self, rows: Indices, x: Wide, t: float, r: float, k: Array, edges: bool) -> tuple[Wide, Wide, Wide]:
+    def _pair_parameters(
+        self, rows: IndexArray, x: ExtendedArray, t: float, r: float, k: Array, edges: bool
+    ) -> tuple[ExtendedArray, ExtendedArray, ExtendedArray]:
         """Return the scale of t and r, the mollifier and the stiffness [N/m]."""
-        share = self.apart(rows, edges) / (wide(t) + wide(r))
-        scale, m = np.where(share < 1, (1 - wide(1e-12)) * share, 1), wide(np.ones(len(rows)))
+        share = self.rest_distance(rows, edges) / (to_extended(t) + to_extended(r))
+        scale, m = np.where(share < 1, (1 - to_extended(1e-12)) * share, 1), to_extended(np.ones(len(rows)))
         if edges:
-            c, e = _crossed(rows, x), _sides(rows, wide(self.rest)) / 1000
+            c, e = _cross_squarednorm(rows, x), _side_product(rows, to_extended(self.rest_positions)) / 1000
             m = np.where(np.real(c) < e, (2 - c / e) * (c / e), 1)
         own = rows < len(k)
-        return scale, m, wide(np.where(own, k[np.where(own, rows, 0)], 0).sum(axis=1)) / own.sum(axis=1)
+        return scale, m, to_extended(np.where(own, k[np.where(own, rows, 0)], 0).sum(axis=1)) / own.sum(axis=1)
 
-    def rubs(self, friction: float, grip: Grip, slip: float, time: float) -> Values:
+    def build_friction_energy(self, friction: float, grip: FrictionPairs, slip: float, time: float) -> ValueFunction:
         """Build the friction potential [J] of pairs.
 
         Args:
@@ -156,9 +164,11 @@ class Touching:
           slip: s [m].
           time: time [s].
         """
-        return lambda x: friction * rubbed(self.whole(x, time), *grip, slip)
+        return lambda x: friction * friction_potential(self.all_positions(x, time), *grip, slip)
 
-    def grip(self, p: Wide, begun: Wide, t: float, r: float, k: Array, edges: bool) -> Grip:
+    def find_friction_pairs(
+        self, p: ExtendedArray, begun: ExtendedArray, t: float, r: float, k: Array, edges: bool
+    ) -> FrictionPairs:
         """Find the friction data of pairs within range at p (N, 3) [m].
 
         Args:
@@ -171,17 +181,17 @@ class Touching:
 
         Returns: rows (g, 4), c (g, 4), n (g, 3), z^t (g, 3) [m], and the force (g,) [N].
         """
-        rows = self.near(np.asarray(p, float), t + r)[int(edges)]
-        z, four = _between(rows, p, edges), np.arange(4 * len(rows)).reshape(-1, 4)
-        d = length(z)
-        n: Wide = z / d[:, None]
-        weights: list[Wide] = []
+        rows = self.find_near_pairs(np.asarray(p, float), t + r)[int(edges)]
+        z, four = _distance_vectors(rows, p, edges), np.arange(4 * len(rows)).reshape(-1, 4)
+        d = row_norms(z)
+        n: ExtendedArray = z / d[:, None]
+        weights: list[ExtendedArray] = []
         for i in range(4):
             same = rows == rows[:, i : i + 1]  # a rope's edge names a vertex twice, bumped once in both
             bumped = p[rows] + 1e-100j * same[:, :, None] * n[:, None, :]
-            slope = np.imag(length(_between(four, bumped.reshape(-1, 3), edges))) / np.longdouble(1e-100)
+            slope = np.imag(row_norms(_distance_vectors(four, bumped.reshape(-1, 3), edges))) / np.longdouble(1e-100)
             weights.append(np.where(same[:, :i].any(axis=1), 0, slope))
-        scale, m, stiff = self._of(rows, p, t, r, k, edges)
+        scale, m, stiff = self._pair_parameters(rows, p, t, r, k, edges)
         at = (d / scale - t) / r
         inside = (at > 0) & (at < 1)
         at = np.where(inside, at, 1)
@@ -190,7 +200,7 @@ class Touching:
         return rows, c, n, (c[:, :, None] * begun[rows]).sum(axis=1), np.where(inside, force, 0)
 
 
-def near(x: Array, one: Indices, two: Indices, reach: float) -> Indices:
+def find_near_primitives(x: Array, one: IndexArray, two: IndexArray, radius: float) -> IndexArray:
     """Find pairs of primitives that share no vertex and are closer than a distance.
 
     Args:
@@ -206,17 +216,25 @@ def near(x: Array, one: Indices, two: Indices, reach: float) -> Indices:
     middles = [x[part].mean(axis=1) for part in (one, two)]
     radii = [np.linalg.norm(x[part] - at[:, None], axis=2).max() for part, at in zip((one, two), middles, strict=True)]
     tree: Any = cKDTree(middles[1])
-    lists: list[list[int]] = tree.query_ball_point(middles[0], (reach + sum(radii)) * (1 + 1e-9)).tolist()
+    lists: list[list[int]] = tree.query_ball_point(middles[0], (radius + sum(radii)) * (1 + 1e-9)).tolist()
     i = np.repeat(np.arange(len(one)), [len(found) for found in lists])
     j = np.array([j for found in lists for j in sorted(found)], int)
     apart = (one[i][:, :, None] != two[j][:, None, :]).all(axis=(1, 2))
     apart &= (i < j) | (one is not two)
     rows = np.concatenate([one[i[apart]], two[j[apart]]], axis=1)
-    far = length(_between(rows, x, one.shape[1] == 2))
-    return rows[far < reach]
+    far = row_norms(_distance_vectors(rows, x, one.shape[1] == 2))
+    return rows[far < radius]
 
 
-def rubbed(x: Wide, rows: Indices, weights: Wide, n: Wide, anchor: Wide, force: Wide, slip: float) -> Wide:
+def friction_potential(
+    x: ExtendedArray,
+    rows: IndexArray,
+    weights: ExtendedArray,
+    n: ExtendedArray,
+    anchor: ExtendedArray,
+    force: ExtendedArray,
+    slip: float,
+) -> ExtendedArray:
     """Compute the friction potential (g,) [J] of pairs, without the factor mu.
 
     Args:
@@ -234,24 +252,29 @@ def rubbed(x: Wide, rows: Indices, weights: Wide, n: Wide, anchor: Wide, force: 
     sticks = square.real < slip**2
     held = np.where(sticks, square, slip**2)
     rounded = held / slip - held * np.sqrt(np.where(held == 0, 1, held)) / (3 * slip**2)
-    return force * np.where(sticks, rounded, np.sqrt(np.where(sticks, 1, square)) - wide(slip) / 3)
+    return force * np.where(sticks, rounded, np.sqrt(np.where(sticks, 1, square)) - to_extended(slip) / 3)
 
 
-def _between(rows: Indices, x: Wide, edges: bool) -> Wide:
+def _distance_vectors(rows: IndexArray, x: ExtendedArray, edges: bool) -> ExtendedArray:
     """Compute the vectors (k, 3) between nearest points, selected by real parts."""
     a, b, c, d = (x[rows[:, i]] for i in range(4))
-    found = [_inside(a, b, c, d, edges)]
+    found = [_interior_distance(a, b, c, d, edges)]
     if edges:
-        found += [_to_side(a, c, d), _to_side(b, c, d), -_to_side(c, a, b), -_to_side(d, a, b)]
+        found += [
+            _point_to_segment(a, c, d),
+            _point_to_segment(b, c, d),
+            -_point_to_segment(c, a, b),
+            -_point_to_segment(d, a, b),
+        ]
     else:
         corners = (a, b, c, d)
-        found += [_to_side(a, corners[i], corners[j]) for i, j in _SIDES]
+        found += [_point_to_segment(a, corners[i], corners[j]) for i, j in _TRIANGLE_SIDES]
     all_ = np.stack(found)
     best = np.argmin((np.real(all_) ** 2).sum(axis=2), axis=0)
     return all_[best, np.arange(len(rows))]
 
 
-def _to_side(p: Wide, a: Wide, b: Wide) -> Wide:
+def _point_to_segment(p: ExtendedArray, a: ExtendedArray, b: ExtendedArray) -> ExtendedArray:
     """Compute the vector from the nearest point of the segment a b to p."""
     along, away = b - a, p - a
     square = (along * along).sum(axis=1)
@@ -260,7 +283,9 @@ def _to_side(p: Wide, a: Wide, b: Wide) -> Wide:
     return away - at[:, None] * along
 
 
-def _inside(a: Wide, b: Wide, c: Wide, d: Wide, edges: bool) -> Wide:
+def _interior_distance(
+    a: ExtendedArray, b: ExtendedArray, c: ExtendedArray, d: ExtendedArray, edges: bool
+) -> ExtendedArray:
     """Compute the vector between lines, or from a plane to a point.
 
     It is a large vector where the nearest points are not interior.
@@ -281,18 +306,18 @@ def _inside(a: Wide, b: Wide, c: Wide, d: Wide, edges: bool) -> Wide:
     return np.where(inside[:, None], z, 1e30)
 
 
-def _crossed(rows: Indices, x: Wide) -> Wide:
+def _cross_squarednorm(rows: IndexArray, x: ExtendedArray) -> ExtendedArray:
     a, b, c, d = (x[rows[:, i]] for i in range(4))
     u, v = b - a, d - c
     return (u * u).sum(axis=1) * (v * v).sum(axis=1) - (u * v).sum(axis=1) ** 2
 
 
-def _sides(rows: Indices, rest: Wide) -> Wide:
+def _side_product(rows: IndexArray, rest: ExtendedArray) -> ExtendedArray:
     a, b, c, d = (rest[rows[:, i]] for i in range(4))
     return ((b - a) ** 2).sum(axis=1) * ((d - c) ** 2).sum(axis=1)
 
 
-def gathered(effect: Any, declared: Declared, p: Array) -> Array:
+def contract_to_contact(effect: Any, declared: SceneDeclaration, p: Array) -> Array:
     """Contract positions until the nearest pairs are in mid-range.
 
     Args:
@@ -300,9 +325,9 @@ def gathered(effect: Any, declared: Declared, p: Array) -> Array:
       declared: declaration of the scene.
       p: positions (n, 3) [m].
     """
-    mesh, r = Touching(declared), effect.thickness if effect.range is None else effect.range
+    mesh, r = ContactPairs(declared), effect.thickness if effect.range is None else effect.range
     wanted = effect.thickness + r
     reach = max(wanted, 2.0 * declared.mesh.spacing)
-    nearest = mesh.nearest(p, reach)
+    nearest = mesh.min_distance(p, reach)
     share = (effect.thickness + 0.5 * r) / max(wanted, nearest)
     return p.mean(axis=0) + share * (p - p.mean(axis=0))

@@ -9,36 +9,36 @@ from typing import Any
 import numpy as np
 
 from harness.scenes.bind import Scene
-from harness.scenes.effects.effect_names import EFFECTS
+from harness.scenes.effects.effect_names import EFFECT_CLASSES
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.spec import SceneSpec
 from harness.simulation.opinion import contact, edges, forces, self_contact, surface_contact, surfaces, vertices
-from harness.simulation.opinion.declared import Array, Begin, Declared, Opinion
-from harness.simulation.opinion.outside import from_outside, resistance
+from harness.simulation.opinion.declared import Array, BeginFunction, EffectTerms, SceneDeclaration
+from harness.simulation.opinion.outside import build_external_effect, sum_diagonals
 
-_OPINIONS: dict[str, Callable[[Any, Declared], Opinion]] = {
-    "air-drag": vertices.air_drag,
-    "attachments": vertices.attachments,
-    "bending": surfaces.bending,
-    "constant-force": forces.constant_force,
-    "contact": contact.contact,
-    "dashpots": edges.dashpots,
-    "ether-drag": vertices.ether_drag,
-    "gas": surfaces.gas,
-    "gravity": forces.gravity,
-    "pins": vertices.pins,
-    "rayleigh": vertices.rayleigh,
-    "self-contact": self_contact.self_contact,
-    "sewing": edges.sewing,
-    "springs": edges.springs,
-    "strain-limits": edges.strain_limits,
-    "surface-contact": surface_contact.surface_contact,
-    "wind": forces.wind,
+_EFFECT_BUILDERS: dict[str, Callable[[Any, SceneDeclaration], EffectTerms]] = {
+    "air-drag": vertices.build_air_drag_terms,
+    "attachments": vertices.build_attachments_terms,
+    "bending": surfaces.build_bending_terms,
+    "constant-force": forces.build_constant_force_terms,
+    "contact": contact.build_contact_terms,
+    "dashpots": edges.build_dashpots_terms,
+    "ether-drag": vertices.build_ether_drag_terms,
+    "gas": surfaces.build_gas_terms,
+    "gravity": forces.build_gravity_terms,
+    "pins": vertices.build_pins_terms,
+    "rayleigh": vertices.build_rayleigh_terms,
+    "self-contact": self_contact.build_self_contact_terms,
+    "sewing": edges.build_sewing_terms,
+    "springs": edges.build_springs_terms,
+    "strain-limits": edges.build_strain_limits_terms,
+    "surface-contact": surface_contact.build_surface_contact_terms,
+    "wind": forces.build_wind_terms,
 }
 
 
 @dataclass(frozen=True, eq=False)
-class Side:
+class SceneTerms:
     """A scene with a fixed step size, and its reference terms.
 
     Attributes:
@@ -49,60 +49,65 @@ class Side:
       external_effects: effects without a reference implementation.
     """
 
-    declared: Declared
-    opinions: list[Opinion]
-    begins: list[Begin | None]
-    owned: list[list[int]]
-    outside: set[int]
+    declaration: SceneDeclaration
+    effect_terms: list[EffectTerms]
+    energy_builders: list[BeginFunction | None]
+    energy_indices: list[list[int]]
+    external_effects: set[int]
 
-    def name(self, k: int) -> str:
+    def format_effect_name(self, k: int) -> str:
         """Return a description of effect k."""
-        return f"effects[{k}] {self.declared.effects[k].kind}"
+        return f"effects[{k}] {self.declaration.effects[k].kind}"
 
-    def shortest(self, k: int | None = None) -> float:
+    def min_length(self, k: int | None = None) -> float:
         """Return the smallest length [m] of effect k, or of springs at rest."""
-        lengths = self.declared.mesh.rest_lengths
-        springs = float(lengths[lengths > 0.0].min(initial=self.declared.mesh.spacing))
-        return springs if k is None else min(springs, self.opinions[k].shortest)
+        lengths = self.declaration.mesh.rest_lengths
+        springs = float(lengths[lengths > 0.0].min(initial=self.declaration.mesh.spacing))
+        return springs if k is None else min(springs, self.effect_terms[k].min_length)
 
 
-def side(spec: SceneSpec, scene: Scene) -> Side:
+def build_scene_terms(spec: SceneSpec, scene: Scene) -> SceneTerms:
     """Build the reference terms of a scene built from the specification."""
     mesh, dt = scene.mesh, spec.time_step
-    mass = _mass(spec, mesh)
-    declared = Declared(mesh, mass, dt, tuple(spec.effects), not getattr(scene.integrator, "splits", False))
+    mass = _compute_masses(spec, mesh)
+    declared = SceneDeclaration(mesh, mass, dt, tuple(spec.effects), not getattr(scene.integrator, "splits", False))
     bound = [effect.bind(mesh, mass, dt).by(scene.integrator) for effect in declared.effects]
     # The order is that of the scene's energies: those of each effect first, then those derived from all of them.
     first = [energy for part in bound for energy in part.energies]
     owners = [k for k, part in enumerate(bound) for _ in part.energies]
-    owners += [k for k, part in enumerate(bound) for derive in part.derived for _ in derive(first)]
+    owners += [k for k, part in enumerate(bound) for derive in part.derived_energies for _ in derive(first)]
     owned = [[i for i, owner in enumerate(owners) if owner == k] for k in range(len(bound))]
-    outside = {k for k, effect in enumerate(declared.effects) if not _known(effect)}
+    outside = {k for k, effect in enumerate(declared.effects) if not _is_shipped(effect)}
     if any(owned[k] for k in outside):  # nobody knows what damping by stiffness makes of their energies
         outside |= {k for k, one in enumerate(declared.effects) if one.kind == "rayleigh" and one.stiffness}
-    opinions = list[Opinion]()
+    opinions = list[EffectTerms]()
     resists: Array = mass / dt**2
     for k, (effect, part) in enumerate(zip(declared.effects, bound, strict=True)):
         if k in outside:
-            opinions.append(from_outside(part))
-            resists = resists + resistance(part.energies, len(mass), dt)
+            opinions.append(build_external_effect(part))
+            resists = resists + sum_diagonals(part.energies, len(mass), dt)
         else:
-            opinions.append(Opinion() if part.empty else _OPINIONS[effect.kind](effect, declared))
-            if (share := opinions[k].resists) is not None:
+            opinions.append(EffectTerms() if part.is_empty else _EFFECT_BUILDERS[effect.kind](effect, declared))
+            if (share := opinions[k].diagonal) is not None:
                 resists = resists + share
-    begins = [opinion.needs(resists) if opinion.needs else opinion.begin for opinion in opinions]
-    return Side(declared, opinions, begins, owned, outside)
+    begins = [
+        opinion.build_from_diagonal(resists) if opinion.build_from_diagonal else opinion.build_energy
+        for opinion in opinions
+    ]
+    return SceneTerms(declared, opinions, begins, owned, outside)
 
 
-def _mass(spec: SceneSpec, mesh: Mesh) -> Array:
+def _compute_masses(spec: SceneSpec, mesh: Mesh) -> Array:
     """Compute the masses (n,) [kg]."""
     if spec.mass_per_area is not None:
-        area = sum(float(np.linalg.norm(np.cross(b - a, c - a))) / 2 for a, b, c in mesh.rest[mesh.triangles])
-        return spec.mass_per_area * area * mesh.shares
-    return np.asarray(mesh.mass if spec.mass is None else spec.mass * mesh.shares)
+        area = sum(float(np.linalg.norm(np.cross(b - a, c - a))) / 2 for a, b, c in mesh.rest_positions[mesh.triangles])
+        return spec.mass_per_area * area * mesh.mass_fractions
+    return np.asarray(mesh.mass if spec.mass is None else spec.mass * mesh.mass_fractions)
 
 
-def _known(effect: Any) -> bool:
+def _is_shipped(effect: Any) -> bool:
     """Return whether an effect is the shipped one of its kind."""
     kind: type = effect.__class__
-    return effect.kind in _OPINIONS and EFFECTS.get(effect.kind) == f"{kind.__module__}:{kind.__qualname__}"
+    return (
+        effect.kind in _EFFECT_BUILDERS and EFFECT_CLASSES.get(effect.kind) == f"{kind.__module__}:{kind.__qualname__}"
+    )

@@ -23,58 +23,58 @@ from typing import Any
 
 import numpy as np
 
-from harness.simulation.opinion.declared import Array, Declared, Moment, Opinion
-from harness.simulation.opinion.derivatives import Wide, wide
-from harness.simulation.opinion.steps import Motion, Stated, decayed, pushed
+from harness.simulation.opinion.declared import Array, EffectTerms, SceneDeclaration, StepMoment
+from harness.simulation.opinion.derivatives import ExtendedArray, to_extended
+from harness.simulation.opinion.steps import MotionArrays, ReferenceStep, filter_motion, sum_forces
 
-Answer = Callable[[float], Array]
+AnswerFunction = Callable[[float], Array]
 """Maps the time [s] of a stage to the solution (n, 3) [m] that the solver returns."""
 
-_HALF = np.sqrt(wide(0.5))
+_HALF = np.sqrt(to_extended(0.5))
 
 
-def _alexander() -> list[Any]:
-    g = wide(0.4358665215)
+def _build_alexander() -> list[Any]:
+    g = to_extended(0.4358665215)
     for _ in range(5):  # Newton's method
-        g -= (g**3 - 3 * g**2 + 1.5 * g - wide(1) / 6) / (3 * g**2 - 6 * g + 1.5)
+        g -= (g**3 - 3 * g**2 + 1.5 * g - to_extended(1) / 6) / (3 * g**2 - 6 * g + 1.5)
     c = (1 + g) / 2
     two = (0.5 - g - g * (1 - g)) / (c - g)  # b_1 + b_2 = 1 - g and b_1 g + b_2 c = 1/2 - g
     return [[g], [c - g, g], [1 - g - two, two, g]]
 
 
-def _tr_bdf2() -> list[Any]:
+def _build_tr_bdf2() -> list[Any]:
     d = 1 - _HALF
     return [[0], [d, d], [(1 - d) / 2, (1 - d) / 2, d]]
 
 
-def _esdirk3() -> list[Any]:
-    g = wide(1767732205903) / 4055673282236
-    third = [wide(2746238789719) / 10658868560708, -wide(640167445237) / 6845629431997, g]
-    last = [wide(1471266399579) / 7840856788654, -wide(4482444167858) / 7529755066697]
-    return [[0], [g, g], third, [*last, wide(11266239266428) / 11593286722821, g]]
+def _build_esdirk3() -> list[Any]:
+    g = to_extended(1767732205903) / 4055673282236
+    third = [to_extended(2746238789719) / 10658868560708, -to_extended(640167445237) / 6845629431997, g]
+    last = [to_extended(1471266399579) / 7840856788654, -to_extended(4482444167858) / 7529755066697]
+    return [[0], [g, g], third, [*last, to_extended(11266239266428) / 11593286722821, g]]
 
 
-def _quarters(*rows: list[Any]) -> list[Any]:
+def _append_quarters(*rows: list[Any]) -> list[Any]:
     """Return the rows with a quarter appended to each."""
-    return [[*row, wide(1) / 4] for row in rows]
+    return [[*row, to_extended(1) / 4] for row in rows]
 
 
-_W = wide
+_W = to_extended
 _TABLEAUX: dict[str, list[Any]] = {
     "sdirk-2": [[1 - _HALF], [_HALF, 1 - _HALF]],
-    "sdirk-3": _alexander(),
-    "sdirk-4": _quarters(
+    "sdirk-3": _build_alexander(),
+    "sdirk-4": _append_quarters(
         [],
         [_W(1) / 2],
         [_W(17) / 50, -_W(1) / 25],
         [_W(371) / 1360, -_W(137) / 2720, _W(15) / 544],
         [_W(25) / 24, -_W(49) / 48, _W(125) / 16, -_W(85) / 12],
     ),
-    "tr-bdf2": _tr_bdf2(),
-    "esdirk-3": _esdirk3(),
+    "tr-bdf2": _build_tr_bdf2(),
+    "esdirk-3": _build_esdirk3(),
     "esdirk-4": [
         [0],
-        *_quarters(
+        *_append_quarters(
             [_W(1) / 4],
             [_W(8611) / 62500, -_W(1743) / 31250],
             [_W(5012029) / 34652500, -_W(654441) / 2922500, _W(174375) / 388108],
@@ -86,46 +86,58 @@ _TABLEAUX: dict[str, list[Any]] = {
         ),
     ],
 }
-_ALPHAS = {"generalised-alpha": (wide(0), wide(1) / 3), "hht": (wide(0), wide(0.1)), "newmark": (wide(0), wide(0))}
+_ALPHA_PARAMETERS = {
+    "generalised-alpha": (to_extended(0), to_extended(1) / 3),
+    "hht": (to_extended(0), to_extended(0.1)),
+    "newmark": (to_extended(0), to_extended(0)),
+}
 """am and af; for a spectral radius of 1/2 they are (2/2 - 1)/(3/2) and (1/2)/(3/2)."""
 _ORDERS = {"sdirk-3": 3, "esdirk-3": 3, "sdirk-4": 4, "esdirk-4": 4}
-STAGED = (*_TABLEAUX, *_ALPHAS)
+STAGED_INTEGRATORS = (*_TABLEAUX, *_ALPHA_PARAMETERS)
 
 
 @dataclass(frozen=True, eq=False)
-class Steps:
+class StageAnswers:
     """Reference stages of a step, their solutions (n, 3) [m], and its end."""
 
-    stated: list[Stated]
+    reference_steps: list[ReferenceStep]
     answers: list[Array]
-    end: Motion
-    acceleration: Wide
+    end: MotionArrays
+    acceleration: ExtendedArray
 
 
-class _Step:
+class _StageRecorder:
     """One step from a motion and its acceleration (n, 3) [m/s^2] at a time [s]."""
 
     def __init__(
-        self, name: str, declared: Declared, opinions: Sequence[Opinion], now: Motion, time: float, answer: Answer
+        self,
+        name: str,
+        declared: SceneDeclaration,
+        opinions: Sequence[EffectTerms],
+        now: MotionArrays,
+        time: float,
+        answer: AnswerFunction,
     ) -> None:
         self.declared, self.opinions, self.answer, self.time = declared, opinions, answer, time
-        self.dt = wide(declared.time_step)
-        pinned = {i: pin for opinion in opinions for i, pin in opinion.pins.items()}
+        self.dt = to_extended(declared.time_step)
+        pinned = {i: pin for opinion in opinions for i, pin in opinion.pinned_vertices.items()}
         self.pins = sorted(pinned.items())
         self.exact = [(i, pin) for i, pin in self.pins if np.isinf(pin.weight)]
-        self.now = self.carried(decayed(now, opinions), time)
+        self.now = self.apply_exact_pins(filter_motion(now, opinions), time)
         self.lags = _ORDERS.get(name, 2) > 2
-        self.stated: list[Stated] = []
+        self.reference_steps: list[ReferenceStep] = []
         self.answers: list[Array] = []
 
-    def carried(self, motion: Motion, time: float) -> list[Wide]:
+    def apply_exact_pins(self, motion: MotionArrays, time: float) -> list[ExtendedArray]:
         """Return the motion with positions and velocities of exact pins at a time [s]."""
-        p, v = (wide(part).copy() for part in motion)
+        p, v = (to_extended(part).copy() for part in motion)
         for i, pin in self.exact:
-            p[i], v[i] = pin.place(time), pin.speed(time)
+            p[i], v[i] = pin.position(time), pin.velocity(time)
         return [p, v]
 
-    def state(self, c: Any, rate: Any, when: Any, target: Wide, origin: Wide, expected: Wide) -> tuple[Wide, Wide]:
+    def add_stage(
+        self, c: Any, rate: Any, when: Any, target: ExtendedArray, origin: ExtendedArray, expected: ExtendedArray
+    ) -> tuple[ExtendedArray, ExtendedArray]:
         """Record a stage; return its solution and velocity.
 
         Args:
@@ -138,43 +150,45 @@ class _Step:
         """
         until = self.time + float(when) * self.declared.time_step
         origin, led = origin.copy(), target + self.dt**2 / c * expected
-        held = wide([pin.place(until) for _, pin in self.pins]).reshape(-1, 3)
+        held = to_extended([pin.position(until) for _, pin in self.pins]).reshape(-1, 3)
         for k, (i, pin) in enumerate(self.pins):
             led[i] = held[k]
             if np.isinf(pin.weight):
-                origin[i] = held[k] - wide(pin.speed(until)) / rate
+                origin[i] = held[k] - to_extended(pin.velocity(until)) / rate
         x = self.answer(until)
-        there = wide(x) if self.lags else led
+        there = to_extended(x) if self.lags else led
         p, v = (np.asarray(part, float) for part in (there, rate * (there - origin)))
-        force, size = pushed(self.opinions, p, v, until)
+        force, size = sum_forces(self.opinions, p, v, until)
         q, u = self.now
-        moment = Moment(self.declared.time_step, float(rate), float(when), self.time, until, q, u, there, origin)
+        moment = StepMoment(self.declared.time_step, float(rate), float(when), self.time, until, q, u, there, origin)
         weights = [pin.weight for _, pin in self.pins]
         vertices = [i for i, _ in self.pins]
         now = [np.asarray(part, float) for part in self.now]
-        self.stated.append(Stated(float(c), target, force, size, vertices, weights, held, moment, now))
+        self.reference_steps.append(ReferenceStep(float(c), target, force, size, vertices, weights, held, moment, now))
         self.answers.append(x)
-        return wide(x), rate * (wide(x) - origin)
+        return to_extended(x), rate * (to_extended(x) - origin)
 
-    def free(self, a: Wide) -> Wide:
+    def zero_exact_pins(self, a: ExtendedArray) -> ExtendedArray:
         """Set an acceleration to zero at exact pins."""
         a[[i for i, _ in self.exact]] = 0
         return a
 
-    def done(self, end: Motion, a: Wide) -> Steps:
+    def finish_step(self, end: MotionArrays, a: ExtendedArray) -> StageAnswers:
         """Return the completed step."""
-        return Steps(self.stated, self.answers, self.carried(end, self.time + self.declared.time_step), a)
+        return StageAnswers(
+            self.reference_steps, self.answers, self.apply_exact_pins(end, self.time + self.declared.time_step), a
+        )
 
 
-def stages(
+def solve_stages(
     name: str,
-    declared: Declared,
-    opinions: Sequence[Opinion],
-    now: Motion,
+    declared: SceneDeclaration,
+    opinions: Sequence[EffectTerms],
+    now: MotionArrays,
     acceleration: Array,
     time: float,
-    answer: Answer,
-) -> Steps:
+    answer: AnswerFunction,
+) -> StageAnswers:
     """Take the step of an integrator from a motion and its acceleration.
 
     Args:
@@ -186,14 +200,14 @@ def stages(
       time: time [s] of the start.
       answer: solution of a stage as a function of time.
     """
-    step = _Step(name, declared, opinions, now, time, answer)
-    run = _alpha if name in _ALPHAS else _runge_kutta
-    return run(name, step, wide(acceleration))
+    step = _StageRecorder(name, declared, opinions, now, time, answer)
+    run = _generalised_alpha if name in _ALPHA_PARAMETERS else _runge_kutta
+    return run(name, step, to_extended(acceleration))
 
 
-def _runge_kutta(name: str, step: _Step, a0: Wide) -> Steps:
+def _runge_kutta(name: str, step: _StageRecorder, a0: ExtendedArray) -> StageAnswers:
     rows, dt, (p, v) = _TABLEAUX[name], step.dt, step.now
-    known, V, A = [(wide(0), a0)], list[Wide](), list[Wide]()
+    known, V, A = [(to_extended(0), a0)], list[ExtendedArray](), list[ExtendedArray]()
     if rows[0] == [0]:
         V, A, rows = [v], [a0], rows[1:]
     x = p
@@ -205,18 +219,18 @@ def _runge_kutta(name: str, step: _Step, a0: Wide) -> Steps:
         distance = [abs(when - t) for t, _ in known]
         expected = known[distance.index(min(distance))][1]
         target = origin + g * dt * base
-        x, u = step.state(1 / g**2, 1 / (g * dt), when, target, origin, expected)
+        x, u = step.add_stage(1 / g**2, 1 / (g * dt), when, target, origin, expected)
         V.append(u)
-        A.append(step.free((x - target) / (g * dt) ** 2))
+        A.append(step.zero_exact_pins((x - target) / (g * dt) ** 2))
         known.append((when, A[-1]))
-    return step.done([x, V[-1]], A[-1])
+    return step.finish_step([x, V[-1]], A[-1])
 
 
-def _alpha(name: str, step: _Step, a: Wide) -> Steps:
-    (am, af), dt, (d, v) = _ALPHAS[name], step.dt, step.now
-    gamma, beta = wide(0.5) - am + af, (1 - am + af) ** 2 / 4
+def _generalised_alpha(name: str, step: _StageRecorder, a: ExtendedArray) -> StageAnswers:
+    (am, af), dt, (d, v) = _ALPHA_PARAMETERS[name], step.dt, step.now
+    gamma, beta = to_extended(0.5) - am + af, (1 - am + af) ** 2 / 4
 
-    def after(x: Wide) -> list[Wide]:
+    def after(x: ExtendedArray) -> list[ExtendedArray]:
         """Return d', v' and a' of a solution."""
         end = (x - af * d) / (1 - af)
         b = (end - d - dt * v) / (beta * dt**2) - (1 / (2 * beta) - 1) * a
@@ -226,8 +240,8 @@ def _alpha(name: str, step: _Step, a: Wide) -> Steps:
     _, u, b = after(d)  # the formulas are linear in x, and so may be read off anywhere
     target = d - dt**2 / c * ((1 - am) * b + am * a)
     origin = d - ((1 - af) * u + af * v) / rate
-    x, _ = step.state(c, rate, 1 - af, target, origin, a)
-    mean = step.free(c / dt**2 * (x - target))
+    x, _ = step.add_stage(c, rate, 1 - af, target, origin, a)
+    mean = step.zero_exact_pins(c / dt**2 * (x - target))
     b = (mean - am * a) / (1 - am)
-    end = d + dt * v + dt**2 * ((wide(0.5) - beta) * a + beta * b)
-    return step.done([end, v + dt * ((1 - gamma) * a + gamma * b)], b)
+    end = d + dt * v + dt**2 * ((to_extended(0.5) - beta) * a + beta * b)
+    return step.finish_step([end, v + dt * ((1 - gamma) * a + gamma * b)], b)

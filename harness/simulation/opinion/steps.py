@@ -17,15 +17,15 @@ from typing import Any
 
 import numpy as np
 
-from harness.simulation.opinion.declared import Array, Declared, Moment, Opinion
-from harness.simulation.opinion.derivatives import wide
+from harness.simulation.opinion.declared import Array, EffectTerms, SceneDeclaration, StepMoment
+from harness.simulation.opinion.derivatives import to_extended
 
-Motion = Sequence[Array]
+MotionArrays = Sequence[Array]
 """Positions (n, 3) [m] and velocities (n, 3) [m/s]."""
 
 
 @dataclass(frozen=True, eq=False)
-class Stated:
+class ReferenceStep:
     """One reference step.
 
     Attributes:
@@ -41,25 +41,30 @@ class Stated:
     """
 
     c: float
-    target: Any
-    force: Array
+    inertial_target: Any
+    external_force: Array
     force_size: float
     vertices: list[int]
     weights: list[float]
-    held: Any
-    moment: Moment
-    now: Motion
+    pin_targets: Any
+    step_moment: StepMoment
+    start_motion: MotionArrays
 
-    def after(self, x: Array) -> tuple[Any, Any]:
+    def end_motion(self, x: Array) -> tuple[Any, Any]:
         """Return positions and velocities at the step's end from its solution x (n, 3) [m]."""
-        m = self.moment
-        v = m.rate * (wide(x) - m.origin)
-        return (wide(x), v) if m.when == 1.0 else (2 * wide(x) - m.p, 2 * v - m.v)
+        m = self.step_moment
+        v = m.velocity_rate * (to_extended(x) - m.velocity_origin)
+        return (to_extended(x), v) if m.stage_fraction == 1.0 else (2 * to_extended(x) - m.p, 2 * v - m.v)
 
 
-def state(
-    integrator: str, declared: Declared, opinions: Sequence[Opinion], now: Motion, before: Motion | None, time: float
-) -> Stated:
+def build_reference_step(
+    integrator: str,
+    declared: SceneDeclaration,
+    opinions: Sequence[EffectTerms],
+    now: MotionArrays,
+    before: MotionArrays | None,
+    time: float,
+) -> ReferenceStep:
     """Build the reference step.
 
     Args:
@@ -71,8 +76,8 @@ def state(
       time: time [s] of the start.
     """
     dt = declared.time_step
-    now, earlier = decayed(now, opinions), decayed(before or now, opinions)
-    (p, v), (p0, v0) = ((wide(a), wide(b)) for a, b in (now, earlier))
+    now, earlier = filter_motion(now, opinions), filter_motion(before or now, opinions)
+    (p, v), (p0, v0) = ((to_extended(a), to_extended(b)) for a, b in (now, earlier))
     starts = integrator == "own" or (integrator == "bdf2" and before is None)
     method = "implicit-euler" if starts else integrator
     if method == "implicit-euler":
@@ -84,16 +89,16 @@ def state(
         c, target, origin, when, ahead = 4.0, p + dt * v / 2, p, 0.5, 0.5
     far = ahead if before else 0.0
     at = [np.asarray(x + far * (x - y), float) for x, y in zip(now, earlier, strict=True)]
-    force, size = pushed(opinions, at[0], at[1], time + ahead * dt)
-    pinned = {i: pin for opinion in opinions for i, pin in opinion.pins.items()}
+    force, size = sum_forces(opinions, at[0], at[1], time + ahead * dt)
+    pinned = {i: pin for opinion in opinions for i, pin in opinion.pinned_vertices.items()}
     vertices = sorted(pinned)
-    held = wide([pinned[i].place(time + dt) for i in vertices]).reshape(-1, 3)
+    held = to_extended([pinned[i].position(time + dt) for i in vertices]).reshape(-1, 3)
     held = p[vertices] + when * (held - p[vertices]) if when < 1.0 else held
-    moment = Moment(dt, c**0.5 / dt, when, time, time + when * dt, p, v, p + ahead * dt * v, origin)
-    return Stated(c, target, force, size, vertices, [pinned[i].weight for i in vertices], held, moment, now)
+    moment = StepMoment(dt, c**0.5 / dt, when, time, time + when * dt, p, v, p + ahead * dt * v, origin)
+    return ReferenceStep(c, target, force, size, vertices, [pinned[i].weight for i in vertices], held, moment, now)
 
 
-def pushed(opinions: Sequence[Opinion], p: Array, v: Array, time: float) -> tuple[Array, float]:
+def sum_forces(opinions: Sequence[EffectTerms], p: Array, v: Array, time: float) -> tuple[Array, float]:
     """Sum all forces (n, 3) [N], and the sizes [N] of their round-off.
 
     Args:
@@ -104,15 +109,15 @@ def pushed(opinions: Sequence[Opinion], p: Array, v: Array, time: float) -> tupl
     """
     force, size = np.zeros_like(p), 0.0
     for opinion in opinions:
-        if opinion.force:
-            more, its = opinion.force(p, v, time)
+        if opinion.evaluate_force:
+            more, its = opinion.evaluate_force(p, v, time)
             force, size = force + more, size + its
     return force, size
 
 
-def decayed(motion: Motion, opinions: Sequence[Opinion]) -> Motion:
+def filter_motion(motion: MotionArrays, opinions: Sequence[EffectTerms]) -> MotionArrays:
     """Return the motion at a step's start with filtered velocity."""
     p, v = motion
     for opinion in opinions:
-        v = opinion.decay(v) if opinion.decay else v
+        v = opinion.filter_velocity(v) if opinion.filter_velocity else v
     return [p, v]

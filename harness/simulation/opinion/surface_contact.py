@@ -14,45 +14,45 @@ from typing import Any
 
 import numpy as np
 
-from harness.simulation.opinion.declared import Array, Declared, Opinion
-from harness.simulation.opinion.derivatives import Wide, wide
-from harness.simulation.opinion.motion import place
-from harness.simulation.opinion.self_contact import Indices, Touching, barriers, near
+from harness.simulation.opinion.declared import Array, EffectTerms, SceneDeclaration
+from harness.simulation.opinion.derivatives import ExtendedArray, to_extended
+from harness.simulation.opinion.motion import place_at
+from harness.simulation.opinion.self_contact import ContactPairs, IndexArray, build_barriers, find_near_primitives
 
-_SOME = 200
+_MAX_TRIALS = 200
 """Maximum number of moves towards an obstacle, none longer than the mesh spacing."""
-_WAYS = 20
+_NUM_DIRECTIONS = 20
 """Number of directions that are tried, since some lead into another obstacle."""
 
 
-def surface_contact(effect: Any, declared: Declared) -> Opinion:
+def build_surface_contact_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build the barriers between the mesh and all obstacles."""
-    return barriers(effect, against(effect, declared))
+    return build_barriers(effect, build_obstacle_pairs(effect, declared))
 
 
-def against(effect: Any, declared: Declared) -> list[Against]:
+def build_obstacle_pairs(effect: Any, declared: SceneDeclaration) -> list[ObstaclePairs]:
     """Build the pairs of the mesh and each obstacle."""
-    shapes = effect.shapes(np.asarray(declared.mesh.rest, float))
-    return [Against(declared, one, *shape) for one, shape in zip(effect.obstacles, shapes, strict=True)]
+    shapes = effect.build_obstacle_surfaces(np.asarray(declared.mesh.rest_positions, float))
+    return [ObstaclePairs(declared, one, *shape) for one, shape in zip(effect.obstacles, shapes, strict=True)]
 
 
-class Against(Touching):
+class ObstaclePairs(ContactPairs):
     """A mesh and one obstacle.
 
     The obstacle has points (o, 3) [m], as declared, and triangles (f, 3), whose vertices are numbered after the mesh's.
     """
 
-    def __init__(self, declared: Declared, one: Any, points: Array, triangles: Indices) -> None:
+    def __init__(self, declared: SceneDeclaration, one: Any, points: Array, triangles: IndexArray) -> None:
         super().__init__(declared)
-        n = len(self.rest)
-        self._declared, self._motion, self._faces = wide(points), one.motion, triangles + n
+        n = len(self.rest_positions)
+        self._declared, self._motion, self._faces = to_extended(points), one.motion, triangles + n
         self._one, self._frames = one, getattr(one, "frames", None)
         sides = {tuple(sorted(pair)) for corners in triangles.tolist() for pair in combinations(corners, 2)}
         self._sides = n + np.array(sorted(sides), int)
         self._corners = n + np.unique(triangles)[:, None]
-        self.rest = np.concatenate([self.rest, points])
+        self.rest_positions = np.concatenate([self.rest_positions, points])
 
-    def obstacle(self, time: float) -> Wide:
+    def obstacle_positions(self, time: float) -> ExtendedArray:
         """Return the positions (o, 3) [m] of the obstacle's points at a time [s]."""
         points = self._declared
         if self._frames:
@@ -60,23 +60,26 @@ class Against(Touching):
             since = min(max((time - self._frames.begin) * self._frames.rate, 0.0), len(x) - 1.0)
             low, high = int(np.floor(since)), int(np.ceil(since))
             between = (1.0 - (since - low)) * x[low] + (since - low) * x[high]
-            points = wide(self._one.scale * between + np.array(self._one.offset))
-        return place(self._motion, time).there(points)
+            points = to_extended(self._one.scale * between + np.array(self._one.offset))
+        return place_at(self._motion, time).transform(points)
 
-    def whole(self, x: Wide, time: float) -> Wide:
+    def all_positions(self, x: ExtendedArray, time: float) -> ExtendedArray:
         """Return the positions of mesh and obstacle vertices at a time [s]."""
-        return np.concatenate([x, self.obstacle(time)])
+        return np.concatenate([x, self.obstacle_positions(time)])
 
-    def near(self, x: Array, reach: float) -> tuple[Indices, Indices]:
+    def find_near_pairs(self, x: Array, reach: float) -> tuple[IndexArray, IndexArray]:
         """Find the pairs of mesh and obstacle closer than a distance [m]."""
-        points = near(x, self.points, self._faces, reach), near(x, self._corners, self.triangles, reach)
-        return np.concatenate(points), near(x, self.edges, self._sides, reach)
+        points = (
+            find_near_primitives(x, self.points, self._faces, reach),
+            find_near_primitives(x, self._corners, self.triangles, reach),
+        )
+        return np.concatenate(points), find_near_primitives(x, self.edges, self._sides, reach)
 
-    def apart(self, rows: Indices, edges: bool) -> Wide:
+    def rest_distance(self, rows: IndexArray, edges: bool) -> ExtendedArray:
         """Return infinite rest distances: the rest shape is not near the obstacle."""
-        return wide(np.full(len(rows), np.inf))
+        return to_extended(np.full(len(rows), np.inf))
 
-    def clear(self, p: Array, time: float, apart: float) -> bool:
+    def is_separated(self, p: Array, time: float, apart: float) -> bool:
         """Return whether no pair is closer than a distance.
 
         Args:
@@ -84,15 +87,17 @@ class Against(Touching):
           time: time [s].
           apart: distance [m].
         """
-        return self.nearest(np.concatenate([p, np.asarray(self.obstacle(time), float)]), apart) >= apart
+        return self.min_distance(np.concatenate([p, np.asarray(self.obstacle_positions(time), float)]), apart) >= apart
 
 
-Rng = np.random.Generator
-Beside = tuple[Any, Against]
+RandomGenerator = np.random.Generator
+EffectPairs = tuple[Any, ObstaclePairs]
 """An effect, and the mesh with one of its obstacles."""
 
 
-def met(all_: list[Beside], k: int, p: Array, spacing: float, times: tuple[float, float], rng: Rng) -> list[Array]:
+def sample_contact_positions(
+    all_: list[EffectPairs], k: int, p: Array, spacing: float, times: tuple[float, float], rng: RandomGenerator
+) -> list[Array]:
     """Translate positions near to an obstacle at each of two times.
 
     At the first time they are separated from all obstacles, as at the start of every step.
@@ -107,15 +112,17 @@ def met(all_: list[Beside], k: int, p: Array, spacing: float, times: tuple[float
     """
     effect, one = all_[k % len(all_)]
     found = list[Array]()
-    for _ in range(_WAYS):
+    for _ in range(_NUM_DIRECTIONS):
         way = rng.normal(size=3)
-        found = [brought(effect, one, p, spacing, time, way / np.linalg.norm(way), rng) for time in times]
-        if all(other.clear(found[0], times[0], its.thickness) for its, other in all_):
+        found = [move_to_obstacle(effect, one, p, spacing, time, way / np.linalg.norm(way), rng) for time in times]
+        if all(other.is_separated(found[0], times[0], its.thickness) for its, other in all_):
             break
     return found
 
 
-def brought(effect: Any, one: Against, p: Array, spacing: float, time: float, way: Array, rng: Rng) -> Array:
+def move_to_obstacle(
+    effect: Any, one: ObstaclePairs, p: Array, spacing: float, time: float, way: Array, rng: RandomGenerator
+) -> Array:
     """Translate positions to an obstacle until some pair is in range.
 
     The mesh starts far away and moves against a direction, each time by the free distance.
@@ -130,13 +137,13 @@ def brought(effect: Any, one: Against, p: Array, spacing: float, time: float, wa
       rng: random generator.
     """
     reach = effect.thickness if effect.range is None else effect.range
-    there = np.asarray(one.obstacle(time), float)
+    there = np.asarray(one.obstacle_positions(time), float)
     middle = 0.5 * (there.max(axis=0) + there.min(axis=0))
     at = p - p.mean(axis=0)
     out = float(((there - middle) @ way).max() - (at @ way).min()) + effect.thickness + reach  # a plane between them
     wanted = effect.thickness + reach * rng.uniform(0.3, 0.7)
-    for _ in range(_SOME):
-        free = one.nearest(np.concatenate([middle + out * way + at, there]), wanted + spacing) - wanted
+    for _ in range(_MAX_TRIALS):
+        free = one.min_distance(np.concatenate([middle + out * way + at, there]), wanted + spacing) - wanted
         if free < 1e-3 * reach:
             break
         out -= free

@@ -16,23 +16,23 @@ from typing import Any
 
 import numpy as np
 
-from harness.simulation.opinion.declared import Array, Declared, Moment, Opinion
-from harness.simulation.opinion.derivatives import Values, Wide, wide
+from harness.simulation.opinion.declared import Array, EffectTerms, SceneDeclaration, StepMoment
+from harness.simulation.opinion.derivatives import ExtendedArray, ValueFunction, to_extended
 
 Triangle = frozenset[int]
-_SAME = 1e-6
+_RECTANGLE_RTOL = 1e-6
 """Relative tolerance, with respect to a diagonal, within which a quadrangle is a rectangle."""
 
 
-def bending(effect: Any, declared: Declared) -> Opinion:
+def build_bending_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build the quadratic bending energy of the mesh's triangles."""
-    corners, K, weight = stencils(effect.stiffness, declared)
+    corners, K, weight = build_stencils(effect.stiffness, declared)
     share = np.asarray(weight[:, None] * K**2, float)
     resists = np.asarray(np.bincount(corners.ravel(), share.ravel(), len(declared.mass)), float)
-    return Opinion(lambda moment: _bent(corners, K, weight, 0.0), resists)
+    return EffectTerms(lambda moment: _bending_energy(corners, K, weight, 0.0), resists)
 
 
-def damped_bending(effect: Any, b: float, declared: Declared) -> Any:
+def build_bending_damping(effect: Any, b: float, declared: SceneDeclaration) -> Any:
     """Build damping by the bending matrix.
 
     Args:
@@ -42,41 +42,41 @@ def damped_bending(effect: Any, b: float, declared: Declared) -> Any:
 
     Returns: builder of the energy of a step.
     """
-    corners, K, weight = stencils(effect.stiffness, declared)
+    corners, K, weight = build_stencils(effect.stiffness, declared)
 
-    def begin(moment: Moment) -> Values:
-        return _bent(corners, K, b * moment.rate * weight, moment.origin)
+    def begin(moment: StepMoment) -> ValueFunction:
+        return _bending_energy(corners, K, b * moment.velocity_rate * weight, moment.velocity_origin)
 
     return begin
 
 
-def _bent(corners: Any, K: Wide, weight: Wide, origin: Any) -> Values:
-    def values(x: Wide) -> Wide:
+def _bending_energy(corners: Any, K: ExtendedArray, weight: ExtendedArray, origin: Any) -> ValueFunction:
+    def values(x: ExtendedArray) -> ExtendedArray:
         bent = (K[:, :, None] * (x - origin)[corners]).sum(axis=1)
         return weight / 2 * (bent**2).sum(axis=1)
 
     return values
 
 
-def stencils(B: float, declared: Declared) -> tuple[Any, Wide, Wide]:
+def build_stencils(B: float, declared: SceneDeclaration) -> tuple[Any, ExtendedArray, ExtendedArray]:
     """Build the stencils of all hinges for a rigidity B.
 
     Returns: corners (h, 4), coefficients K (h, 4) and weights (h,).
     """
     rest, surface = declared.rest, [frozenset(t) for t in declared.mesh.triangles.tolist()]
-    pairs = list(_pairs(surface))
-    rectangles, share = [pair for pair in pairs if _rectangle(rest[list(pair)])], B
+    pairs = list(_find_hinges(surface))
+    rectangles, share = [pair for pair in pairs if _is_rectangle(rest[list(pair)])], B
     if rectangles:
         cut = {frozenset(pair[:2]) | {tip} for pair in rectangles for tip in pair[2:]}
         other = [frozenset(pair[2:]) | {end} for pair in rectangles for end in pair[:2]]
-        pairs += _pairs([triangle for triangle in surface if triangle not in cut] + other)
+        pairs += _find_hinges([triangle for triangle in surface if triangle not in cut] + other)
         share = B / 2
-    made = [_stencil(rest[list(pair)]) for pair in pairs]
+    made = [_compute_stencil(rest[list(pair)]) for pair in pairs]
     K, weight = [K for K, _ in made], [share / area for _, area in made]
-    return np.array(pairs, int).reshape(-1, 4), wide(K).reshape(-1, 4), wide(weight)
+    return np.array(pairs, int).reshape(-1, 4), to_extended(K).reshape(-1, 4), to_extended(weight)
 
 
-def _pairs(surface: Sequence[Triangle]) -> Iterator[tuple[int, int, int, int]]:
+def _find_hinges(surface: Sequence[Triangle]) -> Iterator[tuple[int, int, int, int]]:
     """Find the edges that two triangles share, and the two opposite vertices."""
     tips: dict[Triangle, list[int]] = {}
     for triangle in surface:
@@ -88,18 +88,18 @@ def _pairs(surface: Sequence[Triangle]) -> Iterator[tuple[int, int, int, int]]:
             yield i, j, across[0], across[1]
 
 
-def _rectangle(x: Wide) -> bool:
+def _is_rectangle(x: ExtendedArray) -> bool:
     """Return whether the diagonals of x (4, 3) are equally long and bisect each other."""
     one, two, apart = x[0] - x[1], x[2] - x[3], x[0] + x[1] - x[2] - x[3]
     a, b, c = (np.sqrt(v @ v) for v in (one, two, apart))
-    return bool(max(abs(a - b), c) <= _SAME * a)
+    return bool(max(abs(a - b), c) <= _RECTANGLE_RTOL * a)
 
 
-def _stencil(x: Wide) -> tuple[list[Any], Any]:
+def _compute_stencil(x: ExtendedArray) -> tuple[list[Any], Any]:
     """Compute K and A0 + A1 of the corners x (4, 3)."""
     edge = x[1] - x[0]
 
-    def cotangent(u: Wide, v: Wide) -> Any:
+    def cotangent(u: ExtendedArray, v: ExtendedArray) -> Any:
         w = np.cross(u, v)
         return (u @ v) / np.sqrt(w @ w)
 
@@ -109,33 +109,33 @@ def _stencil(x: Wide) -> tuple[list[Any], Any]:
     return [c03 + c04, c01 + c02, -c01 - c03, -c02 - c04], sum(np.sqrt(w @ w) for w in normals) / 2
 
 
-def gas(effect: Any, declared: Declared) -> Opinion:
+def build_gas_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build isothermal gas in the closed mesh."""
     a, b, c = declared.mesh.triangles.T
     about = declared.rest.mean(axis=0)
 
-    def volume(x: Wide) -> Any:
+    def volume(x: ExtendedArray) -> Any:
         y = x - about
-        return (y[a] * _cross(y[b], y[c])).sum() / 6
+        return (y[a] * _cross_product(y[b], y[c])).sum() / 6
 
     at_rest = volume(declared.rest)  # negative where the triangles face inwards
 
-    def values(x: Wide) -> Wide:
+    def values(x: ExtendedArray) -> ExtendedArray:
         part = volume(x) / at_rest
         if part.real <= 0:
-            return wide([np.inf])
+            return to_extended([np.inf])
         much = effect.pressure * abs(at_rest)
         return np.array([-much * (1 + np.log(part)), part * 0 + much])  # the logarithm's round-off is that of one
 
-    return Opinion(lambda moment: values)
+    return EffectTerms(lambda moment: values)
 
 
-def _cross(u: Wide, v: Wide) -> Wide:
+def _cross_product(u: ExtendedArray, v: ExtendedArray) -> ExtendedArray:
     (x, y, z), (a, b, c) = u.T, v.T
     return np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=1)
 
 
-def triangle_areas(x: Array, triangles: Any) -> Array:
+def compute_triangle_areas(x: Array, triangles: Any) -> Array:
     """Compute the areas (f,) [m^2] of triangles at x (n, 3) [m]."""
     a, b, c = (x[corner] for corner in triangles.T)
-    return 0.5 * np.sqrt((_cross(b - a, c - a) ** 2).sum(axis=1))
+    return 0.5 * np.sqrt((_cross_product(b - a, c - a) ** 2).sum(axis=1))

@@ -15,99 +15,113 @@ from typing import Any
 
 import numpy as np
 
-from harness.simulation.opinion.declared import Array, Begin, Declared, Moment, Opinion, PinnedVertex
-from harness.simulation.opinion.derivatives import Values, Wide, wide
-from harness.simulation.opinion.edges import along_edges, finite, of_springs
-from harness.simulation.opinion.motion import place, speed
-from harness.simulation.opinion.selected import chosen
-from harness.simulation.opinion.surfaces import damped_bending
+from harness.simulation.opinion.declared import (
+    Array,
+    BeginFunction,
+    EffectTerms,
+    PinnedVertex,
+    SceneDeclaration,
+    StepMoment,
+)
+from harness.simulation.opinion.derivatives import ExtendedArray, ValueFunction, to_extended
+from harness.simulation.opinion.edges import build_edge_damping, compute_reference_stiffness, select_finite
+from harness.simulation.opinion.motion import place_at, velocity_at
+from harness.simulation.opinion.selected import select_vertices
+from harness.simulation.opinion.surfaces import build_bending_damping
 
 
-def attachments(effect: Any, declared: Declared) -> Opinion:
+def build_attachments_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build springs of zero length to points."""
-    vertices = chosen(declared, effect)
+    vertices = select_vertices(declared, effect)
     k = np.longdouble(effect.stiffness) / len(vertices)
-    given = declared.rest[vertices] if effect.to is None else np.broadcast_to(wide(effect.to), (len(vertices), 3))
+    given = (
+        declared.rest[vertices] if effect.to is None else np.broadcast_to(to_extended(effect.to), (len(vertices), 3))
+    )
 
-    def begin(moment: Moment) -> Values:
-        q = place(effect.motion, moment.until).there(given)
+    def begin(moment: StepMoment) -> ValueFunction:
+        q = place_at(effect.motion, moment.stage_time).transform(given)
         return lambda x: k / 2 * ((x[vertices] - q) ** 2).sum(axis=1)
 
     resists = np.zeros(len(declared.mass))
     resists[vertices] = float(k)
-    return Opinion(begin, resists, reach=float(np.abs(given).max()) + _reach(effect.motion))
+    return EffectTerms(begin, resists, coordinate_scale=float(np.abs(given).max()) + _motion_extent(effect.motion))
 
 
-def _reach(motion: Any) -> float:
+def _motion_extent(motion: Any) -> float:
     """Return the largest translation [m] of key frames, without rotations."""
     return max((float(np.abs(key.offset).max()) for key in motion.keys), default=0.0) if motion else 0.0
 
 
-def air_drag(effect: Any, declared: Declared) -> Opinion:
+def build_air_drag_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build drag in still air, as an energy or as a velocity filter."""
-    c = effect.coefficient * declared.mesh.shares
+    c = effect.coefficient * declared.mesh.mass_fractions
     if effect.law == "linear":
-        return Opinion(_drag(c), c / declared.time_step)
+        return EffectTerms(_build_drag(c), c / declared.time_step)
     dt, mass = declared.time_step, declared.mass
 
     def force(p: Array, v: Array, t: float) -> tuple[Array, float]:
         speed = np.sqrt((v**2).sum(axis=1))
         drag = np.minimum(c * speed, mass / dt)
         # The accuracy of a speed is the round-off of positions, times the rate.
-        return -drag[:, None] * v, float((drag + c * speed).max()) * (float(speed.max()) + declared.mesh.size / dt)
+        return -drag[:, None] * v, float((drag + c * speed).max()) * (
+            float(speed.max()) + declared.mesh.bounding_box_diagonal / dt
+        )
 
-    if declared.staged:
-        return Opinion(force=force)
+    if declared.has_stages:
+        return EffectTerms(evaluate_force=force)
 
     def slowed(v: Array) -> Array:
         speed = np.sqrt((v**2).sum(axis=1))
         drag = dt * c * speed
         return np.array([u * m / (m + d) if d > 0 else u for u, m, d in zip(v, mass, drag, strict=True)])
 
-    return Opinion(decay=slowed)
+    return EffectTerms(filter_velocity=slowed)
 
 
-def _drag(c: Array) -> Begin:
-    def begin(moment: Moment) -> Values:
-        return lambda x: wide(c) * moment.rate / 2 * ((x - moment.origin) ** 2).sum(axis=1)
+def _build_drag(c: Array) -> BeginFunction:
+    def begin(moment: StepMoment) -> ValueFunction:
+        return lambda x: to_extended(c) * moment.velocity_rate / 2 * ((x - moment.velocity_origin) ** 2).sum(axis=1)
 
     return begin
 
 
-def ether_drag(effect: Any, declared: Declared) -> Opinion:
+def build_ether_drag_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build decay of all velocities, or drag proportional to mass."""
-    if declared.staged:
+    if declared.has_stages:
         c = effect.rate * declared.mass
-        return Opinion(_drag(c), c / declared.time_step)
-    return Opinion(decay=lambda v: math.exp(-effect.rate * declared.time_step) * v)
+        return EffectTerms(_build_drag(c), c / declared.time_step)
+    return EffectTerms(filter_velocity=lambda v: math.exp(-effect.rate * declared.time_step) * v)
 
 
-def rayleigh(effect: Any, declared: Declared) -> Opinion:
+def build_rayleigh_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build damping proportional to the masses and to the stiffness of springs and bending."""
-    b, parts = effect.stiffness, [_drag(effect.mass * declared.mass)]
+    b, parts = effect.stiffness, [_build_drag(effect.mass * declared.mass)]
     if b:
-        parts += [along_edges(declared, b * finite(of_springs(s, declared))) for s in declared.of_kind("springs")]
-        parts += [damped_bending(one, b, declared) for one in declared.of_kind("bending")]
+        parts += [
+            build_edge_damping(declared, b * select_finite(compute_reference_stiffness(s, declared)))
+            for s in declared.select_effects("springs")
+        ]
+        parts += [build_bending_damping(one, b, declared) for one in declared.select_effects("bending")]
 
-    def begin(moment: Moment) -> Values:
+    def begin(moment: StepMoment) -> ValueFunction:
         begun = [part(moment) for part in parts]
 
-        def values(x: Wide) -> Wide:
+        def values(x: ExtendedArray) -> ExtendedArray:
             return np.concatenate([values(x) for values in begun])
 
         return values
 
-    return Opinion(begin, effect.mass * declared.mass / declared.time_step)
+    return EffectTerms(begin, effect.mass * declared.mass / declared.time_step)
 
 
-def pins(effect: Any, declared: Declared) -> Opinion:
+def build_pins_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build pinned vertices."""
     weight = math.inf if effect.weight == "exact" else float(effect.weight)
-    held = {i: pin(weight, effect.motion, declared.rest[i]) for i in chosen(declared, effect)}
-    return Opinion(pins=held, reach=_reach(effect.motion))
+    held = {i: build_pin(weight, effect.motion, declared.rest[i]) for i in select_vertices(declared, effect)}
+    return EffectTerms(pinned_vertices=held, coordinate_scale=_motion_extent(effect.motion))
 
 
-def pin(weight: float, motion: Any, q: Wide) -> PinnedVertex:
+def build_pin(weight: float, motion: Any, q: ExtendedArray) -> PinnedVertex:
     """Build a pin.
 
     Args:
@@ -116,10 +130,10 @@ def pin(weight: float, motion: Any, q: Wide) -> PinnedVertex:
       q: declared point (3,) [m].
     """
 
-    def there(time: float) -> Wide:
-        return place(motion, time).there(q[None])[0]
+    def there(time: float) -> ExtendedArray:
+        return place_at(motion, time).transform(q[None])[0]
 
-    def moving(time: float) -> Wide:
-        return speed(motion, q, time)
+    def moving(time: float) -> ExtendedArray:
+        return velocity_at(motion, q, time)
 
     return PinnedVertex(weight, there, moving)
