@@ -34,18 +34,18 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 __all__ = [
     "IntegratorName",
     "OptionKeys",
-    "OwnName",
-    "Picture",
+    "PngImage",
     "SceneKeys",
     "Simulation",
     "SolverName",
     "SweepKeys",
-    "draw",
+    "UserCodeName",
+    "draw_picture",
+    "load_rows",
     "load_scene",
     "make_scene",
     "open_recording",
-    "rows",
-    "run",
+    "run_config",
 ]
 
 

@@ -39,18 +39,18 @@ from solvers.registry import SOLVER_TABLE
 __all__ = [
     "IntegratorName",
     "OptionKeys",
-    "OwnName",
-    "Picture",
+    "PngImage",
     "SceneKeys",
     "Simulation",
     "SolverName",
     "SweepKeys",
-    "draw",
+    "UserCodeName",
+    "draw_picture",
+    "load_rows",
     "load_scene",
     "make_scene",
     "open_recording",
-    "rows",
-    "run",
+    "run_config",
 ]
 
 

@@ -5,9 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 from solvers.about import SolverInfo
-from solvers.plugins import PluginTable
+from solvers.plugins import PluginTable, load_target
 
-__all__ = ["EVERY", "OPTIONAL", "SOLVERS", "about", "load", "minimises", "name_of"]
+__all__ = [
+    "OPTIONAL_SOLVERS",
+    "SOLVERS",
+    "SOLVER_TABLE",
+    "find_solver_info",
+    "find_solver_name",
+    "is_minimiser",
+    "load_target",
+]
 
 SOLVERS = {
     "dense": "solvers.methods.local_global:DenseLocalGlobal",

@@ -31,7 +31,7 @@ REPORT_TABLE = PluginTable("springbench.reports", SHIPPED_REPORTS)
 if TYPE_CHECKING:
     ReportName = str
 else:
-    ReportName = named_in(EVERY_REPORT)
+    ReportName = registered_name(REPORT_TABLE)
 
 
 class VariedOptions(build_list_model(*RUN_OPTIONS)):

@@ -50,7 +50,7 @@ def registered_name(table: PluginTable) -> Any:
 if TYPE_CHECKING:
     IntegratorName = str
 else:
-    IntegratorName = named_in(integrators.EVERY)
+    IntegratorName = registered_name(integrators.INTEGRATOR_TABLE)
 
 
 def _parse_seconds(value: Any) -> Any:

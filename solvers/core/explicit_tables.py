@@ -132,7 +132,7 @@ def integrate_drag(kicks: FloatArray, h: float, drag: FloatArray) -> tuple[Float
 
 
 def _find_stability_limit(method: SplittingMethod | ExplicitTableau) -> float:
-    grows = method.amplification_factor if isinstance(method, SplittingMethod) else method.amplification_factor
+    grows = method.amplification_factor
     found = next(y for y in np.arange(0.01, 40.0, 0.01) if abs(grows(float(y))) > 1.0 + 1e-6)
     return float(found) - 0.01
 

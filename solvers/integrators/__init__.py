@@ -9,21 +9,21 @@ from solvers.integrators.single import BDF2, IMPLICIT_EULER, MIDPOINT, SUBSTEPPI
 from solvers.plugins import PluginTable, load_target
 
 __all__ = [
-    "EVERY",
     "IMPLICIT_EULER",
     "INTEGRATORS",
-    "OWN",
+    "INTEGRATOR_TABLE",
+    "SUBSTEPPING",
     "AnyIntegrator",
-    "End",
     "GeneralisedAlpha",
-    "Integrator",
     "Motion",
     "RungeKutta",
-    "Solved",
-    "Staged",
-    "Unknown",
-    "find",
-    "splits",
+    "SingleStageIntegrator",
+    "Stage",
+    "StageSolution",
+    "StagedIntegrator",
+    "StepEnd",
+    "find_integrator",
+    "has_split_filters",
 ]
 
 StagedIntegrator = RungeKutta | GeneralisedAlpha

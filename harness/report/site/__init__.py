@@ -16,4 +16,4 @@ from __future__ import annotations
 
 from harness.report.site.build import refresh_results_page, update_page
 
-__all__ = ["keep", "update"]
+__all__ = ["refresh_results_page", "update_page"]
