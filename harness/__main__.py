@@ -6,7 +6,7 @@ import os
 import sys
 from io import TextIOWrapper
 
-from harness.base import interrupts
+from springbench.harness.execution import interrupts
 
 
 def main() -> None:
@@ -14,7 +14,7 @@ def main() -> None:
     interrupts.install_handler()
     try:
         _prepare_environment()
-        from harness.cli import main as run_command
+        from springbench.harness.cli.main import main as run_command
 
         run_command()
     except BaseException as end:

@@ -1,8 +1,8 @@
 """Python interface for scripts and notebooks: scenes, steps, sweeps, rows, pictures and recordings.
 
-scene = harness.make_scene(mesh={"kind": "grid"}, mass=1.0, time_step=1/30, frames=60, default_size=16,
+scene = springbench.make_scene(mesh={"kind": "grid"}, mass=1.0, time_step=1/30, frames=60, default_size=16,
                            effects=[{"kind": "springs", "stretch": 300.0}, {"kind": "gravity"}])
-simulation = harness.Simulation(scene, "hybrid")
+simulation = springbench.Simulation(scene, "hybrid")
 positions = simulation.step()                        # (n, 3) [m], after 1/30 s
 """
 
@@ -19,22 +19,28 @@ from typing import Any, Unpack, cast
 
 import numpy as np
 from numpy.typing import NDArray
-
-from harness.base.document import ConfigDocument, ConfigKey, format_key
-from harness.base.errors import InputError, InputMistake
-from harness.config import load
-from harness.config.keys import IntegratorName, OptionKeys, SceneKeys, SolverName, SweepKeys, UserCodeName
-from harness.config.options import DEFAULT_SOLVER, DEFAULT_STOP_RULE
-from harness.config.solvers import read_solvers
-from harness.record.base import RecordingReplay
-from harness.scenes.bind import build_scene
-from harness.scenes.effects.base import SceneEffect
-from harness.scenes.mesh.base import Mesh
-from harness.scenes.spec import InitialGuess, MeshSource, SceneSpec
-from harness.simulation.step import SimulationStep, build_initial_state, prepare, simulate_scene
-from solvers import plugins
-from solvers.problem import Positions, Solver, StopRule
-from solvers.registry import SOLVER_TABLE
+from springbench.harness.config import config_loader
+from springbench.harness.config.run_options import DEFAULT_SOLVER, DEFAULT_STOP_RULE
+from springbench.harness.config.solver_parameters import read_solvers
+from springbench.harness.config.typed_keys import (
+    IntegratorName,
+    OptionKeys,
+    SceneKeys,
+    SolverName,
+    SweepKeys,
+    UserCodeName,
+)
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.recording.recorder_interface import RecordingReplay
+from springbench.harness.scenes.effects.effect_interface import SceneEffect
+from springbench.harness.scenes.mesh.mesh import Mesh
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.scenes.scene_spec import InitialGuess, MeshSource, SceneSpec
+from springbench.harness.schema.config_document import ConfigDocument, ConfigKey, format_key
+from springbench.harness.simulation.time_loop import SimulationStep, build_initial_state, prepare, simulate_scene
+from springbench.solvers.model.step_problem import Positions, Solver, StopRule
+from springbench.solvers.plugins import plugin_discovery
+from springbench.solvers.registry import SOLVER_TABLE
 
 __all__ = [
     "IntegratorName",
@@ -56,7 +62,7 @@ __all__ = [
 
 def load_scene(path: str | Path) -> SceneSpec:
     """Load a scene from a YAML file, or from an assignment's JSON file; raise InputError."""
-    return load.load_scene_in_process(Path(path))
+    return config_loader.load_scene_in_process(Path(path))
 
 
 def make_scene(
@@ -82,7 +88,9 @@ def make_scene(
     listed = [dict(effect) if isinstance(effect, Mapping) else {"kind": "gravity"} for effect in effects]
     given = dict(mesh) if isinstance(mesh, Mapping) else {"kind": "grid"}
     data = {**fields, "mesh": given, "effects": listed}
-    checked = load.build_scene_from_document(ConfigDocument(Path(folder) / f"{name}.yaml", _to_plain_data(data)))
+    checked = config_loader.build_scene_from_document(
+        ConfigDocument(Path(folder) / f"{name}.yaml", _to_plain_data(data))
+    )
     own = tuple(
         made if isinstance(effect, Mapping) else effect for effect, made in zip(effects, checked.effects, strict=True)
     )
@@ -174,7 +182,7 @@ def _create_solver(name: str, parameters: Mapping[str, Any], path: Path) -> Solv
     found = read_solvers(document)
     if document.mistakes:
         raise document.build_error()
-    return plugins.load_target(SOLVER_TABLE[found[0].name])(**found[0].parameters)
+    return plugin_discovery.load_target(SOLVER_TABLE[found[0].name])(**found[0].parameters)
 
 
 def run_config(
@@ -197,20 +205,20 @@ def run_config(
     Raises:
         InputError: for any mistake in the config.
     """
-    from harness.base.claim import claim_folder
-    from harness.base.console import get_error_console
-    from harness.base.progress import ProgressLines
-    from harness.experiments.sweep import run_sweep
-    from harness.report.named import run_reports
+    from springbench.harness.console import get_error_console
+    from springbench.harness.execution.progress_display import ProgressLines
+    from springbench.harness.experiments.sweep_runner import run_sweep
+    from springbench.harness.report.report_plugins import run_reports
+    from springbench.harness.results.folder_ownership import claim_folder
 
     if isinstance(config, Mapping):
         if not name:
             raise InputError("a sweep that is a mapping needs a name: run({...}, name='mine')")
         path = Path(folder) / f"{name}.yaml"
-        sweep = load.build_sweep_from_document(ConfigDocument(path, _to_plain_data(config)))
+        sweep = config_loader.build_sweep_from_document(ConfigDocument(path, _to_plain_data(config)))
     else:
         path = Path(config)
-        sweep = load.load_config(path)
+        sweep = config_loader.load_config(path)
     place = claim_folder(Path(results) / sweep.name, path)
     table = run_sweep(
         sweep.name, sweep.list_runs(), place, ProgressLines(get_error_console()), lambda line: None, rerun=rerun
@@ -247,8 +255,8 @@ def load_rows(folder: str | Path) -> Any:
 
     Returns: a polars DataFrame if polars is installed, else a pandas DataFrame, else a pyarrow table.
     """
-    from harness.base.rows import read_rows
-    from harness.base.shelf import list_units
+    from springbench.harness.results.parquet_rows import read_rows
+    from springbench.harness.results.row_store import list_units
 
     return _to_dataframe(read_rows(list_units(Path(folder) / "rows")))
 
@@ -265,7 +273,7 @@ def open_recording(path: str | Path) -> RecordingReplay:
     Returns: times (k,) [s], positions (k, n, 3) [m] relative to `origin` (3,), springs and scalars. Its method
     `absolute_positions(k)` adds the origin in double precision.
     """
-    from harness.record.reader import read_replay
+    from springbench.harness.recording.recording_reader import read_replay
 
     return read_replay(Path(path))
 
@@ -294,8 +302,8 @@ def draw_picture(source: str | Path | RecordingReplay | Mapping[str, str | Path 
         InputError: if a recording cannot be read.
         RunFailed: if the system cannot draw.
     """
-    from harness.report.comparison import draw_comparison_picture
-    from harness.report.run_picture import draw_run_picture
+    from springbench.harness.report.comparison_picture import draw_comparison_picture
+    from springbench.harness.report.run_picture import draw_run_picture
 
     with TemporaryDirectory() as folder:
         path = Path(folder) / "picture.png"

@@ -1,3 +1,3 @@
 """Implicit time stepping of mass-spring systems: numerics only, without files or clocks."""
 
-from solvers import sources  # noqa: F401  notes the state of all sources before any other is imported
+from springbench.solvers.jit import source_digest  # noqa: F401  notes the state of all sources before any other is imported

@@ -1,11 +1,12 @@
-"""The solvers by name. A built-in solver has a line here; a third-party one needs none, see `solvers.plugins`."""
+"""The solvers by name. A built-in solver has a line here; a third-party one needs none, see
+`springbench.solvers.plugins.plugin_discovery`."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from solvers.about import SolverInfo
-from solvers.plugins import PluginTable, load_target
+from springbench.solvers.iteration.solver_info import SolverInfo
+from springbench.solvers.plugins.plugin_discovery import PluginTable, load_target
 
 __all__ = [
     "OPTIONAL_SOLVERS",
@@ -18,44 +19,44 @@ __all__ = [
 ]
 
 SOLVERS = {
-    "dense": "solvers.methods.local_global:DenseLocalGlobal",
-    "sparse": "solvers.methods.local_global:SparseLocalGlobal",
-    "numba": "solvers.methods.local_global_compiled:CompiledLocalGlobal",
-    "anderson": "solvers.methods.anderson:Anderson",
-    "chebyshev": "solvers.methods.chebyshev:Chebyshev",
-    "lbfgs": "solvers.methods.lbfgs:Lbfgs",
-    "newton": "solvers.methods.newton:Newton",
-    "newton-cg": "solvers.methods.newton_cg:NewtonCG",
-    "hybrid": "solvers.methods.hybrid:Hybrid",
-    "xpbd": "solvers.methods.xpbd:Xpbd",
-    "xpbd-small-steps": "solvers.methods.xpbd:XpbdSmallSteps",
-    "vbd": "solvers.methods.vbd:VertexBlockDescent",
-    "symplectic-euler": "solvers.methods.symplectic_euler:SymplecticEuler",
-    "velocity-verlet": "solvers.methods.explicit:VelocityVerlet",
-    "blanes-moan-4": "solvers.methods.explicit:BlanesMoan4",
-    "blanes-moan-6": "solvers.methods.explicit:BlanesMoan6",
-    "runge-kutta-4": "solvers.methods.explicit:RungeKutta4",
-    "tsitouras-5": "solvers.methods.explicit:Tsitouras5",
-    "dormand-prince-8": "solvers.methods.explicit:DormandPrince8",
-    "baraff-witkin": "solvers.methods.linearised:BaraffWitkin",
-    "ros2": "solvers.methods.rosenbrock:Ros2",
-    "ros3p": "solvers.methods.rosenbrock:Ros3P",
-    "rodas": "solvers.methods.rosenbrock:Rodas",
-    "pncg": "solvers.methods.pncg:NonlinearCG",
-    "admm": "solvers.methods.admm:Admm",
-    "a-jacobi": "solvers.methods.a_jacobi:AggregatedJacobi",
-    "mgpbd": "solvers.methods.mgpbd:MultigridXpbd",
-    "jgs2": "solvers.methods.jgs2:Jgs2",
-    "avbd": "solvers.methods.avbd:AugmentedVertexBlockDescent",
+    "dense": "springbench.solvers.methods.local_global.reference_local_global:DenseLocalGlobal",
+    "sparse": "springbench.solvers.methods.local_global.reference_local_global:SparseLocalGlobal",
+    "numba": "springbench.solvers.methods.local_global.compiled_local_global:CompiledLocalGlobal",
+    "anderson": "springbench.solvers.methods.quasi_newton.anderson:Anderson",
+    "chebyshev": "springbench.solvers.methods.quasi_newton.chebyshev:Chebyshev",
+    "lbfgs": "springbench.solvers.methods.quasi_newton.lbfgs:Lbfgs",
+    "newton": "springbench.solvers.methods.newton.newton_direct:NewtonSolver",
+    "newton-cg": "springbench.solvers.methods.newton.newton_cg:NewtonCG",
+    "hybrid": "springbench.solvers.methods.newton.hybrid_newton:HybridNewton",
+    "xpbd": "springbench.solvers.methods.position_based.xpbd:Xpbd",
+    "xpbd-small-steps": "springbench.solvers.methods.position_based.xpbd:XpbdSmallSteps",
+    "vbd": "springbench.solvers.methods.vertex_block.vbd:VertexBlockDescent",
+    "symplectic-euler": "springbench.solvers.methods.time_stepping.symplectic_euler:SymplecticEuler",
+    "velocity-verlet": "springbench.solvers.methods.time_stepping.explicit_integrators:VelocityVerlet",
+    "blanes-moan-4": "springbench.solvers.methods.time_stepping.explicit_integrators:BlanesMoan4",
+    "blanes-moan-6": "springbench.solvers.methods.time_stepping.explicit_integrators:BlanesMoan6",
+    "runge-kutta-4": "springbench.solvers.methods.time_stepping.explicit_integrators:RungeKutta4",
+    "tsitouras-5": "springbench.solvers.methods.time_stepping.explicit_integrators:Tsitouras5",
+    "dormand-prince-8": "springbench.solvers.methods.time_stepping.explicit_integrators:DormandPrince8",
+    "baraff-witkin": "springbench.solvers.methods.time_stepping.baraff_witkin:BaraffWitkin",
+    "ros2": "springbench.solvers.methods.time_stepping.rosenbrock:Ros2",
+    "ros3p": "springbench.solvers.methods.time_stepping.rosenbrock:Ros3P",
+    "rodas": "springbench.solvers.methods.time_stepping.rosenbrock:Rodas",
+    "pncg": "springbench.solvers.methods.quasi_newton.nonlinear_cg:NonlinearCG",
+    "admm": "springbench.solvers.methods.local_global.admm:Admm",
+    "a-jacobi": "springbench.solvers.methods.local_global.aggregated_jacobi:AggregatedJacobi",
+    "mgpbd": "springbench.solvers.methods.position_based.mgpbd:MultigridXpbd",
+    "jgs2": "springbench.solvers.methods.vertex_block.jgs2:Jgs2",
+    "avbd": "springbench.solvers.methods.vertex_block.avbd:AugmentedVertexBlockDescent",
 }
 
 OPTIONAL_SOLVERS = {
-    "eigen": "solvers.methods.eigen:EigenLocalGlobal",
-    "cholmod": "solvers.methods.cholmod:CholmodLocalGlobal",
-    "mujoco": "solvers.engines.mujoco:Mujoco",
-    "pypbd": "solvers.engines.pypbd:PyPbd",
-    "taichi": "solvers.engines.taichi_newton:TaichiNewton",
-    "newton-physics": "solvers.engines.newton_physics:NewtonPhysics",
+    "eigen": "springbench.solvers.methods.local_global.eigen_local_global:EigenLocalGlobal",
+    "cholmod": "springbench.solvers.methods.local_global.cholmod_local_global:CholmodLocalGlobal",
+    "mujoco": "springbench.solvers.external.mujoco_engine:MujocoEngine",
+    "pypbd": "springbench.solvers.external.pypbd_engine:PyPbdEngine",
+    "taichi": "springbench.solvers.external.taichi_newton_engine:TaichiNewtonEngine",
+    "newton-physics": "springbench.solvers.external.newton_physics_engine:NewtonPhysicsEngine",
 }
 """Solvers with optional dependencies; they raise an error with the reason if one is missing."""
 

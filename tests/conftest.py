@@ -10,11 +10,11 @@ from collections.abc import Generator
 from typing import Any
 
 import pytest
+import springbench  # noqa: F401  sets what Numba and OpenMP read when they load
 import typer.testing
 from hypothesis import settings
 
-import harness  # noqa: F401  sets what Numba and OpenMP read when they load
-from tests import slow
+from tests import slow_tests
 
 # What commands time in tests waits for no other's.
 _LOCK_FOLDER = tempfile.TemporaryDirectory(prefix="springbench-locks-")
@@ -45,7 +45,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     limit: float | None = config.getoption("--find-slow")
     if limit and not hasattr(config, "workerinput"):  # the test runner's processes report to the first
-        config.pluginmanager.register(slow.SlowTestFinder(limit))
+        config.pluginmanager.register(slow_tests.SlowTestFinder(limit))
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks
@@ -62,7 +62,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         )
 
     items.sort(key=order)
-    slow.mark_slow_tests(items)
+    slow_tests.mark_slow_tests(items)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)

@@ -11,19 +11,19 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+from springbench.harness.scenes.effects.ether_drag_effect import EtherDragEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.self_contact_effect import SelfContactEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.effects.surface_contact_effect import SurfaceContactEffect
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.primitive_obstacles import SphereObstacle
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.step_problem import Positions, StopRule
 
-from harness.scenes.effects.ether_drag import EtherDragEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.self_contact import SelfContactEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.effects.surface_contact import SurfaceContactEffect
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.obstacles import SphereObstacle
-from harness.simulation.step import prepare, simulate_scene
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import Positions, StopRule
-from tests.scenes import build_test_scene
+from tests.scene_builders import build_test_scene
 
 THICKNESSES = tuple(0.04 / 2**k for k in range(6))
 STIFFNESSES = tuple(1e2 * 16**k for k in range(6))

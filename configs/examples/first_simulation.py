@@ -1,8 +1,8 @@
 """A first simulation: a cloth that hangs by two corners, for one second."""
 
-import harness
+import springbench
 
-scene = harness.make_scene(
+scene = springbench.make_scene(
     mesh={"kind": "grid"},
     mass=0.5,
     time_step="1/30",
@@ -12,7 +12,7 @@ scene = harness.make_scene(
 )
 
 if __name__ == "__main__":
-    simulation = harness.Simulation(scene, "hybrid", rtol=1e-6)
+    simulation = springbench.Simulation(scene, "hybrid", rtol=1e-6)
     lowest = simulation.run_steps(30)[:, :, 1].min(axis=1)
     for k in range(4, 30, 5):
         print(f"after {(k + 1) / 30:.2f} s the lowest vertex is at {lowest[k]:.3f} m")

@@ -6,13 +6,12 @@ effects: [{kind: "./own_effect.py:LinearDrag", coefficient: 0.01}]
 from typing import Literal
 
 import numpy as np
+import springbench
 from numpy.typing import NDArray
 from pydantic import NonNegativeFloat
-
-import harness
-from harness.base.model import ConfigModel
-from harness.scenes.effects.base import EffectContribution
-from harness.scenes.mesh.base import Mesh
+from springbench.harness.scenes.effects.effect_interface import EffectContribution
+from springbench.harness.scenes.mesh.mesh import Mesh
+from springbench.harness.schema.base_model import ConfigModel
 
 
 class LinearDrag(ConfigModel):
@@ -31,5 +30,5 @@ if __name__ == "__main__":
     fall = {"mesh": {"kind": "chain"}, "mass": 1.0, "time_step": "1/30", "frames": 30, "default_size": 4}
     springs, gravity = {"kind": "springs", "stretch": 300.0}, {"kind": "gravity"}
     for c in (0.0, 0.5):
-        scene = harness.make_scene(**fall, effects=[springs, gravity, LinearDrag(coefficient=c)])
-        print(f"c = {c}: {harness.Simulation(scene).run_steps(30)[-1, 0, 1]:.2f} m")
+        scene = springbench.make_scene(**fall, effects=[springs, gravity, LinearDrag(coefficient=c)])
+        print(f"c = {c}: {springbench.Simulation(scene).run_steps(30)[-1, 0, 1]:.2f} m")

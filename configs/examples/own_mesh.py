@@ -6,11 +6,10 @@ mesh: {kind: "./own_mesh.py:Wheel", radius: 0.5}
 from typing import ClassVar, Literal
 
 import numpy as np
-
-import harness
-from harness.scenes.mesh.base import SHEAR, STRETCH, Mesh
-from harness.scenes.mesh.generator import LengthMetres, MeshGenerator
-from harness.scenes.mesh.topology import assemble_mesh
+import springbench
+from springbench.harness.scenes.mesh.mesh import SHEAR, STRETCH, Mesh
+from springbench.harness.scenes.mesh.mesh_generator import LengthMetres, MeshGenerator
+from springbench.harness.scenes.mesh.mesh_topology import assemble_mesh
 
 
 class Wheel(MeshGenerator):
@@ -36,5 +35,5 @@ class Wheel(MeshGenerator):
 if __name__ == "__main__":
     springs = {"kind": "springs", "stretch": 500.0, "shear": 500.0}
     effects = [springs, {"kind": "gravity"}, {"kind": "pins", "at": ["hub"]}]
-    scene = harness.make_scene(mesh=Wheel(radius=0.5), effects=effects, mass=1.0, time_step=0.02, frames=20)
-    print(f"the rim sinks to {harness.Simulation(scene, size=12).run_steps(20)[:, :, 1].min():.3f} m")
+    scene = springbench.make_scene(mesh=Wheel(radius=0.5), effects=effects, mass=1.0, time_step=0.02, frames=20)
+    print(f"the rim sinks to {springbench.Simulation(scene, size=12).run_steps(20)[:, :, 1].min():.3f} m")

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import pyarrow as pa
-
-import harness
+import springbench
 
 
 def iterations(rows: pa.Table, folder: Path) -> list[Path]:
@@ -22,13 +21,13 @@ def iterations(rows: pa.Table, folder: Path) -> list[Path]:
 
 
 if __name__ == "__main__":
-    sweep: harness.SweepKeys = {
+    sweep: springbench.SweepKeys = {
         "scenes": ["../scenes/hanging-cloth.yaml"],
         "sizes": [8],
         "solvers": ["sparse", "lbfgs"],
         "options": {"frames": 3, "iterations": 300, "tolerance": 1e-3, "record": False, "pictures": False, "rounds": 1},
-        "reports": [harness.UserCodeName("./own_report.py:iterations")],
+        "reports": [springbench.UserCodeName("./own_report.py:iterations")],
     }
     here = Path(globals().get("__file__", "configs/examples/own_report.py")).parent  # a notebook is no file
-    rows = harness.run_config(sweep, name="own-report", folder=here)
+    rows = springbench.run_config(sweep, name="own-report", folder=here)
     print(f"{len(rows)} rows, and results/own-report/iterations.png")

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import harness
-from solvers.core.formula import FixedPointSolver
-from solvers.problem import Positions
+import springbench
+from springbench.solvers.methods.local_global.fixed_point import FixedPointSolver
+from springbench.solvers.model.step_problem import Positions
 
 
 @dataclass(frozen=True)
@@ -20,12 +20,12 @@ class HeavyBall(FixedPointSolver):
 
 
 if __name__ == "__main__":
-    sweep: harness.SweepKeys = {
+    sweep: springbench.SweepKeys = {
         "scenes": ["../scenes/hanging-cloth.yaml"],
         "sizes": [8],
-        "solvers": ["sparse", harness.UserCodeName("./own_solver.py:HeavyBall")],
+        "solvers": ["sparse", springbench.UserCodeName("./own_solver.py:HeavyBall")],
         "options": {"frames": 3, "iterations": 500, "tolerance": 1e-4, "record": False, "pictures": False, "rounds": 1},
     }
     here = Path(globals().get("__file__", "configs/examples/own_solver.py")).parent  # a notebook is no file
-    rows = harness.run_config(sweep, name="heavy-ball", folder=here)
+    rows = springbench.run_config(sweep, name="heavy-ball", folder=here)
     print(rows.select(["solver", "iterations"]))

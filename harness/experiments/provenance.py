@@ -9,16 +9,16 @@ import json
 from datetime import UTC, datetime
 from typing import Any
 
-from harness.base import machine
-from harness.config.options import RUN_OPTIONS
-from harness.config.sweep import RunSpec, SolverSpec
+from springbench.harness.config.run_options import RUN_OPTIONS
+from springbench.harness.config.sweep_config import RunSpec, SolverSpec
+from springbench.harness.execution import machine_info
 
 
 def build_run_columns(run: RunSpec) -> dict[str, Any]:
     """Return the columns that are equal in all rows of a run."""
     limits = {"time_limit": run.time_limit, "memory_limit": run.memory_limit, "timing": run.timing}
     return (
-        {"run_id": run.compute_run_id(machine.describe_machine().machine_id), "sweep": run.sweep}
+        {"run_id": run.compute_run_id(machine_info.describe_machine().machine_id), "sweep": run.sweep}
         | build_specification_columns(run)
         | limits
         | build_provenance_columns(run.solver)
@@ -36,7 +36,7 @@ def build_specification_columns(run: RunSpec) -> dict[str, Any]:
         **run.solver.metadata_columns,
         **{option.column: getattr(run, name) for name, option in RUN_OPTIONS.items() if option.column},
         "tolerance": convert_tolerance(run.tolerance),
-        "threads": machine.choose_threads(run.threads).count,
+        "threads": machine_info.choose_threads(run.threads).count,
     }
 
 
@@ -51,16 +51,16 @@ def build_provenance_columns(solver: SolverSpec | None = None) -> dict[str, Any]
     Args:
         solver: solver whose package versions are included, where it is an interface to a package.
     """
-    here = machine.describe_machine()
+    here = machine_info.describe_machine()
     return {
         "machine": here.machine_id,
-        "node": machine.compute_node_id(),
+        "node": machine_info.compute_node_id(),
         "cpu": here.cpu,
         "cores": here.cores,
         "memory_gib": here.memory_gib,
         "system": here.operating_system,
-        "versions": json.dumps(machine.collect_versions(*(solver.packages if solver else ())), sort_keys=True),
-        "commit": machine.read_commit(),
-        "code": machine.hash_sources(),
+        "versions": json.dumps(machine_info.collect_versions(*(solver.packages if solver else ())), sort_keys=True),
+        "commit": machine_info.read_commit(),
+        "code": machine_info.hash_sources(),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }

@@ -7,20 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from harness.base import rows
-from harness.base.files import find_partial_files
-from harness.base.progress import RunCost
-from harness.base.quantities import compute_ms_per_step
-from harness.base.workers import ProgressCallback, TaskFailure, TaskLimits
-from harness.config.sweep import RunSpec
-from harness.experiments.code import collect_source_parts, compute_source_fingerprint
-from harness.experiments.plan import RunFiles
-from harness.experiments.provenance import build_run_columns
+from springbench.harness.atomic_files import find_partial_files
+from springbench.harness.config.sweep_config import RunSpec
+from springbench.harness.execution.isolated_worker import ProgressCallback, TaskFailure, TaskLimits
+from springbench.harness.execution.progress_display import RunCost
+from springbench.harness.experiments.provenance import build_run_columns
+from springbench.harness.experiments.source_fingerprint import collect_source_parts, compute_source_fingerprint
+from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.harness.results import parquet_rows
+from springbench.harness.results.quantities import compute_ms_per_step
 
 
 @dataclass(frozen=True, slots=True)
 class RunUnit:
-    """Run of a sweep as a unit (`harness.experiments.experiment_units.ExperimentUnit`).
+    """Run of a sweep as a unit (`springbench.harness.experiments.experiment_units.ExperimentUnit`).
 
     Attributes:
         run: specification of the run.
@@ -75,7 +75,9 @@ class RunUnit:
 
     def execute_unit(self, tick: ProgressCallback) -> str:
         """Execute the run and return its outcome as text."""
-        from harness.experiments.run import execute_run  # brings along all that simulates and records
+        from springbench.harness.experiments.run_pipeline import (
+            execute_run,  # brings along all that simulates and records
+        )
 
         files = self.files.to_absolute()  # code of others may change the folder
         positions = self.positions_path and self.positions_path.absolute()
@@ -99,7 +101,7 @@ def _write_lost_rows(run: RunSpec, files: RunFiles, status: str, reason: str) ->
         | {"code": compute_source_fingerprint(collect_source_parts(run))}
         | {"phase": "run", "status": status, "reason": reason}
     ]
-    rows.write_rows(files.rows_path, found)
+    parquet_rows.write_rows(files.rows_path, found)
     return found
 
 

@@ -15,12 +15,18 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-
-from harness.base import machine
-from harness.report.ablation import ResultRow, largest_known_error, select_kind
-from harness.report.origin import describe_machine_and_commit
-from harness.report.page import add_axes, draw_header, draw_text, format_quantity, new_page, save_page, tick_formatter
-from harness.report.style import (
+from springbench.harness.execution import machine_info
+from springbench.harness.report.ablation_summary import ResultRow, largest_known_error, select_kind
+from springbench.harness.report.page_layout import (
+    add_axes,
+    draw_header,
+    draw_text,
+    format_quantity,
+    new_page,
+    save_page,
+    tick_formatter,
+)
+from springbench.harness.report.plot_style import (
     BACKGROUND_COLOUR,
     MUTED_COLOUR,
     PAGE_RC,
@@ -29,6 +35,7 @@ from harness.report.style import (
     WARNING_COLOUR,
     indexed_style,
 )
+from springbench.harness.report.provenance_words import describe_machine_and_commit
 
 _ERROR_LABELS = {"solver": "error of the solver", "time-step": "error of the time step"}
 _MIN_DISPLACEMENT = 1e-6
@@ -56,7 +63,7 @@ def draw_ablation_plot(rows: Sequence[ResultRow], path: Path) -> None:
         draw_header(page, f"{whole['scene']}: what its effects cost and change", facts)
         ax = add_axes(page, 130, 138, 1380, 630)
         _draw_error_lines(ax, rows, points)
-        older = whole["code"] not in (None, machine.hash_sources())
+        older = whole["code"] not in (None, machine_info.hash_sources())
         _draw_effects(ax, points, whole["seconds"], is_stale=older)
         gone = [row["name"] for row in select_kind(rows, "without") if row["status"] != "ok"]
         called = [row["name"] for row in select_kind(rows, "suggestion")]

@@ -12,9 +12,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from math import inf, isfinite
 from typing import NamedTuple
 
-from harness.base.quantities import compute_slowdown
-from harness.report.page import format_factor, format_quantity
-from harness.report.timing_table import ROUNDOFF_RATIO, RunTimes
+from springbench.harness.report.page_layout import format_factor, format_quantity
+from springbench.harness.report.timing_table import ROUNDOFF_RATIO, RunTimes
+from springbench.harness.results.quantities import compute_slowdown
 
 EQUAL_ERROR_FACTOR = 10.0
 """Errors within this factor of the lowest count as equal."""

@@ -21,11 +21,10 @@ from typing import Any, NamedTuple
 from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
-
-from harness.base import rows, shelf
-from harness.base.errors import InputError
-from harness.config.options import RUN_OPTIONS
-from solvers.registry import OPTIONAL_SOLVERS, SOLVERS
+from springbench.harness.config.run_options import RUN_OPTIONS
+from springbench.harness.errors import InputError
+from springbench.harness.results import parquet_rows, row_store
+from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS
 
 TOLERANCE_SLACK = 1.1
 """Factor on the tolerance, because the reference evaluator and a solver factorise the same matrix differently.
@@ -162,9 +161,9 @@ def read_verified_runs(folder: Path) -> list[VerifiedRun]:
     Raises:
         InputError: if no run was verified.
     """
-    files = shelf.list_units(folder / "rows")
+    files = row_store.list_units(folder / "rows")
     needed = "run_id", "scene", "size", "solver", "phase", "status", "started"
-    table = rows.read_rows(files, required_columns=needed, on_invalid=lambda mistake: None).to_pylist()
+    table = parquet_rows.read_rows(files, required_columns=needed, on_invalid=lambda mistake: None).to_pylist()
     runs: dict[str, list[dict[str, Any]]] = {}
     for row in table:
         if row["phase"] == "run" or (row["phase"] == "step" and row["round"] == 0):

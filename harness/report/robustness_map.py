@@ -13,11 +13,10 @@ from textwrap import wrap
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-
-from harness.base import shelf
-from harness.base.errors import InputError
-from harness.report.origin import describe_machine_and_commit
-from harness.report.robustness import (
+from springbench.harness.errors import InputError
+from springbench.harness.report.plot_style import BACKGROUND_COLOUR, MUTED_COLOUR, PAGE_DPI, RULE_COLOUR, TEXT_COLOUR
+from springbench.harness.report.provenance_words import describe_machine_and_commit
+from springbench.harness.report.robustness import (
     CORRECT,
     DIVERGED,
     FAILED,
@@ -29,7 +28,7 @@ from harness.report.robustness import (
     read_verified_runs,
     score_solvers,
 )
-from harness.report.style import BACKGROUND_COLOUR, MUTED_COLOUR, PAGE_DPI, RULE_COLOUR, TEXT_COLOUR
+from springbench.harness.results import row_store
 
 (
     _CELL_HEIGHT,
@@ -204,7 +203,7 @@ def draw_robustness_maps(
         find_stale: returns the ids of those runs in a sweep's folder that other code than the current version executed.
     Yields: each picture and its runs.
     """
-    for rows in shelf.find_row_folders(results, "rows"):
+    for rows in row_store.find_row_folders(results, "rows"):
         with suppress(InputError):
             cells = read_verified_runs(rows.parent)
             picture = rows.parent / "pictures" / "robustness.png"

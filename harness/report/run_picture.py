@@ -18,12 +18,23 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
-
-from harness.record.base import RecordingReplay
-from harness.record.framing import describe_outside
-from harness.report.frames import find_drawable_frames, max_recorded_strain, strain_extremes, strain_scale_limit
-from harness.report.origin import draw_provenance
-from harness.report.page import (
+from springbench.harness.recording.camera_framing import describe_outside
+from springbench.harness.recording.recorder_interface import RecordingReplay
+from springbench.harness.report.drawable_frames import (
+    find_drawable_frames,
+    max_recorded_strain,
+    strain_extremes,
+    strain_scale_limit,
+)
+from springbench.harness.report.mesh_rendering import (
+    OffscreenRenderer,
+    choose_view_angles,
+    compute_area_vectors,
+    fit_camera,
+    view_aspect,
+)
+from springbench.harness.report.obstacle_meshes import framed_vertex_mask, points_to_frame
+from springbench.harness.report.page_layout import (
     draw_header,
     draw_strain_scale,
     draw_text,
@@ -36,10 +47,7 @@ from harness.report.page import (
     scene_headline,
     shorten_words,
 )
-from harness.report.render import OffscreenRenderer, choose_view_angles, compute_area_vectors, fit_camera, view_aspect
-from harness.report.self_contact import describe_self_intersection
-from harness.report.solids import framed_vertex_mask, points_to_frame
-from harness.report.style import (
+from springbench.harness.report.plot_style import (
     BACKGROUND_COLOUR,
     MUTED_COLOUR,
     PAGE_HEIGHT,
@@ -48,6 +56,8 @@ from harness.report.style import (
     RULE_COLOUR,
     TEXT_COLOUR,
 )
+from springbench.harness.report.provenance_words import draw_provenance
+from springbench.harness.report.self_intersection_notes import describe_self_intersection
 
 _FRAMES_LEFT, _FRAMES_TOP, _FRAMES_RIGHT, _FRAMES_HEIGHT = 36, 114, PAGE_WIDTH - 36, 750
 _MAX_FINAL_WIDTH, _MIN_FINAL_WIDTH = 1180, 420  # of the final frame; the earlier ones have the rest

@@ -18,10 +18,8 @@ import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, LogLocator, NullLocator
-
-from harness.report.labels import LABEL_SPACING, LineEnd, draw_direct_labels
-from harness.report.origin import describe_machine_and_commit
-from harness.report.page import (
+from springbench.harness.report.line_end_labels import LABEL_SPACING, LineEnd, draw_direct_labels
+from springbench.harness.report.page_layout import (
     add_axes,
     draw_header,
     draw_text,
@@ -32,7 +30,7 @@ from harness.report.page import (
     shorten_words,
     tick_formatter,
 )
-from harness.report.style import (
+from springbench.harness.report.plot_style import (
     BACKGROUND_COLOUR,
     DASH_DOTTED_LINE,
     DASHED_LINE,
@@ -45,8 +43,9 @@ from harness.report.style import (
     SeriesStyle,
     assign_solver_styles,
 )
-from harness.report.timing_rows import PANEL_TITLES, draw_timing_rows
-from harness.report.timing_table import RunTimes, label_runs, read_run_times
+from springbench.harness.report.provenance_words import describe_machine_and_commit
+from springbench.harness.report.timing_rows_plot import PANEL_TITLES, draw_timing_rows
+from springbench.harness.report.timing_table import RunTimes, label_runs, read_run_times
 
 _PANELS_LEFT, _PANELS_TOP, _PANELS_RIGHT, _PANELS_BOTTOM = 40, 118, PAGE_WIDTH - 40, PAGE_HEIGHT - 30
 _PANEL_COLUMNS = 4  # scenes side by side
@@ -76,7 +75,7 @@ def draw_timing_plot(table: pa.Table, path: Path, title: str, stale_ids: Collect
     frame.
 
     Args:
-        table: rows (schema: `harness.results.run_schema.RUN_SCHEMA`).
+        table: rows (schema: `springbench.harness.results.run_schema.RUN_SCHEMA`).
         path: target file.
         title: title of the picture.
         stale_ids: ids of runs that were executed by other code than the current version; their marks are hollow.

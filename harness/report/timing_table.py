@@ -18,21 +18,20 @@ from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
-
-from harness.base.columns import RUN_SCHEMA
-from harness.base.quantities import SQL_EXPRESSIONS
-from harness.report.machines import assign_machine_names as machine_names
-from harness.report.machines import machine_footer
-from harness.report.page import format_quantity, format_time_step
-from harness.report.references import format_citation
-from harness.report.sql import query_table
+from springbench.harness.report.citations import format_citation
+from springbench.harness.report.machine_footer import assign_machine_names as machine_names
+from springbench.harness.report.machine_footer import machine_footer
+from springbench.harness.report.page_layout import format_quantity, format_time_step
+from springbench.harness.report.table_queries import query_table
+from springbench.harness.results.quantities import SQL_EXPRESSIONS
+from springbench.harness.results.run_schema import RUN_SCHEMA
 
 
 class RunTimes(NamedTuple):
     """One run: identification, status, and its times [ms]; None where the rows lack a value.
 
     The fields are the columns of `_SUMMARY_QUERY`, in order. The statistics step, lower, upper, least, num_iterations,
-    residual, worst_residual, max_strain and strain_p99 are defined in `harness.results.quantities`.
+    residual, worst_residual, max_strain and strain_p99 are defined in `springbench.harness.results.quantities`.
 
     Attributes:
         cold, warm: time of the preparation.
@@ -124,7 +123,7 @@ from rows_of group by run_id order by min(place)
 def read_run_times(table: pa.Table) -> list[RunTimes]:
     """Return the runs in a table of rows, in the order of their first rows.
 
-    The rows have the schema `harness.results.run_schema.RUN_SCHEMA`.
+    The rows have the schema `springbench.harness.results.run_schema.RUN_SCHEMA`.
     """
     numbered = table.append_column("place", pa.array(np.arange(len(table))))
     return [RunTimes(*row) for row in query_table(_SUMMARY_QUERY, numbered)]

@@ -15,7 +15,8 @@ A gain is measured relative to the available energy: that of the start, the ener
 ROUNDOFF_SAFETY times the work of sources, and the energy that the load gives to bodies at rest in one step. Pinned
 vertices have no kinetic energy. Stored energy counts where a spring is strained by more than its length: stiff springs
 that a solve leaves slightly too long store much energy, but move nothing. Exact lengths contribute the penalties of
-their Lagrangian (`solvers.model.energies.augmented_lagrangian`). The round-off bound is subtracted from a gain.
+their Lagrangian (`springbench.solvers.model.energies.augmented_lagrangian`). The round-off bound is subtracted from
+a gain.
 """
 
 from __future__ import annotations
@@ -25,14 +26,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from harness.record.shading import compute_strains
-from harness.scenes.bind import Scene
-from harness.simulation.step import SimulationStep, build_initial_state
-from solvers.energies.augmented import compute_penalty_stiffness, concatenate_constraints, length_errors
-from solvers.matrices import assemble_system_matrix
-from solvers.problem import Energy, Positions, ProjectiveEnergy, StepProblem, is_lagged
-from solvers.round_off import ROUNDOFF_FACTOR, gradient_roundoff
+from springbench.harness.recording.strain_shading import compute_strains
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import SimulationStep, build_initial_state
+from springbench.solvers.model.energies.augmented_lagrangian import (
+    compute_penalty_stiffness,
+    concatenate_constraints,
+    length_errors,
+)
+from springbench.solvers.model.rounding_bound import ROUNDOFF_FACTOR, gradient_roundoff
+from springbench.solvers.model.step_problem import Energy, Positions, ProjectiveEnergy, StepProblem, is_lagged
+from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix
 
 GROWTH_LIMIT = 1.0
 """Ratio of gain to available energy above which energy has grown without a source. Converged steps of implicit Euler

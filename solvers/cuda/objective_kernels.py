@@ -2,7 +2,7 @@
 
     grad_i g = h_i (p_i - c_i) - f_i + sum over its edges of t n,      t = k (l - r), or k (n.v - o) of a dashpot
     (H x)_i  = h_i x_i + sum over its edges of b + a n (n.b),  b = s (x_i - x_j),  s = t/l,  a = (k - s)
-    g(q) - g(p): a sum of differences, as in `solvers.kernels.objective_kernels`
+    g(q) - g(p): a sum of differences, as in `springbench.solvers.kernels.objective_kernels`
 
 Each row gathers its own terms, in the order of its list, so no thread writes to another's row.
 """
@@ -14,10 +14,9 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-
-from solvers.cuda import sums
-from solvers.cuda.target import cuda
-from solvers.energies.edges import ZERO_LENGTH
+from springbench.solvers.cuda import device_sums
+from springbench.solvers.cuda.cuda_target import cuda
+from springbench.solvers.model.energies.edge_energy import ZERO_LENGTH
 
 
 @cuda.jit(device=True)
@@ -101,7 +100,7 @@ def sum_objective_change(edges, step_data, p, q, sum_slot, partials):
                 closer += edges.edge_direction[e, c] * ((q[i, c] - p[i, c]) - (q[j, c] - p[j, c]))
             total += k * closer * (closing + 0.5 * closer)
         e += cuda.gridsize(1)
-    sums.store_partial_sum(total, sum_slot, partials)
+    device_sums.store_partial_sum(total, sum_slot, partials)
 
 
 class HessianKernels(NamedTuple):
@@ -171,6 +170,6 @@ def build_hessian_kernels(real: type[np.float32] | type[np.float64]) -> HessianK
             out[i, 0], out[i, 1], out[i, 2] = y0, y1, y2
             total += np.float64(x0) * np.float64(y0) + np.float64(x1) * np.float64(y1) + np.float64(x2) * np.float64(y2)
             i += cuda.gridsize(1)
-        sums.store_partial_sum(total, which, partials)
+        device_sums.store_partial_sum(total, which, partials)
 
     return HessianKernels(linearise, multiply)

@@ -14,10 +14,9 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-
-from solvers.cuda import sums
-from solvers.cuda.target import cuda
-from solvers.energies.edges import ZERO_LENGTH
+from springbench.solvers.cuda import device_sums
+from springbench.solvers.cuda.cuda_target import cuda
+from springbench.solvers.model.energies.edge_energy import ZERO_LENGTH
 
 RealType = type[np.float32] | type[np.float64]
 
@@ -229,6 +228,6 @@ def build_schwarz_kernels(real: RealType, patch: int) -> SchwarzKernels:
             for c in range(3):
                 total += np.float64(r[i, c]) * np.float64(z[i, c])
             i += cuda.gridsize(1)
-        sums.store_partial_sum(total, which, partials)
+        device_sums.store_partial_sum(total, which, partials)
 
     return SchwarzKernels(invert, gather, multiply, dot)

@@ -13,9 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 DRAWING = {"PIL", "matplotlib", "mpl_toolkits", "plotly", "pyvista", "vtkmodules", "rerun"}
 COMPUTING = {"duckdb", "llvmlite", "numba", "numpy", "pyarrow", "pydantic", "scipy"}
 STEPPING = {"duckdb", "llvmlite", "numba", "pyarrow", "scipy.linalg"}
-PROGRAM = (
-    "import atexit, sys; atexit.register(lambda: print('loaded', *sys.modules)); from harness.cli import main; main()"
-)
+PROGRAM = "import atexit, sys; atexit.register(lambda: print('loaded', *sys.modules)); from springbench.harness.cli.main import main; main()"
 
 
 def loads(arguments: list[str], cache: Path) -> list[str]:
@@ -35,7 +33,11 @@ def loads(arguments: list[str], cache: Path) -> list[str]:
     ("arguments", "without", "fewer"),
     [
         (["--help"], DRAWING | COMPUTING | {"rich"}, 220),
-        (["list", "configs/quickstart.yaml"], DRAWING | STEPPING | {"harness.report", "harness.record.rerun"}, 800),
+        (
+            ["list", "configs/quickstart.yaml"],
+            DRAWING | STEPPING | {"springbench.harness.report", "springbench.harness.recording.rerun_recorder"},
+            800,
+        ),
     ],
     ids=["--help", "list"],
 )

@@ -65,24 +65,44 @@ def tree(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("file", "line", "refused"),
     [
-        ("solvers/matrices.py", "from harness.base import rows", "The solvers know nothing of the harness BROKEN"),
-        ("solvers/matrices.py", "import solvers.methods.local_global", "The rows of the solvers BROKEN"),
-        ("solvers/methods/local_global.py", "from time import perf_counter", "solvers is not allowed to import time"),
-        ("solvers/methods/local_global.py", "import rerun", "solvers is not allowed to import rerun"),
         (
-            "harness/scenes/mesh/base.py",
-            "import harness.experiments.run",
-            "harness.scenes is not allowed to import harness.experiments",
+            "solvers/model/system_matrix_assembly.py",
+            "from springbench.harness.execution import rows",
+            "The solvers know nothing of the harness BROKEN",
         ),
         (
-            "harness/scenes/effects/wind.py",
-            "import harness.scenes.effects.gravity",
+            "solvers/model/system_matrix_assembly.py",
+            "import springbench.solvers.methods.local_global.reference_local_global",
+            "The rows of the solvers BROKEN",
+        ),
+        (
+            "solvers/methods/local_global/reference_local_global.py",
+            "from time import perf_counter",
+            "solvers is not allowed to import time",
+        ),
+        (
+            "solvers/methods/local_global/reference_local_global.py",
+            "import rerun",
+            "solvers is not allowed to import rerun",
+        ),
+        (
+            "harness/scenes/mesh/mesh.py",
+            "import springbench.harness.experiments.run_pipeline",
+            "springbench.harness.scenes is not allowed to import springbench.harness.experiments",
+        ),
+        (
+            "harness/scenes/effects/wind_effect.py",
+            "import springbench.harness.scenes.effects.gravity_effect",
             "The effects do not know each other BROKEN",
         ),
-        ("harness/report/style.py", "import harness.simulation.step", "harness.report is not allowed to import"),
-        ("harness/experiments/run.py", "import rerun", "Rerun is known in the recordings alone BROKEN"),
         (
-            "harness/scenes/bind.py",
+            "harness/report/plot_style.py",
+            "import springbench.harness.simulation.time_loop",
+            "springbench.harness.report is not allowed to import",
+        ),
+        ("harness/experiments/run_pipeline.py", "import rerun", "Rerun is known in the recordings alone BROKEN"),
+        (
+            "harness/scenes/scene_builder.py",
             "import pyvista",
             "PyVista, Matplotlib and Plotly are known in the reports alone BROKEN",
         ),

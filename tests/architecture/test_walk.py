@@ -7,38 +7,61 @@ from types import FrameType
 from typing import Any, NamedTuple
 
 import pytest
+from springbench.harness.cli.main import app
 from typer.testing import CliRunner
-
-from harness.cli import app
 
 ROWS = ("cli", "experiments", "report", "config", "reference", "simulation", "record", "scenes", "base", "solvers")
 """The rows of the page, the uppermost first."""
 
 GIVEN = {
-    ("harness.base.commands", "harness.config.command_line"): "Typer asks for a command's options",
-    ("harness.base.commands", "harness.cli"): "and calls what stands before every command, `--version`",
-    ("harness.config.command_line", "harness.cli"): "and calls the command",
-    ("harness.base.document", "harness.scenes.selection"): "the models of what a document says check their fields",
-    ("harness.base.document", "harness.scenes.spec"): "the same",
-    ("harness.base.rows", "harness.experiments.sweep"): "paths, one after the other",
-    ("solvers.contact.friction_rounds", "harness.reference.grade"): "a solver whose residuals are graded",
-    ("solvers.contact.friction_rounds", "harness.simulation.contract"): "a solver whose inputs are compared after it",
-    ("harness.simulation.clock", "harness.experiments.run"): "what is measured once more where clocks do not agree",
-    ("harness.simulation.observe", "harness.experiments.run"): "who is told of each step",
+    (
+        "springbench.harness.cli.shared_options",
+        "springbench.harness.config.cli_options",
+    ): "Typer asks for a command's options",
+    (
+        "springbench.harness.cli.shared_options",
+        "springbench.harness.cli.main",
+    ): "and calls what stands before every command, `--version`",
+    ("springbench.harness.config.cli_options", "springbench.harness.cli.main"): "and calls the command",
+    (
+        "springbench.harness.schema.config_document",
+        "springbench.harness.scenes.vertex_selectors",
+    ): "the models of what a document says check their fields",
+    ("springbench.harness.schema.config_document", "springbench.harness.scenes.scene_spec"): "the same",
+    (
+        "springbench.harness.results.parquet_rows",
+        "springbench.harness.experiments.sweep_runner",
+    ): "paths, one after the other",
+    (
+        "springbench.solvers.contact.lagged_friction",
+        "springbench.harness.reference.residual_audit",
+    ): "a solver whose residuals are graded",
+    (
+        "springbench.solvers.contact.lagged_friction",
+        "springbench.harness.simulation.solver_contract",
+    ): "a solver whose inputs are compared after it",
+    (
+        "springbench.harness.simulation.stopwatch",
+        "springbench.harness.experiments.run_pipeline",
+    ): "what is measured once more where clocks do not agree",
+    (
+        "springbench.harness.simulation.instrumentation_pass",
+        "springbench.harness.experiments.run_pipeline",
+    ): "who is told of each step",
 }
 """The calls that lead up, each to what was given on the way down."""
 
 STATIONS = (
-    "harness.config.load",
-    "harness.config.expand",
-    "harness.experiments.plan",
-    "harness.experiments.run",
-    "harness.simulation.measure",
-    "harness.simulation.step",
-    "harness.record.rerun",
-    "harness.simulation.observe",
-    "harness.record.verify",
-    "harness.report.timing_table",
+    "springbench.harness.config.config_loader",
+    "springbench.harness.config.expand_grid",
+    "springbench.harness.experiments.sweep_plan",
+    "springbench.harness.experiments.run_pipeline",
+    "springbench.harness.simulation.timing_pass",
+    "springbench.harness.simulation.time_loop",
+    "springbench.harness.recording.rerun_recorder",
+    "springbench.harness.simulation.instrumentation_pass",
+    "springbench.harness.recording.recording_check",
+    "springbench.harness.report.timing_table",
 )
 
 SCENE = """
@@ -112,15 +135,21 @@ def test_a_solve_takes_nothing_of_the_harness_along(walk: list[Call]):
 def test_a_run_comes_by_its_stations_in_the_order_of_the_page(walk: list[Call]):
     assert [module for module in dict.fromkeys(call.of for call in walk) if module in STATIONS] == list(STATIONS)
     # A config is bound once to be checked, and a run once.
-    assert [call.by for call in walk if (call.of, call.name) == ("harness.scenes.bind", "build")] == [
-        "harness.config.load",
-        "harness.experiments.run",
+    assert [
+        call.by for call in walk if (call.of, call.name) == ("springbench.harness.scenes.scene_builder", "build")
+    ] == [
+        "springbench.harness.config.config_loader",
+        "springbench.harness.experiments.run_pipeline",
     ]
 
 
 def test_a_run_enters_few_modules_and_seldom_changes_them(walk: list[Call]):
     """Pages and tables apart, which are of all results."""
-    before = [call for call in walk if "harness.report" not in call.by and "harness.report" not in call.of]
+    before = [
+        call
+        for call in walk
+        if "springbench.harness.report" not in call.by and "springbench.harness.report" not in call.of
+    ]
     modules = {call.of for call in before}
     assert len(modules) <= 100, "100 when this was counted last"
     assert len(before) <= 1460, "1,447 when this was counted last, friction and the balance of energy among them"

@@ -20,19 +20,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
+from springbench.harness.reference.step_snapshot import build_exact_scene
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.scene_spec import IntegratorName, SceneSpec
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.newton.newton_direct import is_positive_definite
+from springbench.solvers.model.step_problem import Positions, StepProblem, StopRule
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
+from springbench.solvers.registry import SOLVERS, load_target
 
-from harness.config.load import load_scene
-from harness.experiments.accuracy.units import open_reference_store
-from harness.reference.frozen import build_exact_scene
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.spec import IntegratorName, SceneSpec
-from harness.simulation.step import prepare, simulate_scene
-from solvers.core.fixed_objective import FixedObjective
-from solvers.core.objective import StepObjective
-from solvers.methods.newton import is_positive_definite
-from solvers.problem import Positions, StepProblem, StopRule
-from solvers.registry import SOLVERS, load_target
 from tests.bench.gates import STOP, Gate, Work
 
 ROOT = Path(__file__).resolve().parents[2]

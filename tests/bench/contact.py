@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from harness.scenes.bind import build_scene
-from harness.scenes.effects.contact import ContactEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.spec import SceneSpec
-from harness.simulation.step import simulate_scene
+from springbench.harness.scenes.effects.contact_effect import ContactEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.simulation.time_loop import simulate_scene
+
 from tests.bench.gates import STOP, Gate, Work, last, prepare
 
 FAR = ContactEffect.model_validate(

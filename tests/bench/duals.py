@@ -23,25 +23,25 @@ import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect as PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect as SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.solid_meshes import BlockMesh
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.simulation.time_loop import MotionState, build_problem, prepare, simulate_scene
+from springbench.solvers.linalg.multigrid.near_nullspace import PreconditionedSolve, VCycle
+from springbench.solvers.methods.local_global.prefactored import require_only_springs
+from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.position_based.mgpbd import MultigridXpbd
+from springbench.solvers.methods.position_based.xpbd import PreparedXpbd, Xpbd
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import StepProblem, StopRule
 
-from harness.base.machine import limit_threads
-from harness.config.load import load_scene
-from harness.scenes.bind import build_scene
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect as PinsEffect
-from harness.scenes.effects.springs import SpringsEffect as SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.solids import BlockMesh
-from harness.simulation.step import MotionState, build_problem, prepare, simulate_scene
-from solvers.core.prefactored import require_only_springs
-from solvers.integrators import Motion
-from solvers.linear.near_kernel import PreconditionedSolve, VCycle
-from solvers.methods.hybrid import HybridNewton
-from solvers.methods.mgpbd import MultigridXpbd
-from solvers.methods.newton import NewtonSolver
-from solvers.methods.xpbd import PreparedXpbd, Xpbd
-from solvers.problem import StepProblem, StopRule
-from tests.scenes import build_first_problem, build_test_scene
+from tests.scene_builders import build_first_problem, build_test_scene
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 CLOTHS = {

@@ -2,7 +2,8 @@
 
     python -m tests.bench.effects [--size 33] [--rounds 3] [--frames 8] [SOLVER ...]
 
-The hanging cloth is simulated to a tolerance of 1e-6 (see `harness.experiments.ablation.prices`). Each cell tells the
+The hanging cloth is simulated to a tolerance of 1e-6 (see
+`springbench.harness.experiments.ablation.iteration_overhead`). Each cell tells the
 price, how it is reached (ms an iteration) and the limit that it is to keep.
 """
 
@@ -14,12 +15,11 @@ from pathlib import Path
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
-
-from harness.base.machine import limit_threads
-from harness.config.load import load_scene
-from harness.experiments.ablation.prices import measure_overhead, prepare_scene
-from solvers.problem import StopRule, Unsupported
-from solvers.registry import SOLVERS, load_target
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.harness.experiments.ablation.iteration_overhead import measure_overhead, prepare_scene
+from springbench.solvers.model.step_problem import StopRule, Unsupported
+from springbench.solvers.registry import SOLVERS, load_target
 
 PRICES = Path(__file__).parents[2] / "configs" / "prices.yaml"
 STOP = StopRule(5000, 1e-6)

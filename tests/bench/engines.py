@@ -20,16 +20,15 @@ import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
-
-from harness.base.machine import limit_threads
-from harness.config.load import load_scene
-from harness.reference.frozen import build_exact_scene
-from harness.reference.oracle import ReferenceEvaluator
-from harness.scenes.bind import Scene
-from harness.simulation.step import build_initial_state, prepare, simulate_scene
-from solvers.core.forces import estimate_max_frequency
-from solvers.problem import Positions, StopRule, Unsupported
-from solvers.registry import SOLVER_TABLE, load_target
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.harness.reference.reference_evaluator import ReferenceEvaluator
+from springbench.harness.reference.step_snapshot import build_exact_scene
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import build_initial_state, prepare, simulate_scene
+from springbench.solvers.methods.time_stepping.explicit_forces import estimate_max_frequency
+from springbench.solvers.model.step_problem import Positions, StopRule, Unsupported
+from springbench.solvers.registry import SOLVER_TABLE, load_target
 
 SCENES = [Path(__file__).parents[2] / "configs" / "scenes" / f"{name}.yaml" for name in ("curtain", "stiff-cloth-sway")]
 ENGINES: tuple[tuple[str, dict[str, Any]], ...] = (

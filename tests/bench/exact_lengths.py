@@ -19,24 +19,24 @@ import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.harness.scenes.effects.ether_drag_effect import EtherDragEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import build_initial_state, build_problem, simulate_scene
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.position_based.xpbd import PreparedXpbd, Xpbd, XpbdSmallSteps
+from springbench.solvers.methods.vertex_block.avbd import AugmentedVertexBlockDescent as Avbd
+from springbench.solvers.methods.vertex_block.avbd import PreparedAugmentedVertexBlockDescent
+from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent as Vbd
+from springbench.solvers.model.energies import spring_energy
+from springbench.solvers.model.energies.augmented_lagrangian import concatenate_constraints, length_errors
+from springbench.solvers.model.step_problem import PreparedSolver, Solver, StepProblem, StopRule
 
-from harness.base.machine import limit_threads
-from harness.scenes.bind import Scene
-from harness.scenes.effects.ether_drag import EtherDragEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.simulation.step import build_initial_state, build_problem, simulate_scene
-from solvers.energies import springs
-from solvers.energies.augmented import concatenate_constraints, length_errors
-from solvers.methods.avbd import AugmentedVertexBlockDescent as Avbd
-from solvers.methods.avbd import PreparedAugmentedVertexBlockDescent
-from solvers.methods.newton import NewtonSolver
-from solvers.methods.vbd import VertexBlockDescent as Vbd
-from solvers.methods.xpbd import PreparedXpbd, Xpbd, XpbdSmallSteps
-from solvers.problem import PreparedSolver, Solver, StepProblem, StopRule
-from tests.scenes import build_test_scene
+from tests.scene_builders import build_test_scene
 
 FRAME, LINKS, HEAVY = 1 / 60, 50, 50_000.0
 FIRST = PinsEffect.model_validate({"at": ["first"], "weight": "exact"})
@@ -98,7 +98,7 @@ def ratios() -> Table:
     chain = build_test_scene(ChainMesh(), SpringsEffect(stretch=1e4, rule="fixed"), GravityEffect(), ENDS, EtherDragEffect(rate=2.0), size=12,
                   mass=11.0, time_step=FRAME)  # fmt: skip
     (found,) = chain.system.energies
-    assert isinstance(found, springs.Springs)
+    assert isinstance(found, spring_energy.Springs)
     k = np.where(np.arange(11) % 2, 1e4, 1.0) * found.stiffness
     chain = replace(chain, system=replace(chain.system, energies=(replace(found, stiffness=k),)))
 

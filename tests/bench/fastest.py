@@ -26,15 +26,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from harness.base.machine import limit_threads
-from harness.config.accuracy import CurveSpec
-from harness.config.accuracy_load import load_accuracy
-from harness.experiments.accuracy.scales import compute_vertex_distances
-from harness.experiments.accuracy.solves import SnapshotEvaluation
-from harness.experiments.accuracy.units import open_reference_store
-from solvers.problem import Positions, PreparedSolver, StepProblem, Unsupported
-from solvers.registry import SOLVER_TABLE, load_target
+from springbench.harness.config.accuracy_config import CurveSpec
+from springbench.harness.config.accuracy_loader import load_accuracy
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
+from springbench.harness.experiments.accuracy.snapshot_rows import SnapshotEvaluation
+from springbench.harness.experiments.accuracy.step_scales import compute_vertex_distances
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, Unsupported
+from springbench.solvers.registry import SOLVER_TABLE, load_target
 
 ROOT = Path(__file__).resolve().parents[2]
 TARGETS = {"gap": (1e-3, 1e-4, 1e-6), "error": (1e-3, 1e-6)}

@@ -15,23 +15,22 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-
-from harness.experiments.gates.abba import ClockName
-from harness.experiments.gates.sequential import DEFAULT_ALPHA
-from harness.record.base import RecordingInfo
-from harness.record.rerun import RerunRecorder
-from harness.scenes.bind import Scene, build_scene
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.spec import SceneSpec
-from harness.simulation.measure import SteppingSettings
-from harness.simulation.observe import observe_run
-from harness.simulation.step import SimulationStep, simulate_scene
-from solvers.core.prefactored import PreparedLocalGlobal
-from solvers.problem import Positions, PreparedSolver, Solution, StopRule
-from solvers.registry import SOLVERS, load_target
+from springbench.harness.experiments.regression.abba_benchmark import ClockName
+from springbench.harness.experiments.regression.confidence_sequence import DEFAULT_ALPHA
+from springbench.harness.recording.recorder_interface import RecordingInfo
+from springbench.harness.recording.rerun_recorder import RerunRecorder
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.simulation.instrumentation_pass import observe_run
+from springbench.harness.simulation.time_loop import SimulationStep, simulate_scene
+from springbench.harness.simulation.timing_pass import SteppingSettings
+from springbench.solvers.methods.local_global.prefactored import PreparedLocalGlobal
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solution, StopRule
+from springbench.solvers.registry import SOLVERS, load_target
 
 THREADS = 1
 STOP = StopRule(max_iterations=50)

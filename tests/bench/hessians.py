@@ -20,21 +20,20 @@ from unittest.mock import patch
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
-
-from harness.base.machine import limit_threads
-from harness.config.load import load_scene
-from harness.scenes.bind import build_scene
-from harness.simulation.step import SimulationStep, prepare, simulate_scene
-from solvers.core import definite
-from solvers.core.definite import IndefiniteStrategy
-from solvers.core.eigenvalues import ProjectedHessian, PsdProjection
-from solvers.core.objective import Hessian
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import StopRule
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.simulation.time_loop import SimulationStep, prepare, simulate_scene
+from springbench.solvers.methods.newton import hessian_regularisation
+from springbench.solvers.methods.newton.hessian_regularisation import IndefiniteStrategy
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.step_problem import StopRule
+from springbench.solvers.objective.psd_projection import ProjectedHessian, PsdProjection
+from springbench.solvers.objective.step_objective import Hessian
 
 SCENES = sorted((Path(__file__).parents[2] / "configs" / "hessians").glob("*.yaml"))
 STOP = StopRule(1000, 1e-6)
-RULES: tuple[IndefiniteStrategy, ...] = tuple(definite.REGULARISATION_RULES)
+RULES: tuple[IndefiniteStrategy, ...] = tuple(hessian_regularisation.REGULARISATION_RULES)
 
 
 @dataclass

@@ -21,15 +21,15 @@ from pathlib import Path
 from time import perf_counter, process_time
 from typing import NamedTuple
 
-from harness.base.machine import limit_threads
-from harness.config.load import load_sweep
-from harness.config.sweep import RunSpec
-from harness.reference.oracle import ReferenceEvaluator
-from harness.scenes.bind import build_scene
-from harness.simulation.algebraic import build_stop_rule
-from harness.simulation.step import build_initial_state, build_problem, prepare, simulate_scene
-from solvers.problem import StopRule
-from solvers.registry import SOLVERS, load_target
+from springbench.harness.config.config_loader import load_sweep
+from springbench.harness.config.sweep_config import RunSpec
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.harness.reference.reference_evaluator import ReferenceEvaluator
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.simulation.auto_tolerance import build_stop_rule
+from springbench.harness.simulation.time_loop import build_initial_state, build_problem, prepare, simulate_scene
+from springbench.solvers.model.step_problem import StopRule
+from springbench.solvers.registry import SOLVERS, load_target
 
 GROWTH = Path(__file__).parents[2] / "configs" / "growth-large.yaml"
 

@@ -30,18 +30,26 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from scipy.sparse import csr_array
+from springbench.harness.execution.machine_info import describe_machine, limit_threads
+from springbench.harness.scenes.collision_primitives import collision_primitives
+from springbench.solvers.contact.collision_mesh import CollisionMesh
+from springbench.solvers.contact.contact_potential import SelfContact
+from springbench.solvers.iteration.descent_method import DescentPoint, ResidualMetric, backtracking_line_search
+from springbench.solvers.model.barrier_energy import without_barriers
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.step_problem import (
+    DirichletPins,
+    Energy,
+    Positions,
+    StepProblem,
+    StepStart,
+    StopRule,
+    System,
+)
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
+from springbench.solvers.registry import SOLVERS, load_target
 
-from harness.base.machine import describe_machine, limit_threads
-from harness.scenes.touching import collision_primitives
-from solvers.contact.self_contact import SelfContact
-from solvers.contact.surface import CollisionMesh
-from solvers.core.bounds import without_barriers
-from solvers.core.descent import DescentPoint, ResidualMetric, backtracking_line_search
-from solvers.core.fixed_objective import FixedObjective
-from solvers.core.objective import StepObjective
-from solvers.energies.springs import Springs
-from solvers.problem import DirichletPins, Energy, Positions, StepProblem, StepStart, StopRule, System
-from solvers.registry import SOLVERS, load_target
 from tests.bench.pairs import Folded, folded, seconds
 
 OURS = ("hybrid", "newton", "lbfgs")
@@ -67,7 +75,8 @@ def stated(made: Folded, contact: Energy) -> StepProblem:
 
 
 class Blocks(NamedTuple):
-    """A matrix by its blocks, as an objective takes those of pairs (`solvers.core.bounds.PairBlocks`). vertices (b, 2):
+    """A matrix by its blocks, as an objective takes those of pairs
+    (`springbench.solvers.model.barrier_energy.PairBlocks`). vertices (b, 2):
     the row and the column of each; values (b, 3, 3) [N/m]."""
 
     vertices: NDArray[np.int64]
@@ -157,17 +166,17 @@ class Ipctk:
         return self._bent[1]
 
     def block_vertices(self, p: Positions) -> NDArray[np.int64]:
-        """See `solvers.core.bounds.Bounded`."""
+        """See `springbench.solvers.model.barrier_energy.BarrierEnergy`."""
         return self.hessian_blocks(p).vertices
 
     def add_hessian_blocks(
         self, p: Positions, keep: float, places: NDArray[np.int64], values: NDArray[np.float64]
     ) -> None:
-        """See `solvers.core.bounds.Bounded`; clamped."""
+        """See `springbench.solvers.model.barrier_energy.BarrierEnergy`; clamped."""
         self.hessian_blocks(p).add(places, values)
 
     def collision_free_step_size(self, p: Positions, direction: Positions) -> float:
-        """See `solvers.core.bounds.Bounded`."""
+        """See `springbench.solvers.model.barrier_energy.BarrierEnergy`."""
         V, W = np.asfortranarray(p), np.asfortranarray(p + direction)
         return self._timed("CCD", lambda: self._safe(V, W))
 

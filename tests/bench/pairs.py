@@ -24,14 +24,13 @@ import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
-
-from harness.base.machine import describe_machine, limit_threads
-from harness.scenes.mesh.base import Mesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.touching import collision_primitives
-from solvers.contact.self_contact import SelfContact
-from solvers.contact.surface import CollisionMesh
-from solvers.problem import Positions
+from springbench.harness.execution.machine_info import describe_machine, limit_threads
+from springbench.harness.scenes.collision_primitives import collision_primitives
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.mesh.mesh import Mesh
+from springbench.solvers.contact.collision_mesh import CollisionMesh
+from springbench.solvers.contact.contact_potential import SelfContact
+from springbench.solvers.model.step_problem import Positions
 
 GAP, LAYERS = 0.004, 4
 """At 64 vertices a side [m]."""

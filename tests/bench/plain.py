@@ -1,4 +1,4 @@
-"""What the vectors of `solvers.vectors` do, as one writes it in Numba: drop-in functions, the same arguments.
+"""What the vectors of `springbench.solvers.simd` do, as one writes it in Numba: drop-in functions, the same arguments.
 
 Where a vector kernel refuses a bundle of springs, kernels go on with a plain one: refusing all of them is that.
 """
@@ -6,14 +6,17 @@ Where a vector kernel refuses a bundle of springs, kernels go on with a plain on
 from __future__ import annotations
 
 import numpy as np
-
-from solvers.contact.closest import edge_edge_distance_vector, load_point, point_triangle_distance_vector
-from solvers.vectors.block import TILE_ROWS
-from solvers.vectors.springs import LANES, RHS_STRIDE
+from springbench.solvers.contact.geometry.distance import (
+    edge_edge_distance_vector,
+    load_point,
+    point_triangle_distance_vector,
+)
+from springbench.solvers.simd.front_tiles import TILE_ROWS
+from springbench.solvers.simd.spring_packets import LANES, RHS_STRIDE
 
 
 def refuse(bundles, number, x, right, out):
-    """Springs: `solvers.kernels.springs.add_short` does the bundle."""
+    """Springs: `springbench.solvers.kernels.spring_local_step.add_degenerate_packet` does the bundle."""
     return True
 
 
@@ -218,7 +221,7 @@ def add(source, at, target, to, count):
 
 
 def eight(vertices, x, first, last, edges, limit, tile):
-    """See `solvers.contact.contacts`."""
+    """See `springbench.solvers.contact.collisions`."""
     left = 0
     for lane in range(8):
         v = vertices[min(first + lane, last)]

@@ -17,17 +17,16 @@ from unittest.mock import patch
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
-
-from harness.base.machine import limit_threads
-from harness.config.load import load_scene
-from harness.scenes.bind import build_scene
-from harness.simulation.step import prepare, simulate_scene
-from solvers.core.objective import Hessian
-from solvers.core.preconditioning import PreconditionerName
-from solvers.methods import newton_cg
-from solvers.methods.newton_cg import NewtonCG
-from solvers.methods.pncg import NonlinearCG
-from solvers.problem import Positions, Solver, StopRule
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.iteration.preconditioners import PreconditionerName
+from springbench.solvers.methods.newton import newton_cg
+from springbench.solvers.methods.newton.newton_cg import NewtonCG
+from springbench.solvers.methods.quasi_newton.nonlinear_cg import NonlinearCG
+from springbench.solvers.model.step_problem import Positions, Solver, StopRule
+from springbench.solvers.objective.step_objective import Hessian
 
 FOLDER = Path(__file__).parents[2] / "configs" / "hessians"
 SCENES = tuple(FOLDER / f"{name}-pressed-0.yaml" for name in ("block", "cloth-100", "cloth-1e4"))

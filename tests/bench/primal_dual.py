@@ -20,19 +20,19 @@ import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.position_based.xpbd import Xpbd
+from springbench.solvers.methods.vertex_block.jgs2 import Jgs2
+from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
+from springbench.solvers.model.energies import spring_energy
+from springbench.solvers.model.step_problem import Solver, StepProblem, StopRule
 
-from harness.base.machine import limit_threads
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from solvers.energies import springs
-from solvers.methods.jgs2 import Jgs2
-from solvers.methods.newton import NewtonSolver
-from solvers.methods.vbd import VertexBlockDescent
-from solvers.methods.xpbd import Xpbd
-from solvers.problem import Solver, StepProblem, StopRule
-from tests.scenes import build_first_problem, build_test_scene
+from tests.scene_builders import build_first_problem, build_test_scene
 
 RATIOS = (1.0, 10.0, 100.0, 1e3, 1e4)
 METHODS: dict[str, Solver] = {
@@ -55,7 +55,7 @@ def hanging(stiffness: float, stiffer: float = 1.0, heavier: float = 1.0) -> Ste
     mass = stated.system.mass.copy()
     mass[-1] *= heavier
     (found,) = stated.system.energies
-    assert isinstance(found, springs.Springs)
+    assert isinstance(found, spring_energy.Springs)
     k = np.where(np.arange(len(found.edges)) % 2, stiffer, 1.0) * found.stiffness
     energies = (replace(found, stiffness=k),)
     force = stated.external_force * (mass / stated.system.mass)[:, None]

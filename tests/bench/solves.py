@@ -6,15 +6,15 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.sparse import csr_array
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import build_initial_state, build_problem
+from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky
+from springbench.solvers.linalg.direct_solvers import LinearSolver, SimplicialCholesky, SparseLU
+from springbench.solvers.linalg.solver_selection import LinearSolverName
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.model import system_matrix_assembly
+from springbench.solvers.model.step_problem import Positions
 
-from harness.scenes.bind import Scene
-from harness.simulation.step import build_initial_state, build_problem
-from solvers import matrices
-from solvers.linear.choice import LinearSolverName
-from solvers.linear.factors import LinearSolver, SimplicialCholesky, SparseLU
-from solvers.linear.supernodal import SupernodalCholesky
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.problem import Positions
 from tests.bench.gates import STOP, Gate, Work, sheet
 
 GUARDS = ("test_a_supernodal_factor_is_as_large_as_stored",)
@@ -22,7 +22,7 @@ GUARDS = ("test_a_supernodal_factor_is_as_large_as_stored",)
 
 def system_matrix(scene: Scene) -> csr_array:
     """Q of a scene of springs."""
-    return matrices.assemble_system_matrix(scene.system, [scene.all_springs])
+    return system_matrix_assembly.assemble_system_matrix(scene.system, [scene.all_springs])
 
 
 def solves(factorise: Callable[[csr_array], LinearSolver], size: int, repeats: int) -> Work:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.harness.experiments.ablation.iteration_overhead import measure_overhead, prepare_scene
+from springbench.solvers.registry import SOLVERS, load_target
 
-from harness.base.machine import limit_threads
-from harness.config.load import load_scene
-from harness.experiments.ablation.prices import measure_overhead, prepare_scene
-from solvers.registry import SOLVERS, load_target
 from tests.bench.effects import GATES, KINDS, PRICES, SOLVED, STOP
 
 

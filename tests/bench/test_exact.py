@@ -12,19 +12,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.harness.experiments.regression import hardware_counters
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import build_initial_state, build_problem, simulate_scene
+from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
+from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky
+from springbench.solvers.model.step_problem import StopRule
+from springbench.solvers.registry import SOLVERS, load_target
 
-from harness.base.machine import limit_threads
-from harness.experiments.gates import instructions
-from harness.scenes.bind import Scene
-from harness.simulation.step import build_initial_state, build_problem, simulate_scene
-from solvers.linear.block import BlockCholesky
-from solvers.linear.supernodal import SupernodalCholesky
-from solvers.problem import StopRule
-from solvers.registry import SOLVERS, load_target
 from tests.bench.contact import FAR, fallen
 from tests.bench.gates import STOP, THREADS, prepare, record, sheet, simulated, steps
 from tests.bench.solves import system_matrix
-from tests.scenes import SCENE_BUILDERS
+from tests.scene_builders import SCENE_BUILDERS
 
 
 @pytest.mark.parametrize(
@@ -180,10 +180,10 @@ def test_the_same_work_retires_the_same_instructions(solver: str, frames: int):
     work = simulated(solver, 16, frames)
     with limit_threads(THREADS):
         work()
-        first, second = instructions.count_events(work), instructions.count_events(work)
+        first, second = hardware_counters.count_events(work), hardware_counters.count_events(work)
     if first is None or second is None:
         assert (
-            instructions.explain_unavailable()
+            hardware_counters.explain_unavailable()
         )  # it says why: a virtual machine hides the counter, or the kernel refuses it
     else:
         assert second == pytest.approx(first, rel=1e-3)  # the interpreter's own housekeeping, once in a while

@@ -2,10 +2,10 @@
 
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.harness.experiments.regression.pytest_plugin import PairedBenchmark
+from springbench.harness.experiments.regression.solver_pair import CLOCK_FUNCTIONS
 
-from harness.base.machine import limit_threads
-from harness.experiments.gates.plugin import PairedBenchmark
-from harness.experiments.gates.scenes import CLOCK_FUNCTIONS
 from tests.bench import test_exact
 from tests.bench.accuracy import ACCURACY
 from tests.bench.contact import CONTACT

@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
-from solvers.vectors import intrinsics
+from springbench.solvers.simd import llvm_vectors
+
 from tests.bench.vectors import CASES
 
 
 def test_every_file_of_vectors_is_measured_but_what_they_share():
-    files = {path.stem for path in Path(intrinsics.__file__).parent.glob("*.py")}
+    files = {path.stem for path in Path(llvm_vectors.__file__).parent.glob("*.py")}
     assert files - {"__init__", "intrinsics", "springs"} == CASES.keys()

@@ -16,13 +16,13 @@ from statistics import median
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.harness.experiments.regression.abba_benchmark import BenchmarkResult, ProgramPair, run_paired_benchmark
+from springbench.harness.experiments.regression.answer_agreement import describe_difference
+from springbench.harness.experiments.regression.confidence_sequence import SequentialTest, SequentialVerdict
+from springbench.harness.experiments.regression.replay_study import run_background_load
+from springbench.harness.experiments.regression.solver_pair import build_timer, choose_num_calls
 
-from harness.base.machine import limit_threads
-from harness.experiments.gates.abba import BenchmarkResult, ProgramPair, run_paired_benchmark
-from harness.experiments.gates.agreement import describe_difference
-from harness.experiments.gates.scenes import build_timer, choose_num_calls
-from harness.experiments.gates.sequential import SequentialTest, SequentialVerdict
-from harness.experiments.gates.study import run_background_load
 from tests.bench.contact import CONTACT
 from tests.bench.gates import GATES, THREADS, Gate
 

@@ -20,19 +20,26 @@ from typing import Any
 import numpy as np
 from numba import njit  # noqa: TID251
 from scipy.sparse import csr_array
+from springbench.harness.execution.machine_info import describe_machine, limit_threads
+from springbench.harness.experiments.regression.abba_benchmark import MIN_CALL_SECONDS, TimedBlock, draw_block_orders
+from springbench.harness.experiments.regression.confidence_sequence import compute_interval
+from springbench.harness.scenes.collision_primitives import collision_primitives
+from springbench.harness.simulation.time_loop import build_initial_state, build_problem
+from springbench.solvers.contact import collisions
+from springbench.solvers.contact.collision_mesh import CollisionMesh
+from springbench.solvers.kernels import accelerated_descent, accelerated_step, spring_local_step, spring_objective
+from springbench.solvers.linalg.cholesky import (
+    block_cholesky,
+    block_multifrontal,
+    supernodal_cholesky,
+    triangular_solve,
+)
+from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky
+from springbench.solvers.linalg.multigrid import multigrid_kernels
+from springbench.solvers.linalg.multigrid.multigrid_pcg import ConjugateGradients
+from springbench.solvers.methods.vertex_block import vbd_sweeps
+from springbench.solvers.model.step_problem import Positions
 
-from harness.base.machine import describe_machine, limit_threads
-from harness.experiments.gates.abba import MIN_CALL_SECONDS, TimedBlock, draw_block_orders
-from harness.experiments.gates.sequential import compute_interval
-from harness.scenes.touching import collision_primitives
-from harness.simulation.step import build_initial_state, build_problem
-from solvers.contact import contacts
-from solvers.contact.surface import CollisionMesh
-from solvers.kernels import accelerate, accelerate_springs, accelerate_step, springs, vbd
-from solvers.linear import block, block_factor, multigrid_kernels, supernodal, supernodal_solve
-from solvers.linear.conjugate_gradients import ConjugateGradients
-from solvers.linear.supernodal import SupernodalCholesky
-from solvers.problem import Positions
 from tests.bench import plain
 from tests.bench.gates import STOP, prepare, sheet
 from tests.bench.pairs import folded
@@ -115,12 +122,16 @@ def solving(solver: str) -> Callable[[], object]:
 
 def of_springs() -> Iterator[Case]:
     """Over bundles of eight vertices with their springs."""
-    state, _, window, _, _ = given(accelerate_step, "run", solving("lbfgs"))
+    state, _, window, _, _ = given(accelerated_step, "run", solving("lbfgs"))
     parts, p, out = state.spring_packets, window.trial_position, window.trial_descent.copy()
     whole = 0, len(parts.start) - 1
     short = {"project": plain.refuse, "correct": plain.refuse}
-    yield Case("projections", springs.add_projection, (parts, *whole, p, state.right_hand_side, out, 0), short, (5,))
-    yield Case("gradient", springs.add_descent, (parts, *whole, p, state.right_hand_side, out, 0), short, (5,))
+    yield Case(
+        "projections", spring_local_step.add_projection, (parts, *whole, p, state.right_hand_side, out, 0), short, (5,)
+    )
+    yield Case(
+        "gradient", spring_local_step.add_descent, (parts, *whole, p, state.right_hand_side, out, 0), short, (5,)
+    )
     norm = (
         state.norm_packets,
         0,
@@ -128,12 +139,12 @@ def of_springs() -> Iterator[Case]:
         window.direction.copy(),
         state.iteration_plan.measure,
     )
-    yield Case("norm of Q", springs.squared_norm, norm, {"energy": plain.energy}, ())
+    yield Case("norm of Q", spring_local_step.squared_norm, norm, {"energy": plain.energy}, ())
 
 
 def of_descent() -> Iterator[Case]:
     """Over the same bundles, with the objective."""
-    state, _, window, _, _ = given(accelerate_step, "run", solving("lbfgs"))
+    state, _, window, _, _ = given(accelerated_step, "run", solving("lbfgs"))
     descent = (
         state.spring_packets,
         state.objective_weights,
@@ -142,20 +153,22 @@ def of_descent() -> Iterator[Case]:
         window.trial_descent.copy(),
     )
     none = {"descend": plain.refuse_energy}
-    yield Case("objective and gradient", accelerate_springs.value_and_descent, descent, none, (4,))
+    yield Case("objective and gradient", spring_objective.value_and_descent, descent, none, (4,))
 
 
 def of_dots() -> Iterator[Case]:
     """Over the vectors of L-BFGS."""
-    _, _, window, _, _ = given(accelerate_step, "run", solving("lbfgs"))
+    _, _, window, _, _ = given(accelerated_step, "run", solving("lbfgs"))
     both = {"dot": plain.dot, "dots": plain.dots}
-    yield Case("a step of L-BFGS", accelerate.accept_trial, (window, window.correction.copy()), both, ())
+    yield Case("a step of L-BFGS", accelerated_descent.accept_trial, (window, window.correction.copy()), both, ())
 
 
 def of_vbd() -> Iterator[Case]:
     """Over colours."""
-    blocks, spaces, beside, right, _, work, p, _ = given(vbd, "iterate", solving("vbd"))
-    yield Case("sweep", vbd._sweep_vertices, (blocks, spaces, beside, right, p, work), {"descend": plain.newton}, (4,))
+    blocks, spaces, beside, right, _, work, p, _ = given(vbd_sweeps, "iterate", solving("vbd"))
+    yield Case(
+        "sweep", vbd_sweeps._sweep_vertices, (blocks, spaces, beside, right, p, work), {"descend": plain.newton}, (4,)
+    )
 
 
 def of_supernodal() -> Iterator[Case]:
@@ -164,8 +177,8 @@ def of_supernodal() -> Iterator[Case]:
     panel = {"add_forward": plain.add_forward, "set_backward": plain.set_backward}
     for precision in ("float64", "float32"):
         factor = SupernodalCholesky(Q, precision=precision)
-        solve = given(supernodal, "solve_by", lambda factor=factor: factor.solve(b, np.empty_like(b)))
-        yield Case(f"solve, {precision}", supernodal_solve.solve_from_arrays, solve, panel, (10,))
+        solve = given(supernodal_cholesky, "solve_by", lambda factor=factor: factor.solve(b, np.empty_like(b)))
+        yield Case(f"solve, {precision}", triangular_solve.solve_from_arrays, solve, panel, (10,))
 
 
 def of_block() -> Iterator[Case]:
@@ -173,8 +186,10 @@ def of_block() -> Iterator[Case]:
     names = ("subtract_product", "divide", "factorise_corner", "solve_columns", "solve_rows", "add")
     tiles = {name: getattr(plain, name) for name in names}
     newton = solving("newton")
-    yield Case("factorisation", block_factor.factorise_blocks, given(block, "factorise", newton), tiles, (2,))
-    yield Case("solve", block_factor.solve_blocks, given(block, "solve", newton), tiles, (2,))
+    yield Case(
+        "factorisation", block_multifrontal.factorise_blocks, given(block_cholesky, "factorise", newton), tiles, (2,)
+    )
+    yield Case("solve", block_multifrontal.solve_blocks, given(block_cholesky, "solve", newton), tiles, (2,))
 
 
 def of_rows() -> Iterator[Case]:
@@ -200,10 +215,10 @@ def of_eights() -> Iterator[Case]:
         mesh.rest_positions, collision_primitives(mesh)[0], mesh.triangles, np.ones(len(p)), made.thickness, made.reach
     )
     pairs = surface.find_proximity_candidates(p, 1.5 * (made.thickness + made.reach))
-    space = contacts.allocate_collisions(len(pairs.vertices), made.thickness, made.reach)
+    space = collisions.allocate_collisions(len(pairs.vertices), made.thickness, made.reach)
     slots = np.empty(1 << (2 * len(pairs.vertices)).bit_length(), np.int32)
-    arguments = pairs, contacts.pad_positions(p), np.empty((9, 8)), slots, space
-    yield Case("closest points of pairs", contacts.gather_collisions, arguments, {"eight": plain.eight}, (2, 3))
+    arguments = pairs, collisions.pad_positions(p), np.empty((9, 8)), slots, space
+    yield Case("closest points of pairs", collisions.gather_collisions, arguments, {"eight": plain.eight}, (2, 3))
 
 
 CASES = {

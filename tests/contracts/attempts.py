@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from springbench.harness.execution import sandbox
 from typer.testing import CliRunner
 
-from harness.base import child
-
-LIMITS = child.CallLimits(20.0, 2**31)
+LIMITS = sandbox.CallLimits(20.0, 2**31)
 """What an answer may take: 20 s of processor time, and 2 GiB of memory beyond that of a bare interpreter."""
 
 
@@ -28,14 +27,14 @@ class Outcome:
 
 def attempt(folder: Path, arguments: list[str]) -> Outcome:
     """What a command line comes to in a folder, of which `results` is the folder of results. Raises child.NoAnswer."""
-    return child.call_in_sandbox(_attempt, folder, arguments, limits=LIMITS)
+    return sandbox.call_in_sandbox(_attempt, folder, arguments, limits=LIMITS)
 
 
 def _attempt(folder: Path, arguments: list[str]) -> Outcome:
-    from harness.cli import app
-    from harness.scenes.mesh import files
+    from springbench.harness.cli.main import app
+    from springbench.harness.scenes.mesh import file_mesh
 
-    files.MIN_READ_SECONDS = 1.0  # some of these would be read for ever
+    file_mesh.MIN_READ_SECONDS = 1.0  # some of these would be read for ever
     os.chdir(folder)
     (folder / "temporary").mkdir(exist_ok=True)
     tempfile.tempdir = os.environ["TMPDIR"] = str(folder / "temporary")  # what is left there is seen

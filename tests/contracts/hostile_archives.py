@@ -13,12 +13,12 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.experiments.archive.publication import publish_results
+from springbench.harness.results import parquet_rows
 
-from harness.base import rows
-from harness.config.load import load_config
-from harness.experiments.archive.publish import publish_results
 from tests.contracts.hostile import BOMB, scene
-from tests.dummies import build_dummy_rows
+from tests.synthetic_run_rows import build_dummy_rows
 
 SWEEP = "scenes: [cloth.yaml]\nsizes: [4]\nsolvers: [sparse]\n"
 ROWS = "results/sweep/rows/a.parquet"
@@ -35,7 +35,7 @@ def good_results(folder: Path) -> None:
     (folder / "results" / "sweep" / ".config").write_text("../../sweep.yaml\n")
     (run,) = load_config(folder / "sweep.yaml").list_runs()
     made = [row | {"run_id": run.compute_run_id("00000000"), "solver": "sparse"} for row in build_dummy_rows(0)]
-    rows.write_rows(folder / "results" / "sweep" / "rows" / "a.parquet", made)
+    parquet_rows.write_rows(folder / "results" / "sweep" / "rows" / "a.parquet", made)
 
 
 def good_archive(folder: Path) -> Content:

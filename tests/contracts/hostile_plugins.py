@@ -12,13 +12,13 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from harness.base.model import Model
-from harness.scenes.effects.base import Contribution, Pin, steady
-from harness.scenes.mesh.base import Mesh
-from harness.scenes.mesh.chain import Chain
-from solvers.integrators import IMPLICIT_EULER
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import Solution
+from springbench.harness.base.model import Model
+from springbench.harness.scenes.effects.base import Contribution, Pin, steady
+from springbench.harness.scenes.mesh.base import Mesh
+from springbench.harness.scenes.mesh.chain import Chain
+from springbench.solvers.integrators import IMPLICIT_EULER
+from springbench.solvers.methods.local_global import SparseLocalGlobal
+from springbench.solvers.problem import Solution
 
 {importing}
 
@@ -286,7 +286,9 @@ BINDING = {
     "filters to nothing": Hostile("filtering", "return None", "effect", FAILED, "gave None; wanted a velocity [m/s]"),
 }
 MESHES = {
-    "is none": Hostile("generating", "return None", "mesh", MISTAKE, "returned None; wanted a harness.scenes.mesh"),
+    "is none": Hostile(
+        "generating", "return None", "mesh", MISTAKE, "returned None; wanted a springbench.harness.scenes.mesh"
+    ),
     "has NaN": Hostile(
         "generating", "return replace(made, rest=made.rest * np.nan)", "mesh", MISTAKE, "`rest` has values"
     ),

@@ -11,9 +11,9 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from springbench.harness.results.run_schema import RUN_SCHEMA
 
-from harness.base.columns import RUN_SCHEMA
-from tests import site_results
+from tests import synthetic_site_rows
 
 DEEP = "[" * 50_000
 NO_SOURCE = {"authors": "A, B", "year": 2000, "title": "T", "doi": ""}
@@ -123,8 +123,8 @@ SHOWN: dict[str, tuple[str, Any]] = {
 def rows_with(column: str, value: Any, number: int = 0) -> pa.Table:
     """The rows of two runs, of which the first has the value in all rows of the column; number: in the runs' ids."""
     first, second = ({"run_id": f"{2 * number + k:012x}"} for k in range(2))
-    told = [row | first | {column: value} for row in site_results.build_run_rows(0)]
-    told += [row | second for row in site_results.build_run_rows(5)]
+    told = [row | first | {column: value} for row in synthetic_site_rows.build_run_rows(0)]
+    told += [row | second for row in synthetic_site_rows.build_run_rows(5)]
     columns = {field.name: [row.get(field.name) for row in told] for field in RUN_SCHEMA}
     return pa.table(columns, schema=RUN_SCHEMA)
 

@@ -10,20 +10,20 @@ from functools import cache
 
 import numpy as np
 import pytest
+from springbench.harness.scenes.effects.constant_force_effect import ConstantForceEffect
+from springbench.harness.scenes.effects.effect_interface import SceneEffect
+from springbench.harness.scenes.effects.ether_drag_effect import EtherDragEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.effects.wind_effect import WindEffect
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.model.step_problem import PreparedSolver, StopRule
 
-from harness.scenes.bind import Scene
-from harness.scenes.effects.base import SceneEffect
-from harness.scenes.effects.constant_force import ConstantForceEffect
-from harness.scenes.effects.ether_drag import EtherDragEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.effects.wind import WindEffect
-from harness.scenes.mesh.grid import GridMesh
-from harness.simulation.step import prepare, simulate_scene
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import PreparedSolver, StopRule
-from tests.effects import (
+from tests.effect_scenes import (
     AIR_DRAG_EFFECT,
     ATTACHMENT_EFFECT,
     BENDING_EFFECT,
@@ -31,7 +31,7 @@ from tests.effects import (
     RAYLEIGH_EFFECT,
     STRAIN_LIMIT_EFFECT,
 )
-from tests.scenes import build_test_scene
+from tests.scene_builders import build_test_scene
 
 SIDE = 20
 PRESENT: tuple[SceneEffect, ...] = (

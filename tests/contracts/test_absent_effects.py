@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix
 
-from harness.config.load import load_scene
-from harness.scenes.bind import build_scene
-from harness.scenes.effects.effect_names import EFFECT_CLASSES
-from solvers.matrices import assemble_system_matrix
-from tests.effects import AIR_DRAG_EFFECT, BENDING_EFFECT, DASHPOT_EFFECT, STRAIN_LIMIT_EFFECT, build_effect_cloth
+from tests.effect_scenes import AIR_DRAG_EFFECT, BENDING_EFFECT, DASHPOT_EFFECT, STRAIN_LIMIT_EFFECT, build_effect_cloth
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = ROOT / "configs" / "scenes" / "hanging-cloth.yaml"
@@ -23,18 +23,32 @@ LISTED = {"springs", "gravity", "ether-drag", "pins"}
 ABSENT = sorted(set(EFFECT_CLASSES) - LISTED)
 
 ENERGIES = {
-    "bending": ["solvers.energies.bending", "solvers.energies.quadratic"],
-    "contact": ["solvers.contact.energy", "solvers.contact.planes", "harness.scenes.obstacles"],
-    "self-contact": ["solvers.contact.self_contact", "solvers.contact.barrier", "harness.scenes.intersections"],
-    "surface-contact": ["solvers.contact.obstacles", "harness.scenes.shapes"],
-    "sewing": ["solvers.energies.sewing"],
-    "strain-limits": ["solvers.energies.strain_limits"],
-    "dashpots": ["solvers.energies.dashpots"],
-    "air-drag": ["solvers.energies.quadratic"],
-    "ether-drag": ["solvers.energies.quadratic"],
-    "rayleigh": ["solvers.energies.quadratic", "solvers.energies.dashpots"],
-    "attachments": ["solvers.energies.attachments"],
-    "gas": ["solvers.energies.gas"],
+    "bending": [
+        "springbench.solvers.model.energies.bending_energy",
+        "springbench.solvers.model.energies.quadratic_energy",
+    ],
+    "contact": [
+        "springbench.solvers.contact.half_space.half_space_potential",
+        "springbench.solvers.contact.half_space.separating_planes",
+        "springbench.harness.scenes.primitive_obstacles",
+    ],
+    "self-contact": [
+        "springbench.solvers.contact.contact_potential",
+        "springbench.solvers.contact.potentials.barrier",
+        "springbench.harness.scenes.edge_triangle_intersections",
+    ],
+    "surface-contact": ["springbench.solvers.contact.obstacle_mesh", "springbench.harness.scenes.surface_obstacles"],
+    "sewing": ["springbench.solvers.model.energies.sewing_energy"],
+    "strain-limits": ["springbench.solvers.model.energies.strain_limit_energy"],
+    "dashpots": ["springbench.solvers.model.energies.dashpot_energy"],
+    "air-drag": ["springbench.solvers.model.energies.quadratic_energy"],
+    "ether-drag": ["springbench.solvers.model.energies.quadratic_energy"],
+    "rayleigh": [
+        "springbench.solvers.model.energies.quadratic_energy",
+        "springbench.solvers.model.energies.dashpot_energy",
+    ],
+    "attachments": ["springbench.solvers.model.energies.attachment_energy"],
+    "gas": ["springbench.solvers.model.energies.gas_energy"],
 }
 """The energies that an effect brings along."""
 
@@ -48,17 +62,17 @@ class Hidden:
             raise ImportError(name + " is hidden")
 
 sys.meta_path.insert(0, Hidden())
-import harness
+import springbench
 if {load}:
-    from harness.scenes.effects.effect_names import EFFECTS
-    from solvers.registry import load
+    from springbench.harness.scenes.effects.effect_names import EFFECTS
+    from springbench.solvers.registry import load
     for target in EFFECTS.values():
         load(target)
-from harness.config.load import load_scene
-from harness.scenes.bind import build
-from harness.simulation.step import prepare, simulate
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import StopRule
+from springbench.harness.config.load import load_scene
+from springbench.harness.scenes.bind import build
+from springbench.harness.simulation.step import prepare, simulate
+from springbench.solvers.methods.local_global import SparseLocalGlobal
+from springbench.solvers.problem import StopRule
 made = build(load_scene(Path({scene!r})), 10)
 steps = simulate(made, prepare(made, SparseLocalGlobal()), StopRule(10), first_guess="current", frames=5)
 digests = [hashlib.sha256(step.positions.tobytes()).hexdigest() for step in steps]

@@ -10,20 +10,20 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from springbench.harness.cli.main import main
+from springbench.harness.config.accuracy_loader import load_accuracy
+from springbench.harness.execution.progress_display import ProgressDisplay
+from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
+from springbench.harness.experiments.accuracy.accuracy_study import run_accuracy_study
+from springbench.harness.recording.recording_reader import read_replay
+from springbench.harness.reference import reference_store
+from springbench.harness.reference.certified_minimum import INACCURATE, KnownMinima, certify_minimum
+from springbench.harness.results import parquet_rows
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, System
+from springbench.solvers.registry import SOLVERS
 
-from harness.base import rows
-from harness.base.progress import ProgressDisplay
-from harness.cli import main
-from harness.config.accuracy_load import load_accuracy
-from harness.experiments.accuracy.accuracy_rows import ACCURACY_SCHEMA
-from harness.experiments.accuracy.studies import run_accuracy_study
-from harness.record.reader import read_replay
-from harness.reference import store
-from harness.reference.minimiser import INACCURATE, KnownMinima, certify_minimum
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import Positions, PreparedSolver, System
-from solvers.registry import SOLVERS
-from tests.displays import SilentDisplay
+from tests.progress_displays import SilentDisplay
 
 SCENE = """
 mesh: {kind: grid}
@@ -62,12 +62,14 @@ class Home:
 
     def rows(self, kind: str, **values: Any) -> list[dict[str, Any]]:
         """The rows of a kind that have these values, file by file."""
-        table = rows.read_rows(sorted((self.folder / "accuracy").glob("*.parquet")), ACCURACY_SCHEMA).to_pylist()
+        table = parquet_rows.read_rows(
+            sorted((self.folder / "accuracy").glob("*.parquet")), ACCURACY_SCHEMA
+        ).to_pylist()
         return [row for row in table if row["kind"] == kind and all(row[key] == v for key, v in values.items())]
 
     def told(self) -> list[str]:
         """All rows, less their times; as text, because what is not a number equals nothing."""
-        table = rows.read_rows(sorted((self.folder / "accuracy").glob("*.parquet")), ACCURACY_SCHEMA)
+        table = parquet_rows.read_rows(sorted((self.folder / "accuracy").glob("*.parquet")), ACCURACY_SCHEMA)
         return list(map(repr, table.drop_columns(list(TIMES)).to_pylist()))
 
     def written(self) -> dict[str, int]:
@@ -75,7 +77,7 @@ class Home:
 
     def units(self) -> Iterator[Path]:
         for path in sorted((self.folder / "accuracy").glob("*.parquet")):
-            if rows.read_rows([path], ACCURACY_SCHEMA)["kind"][0].as_py() != "problem":
+            if parquet_rows.read_rows([path], ACCURACY_SCHEMA)["kind"][0].as_py() != "problem":
                 yield path
 
 
@@ -174,9 +176,9 @@ def test_what_is_not_asked_for_any_more_stays_and_is_not_counted(tmp_path: Path)
         load_accuracy(made.config), made.folder, SilentDisplay(), lambda line: None, isolated=False
     )
     assert set(made.written()) == before
-    moments = rows.read_rows(files, ACCURACY_SCHEMA)["moment"].to_pylist()
+    moments = parquet_rows.read_rows(files, ACCURACY_SCHEMA)["moment"].to_pylist()
     assert set(moments) == {"early"}
-    assert "problem" in rows.read_rows(files, ACCURACY_SCHEMA)["kind"].to_pylist()
+    assert "problem" in parquet_rows.read_rows(files, ACCURACY_SCHEMA)["kind"].to_pylist()
 
 
 def test_moments_that_are_one_step_are_measured_once(tmp_path: Path) -> None:
@@ -190,9 +192,9 @@ def test_moments_that_are_one_step_are_measured_once(tmp_path: Path) -> None:
 def test_a_minimum_that_is_not_certified_is_told_and_nothing_is_graded_by_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(store, "find_minima", lambda problem, solver: KnownMinima((), "it ended on a saddle"))
+    monkeypatch.setattr(reference_store, "find_minima", lambda problem, solver: KnownMinima((), "it ended on a saddle"))
     monkeypatch.setattr(
-        store, "polish", lambda problem, p, solver: replace(certify_minimum(problem, p), kind=INACCURATE)
+        reference_store, "polish", lambda problem, p, solver: replace(certify_minimum(problem, p), kind=INACCURATE)
     )
     made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, violent]", "early"))
     made.run()

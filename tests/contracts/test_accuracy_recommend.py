@@ -11,21 +11,21 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from springbench.harness.cli.main import main
+from springbench.harness.config.config_loader import load_config, load_scene
+from springbench.harness.config.sweep_config import SolverSpec
+from springbench.harness.errors import InputError, RunFailed
+from springbench.harness.experiments.accuracy import method_recommendation as module
+from springbench.harness.experiments.accuracy import work_precision
+from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
+from springbench.harness.experiments.accuracy.accuracy_units import load_reference_trajectory, open_reference_store
+from springbench.harness.experiments.accuracy.method_recommendation import MethodRecommendation, recommend_method
+from springbench.harness.reference.reference_store import ReferenceStore
+from springbench.harness.results import parquet_rows
+from springbench.harness.results.folder_ownership import claim_folder
+from springbench.harness.schema.yaml_loader import parse_scalar
 
-from harness.base import rows
-from harness.base.claim import claim_folder
-from harness.base.errors import InputError, RunFailed
-from harness.base.yaml import parse_scalar
-from harness.cli import main
-from harness.config.load import load_config, load_scene
-from harness.config.sweep import SolverSpec
-from harness.experiments.accuracy import recommend as module
-from harness.experiments.accuracy import work
-from harness.experiments.accuracy.accuracy_rows import ACCURACY_SCHEMA
-from harness.experiments.accuracy.recommend import MethodRecommendation, recommend_method
-from harness.experiments.accuracy.units import load_reference_trajectory, open_reference_store
-from harness.reference.store import ReferenceStore
-from tests.displays import SilentDisplay
+from tests.progress_displays import SilentDisplay
 
 SCENE = """
 mesh: {kind: chain, length: 2.0}
@@ -74,7 +74,7 @@ def test_the_cheapest_that_keeps_to_the_error_is_recommended_and_checked(scene: 
     found, count = asked(scene, 0.1, say=said.append)
     assert count == len(measured(scene)) <= COUNT
     assert any(line.startswith(f"chain 4: {count} of {COUNT} settings measured") for line in said)
-    table = rows.read_rows(measured(scene), ACCURACY_SCHEMA).to_pylist()
+    table = parquet_rows.read_rows(measured(scene), ACCURACY_SCHEMA).to_pylist()
     within = [row for row in table if row["error"] <= 0.1]
     assert 0 < len(within) < len(table), "the error separates nothing"
     cheapest = min(within, key=lambda row: row["seconds_per_simulated"])
@@ -195,7 +195,7 @@ def test_a_scene_without_a_reference_is_refused_before_anything_is_measured(scen
 
 def test_compiling_counts_against_no_time_limit(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = module._build_study(scene, load_scene(scene), 4, 0.2, 60.0).work[0]
-    first, slow = [True], work.simulate_scene
+    first, slow = [True], work_precision.simulate_scene
 
     def simulate(*given: Any, **more: Any) -> Any:
         for step in slow(*given, **more):
@@ -203,9 +203,9 @@ def test_compiling_counts_against_no_time_limit(scene: Path, monkeypatch: pytest
                 sleep(0.3)
             yield step
 
-    monkeypatch.setattr(work, "simulate", simulate)
+    monkeypatch.setattr(work_precision, "simulate", simulate)
     limited = replace(spec, measurement=replace(spec.measurement, time_limit=0.25))
-    row = work.build_work_rows(
+    row = work_precision.build_work_rows(
         limited, load_reference_trajectory(limited, open_reference_store(scene.parent / "results")), lambda: None
     )[0]
     assert row["status"] == "ok", row

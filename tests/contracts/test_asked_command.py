@@ -8,23 +8,25 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
-
-from harness.base import rows
-from harness.cli import app
-from harness.config.load import load_scene
-from harness.config.sweep import SolverSpec
-from harness.experiments.accuracy.accuracy_rows import ACCURACY_SCHEMA
-from harness.experiments.asked.known import (
+from springbench.harness.cli.main import app
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.config.sweep_config import SolverSpec
+from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
+from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget
+from springbench.harness.experiments.error_control.method_search import (
+    compute_predictability_horizon,
+    search_cheapest_method,
+)
+from springbench.harness.experiments.error_control.stored_trials import (
     build_trial_rows,
     format_problem_id,
     read_stored_trials,
     select_promising_methods,
 )
-from harness.experiments.asked.libraries import THIRD_PARTY_INTEGRATORS
-from harness.experiments.asked.search import compute_predictability_horizon, search_cheapest_method
-from harness.experiments.asked.ways import ErrorTarget
-from harness.experiments.provenance import build_provenance_columns
+from springbench.harness.experiments.error_control.third_party_integrators import THIRD_PARTY_INTEGRATORS
+from springbench.harness.experiments.provenance import build_provenance_columns
+from springbench.harness.results import parquet_rows
+from typer.testing import CliRunner
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
 
@@ -53,7 +55,7 @@ def rows_of(folder: Path, *options: str) -> list[dict[str, Any]]:
     given = ["run", str(SCENES / "chain.yaml"), "--size", "5", "--error", "1e-3", "--horizon", "0.2", *options]
     found = CliRunner().invoke(app, [*given, "--results", str(folder)])
     assert found.exit_code == 0, found.output
-    return rows.read_rows((folder / "chain" / "accuracy").glob("*.parquet"), ACCURACY_SCHEMA).to_pylist()
+    return parquet_rows.read_rows((folder / "chain" / "accuracy").glob("*.parquet"), ACCURACY_SCHEMA).to_pylist()
 
 
 def test_a_run_to_an_error_leaves_its_row_its_recording_and_its_positions(tmp_path):
@@ -69,15 +71,15 @@ def test_a_run_to_an_error_leaves_its_row_its_recording_and_its_positions(tmp_pa
 
 def test_what_rows_measured_before_tell_to_be_dear_is_not_tried_again(tmp_path, monkeypatch):
     few = [("own", SolverSpec(name, {})) for name in ("velocity-verlet", "blanes-moan-4", "rodas")]  # the last is dear
-    monkeypatch.setattr("harness.experiments.asked.ways.tried", lambda: few)
-    monkeypatch.setattr("harness.experiments.asked.known.tried", lambda: few)
+    monkeypatch.setattr("springbench.harness.experiments.error_control.candidate_methods.list_candidate_methods", lambda: few)
+    monkeypatch.setattr("springbench.harness.experiments.error_control.stored_trials.tried", lambda: few)
     asked = ErrorTarget.from_scene(load_scene(SCENES / "single-spring.yaml"), 2, 0.2)
     seen = compute_predictability_horizon(asked, 1e-3, lambda line: None)
     answer = search_cheapest_method(asked, 1e-3, seen, lambda line: None)
     promises: dict[str, float] = {"velocity-verlet": 1.0, "blanes-moan-4": 1.9, "rodas": 2.1}
     answer = replace(answer, trials=tuple((one, promises[one.method.solver]) for one, _ in answer.trials))
     shared = {"problem": format_problem_id(asked), "asked": 1e-3} | build_provenance_columns()
-    rows.write_rows(
+    parquet_rows.write_rows(
         tmp_path / "s-2-asked-0.001.parquet",
         [shared | row for row in build_trial_rows(answer, [], 1e-3)],
         ACCURACY_SCHEMA,
@@ -90,7 +92,7 @@ def test_what_rows_measured_before_tell_to_be_dear_is_not_tried_again(tmp_path, 
     again = build_trial_rows(replace(answer, trials=answer.trials[:1]), found, 1e-3)
     assert {row["solver"] for row in again} == set(promises), "what is not tried again is not forgotten"
     assert not read_stored_trials(tmp_path, replace(asked, num_frames=asked.num_frames + 1))
-    monkeypatch.setattr("harness.base.machine.code_hash", lambda: "other")
+    monkeypatch.setattr("springbench.harness.execution.machine_info.hash_sources", lambda: "other")
     assert not read_stored_trials(tmp_path, asked)
 
 

@@ -8,42 +8,52 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from harness.base.errors import RunFailed
-from harness.config.load import load_scene
-from harness.experiments.asked import ways as module
-from harness.experiments.asked.halving import estimate_by_step_doubling
-from harness.experiments.asked.libraries import build_jacobian_sparsity
-from harness.experiments.asked.search import compute_predictability_horizon, search_cheapest_method
-from harness.experiments.asked.ways import ErrorTarget, list_candidate_methods, prepare_candidate_methods
-from harness.reference.growth import estimate_growth
-from harness.reference.motion import OdeField, build_ode_scene
-from harness.reference.store import ReferenceStore
-from harness.reference.trajectory import (
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.errors import RunFailed
+from springbench.harness.experiments.error_control import candidate_methods as module
+from springbench.harness.experiments.error_control.candidate_methods import (
+    ErrorTarget,
+    list_candidate_methods,
+    prepare_candidate_methods,
+)
+from springbench.harness.experiments.error_control.method_search import (
+    compute_predictability_horizon,
+    search_cheapest_method,
+)
+from springbench.harness.experiments.error_control.step_doubling import estimate_by_step_doubling
+from springbench.harness.experiments.error_control.third_party_integrators import build_jacobian_sparsity
+from springbench.harness.reference.equations_of_motion import OdeField, build_ode_scene
+from springbench.harness.reference.perturbation_growth import estimate_growth
+from springbench.harness.reference.reference_store import ReferenceStore
+from springbench.harness.reference.reference_trajectory import (
     CHECK_PERTURBATION,
     INTEGRATION_RTOL,
     UnpredictableMotion,
     _integrate_dop853,
     integrate_motion,
 )
-from harness.scenes.bind import Scene, build_scene
-from harness.scenes.effects.air_drag import AirDragEffect
-from harness.scenes.effects.contact import ContactEffect
-from harness.scenes.effects.dashpots import DashpotsEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.spec import SceneSpec
-from harness.simulation.controlled import AdaptiveImplicitStepper, StepSizeUnderflow, interpolate_hermite
-from harness.simulation.own_steps import AdaptiveSubstepper, FixedSubstepper
-from harness.simulation.step import prepare, simulate_scene
-from solvers.integrators import Motion
-from solvers.methods.explicit import VelocityVerlet
-from solvers.methods.newton import NewtonSolver
-from solvers.methods.rosenbrock import Rodas
-from solvers.problem import StopRule
+from springbench.harness.scenes.effects.air_drag_effect import AirDragEffect
+from springbench.harness.scenes.effects.contact_effect import ContactEffect
+from springbench.harness.scenes.effects.dashpots_effect import DashpotsEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.simulation.adaptive_stepping import (
+    AdaptiveImplicitStepper,
+    StepSizeUnderflow,
+    interpolate_hermite,
+)
+from springbench.harness.simulation.substepping import AdaptiveSubstepper, FixedSubstepper
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.time_stepping.explicit_integrators import VelocityVerlet
+from springbench.solvers.methods.time_stepping.rosenbrock import Rodas
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import StopRule
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
 HELD = PinsEffect(at=("first",), weight="exact")
@@ -150,7 +160,9 @@ def test_the_error_is_never_above_the_one_that_was_asked_for_whichever_way_wins(
         integrate_motion(asked.build_scene(asked.frame_seconds, "own"), [horizon]),
     )
     for way in prepare_candidate_methods(asked, told.append):
-        monkeypatch.setattr("harness.experiments.asked.search.ways", lambda *_, way=way: [way])
+        monkeypatch.setattr(
+            "springbench.harness.experiments.error_control.method_search.ways", lambda *_, way=way: [way]
+        )
         found = search_cheapest_method(asked, error, seen, told.append).best_trial
         true = truth.measure_error(0, found.trajectory.positions[-1])
         assert true <= found.error_estimated <= error, found.method

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.scenes.scene_builder import build_scene
 
-from harness.config.load import load_scene
-from harness.scenes.bind import build_scene
-from tests.scenes import LOCAL_GLOBAL_BACKENDS, simulate_trajectory
+from tests.scene_builders import LOCAL_GLOBAL_BACKENDS, simulate_trajectory
 
 FRAMES = 30
 AGREEMENT = 1e-9

@@ -9,16 +9,16 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from springbench.harness.config.config_loader import convert_assignment_scene
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.simulation.time_loop import INITIAL_GUESSES
+from springbench.solvers.linalg.solver_selection import LinearSolverName
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.methods.local_global.prefactored import require_only_springs
+from springbench.solvers.methods.local_global.reference_local_global import DenseLocalGlobal
+from springbench.solvers.model.step_problem import Positions, Solver
 
-from harness.config.load import convert_assignment_scene
-from harness.scenes.bind import Scene, build_scene
-from harness.simulation.step import INITIAL_GUESSES
-from solvers.core.prefactored import require_only_springs
-from solvers.linear.choice import LinearSolverName
-from solvers.methods.local_global import DenseLocalGlobal
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.problem import Positions, Solver
-from tests.scenes import (
+from tests.scene_builders import (
     LOCAL_GLOBAL_BACKENDS,
     SCENE_BUILDERS,
     THREAD_COUNT,

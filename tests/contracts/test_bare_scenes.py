@@ -3,11 +3,11 @@
 from pathlib import Path
 
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.recording.recording_reader import read_replay
 from typer.testing import CliRunner
 
-from harness.cli import app
-from harness.record.reader import read_replay
-from tests.often import mark_rare_cases
+from tests.rare_cases import mark_rare_cases
 
 SCENES = {
     "falls": "[{kind: gravity}]",

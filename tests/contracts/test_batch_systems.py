@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.experiments.sweep_runner import run_sweep
+from springbench.harness.results import parquet_rows
 
-from harness.base import rows
-from harness.config.load import load_config
-from harness.experiments.sweep import run_sweep
-from tests.displays import SilentDisplay
-from tests.own_solvers import SCENE_SOURCE
+from tests.plugin_solvers import SCENE_SOURCE
+from tests.progress_displays import SilentDisplay
 
 pytest.importorskip("dask_jobqueue", reason="pip install 'springbench[cluster]'")
 
@@ -77,7 +77,7 @@ def test_runs_are_done_by_jobs_that_are_submitted_and_cancelled(tmp_path: Path, 
     )
     assert set(table["status"].to_pylist()) == {"ok"}
     assert len(set(table["run_id"].to_pylist())) == 3
-    assert rows.read_rows((tmp_path / "r" / "rows").glob("*.parquet")).num_rows == table.num_rows
+    assert parquet_rows.read_rows((tmp_path / "r" / "rows").glob("*.parquet")).num_rows == table.num_rows
     scripts = [path.read_text() for path in jobs.glob("*.sh")]
     assert len(scripts) == 2
     assert all("#SBATCH -A springs" in text and "distributed.cli.dask_worker" in text for text in scripts)

@@ -13,9 +13,9 @@ from time import monotonic, sleep
 from typing import Any, NamedTuple
 
 import pytest
+from springbench.harness.results import parquet_rows
 
-from harness.base import rows
-from tests.own_solvers import SCENE_SOURCE
+from tests.plugin_solvers import SCENE_SOURCE
 
 ROOT = Path(__file__).resolve().parents[2]
 RUNS, PATIENCE = 12, 240.0
@@ -30,7 +30,7 @@ options: {frames: 4, rounds: 1, iterations: [5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 
 
 FAR = """
 from pathlib import Path
-from harness.experiments import cluster
+from springbench.harness.experiments import cluster
 if cluster._do.__name__ == "_do":  # Dask loads it twice
     def far(unit, folder, *rest, do=cluster._do):
         return do(unit, Path("/elsewhere"), *rest)
@@ -85,7 +85,7 @@ def wait_for(holds: Any) -> None:
 
 class Sweep(NamedTuple):
     config: Path
-    rows: Path
+    parquet_rows: Path
 
     @classmethod
     def made(cls, folder: Path) -> Sweep:
@@ -110,7 +110,7 @@ class Sweep(NamedTuple):
         after = self.done()
         assert before.items() <= after.items()
         assert len(after) == RUNS
-        assert set(rows.read_rows(self.rows / name for name in after)["status"].to_pylist()) == {"ok"}
+        assert set(parquet_rows.read_rows(self.rows / name for name in after)["status"].to_pylist()) == {"ok"}
         assert not [*self.rows.parent.rglob("*partial*")]
         return " ".join(words.split())
 

@@ -16,14 +16,14 @@ import pyarrow as pa
 import pytest
 from distributed import Client, LocalCluster
 from distributed.security import Security
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.execution.dask_scheduler import open_scheduler
+from springbench.harness.execution.machine_info import compute_node_id
+from springbench.harness.experiments.machine_calibration import CALIBRATION_COLUMNS as MACHINE
+from springbench.harness.experiments.sweep_runner import run_sweep
 
-from harness.base.machine import compute_node_id
-from harness.config.load import load_config
-from harness.experiments.ability import CALIBRATION_COLUMNS as MACHINE
-from harness.experiments.scheduler import open_scheduler
-from harness.experiments.sweep import run_sweep
-from tests.displays import SilentDisplay
-from tests.own_solvers import SCENE_SOURCE, SOLVER_SOURCE, write_plugin_solver
+from tests.plugin_solvers import SCENE_SOURCE, SOLVER_SOURCE, write_plugin_solver
+from tests.progress_displays import SilentDisplay
 
 
 def done(sweep: Path, results: Path, address: str) -> pa.Table:

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import cast
 
 import pytest
+from springbench.harness.cli.main import app
 from typer.core import TyperGroup
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from harness.cli import app
 from tests.contracts.test_readme import PAGES
 
 ROOT = Path(__file__).resolve().parents[2]

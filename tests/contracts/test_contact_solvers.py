@@ -8,14 +8,14 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.local_global import half_space_contact as method
+from springbench.solvers.model.step_problem import Positions, Solver, StepProblem, StopRule, Unsupported
+from springbench.solvers.registry import SOLVERS, load_target
 
-from harness.scenes.bind import Scene
-from harness.scenes.effects.pins import PinsEffect
-from harness.simulation.step import prepare, simulate_scene
-from solvers.contact import local_global as method
-from solvers.problem import Positions, Solver, StepProblem, StopRule, Unsupported
-from solvers.registry import SOLVERS, load_target
-from tests.contacts import OBSTACLE_SPECS, build_contact, build_sheet, collect_steps
+from tests.contact_scenes import OBSTACLE_SPECS, build_contact, build_sheet, collect_steps
 
 SOLVED: dict[str, Solver] = {name: load_target(target)() for name, target in SOLVERS.items()}
 PREFACTORED = ("sparse", "numba", "anderson", "chebyshev", "lbfgs")

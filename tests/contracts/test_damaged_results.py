@@ -10,15 +10,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.errors import InputError
+from springbench.harness.recording.recording_reader import read_replay, summarise_recording
+from springbench.harness.results import parquet_rows
 from typer.testing import CliRunner
 
-from harness.base import rows
-from harness.base.errors import InputError
-from harness.cli import app
-from harness.record.reader import read_replay, summarise_recording
 from tests.contracts.attempts import attempt
 from tests.contracts.hostile import scene
-from tests.recordings import write_recording
+from tests.synthetic_recordings import write_recording
 
 SWEEP = "{scenes: [good.yaml], sizes: [4], solvers: [sparse, dense], options: {rounds: 1, pictures: false}}"
 
@@ -48,7 +48,7 @@ def foreign(path: Path) -> None:
 
 
 def many(path: Path) -> None:
-    pq.write_table(pa.table({"status": pa.array(["ok"] * (rows.MAX_ROWS + 1)).dictionary_encode()}), path)
+    pq.write_table(pa.table({"status": pa.array(["ok"] * (parquet_rows.MAX_ROWS + 1)).dictionary_encode()}), path)
 
 
 def replaced(path: Path, make: Callable[[Path], object]) -> None:
@@ -60,7 +60,7 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
     "empty": lambda path: path.write_bytes(b""),
     "cut": lambda path: os.truncate(path, path.stat().st_size // 2),
     "less its last byte": lambda path: os.truncate(path, path.stat().st_size - 1),
-    "without rows": lambda path: rows.write_rows(path, []),
+    "without rows": lambda path: parquet_rows.write_rows(path, []),
     "foreign": foreign,
     "of many rows": many,
     "text": lambda path: path.write_text("status\nok\n"),
@@ -96,7 +96,7 @@ def test_the_runs_of_damaged_rows_and_recordings_are_done_again(home: Path):
     said = " ".join(told.output.split())
     assert f"{first.name} holds no rows" in said
     assert f"{recording.name} is cut before its end" in said
-    assert rows.read_rows([first, second], required_columns=("status",)).num_rows > 0
+    assert parquet_rows.read_rows([first, second], required_columns=("status",)).num_rows > 0
     assert len(read_replay(recording).frames) == 3
     again = CliRunner().invoke(app, ["run", str(home / "sweep.yaml"), "--results", str(home / "results")])
     assert "2 of 2 runs are there already" in again.output
@@ -133,7 +133,7 @@ def test_two_configs_of_one_name_do_not_share_their_results(home: Path):
 
 
 def test_an_answer_is_text_and_no_markup(home: Path):
-    rows.write_rows(
+    parquet_rows.write_rows(
         home / "results/sweep/rows/x.parquet", [{"scene": "[red]x[/nothing]", "status": "ok", "run_id": "\x1b[2J"}]
     )
     told = attempt(home, ["query", 'SELECT scene, run_id AS "[bold" FROM rows WHERE solver IS NULL'])

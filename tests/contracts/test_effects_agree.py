@@ -7,15 +7,15 @@ from functools import cache
 
 import numpy as np
 import pytest
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.methods.newton.negative_curvature import is_positive_definite
+from springbench.solvers.model.step_problem import Positions, Solver, StepProblem, StopRule, Unsupported
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
+from springbench.solvers.registry import SOLVERS, load_target
 
-from harness.simulation.step import prepare, simulate_scene
-from solvers.core.fixed_objective import FixedObjective
-from solvers.core.objective import StepObjective
-from solvers.core.saddles import is_positive_definite
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import Positions, Solver, StepProblem, StopRule, Unsupported
-from solvers.registry import SOLVERS, load_target
-from tests.effects import EFFECT_SCENES, build_moving_problem, with_integrator
+from tests.effect_scenes import EFFECT_SCENES, build_moving_problem, with_integrator
 
 SOLVED: dict[str, Solver] = {
     name: solver

@@ -13,19 +13,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from harness.reference.trajectory import ReferenceTrajectory, integrate_motion
-from harness.scenes.bind import Scene, build_scene
-from harness.scenes.effects.effect_names import EFFECT_CLASSES
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.mesh.surfaces import BalloonMesh
-from harness.scenes.spec import SceneSpec
-from harness.simulation.step import prepare, simulate_scene
-from solvers.integrators import INTEGRATORS
-from solvers.methods.newton import NewtonSolver
-from solvers.plugins import load_target
-from solvers.problem import StopRule
+from springbench.harness.reference.reference_trajectory import ReferenceTrajectory, integrate_motion
+from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.mesh.surface_meshes import BalloonMesh
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.integrators import INTEGRATORS
+from springbench.solvers.model.step_problem import StopRule
+from springbench.solvers.plugins.plugin_discovery import load_target
 
 END, ROUGH_END = 0.15, 0.3
 """Seconds; what begins within steps takes longer to act."""

@@ -8,12 +8,12 @@ from pathlib import Path
 from statistics import median
 
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.recording.recording_reader import read_replay
+from springbench.harness.results import parquet_rows as base_rows
 from typer.testing import CliRunner
 
-from harness.base import rows as base_rows
-from harness.cli import app
-from harness.record.reader import read_replay
-from tests.browser import launch_chromium
+from tests.headless_browser import launch_chromium
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
 SWEEP = """

@@ -10,8 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-
-from harness.base import rows
+from springbench.harness.results import parquet_rows
 
 ROOT = Path(__file__).resolve().parents[2]
 CLOTH = """
@@ -49,7 +48,7 @@ def small_disk(folder: Path, size: str) -> Iterator[None]:
 
 def start(config: Path, results: Path, limit: str = "") -> subprocess.CompletedProcess[str]:
     """Run a sweep; limit: Python code that goes first."""
-    code = f"{limit}\nimport sys\nfrom harness.cli import main\nsys.argv[0] = 'springbench'\nmain()"
+    code = f"{limit}\nimport sys\nfrom springbench.harness.cli.main import main\nsys.argv[0] = 'springbench'\nmain()"
     command = [sys.executable, "-c", code, "run", str(config), "--results", str(results)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=WALL)
 
@@ -78,12 +77,12 @@ def test_a_full_disk_is_said_by_name_and_what_failed_is_done_again(size: str, co
         assert "shut down prematurely" not in told.stderr
         left = [path for path in results.rglob("*") if "partial" in path.name]
         assert left == []
-        done = rows.read_rows(results.glob("sweep/rows/*.parquet"))
+        done = parquet_rows.read_rows(results.glob("sweep/rows/*.parquet"))
         assert set(done["status"].to_pylist()) <= {"ok"}
         subprocess.run(["mount", "-o", "remount,size=64m", results], check=True)
         again = start(config, results)
         assert again.returncode == 0, again.stderr
-        assert len(set(rows.read_rows(results.glob("sweep/rows/*.parquet"))["run_id"].to_pylist())) == 2
+        assert len(set(parquet_rows.read_rows(results.glob("sweep/rows/*.parquet"))["run_id"].to_pylist())) == 2
 
 
 LARGEST = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (2**16, resource.RLIM_INFINITY))"
@@ -94,7 +93,7 @@ def test_a_limit_to_the_size_of_files_is_no_outcome_of_a_run_either(config: Path
     assert told.returncode == 1, told.stderr
     assert "cannot be written: File too large" in told.stderr
     assert "Traceback" not in told.stderr
-    outcomes = rows.read_rows(tmp_path.rglob("rows/*.parquet")).select(["status", "reason"]).to_pylist()
+    outcomes = parquet_rows.read_rows(tmp_path.rglob("rows/*.parquet")).select(["status", "reason"]).to_pylist()
     assert list(tmp_path.rglob("*.parquet")) == [], outcomes
 
 

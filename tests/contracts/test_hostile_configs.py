@@ -6,9 +6,9 @@ import os
 from pathlib import Path
 
 import pytest
+from springbench.harness.cli.main import app
 from typer.testing import CliRunner
 
-from harness.cli import app
 from tests.contracts.hostile import JSONS, OTHER_FILES, QUAD, SCENES, SWEEPS, scene, sweep
 
 

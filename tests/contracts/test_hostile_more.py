@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 
 import pytest
+from springbench.harness.results import parquet_rows
 
-from harness.base import rows
 from tests.contracts.attempts import Outcome, attempt
 from tests.contracts.hostile import QUAD, scene, sweep
 from tests.contracts.hostile_meshes import MESHES
@@ -63,7 +63,7 @@ def test_a_hostile_benchmark_is_refused_by_name(folder: Path, case: str) -> None
 @pytest.mark.parametrize("case", QUERIES)
 def test_a_hostile_query_is_refused(folder: Path, case: str) -> None:
     (folder / "results" / "a" / "rows").mkdir(parents=True)
-    rows.write_rows(folder / "results" / "a" / "rows" / "a.parquet", [{"sweep": "a", "seconds": 0.5}])
+    parquet_rows.write_rows(folder / "results" / "a" / "rows" / "a.parquet", [{"sweep": "a", "seconds": 0.5}])
     require_message(attempt(folder, ["query", QUERIES[case]]), 2, "query")
 
 

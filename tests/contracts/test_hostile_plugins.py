@@ -12,11 +12,11 @@ import numpy as np
 import psutil
 import pyarrow.parquet as pq
 import pytest
+from springbench.harness.cli.main import app
 from typer.testing import CliRunner
 
-from harness.cli import app
 from tests.contracts.hostile_plugins import FAILED, FINE, HOSTILE, MISTAKE, Hostile, write
-from tests.often import mark_rare_cases
+from tests.rare_cases import mark_rare_cases
 
 HANGS = 90.0
 """Seconds after which a command counts as hanging; its own limits end it within 20 s on an idle machine."""

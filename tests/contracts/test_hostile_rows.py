@@ -10,17 +10,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
+from springbench.harness.errors import InputError
+from springbench.harness.report.median_times import write_medians
+from springbench.harness.report.site.data_scripts import write_script
+from springbench.harness.report.site.sweep_folders import locate_folder
+from springbench.harness.report.sweep_summary import summarise_sweep
+from springbench.harness.report.timing_plot import draw_timing_plot
+from springbench.harness.report.timing_table import build_summary_table, read_run_times
+from springbench.harness.results.parquet_rows import read_rows
+from springbench.harness.results.row_store import FILE_COLUMN
 
-from harness.base.errors import InputError
-from harness.base.rows import read_rows
-from harness.base.shelf import FILE_COLUMN
-from harness.report.learned import summarise_sweep
-from harness.report.medians import write_medians
-from harness.report.site.folders import locate_folder
-from harness.report.site.script import write_script
-from harness.report.timing_plot import draw_timing_plot
-from harness.report.timing_table import build_summary_table, read_run_times
-from tests import accuracy_rows, site_results
+from tests import synthetic_accuracy_rows, synthetic_site_rows
 from tests.contracts.attempts import Outcome, attempt
 from tests.contracts.hostile_rows import LEFT_OUT, SHOWN, rows_with, write_cases
 
@@ -91,7 +91,7 @@ def test_a_hostile_file_of_rows_is_named_within_limits(tmp_path: Path, name: str
 
 @pytest.mark.parametrize("unit", ["../../evil", "/evil", "..", "", ".hidden", "a/b", "x" * 300, "a\0b"])
 def test_a_unit_of_packed_rows_is_no_path(tmp_path: Path, unit: str):
-    folder = site_results.write_site_results(tmp_path / "results", 2)
+    folder = synthetic_site_rows.write_site_results(tmp_path / "results", 2)
     packed = pq.read_table(folder / "rows.parquet")
     pq.write_table(
         packed.set_column(packed.column_names.index(FILE_COLUMN), FILE_COLUMN, [[unit] * len(packed)]),
@@ -106,24 +106,24 @@ def test_a_unit_of_packed_rows_is_no_path(tmp_path: Path, unit: str):
     "recording", ["/etc/hostname", "../../secret.rrd", "a/../../secret.rrd", "a\0b", "recordings/" + "x" * 300]
 )
 def test_a_recording_is_looked_for_below_its_folder(tmp_path: Path, recording: str):
-    told = accuracy_rows.build_snapshot_rows("net", 6, "early") + list(
-        accuracy_rows.build_curve_rows("net", 6, "early", "numba")
+    told = synthetic_accuracy_rows.build_snapshot_rows("net", 6, "early") + list(
+        synthetic_accuracy_rows.build_curve_rows("net", 6, "early", "numba")
     )
     for row in told:
         if row["kind"] == "curve":
             row["recording"] = recording
-    accuracy_rows.write_accuracy_rows(tmp_path / "results" / "study", told)
+    synthetic_accuracy_rows.write_accuracy_rows(tmp_path / "results" / "study", told)
     found = reported(tmp_path)
     assert "recording: came" in " ".join(found.said.split())
 
 
 def test_rows_of_accuracy_that_do_not_belong_together_are_refused(tmp_path: Path):
-    told = accuracy_rows.build_snapshot_rows("net", 6, "early") + list(
-        accuracy_rows.build_curve_rows("net", 6, "early", "numba")
+    told = synthetic_accuracy_rows.build_snapshot_rows("net", 6, "early") + list(
+        synthetic_accuracy_rows.build_curve_rows("net", 6, "early", "numba")
     )
     for row in told:
         row["g0"] = row["time_step"] = None
-    accuracy_rows.write_accuracy_rows(tmp_path / "results" / "study", told)
+    synthetic_accuracy_rows.write_accuracy_rows(tmp_path / "results" / "study", told)
     assert reported(tmp_path).code in (0, 2)
 
 

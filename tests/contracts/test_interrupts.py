@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
-
-from harness.base import interrupts, rows
+from springbench.harness.execution import interrupts
+from springbench.harness.results import parquet_rows
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = ROOT / "configs" / "scenes" / "hanging-cloth.yaml"
@@ -68,7 +68,7 @@ def test_ctrl_c_at_a_random_moment(seed: int, where: tuple[str, ...], tmp_path: 
 def test_an_interrupt_that_a_destructor_swallows_is_raised_again():
     code = """
         import os, signal, time
-        from harness.base import interrupts, rows
+        from springbench.harness.base import interrupts, rows
 
         class Swallows:
             def __del__(self):
@@ -100,7 +100,7 @@ def test_a_number_of_threads_without_a_meaning_is_refused(value: str):
 @pytest.mark.parametrize("arguments", [[], ["--csv"]])
 def test_a_terminal_that_writes_ascii_alone_gets_escape_sequences(arguments: list[str], tmp_path: Path):
     (tmp_path / "sweep" / "rows").mkdir(parents=True)
-    rows.write_rows(tmp_path / "sweep" / "rows" / "a.parquet", [{"sweep": "sweep", "seconds": 0.5}])
+    parquet_rows.write_rows(tmp_path / "sweep" / "rows" / "a.parquet", [{"sweep": "sweep", "seconds": 0.5}])
     process = start(
         *("query", "SELECT 'fl\u00e4che' AS name", "--results", str(tmp_path), *arguments),
         PYTHONIOENCODING="ascii",

@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.image import imread
-
-from harness.base import rows
-from harness.cli import main
-from harness.experiments.ability import CALIBRATION_COLUMNS as MACHINE
-from harness.record.reader import read_replay
-from harness.report import opengl
+from springbench.harness.cli.main import main
+from springbench.harness.experiments.machine_calibration import CALIBRATION_COLUMNS as MACHINE
+from springbench.harness.recording.recording_reader import read_replay
+from springbench.harness.report import opengl_probe
+from springbench.harness.results import parquet_rows
 
 ROOT = Path(__file__).resolve().parents[2]
 FRAMES = 8
@@ -49,7 +48,12 @@ options: {iterations: 10, rounds: 2, pictures: %s}
 # One process imports what the command needs, and a copy of it runs each command.
 PROCESSES = get_context("forkserver")
 PROCESSES.set_forkserver_preload(
-    ["harness.cli", "harness.config.load", "harness.experiments.sweep", "harness.report.timing_table"]
+    [
+        "springbench.harness.cli.main",
+        "springbench.harness.config.config_loader",
+        "springbench.harness.experiments.sweep_runner",
+        "springbench.harness.report.timing_table",
+    ]
 )
 
 
@@ -102,7 +106,7 @@ class Sweep:
         return {str(path.relative_to(self.folder)) for path in self.folder.rglob("*") if path.is_file()}
 
     def rows(self) -> list[dict[str, Any]]:
-        table = rows.read_rows(sorted((self.folder / "rows").iterdir()))
+        table = parquet_rows.read_rows(sorted((self.folder / "rows").iterdir()))
         return table.drop_columns(list(WRITTEN_BY)).to_pylist()
 
     def complete(self) -> dict[Path, tuple[int, int]]:
@@ -171,7 +175,7 @@ def test_a_sweep_leaves_its_files_and_nothing_else(undisturbed: Undisturbed):
     expected |= {f"rows/{run}.parquet" for run in runs} | {f"recordings/{run}.rrd" for run in runs}
     if undisturbed.case.pictures:
         expected.add("pictures/timing.png")
-        if not opengl.find_opengl_problem():
+        if not opengl_probe.find_opengl_problem():
             expected |= {f"pictures/{run}.png" for run in runs} | {"pictures/cloth-6-solvers.png"}
     assert undisturbed.sweep.files() == expected
 

@@ -11,19 +11,27 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.experiments.run_pipeline import execute_run
+from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.harness.recording.recorder_interface import RecordedFrame
+from springbench.harness.recording.rerun_recorder import RerunRecorder
+from springbench.harness.recording.strain_shading import StrainShading
+from springbench.harness.simulation import stopwatch as clocks
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.model.integrators import Motion, SingleStageIntegrator
+from springbench.solvers.model.step_problem import (
+    Positions,
+    PreparedSolver,
+    Solution,
+    StepProblem,
+    StepStart,
+    StopRule,
+    System,
+)
+from springbench.solvers.registry import SOLVERS
 
-from harness.config.load import load_config
-from harness.experiments.plan import RunFiles
-from harness.experiments.run import execute_run
-from harness.record.base import RecordedFrame
-from harness.record.rerun import RerunRecorder
-from harness.record.shading import StrainShading
-from harness.simulation import clock as clocks
-from solvers.integrators import Motion, SingleStageIntegrator
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import Positions, PreparedSolver, Solution, StepProblem, StepStart, StopRule, System
-from solvers.registry import SOLVERS
-from tests.undisturbed import retry_if_preempted
+from tests.preemption_retry import retry_if_preempted
 
 FRAMES = 6
 SCENE = f"""

@@ -11,29 +11,29 @@ from typing import ClassVar, Literal
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from springbench.harness.config.accuracy_loader import load_accuracy
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.config.json_schema import build_json_schema
+from springbench.harness.experiments.ablation.effect_suggestions import build_evidence, suggest_effects
+from springbench.harness.experiments.accuracy.accuracy_study import run_accuracy_study
+from springbench.harness.experiments.run_pipeline import execute_run
+from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.harness.report.accuracy import draw_accuracy_report
+from springbench.harness.report.plot_style import assign_solver_styles
+from springbench.harness.report.robustness import CORRECT, read_verified_runs
+from springbench.harness.report.site import update_page
+from springbench.harness.report.timing_plot import draw_timing_plot
+from springbench.harness.report.timing_table import build_summary_table
+from springbench.harness.scenes.effects.effect_interface import EffectContribution, ObservedMotion, build_constant_force
+from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES
+from springbench.harness.scenes.mesh.mesh import Mesh
+from springbench.harness.schema.base_model import ConfigModel
+from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.registry import SOLVERS
 
-from harness.base.model import ConfigModel
-from harness.config.accuracy_load import load_accuracy
-from harness.config.load import load_config
-from harness.config.schema import build_json_schema
-from harness.experiments.ablation.suggest import build_evidence, suggest_effects
-from harness.experiments.accuracy.studies import run_accuracy_study
-from harness.experiments.plan import RunFiles
-from harness.experiments.run import execute_run
-from harness.report.accuracy import draw_accuracy_report
-from harness.report.robustness import CORRECT, read_verified_runs
-from harness.report.site import update_page
-from harness.report.style import assign_solver_styles
-from harness.report.timing_plot import draw_timing_plot
-from harness.report.timing_table import build_summary_table
-from harness.scenes.effects.base import EffectContribution, ObservedMotion, build_constant_force
-from harness.scenes.effects.effect_names import EFFECT_CLASSES
-from harness.scenes.mesh.base import Mesh
-from solvers.about import Citation, SolverInfo
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.registry import SOLVERS
-from tests.displays import SilentDisplay
-from tests.scenes import build_cloth
+from tests.progress_displays import SilentDisplay
+from tests.scene_builders import build_cloth
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -122,8 +122,7 @@ def test_no_report_and_no_experiment_knows_an_effect_by_name(folder: str):
 
 def test_a_sweep_and_its_reports_take_a_new_solver_and_effect(configs: Path):
     import pyarrow as pa
-
-    from harness.base.columns import RUN_SCHEMA
+    from springbench.harness.results.run_schema import RUN_SCHEMA
 
     found = []
     (configs / "rows").mkdir()

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from springbench.harness.report.site import update_page
 
-from harness.report.site import update_page
-from tests import accuracy_rows, figure_results, gate_results, site_results
-from tests.browser import launch_chromium
-from tests.site_results import build_run_columns, is_failing_run
+from tests import synthetic_accuracy_rows, synthetic_benchmarks, synthetic_results, synthetic_site_rows
+from tests.headless_browser import launch_chromium
+from tests.synthetic_site_rows import build_run_columns, is_failing_run
 
 COUNT = 300
 VIEWS = {
@@ -35,14 +35,14 @@ FITS = "document.documentElement.scrollWidth <= innerWidth"
 
 
 def results(folder: Path, count: int) -> Path:
-    made = site_results.write_site_results(folder, count)
+    made = synthetic_site_rows.write_site_results(folder, count)
     for number in range(4):
-        site_results.write_foreign_picture(made / "pictures" / f"{build_run_columns(number)['file']}.png")
-    rows = accuracy_rows.build_snapshot_rows("net", 6, "early", minima_count=2)
+        synthetic_site_rows.write_foreign_picture(made / "pictures" / f"{build_run_columns(number)['file']}.png")
+    rows = synthetic_accuracy_rows.build_snapshot_rows("net", 6, "early", minima_count=2)
     for solver in ("numba", "newton", "lbfgs"):
-        rows += list(accuracy_rows.build_curve_rows("net", 6, "early", solver))
-    rows.append(accuracy_rows.build_failure_row("net", 6, "early", "dense", "failed", "why"))
-    accuracy_rows.write_accuracy_rows(folder / "study", rows)
+        rows += list(synthetic_accuracy_rows.build_curve_rows("net", 6, "early", solver))
+    rows.append(synthetic_accuracy_rows.build_failure_row("net", 6, "early", "dense", "failed", "why"))
+    synthetic_accuracy_rows.write_accuracy_rows(folder / "study", rows)
     return update_page(folder)
 
 
@@ -55,13 +55,14 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> str:
 def studies(tmp_path_factory: pytest.TempPathFactory) -> str:
     """A page with every kind of study."""
     folder = tmp_path_factory.mktemp("studies")
-    figure_results.write_accuracy_results(folder / "accuracy")
-    figure_results.write_sweep_results(folder / "cases")
-    figure_results.write_speed_results(folder / "machine")
-    figure_results.write_ablation_results(folder / "effects")
-    figure_results.write_engine_results(folder / "engines")
-    gate_results.write_benchmark_files(
-        folder / "bench" / "Linux-CPython-3.11-64bit", {"solve": gate_results.build_ratio_series(2, 8, (4, 1.2))}
+    synthetic_results.write_accuracy_results(folder / "accuracy")
+    synthetic_results.write_sweep_results(folder / "cases")
+    synthetic_results.write_speed_results(folder / "machine")
+    synthetic_results.write_ablation_results(folder / "effects")
+    synthetic_results.write_engine_results(folder / "engines")
+    synthetic_benchmarks.write_benchmark_files(
+        folder / "bench" / "Linux-CPython-3.11-64bit",
+        {"solve": synthetic_benchmarks.build_ratio_series(2, 8, (4, 1.2))},
     )
     return results(folder, COUNT).as_uri()
 
@@ -216,7 +217,7 @@ def test_a_failure_is_told_in_words_with_the_number_of_its_runs(tab: Tab, page: 
     row = shown.get_by_role("row").filter(has_text="unsupported")
     assert row.count() == 1
     assert str(sum(is_failing_run(k) for k in range(COUNT))) in row.inner_text()
-    assert site_results.UNSUPPORTED_REASON in row.inner_text(), "words cannot end a script"
+    assert synthetic_site_rows.UNSUPPORTED_REASON in row.inner_text(), "words cannot end a script"
 
 
 def test_a_point_of_a_curve_leads_to_its_solve_by_keys(tab: Tab, page: str):
@@ -304,8 +305,8 @@ HOSTILE = "javascript:document.title='taken'"
 
 def test_no_folder_or_name_runs_as_code(browser: Any, tmp_path: Path):
     for name in (HOSTILE, "a b?c#d", "%2e%2e", "constructor"):
-        made = site_results.write_site_results(tmp_path, 4, name)
-        site_results.write_foreign_picture(made / "pictures" / f"{build_run_columns(0)['file']}.png")
+        made = synthetic_site_rows.write_site_results(tmp_path, 4, name)
+        synthetic_site_rows.write_foreign_picture(made / "pictures" / f"{build_run_columns(0)['file']}.png")
     made = update_page(tmp_path)
     tab = Tab(browser)
     tab.page.on("dialog", lambda dialog: tab.said.append(dialog.message))

@@ -5,16 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-
-from harness.config.load import load_scene
-from harness.config.sweep import SolverSpec
-from harness.experiments.asked import libraries
-from harness.experiments.asked.libraries import THIRD_PARTY_INTEGRATORS, InitialValueProblem
-from harness.experiments.asked.peers import compare_third_party
-from harness.experiments.asked.search import compute_predictability_horizon, search_cheapest_method
-from harness.experiments.asked.ways import ErrorTarget
-from harness.reference.motion import OdeField
-from harness.reference.trajectory import integrate_motion
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.config.sweep_config import SolverSpec
+from springbench.harness.experiments.error_control import third_party_integrators
+from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget
+from springbench.harness.experiments.error_control.method_search import (
+    compute_predictability_horizon,
+    search_cheapest_method,
+)
+from springbench.harness.experiments.error_control.third_party_comparison import compare_third_party
+from springbench.harness.experiments.error_control.third_party_integrators import (
+    THIRD_PARTY_INTEGRATORS,
+    InitialValueProblem,
+)
+from springbench.harness.reference.equations_of_motion import OdeField
+from springbench.harness.reference.reference_trajectory import integrate_motion
 
 SPRING = Path(__file__).parents[2] / "configs" / "scenes" / "single-spring.yaml"
 
@@ -39,7 +44,7 @@ def test_cvode_follows_the_motion_to_its_tolerance(name):
 
 
 def test_a_peer_that_is_not_installed_is_a_row_that_says_which_command_installs_it(monkeypatch):
-    monkeypatch.setattr(libraries, "find_spec", lambda name: None)
+    monkeypatch.setattr(third_party_integrators, "find_spec", lambda name: None)
     asked = ErrorTarget.from_scene(load_scene(SPRING), 2, 0.1)
     seen = compute_predictability_horizon(asked, 1e-2, lambda line: None)
     answer = search_cheapest_method(asked, 1e-2, seen, lambda line: None, [("own", SolverSpec("velocity-verlet", {}))])

@@ -7,19 +7,19 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from springbench.harness.scenes.effects.ether_drag_effect import EtherDragEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import MotionState, prepare, simulate_scene
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import Positions, StopRule
 
-from harness.scenes.bind import Scene
-from harness.scenes.effects.ether_drag import EtherDragEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.simulation.step import MotionState, prepare, simulate_scene
-from solvers.integrators import Motion
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.problem import Positions, StopRule
-from tests.scenes import LOCAL_GLOBAL_BACKENDS, build_test_scene, compute_static_shape, simulate_trajectory
+from tests.scene_builders import LOCAL_GLOBAL_BACKENDS, build_test_scene, compute_static_shape, simulate_trajectory
 
 G = 9.81
 DT = 1 / 30

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.errors import InputError
+from springbench.harness.experiments.source_fingerprint import collect_source_parts, compute_source_fingerprint
+from springbench.harness.report.sweep_pictures import PictureJob, group_by_scene
+from springbench.solvers.plugins.plugin_discovery import InvalidPluginName
+from springbench.solvers.registry import SOLVER_TABLE
 
-from harness.base.errors import InputError
-from harness.config.load import load_config
-from harness.experiments.code import collect_source_parts, compute_source_fingerprint
-from harness.report.sweep import PictureJob, group_by_scene
-from solvers.plugins import InvalidPluginName
-from solvers.registry import SOLVER_TABLE
-from tests.often import mark_rare_cases
+from tests.rare_cases import mark_rare_cases
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -30,11 +30,11 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from harness.base.model import Model
-from harness.scenes.effects.base import Contribution, steady
-from harness.scenes.mesh.chain import Chain
-from solvers.integrators import IMPLICIT_EULER
-from solvers.methods.local_global import SparseLocalGlobal
+from springbench.harness.base.model import Model
+from springbench.harness.scenes.effects.base import Contribution, steady
+from springbench.harness.scenes.mesh.chain import Chain
+from springbench.solvers.integrators import IMPLICIT_EULER
+from springbench.solvers.methods.local_global import SparseLocalGlobal
 
 open(__file__ + ".was-run", "w").close()
 

@@ -11,11 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.model.step_problem import StepProblem, StopRule
+from springbench.solvers.registry import SOLVERS, load_target
 
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.problem import StepProblem, StopRule
-from solvers.registry import SOLVERS, load_target
-from tests.scenes import build_cloth, build_first_problem, build_random_problem, make_read_only
+from tests.scene_builders import build_cloth, build_first_problem, build_random_problem, make_read_only
 
 FORCED = {
     f"numba, {solver.linear} in {solver.precision}": solver

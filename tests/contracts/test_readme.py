@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from harness.config.load import load_config
-from harness.scenes.mesh.chain import ChainMesh
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
 
 ROOT = Path(__file__).resolve().parents[2]
 

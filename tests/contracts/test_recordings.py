@@ -11,16 +11,16 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from rerun.chunk import RrdReader
+from springbench.harness.atomic_files import WriteError
+from springbench.harness.errors import InputError
+from springbench.harness.recording.recorder_interface import LAYOUT_VERSION, RecordedFrame
+from springbench.harness.recording.recording_reader import open_recording, read_cell, read_replay, summarise_recording
+from springbench.harness.recording.rerun_recorder import FLUSH_INTERVAL, RerunRecorder
+from springbench.harness.recording.side_by_side import LineStyle, read_residuals, write_side_by_side
+from springbench.harness.recording.strain_shading import NUM_LEVELS, build_palette
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
 
-from harness.base.errors import InputError
-from harness.base.files import WriteError
-from harness.record.base import LAYOUT_VERSION, RecordedFrame
-from harness.record.compare import LineStyle, read_residuals, write_side_by_side
-from harness.record.reader import open_recording, read_cell, read_replay, summarise_recording
-from harness.record.rerun import FLUSH_INTERVAL, RerunRecorder
-from harness.record.shading import NUM_LEVELS, build_palette
-from harness.scenes.mesh.grid import GridMesh
-from tests.recordings import (
+from tests.synthetic_recordings import (
     MESHES_BY_KIND,
     build_recording_info,
     generate_waves,
@@ -233,7 +233,7 @@ def test_a_small_recording_is_small(tmp_path: Path):
 
 
 def test_a_recording_of_another_layout_is_refused_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("harness.record.rerun.LAYOUT", LAYOUT_VERSION - 1)
+    monkeypatch.setattr("springbench.harness.recording.rerun_recorder.LAYOUT", LAYOUT_VERSION - 1)
     path = write_recording(tmp_path / "a.rrd")
     with pytest.raises(InputError, match=r"laid out as another version .* do its run again, with --again"):
         read_replay(path)

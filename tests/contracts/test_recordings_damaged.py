@@ -11,16 +11,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from springbench.harness.errors import InputError
+from springbench.harness.recording.recording_reader import read_replay, summarise_recording
+from springbench.harness.recording.rerun_recorder import FLUSH_INTERVAL
 
-from harness.base.errors import InputError
-from harness.record.reader import read_replay, summarise_recording
-from harness.record.rerun import FLUSH_INTERVAL
-from tests.recordings import build_recording_info, generate_waves, write_foreign_recording, write_recording
+from tests.synthetic_recordings import build_recording_info, generate_waves, write_foreign_recording, write_recording
 
 RECORD = """
 import os, resource, signal, sys
 from pathlib import Path
-from harness.record.rerun import RerunRecorder
+from springbench.harness.record.rerun import RerunRecorder
 from tests.recordings import info, waving
 recorder = RerunRecorder(Path(sys.argv[1]), info())
 {before}

@@ -14,14 +14,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.solvers.model.step_problem import Positions
 
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from solvers.problem import Positions
-from tests.scenes import build_test_scene, compute_static_shape
+from tests.scene_builders import build_test_scene, compute_static_shape
 
 G, MASS, LENGTH = 9.81, 1.5, 2.0
 

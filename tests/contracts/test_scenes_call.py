@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from springbench.harness.cli.commands.ablate import DEFAULT_ABLATION_SOLVER, DEFAULT_ABLATION_TOLERANCE
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.experiments.ablation.ablation_unit import run_ablation
+from springbench.harness.report.ablation_summary import describe_effect, read_ablation, select_kind
 
-from harness.config.load import load_config
-from harness.experiments.ablation.command import DEFAULT_ABLATION_SOLVER, DEFAULT_ABLATION_TOLERANCE
-from harness.experiments.ablation.unit import run_ablation
-from harness.report.ablation import describe_effect, read_ablation, select_kind
-from tests.displays import SilentDisplay
+from tests.progress_displays import SilentDisplay
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 QUICK: dict[str, int | None] = {"heavy-bob": None, "tower": 8, "hanging-cloth": 12}

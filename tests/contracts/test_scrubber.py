@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from springbench.harness.recording.recording_reader import read_replay
+from springbench.harness.report.site import update_page
 
-from harness.record.reader import read_replay
-from harness.report.site import update_page
-from tests import accuracy_rows
-from tests.browser import launch_chromium
-from tests.recordings import build_recording_info, write_recording
+from tests import synthetic_accuracy_rows
+from tests.headless_browser import launch_chromium
+from tests.synthetic_recordings import build_recording_info, write_recording
 
 AMPLITUDES = {"newton": 0.05, "lbfgs": 0.1}
 COLOURED = """canvas => {
@@ -29,15 +29,17 @@ COLOURED = """canvas => {
 
 def study(folder: Path) -> str:
     """A page with two solves of one step and their recordings, whose iterates differ."""
-    rows = accuracy_rows.build_snapshot_rows("net", 6, "early")
+    rows = synthetic_accuracy_rows.build_snapshot_rows("net", 6, "early")
     (folder / "study" / "recordings").mkdir(parents=True)
     for solver, amplitude in AMPLITUDES.items():
         name = f"recordings/net-6-early-{solver}.rrd"
         write_recording(
             folder / "study" / name, replace(build_recording_info(), is_solve=True), frame_count=8, amplitude=amplitude
         )
-        rows += [row | {"recording": name} for row in accuracy_rows.build_curve_rows("net", 6, "early", solver)]
-    accuracy_rows.write_accuracy_rows(folder / "study", rows)
+        rows += [
+            row | {"recording": name} for row in synthetic_accuracy_rows.build_curve_rows("net", 6, "early", solver)
+        ]
+    synthetic_accuracy_rows.write_accuracy_rows(folder / "study", rows)
     return update_page(folder, with_recordings=True).as_uri()
 
 

@@ -10,13 +10,12 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-
-from harness.base.errors import RunFailed
-from harness.config.load import load_scene
-from harness.experiments.asked.search import SearchResult, Trial, search_cheapest_method
-from harness.experiments.asked.ways import ErrorTarget, Method
-from harness.reference.growth import estimate_growth
-from harness.simulation.controlled import Stepper, TimeBudgetExceeded, Trajectory
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.errors import RunFailed
+from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget, Method
+from springbench.harness.experiments.error_control.method_search import SearchResult, Trial, search_cheapest_method
+from springbench.harness.reference.perturbation_growth import estimate_growth
+from springbench.harness.simulation.adaptive_stepping import Stepper, TimeBudgetExceeded, Trajectory
 
 SPRING = load_scene(File(__file__).parents[2] / "configs" / "scenes" / "single-spring.yaml")
 STEPS = 10
@@ -58,7 +57,7 @@ def found(monkeypatch: pytest.MonkeyPatch, error: float, told: list[str], **foll
     """The answer among ways of these names, the last of which tells the errors of all."""
     exact = Tolerant(lambda steps: 5.0 * steps**-4.0, 0.5, 4)
     named = [Method("own", name, one) for name, one in {**followers, "exact": exact}.items()]
-    monkeypatch.setattr("harness.experiments.asked.search.ways", lambda *_: named)
+    monkeypatch.setattr("springbench.harness.experiments.error_control.method_search.ways", lambda *_: named)
     asked = ErrorTarget.from_scene(SPRING, 2, 0.2)
     return search_cheapest_method(asked, error, estimate_growth(SPRING, 2, 0.2), told.append)
 
@@ -110,8 +109,10 @@ def test_a_way_that_takes_longer_than_the_next_promises_is_tried_after_it(monkey
 def test_an_error_that_no_way_comes_near_is_refused_with_the_nearest(monkeypatch):
     lows = {"a": 0.3, "b": 0.2}
     named = [Method("own", k, Formula(lambda steps, low=low: low + 1.0 / steps**2, 1e-3)) for k, low in lows.items()]
-    monkeypatch.setattr("harness.experiments.asked.search.ways", lambda *_: named)
-    monkeypatch.setattr("harness.experiments.asked.search._Search._closer", lambda *_: _truth())
+    monkeypatch.setattr("springbench.harness.experiments.error_control.method_search.ways", lambda *_: named)
+    monkeypatch.setattr(
+        "springbench.harness.experiments.error_control.method_search._Search._closer", lambda *_: _truth()
+    )
     with pytest.raises(RunFailed, match=r"no steps keep to an error of 0.01: b came nearest and reached 0\.3"):
         search_cheapest_method(
             ErrorTarget.from_scene(SPRING, 2, 0.2), 1e-2, estimate_growth(SPRING, 2, 0.2), lambda line: None

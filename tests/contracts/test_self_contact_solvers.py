@@ -9,30 +9,36 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.errors import InputError
+from springbench.harness.scenes import collision_primitives
+from springbench.harness.scenes.effects.effect_interface import SceneEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.self_contact_effect import SelfContactEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.key_frames import KeyFrame, KeyFrameMotion
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.mesh.stack_mesh import StackMesh
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.scenes.start_positions import CollapsedStart, ScaledStart
+from springbench.harness.simulation.instrumentation_pass import count_intersections
+from springbench.harness.simulation.time_loop import (
+    MotionState,
+    build_initial_state,
+    build_problem,
+    prepare,
+    simulate_scene,
+)
+from springbench.harness.verification.verify_scene import verify_terms
+from springbench.solvers.contact.contact_potential import SelfContact as Energy
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model import integrators
+from springbench.solvers.model.step_problem import StopRule, Unsupported
+from springbench.solvers.registry import SOLVERS, load_target
 
-from harness.base.errors import InputError
-from harness.config.load import load_scene
-from harness.scenes import touching
-from harness.scenes.bind import Scene, build_scene
-from harness.scenes.effects.base import SceneEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.self_contact import SelfContactEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.mesh.stack import StackMesh
-from harness.scenes.motion import KeyFrame, KeyFrameMotion
-from harness.scenes.spec import SceneSpec
-from harness.scenes.start import CollapsedStart, ScaledStart
-from harness.simulation.observe import count_intersections
-from harness.simulation.opinion.second import verify_terms
-from harness.simulation.step import MotionState, build_initial_state, build_problem, prepare, simulate_scene
-from solvers import integrators
-from solvers.contact.self_contact import SelfContact as Energy
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import StopRule, Unsupported
-from solvers.registry import SOLVERS, load_target
-from tests.scenes import build_test_scene
+from tests.scene_builders import build_test_scene
 
 SOON = ("newton", "newton-cg", "pncg", "lbfgs", "hybrid", "vbd", "anderson")
 """Those that are near a minimum within some hundred iterations."""
@@ -214,7 +220,7 @@ def test_the_second_opinion_agrees_with_the_barrier_and_with_no_other(stiff, tol
     spec = SceneSpec.model_validate(
         given | {"effects": (SpringsEffect(stretch=100.0), SelfContactEffect(thickness=0.4, friction=friction))}
     )
-    monkeypatch.setattr(touching, "_STIFF", stiff)
+    monkeypatch.setattr(collision_primitives, "_STIFF", stiff)
     assert verify_terms(spec, build_scene(spec, 3), "implicit-euler").startswith(told)
 
 

@@ -10,11 +10,12 @@ from pathlib import Path
 from time import sleep
 
 import pytest
+from springbench.harness.errors import InputError
+from springbench.harness.execution import folder_locks
+from springbench.harness.execution.folder_locks import CLAIMED_ELSEWHERE, DONE_ELSEWHERE, UnitClaims
+from springbench.harness.results import parquet_rows
 
-from harness.base import holding, rows
-from harness.base.errors import InputError
-from harness.base.holding import CLAIMED_ELSEWHERE, DONE_ELSEWHERE, UnitClaims
-from tests.own_solvers import SCENE_SOURCE
+from tests.plugin_solvers import SCENE_SOURCE
 
 ROOT = Path(__file__).resolve().parents[2]
 RUNS = 4
@@ -65,7 +66,7 @@ def test_what_a_killed_command_had_claimed_is_done_by_the_other(tmp_path: Path):
     assert not list((tmp_path / "r").rglob(".*partial*"))
 
 
-CLAIM = "from pathlib import Path; from harness.base.holding import Claims; import sys\n"
+CLAIM = "from pathlib import Path; from springbench.harness.execution.folder_locks import Claims; import sys\n"
 
 
 def claimed_elsewhere(folder: Path, unit: Path) -> subprocess.Popen[str]:
@@ -92,7 +93,7 @@ def test_a_claim_holds_against_others_and_goes_with_its_process(tmp_path: Path):
 def test_what_its_claimant_has_done_is_done_though_the_claim_is_kept(tmp_path: Path):
     unit = tmp_path / "a.parquet"
     claims, other = UnitClaims(tmp_path, [unit]), claimed_elsewhere(tmp_path, unit)
-    rows.write_rows(unit, [{"run_id": "x"}])
+    parquet_rows.write_rows(unit, [{"run_id": "x"}])
     claims.wait_for_any([unit])
     assert claims.try_claim(unit) == DONE_ELSEWHERE
     other.kill()
@@ -103,24 +104,24 @@ def test_what_its_claimant_has_done_is_done_though_the_claim_is_kept(tmp_path: P
 def test_what_somebody_else_has_done_since_is_left_to_that(tmp_path: Path):
     unit = tmp_path / "a.parquet"
     claims = UnitClaims(tmp_path, [unit])
-    rows.write_rows(unit, [{"run_id": "x"}])
+    parquet_rows.write_rows(unit, [{"run_id": "x"}])
     assert claims.try_claim(unit) == DONE_ELSEWHERE
     claims.wait_for_any([unit])
     claims.close()
 
 
 def test_whoever_packs_a_folder_has_it_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(holding, "_PATIENCE", 0.0)
+    monkeypatch.setattr(folder_locks, "_PATIENCE", 0.0)
     with (
-        holding.lock_folder_shared(tmp_path),
+        folder_locks.lock_folder_shared(tmp_path),
         pytest.raises(InputError, match="another springbench is running"),
-        holding.lock_folder_exclusive(tmp_path),
+        folder_locks.lock_folder_exclusive(tmp_path),
     ):
         pass
     with (
-        holding.lock_folder_exclusive(tmp_path),
+        folder_locks.lock_folder_exclusive(tmp_path),
         pytest.raises(InputError, match="has it for itself"),
-        holding.lock_folder_shared(tmp_path),
+        folder_locks.lock_folder_shared(tmp_path),
     ):
         pass
 
@@ -129,10 +130,10 @@ def test_the_first_and_the_last_remove_what_is_half_written(tmp_path: Path):
     half = tmp_path / "rows" / ".a.1.partial.parquet"
     half.parent.mkdir()
     half.touch()
-    with holding.lock_folder_shared(tmp_path):
+    with folder_locks.lock_folder_shared(tmp_path):
         assert not half.exists()
         half.touch()
-        with holding.lock_folder_shared(tmp_path):
+        with folder_locks.lock_folder_shared(tmp_path):
             assert half.exists()
         assert half.exists()
     assert not half.exists()

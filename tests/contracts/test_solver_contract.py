@@ -1,4 +1,5 @@
-"""What every solver promises: the contract of `solvers.problem`, for each name in the registry."""
+"""What every solver promises: the contract of `springbench.solvers.model.step_problem`, for each name in the
+registry."""
 
 from __future__ import annotations
 
@@ -7,17 +8,21 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from springbench.harness.simulation.convergence_trace import EnergyNorm, trace_convergence
+from springbench.solvers.linalg.direct_solvers import SparseLU
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.methods.local_global.reference_local_global import (
+    DenseLocalGlobal,
+    PreparedLocalGlobal,
+    SparseLocalGlobal,
+)
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.step_problem import Positions, StepProblem, StopRule
+from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix, energy_norm
+from springbench.solvers.registry import SOLVERS, load_target
 
-from harness.simulation.trace import EnergyNorm, trace_convergence
-from solvers.energies.springs import Springs
-from solvers.linear.factors import SparseLU
-from solvers.matrices import assemble_system_matrix, energy_norm
-from solvers.methods.local_global import DenseLocalGlobal, PreparedLocalGlobal, SparseLocalGlobal
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import Positions, StepProblem, StopRule
-from solvers.registry import SOLVERS, load_target
-from tests.scenes import build_cloth, build_first_problem, build_random_problem, make_read_only
+from tests.scene_builders import build_cloth, build_first_problem, build_random_problem, make_read_only
 
 FORCED = {
     "numba, inverse in float32": CompiledLocalGlobal("inverse", "float32"),

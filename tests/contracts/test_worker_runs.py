@@ -13,14 +13,14 @@ from typing import Any, NamedTuple
 
 import psutil
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.harness.results import parquet_rows
 from typer.testing import CliRunner, Result
 
-from harness.base import rows
-from harness.cli import app
-from harness.config.load import load_config
-from harness.experiments.plan import RunFiles
-from tests.often import mark_rare_cases
-from tests.own_solvers import SWEEP_OPTIONS, PluginSweep, write_plugin_solver
+from tests.plugin_solvers import SWEEP_OPTIONS, PluginSweep, write_plugin_solver
+from tests.rare_cases import mark_rare_cases
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -72,7 +72,8 @@ def first_rows(made: PluginSweep) -> dict[str, dict[str, Any]]:
     """By solver, the first row of its run."""
     folder = made.sweep_path.parent / "r" / "sweep"
     found = (
-        rows.read_first_row(RunFiles.for_run(run, folder).rows_path) for run in load_config(made.sweep_path).list_runs()
+        parquet_rows.read_first_row(RunFiles.for_run(run, folder).rows_path)
+        for run in load_config(made.sweep_path).list_runs()
     )
     return {row["solver"]: row for row in found if isinstance(row, dict)}
 
@@ -171,10 +172,10 @@ def test_a_worker_stays_from_run_to_run(tmp_path: Path, monkeypatch: pytest.Monk
 def test_a_drawing_process_that_is_lost_fails_the_command_and_keeps_what_was_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    from harness.report import sweep
+    from springbench.harness.report import sweep_pictures
 
-    monkeypatch.setattr(sweep, "get_ready", int)
-    monkeypatch.setattr(sweep, "draw_sweep", leave)  # where it draws: that process is a fork of this one
+    monkeypatch.setattr(sweep_pictures, "get_ready", int)
+    monkeypatch.setattr(sweep_pictures, "draw_sweep", leave)  # where it draws: that process is a fork of this one
     made = write_plugin_solver(tmp_path, monkeypatch, options="frames: 1, rounds: 1, iterations: 5")
     told = ran(made)
     assert told.exit_code == 1

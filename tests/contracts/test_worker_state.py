@@ -7,14 +7,14 @@ from statistics import median
 
 import psutil
 import pytest
+from springbench.harness.execution.isolated_worker import IsolatedWorker
+from springbench.harness.execution.worker_pool import PoolTask, run_tasks
+from springbench.harness.execution.worker_process import ProgressCallback, TaskLimits
+from springbench.harness.simulation.timing_pass import SteppingSettings, measure_run
+from springbench.solvers.model.step_problem import StopRule
+from springbench.solvers.registry import SOLVERS, load_target
 
-from harness.base.crew import PoolTask, run_tasks
-from harness.base.worker import ProgressCallback, TaskLimits
-from harness.base.workers import IsolatedWorker
-from harness.simulation.measure import SteppingSettings, measure_run
-from solvers.problem import StopRule
-from solvers.registry import SOLVERS, load_target
-from tests.scenes import build_cloth
+from tests.scene_builders import build_cloth
 
 TURNS, OTHERS, NOISE = 12, 100, 1.08
 """The least time of identical runs moves by 4 %: twice that, in the median of some turns."""

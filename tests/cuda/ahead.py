@@ -19,10 +19,9 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
-
-import solvers.cuda
-from solvers.cuda.target import cuda
-from solvers.linear import schwarz
+import springbench.solvers.cuda
+from springbench.solvers.cuda.cuda_target import cuda
+from springbench.solvers.linalg import additive_schwarz
 
 CAPABILITY = 9, 0
 
@@ -39,16 +38,16 @@ class Compiled(NamedTuple):
 
 
 def kernels() -> dict[str, Any]:
-    """All kernels of `solvers.cuda` that a host launches, by names that are the same in the simulator."""
+    """All kernels of `springbench.solvers.cuda` that a host launches, by names that are the same in the simulator."""
     found = dict[str, Any]()
-    for _, name, _ in iter_modules(solvers.cuda.__path__):
-        module = import_module(f"{solvers.cuda.__name__}.{name}")
+    for _, name, _ in iter_modules(springbench.solvers.cuda.__path__):
+        module = import_module(f"{springbench.solvers.cuda.__name__}.{name}")
         own = {k: v for k, v in vars(module).items() if getattr(v, "__module__", None) == module.__name__}
         found |= {f"{name}.{k}": v for k, v in own.items() if hasattr(v, "py_func")}
         if "kernels" not in own:
             continue
         for real in (np.float32, np.float64):
-            more = (schwarz.SUBDOMAIN_SIZE,) if "patch" in signature(own["kernels"]).parameters else ()
+            more = (additive_schwarz.SUBDOMAIN_SIZE,) if "patch" in signature(own["kernels"]).parameters else ()
             made: Any = own["kernels"](real, *more)
             each = {made.py_func.__name__: made} if hasattr(made, "py_func") else made._asdict()
             found |= {f"{name}.{k}, {real.__name__}": v for k, v in each.items()}

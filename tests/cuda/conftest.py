@@ -8,14 +8,13 @@ Without either there is nothing to ask: `tests/unit/test_device.py` has what the
 from __future__ import annotations
 
 import pytest
-
-from solvers.cuda import device
-from solvers.problem import Unsupported
+from springbench.solvers.cuda import cuda_device
+from springbench.solvers.model.step_problem import Unsupported
 
 
 def _there() -> bool:
     try:
-        device.require_device("tests")
+        cuda_device.require_device("tests")
     except Unsupported:
         return False
     return True
@@ -27,7 +26,7 @@ collect_ignore_glob = [] if _there() else ["test_*.py"]
 @pytest.fixture(autouse=True)
 def fast(monkeypatch: pytest.MonkeyPatch) -> None:
     """The simulator is, where it stands for a device."""
-    if device.is_simulated():
+    if cuda_device.is_simulated():
         from tests.cuda.simulator import hasten  # what it loads takes a second, which others need not wait for
 
         hasten(monkeypatch)

@@ -15,16 +15,15 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from harness.scenes.bind import Scene
-from harness.simulation.step import build_initial_state, build_problem, prepare, simulate_scene
-from solvers.core.fixed_objective import FixedObjective
-from solvers.core.objective import StepObjective
-from solvers.integrators import Motion
-from solvers.methods.newton_cg import NewtonCG
-from solvers.methods.vbd import VertexBlockDescent
-from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
-from solvers.problem import Positions, StopRule, Unsupported
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import build_initial_state, build_problem, prepare, simulate_scene
+from springbench.solvers.methods.newton.newton_cg import NewtonCG
+from springbench.solvers.methods.position_based.xpbd import Xpbd, XpbdSmallSteps
+from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import Positions, StopRule, Unsupported
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
 
 METHODS: dict[str, Callable[..., Any]] = {
     "vbd": VertexBlockDescent,

@@ -7,9 +7,8 @@ from itertools import islice
 from typing import Any, Literal
 
 import numpy as np
-
-from solvers.energies.springs import Springs
-from solvers.problem import Positions, StepProblem
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.step_problem import Positions, StepProblem
 
 PRECISIONS: tuple[Literal["float64", "float32"], ...] = ("float64", "float32")
 

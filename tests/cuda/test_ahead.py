@@ -21,19 +21,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from springbench.solvers.cuda import cuda_device
+from springbench.solvers.linalg import additive_schwarz
+from springbench.solvers.methods.newton.newton_cg import NewtonCG
+from springbench.solvers.methods.position_based.xpbd import Xpbd, XpbdSmallSteps
+from springbench.solvers.methods.vertex_block import device_vbd
+from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
+from springbench.solvers.model.step_problem import StopRule
 
-from solvers.cuda import device, vbd
-from solvers.linear import schwarz
-from solvers.methods.newton_cg import NewtonCG
-from solvers.methods.vbd import VertexBlockDescent
-from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
-from solvers.problem import StopRule
 from tests.cuda import ahead
 from tests.cuda.near import PRECISIONS
 from tests.cuda.test_touching import touching
-from tests.effects import AIR_DRAG_EFFECT, BENDING_EFFECT, DASHPOT_EFFECT, build_moving_problem
-from tests.effects import build_effect_cloth as cloth_with
-from tests.scenes import build_cloth, build_first_problem, build_random_problem
+from tests.effect_scenes import AIR_DRAG_EFFECT, BENDING_EFFECT, DASHPOT_EFFECT, build_moving_problem
+from tests.effect_scenes import build_effect_cloth as cloth_with
+from tests.scene_builders import build_cloth, build_first_problem, build_random_problem
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -102,12 +103,12 @@ def launch_all() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not device.is_simulated(), reason="on a device each kernel that is launched is compiled")
-@pytest.mark.skipif(bool(missing()), reason=f"{missing()} is not installed; {device.INSTALL_HINT}")
+@pytest.mark.skipif(not cuda_device.is_simulated(), reason="on a device each kernel that is launched is compiled")
+@pytest.mark.skipif(bool(missing()), reason=f"{missing()} is not installed; {cuda_device.INSTALL_HINT}")
 def test_every_kernel_compiles_as_it_is_launched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(schwarz, "PATCH", 3)  # small scenes have levels, and the reference changes soon
-        patch.setattr(vbd, "REBASE", 3)
+        patch.setattr(additive_schwarz, "PATCH", 3)  # small scenes have levels, and the reference changes soon
+        patch.setattr(device_vbd, "REBASE", 3)
         launches = recorded(patch)
         launch_all()
         assert set(launches) == set(ahead.kernels())

@@ -7,19 +7,25 @@ from functools import partial
 
 import numpy as np
 import pytest
+from springbench.solvers.cuda import device_sums
+from springbench.solvers.cuda.cuda_device import is_simulated
+from springbench.solvers.cuda.cuda_target import cuda
+from springbench.solvers.iteration.preconditioners import PreconditionerName
+from springbench.solvers.linalg import additive_schwarz
+from springbench.solvers.methods.newton.newton_cg import NewtonCG
+from springbench.solvers.model.step_problem import StepProblem, StopRule, Unsupported
 
-from solvers.core.preconditioning import PreconditionerName
-from solvers.cuda import sums
-from solvers.cuda.device import is_simulated
-from solvers.cuda.target import cuda
-from solvers.linear import schwarz
-from solvers.methods.newton_cg import NewtonCG
-from solvers.problem import StepProblem, StopRule, Unsupported
 from tests.cuda.near import same_iterates
-from tests.effects import AIR_DRAG_EFFECT, BENDING_EFFECT, DASHPOT_EFFECT, STRAIN_LIMIT_EFFECT, build_moving_problem
-from tests.effects import EFFECT_SCENES as EFFECTS
-from tests.effects import build_effect_cloth as cloth_with
-from tests.scenes import SCENE_BUILDERS, build_cloth, build_first_problem, build_random_problem
+from tests.effect_scenes import (
+    AIR_DRAG_EFFECT,
+    BENDING_EFFECT,
+    DASHPOT_EFFECT,
+    STRAIN_LIMIT_EFFECT,
+    build_moving_problem,
+)
+from tests.effect_scenes import EFFECT_SCENES as EFFECTS
+from tests.effect_scenes import build_effect_cloth as cloth_with
+from tests.scene_builders import SCENE_BUILDERS, build_cloth, build_first_problem, build_random_problem
 
 schwarz_cg = partial(NewtonCG, preconditioner="schwarz")
 
@@ -45,7 +51,7 @@ def test_iterates_on_several_levels_are_those_of_the_processor(
     name: str, make: Callable[[], StepProblem], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In patches of three, so that small scenes have three levels, and a last patch that is not full."""
-    monkeypatch.setattr(schwarz, "PATCH", 3)
+    monkeypatch.setattr(additive_schwarz, "PATCH", 3)
     same_iterates(schwarz_cg, make(), 2)
 
 
@@ -82,10 +88,10 @@ def test_what_it_does_not_know_it_refuses_by_name(
 
 def test_sums_of_blocks_are_added_by_a_tree(monkeypatch: pytest.MonkeyPatch) -> None:
     if is_simulated():
-        monkeypatch.setattr(sums, "THREADS", 8)
-    count = 3 * sums.THREADS_PER_BLOCK + 1
+        monkeypatch.setattr(device_sums, "THREADS", 8)
+    count = 3 * device_sums.THREADS_PER_BLOCK + 1
     terms = np.random.default_rng(0).normal(size=(2, count))
     given, out = cuda.to_device(terms), cuda.to_device(np.zeros(2))
     for _ in range(2):  # whoever of the threads goes first
-        sums.collect_sums[1, sums.THREADS_PER_BLOCK](2, given, count, out)
+        device_sums.collect_sums[1, device_sums.THREADS_PER_BLOCK](2, given, count, out)
         np.testing.assert_allclose(out.copy_to_host(), terms.sum(axis=1), rtol=1e-12)

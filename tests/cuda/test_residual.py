@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from springbench.harness.reference.reference_evaluator import ReferenceEvaluator
+from springbench.solvers.iteration import vertex_terms
+from springbench.solvers.methods.newton.newton_cg import NewtonCG
+from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
+from springbench.solvers.model.step_problem import StepProblem
 
-from harness.reference.oracle import ReferenceEvaluator
-from solvers.core import vertex_terms
-from solvers.methods.newton_cg import NewtonCG
-from solvers.methods.vbd import VertexBlockDescent
-from solvers.problem import StepProblem
 from tests.cuda.test_touching import touching
-from tests.effects import AIR_DRAG_EFFECT, BENDING_EFFECT, DASHPOT_EFFECT, build_moving_problem
-from tests.effects import build_effect_cloth as cloth_with
-from tests.scenes import SCENE_BUILDERS, build_cloth, build_first_problem, build_random_problem
+from tests.effect_scenes import AIR_DRAG_EFFECT, BENDING_EFFECT, DASHPOT_EFFECT, build_moving_problem
+from tests.effect_scenes import build_effect_cloth as cloth_with
+from tests.scene_builders import SCENE_BUILDERS, build_cloth, build_first_problem, build_random_problem
 
 PROBLEMS: dict[str, Callable[[], StepProblem]] = {
     "cloth, pinned exactly": lambda: build_first_problem(build_cloth(4, "exact")),

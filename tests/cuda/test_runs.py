@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.harness.results import parquet_rows
+from springbench.solvers.cuda import cuda_device, cuda_target, device_solver
+from springbench.solvers.iteration import device_interface as where
+from springbench.solvers.model.step_problem import StepProblem
 from typer.testing import CliRunner, Result
 
-from harness.base import rows
-from harness.cli import app
-from harness.config.load import load_config
-from harness.experiments.plan import RunFiles
-from solvers import device as where
-from solvers.cuda import device, run, target
-from solvers.problem import StepProblem
-from tests.scenes import CLOTH_SCENE_YAML
+from tests.scene_builders import CLOTH_SCENE_YAML
 
 SWEEP = """
 scenes: [cloth.yaml]
@@ -33,7 +33,7 @@ def ran(folder: Path) -> tuple[Result, list[list[dict[str, Any]]]]:
     sweep.write_text(SWEEP)
     told = CliRunner().invoke(app, ["run", str(sweep), "--results", str(folder / "r"), "--here"])
     found = [
-        rows.read_rows([RunFiles.for_run(run, folder / "r" / "sweep").rows_path]).to_pylist()
+        parquet_rows.read_rows([RunFiles.for_run(run, folder / "r" / "sweep").rows_path]).to_pylist()
         for run in load_config(sweep).list_runs()
     ]
     return told, found
@@ -43,7 +43,7 @@ def test_rows_tell_of_the_device_and_timed_steps_ask_for_no_residual(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked, timed = list[float](), list[tuple[int, int]]()
-    residual, replay = run.DeviceSolverState.residual, run.DeviceSolver.replay_iterations
+    residual, replay = device_solver.DeviceSolverState.residual, device_solver.DeviceSolver.replay_iterations
 
     def counted(self: Any) -> float:
         asked.append(residual(self))
@@ -55,19 +55,19 @@ def test_rows_tell_of_the_device_and_timed_steps_ask_for_no_residual(
         timed.append((iterations, len(asked) - before))
         return found
 
-    monkeypatch.setattr(run.DeviceSolverState, "residual", counted)
-    monkeypatch.setattr(run.DeviceSolver, "replay", seen)
+    monkeypatch.setattr(device_solver.DeviceSolverState, "residual", counted)
+    monkeypatch.setattr(device_solver.DeviceSolver, "replay", seen)
     told, (here, there) = ran(tmp_path)
     assert told.exit_code == 0, told.output
-    assert {row["device"] for row in here} == {device.describe_device()["device"]}
+    assert {row["device"] for row in here} == {cuda_device.describe_device()["device"]}
     assert {row["device"] for row in there} == {None}
     phases = Counter(row["phase"] for row in here)
     assert phases == {"prepare": 2, "step": 2}
     steps = [row for row in here if row["phase"] == "step"]
-    assert all((row["power_w"] is None) == device.is_simulated() for row in steps)
+    assert all((row["power_w"] is None) == cuda_device.is_simulated() for row in steps)
     assert {row["stopped"] for row in steps} == {"tolerance"}
     assert timed == [(row["iterations"], 0) for row in steps]
-    assert all(count % run.ITERATIONS_PER_RESIDUAL == 0 for count, _ in timed)
+    assert all(count % device_solver.ITERATIONS_PER_RESIDUAL == 0 for count, _ in timed)
     assert asked
     assert "vbd, device cuda" in " ".join(told.output.split())
 
@@ -100,7 +100,7 @@ def test_a_device_that_fails_is_a_row_and_the_sweep_goes_on(
     def fails(self: Any, array: Any) -> Any:
         raise error
 
-    monkeypatch.setattr(target.DeviceStream, "download", fails)
+    monkeypatch.setattr(cuda_target.DeviceStream, "download", fails)
     told, (here, there) = ran(tmp_path)
     assert told.exit_code == 1
     assert [row["status"] for row in here] == ["failed"]

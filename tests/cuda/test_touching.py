@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from springbench.harness.simulation.device_stepping import wrap_device_solver
+from springbench.harness.simulation.time_loop import MotionState, build_initial_state, build_problem, prepare
+from springbench.harness.simulation.timing_pass import SteppingSettings, iterate_steps
+from springbench.solvers.contact.half_space.half_space_potential import HalfSpaceContact
+from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
+from springbench.solvers.model.step_problem import StepProblem, StopRule
 
-from harness.simulation.measure import SteppingSettings, iterate_steps
-from harness.simulation.on_device import wrap_device_solver
-from harness.simulation.step import MotionState, build_initial_state, build_problem, prepare
-from solvers.contact.energy import HalfSpaceContact
-from solvers.methods.vbd import VertexBlockDescent
-from solvers.problem import StepProblem, StopRule
-from tests import contacts
+from tests import contact_scenes
 from tests.cuda.near import iterates, same_iterates
 
 ITERATIONS = 2
@@ -23,7 +23,9 @@ INSIDE = 0.003
 
 def touching(name: str) -> StepProblem:
     """A step of a sheet that slides over an obstacle: some vertices press, with friction."""
-    made = contacts.build_sheet(contacts.build_contact(contacts.OBSTACLE_SPECS[name], friction=0.5), size=4)
+    made = contact_scenes.build_sheet(
+        contact_scenes.build_contact(contact_scenes.OBSTACLE_SPECS[name], friction=0.5), size=4
+    )
     (energy,) = (energy for energy in made.system.energies if isinstance(energy, HalfSpaceContact))
     state = build_initial_state(made)
     p, v = state.motion.positions.copy(), state.motion.velocity - [0.3, 1.0, 0.1]
@@ -49,8 +51,10 @@ def test_iterates_against_an_obstacle_are_those_of_the_processor(name: str, roun
 
 def test_a_host_iterates_the_normal_forces_of_friction_and_timed_steps_repeat_its_rounds() -> None:
     """The sheet lands: friction takes more than one solve, and each is replayed with its own iterations."""
-    made = contacts.build_sheet(
-        contacts.build_contact(contacts.OBSTACLE_SPECS["plane"], friction=0.5), size=3, velocity=(0.5, -8.0, 0.0)
+    made = contact_scenes.build_sheet(
+        contact_scenes.build_contact(contact_scenes.OBSTACLE_SPECS["plane"], friction=0.5),
+        size=3,
+        velocity=(0.5, -8.0, 0.0),
     )
     settings = SteppingSettings(StopRule(2), "current", 2, 1)
     found = wrap_device_solver(prepare(made, VertexBlockDescent(device="cuda", precision="float64")))

@@ -9,19 +9,19 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from springbench.solvers.cuda.device_solver import ITERATIONS_PER_RESIDUAL, DeviceSolver
+from springbench.solvers.iteration import vertex_terms
+from springbench.solvers.methods.vertex_block import device_vbd
+from springbench.solvers.methods.vertex_block.device_vbd_kernels import OBJECTIVE
+from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.step_problem import Positions, StepProblem, StopRule, Unsupported
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
 
-from solvers.core import vertex_terms
-from solvers.core.fixed_objective import FixedObjective
-from solvers.core.objective import StepObjective
-from solvers.cuda import vbd
-from solvers.cuda.run import ITERATIONS_PER_RESIDUAL, DeviceSolver
-from solvers.cuda.vbd_kernels import OBJECTIVE
-from solvers.energies.springs import Springs
-from solvers.methods.vbd import VertexBlockDescent
-from solvers.problem import Positions, StepProblem, StopRule, Unsupported
-from tests.effects import BENDING_EFFECT, STRAIN_LIMIT_EFFECT
-from tests.effects import build_effect_cloth as cloth_with
-from tests.scenes import SCENE_BUILDERS, build_cloth, build_first_problem, build_random_problem
+from tests.effect_scenes import BENDING_EFFECT, STRAIN_LIMIT_EFFECT
+from tests.effect_scenes import build_effect_cloth as cloth_with
+from tests.scene_builders import SCENE_BUILDERS, build_cloth, build_first_problem, build_random_problem
 
 PROBLEMS: dict[str, Callable[[], StepProblem]] = {
     "chain": lambda: build_first_problem(SCENE_BUILDERS["chain"](1e10)),
@@ -44,7 +44,7 @@ STARTS: dict[str, Callable[[Positions, np.random.Generator], Positions]] = {
 @pytest.fixture(autouse=True)
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """The reference changes within few iterations."""
-    monkeypatch.setattr(vbd, "REBASE", 3)
+    monkeypatch.setattr(device_vbd, "REBASE", 3)
 
 
 PRECISIONS: tuple[Literal["float64", "float32"], ...] = ("float64", "float32")

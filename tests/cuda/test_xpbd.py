@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from springbench.solvers.cuda.device_solver import DeviceSolver
+from springbench.solvers.methods.position_based.xpbd import Xpbd, XpbdSmallSteps
+from springbench.solvers.model.step_problem import StepProblem, StopRule, Unsupported
 
-from solvers.cuda.run import DeviceSolver
-from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
-from solvers.problem import StepProblem, StopRule, Unsupported
 from tests.cuda.near import iterates, same_iterates
-from tests.effects import BENDING_EFFECT
-from tests.effects import build_effect_cloth as cloth_with
-from tests.scenes import SCENE_BUILDERS, build_cloth, build_first_problem, build_random_problem
+from tests.effect_scenes import BENDING_EFFECT
+from tests.effect_scenes import build_effect_cloth as cloth_with
+from tests.scene_builders import SCENE_BUILDERS, build_cloth, build_first_problem, build_random_problem
 
 
 def one_point() -> StepProblem:

@@ -14,7 +14,7 @@ _SHELF, _MERGED, _PUBLISHED, _REFUSED, _LOCKS = (
 ARCHIVE = (
     Mutation(
         "columns-from-folders",
-        "harness/base/union.py",
+        "harness/results/row_union.py",
         ", hive_partitioning = false)",
         ")",
         (f"{_SHELF}::test_no_name_of_a_folder_sets_a_column_or_leads_to_other_files",),
@@ -70,7 +70,7 @@ ARCHIVE = (
     ),
     Mutation(
         "locks-that-are-links",
-        "harness/base/files.py",
+        "harness/atomic_files.py",
         "access | os.O_NOFOLLOW | os.O_NONBLOCK",
         "access | os.O_NONBLOCK",
         (f"{_LOCKS}::test_what_is_in_the_way_of_a_lock_is_named_at_once",),

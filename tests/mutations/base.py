@@ -50,4 +50,4 @@ class Mutation:
     @property
     def compiled(self) -> bool:
         """Whether compiled code may hold what it changes, so that none from before will do."""
-        return self.file.startswith("solvers/") or self.file == "harness/record/shading.py"
+        return self.file.startswith("solvers/") or self.file == "harness/recording/strain_shading.py"

@@ -7,14 +7,14 @@ from tests.mutations.base import Mutation
 DEVICE = (
     Mutation(
         "device-depth-of-the-other-side",
-        "solvers/cuda/half_spaces.py",
+        "solvers/methods/vertex_block/device_half_spaces.py",
         "depth = when * (spaces.offset[k] - lagged)",
         "depth = when * (lagged - spaces.offset[k])",
         ("tests/cuda/test_touching.py",),
     ),
     Mutation(
         "device-tension-forgotten",
-        "solvers/cuda/xpbd_kernels.py",
+        "solvers/methods/position_based/device_xpbd_kernels.py",
         "springs.tension[e] += change",
         "springs.tension[e] = change",
         ("tests/cuda/test_xpbd.py",),

@@ -83,28 +83,34 @@ _TABLE = (
     ),
     (
         "contact-side",
-        "solvers/contact/energy.py",
+        "solvers/contact/half_space/half_space_potential.py",
         "@ np.minimum(0.0, self.gap(p)) ** 2",
         "@ np.maximum(0.0, self.gap(p)) ** 2",
         _SLOPES,
     ),
     (
         "contact-friction",
-        "solvers/contact/energy.py",
+        "solvers/contact/half_space/half_space_potential.py",
         "self.friction * stiffness * np.maximum(0.0, depth)",
         "0.9 * self.friction * stiffness * np.maximum(0.0, depth)",
         f"{_U}/test_effect_contact.py",
     ),
     (
         "contact-way",
-        "solvers/contact/planes.py",
+        "solvers/contact/half_space/separating_planes.py",
         "s = begin - (far - radius) / slope",
         "s = begin - (far - 0.5 * radius) / slope",
         f"{_U}/test_contact_planes.py",
     ),
     ("gravity-mass", f"{_F}/gravity.py", "mass[:, None] * np.array", "mass.mean() * np.array", f"{_U}/test_effects.py"),
     ("ether-decay", f"{_F}/ether_drag.py", "exp(-self.rate * time_step)", "1.0 - self.rate * time_step", _STEPS),
-    ("air-drag", "solvers/filters.py", "np.divide(mass, mass + drag,", "np.divide(mass, mass + 2.0 * drag,", _DAMPING),
+    (
+        "air-drag",
+        "solvers/model/velocity_filters.py",
+        "np.divide(mass, mass + drag,",
+        "np.divide(mass, mass + 2.0 * drag,",
+        _DAMPING,
+    ),
     ("wind-density", f"{_F}/wind.py", "f = 0.5 * wind.density", "f = wind.density", f"{_U}/test_effect_wind.py"),
 )
 

@@ -41,10 +41,12 @@ ENERGY_BALANCE = (
     Mutation("growth-of-a-thousand", _BALANCE, "GROWTH = 1.0", "GROWTH = 1e4", _TESTS),
     Mutation(
         "growth-is-ok",
-        "harness/experiments/failure.py",
+        "harness/experiments/failure_columns.py",
         '"status": "energy-growth"',
         '"status": "ok"',
         _TESTS,
     ),
-    Mutation("no-blow-up", "harness/simulation/observe.py", "if balance.exceeds(BLOW_UP):", "if False:", _TESTS),
+    Mutation(
+        "no-blow-up", "harness/simulation/instrumentation_pass.py", "if balance.exceeds(BLOW_UP):", "if False:", _TESTS
+    ),
 )

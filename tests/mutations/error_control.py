@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tests.mutations.base import Mutation
 
-_SEARCH, _GROWTH = "harness/experiments/asked/search.py", "harness/reference/growth.py"
+_SEARCH, _GROWTH = "harness/experiments/error_control/method_search.py", "harness/reference/perturbation_growth.py"
 _FORMULAS = "tests/contracts/test_search.py"
 _ASKED = "tests/contracts/test_asked_error.py"
 _GROWS = f"{_ASKED}::test_growth_does_not_depend_on_the_time_step_and_ends_where_nothing_is_known"
@@ -12,7 +12,7 @@ _GROWS = f"{_ASKED}::test_growth_does_not_depend_on_the_time_step_and_ends_where
 _TABLE = (
     (
         "control-power",
-        "harness/simulation/controlled.py",
+        "harness/simulation/adaptive_stepping.py",
         "setting * ratio ** ((order + 1.0) / order)",
         "setting * ratio ** (order / (order + 1.0))",
         f"{_ASKED}::test_a_tolerance_is_changed_by_the_order_of_a_step",

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from tests.mutations.base import Mutation
 
-_MULTIPLIERS, _AVBD, _GRADE = "solvers/core/multipliers.py", "solvers/methods/avbd.py", "harness/reference/grade.py"
+_MULTIPLIERS, _AVBD, _GRADE = (
+    "solvers/methods/vertex_block/lagrange_multipliers.py",
+    "solvers/methods/vertex_block/avbd.py",
+    "harness/reference/residual_audit.py",
+)
 _TESTS = "tests/unit/test_avbd.py"
 
 EXACT_LENGTHS = (
@@ -46,7 +50,7 @@ EXACT_LENGTHS = (
     ),
     Mutation(
         "doubt-a-hundredth",
-        "harness/reference/curvature.py",
+        "harness/reference/hessian_curvature.py",
         "here = Curvature(smallest, 4.0 * (sums + moved), direction, solve)",
         "here = Curvature(smallest, 0.04 * (sums + moved), direction, solve)",
         ("tests/unit/test_judge.py",),

@@ -6,7 +6,7 @@ from __future__ import annotations
 from tests.mutations.base import Mutation
 
 _MEASURE, _CLOCK = (f"harness/simulation/{name}.py" for name in ("measure", "clock"))
-_RERUN, _RENDER = "harness/record/rerun.py", "harness/report/render.py"
+_RERUN, _RENDER = "harness/recording/rerun_recorder.py", "harness/report/mesh_rendering.py"
 _LIES, _RECORDINGS = "tests/contracts/test_lies.py", "tests/contracts/test_recordings.py"
 _UNIT_STEP, _UNIT_MEASURE, _UNIT_CLOCK = (f"tests/unit/test_{name}.py" for name in ("simulate", "measure", "clock"))
 _PICTURES, _PHASES = (
@@ -45,7 +45,7 @@ MEASURING = (
     ),
     Mutation(
         "rows-scaled",
-        "harness/simulation/times.py",
+        "harness/simulation/timing_rows.py",
         '"seconds": t.seconds,',
         '"seconds": t.seconds / 1000,',
         (_UNIT_MEASURE,),
@@ -53,7 +53,7 @@ MEASURING = (
     ),
     Mutation(
         "global-does-nothing",
-        "solvers/core/prefactored.py",
+        "solvers/methods/local_global/prefactored.py",
         '"global": whole}',
         '"global": lambda: None}',
         (_PHASES,),
@@ -61,7 +61,7 @@ MEASURING = (
     ),
     Mutation(
         "global-leaves-what-is-there",
-        "solvers/core/compiled.py",
+        "solvers/methods/local_global/fused_local_global.py",
         '"global": lambda: self.base.correction(y, out)}',
         '"global": lambda: out}',
         (_PHASES,),
@@ -79,14 +79,14 @@ MEASURING = (
     Mutation("phases-of-any-time", _CLOCK, "ITERATION_SHARE = 0.15", "ITERATION_SHARE = 15.0", (_UNIT_MEASURE,)),
     Mutation(
         "curves-scaled",
-        "harness/experiments/accuracy/curves.py",
+        "harness/experiments/accuracy/convergence_curves.py",
         "    stamps[1:] -= began\n",
         "    stamps[1:] -= began\n    stamps /= 1000.0\n",
         ("tests/unit/test_accuracy_curves.py",),
     ),
     Mutation(
         "turns-scaled",
-        "harness/experiments/speed/candidates.py",
+        "harness/experiments/roofline/benchmark_candidates.py",
         "found = perf_counter() - began",
         "found = (perf_counter() - began) / 1000",
         ("tests/unit/test_speed.py::test_a_time_that_another_clock_does_not_bear_out_is_a_failure",),
@@ -108,7 +108,7 @@ MEASURING = (
     ),
     Mutation(
         "frame-of-the-start",
-        "harness/simulation/observe.py",
+        "harness/simulation/instrumentation_pass.py",
         "scene.time(step.index), step.positions, *drawn",
         "scene.time(step.index), step.problem.start.positions, *drawn",
         (_LIES,),
@@ -124,23 +124,25 @@ MEASURING = (
     ),
     Mutation(
         "colours-inverted",
-        "harness/record/shading.py",
+        "harness/recording/strain_shading.py",
         "np.clip(strain / end, -1, 1)",
         "np.clip(-strain / end, -1, 1)",
         ("tests/unit/test_record_shading.py",),
         ("sparse", "other colours"),
     ),
-    Mutation("times-in-microseconds", "harness/record/cells.py", "counts / 1e9", "counts / 1e6", (_RECORDINGS,)),
+    Mutation(
+        "times-in-microseconds", "harness/recording/chunk_cells.py", "counts / 1e9", "counts / 1e6", (_RECORDINGS,)
+    ),
     Mutation(
         "recording-not-compared",
-        "harness/record/verify.py",
+        "harness/recording/recording_check.py",
         "if recorded.positions.tobytes() != store_relative(p, origin).tobytes():",
         "if False:",
         ("tests/unit/test_record_verify.py",),
     ),
     Mutation(
         "passes-not-compared",
-        "harness/experiments/run.py",
+        "harness/experiments/run_pipeline.py",
         'if measured.final is not None and found[run.frames]["digest"] != digest(measured.final):',
         "if False:",
         (_LIES,),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tests.mutations.base import Mutation
 
-_QUANTITIES, _RENDER = "harness/base/quantities.py", "harness/report/render.py"
+_QUANTITIES, _RENDER = "harness/results/quantities.py", "harness/report/mesh_rendering.py"
 _STATED, _TIMES = "tests/unit/test_quantities.py", "tests/unit/test_report_timing.py"
 _PAGE, _SITE, _ROWS = "tests/contracts/test_page.py", "tests/unit/test_site.py", "tests/contracts/test_hostile_rows.py"
 _STATIC = "harness/report/site/static"
@@ -12,14 +12,14 @@ _STATIC = "harness/report/site/static"
 PAGE = (
     Mutation(
         "picture-distance-mean",
-        "harness/report/comparison.py",
+        "harness/report/comparison_picture.py",
         "np.linalg.norm(away, axis=1).max(initial=0.0)",
         "np.linalg.norm(away, axis=1).mean()",
         (_STATED,),
     ),
     Mutation(
         "ablation-share-of-variant",
-        "harness/report/ablation.py",
+        "harness/report/ablation_summary.py",
         'share = [100 * row[key] / whole["seconds"] for key',
         'share = [100 * row[key] / (whole["seconds"] - row["cost"]) for key',
         (_STATED,),
@@ -52,15 +52,19 @@ PAGE = (
     ),
     Mutation(
         "figure-of-times-scaled",
-        "harness/report/figures/of_runs.py",
+        "harness/report/figures/timing_panels.py",
         "values = [1e-3 * np.array(",
         "values = [1e-2 * np.array(",
         (_STATED,),
     ),
     Mutation(
-        "page-frame-longest", "harness/report/site/frames.py", "1e3 * median(seconds)", "1e3 * max(seconds)", (_SITE,)
+        "page-frame-longest",
+        "harness/report/site/frame_scripts.py",
+        "1e3 * median(seconds)",
+        "1e3 * max(seconds)",
+        (_SITE,),
     ),
-    Mutation("page-folder-unescaped", "harness/report/site/folders.py", "safe=''", "safe=':()'", (_ROWS,)),
+    Mutation("page-folder-unescaped", "harness/report/site/sweep_folders.py", "safe=''", "safe=':()'", (_ROWS,)),
     Mutation("page-inherited-names", f"{_STATIC}/base.js", "Object.hasOwn(object, name)", "name in object", (_PAGE,)),
     Mutation(
         "page-ratio-inverted",

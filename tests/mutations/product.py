@@ -9,9 +9,9 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from harness.config.load import load_config
-from harness.experiments.plan import RunFiles
-from harness.experiments.run import execute_run
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.experiments.run_pipeline import execute_run
+from springbench.harness.experiments.sweep_plan import RunFiles
 
 SCENE = """
 mesh: {kind: grid}

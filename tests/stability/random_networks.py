@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from hypothesis import settings
 from hypothesis import strategies as st
-
-from harness.scenes.bind import Scene
-from harness.scenes.mesh.network import NetworkMesh
-from harness.simulation.step import MotionState
-from solvers.energies.springs import Springs
-from solvers.integrators import INTEGRATORS, Motion
-from solvers.problem import DirichletPins, Positions, StepProblem, StepStart, System
-from solvers.registry import SOLVERS, load_target
+from springbench.harness.scenes.mesh.network_mesh import NetworkMesh
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import MotionState
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.integrators import INTEGRATORS, Motion
+from springbench.solvers.model.step_problem import DirichletPins, Positions, StepProblem, StepStart, System
+from springbench.solvers.registry import SOLVERS, load_target
 
 ALL = {name: load_target(target)() for name, target in SOLVERS.items()}
 MINIMISERS = {name: solver for name, solver in ALL.items() if solver.minimises}

@@ -6,23 +6,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.config.config_loader import load_config, load_scene
+from springbench.harness.experiments.run_pipeline import execute_run
+from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.harness.recording.recording_reader import read_replay, summarise_recording
+from springbench.harness.reference.step_verifier import StepVerifier
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.simulation.time_loop import build_initial_state, prepare, simulate_scene
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.time_stepping.symplectic_euler import PreparedSymplecticEuler, SymplecticEuler
+from springbench.solvers.model.step_problem import StopRule, Unsupported
+from springbench.solvers.registry import SOLVERS, load_target
 from typer.testing import CliRunner
-
-from harness.cli import app
-from harness.config.load import load_config, load_scene
-from harness.experiments.plan import RunFiles
-from harness.experiments.run import execute_run
-from harness.record.reader import read_replay, summarise_recording
-from harness.reference.judge import StepVerifier
-from harness.scenes.bind import Scene, build_scene
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.spec import SceneSpec
-from harness.simulation.step import build_initial_state, prepare, simulate_scene
-from solvers.methods.newton import NewtonSolver
-from solvers.methods.symplectic_euler import PreparedSymplecticEuler, SymplecticEuler
-from solvers.problem import StopRule, Unsupported
-from solvers.registry import SOLVERS, load_target
 
 FILE = Path(__file__).resolve().parents[2] / "configs" / "hard" / "motion-alternating-steps.yaml"
 LENGTHS = (1 / 3, 1 / 300)

@@ -4,29 +4,29 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from springbench.harness.scenes.effects.air_drag_effect import AirDragEffect
+from springbench.harness.scenes.effects.attachments_effect import AttachmentsEffect
+from springbench.harness.scenes.effects.bending_effect import BendingEffect
+from springbench.harness.scenes.effects.dashpots_effect import DashpotsEffect
+from springbench.harness.scenes.effects.effect_interface import SceneEffect
+from springbench.harness.scenes.effects.gas_effect import GasEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.rayleigh_effect import RayleighEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.effects.strain_limits_effect import StrainLimitsEffect
+from springbench.harness.scenes.effects.wind_effect import WindEffect
+from springbench.harness.scenes.key_frames import KeyFrame, KeyFrameMotion
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.mesh.surface_meshes import BalloonMesh
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
+from springbench.solvers.model.step_problem import ProjectiveEnergy, Solver, StopRule
+from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix
 
-from harness.scenes.bind import Scene
-from harness.scenes.effects.air_drag import AirDragEffect
-from harness.scenes.effects.attachments import AttachmentsEffect
-from harness.scenes.effects.base import SceneEffect
-from harness.scenes.effects.bending import BendingEffect
-from harness.scenes.effects.dashpots import DashpotsEffect
-from harness.scenes.effects.gas import GasEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.rayleigh import RayleighEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.effects.strain_limits import StrainLimitsEffect
-from harness.scenes.effects.wind import WindEffect
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.mesh.surfaces import BalloonMesh
-from harness.scenes.motion import KeyFrame, KeyFrameMotion
-from harness.simulation.step import prepare, simulate_scene
-from solvers.matrices import assemble_system_matrix
-from solvers.methods.lbfgs import Lbfgs
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import ProjectiveEnergy, Solver, StopRule
-from tests.scenes import build_test_scene
+from tests.scene_builders import build_test_scene
 
 TINY, HUGE = 1e-9, 1e9
 LEAP = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=1e-6, offset=(0.3, 0.0, 0.0), turn=3e4)))

@@ -13,15 +13,14 @@ from typing import ClassVar
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.recording.recording_reader import read_replay
+from springbench.solvers.linalg.direct_solvers import DenseCholesky
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.methods.time_stepping.symplectic_euler import PreparedSymplecticEuler, SymplecticEuler
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solution, StepProblem, StopRule, System
+from springbench.solvers.registry import SOLVERS
 from typer.testing import CliRunner
-
-from harness.cli import app
-from harness.record.reader import read_replay
-from solvers.linear.factors import DenseCholesky
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.symplectic_euler import PreparedSymplecticEuler, SymplecticEuler
-from solvers.problem import Positions, PreparedSolver, Solution, StepProblem, StopRule, System
-from solvers.registry import SOLVERS
 
 FRAMES, BROKEN = 20, 4
 """Frames of the run, and the one in which what is made to break does."""

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from springbench.harness.reference.reference_evaluator import ReferenceEvaluator
+from springbench.harness.simulation.time_loop import build_initial_state, build_problem, prepare
+from springbench.solvers.model.step_problem import Solution, StepProblem, StopRule, Unsupported
 
-from harness.reference.oracle import ReferenceEvaluator
-from harness.simulation.step import build_initial_state, build_problem, prepare
-from solvers.problem import Solution, StepProblem, StopRule, Unsupported
 from tests.stability.test_hard_scenes import METHODS, cases, scene, spacing
 
 MINIMISERS = {name: solver for name, solver in METHODS.items() if solver.is_minimiser}

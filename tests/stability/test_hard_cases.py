@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import MotionState, build_problem
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import DirichletPins, Positions, Solver, StopRule, System
 
-from harness.scenes.bind import Scene
-from harness.simulation.step import MotionState, build_problem
-from solvers.integrators import Motion
-from solvers.problem import DirichletPins, Positions, Solver, StopRule, System
-from tests.scenes import (
+from tests.scene_builders import (
     LOCAL_GLOBAL_BACKENDS,
     SCENE_BUILDERS,
     build_cloth,

@@ -13,11 +13,10 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
-
-from harness.config.load import load_scene, load_sweep
-from harness.reference.oracle import ReferenceEvaluator
-from harness.scenes.bind import Scene, build_scene
-from harness.simulation.step import (
+from springbench.harness.config.config_loader import load_scene, load_sweep
+from springbench.harness.reference.reference_evaluator import ReferenceEvaluator
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.simulation.time_loop import (
     MotionState,
     SimulationStep,
     build_initial_state,
@@ -25,11 +24,12 @@ from harness.simulation.step import (
     prepare,
     simulate_scene,
 )
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.problem import Positions, PreparedSolver, Solver, StepProblem, StopRule, Unsupported
-from solvers.registry import SOLVER_TABLE, SOLVERS, load_target
-from solvers.round_off import gradient_roundoff
-from tests.scenes import THREAD_COUNT, rounding_scale, single_stage_integrator
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.model.rounding_bound import gradient_roundoff
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solver, StepProblem, StopRule, Unsupported
+from springbench.solvers.registry import SOLVER_TABLE, SOLVERS, load_target
+
+from tests.scene_builders import THREAD_COUNT, rounding_scale, single_stage_integrator
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 CASES = {path.stem: path for path in sorted((CONFIGS / "hard").glob("*.yaml"))}

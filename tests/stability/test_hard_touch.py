@@ -5,15 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.simulation.instrumentation_pass import count_intersections
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.contact.contact_potential import BarrierContact
+from springbench.solvers.contact.obstacle_advancement import NoClearance
+from springbench.solvers.model.step_problem import StopRule
 
-from harness.config.load import load_scene
-from harness.scenes.bind import build_scene
-from harness.simulation.observe import count_intersections
-from harness.simulation.step import prepare, simulate_scene
-from solvers.contact.self_contact import BarrierContact
-from solvers.core.clearing import NoClearance
-from solvers.problem import StopRule
-from tests.self_contacts import SURFACE_CONTACT_SOLVERS
+from tests.self_contact_scenes import SURFACE_CONTACT_SOLVERS
 
 CASES = {
     path.stem: path for path in sorted((Path(__file__).resolve().parents[2] / "configs/hard-touch").glob("*.yaml"))

@@ -19,12 +19,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.optimize import root
+from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.step_problem import DirichletPins, Positions, Solver, StepProblem, StopRule, System
 
-from solvers.energies.springs import Springs
-from solvers.methods.hybrid import HybridNewton
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import DirichletPins, Positions, Solver, StepProblem, StopRule, System
-from tests.scenes import build_step_start
+from tests.scene_builders import build_step_start
 
 LENGTH, WEIGHT = 2.0, 10.0
 """Of the whole cable [m], [N]."""

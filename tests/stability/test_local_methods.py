@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from springbench.harness.simulation.time_loop import build_initial_state, build_problem, simulate_scene
+from springbench.solvers.methods.position_based.xpbd import Xpbd, XpbdSmallSteps
+from springbench.solvers.methods.time_stepping.symplectic_euler import SymplecticEuler
+from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
+from springbench.solvers.model.step_problem import Solver, StopRule, Unsupported
 
-from harness.simulation.step import build_initial_state, build_problem, simulate_scene
-from solvers.methods.symplectic_euler import SymplecticEuler
-from solvers.methods.vbd import VertexBlockDescent
-from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
-from solvers.problem import Solver, StopRule, Unsupported
-from tests.scenes import SCENE_BUILDERS, build_cloth, single_stage_integrator
+from tests.scene_builders import SCENE_BUILDERS, build_cloth, single_stage_integrator
 from tests.stability.test_hard_cases import CASES, STEPS, STOP, VALUE, Case, MotionState, resting
 
 METHODS: dict[str, Solver] = {

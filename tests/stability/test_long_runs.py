@@ -10,16 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from harness.config.load import load_scene
-from harness.scenes.bind import Scene, build_scene
-from harness.simulation.step import build_initial_state, prepare, simulate_scene
-from solvers.integrators import Motion
-from solvers.methods.hybrid import HybridNewton
-from solvers.methods.lbfgs import Lbfgs
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import Solver, StopRule
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.simulation.time_loop import build_initial_state, prepare, simulate_scene
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import Solver, StopRule
 
 pytestmark = pytest.mark.long
 

@@ -7,27 +7,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh, NetMesh
+from springbench.harness.scenes.mesh.mesh_generator import MeshGenerator
+from springbench.harness.scenes.mesh.solid_meshes import BlockMesh, TowerMesh
+from springbench.harness.scenes.mesh.star_mesh import StarMesh
+from springbench.harness.scenes.mesh.surface_meshes import BalloonMesh, SkirtMesh
+from springbench.solvers.linalg import memory
+from springbench.solvers.linalg.solver_selection import build_linear_solver
+from springbench.solvers.methods.local_global.reference_local_global import DenseLocalGlobal
+from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.step_problem import Solver, Unsupported
+from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix
 from typer.testing import CliRunner
 
-from harness.base.errors import InputError
-from harness.cli import app
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.generator import MeshGenerator
-from harness.scenes.mesh.grid import GridMesh, NetMesh
-from harness.scenes.mesh.solids import BlockMesh, TowerMesh
-from harness.scenes.mesh.star import StarMesh
-from harness.scenes.mesh.surfaces import BalloonMesh, SkirtMesh
-from solvers import memory
-from solvers.linear.choice import build_linear_solver
-from solvers.matrices import assemble_system_matrix
-from solvers.methods.hybrid import HybridNewton
-from solvers.methods.local_global import DenseLocalGlobal
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import Solver, Unsupported
-from tests.networks import grid_matrix
-from tests.scenes import build_test_scene
+from tests.network_matrices import grid_matrix
+from tests.scene_builders import build_test_scene
 
 GIB = 2.0**30
 SCENE = """

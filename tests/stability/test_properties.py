@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from springbench.solvers.model.step_problem import Positions, StepProblem, StopRule, System
 
-from solvers.problem import Positions, StepProblem, StopRule, System
-from tests.scenes import rounding_scale
+from tests.scene_builders import rounding_scale
 from tests.stability.random_networks import (
     ALL,
     EPS,

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
+from springbench.harness.reference.certified_minimum import build_free_hessian
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import MotionState, prepare, simulate_scene
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import Positions, StepProblem, StopRule
 
-from harness.reference.minimiser import build_free_hessian
-from harness.scenes.bind import Scene
-from harness.simulation.step import MotionState, prepare, simulate_scene
-from solvers.integrators import Motion
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import Positions, StepProblem, StopRule
 from tests.contracts.test_integrators import LAWS, energies
 from tests.stability.random_networks import (
     DT,

@@ -15,21 +15,21 @@ from itertools import product
 
 import numpy as np
 import pytest
+from springbench.harness.reference.certified_minimum import certify_minimum
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.mesh.solid_meshes import BlockMesh
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.scenes.start_positions import AnyStart, CollapsedStart, FlattenedStart, RandomStart
+from springbench.harness.simulation.time_loop import MotionState, build_problem, prepare, simulate_scene
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import Positions, StopRule
+from springbench.solvers.registry import SOLVERS, load_target
 
-from harness.reference.minimiser import certify_minimum
-from harness.scenes.bind import Scene
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.mesh.solids import BlockMesh
-from harness.scenes.start import AnyStart, CollapsedStart, FlattenedStart, RandomStart
-from harness.simulation.step import MotionState, build_problem, prepare, simulate_scene
-from solvers.integrators import Motion
-from solvers.problem import Positions, StopRule
-from solvers.registry import SOLVERS, load_target
-from tests.often import mark_rare_cases
-from tests.scenes import build_test_scene
+from tests.rare_cases import mark_rare_cases
+from tests.scene_builders import build_test_scene
 
 STEPS, STOP = 100, StopRule(200, 1e-6)
 """Steps of at most so many iterations, converged or not: a step cut short damps more."""

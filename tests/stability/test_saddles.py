@@ -9,24 +9,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.reference.hessian_curvature import compute_curvature
+from springbench.harness.reference.step_verifier import StepVerifier
+from springbench.harness.reference.step_verifier import is_minimum as minimum
+from springbench.harness.report.robustness import TOLERANCE_SLACK
+from springbench.harness.scenes.effects.pins_effect import PinsEffect as PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect as SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.mesh.solid_meshes import TowerMesh
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.simulation.time_loop import MotionState, build_problem, prepare, simulate_scene
+from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.integrators import INTEGRATORS, Motion
+from springbench.solvers.model.step_problem import Positions, Solver, StepProblem, StopRule
 
-from harness.config.load import load_scene
-from harness.reference.curvature import compute_curvature
-from harness.reference.judge import StepVerifier
-from harness.reference.judge import is_minimum as minimum
-from harness.report.robustness import TOLERANCE_SLACK
-from harness.scenes.bind import Scene, build_scene
-from harness.scenes.effects.pins import PinsEffect as PinsEffect
-from harness.scenes.effects.springs import SpringsEffect as SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.mesh.solids import TowerMesh
-from harness.simulation.step import MotionState, build_problem, prepare, simulate_scene
-from solvers.integrators import INTEGRATORS, Motion
-from solvers.methods.hybrid import HybridNewton
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import Positions, Solver, StepProblem, StopRule
-from tests.scenes import build_test_scene
+from tests.scene_builders import build_test_scene
 
 solvers = pytest.mark.parametrize("solver", [NewtonSolver(), HybridNewton()], ids=lambda s: type(s).__name__)
 

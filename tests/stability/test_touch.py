@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.simulation.instrumentation_pass import count_intersections
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.contact.contact_potential import BarrierContact
+from springbench.solvers.model.step_problem import Solver, StopRule
 
-from harness.config.load import load_scene
-from harness.scenes.bind import build_scene
-from harness.simulation.observe import count_intersections
-from harness.simulation.step import prepare, simulate_scene
-from solvers.contact.self_contact import BarrierContact
-from solvers.problem import Solver, StopRule
-from tests.knots import knot_determinant
-from tests.self_contacts import SURFACE_CONTACT_SOLVERS
+from tests.knot_invariants import knot_determinant
+from tests.self_contact_scenes import SURFACE_CONTACT_SOLVERS
 
 SCENES = {path.stem: path for path in sorted((Path(__file__).resolve().parents[2] / "configs/touch").glob("*.yaml"))}
 SMALL = {"knot": 60, "net-on-block": 5}

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from springbench.harness.scenes.effects.bending_effect import BendingEffect
+from springbench.solvers.iteration.descent_method import ResidualMetric
+from springbench.solvers.methods.local_global.aggregated_jacobi import AggregatedJacobi, AggregatedSweeps
+from springbench.solvers.methods.local_global.prefactored import prepare_local_global, require_projective
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.step_problem import StopRule, Unsupported
 
-from harness.scenes.effects.bending import BendingEffect
-from solvers.core.descent import ResidualMetric
-from solvers.core.prefactored import prepare_local_global, require_projective
-from solvers.methods.a_jacobi import AggregatedJacobi, AggregatedSweeps
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import StopRule, Unsupported
-from tests.effects import EFFECT_SCENES, build_moving_problem
-from tests.effects import build_effect_cloth as cloth_with
-from tests.scenes import build_cloth, build_first_problem
+from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
+from tests.effect_scenes import build_effect_cloth as cloth_with
+from tests.scene_builders import build_cloth, build_first_problem
 
 HANGING = build_first_problem(build_cloth(8, "exact", stretch=100.0))
 

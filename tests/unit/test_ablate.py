@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from springbench.harness.cli.commands.ablate import DEFAULT_ABLATION_SOLVER
+from springbench.harness.cli.main import app
+from springbench.harness.config.config_loader import load_config, load_scene
+from springbench.harness.experiments.ablation.ablation_schema import ABLATION_COLUMNS
+from springbench.harness.experiments.ablation.ablation_unit import run_ablation
+from springbench.harness.experiments.ablation.interleaved_variants import VariantRun, compute_cost
+from springbench.harness.experiments.ablation.scene_variants import SceneVariant, build_variants
+from springbench.harness.report.ablation_summary import describe_effect, read_ablation, summarise_ablation
+from springbench.harness.results.folder_ownership import claim_folder
+from springbench.harness.results.run_schema import RUN_COLUMNS as RUN_COLUMNS
+from springbench.harness.results.run_schema import ColumnSpec
 from typer.testing import CliRunner
 
-from harness.base.claim import claim_folder
-from harness.base.columns import RUN_COLUMNS as RUN_COLUMNS
-from harness.base.columns import ColumnSpec
-from harness.cli import app
-from harness.config.load import load_config, load_scene
-from harness.experiments.ablation.ablation_rows import ABLATION_COLUMNS
-from harness.experiments.ablation.command import DEFAULT_ABLATION_SOLVER
-from harness.experiments.ablation.side_by_side import VariantRun, compute_cost
-from harness.experiments.ablation.unit import run_ablation
-from harness.experiments.ablation.variants import SceneVariant, build_variants
-from harness.report.ablation import describe_effect, read_ablation, summarise_ablation
-from tests.displays import SilentDisplay
+from tests.progress_displays import SilentDisplay
 
 ROOT = Path(__file__).resolve().parents[2]
 CLOTH = """

@@ -8,16 +8,16 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 from scipy.sparse import csr_array, diags_array
+from springbench.solvers.iteration.iterative_solver import compute_max_coordinate
+from springbench.solvers.kernels.iteration_loop import iteration_limit
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.methods.quasi_newton.anderson import Anderson
+from springbench.solvers.methods.quasi_newton.chebyshev import Chebyshev
+from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
+from springbench.solvers.methods.quasi_newton.windowed_acceleration import PreparedAccelerated
+from springbench.solvers.model.step_problem import Positions, Solver, StepProblem, StopRule
 
-from solvers.core.driver import compute_max_coordinate
-from solvers.kernels.loop import iteration_limit
-from solvers.methods.anderson import Anderson
-from solvers.methods.chebyshev import Chebyshev
-from solvers.methods.lbfgs import Lbfgs
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.methods.quasi_newton import PreparedAccelerated
-from solvers.problem import Positions, Solver, StepProblem, StopRule
-from tests.scenes import build_cloth, build_first_problem, build_random_problem
+from tests.scene_builders import build_cloth, build_first_problem, build_random_problem
 
 METHODS: tuple[type[Anderson | Chebyshev | Lbfgs], ...] = (Anderson, Chebyshev, Lbfgs)
 methods = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.__name__)

@@ -11,19 +11,23 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from springbench.harness.errors import RunFailed
+from springbench.harness.experiments.accuracy import convergence_curves
+from springbench.harness.experiments.accuracy.convergence_curves import (
+    ScoredCurve,
+    is_scored_iteration,
+    measure_convergence,
+)
+from springbench.harness.experiments.accuracy.step_scales import compute_vertex_distances
+from springbench.harness.reference.certified_minimum import refine_minimum
+from springbench.harness.reference.reference_evaluator import ReferenceEvaluator, StationarityReading
+from springbench.harness.simulation.convergence_trace import EnergyNorm
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.step_problem import Positions, StepProblem
 
-from harness.base.errors import RunFailed
-from harness.experiments.accuracy import curves
-from harness.experiments.accuracy.curves import ScoredCurve, is_scored_iteration, measure_convergence
-from harness.experiments.accuracy.scales import compute_vertex_distances
-from harness.reference.minimiser import refine_minimum
-from harness.reference.oracle import ReferenceEvaluator, StationarityReading
-from harness.simulation.trace import EnergyNorm
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import Positions, StepProblem
-from tests.scenes import build_cloth, build_first_problem
-from tests.undisturbed import retry_if_preempted
+from tests.preemption_retry import retry_if_preempted
+from tests.scene_builders import build_cloth, build_first_problem
 from tests.unit.test_minimiser import FLAT
 
 PROBLEM = build_first_problem(build_cloth(6, "exact"))
@@ -93,7 +97,7 @@ ENDS = {
     "it converges": (towards(lambda n: 0.5**n), "ok", ""),
     "it converges too slowly": (towards(lambda n: 1 / (1 + n)), "ok", "limit of iterations"),
     "it stands still far off": (towards(lambda n: max(0.5**n, 0.01)), "no-progress", "do not change"),
-    "it pauses": (towards(lambda n: 0.5 ** (n // curves.MAX_UNCHANGED_ITERATES)), "ok", ""),
+    "it pauses": (towards(lambda n: 0.5 ** (n // convergence_curves.MAX_UNCHANGED_ITERATES)), "ok", ""),
     "it goes to and fro": (towards(lambda n: 0.5 + 0.1 * (n % 2)), "no-progress", "limit of iterations"),
     "it explodes": (towards(lambda n: 10.0**n), "diverged", "exploded"),
     "it is not a number": (towards(lambda n: np.nan if n == 3 else 0.5 / n), "diverged", "after 3 iterations"),
@@ -119,7 +123,9 @@ def test_a_curve_ends_at_its_time_limit_without_the_iterates_that_compile() -> N
     found = curve(Scripted(towards(lambda n: 1 / (1 + n)), pause=0.02), time_limit=0.05, rounds=1)
     assert found.status == "time-limit"
     # Sleeping takes at least as long as asked: three iterates after the warm-up are over the limit, perhaps fewer.
-    assert curves.NUM_WARMUP_ITERATES < found.iterate_indices[-1] <= curves.NUM_WARMUP_ITERATES + 3
+    assert (
+        convergence_curves.NUM_WARMUP_ITERATES < found.iterate_indices[-1] <= convergence_curves.NUM_WARMUP_ITERATES + 3
+    )
     assert found.seconds[-1, 0] >= 0.02 * found.iterate_indices[-1]
 
 
@@ -140,7 +146,7 @@ def test_grades_are_the_oracles_and_stamps_ascend_in_each_round() -> None:
 def test_stamps_that_another_clock_does_not_bear_out_are_a_failure(
     scale: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(curves, "perf_counter", lambda: scale * perf_counter())
+    monkeypatch.setattr(convergence_curves, "perf_counter", lambda: scale * perf_counter())
     prepared = SparseLocalGlobal().prepare(PROBLEM.system)
     with pytest.raises(RunFailed, match="the times of iterates add up to"):
         retry_if_preempted(lambda: ([{"interrupted": curve(prepared, iterations=120).preempted}], None))
@@ -172,7 +178,7 @@ STARTED = replace(FLAT, current_positions=FLAT.current_positions + np.array([[0.
 
 def test_a_solver_that_sits_on_a_saddle_is_named_so_and_has_not_converged() -> None:
     found = at_a_saddle(lambda number: FLAT.current_positions)
-    assert found.stationarity[-1] <= curves.STATIONARITY_TOLERANCE
+    assert found.stationarity[-1] <= convergence_curves.STATIONARITY_TOLERANCE
     assert found.status == "saddle"
     assert "saddle, where the curvature is -" in found.reason
 

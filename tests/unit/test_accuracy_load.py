@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-
-from harness.base.errors import InputError
-from harness.config.accuracy_load import AccuracyPlan, load_accuracy
-from harness.config.load import load_config
-from harness.report.accuracy.convergence import INITIAL_GUESS_LABELS
-from harness.scenes.bind import build_scene
-from harness.scenes.spec import InitialGuess
-from harness.simulation.step import COARSE_TO_FINE, INITIAL_GUESSES
+from springbench.harness.config.accuracy_loader import AccuracyPlan, load_accuracy
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.errors import InputError
+from springbench.harness.report.accuracy.convergence_plot import INITIAL_GUESS_LABELS
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.scenes.scene_spec import InitialGuess
+from springbench.harness.simulation.time_loop import COARSE_TO_FINE, INITIAL_GUESSES
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SHIPPED = [path for path in sorted(CONFIGS.glob("*.yaml")) if {"curves:", "work:"} & {*path.read_text().splitlines()}]

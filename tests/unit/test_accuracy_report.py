@@ -10,20 +10,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from harness.base.errors import InputError
-from harness.report.accuracy.findings import build_curve_summary, list_failures, summarise_findings
-from harness.report.accuracy.growth import fit_scalings
-from harness.report.accuracy.measured import AccuracyData, ConvergenceCurve, without_short_curves
-from harness.report.accuracy.paper import LIU2013_FIGURE_2, LIU2013_FIGURE_3, MAX_ERROR_RATIO, compare_with_paper
-from harness.report.accuracy.profiles import (
+from springbench.harness.errors import InputError
+from springbench.harness.report.accuracy.accuracy_data import AccuracyData, ConvergenceCurve, without_short_curves
+from springbench.harness.report.accuracy.accuracy_findings import build_curve_summary, list_failures, summarise_findings
+from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
+from springbench.harness.report.accuracy.liu2013_comparison import (
+    LIU2013_FIGURE_2,
+    LIU2013_FIGURE_3,
+    MAX_ERROR_RATIO,
+    compare_with_paper,
+)
+from springbench.harness.report.accuracy.performance_profiles import (
     cumulative_share,
     data_profile_ratios,
     describe_omitted_solvers,
     performance_ratios,
 )
-from harness.report.accuracy.reading import read_accuracy
-from harness.report.accuracy.times import (
+from springbench.harness.report.accuracy.size_scaling import fit_scalings
+from springbench.harness.report.accuracy.time_to_accuracy import (
     GAP_TARGETS,
     amortised_seconds,
     describe_crossings,
@@ -32,8 +36,9 @@ from harness.report.accuracy.times import (
     format_gap,
     is_contested,
 )
-from harness.report.accuracy.work_plot import find_default_setting, pareto_front
-from tests import accuracy_rows as made
+from springbench.harness.report.accuracy.work_precision_plot import find_default_setting, pareto_front
+
+from tests import synthetic_accuracy_rows as made
 
 COST, SETUP = made.SYNTHETIC_METHODS["numba"]["cost"], made.SYNTHETIC_METHODS["numba"]["setup"]
 

@@ -11,19 +11,25 @@ import pytest
 from matplotlib.colors import rgb_to_hsv, to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
+from springbench.harness.recording.viewer_blueprint import BACKGROUND
+from springbench.harness.report import page_layout
+from springbench.harness.report.accuracy import draw_accuracy_report, plot_sheet
+from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
+from springbench.harness.report.accuracy.convergence_plot import draw_convergence
+from springbench.harness.report.accuracy.performance_profiles import draw_profiles
+from springbench.harness.report.accuracy.size_scaling import draw_scalings
+from springbench.harness.report.accuracy.time_to_accuracy_plot import draw_times_to_accuracy
+from springbench.harness.report.accuracy.work_precision_plot import draw_work_precision
+from springbench.harness.report.plot_style import (
+    BACKGROUND_COLOUR,
+    PAGE_HEIGHT,
+    PAGE_WIDTH,
+    STALE_NOTE,
+    assign_solver_styles,
+)
+from springbench.solvers.registry import SOLVER_TABLE, load_target
 
-from harness.record.blueprint import BACKGROUND
-from harness.report import page
-from harness.report.accuracy import draw_accuracy_report, sheet
-from harness.report.accuracy.convergence import draw_convergence
-from harness.report.accuracy.growth import draw_scalings
-from harness.report.accuracy.profiles import draw_profiles
-from harness.report.accuracy.reading import read_accuracy
-from harness.report.accuracy.time_plot import draw_times_to_accuracy
-from harness.report.accuracy.work_plot import draw_work_precision
-from harness.report.style import BACKGROUND_COLOUR, PAGE_HEIGHT, PAGE_WIDTH, STALE_NOTE, assign_solver_styles
-from solvers.registry import SOLVER_TABLE, load_target
-from tests import accuracy_rows as made
+from tests import synthetic_accuracy_rows as made
 
 
 def small() -> list[dict]:
@@ -51,10 +57,10 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], dict[st
 
     def save(sheet: Figure, path: Path) -> None:
         pages[f"{path.parent.name}/{path.stem}"] = sheet
-        page.save_page(sheet, path)
+        page_layout.save_page(sheet, path)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sheet, "save", save)
+        patch.setattr(plot_sheet, "save", save)
         return draw_accuracy_report(folder), pages
 
 
@@ -124,7 +130,7 @@ def test_what_other_code_measured_is_hollow_in_every_picture_and_told(
             rows += made.build_curve_rows("net", size, "early", solver, code="before" if solver == "newton" else None)
     rows += [row | {"code": "before" if row["solver"] == "hybrid" else None} for row in made.build_work_rows("net", 6)]
     pages: dict[str, Figure] = {}
-    monkeypatch.setattr(sheet, "save", lambda drawn, path: pages.setdefault(path.parent.name, drawn))
+    monkeypatch.setattr(plot_sheet, "save", lambda drawn, path: pages.setdefault(path.parent.name, drawn))
     table = read_accuracy(made.write_accuracy_rows(tmp_path, rows))
     for draw_all, name in (
         (draw_convergence, "convergence"),

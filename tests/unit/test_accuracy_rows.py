@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-
-from harness.base import columns, rows
-from harness.base.columns import RUN_COLUMNS as RUN_COLUMNS
-from harness.experiments.accuracy.accuracy_rows import ACCURACY_COLUMNS, ACCURACY_SCHEMA
-from harness.report.query import run_query
+from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_COLUMNS, ACCURACY_SCHEMA
+from springbench.harness.report.sql_query import run_query
+from springbench.harness.results import parquet_rows, run_schema
+from springbench.harness.results.run_schema import RUN_COLUMNS as RUN_COLUMNS
 
 README = Path(__file__).resolve().parents[2] / "results" / "README.md"
 SHARED = {column.name for column in RUN_COLUMNS} - {"status", "seconds"}
@@ -18,7 +17,7 @@ SHARED = {column.name for column in RUN_COLUMNS} - {"status", "seconds"}
 @pytest.mark.parametrize(
     "column", [c for c in ACCURACY_COLUMNS if c.name not in SHARED], ids=lambda column: column.name
 )
-def test_every_column_of_its_own_is_documented(column: columns.ColumnSpec) -> None:
+def test_every_column_of_its_own_is_documented(column: run_schema.ColumnSpec) -> None:
     line = f"| `{column.name}` | {column.unit} | {column.description.replace('|', chr(92) + '|')} |"
     assert line in README.read_text().splitlines()
 
@@ -31,7 +30,7 @@ def test_a_query_sees_the_accuracy_rows_of_all_configs(tmp_path: Path) -> None:
     for name, error in (("first", 0.5), ("second", 0.25)):
         (tmp_path / name / "accuracy").mkdir(parents=True)
         row = {"kind": "work", "sweep": name, "error": error, "seconds": [0.1, 0.2]}
-        rows.write_rows(tmp_path / name / "accuracy" / "a.parquet", [row], ACCURACY_SCHEMA)
+        parquet_rows.write_rows(tmp_path / name / "accuracy" / "a.parquet", [row], ACCURACY_SCHEMA)
     found = run_query("SELECT sweep, list_min(seconds) FROM accuracy ORDER BY error", tmp_path)
     assert found.values == [("second", 0.1), ("first", 0.1)]
     assert run_query("SELECT count(*) FROM rows", tmp_path).values == [(0,)]

@@ -9,24 +9,24 @@ from typing import Any
 
 import numpy as np
 import pytest
+from springbench.harness.config.accuracy_config import BenchmarkCase, MeasurementSettings, WorkSpec
+from springbench.harness.config.sweep_config import SolverSpec
+from springbench.harness.experiments.accuracy.accuracy_units import load_reference_trajectory
+from springbench.harness.experiments.accuracy.work_precision import build_work_rows
+from springbench.harness.reference.reference_store import ReferenceStore
+from springbench.harness.reference.reference_trajectory import ReferenceTrajectory, UnpredictableMotion
+from springbench.harness.reference.step_snapshot import build_exact_scene
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.simulation import stopwatch as clock_module
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.model.step_problem import StopRule
 
-from harness.config.accuracy import BenchmarkCase, MeasurementSettings, WorkSpec
-from harness.config.sweep import SolverSpec
-from harness.experiments.accuracy.units import load_reference_trajectory
-from harness.experiments.accuracy.work import build_work_rows
-from harness.reference.frozen import build_exact_scene
-from harness.reference.store import ReferenceStore
-from harness.reference.trajectory import ReferenceTrajectory, UnpredictableMotion
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.spec import SceneSpec
-from harness.simulation import clock as clock_module
-from harness.simulation.step import prepare, simulate_scene
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import StopRule
-from tests.undisturbed import retry_if_preempted
+from tests.preemption_retry import retry_if_preempted
 
 CHAIN = SceneSpec(
     mesh=ChainMesh(length=2.0),

@@ -7,14 +7,14 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from springbench.solvers.methods.local_global.admm import Admm
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.step_problem import DirichletPins, StepProblem, StopRule, Unsupported
 
-from solvers.energies.springs import Springs
-from solvers.methods.admm import Admm
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import DirichletPins, StepProblem, StopRule, Unsupported
-from tests.effects import EFFECT_SCENES, build_moving_problem
-from tests.scenes import build_cloth, build_first_problem
+from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
+from tests.scene_builders import build_cloth, build_first_problem
 
 HANGING = build_first_problem(build_cloth(8, "exact", stretch=100.0))
 

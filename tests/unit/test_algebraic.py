@@ -7,19 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from harness.reference.trajectory import ReferenceTrajectory, integrate_motion
-from harness.scenes.bind import Scene, build_scene
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.spec import SceneSpec
-from harness.simulation.algebraic import AutoTolerance, StopCriterion, build_stop_rule
-from harness.simulation.step import SimulationStep, prepare, simulate_scene
-from solvers.integrators import INTEGRATORS
-from solvers.methods.lbfgs import Lbfgs
-from solvers.problem import StopRule, Unsupported
+from springbench.harness.reference.reference_trajectory import ReferenceTrajectory, integrate_motion
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.simulation.auto_tolerance import AutoTolerance, StopCriterion, build_stop_rule
+from springbench.harness.simulation.time_loop import SimulationStep, prepare, simulate_scene
+from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
+from springbench.solvers.model.integrators import INTEGRATORS
+from springbench.solvers.model.step_problem import StopRule, Unsupported
 
 END = 0.3
 EFFECTS = (SpringsEffect(stretch=20.0), GravityEffect(), PinsEffect(at=("first",), weight="exact"))

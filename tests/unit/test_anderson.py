@@ -8,11 +8,11 @@ from itertools import islice
 import numpy as np
 import pytest
 from scipy.linalg import cholesky
+from springbench.solvers.methods.quasi_newton.anderson import Anderson
+from springbench.solvers.model.step_problem import Positions, ProjectiveEnergy, StepProblem, StopRule, Unsupported
+from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix
 
-from solvers.matrices import assemble_system_matrix
-from solvers.methods.anderson import Anderson
-from solvers.problem import Positions, ProjectiveEnergy, StepProblem, StopRule, Unsupported
-from tests.scenes import build_cloth, build_first_problem, build_random_problem
+from tests.scene_builders import build_cloth, build_first_problem, build_random_problem
 from tests.unit.test_accelerated import Barrier
 
 PROBLEMS = {"cloth": lambda: build_first_problem(build_cloth(7, "exact")), "random": lambda: build_random_problem(4)}

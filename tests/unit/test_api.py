@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import springbench
+from springbench.harness import api
+from springbench.harness.errors import InputError
+from springbench.harness.results import parquet_rows
 
-import harness
-from harness import api
-from harness.base import rows
-from harness.base.errors import InputError
-from tests.recordings import build_recording_info, generate_waves, write_recording
+from tests.synthetic_recordings import build_recording_info, generate_waves, write_recording
 
 
 @pytest.fixture
@@ -23,17 +23,17 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[object]:
         given.append(what)
         path.write_bytes(b"a picture")
 
-    monkeypatch.setattr("harness.report.run_picture.draw_run", draw)
-    monkeypatch.setattr("harness.report.comparison.draw_comparison", draw)
+    monkeypatch.setattr("springbench.harness.report.run_picture.draw_run_picture", draw)
+    monkeypatch.setattr("springbench.harness.report.comparison_picture.draw_comparison_picture", draw)
     return given
 
 
 def test_rows_of_a_folder_are_a_table_in_the_order_of_their_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "rows").mkdir()
     for name in ("b", "a"):
-        rows.write_rows(tmp_path / "rows" / f"{name}.parquet", [{"solver": name, "frame": k} for k in (1, 2)])
+        parquet_rows.write_rows(tmp_path / "rows" / f"{name}.parquet", [{"solver": name, "frame": k} for k in (1, 2)])
     monkeypatch.setattr(api, "find_spec", lambda name: None)  # neither polars nor pandas
-    found = harness.load_rows(tmp_path)
+    found = springbench.load_rows(tmp_path)
     assert found.build_query(["solver", "frame"]).to_pylist() == [
         {"solver": s, "frame": k} for s in "ab" for k in (1, 2)
     ]
@@ -41,18 +41,18 @@ def test_rows_of_a_folder_are_a_table_in_the_order_of_their_files(tmp_path: Path
 
 def test_an_opened_recording_has_every_frame(tmp_path: Path):
     of = build_recording_info("chain")
-    replay = harness.open_recording(write_recording(tmp_path / "a.rrd", of, frame_count=3))
+    replay = springbench.open_recording(write_recording(tmp_path / "a.rrd", of, frame_count=3))
     np.testing.assert_array_equal(replay.positions, [f.positions.astype(np.float32) for f in generate_waves(of, 3)])
     np.testing.assert_array_equal(replay.springs, of.springs)
     with pytest.raises(InputError, match="nowhere"):
-        harness.open_recording(tmp_path / "nowhere.rrd")
+        springbench.open_recording(tmp_path / "nowhere.rrd")
 
 
 def test_a_recording_is_drawn_alone_and_several_side_by_side(tmp_path: Path, drawn: list[object]):
     path = write_recording(tmp_path / "a.rrd", build_recording_info("chain"), frame_count=2)
-    replay = harness.open_recording(path)
-    picture = harness.draw_picture(replay)
-    harness.draw_picture({"one": path, "other": replay})
+    replay = springbench.open_recording(path)
+    picture = springbench.draw_picture(replay)
+    springbench.draw_picture({"one": path, "other": replay})
     alone, beside = drawn
     assert alone is replay
     assert isinstance(beside, dict)

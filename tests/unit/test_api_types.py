@@ -9,28 +9,34 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-
-import harness
-from harness.base.errors import InputError
-from harness.config.keys import IntegratorName, OptionKeys, ReportName, SceneKeys, SolverName, SweepKeys
-from harness.config.sweep import SHIPPED_REPORTS, SweepConfig, SweepOptions
-from harness.scenes.spec import SceneFields
-from solvers.integrators import INTEGRATORS
-from solvers.registry import OPTIONAL_SOLVERS, SOLVERS
+import springbench
+from springbench.harness.config.sweep_config import SHIPPED_REPORTS, SweepConfig, SweepOptions
+from springbench.harness.config.typed_keys import (
+    IntegratorName,
+    OptionKeys,
+    ReportName,
+    SceneKeys,
+    SolverName,
+    SweepKeys,
+)
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.scene_spec import SceneFields
+from springbench.solvers.model.integrators import INTEGRATORS
+from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS
 
 ROOT = Path(__file__).resolve().parents[2]
 
 MISTAKEN = """
-import harness
+import springbench
 
-scene = harness.make_scene(mesh={"kind": "grid"}, time_step=0.01, frames=3, mass=1.0)
-fine = harness.Simulation(scene, "newton", integrator="bdf2", tolerance=None)
-harness.Simulation(scene, "hybird")  # 6
-harness.Simulation(scene, integrator="implicit-eular")  # 7
-harness.make_scene(mesh={"kind": "grid"}, time_step=0.01, frames=3, mass_per_aera=1.0)  # 8
-sweep: harness.SweepKeys = {"scenes": ["a.yaml"], "solvers": ["sparse"]}
+scene = springbench.make_scene(mesh={"kind": "grid"}, time_step=0.01, frames=3, mass=1.0)
+fine = springbench.Simulation(scene, "newton", integrator="bdf2", tolerance=None)
+springbench.Simulation(scene, "hybird")  # 6
+springbench.Simulation(scene, integrator="implicit-eular")  # 7
+springbench.make_scene(mesh={"kind": "grid"}, time_step=0.01, frames=3, mass_per_aera=1.0)  # 8
+sweep: springbench.SweepKeys = {"scenes": ["a.yaml"], "solvers": ["sparse"]}
 harness.run({"scenes": ["a.yaml"], "solvers": ["sparse"], "options": {"iteration": 3}}, name="a")  # 10
-harness.make_scene(mesh={"kind": "grid"}, time_step=0.01, frames="many")  # 11
+springbench.make_scene(mesh={"kind": "grid"}, time_step=0.01, frames="many")  # 11
 harness.run({"scenes": ["a.yaml"], "solvers": ["sprase"]}, name="a")  # 12
 harness.run({"scenes": ["a.yaml"], "solvers": ["sparse"], "reports": ["timings"]}, name="a")  # 13
 """
@@ -70,4 +76,4 @@ class Mine:
 
 def test_a_class_in_a_sweep_is_answered_by_how_to_name_it():
     with pytest.raises(InputError, match=r'solvers\[1\]: came the class Mine; wanted .* "./test_api_types.py:Mine"'):
-        harness.run_config({"scenes": ["a.yaml"], "solvers": ["sparse", Mine]}, name="a")  # type: ignore[list-item]
+        springbench.run_config({"scenes": ["a.yaml"], "solvers": ["sparse", Mine]}, name="a")  # type: ignore[list-item]

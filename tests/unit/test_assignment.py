@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from harness.base.errors import InputError
-from harness.scenes.assignment import (
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.assignment_scene import (
     ASSIGNMENT_FORCE,
     ASSIGNMENT_ITERATIONS,
     ASSIGNMENT_PIN_WEIGHT,

@@ -7,33 +7,33 @@ from typing import Any
 
 import numpy as np
 import pytest
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.errors import InputError, RunFailed
+from springbench.harness.reference.exact_lengths import ExactLengths
+from springbench.harness.reference.residual_audit import AuditedSolver
+from springbench.harness.reference.step_verifier import StepVerifier
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.effects.strain_limits_effect import StrainLimitsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import NetMesh
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.simulation.delegating_solver import DelegatingSolver
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.harness.verification.verify_scene import verify_terms
+from springbench.solvers import registry
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.vertex_block.avbd import AugmentedVertexBlockDescent as Avbd
+from springbench.solvers.methods.vertex_block.avbd import PreparedAugmentedVertexBlockDescent
+from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
+from springbench.solvers.model.constraints import LengthConstraints
+from springbench.solvers.model.energies import spring_energy
+from springbench.solvers.model.energies.augmented_lagrangian import concatenate_constraints, length_errors
+from springbench.solvers.model.step_problem import Solution, StepProblem, StopRule, Unsupported
 
-from harness.base.errors import InputError, RunFailed
-from harness.config.load import load_scene
-from harness.reference.exact import ExactLengths
-from harness.reference.grade import AuditedSolver
-from harness.reference.judge import StepVerifier
-from harness.scenes.bind import Scene, build_scene
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.effects.strain_limits import StrainLimitsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import NetMesh
-from harness.scenes.spec import SceneSpec
-from harness.simulation.opinion.second import verify_terms
-from harness.simulation.passing import DelegatingSolver
-from harness.simulation.step import prepare, simulate_scene
-from solvers import registry
-from solvers.energies import springs
-from solvers.energies.augmented import concatenate_constraints, length_errors
-from solvers.held import LengthConstraints
-from solvers.methods.avbd import AugmentedVertexBlockDescent as Avbd
-from solvers.methods.avbd import PreparedAugmentedVertexBlockDescent
-from solvers.methods.newton import NewtonSolver
-from solvers.methods.vbd import VertexBlockDescent
-from solvers.problem import Solution, StepProblem, StopRule, Unsupported
-from tests.scenes import build_first_problem, build_test_scene
+from tests.scene_builders import build_first_problem, build_test_scene
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "exact"
 FIRST = PinsEffect.model_validate({"at": ["first"], "weight": "exact"})
@@ -163,7 +163,7 @@ def test_softened_springs_end_at_the_minimum():
         build_test_scene(DOWN, SpringsEffect(stretch=100.0, rule="fixed"), GravityEffect(), FIRST, size=9)
     )
     (found,) = stated.system.energies
-    assert isinstance(found, springs.Springs)
+    assert isinstance(found, spring_energy.Springs)
     ratio = replace(found, stiffness=np.where(np.arange(8) % 2, 100.0, 1.0) * found.stiffness)
     stated = replace(stated, system=replace(stated.system, energies=(ratio,)))
     end = NewtonSolver().prepare(stated.system).solve(stated, StopRule(200)).positions

@@ -8,10 +8,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-
-from harness.config.accuracy import BenchmarkCase, MeasurementSettings, WorkSpec
-from harness.config.sweep import SolverSpec
-from harness.experiments.accuracy.best_first import LEAST_LIMIT, OVER_BUDGET, SLOWER, search
+from springbench.harness.config.accuracy_config import BenchmarkCase, MeasurementSettings, WorkSpec
+from springbench.harness.config.sweep_config import SolverSpec
+from springbench.harness.experiments.accuracy.best_first import LEAST_LIMIT, OVER_BUDGET, SLOWER, search
 
 STEPS, TOLERANCES, SOLVERS = (0.4, 0.2, 0.1, 0.05, 0.025), (1e-1, 1e-2, 1e-3), ("a", "b", "c", "d", "e")
 

@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array, coo_array, csr_array, diags_array
 from scipy.sparse.linalg import spsolve
+from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
 
-from solvers.linear.block import BlockCholesky
-from tests.networks import grid_springs
+from tests.network_matrices import grid_springs
 
 ROUND_OFF = 1e-12
 """Of a solution relative to its largest entry: the matrices are diagonally dominant, so that errors do not grow."""

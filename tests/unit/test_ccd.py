@@ -13,17 +13,16 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-
-from solvers.contact import ways
-from solvers.contact.barrier import compute_distances
-from solvers.contact.contacts import Candidates, pad_positions
-from solvers.contact.known import CACHE_INFLATION
-from solvers.contact.self_contact import SelfContact
-from solvers.contact.surface import CollisionMesh
+from springbench.solvers.contact import ccd
+from springbench.solvers.contact.broad_phase.candidate_cache import CACHE_INFLATION
+from springbench.solvers.contact.collision_mesh import CollisionMesh
+from springbench.solvers.contact.collisions import Candidates, pad_positions
+from springbench.solvers.contact.contact_potential import SelfContact
+from springbench.solvers.contact.potentials.barrier import compute_distances
 
 THICKNESS = 1 / 64
 LEFT = Fraction(1, 20)
-"""Of a gap: what a step leaves at least (`solvers.contact.ways`)."""
+"""Of a gap: what a step leaves at least (`springbench.solvers.contact.ccd`)."""
 
 TRIANGLE = ((0, 0, 0), (8, 0, 0), (0, 8, 0))
 CROSSED = ((-4, 0, 0), (4, 0, 0))
@@ -76,8 +75,8 @@ def test_no_pair_that_closes_at_its_bound_loses_more_than_nineteen_twentieths_of
             d = speed * np.array(closing.displacements, float)[:, axes]
             d += [4.0, -2.0, 0.5]  # a common motion bounds nothing
             step = Fraction(
-                ways.collision_free_step_size(
-                    pairs_of(closing.edges), pad_positions(p), pad_positions(d), 1.0, *ways.allocate_ccd_scratch()
+                ccd.collision_free_step_size(
+                    pairs_of(closing.edges), pad_positions(p), pad_positions(d), 1.0, *ccd.allocate_ccd_scratch()
                 )
             )
             assert step * Fraction(speed) <= (1 - LEFT) * gap  # exactly: the distance is linear in the step
@@ -133,8 +132,8 @@ def test_no_random_pair_comes_nearer_than_it_may_on_the_way(edges):
         if gap <= 0.0:
             continue
         step = Fraction(
-            ways.collision_free_step_size(
-                pairs_of(edges), pad_positions(p), pad_positions(d), 1.0, *ways.allocate_ccd_scratch()
+            ccd.collision_free_step_size(
+                pairs_of(edges), pad_positions(p), pad_positions(d), 1.0, *ccd.allocate_ccd_scratch()
             )
         )
         ended += step < 1

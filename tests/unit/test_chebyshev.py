@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.linalg import eigh
+from springbench.solvers.kernels.iteration_loop import RESIDUAL_EACH, LoopLimits
+from springbench.solvers.methods.quasi_newton.chebyshev import Chebyshev
+from springbench.solvers.methods.quasi_newton.windowed_acceleration import PreparedAccelerated
+from springbench.solvers.model.step_problem import ProjectiveEnergy, StepProblem, StopRule, Unsupported
+from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix
 
-from solvers.kernels.loop import RESIDUAL_EACH, LoopLimits
-from solvers.matrices import assemble_system_matrix
-from solvers.methods.chebyshev import Chebyshev
-from solvers.methods.quasi_newton import PreparedAccelerated
-from solvers.problem import ProjectiveEnergy, StepProblem, StopRule, Unsupported
-from tests.scenes import build_cloth, build_first_problem, build_random_problem
+from tests.scene_builders import build_cloth, build_first_problem, build_random_problem
 from tests.unit.test_accelerated import Barrier
 
 PROBLEMS = {

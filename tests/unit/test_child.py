@@ -9,12 +9,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from springbench.harness.atomic_files import WriteError, atomic_write, describe_os_error
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.execution import sandbox
 
-from harness.base import child
-from harness.base.errors import InputError, InputMistake
-from harness.base.files import WriteError, atomic_write, describe_os_error
-
-LIMITS, SHORT = child.CallLimits(20.0, 2**27), child.CallLimits(0.5, 2**27)
+LIMITS, SHORT = sandbox.CallLimits(20.0, 2**27), sandbox.CallLimits(0.5, 2**27)
 """What ends by itself has time on a slow machine as well; what does not is ended soon."""
 
 
@@ -66,8 +65,8 @@ def here() -> str:
 
 
 def test_it_answers_and_prints_nothing(capfd: pytest.CaptureFixture[str]):
-    assert child.call_in_sandbox(double, 21, limits=LIMITS) == 42
-    child.call_in_sandbox(print, "noise", limits=LIMITS)
+    assert sandbox.call_in_sandbox(double, 21, limits=LIMITS) == 42
+    sandbox.call_in_sandbox(print, "noise", limits=LIMITS)
     assert capfd.readouterr() == ("", "")
 
 
@@ -84,21 +83,21 @@ def test_it_answers_and_prints_nothing(capfd: pytest.CaptureFixture[str]):
     ],
 )
 def test_what_it_does_not_answer_is_said_in_words_and_the_next_call_is_answered(function, why):
-    with pytest.raises(child.SandboxError) as caught:
-        child.call_in_sandbox(function, limits=SHORT if function is loop else LIMITS)
+    with pytest.raises(sandbox.SandboxError) as caught:
+        sandbox.call_in_sandbox(function, limits=SHORT if function is loop else LIMITS)
     assert why in str(caught.value)
-    assert child.call_in_sandbox(double, 21, limits=LIMITS) == 42
+    assert sandbox.call_in_sandbox(double, 21, limits=LIMITS) == 42
 
 
 def test_a_mistake_comes_with_its_place(tmp_path: Path):
     with pytest.raises(InputError) as caught:
-        child.call_in_sandbox(refuse, tmp_path, limits=LIMITS)
+        sandbox.call_in_sandbox(refuse, tmp_path, limits=LIMITS)
     assert caught.value.mistakes == (InputMistake("is odd", tmp_path, 3, "key"),)
 
 
 def test_relative_paths_mean_what_they_mean_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
-    assert child.call_in_sandbox(here, limits=LIMITS) == os.getcwd()
+    assert sandbox.call_in_sandbox(here, limits=LIMITS) == os.getcwd()
 
 
 def test_a_file_takes_its_place_whole_or_not_at_all(tmp_path: Path):

@@ -7,12 +7,12 @@ import re
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
+from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky
+from springbench.solvers.linalg.memory import compute_memory_limit
+from springbench.solvers.linalg.solver_selection import MAX_DENSE_VERTICES, build_linear_solver, select_solver
+from springbench.solvers.model.step_problem import NotPositiveDefinite, Unsupported
 
-from solvers.linear.choice import MAX_DENSE_VERTICES, build_linear_solver, select_solver
-from solvers.linear.supernodal import SupernodalCholesky
-from solvers.memory import compute_memory_limit
-from solvers.problem import NotPositiveDefinite, Unsupported
-from tests.networks import backward_error, grid_matrix, grid_springs, network_matrix, random_right_hand_sides
+from tests.network_matrices import backward_error, grid_matrix, grid_springs, network_matrix, random_right_hand_sides
 
 PLENTY = 1e12
 FORCED = ["inverse", "cholespy", "supernodal", "cg"]

@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from harness.base.errors import RunFailed
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.simulation.clock import (
+from springbench.harness.errors import RunFailed
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.simulation.stopwatch import (
     CALL_OVERHEAD_SECONDS,
     CLOCK_ATOL_SECONDS,
     CLOCK_RTOL,
@@ -26,7 +25,8 @@ from harness.simulation.clock import (
     check_phases,
     retry_on_mismatch,
 )
-from tests.scenes import build_first_problem, build_test_scene
+
+from tests.scene_builders import build_first_problem, build_test_scene
 
 SECOND = PhaseWatch(wall_seconds=1.0, num_entries=100, process_seconds=1.0, thread_seconds=1.0)
 """A second in which one thread computed all the time."""
@@ -117,7 +117,7 @@ def test_a_watch_adds_up_what_is_done_within_it_and_nothing_in_between() -> None
 
 STOPPED = """
 import os, signal
-from harness.simulation.clock import Watch
+from springbench.harness.simulation.clock import Watch
 watch = Watch()
 with watch:
     os.kill(os.getpid(), signal.SIGSTOP)

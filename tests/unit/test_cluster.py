@@ -10,12 +10,11 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
-
-from harness.base.errors import InputError
-from harness.config.sweep import RunSpec
-from harness.experiments import cluster
-from harness.experiments.cluster import WorkerInfo
-from solvers.plugins import PluginName
+from springbench.harness.config.sweep_config import RunSpec
+from springbench.harness.errors import InputError
+from springbench.harness.experiments import dask_cluster
+from springbench.harness.experiments.dask_cluster import WorkerInfo
+from springbench.solvers.plugins.plugin_discovery import PluginName
 
 
 class Workers:
@@ -40,7 +39,7 @@ class Own(NamedTuple):
 def machines(client: Workers, *plugins: PluginName, say: Callable[[str], None] = print) -> list[str]:
     runs: Any = [Own(plugins)]
     asked: Any = client
-    return cluster.check_workers(asked, list[RunSpec](runs), say)
+    return dask_cluster.check_workers(asked, list[RunSpec](runs), say)
 
 
 def test_workers_like_this_one_can_do_runs():
@@ -97,9 +96,9 @@ def test_clocks_that_differ_are_said(off: float, words: str):
     ],
 )
 def test_where_there_is_no_cluster_that_is_said(on: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    monkeypatch.setattr(cluster, "PATIENCE", 0.3)
+    monkeypatch.setattr(dask_cluster, "PATIENCE", 0.3)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=said), cluster.connect_cluster(on, [], print):
+    with pytest.raises(InputError, match=said), dask_cluster.connect_cluster(on, [], print):
         pass
 
 
@@ -117,5 +116,5 @@ def test_a_batch_system_that_is_not_there_is_said(
     hand = SimpleNamespace(job_cls=SimpleNamespace(submit_command="submit-by-hand --now"))
     monkeypatch.setitem(sys.modules, "dask_jobqueue", SimpleNamespace(HANDCluster=hand))
     (tmp_path / "batch.yaml").write_text(described)
-    with pytest.raises(InputError, match=said), cluster.connect_cluster(str(tmp_path / "batch.yaml"), [], print):
+    with pytest.raises(InputError, match=said), dask_cluster.connect_cluster(str(tmp_path / "batch.yaml"), [], print):
         pass

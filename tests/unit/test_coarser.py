@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.simulation.nested_iteration import build_interpolation
+from springbench.harness.simulation.time_loop import build_initial_state, build_problem, prepare, simulate_scene
+from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
+from springbench.solvers.model.step_problem import StopRule, Unsupported
 
-from harness.config.load import load_config
-from harness.scenes.bind import build_scene
-from harness.simulation.coarser import build_interpolation
-from harness.simulation.step import build_initial_state, build_problem, prepare, simulate_scene
-from solvers.methods.lbfgs import Lbfgs
-from solvers.problem import StopRule, Unsupported
-from tests.scenes import CLOTH_SCENE_YAML
+from tests.scene_builders import CLOTH_SCENE_YAML
 
 
 def made(folder, mesh="{kind: grid}", pins="at: [top_corners]", size=21, integrator="implicit-euler"):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from springbench.solvers.methods.vertex_block import colouring
 
-from solvers.core import colouring
-from tests.networks import grid_springs
-from tests.scenes import SCENE_BUILDERS, build_random_network
+from tests.network_matrices import grid_springs
+from tests.scene_builders import SCENE_BUILDERS, build_random_network
 
 
 def star(n: int) -> np.ndarray:

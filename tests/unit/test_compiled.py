@@ -14,18 +14,24 @@ from hypothesis import strategies as st
 from numba import types
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic
+from springbench.solvers.kernels import elimination_schedule
+from springbench.solvers.kernels.spring_local_step import SpringPackets, allocate_aligned, run_local_step
+from springbench.solvers.linalg.solver_selection import LinearSolverName, Precision
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.methods.local_global.fused_local_global import PreparedCompiledLocalGlobal
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.step_problem import Positions, StepProblem, StopRule
+from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix, energy_norm
+from springbench.solvers.simd.spring_packets import PACKET_TYPE, PacketBuilder
 
-from solvers.core.compiled import PreparedCompiledLocalGlobal
-from solvers.energies.springs import Springs
-from solvers.kernels import plan
-from solvers.kernels.springs import SpringPackets, allocate_aligned, run_local_step
-from solvers.linear.choice import LinearSolverName, Precision
-from solvers.matrices import assemble_system_matrix, energy_norm
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.problem import Positions, StepProblem, StopRule
-from solvers.vectors.springs import PACKET_TYPE, PacketBuilder
-from tests.scenes import THREAD_COUNT, build_cloth, build_first_problem, build_random_network, build_random_problem
+from tests.scene_builders import (
+    THREAD_COUNT,
+    build_cloth,
+    build_first_problem,
+    build_random_network,
+    build_random_problem,
+)
 
 LINEAR: tuple[LinearSolverName, ...] = ("inverse", "supernodal")
 PRECISIONS: tuple[Precision, ...] = ("float64", "float32", "float16")
@@ -173,14 +179,14 @@ def test_blocks_change_nothing_but_the_order_of_work(solver, size, monkeypatch):
     """A sheet large enough for groups, in one block each and in many, with one thread and two."""
     problem = build_first_problem(build_cloth(60))
     whole = solver.prepare(problem.system)
-    monkeypatch.setattr(plan, "BLOCK_BYTES", size)
+    monkeypatch.setattr(elimination_schedule, "BLOCK_BYTES", size)
     cut = solver.prepare(problem.system)
     assert isinstance(cut, PreparedCompiledLocalGlobal)
     assert isinstance(whole, PreparedCompiledLocalGlobal)
     assert len(cut.iteration_plan.block_table) > 10 > len(whole.iteration_plan.block_table)
     downs, ups = (
         cut.iteration_plan.visit_schedule[cut.iteration_plan.visit_schedule & 1 == side] >> 1
-        for side in (plan.VISIT_DOWN, plan.VISIT_UP)
+        for side in (elimination_schedule.VISIT_DOWN, elimination_schedule.VISIT_UP)
     )
     assert sorted(downs) == list(ups)  # the blocks of all groups, once each way
     assert (np.diff(downs) < 0).any()  # some lie above others

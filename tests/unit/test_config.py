@@ -7,11 +7,10 @@ from typing import Annotated, Any, Literal
 
 import pytest
 from pydantic import Field
-
-from harness.base.document import ConfigDocument, ConfigKey, format_key, quote_value
-from harness.base.errors import InputError
-from harness.base.model import ConfigModel, Vector3
-from harness.base.yaml import read_yaml
+from springbench.harness.errors import InputError
+from springbench.harness.schema.base_model import ConfigModel, Vector3
+from springbench.harness.schema.config_document import ConfigDocument, ConfigKey, format_key, quote_value
+from springbench.harness.schema.yaml_loader import read_yaml
 
 VALUES = {
     "1e5": 100_000,

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import block_diag, csr_array
 from scipy.sparse.linalg import splu
+from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky
+from springbench.solvers.linalg.multigrid.multigrid_pcg import CG_RTOL, ConjugateGradients
+from springbench.solvers.model.step_problem import NotPositiveDefinite, Unsupported
 
-from solvers.linear.conjugate_gradients import CG_RTOL, ConjugateGradients
-from solvers.linear.supernodal import SupernodalCholesky
-from solvers.problem import NotPositiveDefinite, Unsupported
-from tests.networks import backward_error, grid_matrix, grid_springs, network_matrix, random_right_hand_sides
+from tests.network_matrices import backward_error, grid_matrix, grid_springs, network_matrix, random_right_hand_sides
 
 
 def solved(Q, b):

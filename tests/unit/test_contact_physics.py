@@ -6,23 +6,23 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from springbench.harness.scenes.effects.ether_drag_effect import EtherDragEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.self_contact_effect import SelfContactEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.effects.surface_contact_effect import SurfaceContactEffect
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.mesh.stack_mesh import StackMesh
+from springbench.harness.scenes.primitive_obstacles import PlaneObstacle
+from springbench.harness.simulation.time_loop import MotionState, build_initial_state, prepare, simulate_scene
+from springbench.solvers.contact.contact_potential import SelfContact as Energy
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import StopRule
 
-from harness.scenes.effects.ether_drag import EtherDragEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.self_contact import SelfContactEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.effects.surface_contact import SurfaceContactEffect
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.mesh.stack import StackMesh
-from harness.scenes.obstacles import PlaneObstacle
-from harness.simulation.step import MotionState, build_initial_state, prepare, simulate_scene
-from solvers.contact.self_contact import SelfContact as Energy
-from solvers.integrators import Motion
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import StopRule
 from tests.contact_refinement import simulate_fall, successive_distances
-from tests.scenes import build_test_scene
+from tests.scene_builders import build_test_scene
 
 MU, DT, G = 0.4, 0.01, 9.81
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from springbench.harness.scenes.effects.contact_effect import ContactEffect
+from springbench.solvers.contact.half_space.half_space_potential import ConvexObstacle
+from springbench.solvers.contact.half_space.half_space_potential import HalfSpaceContact as Energy
+from springbench.solvers.model.step_problem import Positions, StepStart
 
-from harness.scenes.effects.contact import ContactEffect
-from solvers.contact.energy import ConvexObstacle
-from solvers.contact.energy import HalfSpaceContact as Energy
-from solvers.problem import Positions, StepStart
-from tests.contacts import CONTACT_THICKNESS, OBSTACLE_SPECS, build_contact
+from tests.contact_scenes import CONTACT_THICKNESS, OBSTACLE_SPECS, build_contact
 
 REACH = 1e-6
 """Relative: so near Newton's method comes to the first contact."""

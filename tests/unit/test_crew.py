@@ -7,8 +7,9 @@ from time import sleep
 
 import pytest
 from numba.core import event
-
-from harness.base.asides import (
+from springbench.harness.errors import InputError
+from springbench.harness.execution.isolated_worker import IsolatedWorker, ProgressCallback, TaskFailure, TaskLimits
+from springbench.harness.execution.progress_events import (
     COMPILING,
     WAITING,
     parse_activity_end,
@@ -16,10 +17,9 @@ from harness.base.asides import (
     report_activity,
     report_compilation,
 )
-from harness.base.crew import PoolTask, run_tasks
-from harness.base.errors import InputError
-from harness.base.workers import IsolatedWorker, ProgressCallback, TaskFailure, TaskLimits
-from tests import workers as does
+from springbench.harness.execution.worker_pool import PoolTask, run_tasks
+
+from tests import worker_tasks as does
 
 
 def quiet(said: str) -> None:

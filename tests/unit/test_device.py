@@ -9,20 +9,20 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.harness.results import parquet_rows
+from springbench.harness.simulation.device_stepping import compute_event_seconds
+from springbench.solvers.cuda import cuda_device
+from springbench.solvers.iteration.device_interface import SolveEvents
+from springbench.solvers.methods.newton.newton_cg import NewtonCG
+from springbench.solvers.methods.position_based.xpbd import Xpbd
+from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
+from springbench.solvers.model.step_problem import Solver, Unsupported
 from typer.testing import CliRunner
 
-from harness.base import rows
-from harness.cli import app
-from harness.config.load import load_config
-from harness.experiments.plan import RunFiles
-from harness.simulation.on_device import compute_event_seconds
-from solvers.cuda import device
-from solvers.device import SolveEvents
-from solvers.methods.newton_cg import NewtonCG
-from solvers.methods.vbd import VertexBlockDescent
-from solvers.methods.xpbd import Xpbd
-from solvers.problem import Solver, Unsupported
-from tests.scenes import CLOTH_SCENE_YAML, build_cloth
+from tests.scene_builders import CLOTH_SCENE_YAML, build_cloth
 
 SWEEP = """
 scenes: [cloth.yaml]
@@ -46,7 +46,7 @@ def test_without_a_device_a_run_is_refused_and_the_others_are_done(sweep: Path) 
     assert told.exit_code == 1, told.output
     found: list[dict[str, Any]] = []
     for run in load_config(sweep).list_runs():
-        row = rows.read_first_row(RunFiles.for_run(run, sweep.parent / "r" / "sweep").rows_path)
+        row = parquet_rows.read_first_row(RunFiles.for_run(run, sweep.parent / "r" / "sweep").rows_path)
         assert isinstance(row, dict)
         found.append(row)
     here, there = found
@@ -65,7 +65,7 @@ def test_the_command_installs_all_that_a_method_needs(solver: Solver, monkeypatc
     def missing(package: str) -> str:
         raise PackageNotFoundError(package)
 
-    monkeypatch.setattr(device, "version", missing)
+    monkeypatch.setattr(cuda_device, "version", missing)
     with pytest.raises(Unsupported, match=re.escape("`.venv/bin/pip install -e '.[cuda]'`")):
         solver.prepare(build_cloth(3).system)
 
@@ -132,16 +132,16 @@ def nvml(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         nvmlDeviceGetTemperature=lambda handle, of: 41,
     )
     there = {"pynvml": made, "numba.cuda": SimpleNamespace(get_current_device=lambda: SimpleNamespace(uuid="GPU-0"))}
-    monkeypatch.setattr(device, "simulated", lambda: False)
-    monkeypatch.setattr(device, "import_module", there.__getitem__)
+    monkeypatch.setattr(cuda_device, "simulated", lambda: False)
+    monkeypatch.setattr(cuda_device, "import_module", there.__getitem__)
     return made
 
 
 def test_a_row_has_what_the_device_tells_of_its_state_and_null_for_what_it_does_not(nvml: SimpleNamespace) -> None:
     told = {"sm_clock_mhz": 1980.0, "memory_clock_mhz": 2619.0, "power_w": None, "power_limit_w": 700.0}
-    assert device.read_device_state() == told | {"performance_state": 0.0, "temperature_c": 41.0}
+    assert cuda_device.read_device_state() == told | {"performance_state": 0.0, "temperature_c": 41.0}
 
 
 def test_where_the_library_cannot_begin_all_is_null(nvml: SimpleNamespace) -> None:
     nvml.nvmlInit = nvml.nvmlDeviceGetPowerUsage
-    assert set(device.read_device_state().values()) == {None}
+    assert set(cuda_device.read_device_state().values()) == {None}

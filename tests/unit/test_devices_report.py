@@ -8,12 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from springbench.harness.cli.main import app
+from springbench.harness.report.device_speedup import (
+    find_break_even,
+    pair_fastest_runs,
+    read_device_runs,
+    summarise_runs,
+)
+from springbench.harness.results import parquet_rows
+from springbench.solvers.iteration.device_interface import SIMULATOR_NAME
 from typer.testing import CliRunner
 
-from harness.base import rows
-from harness.cli import app
-from harness.report.devices import find_break_even, pair_fastest_runs, read_device_runs, summarise_runs
-from solvers.device import SIMULATOR_NAME
 from tests.unit.test_machines import table_of
 
 ON = '{"device": "cuda", "spectral_radius": 0.999}'
@@ -108,7 +113,7 @@ def test_the_report_draws_it_and_the_page_says_it(there: bool, tmp_path: Path) -
     folder = tmp_path / "r" / "gpu" / "rows"
     folder.mkdir(parents=True)
     for unit in {row["run_id"] for row in kept}:
-        rows.write_rows(folder / f"{unit}.parquet", [row for row in kept if row["run_id"] == unit])
+        parquet_rows.write_rows(folder / f"{unit}.parquet", [row for row in kept if row["run_id"] == unit])
     done = CliRunner().invoke(app, ["report", str(tmp_path / "r"), "--without-viewer"])
     assert done.exit_code == 0, done.output
     said = " ".join(done.output.split())

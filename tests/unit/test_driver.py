@@ -1,4 +1,5 @@
-"""The driver: a method is its formula, and gets the loop, the stop rule and its answers from `solvers.core.driver`."""
+"""The driver: a method is its formula, and gets the loop, the stop rule and its answers from
+`springbench.solvers.iteration.iterative_solver`."""
 
 from __future__ import annotations
 
@@ -7,11 +8,9 @@ from itertools import islice
 
 import numpy as np
 import pytest
-
-from solvers.core import driver
-from solvers.core.driver import IterativeSolver, SolverState
-from solvers.core.prefactored import require_only_springs
-from solvers.kernels.loop import (
+from springbench.solvers.iteration import iterative_solver
+from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
+from springbench.solvers.kernels.iteration_loop import (
     REASON_FLOOR,
     REASON_ITERATIONS,
     REASON_STALLED,
@@ -22,8 +21,10 @@ from solvers.kernels.loop import (
     LoopLimits,
     build_loop,
 )
-from solvers.problem import Positions, StepProblem, StopRule, System
-from tests.scenes import build_cloth, build_first_problem
+from springbench.solvers.methods.local_global.prefactored import require_only_springs
+from springbench.solvers.model.step_problem import Positions, StepProblem, StopRule, System
+
+from tests.scene_builders import build_cloth, build_first_problem
 
 
 # A whole method, of the formula p <- p - D^-1 grad g(p), where D holds each vertex by twice its springs: it majorises.
@@ -202,7 +203,7 @@ class PreparedNear(PreparedStepping):
 def test_a_small_residual_is_the_floor_where_the_gradient_is_round_off(monkeypatch, rests, most, wanted, looks):
     run, looked = Stepping(0, 1000), []
     monkeypatch.setattr(PreparedNear, "begin", lambda *_: run)
-    monkeypatch.setattr(driver, "at_rest", lambda *_: looked.append(run.count) or run.count >= rests)
+    monkeypatch.setattr(iterative_solver, "at_rest", lambda *_: looked.append(run.count) or run.count >= rests)
     monkeypatch.setattr(PreparedNear, "residual_at", lambda *_: 1.0)
     solution = PreparedNear(0).solve(build_first_problem(build_cloth(3)), StopRule(most, 1e-300))
     assert ((solution.num_iterations, solution.termination_reason), looked) == (wanted, looks)

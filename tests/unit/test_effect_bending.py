@@ -6,20 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.effects.bending_effect import BendingEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.mesh.surface_meshes import BalloonMesh
+from springbench.harness.scenes.vertex_selectors import BoxRegion
+from springbench.solvers.model.energies.bending_energy import Bending as Energy
+from springbench.solvers.model.energies.bending_energy import find_flaps
 
-from harness.base.errors import InputError
-from harness.scenes.effects.bending import BendingEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.mesh.surfaces import BalloonMesh
-from harness.scenes.selection import BoxRegion
-from solvers.energies.bending import Bending as Energy
-from solvers.energies.bending import find_flaps
-from tests.effects import compute_rest_shape
-from tests.scenes import build_test_scene
+from tests.effect_scenes import compute_rest_shape
+from tests.scene_builders import build_test_scene
 
 B, G = 0.01, 9.81
 LOAD = 1e-3 * 8 * B

@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.effects.contact_effect import ContactEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.key_frames import KeyFrame, KeyFrameMotion
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.solvers.model.step_problem import StopRule
 
-from harness.base.errors import InputError
-from harness.scenes.effects.contact import ContactEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.motion import KeyFrame, KeyFrameMotion
-from solvers.problem import StopRule
-from tests.contacts import (
+from tests.contact_scenes import (
     CONTACT_THICKNESS,
     OBSTACLE_SPECS,
     TIME_STEP,
@@ -26,8 +26,8 @@ from tests.contacts import (
     collect_steps,
     penetration_depth,
 )
-from tests.effects import with_integrator
-from tests.scenes import build_test_scene
+from tests.effect_scenes import with_integrator
+from tests.scene_builders import build_test_scene
 
 TOLERANCE = CONTACT_THICKNESS / 10.0
 """What the effect states where a scene does not say."""

@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from springbench.harness.scenes.effects.air_drag_effect import AirDragEffect
+from springbench.harness.scenes.effects.bending_effect import BendingEffect
+from springbench.harness.scenes.effects.dashpots_effect import DashpotsEffect
+from springbench.harness.scenes.effects.effect_interface import SceneEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.rayleigh_effect import RayleighEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import MotionState, prepare, simulate_scene
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.energies.quadratic_energy import RayleighDamping
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import Positions, StopRule
 
-from harness.scenes.bind import Scene
-from harness.scenes.effects.air_drag import AirDragEffect
-from harness.scenes.effects.base import SceneEffect
-from harness.scenes.effects.bending import BendingEffect
-from harness.scenes.effects.dashpots import DashpotsEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.rayleigh import RayleighEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.simulation.step import MotionState, prepare, simulate_scene
-from solvers.energies.quadratic import RayleighDamping
-from solvers.integrators import Motion
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import Positions, StopRule
-from tests.effects import with_integrator
-from tests.scenes import build_test_scene
+from tests.effect_scenes import with_integrator
+from tests.scene_builders import build_test_scene
 
 INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
 G = 9.81

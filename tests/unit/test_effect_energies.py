@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from springbench.solvers.model.step_problem import Energy, Positions, ProjectiveEnergy, StepProblem, is_lagged
+from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix
 
-from solvers.matrices import assemble_system_matrix
-from solvers.problem import Energy, Positions, ProjectiveEnergy, StepProblem, is_lagged
-from tests.effects import EFFECT_SCENES, build_effect_cloth, build_moving_problem
+from tests.effect_scenes import EFFECT_SCENES, build_effect_cloth, build_moving_problem
 
 INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
 PROBLEMS = {

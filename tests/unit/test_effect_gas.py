@@ -7,38 +7,38 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from springbench.harness.errors import InputError
+from springbench.harness.reference.certified_minimum import certify_minimum
+from springbench.harness.reference.hessian_curvature import build_free_hessian
+from springbench.harness.scenes.effects.gas_effect import GasEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.mesh.surface_meshes import BalloonMesh
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
+from springbench.solvers.methods.newton.negative_curvature import is_positive_definite
+from springbench.solvers.methods.newton.newton_cg import NewtonCG
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
+from springbench.solvers.model.energies import gas_energy
+from springbench.solvers.model.step_problem import StepProblem, StopRule, Unsupported
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
 
-from harness.base.errors import InputError
-from harness.reference.curvature import build_free_hessian
-from harness.reference.minimiser import certify_minimum
-from harness.scenes.effects.gas import GasEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.mesh.surfaces import BalloonMesh
-from harness.simulation.step import prepare, simulate_scene
-from solvers.core.fixed_objective import FixedObjective
-from solvers.core.objective import StepObjective
-from solvers.core.saddles import is_positive_definite
-from solvers.energies import gas
-from solvers.methods.hybrid import HybridNewton
-from solvers.methods.lbfgs import Lbfgs
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.newton import NewtonSolver
-from solvers.methods.newton_cg import NewtonCG
-from solvers.problem import StepProblem, StopRule, Unsupported
-from tests.effects import compute_rest_shape
-from tests.scenes import build_first_problem, build_test_scene
+from tests.effect_scenes import compute_rest_shape
+from tests.scene_builders import build_first_problem, build_test_scene
 
 RADIUS = 0.5
 MESH = BalloonMesh(radius=RADIUS).build_mesh(3)
 
 
-def bound(mesh=MESH, pressure=100.0) -> gas.Gas:
+def bound(mesh=MESH, pressure=100.0) -> gas_energy.Gas:
     (energy,) = GasEffect(pressure=pressure).build_contribution(mesh, np.ones(len(mesh.rest_positions)), 0.1).energies
-    assert isinstance(energy, gas.Gas)
+    assert isinstance(energy, gas_energy.Gas)
     return energy
 
 
@@ -70,7 +70,7 @@ def test_the_volume_is_that_of_the_polyhedron_wherever_it_is():
     faces = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
     triangles = np.array([[f[0], f[i], f[i + 1]] for f in faces for i in (1, 2)])
     for shift in (0.0, 1e3):
-        found = gas.Gas(triangles, 1.0, 1.0).volume_at(2.0 * cube + shift)
+        found = gas_energy.Gas(triangles, 1.0, 1.0).volume_at(2.0 * cube + shift)
         assert found == pytest.approx(8.0, rel=1e-11)  # sixteen digits, of which the shift takes three, cubed none
 
 
@@ -110,7 +110,7 @@ def test_a_balloon_that_falls_into_nothing_stays_a_balloon():
         size=3,
     )
     energy = made.system.energies[1]
-    assert isinstance(energy, gas.Gas)
+    assert isinstance(energy, gas_energy.Gas)
     for step in simulate_scene(made, prepare(made, Lbfgs()), StopRule(100, 1e-6), initial_guess="inertial", frames=20):
         assert energy.volume_at(step.positions) > 0.0
 

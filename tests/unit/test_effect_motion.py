@@ -8,22 +8,22 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.effects.attachments_effect import AttachmentsEffect
+from springbench.harness.scenes.effects.ether_drag_effect import EtherDragEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.effects.wind_effect import WindEffect
+from springbench.harness.scenes.key_frames import KeyFrame, KeyFrameMotion
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.model.step_problem import StopRule
 
-from harness.base.errors import InputError
-from harness.scenes.effects.attachments import AttachmentsEffect
-from harness.scenes.effects.ether_drag import EtherDragEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.effects.wind import WindEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.motion import KeyFrame, KeyFrameMotion
-from harness.simulation.step import prepare, simulate_scene
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import StopRule
-from tests.effects import compute_rest_shape, with_integrator
-from tests.scenes import build_test_scene
+from tests.effect_scenes import compute_rest_shape, with_integrator
+from tests.scene_builders import build_test_scene
 
 POINTS = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 1.0]])
 LIFT = KeyFrameMotion(

@@ -8,21 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
-
-from harness.base.errors import InputError
-from harness.scenes.bind import build_scene
-from harness.scenes.effects.self_contact import SelfContactEffect
-from harness.scenes.effects.sewing import SewingEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.stack import StackMesh
-from harness.scenes.selection import VertexSelection
-from harness.scenes.spec import SceneSpec
-from harness.simulation.observe import count_intersections
-from harness.simulation.opinion.second import verify_terms
-from harness.simulation.step import prepare, simulate_scene
-from solvers.energies.sewing import Sewing as Energy
-from solvers.problem import StopRule
-from solvers.registry import SOLVERS, load_target
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.effects.self_contact_effect import SelfContactEffect
+from springbench.harness.scenes.effects.sewing_effect import SewingEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.stack_mesh import StackMesh
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.scenes.vertex_selectors import VertexSelection
+from springbench.harness.simulation.instrumentation_pass import count_intersections
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.harness.verification.verify_scene import verify_terms
+from springbench.solvers.model.energies.sewing_energy import Sewing as Energy
+from springbench.solvers.model.step_problem import StopRule
+from springbench.solvers.registry import SOLVERS, load_target
 
 ROWS = tuple(VertexSelection(indices=tuple(range(first, first + 5))) for first in (0, 25))
 SEWN = SewingEffect(first=ROWS[0], second=ROWS[1], stiffness=2e4, begin=0.02, end=0.2, gap=0.05)

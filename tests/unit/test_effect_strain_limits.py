@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.effects.strain_limits_effect import StrainLimitsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.solvers.model.energies import strain_limit_energy
 
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.effects.strain_limits import StrainLimitsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from solvers.energies import strain_limits
-from tests.effects import compute_rest_shape
-from tests.scenes import build_test_scene
+from tests.effect_scenes import compute_rest_shape
+from tests.scene_builders import build_test_scene
 
 
 def ratios(made, p) -> np.ndarray:
@@ -75,7 +75,7 @@ def test_springs_within_their_limits_feel_nothing():
 def test_a_spring_pressed_to_a_point_is_pushed_to_its_shortest_length():
     mesh = ChainMesh().build_mesh(2)
     (energy,) = StrainLimitsEffect(shortest=0.5, stiffness=10.0).build_contribution(mesh, np.ones(2), 0.1).energies
-    assert isinstance(energy, strain_limits.StrainLimits)
+    assert isinstance(energy, strain_limit_energy.StrainLimits)
     p, out = np.zeros((2, 3)), np.zeros((2, 3))
     energy.add_gradient(p, out)
     assert np.linalg.norm(out[0]) == pytest.approx(5.0, rel=1e-14)

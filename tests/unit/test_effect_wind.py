@@ -5,19 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.effects.wind_effect import WindEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.mesh.surface_meshes import BalloonMesh
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.model.step_problem import Positions, StopRule
 
-from harness.base.errors import InputError
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.effects.wind import WindEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.mesh.surfaces import BalloonMesh
-from harness.simulation.step import prepare, simulate_scene
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import Positions, StopRule
-from tests.scenes import build_test_scene
+from tests.scene_builders import build_test_scene
 
 PLATE = GridMesh(width=2.0, height=1.5, plane="vertical").build_mesh(5)
 """In the plane z = 0, 3 square metres."""

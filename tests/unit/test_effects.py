@@ -7,24 +7,24 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.effects.constant_force_effect import ConstantForceEffect
+from springbench.harness.scenes.effects.effect_interface import EffectContribution
+from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES
+from springbench.harness.scenes.effects.ether_drag_effect import EtherDragEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.effects.wind_effect import WindEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.spring_stiffness import compute_spring_stiffness
+from springbench.harness.verification.scene_declaration import SceneDeclaration
+from springbench.harness.verification.vertex_selection import select_vertices as opinion_of
+from springbench.solvers.model.energies.spring_energy import Springs as SpringsEnergy
+from springbench.solvers.registry import load_target
 
-from harness.base.errors import InputError
-from harness.scenes.effects.base import EffectContribution
-from harness.scenes.effects.constant_force import ConstantForceEffect
-from harness.scenes.effects.effect_names import EFFECT_CLASSES
-from harness.scenes.effects.ether_drag import EtherDragEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.effects.wind import WindEffect
-from harness.scenes.material import compute_spring_stiffness
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.simulation.opinion.declared import SceneDeclaration
-from harness.simulation.opinion.selected import select_vertices as opinion_of
-from solvers.energies.springs import Springs as SpringsEnergy
-from solvers.registry import load_target
-from tests.scenes import build_test_scene
+from tests.scene_builders import build_test_scene
 
 MESH = GridMesh(width=2.0, height=1.0, skip_one=True).build_mesh(5)
 N = len(MESH.rest_positions)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
+from springbench.harness.scenes.effects.contact_effect import ContactEffect
+from springbench.solvers.model.energies.element_energies import JoinedElements, add_blocks
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
 
-from harness.scenes.effects.contact import ContactEffect
-from solvers.core.fixed_objective import FixedObjective
-from solvers.core.objective import StepObjective
-from solvers.energies.elements import JoinedElements, add_blocks
-from tests.effects import (
+from tests.effect_scenes import (
     DASHPOT_EFFECT,
     FLOOR_CONTACT,
     RAYLEIGH_EFFECT,

@@ -8,24 +8,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from harness.base import rows
-from harness.config.load import load_config
-from harness.config.sweep import RunSpec, SolverSpec
-from harness.experiments.failure import build_energy_growth_columns
-from harness.experiments.plan import RunFiles
-from harness.experiments.run import execute_run
-from harness.experiments.sweep import list_failed_runs
-from harness.record.reader import read_replay
-from harness.report.robustness import DIVERGED, ENERGY_GROWTH, classify_run
-from harness.scenes.bind import Scene
-from harness.scenes.effects.attachments import AttachmentsEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.spec import SceneSpec
-from harness.simulation.energy_balance import (
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.config.sweep_config import RunSpec, SolverSpec
+from springbench.harness.experiments.failure_columns import build_energy_growth_columns
+from springbench.harness.experiments.run_pipeline import execute_run
+from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.harness.experiments.sweep_runner import list_failed_runs
+from springbench.harness.recording.recording_reader import read_replay
+from springbench.harness.report.robustness import DIVERGED, ENERGY_GROWTH, classify_run
+from springbench.harness.results import parquet_rows
+from springbench.harness.scenes.effects.attachments_effect import AttachmentsEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.simulation.energy_balance import (
     BLOW_UP_FACTOR,
     GROWTH_LIMIT,
     ROUNDOFF_SAFETY,
@@ -33,11 +32,12 @@ from harness.simulation.energy_balance import (
     EnergyGain,
     EnergyGrowth,
 )
-from harness.simulation.step import SimulationStep, prepare, simulate_scene
-from solvers import integrators
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import Positions, StopRule
-from tests.scenes import build_test_scene
+from springbench.harness.simulation.time_loop import SimulationStep, prepare, simulate_scene
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model import integrators
+from springbench.solvers.model.step_problem import Positions, StopRule
+
+from tests.scene_builders import build_test_scene
 
 G, DT, CLOSE = 9.81, 0.1, 1e-9
 """Of gravity [m/s^2], a time step [s], and what sums and solves lose of a joule."""
@@ -192,7 +192,7 @@ effects:
 OPTIONS = "options: {frames: 50, tolerance: 1e-8, record: %s, pictures: false, timing: %s, integrator: %s}\n"
 WRONG = '''from dataclasses import dataclass
 
-from solvers.problem import Solution
+from springbench.solvers.problem import Solution
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ def done(folder: Path, solver: str, record: str, timing: str, integrator: str) -
 def test_a_run_whose_energy_grows_says_so_in_all_rows(tmp_path: Path, record: str, timing: str):
     found, files = done(tmp_path, "newton", record, timing, "midpoint")
     assert {row["status"] for row in found} == {"energy-growth"}
-    assert len(list_failed_runs(rows.read_rows([files.rows_path]))) == 1
+    assert len(list_failed_runs(parquet_rows.read_rows([files.rows_path]))) == 1
     assert "without a source, from frame " in found[0]["reason"]
     assert found[0]["reason"].endswith("a step of 0.1 s is too long for midpoint")
     steps = [row | {"distance": None, "stationarity": None} for row in found if row["phase"] == "step"]
@@ -283,5 +283,5 @@ def test_a_blow_up_ends_a_run_at_its_first_frame(tmp_path: Path):
     assert f"from frame {row['frame']} on the motion has " in row["reason"]
     assert 1 < row["frame"] < 20
     assert classify_run([row])[0] is DIVERGED
-    (line,) = list_failed_runs(rows.read_rows([files.rows_path]))  # for which the command exits with 1
+    (line,) = list_failed_runs(parquet_rows.read_rows([files.rows_path]))  # for which the command exits with 1
     assert line == f"limit 2 ./wrong.py:Wrong: diverged: {row['reason']}"

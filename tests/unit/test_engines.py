@@ -11,28 +11,28 @@ from typing import Any
 
 import numpy as np
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.config.sweep_config import SolverSpec
+from springbench.harness.experiments.provenance import build_provenance_columns
+from springbench.harness.scenes.effects.bending_effect import BendingEffect
+from springbench.harness.scenes.effects.dashpots_effect import DashpotsEffect
+from springbench.harness.scenes.effects.ether_drag_effect import EtherDragEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.simulation.time_loop import build_initial_state, build_problem
+from springbench.solvers.external import external_engine
+from springbench.solvers.external.external_engine import ExternalEngine, PreparedEngine
+from springbench.solvers.methods.position_based.xpbd import XpbdSmallSteps
+from springbench.solvers.model.step_problem import Positions, StepProblem, StopRule, System, Unsupported
+from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS, find_solver_info, is_minimiser, load_target
 from typer.testing import CliRunner
 
-from harness.cli import app
-from harness.config.sweep import SolverSpec
-from harness.experiments.provenance import build_provenance_columns
-from harness.scenes.bind import Scene, build_scene
-from harness.scenes.effects.bending import BendingEffect
-from harness.scenes.effects.dashpots import DashpotsEffect
-from harness.scenes.effects.ether_drag import EtherDragEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.spec import SceneSpec
-from harness.simulation.step import build_initial_state, build_problem
-from solvers.engines import base
-from solvers.engines.base import ExternalEngine, PreparedEngine
-from solvers.methods.xpbd import XpbdSmallSteps
-from solvers.problem import Positions, StepProblem, StopRule, System, Unsupported
-from solvers.registry import OPTIONAL_SOLVERS, SOLVERS, find_solver_info, is_minimiser, load_target
-from tests.scenes import build_random_problem
+from tests.scene_builders import build_random_problem
 
 ENGINES = [
     name for name, target in OPTIONAL_SOLVERS.items() if find_solver_info(load_target(target), name).package_name
@@ -86,7 +86,7 @@ def test_where_it_is_not_installed_the_reason_is_the_command_that_does_so(name: 
     def none(module: str) -> None:
         raise ModuleNotFoundError(f"No module named {module!r}")
 
-    monkeypatch.setattr(base, "import_module", none)
+    monkeypatch.setattr(external_engine, "import_module", none)
     engine = load_target(OPTIONAL_SOLVERS[name])()
     wanted = rf"^{name}: .*pip install -e '\.\[{engine.engine_package.extra}\]'` in the checkout"
     with pytest.raises(Unsupported, match=wanted):

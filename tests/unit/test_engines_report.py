@@ -6,27 +6,27 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-from harness.report.accuracy.engines import (
+from springbench.harness.report.accuracy.accuracy_data import WorkPoint
+from springbench.harness.report.accuracy.accuracy_findings import summarise_findings
+from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
+from springbench.harness.report.accuracy.engine_comparison import (
     OWN_PROGRAM,
     compare_engines,
     describe_best_settings,
     format_markdown_table,
     pareto_fronts,
 )
-from harness.report.accuracy.findings import summarise_findings
-from harness.report.accuracy.measured import WorkPoint
-from harness.report.accuracy.reading import read_accuracy
-from harness.report.figures.of_engines import engine_panels
-from harness.report.figures.panel import CurvePlot
-from harness.report.site.engines import build_engine_chart
-from tests import accuracy_rows as made
-from tests import figure_results
+from springbench.harness.report.figures.engine_panels import engine_panels
+from springbench.harness.report.figures.figure_panels import CurvePlot
+from springbench.harness.report.site.engine_chart import build_engine_chart
+
+from tests import synthetic_accuracy_rows as made
+from tests import synthetic_results
 
 
 @pytest.fixture
 def works(tmp_path: Path) -> list[WorkPoint]:
-    return list(read_accuracy(figure_results.write_engine_results(tmp_path)).work_points)
+    return list(read_accuracy(synthetic_results.write_engine_results(tmp_path)).work_points)
 
 
 def test_a_ratio_is_of_the_best_settings_that_end_within_the_error(works: list[WorkPoint]) -> None:
@@ -65,7 +65,7 @@ def test_a_front_holds_what_no_other_setting_of_the_program_beats(works: list[Wo
 
 
 def test_each_mesh_has_a_panel_where_engines_and_ours_were_tried(tmp_path: Path) -> None:
-    panels = [entry.build_panel() for entry in engine_panels(figure_results.write_engine_results(tmp_path))]
+    panels = [entry.build_panel() for entry in engine_panels(synthetic_results.write_engine_results(tmp_path))]
     assert [(one.group, one.name) for one in panels] == [(("engines",), ("net", "9")), (("engines",), ("stiff", "9"))]
     drawn = panels[1]
     assert isinstance(drawn, CurvePlot)
@@ -73,7 +73,7 @@ def test_each_mesh_has_a_panel_where_engines_and_ours_were_tried(tmp_path: Path)
 
 
 def test_the_page_has_a_line_for_each_program_on_each_mesh(tmp_path: Path) -> None:
-    items = build_engine_chart(read_accuracy(figure_results.write_engine_results(tmp_path)))["items"]
+    items = build_engine_chart(read_accuracy(synthetic_results.write_engine_results(tmp_path)))["items"]
     assert {(item["scene"], item["label"]) for item in items} == {
         *(("net 9", OWN_PROGRAM), ("net 9", "mujoco"), ("net 9", "pypbd")),
         *(("stiff 9", OWN_PROGRAM), ("stiff 9", "mujoco")),

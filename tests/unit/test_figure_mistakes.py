@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.report.figures.figure_panels import AxisScale, CurvePlot
+from springbench.harness.report.figures.panel_selection import entries_from_panels, select_entries
 from typer.testing import CliRunner
 
-from harness.cli import app
-from harness.report.figures.entry import entries_from_panels, select_entries
-from harness.report.figures.panel import AxisScale, CurvePlot
-from tests import figure_results as made
+from tests import synthetic_results as made
 
 
 @pytest.fixture(scope="module")

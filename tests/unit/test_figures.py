@@ -16,18 +16,23 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from PIL import Image
+from springbench.harness.cli.main import app
+from springbench.harness.report.figures import figure_kinds
+from springbench.harness.report.figures.figure_layout import (
+    MILLIMETRES_PER_INCH,
+    compose_figure,
+    sort_by_end_value,
+    visible_texts,
+)
+from springbench.harness.report.figures.figure_options import MIN_FONT_SIZE, FigureOptions
+from springbench.harness.report.figures.figure_panels import AxisScale, CurvePlot, CurveSeries
+from springbench.harness.report.figures.layout_checks import find_layout_faults
+from springbench.harness.report.figures.panel_drawing import marker_style
+from springbench.harness.report.plot_style import SeriesStyle
 from typer.testing import CliRunner
 
-from harness.cli import app
-from harness.report.figures import kinds
-from harness.report.figures.asked import MIN_FONT_SIZE, FigureOptions
-from harness.report.figures.canvas import MILLIMETRES_PER_INCH, compose_figure, sort_by_end_value, visible_texts
-from harness.report.figures.drawing import marker_style
-from harness.report.figures.faults import find_layout_faults
-from harness.report.figures.panel import AxisScale, CurvePlot, CurveSeries
-from harness.report.style import SeriesStyle
-from tests import figure_results as made
-from tests.drawn_figures import (
+from tests import synthetic_results as made
+from tests.figure_images import (
     EXPECTED_FOLDER,
     FIGURE_SOURCES,
     MESH_FIGURE_KINDS,
@@ -58,7 +63,7 @@ def figures(results: dict[str, Path]) -> dict[str, Figure]:
 
 
 def test_all_kinds_are_on_a_sheet() -> None:
-    assert {*FIGURE_SOURCES, *MESH_FIGURE_KINDS} == {*kinds.FIGURE_KINDS}
+    assert {*FIGURE_SOURCES, *MESH_FIGURE_KINDS} == {*figure_kinds.FIGURE_KINDS}
 
 
 def test_the_sheet_of_all_figures_looks_as_it_did(figures: dict[str, Figure], tmp_path: Path) -> None:
@@ -196,7 +201,7 @@ def test_a_gate_s_level_has_a_gap_where_it_changed(results: dict[str, Path]) -> 
     assert level.y[3] / level.y[0] == pytest.approx(1.05, rel=0.01)
     said = " ".join(text.get_text() for text in visible_texts(figure))
     assert re.search(r"Changed by \+[456]\.\d % at 00000", said)
-    assert not kinds.find_figure_kind("history").list_panels(results["timing"], lambda _: ())
+    assert not figure_kinds.find_figure_kind("history").list_panels(results["timing"], lambda _: ())
 
 
 def test_a_report_from_outside_is_a_kind_if_it_has_panels(
@@ -212,15 +217,15 @@ def test_a_report_from_outside_is_a_kind_if_it_has_panels(
         return [CurvePlot(("mine",), ("rows",), "all", "", *scales, series)]
 
     monkeypatch.setattr(report, "panels", panels, raising=False)
-    monkeypatch.setattr(type(kinds.REPORT_TABLE), "_installed", lambda _: {"mine": None})
-    monkeypatch.setattr(type(kinds.REPORT_TABLE), "__getitem__", lambda self, name: "tests:mine")
-    monkeypatch.setattr(kinds, "load", lambda _: report)
-    found = kinds.find_figure_kind("mine")
+    monkeypatch.setattr(type(figure_kinds.REPORT_TABLE), "_installed", lambda _: {"mine": None})
+    monkeypatch.setattr(type(figure_kinds.REPORT_TABLE), "__getitem__", lambda self, name: "tests:mine")
+    monkeypatch.setattr(figure_kinds, "load", lambda _: report)
+    found = figure_kinds.find_figure_kind("mine")
     (entry,) = found.list_panels(results["timing"], lambda _: ())
     assert entry.name_parts == ("mine", "rows")
     assert isinstance(compose_figure([entry.build_panel()], found.title, FigureOptions()).axes[0].lines[0], Line2D)
     monkeypatch.setattr(report, "panels", lambda rows: 1 / 0)
-    with pytest.raises(kinds.RunFailed, match="the report mine failed: ZeroDivisionError"):
+    with pytest.raises(figure_kinds.RunFailed, match="the report mine failed: ZeroDivisionError"):
         found.list_panels(results["timing"], lambda _: ())
 
 

@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from springbench.harness.experiments.ablation.ablation_schema import ABLATION_SCHEMA
+from springbench.harness.report.ablation_summary import read_ablation
+from springbench.harness.report.figures.figure_layout import MILLIMETRES_PER_INCH, visible_texts
+from springbench.harness.report.figures.figure_options import FigureOptions
+from springbench.harness.report.figures.layout_checks import find_layout_faults
+from springbench.solvers.registry import SOLVERS
 
-from harness.experiments.ablation.ablation_rows import ABLATION_SCHEMA
-from harness.report.ablation import read_ablation
-from harness.report.figures.asked import FigureOptions
-from harness.report.figures.canvas import MILLIMETRES_PER_INCH, visible_texts
-from harness.report.figures.faults import find_layout_faults
-from solvers.registry import SOLVERS
-from tests import figure_results as made
-from tests.drawn_figures import compose_kind
+from tests import synthetic_results as made
+from tests.figure_images import compose_kind
 
 PRICES = {"bending": (1.7, 1.6, 1.9), "wind": (1.05, 0.98, 1.1), "gas": (2.4, 2.3, 2.5), "all": (1.2, 1.1, 1.3)}
 """Of each effect, with the interval."""

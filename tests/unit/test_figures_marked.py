@@ -9,19 +9,19 @@ from typing import Any
 import pytest
 from matplotlib.figure import Figure
 from rich.console import Console
+from springbench.harness.report.figures.figure_layout import visible_texts
+from springbench.harness.report.figures.figure_options import FigureOptions
+from springbench.harness.report.plot_style import BACKGROUND_COLOUR, STALE_NOTE, assign_solver_styles
+from springbench.harness.report.speed import size_plot
+from springbench.harness.report.speed.speed_figures import compute_speed_figures as speed_figures
+from springbench.harness.report.speed.speed_plots import draw_speed_plots
+from springbench.harness.report.speed.speed_table import build_speed_table
+from springbench.harness.results import parquet_rows as base_rows
+from springbench.harness.results import row_store
 
-from harness.base import rows as base_rows
-from harness.base import shelf
-from harness.report.figures.asked import FigureOptions
-from harness.report.figures.canvas import visible_texts
-from harness.report.speed import size_plot
-from harness.report.speed.figures import compute_speed_figures as speed_figures
-from harness.report.speed.pictures import draw_speed_plots
-from harness.report.speed.speed_table import build_speed_table
-from harness.report.style import BACKGROUND_COLOUR, STALE_NOTE, assign_solver_styles
-from tests import accuracy_rows
-from tests import figure_results as made
-from tests.drawn_figures import FIGURE_SOURCES, compose_kind
+from tests import synthetic_accuracy_rows
+from tests import synthetic_results as made
+from tests.figure_images import FIGURE_SOURCES, compose_kind
 
 
 def test_what_other_code_measured_is_hollow_and_told(tmp_path: Path) -> None:
@@ -44,7 +44,7 @@ def test_what_other_code_measured_is_hollow_and_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["timing", "hard", "ablation", "prices", "speed", "convergence", "winners", "engines"])
 def test_and_what_code_that_is_in_no_commit_did(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     monkeypatch.setitem(made.SHARED_COLUMNS, "commit", f"{'0' * 40}-dirty")
-    monkeypatch.setitem(accuracy_rows.MACHINE_COLUMNS, "commit", f"{'0' * 40}-dirty")
+    monkeypatch.setitem(synthetic_accuracy_rows.MACHINE_COLUMNS, "commit", f"{'0' * 40}-dirty")
     figure, _ = compose_kind(kind, FIGURE_SOURCES[kind][1](tmp_path), FigureOptions())
     assert "commit 0000000-dirty" in "\n".join(text.get_text() for text in visible_texts(figure))
 
@@ -53,15 +53,18 @@ def test_and_what_code_that_is_in_no_commit_did(tmp_path: Path, monkeypatch: pyt
 def test_in_figures_of_accuracy_too(tmp_path: Path, kind: str) -> None:
     rows: list[dict[str, Any]] = []
     for size in (10, 24):
-        rows += accuracy_rows.build_snapshot_rows("net", size, "early")
+        rows += synthetic_accuracy_rows.build_snapshot_rows("net", size, "early")
         for solver in ("numba", "newton"):
-            rows += accuracy_rows.build_curve_rows("net", size, "early", solver)
-    rows += [*accuracy_rows.build_work_rows("net", 10, ("numba", "newton")), *accuracy_rows.build_liu2013_rows()]
+            rows += synthetic_accuracy_rows.build_curve_rows("net", size, "early", solver)
+    rows += [
+        *synthetic_accuracy_rows.build_work_rows("net", 10, ("numba", "newton")),
+        *synthetic_accuracy_rows.build_liu2013_rows(),
+    ]
     # The reproduction of the paper is by one solver alone.
     before = "numba" if kind == "liu2013" else "newton"
     rows = [row | {"code": "before" if row.get("solver") == before else None} for row in rows]
     asked = FigureOptions(selectors=(("net", "10", "gap"),)) if kind == "convergence" else FigureOptions()
-    figure, panels = compose_kind(kind, accuracy_rows.write_accuracy_rows(tmp_path, rows), asked)
+    figure, panels = compose_kind(kind, synthetic_accuracy_rows.write_accuracy_rows(tmp_path, rows), asked)
     said = " ".join(text.get_text() for text in visible_texts(figure)).replace("\n", " ")
     if kind in ("profiles", "liu2013"):
         assert f"Measured by other code than today's, in whole or in part: {before}." in said
@@ -75,7 +78,7 @@ def test_and_in_those_of_speed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     told = made.write_speed_results(tmp_path / "told")
     _, (panel,) = compose_kind("speed", told, FigureOptions())
     assert {row["series"] for row in panel.rows() if row["other_code"]} == {"numba supernodal"}
-    found = speed_figures(base_rows.read_rows(shelf.list_units(told / "rows")))
+    found = speed_figures(base_rows.read_rows(row_store.list_units(told / "rows")))
     pages: list[Figure] = []
     monkeypatch.setattr(size_plot, "save", lambda page, path: pages.append(page))
     draw_speed_plots(found, tmp_path)

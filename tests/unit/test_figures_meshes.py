@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from springbench.harness.report import opengl_probe
+from springbench.harness.report.figures.layout_checks import find_layout_faults
+from springbench.harness.results import parquet_rows as base_rows
 
-from harness.base import rows as base_rows
-from harness.report import opengl
-from harness.report.figures.faults import find_layout_faults
-from tests import figure_results as made
-from tests.drawn_figures import (
+from tests import synthetic_results as made
+from tests.figure_images import (
     EXPECTED_FOLDER,
     MESH_FIGURE_KINDS,
     MIN_SIMILARITY,
@@ -24,7 +24,7 @@ from tests.drawn_figures import (
 LOOKS = EXPECTED_FOLDER / "meshes.png"
 
 
-@pytest.mark.skipif(opengl.find_opengl_problem() is not None, reason=opengl.find_opengl_problem() or "")
+@pytest.mark.skipif(opengl_probe.find_opengl_problem() is not None, reason=opengl_probe.find_opengl_problem() or "")
 def test_meshes_side_by_side_have_one_camera_one_scale_and_the_distance_from_the_lowest_residual(
     tmp_path: Path,
 ) -> None:
@@ -40,7 +40,7 @@ def test_meshes_side_by_side_have_one_camera_one_scale_and_the_distance_from_the
     assert find_layout_faults(alone) == []
 
 
-@pytest.mark.skipif(opengl.find_opengl_problem() is not None, reason=opengl.find_opengl_problem() or "")
+@pytest.mark.skipif(opengl_probe.find_opengl_problem() is not None, reason=opengl_probe.find_opengl_problem() or "")
 def test_a_sheet_has_each_scene_once_of_one_shape_and_by_one_scale(tmp_path: Path) -> None:
     folder = made.write_recorded_runs(tmp_path)
     for path in [*(folder / "rows").glob("*.parquet")]:
@@ -54,7 +54,7 @@ def test_a_sheet_has_each_scene_once_of_one_shape_and_by_one_scale(tmp_path: Pat
     assert "numba, 36 vertices" in pictures[1].facts
 
 
-@pytest.mark.skipif(opengl.find_opengl_problem() is not None, reason=opengl.find_opengl_problem() or "")
+@pytest.mark.skipif(opengl_probe.find_opengl_problem() is not None, reason=opengl_probe.find_opengl_problem() or "")
 def test_the_sheet_of_meshes_looks_as_it_did(tmp_path: Path) -> None:
     folder = made.write_recorded_runs(tmp_path / "results")
     now = tile_figures([compose_mesh_kind(kind, folder, 85.0)[0] for kind in MESH_FIGURE_KINDS], (1020, 360))

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from harness.base.errors import InputError
-from harness.base.yaml import read_yaml
-from harness.scenes.mesh import ply
-from harness.scenes.mesh.files import FileMesh
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.mesh import ply_reader
+from springbench.harness.scenes.mesh.file_mesh import FileMesh
+from springbench.harness.schema.yaml_loader import read_yaml
 
 XYZ = "property float x\nproperty float y\nproperty float z\n"
 CORNERS = "property list uchar int vertex_indices\n"
@@ -42,7 +41,7 @@ def text(face: str, other: str, rows: str, others: str) -> bytes:
 
 @pytest.mark.parametrize("case", TEXTS)
 def test_other_properties_and_elements_of_a_ply_are_skipped(case):
-    found = ply.read_ply(text(*TEXTS[case]))
+    found = ply_reader.read_ply(text(*TEXTS[case]))
     assert found.points.tolist() == [list(point) for point in POINTS]
     assert {k: rows.tolist() for k, (rows, _) in found.faces.items()} == {4: [[0, 1, 2, 3]]}
     assert not found.vertex_attributes
@@ -65,7 +64,7 @@ def test_a_binary_ply_of_any_properties_is_read(order, mixed):
         coordinates = (0.5,) * (2 * i if mixed else 2)
         body += struct.pack(f"{order}bH{len(face)}I", -1, len(face), *face)
         body += struct.pack(f"{order}B{len(coordinates)}d", len(coordinates), *coordinates)
-    found = ply.read_ply(head.encode() + body + struct.pack(order + "2i", 0, 2))
+    found = ply_reader.read_ply(head.encode() + body + struct.pack(order + "2i", 0, 2))
     assert found.points.tolist() == [list(point) for point in POINTS]
     assert found.vertex_attributes["red"].tolist() == [200, 201, 202, 203]
     rows = {k: (rows.tolist(), which.tolist()) for k, (rows, which) in found.faces.items()}
@@ -102,7 +101,7 @@ def test_a_ply_gives_a_mesh_with_its_numbers_in_double_precision(tmp_path):
 def test_a_broken_ply_is_refused_with_the_reason(before, after, words):
     content = text(CORNERS, "", "4 0 1 2 3\n", "")
     with pytest.raises(ValueError, match=words.replace(".", r"\.")):
-        ply.read_ply(content.replace(before, after))
+        ply_reader.read_ply(content.replace(before, after))
 
 
 MSH = """$MeshFormat
@@ -246,5 +245,5 @@ def test_a_colon_without_quotes_is_named_with_what_to_quote(tmp_path, config, li
 
 
 def test_text_is_read_as_float64_and_not_as_the_declared_type():
-    found = ply.read_ply(text(CORNERS, "", "4 0 1 2 3\n", "").replace(b"1 1 0\n", b"1 0.1 0\n"))
+    found = ply_reader.read_ply(text(CORNERS, "", "4 0 1 2 3\n", "").replace(b"1 1 0\n", b"1 0.1 0\n"))
     assert np.array_equal(found.points[2], [1, 0.1, 0])

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from springbench.solvers.methods.local_global.fixed_point import FixedPointSolver
+from springbench.solvers.model.step_problem import PluginContractError, StopRule
 
-from solvers.core.formula import FixedPointSolver
-from solvers.problem import PluginContractError, StopRule
-from tests.scenes import build_cloth, build_first_problem
+from tests.scene_builders import build_cloth, build_first_problem
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -7,21 +7,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from harness.scenes.bind import Scene
-from harness.scenes.effects.contact import ContactEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.self_contact import SelfContactEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.effects.surface_contact import SurfaceContactEffect
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.mesh.network import NetworkMesh
-from harness.scenes.mesh.stack import StackMesh
-from harness.scenes.motion import KeyFrame, KeyFrameMotion
-from harness.scenes.obstacles import PlaneObstacle
-from harness.scenes.shapes import MeshObstacle, TriangleSurface
-from harness.simulation.observe import build_solution_columns
-from harness.simulation.step import (
+from springbench.harness.scenes.effects.contact_effect import ContactEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.self_contact_effect import SelfContactEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.effects.surface_contact_effect import SurfaceContactEffect
+from springbench.harness.scenes.key_frames import KeyFrame, KeyFrameMotion
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.mesh.network_mesh import NetworkMesh
+from springbench.harness.scenes.mesh.stack_mesh import StackMesh
+from springbench.harness.scenes.primitive_obstacles import PlaneObstacle
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.scenes.surface_obstacles import MeshObstacle, TriangleSurface
+from springbench.harness.simulation.instrumentation_pass import build_solution_columns
+from springbench.harness.simulation.time_loop import (
     MotionState,
     SimulationStep,
     build_initial_state,
@@ -29,14 +28,15 @@ from harness.simulation.step import (
     prepare,
     simulate_scene,
 )
-from solvers.contact.friction_rounds import solve_with_friction
-from solvers.integrators import Motion
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import Positions, PreparedSolver, Solution, Solver, StepProblem, StopRule
-from solvers.registry import SOLVERS, load_target
-from tests.effects import with_integrator
-from tests.scenes import build_test_scene
-from tests.self_contacts import SURFACE_CONTACT_SOLVERS
+from springbench.solvers.contact.lagged_friction import solve_with_friction
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solution, Solver, StepProblem, StopRule
+from springbench.solvers.registry import SOLVERS, load_target
+
+from tests.effect_scenes import with_integrator
+from tests.scene_builders import build_test_scene
+from tests.self_contact_scenes import SURFACE_CONTACT_SOLVERS
 
 G, SLOPE = 9.81, 0.5
 SIN, COS = SLOPE / np.hypot(1.0, SLOPE), 1.0 / np.hypot(1.0, SLOPE)

@@ -7,23 +7,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from harness.base.errors import RunFailed
-from harness.reference.frozen import StepSnapshot, build_exact_scene, run_reference, select_snapshot_frames
-from harness.reference.store import ReferenceStore
-from harness.scenes.effects.ether_drag import EtherDragEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.effects.surface_contact import SurfaceContactEffect
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.obstacles import PlaneObstacle
-from harness.scenes.spec import IntegratorName, SceneSpec
-from harness.simulation.step import build_initial_state, build_problem, prepare, simulate_scene
-from solvers.integrators import INTEGRATORS
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import StepProblem, StepStart, StopRule, System
+from springbench.harness.errors import RunFailed
+from springbench.harness.reference.reference_store import ReferenceStore
+from springbench.harness.reference.step_snapshot import (
+    StepSnapshot,
+    build_exact_scene,
+    run_reference,
+    select_snapshot_frames,
+)
+from springbench.harness.scenes.effects.ether_drag_effect import EtherDragEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.effects.surface_contact_effect import SurfaceContactEffect
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.primitive_obstacles import PlaneObstacle
+from springbench.harness.scenes.scene_spec import IntegratorName, SceneSpec
+from springbench.harness.simulation.time_loop import build_initial_state, build_problem, prepare, simulate_scene
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.integrators import INTEGRATORS
+from springbench.solvers.model.step_problem import StepProblem, StepStart, StopRule, System
 
 FRAMES = 12
 SPEC = SceneSpec(

@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
+from springbench.harness.cli.main import app
+from springbench.harness.execution import machine_info
+from springbench.harness.report import gallery_sheet, opengl_probe
+from springbench.harness.report.gallery_sheet import choose_column_count
+from springbench.harness.report.obstacle_meshes import build_obstacle_mesh
+from springbench.harness.report.provenance_words import describe_machine_and_commit
+from springbench.harness.scenes.key_frames import KeyFrame, KeyFrameMotion
+from springbench.harness.scenes.primitive_obstacles import BoxObstacle, CapsuleObstacle, PlaneObstacle, SphereObstacle
 from typer.testing import CliRunner
 
-from harness.base import machine
-from harness.cli import app
-from harness.report import contact_sheet, opengl
-from harness.report.contact_sheet import choose_column_count
-from harness.report.origin import describe_machine_and_commit
-from harness.report.solids import build_obstacle_mesh
-from harness.scenes.motion import KeyFrame, KeyFrameMotion
-from harness.scenes.obstacles import BoxObstacle, CapsuleObstacle, PlaneObstacle, SphereObstacle
-
-needs_opengl = pytest.mark.skipif(opengl.find_opengl_problem() is not None, reason=opengl.find_opengl_problem() or "")
+needs_opengl = pytest.mark.skipif(
+    opengl_probe.find_opengl_problem() is not None, reason=opengl_probe.find_opengl_problem() or ""
+)
 SEEN = np.random.default_rng(0).normal(size=(20, 3))
 
 FACTS = ("at the last frame, by hybrid to 1e-4", "strain: blue −10 % or more, orange as much stretched")
@@ -74,7 +75,7 @@ def test_the_sheet_has_a_tile_for_each_scene_and_says_what_drew_it(tmp_path: Pat
         said.append([text.get_text() for text in page.texts])
         page.savefig(path)
 
-    monkeypatch.setattr(contact_sheet, "save", save)
+    monkeypatch.setattr(gallery_sheet, "save", save)
     paths = [tmp_path / f"scene-{k}.yaml" for k in range(7)]
     for path in paths:
         path.write_text(SCENE)
@@ -89,7 +90,7 @@ def test_the_sheet_has_a_tile_for_each_scene_and_says_what_drew_it(tmp_path: Pat
     assert sizes[0][0] == sizes[1][0] == 1600
     assert sizes[1][1] > sizes[0][1] + 300  # another row
     assert blank == [False, True]  # the last of which is one tile short
-    here = {"cpu": machine.describe_machine().cpu, "commit": machine.read_commit()}
+    here = {"cpu": machine_info.describe_machine().cpu, "commit": machine_info.read_commit()}
     for page in said:
         assert page[-1] == "   ·   ".join([*FACTS, *describe_machine_and_commit([here])])
 

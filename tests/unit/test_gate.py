@@ -10,11 +10,10 @@ from typing import Any
 
 import pytest
 from rich.console import Console
+from springbench.harness.cli.main import app
+from springbench.harness.errors import InputError
+from springbench.harness.report.benchmark_comparison import compare_benchmarks
 from typer.testing import CliRunner
-
-from harness.base.errors import InputError
-from harness.cli import app
-from harness.report.gate import compare_benchmarks
 
 ROOT = Path(__file__).resolve().parents[2]
 HERE = {"cpu": {"brand_raw": "Fast 9000", "count": 2}, "affinity": 2}
@@ -150,7 +149,14 @@ def test_what_the_gates_store_can_be_compared_and_names_no_host(tmp_path: Path):
         sys.executable,
         "-m",
         "pytest",
-        *("-p", "no:springbench", "-p", "harness.experiments.gates.plugin", "-p", "tests.bench.conftest"),
+        *(
+            "-p",
+            "no:springbench",
+            "-p",
+            "springbench.harness.experiments.regression.pytest_plugin",
+            "-p",
+            "tests.bench.conftest",
+        ),
         "--benchmark-only",
         "-p",
         "no:cacheprovider",

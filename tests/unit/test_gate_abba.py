@@ -7,8 +7,7 @@ from itertools import islice
 from random import Random
 
 import pytest
-
-from harness.experiments.gates.abba import (
+from springbench.harness.experiments.regression.abba_benchmark import (
     BLOCK_ORDERS,
     BenchmarkResult,
     LayoutRandomiser,
@@ -18,7 +17,11 @@ from harness.experiments.gates.abba import (
     run_confirmed_benchmark,
     run_paired_benchmark,
 )
-from harness.experiments.gates.sequential import RatioInterval, SequentialTest, SequentialVerdict
+from springbench.harness.experiments.regression.confidence_sequence import (
+    RatioInterval,
+    SequentialTest,
+    SequentialVerdict,
+)
 
 RULE = SequentialTest(1.03)
 
@@ -62,8 +65,8 @@ def test_work_is_made_anew_between_turns_in_its_share_of_the_time(monkeypatch: p
         renewed.append(len(turns))
         now[0] += 1.0
 
-    monkeypatch.setattr("harness.experiments.gates.abba.perf_counter", lambda: now[0])
-    monkeypatch.setattr("harness.experiments.gates.abba.SHARE", 0.2)
+    monkeypatch.setattr("springbench.harness.experiments.regression.abba_benchmark.perf_counter", lambda: now[0])
+    monkeypatch.setattr("springbench.harness.experiments.regression.abba_benchmark.REBUILD_TIME_SHARE", 0.2)
     renewing = LayoutRandomiser(renew)
     for _ in range(12):
         turns.append(None)
@@ -120,14 +123,14 @@ def test_the_budget_is_that_of_both_races(monkeypatch: pytest.MonkeyPatch):
         budgets.append(budget)
         return replace(slow, sequential_test=rule, elapsed_seconds=45.0)
 
-    monkeypatch.setattr("harness.experiments.gates.abba._raced", raced)
+    monkeypatch.setattr("springbench.harness.experiments.regression.abba_benchmark._run_restarted_benchmark", raced)
     for budget in (60.0, 30.0):
         run_confirmed_benchmark(pairs(1.0)[0], RULE, time_budget=budget)  # type: ignore[arg-type]
     assert budgets == [60.0, 15.0, 30.0, 0.0]
 
 
 def test_programs_are_started_anew_as_long_as_a_race_lasts(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("harness.experiments.gates.abba.PAIR", 0.0)  # a start for each turn
+    monkeypatch.setattr("springbench.harness.experiments.regression.abba_benchmark.RESTART_SECONDS", 0.0)  # a start for each turn
     start, started = pairs(*[1.0] * 16)
     found = run_confirmed_benchmark(start, RULE, time_budget=60.0)  # type: ignore[arg-type]
     assert (found.verdict, found.num_process_pairs, len(found.blocks), len(started)) == (
@@ -139,7 +142,7 @@ def test_programs_are_started_anew_as_long_as_a_race_lasts(monkeypatch: pytest.M
 
 
 def test_pairs_that_differ_all_their_lives_decide_nothing_together(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("harness.experiments.gates.abba.PAIR", 0.0)
+    monkeypatch.setattr("springbench.harness.experiments.regression.abba_benchmark.RESTART_SECONDS", 0.0)
     start, _ = pairs(*[1.05, 1.0] * 10_000)
     found = run_confirmed_benchmark(start, RULE, time_budget=0.05)  # type: ignore[arg-type]
     assert found.verdict is SequentialVerdict.INCONCLUSIVE

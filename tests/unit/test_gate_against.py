@@ -7,14 +7,18 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.experiments.regression import git_worktrees, revision_worker
+from springbench.harness.experiments.regression.confidence_sequence import SequentialVerdict
+from springbench.harness.experiments.regression.revision_comparison import (
+    WorkRequest,
+    choose_exit_code,
+    start_revisions,
+)
+from springbench.harness.experiments.regression.revision_process import GitRevision, describe_changes, start_workers
 from typer.testing import CliRunner
 
-from harness.cli import app
-from harness.experiments.gates import revisions, worker
-from harness.experiments.gates.against import WorkRequest, choose_exit_code, start_revisions
-from harness.experiments.gates.pair import GitRevision, describe_changes, start_workers
-from harness.experiments.gates.sequential import SequentialVerdict
-from tests.scenes import CLOTH_SCENE_YAML
+from tests.scene_builders import CLOTH_SCENE_YAML
 
 GATES = """
 from types import SimpleNamespace
@@ -120,7 +124,7 @@ def test_a_revision_whose_libraries_cannot_be_had_does_not_build(repository: Pat
     assert code == 2
     assert "does not build:" in said
     # One that was killed while it was built is not taken for whole.
-    (tree,) = (path for path in revisions.worktree_cache().iterdir() if path.is_dir())
+    (tree,) = (path for path in git_worktrees.worktree_cache().iterdir() if path.is_dir())
     (tree / ".venv" / "bin").mkdir(parents=True)
     (tree / ".venv" / "bin" / "python").touch()
     code, said = gate("--against", "HEAD", "-k", "adding")
@@ -198,8 +202,8 @@ def test_work_that_is_renewed_is_made_again_before_it_is_timed(tmp_path: Path, m
         made.append(number := len(made))
         return lambda: done.append(number) or 0.0
 
-    monkeypatch.setattr(worker, "_gates", lambda: {"mine": SimpleNamespace(candidate=candidate, clock="cpu")})
-    held = worker.RevisionWorker()
+    monkeypatch.setattr(revision_worker, "_gates", lambda: {"mine": SimpleNamespace(candidate=candidate, clock="cpu")})
+    held = revision_worker.RevisionWorker()
     monkeypatch.setattr(held, "_pin", lambda threads: None)
     held.prepare_test("mine", str(tmp_path / "answer.npy"))
     held.rebuild_work()
@@ -210,8 +214,8 @@ def test_work_that_is_renewed_is_made_again_before_it_is_timed(tmp_path: Path, m
 def test_a_worker_that_dies_is_told_with_its_last_words(tmp_path: Path):
     (tmp_path / "json.py").write_text("raise SystemExit('there is no more json')")
     request = WorkRequest("a gate", "gate", {"name": "a gate"})
-    from harness.base.errors import InputError
-    from harness.experiments.gates.against import ComparisonOptions
+    from springbench.harness.errors import InputError
+    from springbench.harness.experiments.regression.revision_comparison import ComparisonOptions
 
     with (
         pytest.raises(InputError, match="that: does not run: there is no more json"),

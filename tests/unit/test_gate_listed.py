@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from springbench.harness.experiments.regression import regression_table
+from springbench.harness.experiments.regression.confidence_sequence import SequentialTest
 
-from harness.experiments.gates import listed
-from harness.experiments.gates.sequential import SequentialTest
 from tests.contracts.hostile import scene
 
 TABLE = """
@@ -27,6 +27,6 @@ def test_the_gates_of_a_table_share_its_error_and_each_may_have_a_budget_of_its_
         asked.append((rule, budget))
         return "holds"
 
-    monkeypatch.setattr(listed, "confirmed", confirmed)
-    listed.run_regression_table(tmp_path / "gates.yaml", 60.0, lambda line: None, alpha=0.01)
+    monkeypatch.setattr(regression_table, "confirmed", confirmed)
+    regression_table.run_regression_table(tmp_path / "gates.yaml", 60.0, lambda line: None, alpha=0.01)
     assert asked == [(SequentialTest(1.5, 0.005), 60.0), (SequentialTest(2.0, 0.005), 7.0)]

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.experiments.regression.answer_agreement import describe_difference
 from typer.testing import CliRunner
-
-from harness.cli import app
-from harness.experiments.gates.agreement import describe_difference
 
 SCENE = """
 mesh: {kind: grid}
@@ -38,7 +37,14 @@ def session(folder: Path, test: str, *options: str) -> tuple[int, str, list[dict
     (folder / "test_mine.py").write_text(f"{SPIN}\n{test}\n")
     stored = folder / "stored.json"
     # The plugin as a module, whether or not the package is installed with it.
-    plugin = ["-p", "no:springbench", "-p", "harness.experiments.gates.plugin", "-p", "no:cacheprovider"]
+    plugin = [
+        "-p",
+        "no:springbench",
+        "-p",
+        "springbench.harness.experiments.regression.pytest_plugin",
+        "-p",
+        "no:cacheprovider",
+    ]
     command = [sys.executable, "-m", "pytest", "-q", *plugin, f"--benchmark-json={stored}", *options]
     # Beside other workers of one session pytest-benchmark times nothing; this session is one of its own.
     alone = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}
@@ -96,7 +102,7 @@ def test_other(race): race(spin(10, 1.0), spin(10, 2.0), limit=9)
 def test_solvers_race_on_a_scene_and_one_of_them_may_be_ones_own(tmp_path: Path):
     (tmp_path / "cloth.yaml").write_text(SCENE)
     test = """
-from solvers.methods.local_global import SparseLocalGlobal
+from springbench.solvers.methods.local_global import SparseLocalGlobal
 def test_named(race): race.solvers("cloth.yaml", "sparse", {"name": "dense"}, limit=1e6, iterations=20)
 def test_own(race): race.solvers("cloth.yaml", SparseLocalGlobal(), "sparse", limit=1e6, agree=0.0)
 def test_other_answers(race): race.solvers("cloth.yaml", "xpbd", "sparse", limit=1e6)

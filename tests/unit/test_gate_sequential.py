@@ -6,8 +6,7 @@ from math import factorial
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-
-from harness.experiments.gates.sequential import (
+from springbench.harness.experiments.regression.confidence_sequence import (
     SequentialTest,
     SequentialVerdict,
     compute_critical_count,

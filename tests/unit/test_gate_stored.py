@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.results import parquet_rows
 from typer.testing import CliRunner
-
-from harness.base import rows
-from harness.cli import app
 
 FRAMES, ROUNDS = 12, 3
 
@@ -28,7 +27,7 @@ def results(folder: Path, *runs: dict[str, Any]) -> Path:
         ]
         if given.get("status", "ok") != "ok":
             steps = [{"phase": "run"}]
-        rows.write_rows(folder / "rows" / f"{number}.parquet", [shared | given | step for step in steps])
+        parquet_rows.write_rows(folder / "rows" / f"{number}.parquet", [shared | given | step for step in steps])
     return folder
 
 

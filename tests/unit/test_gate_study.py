@@ -4,13 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
-
-from harness.base import rows
-from harness.cli import app
-from harness.experiments.gates.live import summarise_live_study
-from harness.experiments.gates.sequential import SequentialTest
-from harness.experiments.gates.study import (
+from springbench.harness.cli.main import app
+from springbench.harness.experiments.regression.confidence_sequence import SequentialTest
+from springbench.harness.experiments.regression.live_study import summarise_live_study
+from springbench.harness.experiments.regression.replay_study import (
     OTHER_COMPARISONS,
     RECORD_SCHEMA,
     RecordedBlocks,
@@ -18,7 +15,10 @@ from harness.experiments.gates.study import (
     replay_comparison,
     replay_tests,
 )
-from tests.scenes import CLOTH_SCENE_YAML
+from springbench.harness.results import parquet_rows
+from typer.testing import CliRunner
+
+from tests.scene_builders import CLOTH_SCENE_YAML
 
 
 def starts(biases: tuple[float, ...] = (1.0, 1.0, 1.0), noise: float = 0.02, turns: int = 500) -> list[RecordedBlocks]:
@@ -67,7 +67,7 @@ def test_pairs_that_differ_all_their_lives_are_drawn_again_in_a_long_race(monkey
     # A third of the pairs is .8 % apart: alone it does not show that the code is 2 % slower and not 1 %.
     recorded = starts((1.0, 1.0, 0.992), noise=0.04)
     several = replay_tests(recorded, 1.02, SequentialTest(1.01), budget=300.0, num_replays=300)
-    monkeypatch.setattr("harness.experiments.gates.study.PAIR", 300.0)
+    monkeypatch.setattr("springbench.harness.experiments.regression.replay_study.PAIR", 300.0)
     alone = replay_tests(recorded, 1.02, SequentialTest(1.01), budget=300.0, num_replays=300)
     assert several.pass_rate == 0.0
     assert several.fail_rate > alone.fail_rate + 0.2  # .90 and .54
@@ -85,13 +85,13 @@ def test_turns_are_recorded_and_replayed_by_the_command(tmp_path: Path, monkeypa
     (tmp_path / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     (tmp_path / ".git").mkdir()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("harness.experiments.gates.revisions.root", lambda folder: folder)
+    monkeypatch.setattr("springbench.harness.experiments.regression.git_worktrees.find_checkout", lambda folder: folder)
     samples = tmp_path / "samples.parquet"
     given = ["record", str(samples), "cloth.yaml", "--solver", "sparse", "--seconds", "1", "--planted", "0.1"]
     for starts in ("2", "1"):  # what is stored already is kept
         done = CliRunner().invoke(app, ["gate-study", *given, "--starts", starts])
         assert done.exit_code == 0, done.output
-    recorded = rows.read_rows([samples], RECORD_SCHEMA).to_pylist()
+    recorded = parquet_rows.read_rows([samples], RECORD_SCHEMA).to_pylist()
     assert {row["start"] for row in recorded} == {0, 1, 2}
     assert {row["planted"] for row in recorded} == {0.1}
     ((key, found),) = read_recorded_blocks([samples]).items()
@@ -106,7 +106,7 @@ def test_turns_are_recorded_and_replayed_by_the_command(tmp_path: Path, monkeypa
 def test_real_gates_are_held_and_counted_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("harness.experiments.gates.revisions.root", lambda folder: folder)
+    monkeypatch.setattr("springbench.harness.experiments.regression.git_worktrees.find_checkout", lambda folder: folder)
     given = ["gate-study", "live", "held.parquet", "cloth.yaml", "--solver", "sparse", "--budget", "20", "--limit", "2"]
     assert CliRunner().invoke(app, [*given, "--gates", "2"]).exit_code == 0
     done = CliRunner().invoke(app, [*given, "--gates", "1", "--planted", "4"])
@@ -134,7 +134,7 @@ def test_a_mistake_is_one_message(
 ):
     (tmp_path / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("harness.experiments.gates.revisions.root", lambda folder: folder)
+    monkeypatch.setattr("springbench.harness.experiments.regression.git_worktrees.find_checkout", lambda folder: folder)
     done = CliRunner().invoke(app, ["gate-study", *arguments])
     assert done.exit_code == 2, done.output
     assert said in " ".join(done.output.split())

@@ -5,18 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.config.performance_targets import load_targets
+from springbench.harness.errors import InputError
+from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
+from springbench.harness.experiments.error_control import target_baseline
+from springbench.harness.experiments.error_control.target_measurement import TargetResult
+from springbench.harness.experiments.error_control.third_party_integrators import THIRD_PARTY_INTEGRATORS
+from springbench.harness.results import parquet_rows
+from springbench.solvers.registry import SOLVER_TABLE
 from typer.testing import CliRunner
-
-from harness.base import rows
-from harness.base.errors import InputError
-from harness.cli import app
-from harness.config.goals import load_targets
-from harness.config.load import load_config
-from harness.experiments.accuracy.accuracy_rows import ACCURACY_SCHEMA
-from harness.experiments.asked import held
-from harness.experiments.asked.goals import TargetResult
-from harness.experiments.asked.libraries import THIRD_PARTY_INTEGRATORS
-from solvers.registry import SOLVER_TABLE
 
 SPRING = """
 mesh: {kind: chain}
@@ -93,7 +92,9 @@ def test_goals_are_timed_beside_a_peer_and_steps_of_one_length(tmp_path: Path) -
     done = CliRunner().invoke(app, ["goals", str(path), "--results", str(tmp_path / "results")])
     assert done.exit_code == 1, done.output
     assert "does not hold" in done.output
-    found = rows.read_rows([tmp_path / "results" / "mine" / "accuracy" / "goals.parquet"], ACCURACY_SCHEMA).to_pylist()
+    found = parquet_rows.read_rows(
+        [tmp_path / "results" / "mine" / "accuracy" / "goals.parquet"], ACCURACY_SCHEMA
+    ).to_pylist()
     assert [row["against"].split(",")[0] for row in found] == ["scipy-dop853-numpy", "midpoint with newton"]
     for row in found:
         assert row["kind"] == "goal"
@@ -105,7 +106,7 @@ def test_goals_are_timed_beside_a_peer_and_steps_of_one_length(tmp_path: Path) -
 
 
 def test_what_takes_too_long_is_a_bound_of_the_goal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(held, "LONGEST", 0.0)
+    monkeypatch.setattr(target_baseline, "LONGEST", 0.0)
     path = config(
         tmp_path, "[{scene: spring, horizon: 0.2, error: 1e-3, integrator: midpoint, solver: newton, wanted: 1e-9}]"
     )
@@ -113,7 +114,9 @@ def test_what_takes_too_long_is_a_bound_of_the_goal(tmp_path: Path, monkeypatch:
     assert done.exit_code == 1, done.output
     assert "an error of" in done.output
     assert "at most" in done.output
-    (row,) = rows.read_rows([tmp_path / "results" / "mine" / "accuracy" / "goals.parquet"], ACCURACY_SCHEMA).to_pylist()
+    (row,) = parquet_rows.read_rows(
+        [tmp_path / "results" / "mine" / "accuracy" / "goals.parquet"], ACCURACY_SCHEMA
+    ).to_pylist()
     assert "given up after" in row["against"]
     assert row["against_error"] is None
     assert row["against_seconds"] > 0.0

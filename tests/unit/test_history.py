@@ -6,11 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from springbench.harness.cli.main import app
+from springbench.harness.report.change_detection import (
+    BenchmarkPoint,
+    detect_changes,
+    find_stored_files,
+    read_histories,
+)
 from typer.testing import CliRunner
 
-from harness.cli import app
-from harness.report.history import BenchmarkPoint, detect_changes, find_stored_files, read_histories
-from tests.gate_results import build_ratio_series, write_benchmark_files
+from tests.synthetic_benchmarks import build_ratio_series, write_benchmark_files
 
 
 def points(values: Any) -> list[BenchmarkPoint]:

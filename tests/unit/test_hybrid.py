@@ -7,18 +7,18 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from springbench.solvers.iteration.descent_method import DescentPoint, ResidualMetric
+from springbench.solvers.linalg.cholesky import symbolic_factorisation
+from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
+from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
+from springbench.solvers.methods.newton.negative_curvature import probe_negative_curvature
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
+from springbench.solvers.model.step_problem import DirichletPins, StepProblem, StopRule, System
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
 
-from solvers.core.descent import DescentPoint, ResidualMetric
-from solvers.core.fixed_objective import FixedObjective
-from solvers.core.objective import StepObjective
-from solvers.core.saddles import probe_negative_curvature
-from solvers.linear import symbolic
-from solvers.linear.block import BlockCholesky
-from solvers.methods.hybrid import HybridNewton
-from solvers.methods.lbfgs import Lbfgs
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import DirichletPins, StepProblem, StopRule, System
-from tests.scenes import build_cloth, build_first_problem, build_random_problem
+from tests.scene_builders import build_cloth, build_first_problem, build_random_problem
 
 
 def stiff(ratio: float) -> StepProblem:
@@ -60,13 +60,13 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def test_a_graph_is_ordered_once(monkeypatch):
     """Q for residuals, Q for L-BFGS and the Hessian have one graph."""
-    ordered, whole = [0], symbolic.nested_dissection_order
+    ordered, whole = [0], symbolic_factorisation.nested_dissection_order
 
     def ordering(*graph):
         ordered[0] += 1
         return whole(*graph)
 
-    monkeypatch.setattr(symbolic, "nested_dissection", ordering)
+    monkeypatch.setattr(symbolic_factorisation, "nested_dissection", ordering)
     HybridNewton().prepare(stiff(1.0).system)
     assert ordered == [1]
     HybridNewton().prepare(stiff(1.0).system)

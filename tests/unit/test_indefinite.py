@@ -8,8 +8,8 @@ from typing import get_args
 
 import numpy as np
 import pytest
-
-from solvers.core.definite import (
+from springbench.solvers.iteration.descent_method import DescentPoint, ResidualMetric
+from springbench.solvers.methods.newton.hessian_regularisation import (
     REGULARISATION_RULES,
     ClampRule,
     ContactScheduleRule,
@@ -17,16 +17,16 @@ from solvers.core.definite import (
     ProgressiveRule,
     TrustRegionRule,
 )
-from solvers.core.descent import DescentPoint, ResidualMetric
-from solvers.core.eigenvalues import PsdProjection
-from solvers.core.fixed_objective import FixedObjective
-from solvers.core.objective import StepObjective
-from solvers.energies.springs import Springs
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import DirichletPins, StepProblem, StopRule, Unsupported
-from tests.effects import EFFECT_SCENES, build_moving_problem
-from tests.scenes import build_cloth, build_first_problem
-from tests.self_contacts import build_touching_sheets
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.step_problem import DirichletPins, StepProblem, StopRule, Unsupported
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.psd_projection import PsdProjection
+from springbench.solvers.objective.step_objective import StepObjective
+
+from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
+from tests.scene_builders import build_cloth, build_first_problem
+from tests.self_contact_scenes import build_touching_sheets
 
 OTHERS = [name for name in get_args(IndefiniteStrategy) if name != "graded"]
 others = pytest.mark.parametrize("rule", OTHERS)

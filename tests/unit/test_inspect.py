@@ -14,15 +14,15 @@ import pyarrow.csv
 import pytest
 import pyvista as pv
 from rich.console import Console
+from springbench.harness.errors import InputError, RunFailed
+from springbench.harness.recording.chunk_cells import read_cell
+from springbench.harness.recording.recording_reader import open_recording, read_replay
+from springbench.harness.recording.side_by_side import LineStyle, write_side_by_side
+from springbench.harness.report import recording_inspection as module
+from springbench.harness.report.recording_inspection import find_recordings, inspect_recordings, view_recordings
+from springbench.harness.scenes.mesh.file_mesh import FileMesh
 
-from harness.base.errors import InputError, RunFailed
-from harness.record.cells import read_cell
-from harness.record.compare import LineStyle, write_side_by_side
-from harness.record.reader import open_recording, read_replay
-from harness.report import inspect as module
-from harness.report.inspect import find_recordings, inspect_recordings, view_recordings
-from harness.scenes.mesh.files import FileMesh
-from tests.recordings import MESHES_BY_KIND, build_recording_info, generate_waves, write_recording
+from tests.synthetic_recordings import MESHES_BY_KIND, build_recording_info, generate_waves, write_recording
 
 
 @pytest.fixture

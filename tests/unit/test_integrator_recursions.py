@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from springbench.harness.scenes.effects.constant_force_effect import ConstantForceEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import MotionState, build_initial_state, prepare, simulate_scene
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.integrators import INTEGRATORS, GeneralisedAlpha, Motion, RungeKutta, StageSolution
+from springbench.solvers.model.step_problem import StopRule
 
-from harness.scenes.bind import Scene
-from harness.scenes.effects.constant_force import ConstantForceEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.simulation.step import MotionState, build_initial_state, prepare, simulate_scene
-from solvers.integrators import INTEGRATORS, GeneralisedAlpha, Motion, RungeKutta, StageSolution
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import StopRule
-from tests.scenes import build_test_scene
+from tests.scene_builders import build_test_scene
 
 DT, STEPS = 1 / 30, 25
 CONVERGED = StopRule(100, 1e-14)

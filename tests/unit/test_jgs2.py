@@ -8,19 +8,19 @@ from itertools import islice
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect as SpringsEffect
+from springbench.harness.scenes.mesh.solid_meshes import BlockMesh
+from springbench.solvers.linalg import memory
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.vertex_block.jgs2 import Jgs2, compute_responses
+from springbench.solvers.methods.vertex_block.jgs2_patches import PatchScratch, compute_directions
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.step_problem import Positions, StepProblem, StopRule, Unsupported
 
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect as SpringsEffect
-from harness.scenes.mesh.solids import BlockMesh
-from solvers import memory
-from solvers.energies.springs import Springs
-from solvers.kernels.jgs2 import PatchScratch, compute_directions
-from solvers.methods.jgs2 import Jgs2, compute_responses
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import Positions, StepProblem, StopRule, Unsupported
-from tests.effects import EFFECT_SCENES, build_moving_problem
-from tests.scenes import build_cloth, build_first_problem, build_test_scene
+from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
+from tests.scene_builders import build_cloth, build_first_problem, build_test_scene
 
 HANGING = build_first_problem(build_cloth(8, "exact", stretch=1000.0))
 PINS = PinsEffect.model_validate({"at": ["left"], "weight": "exact"})

@@ -7,17 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from harness.base import rows
-from harness.base.errors import InputError
-from harness.config.load import load_config
-from harness.experiments.plan import RunFiles
-from harness.experiments.run import execute_run
-from harness.record.reader import read_replay
-from harness.reference.curvature import compute_curvature
-from harness.reference.judge import StepVerifier, compute_reference_positions, is_minimum
-from harness.reference.oracle import ReferenceEvaluator
-from harness.report.robustness import (
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.errors import InputError
+from springbench.harness.experiments.run_pipeline import execute_run
+from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.harness.recording.recording_reader import read_replay
+from springbench.harness.reference.hessian_curvature import compute_curvature
+from springbench.harness.reference.reference_evaluator import ReferenceEvaluator
+from springbench.harness.reference.step_verifier import StepVerifier, compute_reference_positions, is_minimum
+from springbench.harness.report.robustness import (
     CORRECT,
     DEGENERATE_MINIMUM,
     DIVERGED,
@@ -33,16 +31,18 @@ from harness.report.robustness import (
     read_verified_runs,
     score_solvers,
 )
-from harness.report.robustness_map import draw_robustness_map, map_headline
-from harness.scenes.bind import Scene
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.simulation.step import simulate_scene
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import Positions, StepProblem, StopRule
-from solvers.round_off import EPS
-from tests.scenes import build_cloth, build_first_problem, build_random_problem, build_test_scene
+from springbench.harness.report.robustness_map import draw_robustness_map, map_headline
+from springbench.harness.results import parquet_rows
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import simulate_scene
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.rounding_bound import EPS
+from springbench.solvers.model.step_problem import Positions, StepProblem, StopRule
+
+from tests.scene_builders import build_cloth, build_first_problem, build_random_problem, build_test_scene
 
 
 def stated() -> StepProblem:
@@ -205,7 +205,7 @@ def test_a_judged_sweep_becomes_a_map_whose_cells_name_their_runs(tmp_path: Path
 def test_results_that_were_not_judged_are_refused(tmp_path: Path):
     (tmp_path / "rows").mkdir()
     row = {"run_id": "x", "scene": "net", "size": 4, "solver": "sparse", "started": "2026", "phase": "step"}
-    rows.write_rows(tmp_path / "rows" / "x.parquet", [row | {"round": 0, "status": "ok"}])
+    parquet_rows.write_rows(tmp_path / "rows" / "x.parquet", [row | {"round": 0, "status": "ok"}])
     with pytest.raises(InputError, match="judge: true"):
         read_verified_runs(tmp_path)
 
@@ -215,7 +215,7 @@ def test_runs_of_a_solver_from_outside_may_give_different_parameters(tmp_path: P
     base = {"scene": "net", "size": 4, "solver": "./own.py:Own", "started": "2026", "phase": "step", "round": 0}
     for run_id, given in (("x", "{}"), ("y", '{"momentum": 0.5}'), ("z", '{"momentum": 0.8}')):
         one = base | {"run_id": run_id, "parameters": given, "status": "ok", "distance": 0.0}
-        rows.write_rows(tmp_path / "rows" / f"{run_id}.parquet", [one])
+        parquet_rows.write_rows(tmp_path / "rows" / f"{run_id}.parquet", [one])
     own = "./own.py:Own"
     assert [(cell.solver, cell.run_id) for cell in read_verified_runs(tmp_path)] == [
         (own, "x"),
@@ -239,7 +239,7 @@ def test_a_run_that_fails_keeps_and_marks_its_recording_up_to_there(tmp_path: Pa
                 step.positions[1] = np.inf
             yield step
 
-    monkeypatch.setattr("harness.simulation.measure.simulate", burst)
+    monkeypatch.setattr("springbench.harness.simulation.timing_pass.simulate", burst)
     (row,) = execute_run(spec, files, lambda phase: None)
     assert (row["status"], row["frame"]) == ("diverged", 3)
     assert "not finite" in row["reason"]

@@ -11,29 +11,28 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-from solvers import caching, sources
-from solvers.compiling import cached_njit
+from springbench.solvers.jit import kernel_cache, source_digest
+from springbench.solvers.jit.kernel_compilation import cached_njit
 
 YEAR_2001 = 1e9
 """Seconds since 1970."""
 
 KERNEL = """
-from solvers.compiling import kernel
-from solvers.kernels.inner_of_test import FACTOR, times
+from springbench.solvers.compiling import kernel
+from springbench.solvers.kernels.inner_of_test import FACTOR, times
 @kernel
 def product(x):
     return times(x) * FACTOR
 """
 INNER = """
-from solvers.compiling import inner
+from springbench.solvers.compiling import inner
 FACTOR = 2.0
 @inner
 def times(x):
     return 3.0 * x
 """
 ASK = """
-from solvers.kernels.kernel_of_test import product
+from springbench.solvers.kernels.kernel_of_test import product
 print(product(1.0), sum(product.stats.cache_hits.values()))
 """
 
@@ -78,7 +77,7 @@ def test_a_changed_kernel_never_runs_stale_whoever_imports_the_solvers_and_in_wh
     assert asked(checkout, ASK) == "12.0 0"
     assert asked(checkout, "import numba, harness\n" + ASK) == "12.0 1"
     edit(inner, "FACTOR = 2.0", "FACTOR = 4.0")  # a constant from another file
-    assert asked(checkout, "import harness, numba\n" + ASK) == "24.0 0"
+    assert asked(checkout, "import springbench, numba\n" + ASK) == "24.0 0"
     edit(outer, "* FACTOR", "/ FACTOR")
     assert asked(checkout, "import numba\n" + ASK) == "1.5 0"
     edit(outer, "/ FACTOR", "* FACTOR")  # as it was: what was compiled then serves again
@@ -102,7 +101,7 @@ def test_one_folder_may_serve_many_checkouts(checkout: Path, tmp_path_factory: p
 
 DIGESTS_OF_MODULES = """
 from pathlib import Path
-from solvers import sources
+from springbench.solvers import sources
 for path in sorted(Path("solvers").rglob("*.py")):
     print(path.as_posix(), sources.digest([path]))
 """
@@ -122,7 +121,7 @@ def test_editing_one_solver_recompiles_its_own_kernels_only(checkout: Path):
 
 
 def test_what_was_edited_since_it_was_imported_is_kept_for_nobody_else(checkout: Path):
-    editing = "from pathlib import Path\nimport solvers.kernels.inner_of_test\n"
+    editing = "from pathlib import Path\nimport springbench.solvers.kernels.inner_of_test\n"
     editing += "path = Path('solvers/kernels/inner_of_test.py')\n"
     editing += "path.write_text(path.read_text().replace('3.0', '9.0'))\n"
     assert asked(checkout, editing + ASK) == "6.0 0"  # its own module is as it was
@@ -131,7 +130,7 @@ def test_what_was_edited_since_it_was_imported_is_kept_for_nobody_else(checkout:
 
 
 def test_a_source_that_is_removed_while_a_process_runs_stops_nothing(checkout: Path):
-    removing = "from pathlib import Path\nimport solvers.kernels.kernel_of_test\n"
+    removing = "from pathlib import Path\nimport springbench.solvers.kernels.kernel_of_test\n"
     removing += "Path('solvers/kernels/inner_of_test.py').unlink()\n"
     assert asked(checkout, removing + ASK) == "6.0 0"
 
@@ -148,15 +147,15 @@ def imported(path: Path) -> set[str]:
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             found |= {node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)}
-    return {name for name in found if name.split(".")[0] in sources.PACKAGE_NAMES}
+    return {name for name in found if name.split(".")[0] in source_digest.PACKAGE_NAMES}
 
 
 def test_every_import_of_the_project_is_followed():
-    for package in sources.PACKAGE_NAMES:
-        for path in (sources.PROJECT_ROOT / package).rglob("*.py"):
-            reached = sources.find_dependencies(str(path))
+    for package in source_digest.PACKAGE_NAMES:
+        for path in (source_digest.PROJECT_ROOT / package).rglob("*.py"):
+            reached = source_digest.find_dependencies(str(path))
             for name in imported(path):
-                place = sources.PROJECT_ROOT.joinpath(*name.split("."))
+                place = source_digest.PROJECT_ROOT.joinpath(*name.split("."))
                 module = {str(place.with_suffix(".py")), str(place / "__init__.py")}
                 exists = any(os.path.exists(file) for file in module)
                 assert not exists or module & reached, f"{path} imports {name}"
@@ -164,7 +163,7 @@ def test_every_import_of_the_project_is_followed():
 
 OUTSIDE = {
     "own.py": "import numpy\nfrom helper import (\n    A,  # one, with a comma\n    B,\n)\nfrom pack import part\n",
-    "helper.py": "import json\nimport solvers.memory as memory, unused\n",
+    "helper.py": "import json\nimport springbench.solvers.linalg.memory as memory, unused\n",
     "unused.py": "",
     "json.py": "",
     "pack/__init__.py": "from .part import C\n",
@@ -180,11 +179,11 @@ def test_a_source_from_outside_depends_on_what_lies_beside_it_and_on_the_solvers
     for name, text in OUTSIDE.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
-    found = {Path(path) for path in sources.find_dependencies(str(tmp_path / "own.py"))}
+    found = {Path(path) for path in source_digest.find_dependencies(str(tmp_path / "own.py"))}
     assert {path.relative_to(tmp_path).as_posix() for path in found if tmp_path in path.parents} == (
         OUTSIDE.keys() - {"alien.py"}
     )
-    assert sources.PROJECT_ROOT / "solvers" / "memory.py" in found
+    assert source_digest.PROJECT_ROOT / "solvers" / "memory.py" in found
 
 
 def twice(x: float) -> float:
@@ -195,7 +194,7 @@ Damage = Callable[[Path], object]
 DAMAGES: dict[str, Damage] = {
     "empty": lambda path: path.write_bytes(b""),
     "half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
-    "of another key": lambda path: path.write_bytes(caching.dumps((("another",), None))),
+    "of another key": lambda path: path.write_bytes(kernel_cache.dumps((("another",), None))),
     "gone": lambda path: path.unlink(),
 }
 
@@ -214,7 +213,7 @@ def test_what_cannot_be_read_is_compiled_and_kept_anew(home: Path, damage: Damag
 @pytest.fixture
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder in which kernels are kept."""
-    monkeypatch.setattr(caching, "_home", lambda source: tmp_path)
+    monkeypatch.setattr(kernel_cache, "_home", lambda source: tmp_path)
     return tmp_path
 
 
@@ -222,7 +221,7 @@ def test_a_disk_without_room_costs_the_kept_code_alone(home: Path, monkeypatch: 
     def full(path: Path, content: bytes) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(caching, "_write", full)
+    monkeypatch.setattr(kernel_cache, "_write", full)
     assert cached_njit()(twice)(1.0) == 2.0
     assert not [*home.glob("*/*")]
 
@@ -241,15 +240,15 @@ def test_code_of_other_sources_goes_when_new_comes_and_nobody_has_used_it(home: 
 def test_sources_that_cannot_be_written_beside_are_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "__pycache__").write_text("a file, where a folder would have to be")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "users"))
-    monkeypatch.setattr(caching._NUMBA_CONFIG, "CACHE_DIR", "")
-    assert caching._writable_root(str(tmp_path)).is_relative_to(tmp_path / "users")
+    monkeypatch.setattr(kernel_cache._NUMBA_CONFIG, "CACHE_DIR", "")
+    assert kernel_cache._writable_root(str(tmp_path)).is_relative_to(tmp_path / "users")
 
 
 DIGESTS = """
 import hashlib
 from itertools import islice
-import harness
-from solvers.registry import SOLVERS, load
+import springbench
+from springbench.solvers.registry import SOLVERS, load
 from tests.scenes import cloth, first_problem
 problem = first_problem(cloth(12))
 for name in ("numba", "lbfgs", "vbd"):

@@ -6,11 +6,10 @@ import importlib
 from pathlib import Path
 
 import pytest
-
-from solvers import caching
+from springbench.solvers.jit import kernel_cache
 
 CLOSURES = """
-from solvers.compiling import inner, inner_closure, kernel
+from springbench.solvers.compiling import inner, inner_closure, kernel
 @inner
 def double(x):
     return 2.0 * x
@@ -35,6 +34,6 @@ def test_closures_of_other_functions_however_deep_are_other_kernels(tmp_path: Pa
     (tmp_path / "closures_of_test.py").write_text(CLOSURES)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
-    monkeypatch.setattr(caching.config, "CACHE_DIR", str(tmp_path / "kept"))
+    monkeypatch.setattr(kernel_cache.config, "CACHE_DIR", str(tmp_path / "kept"))
     module = importlib.import_module("closures_of_test")
     assert [module.made(part)(1.0) for part in (module.double, module.triple, module.double)] == [2.0, 3.0, 2.0]

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from springbench.solvers.iteration.descent_method import ResidualMetric
+from springbench.solvers.methods.local_global.aggregated_jacobi import AggregatedSweeps
+from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
+from springbench.solvers.model.step_problem import Positions, ProjectiveEnergy, StepProblem, StopRule, Unsupported
+from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix
 
-from solvers.core.descent import ResidualMetric
-from solvers.matrices import assemble_system_matrix
-from solvers.methods.a_jacobi import AggregatedSweeps
-from solvers.methods.lbfgs import Lbfgs
-from solvers.problem import Positions, ProjectiveEnergy, StepProblem, StopRule, Unsupported
-from tests.effects import EFFECT_SCENES as EFFECTS
-from tests.scenes import build_random_problem
+from tests.effect_scenes import EFFECT_SCENES as EFFECTS
+from tests.scene_builders import build_random_problem
 
 PROBLEMS = {"random": lambda: build_random_problem(4), "larger": lambda: build_random_problem(8, n=30, m=80)}
 

@@ -9,26 +9,25 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from harness.reference.trajectory import ReferenceTrajectory, integrate_motion
-from harness.scenes.bind import Scene, build_scene
-from harness.scenes.effects.air_drag import AirDragEffect
-from harness.scenes.effects.bending import BendingEffect
-from harness.scenes.effects.contact import ContactEffect
-from harness.scenes.effects.dashpots import DashpotsEffect
-from harness.scenes.effects.ether_drag import EtherDragEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.rayleigh import RayleighEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.spec import SceneSpec
-from harness.simulation.step import build_initial_state, prepare, simulate_scene
-from solvers.integrators import Motion
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import StopRule, Unsupported
-from solvers.registry import SOLVERS, load_target
+from springbench.harness.reference.reference_trajectory import ReferenceTrajectory, integrate_motion
+from springbench.harness.scenes.effects.air_drag_effect import AirDragEffect
+from springbench.harness.scenes.effects.bending_effect import BendingEffect
+from springbench.harness.scenes.effects.contact_effect import ContactEffect
+from springbench.harness.scenes.effects.dashpots_effect import DashpotsEffect
+from springbench.harness.scenes.effects.ether_drag_effect import EtherDragEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.rayleigh_effect import RayleighEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.simulation.time_loop import build_initial_state, prepare, simulate_scene
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import StopRule, Unsupported
+from springbench.solvers.registry import SOLVERS, load_target
 
 END, ONCE = 0.3, StopRule(1)
 HELD, SOFT = PinsEffect(at=("first",), weight="exact"), SpringsEffect(stretch=20.0)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from springbench.harness.cli.main import app
+from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES
+from springbench.harness.scenes.mesh.mesh_table import MESH_CLASSES
+from springbench.solvers.model.integrators import INTEGRATORS
+from springbench.solvers.registry import SOLVERS
 from typer.testing import CliRunner
-
-from harness.cli import app
-from harness.scenes.effects.effect_names import EFFECT_CLASSES
-from harness.scenes.mesh.mesh_names import MESH_CLASSES
-from solvers.integrators import INTEGRATORS
-from solvers.registry import SOLVERS
 
 SWEEP = """
 scenes: [{scene}]

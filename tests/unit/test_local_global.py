@@ -8,15 +8,23 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
+from springbench.solvers.methods.local_global import reference_local_global
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.methods.local_global.prefactored import require_only_springs
+from springbench.solvers.methods.local_global.reference_local_global import DenseLocalGlobal, SparseLocalGlobal
+from springbench.solvers.model.energies.spring_energy import ZERO_LENGTH, Springs
+from springbench.solvers.model.step_problem import (
+    DirichletPins,
+    NotPositiveDefinite,
+    Positions,
+    StepProblem,
+    StopRule,
+    System,
+    Unsupported,
+)
+from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix
 
-from solvers.core.prefactored import require_only_springs
-from solvers.energies.springs import ZERO_LENGTH, Springs
-from solvers.matrices import assemble_system_matrix
-from solvers.methods import local_global
-from solvers.methods.local_global import DenseLocalGlobal, SparseLocalGlobal
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.problem import DirichletPins, NotPositiveDefinite, Positions, StepProblem, StopRule, System, Unsupported
-from tests.scenes import (
+from tests.scene_builders import (
     LOCAL_GLOBAL_BACKENDS,
     SCENE_BUILDERS,
     build_cloth,
@@ -262,6 +270,6 @@ def test_stiffness_beyond_the_digits_of_inertia_leaves_numbers(backend):
 def test_the_product_with_a_large_dense_matrix_is_the_same(monkeypatch):
     problem = build_first_problem(build_cloth(12))
     usual = iterates(DenseLocalGlobal(), problem, 10)
-    monkeypatch.setattr(local_global, "_LARGE", 0)
+    monkeypatch.setattr(reference_local_global, "_LARGE", 0)
     for one, other in zip(usual, iterates(DenseLocalGlobal(), problem, 10), strict=True):
         np.testing.assert_allclose(other, one, rtol=0.0, atol=1e-12)  # metres, beside an extent of one

@@ -11,12 +11,11 @@ from pathlib import Path
 
 import psutil
 import pytest
+from springbench.harness.errors import InputError
+from springbench.harness.execution import machine_info
 from threadpoolctl import threadpool_info
 
-from harness.base import machine
-from harness.base.errors import InputError
-
-CORES = machine.describe_machine().cores
+CORES = machine_info.describe_machine().cores
 
 
 def git(folder: Path, *arguments: str) -> str:
@@ -38,21 +37,21 @@ def checkout(tmp_path: Path) -> Path:
 
 
 def test_the_machine_is_described():
-    here = machine.describe_machine()
+    here = machine_info.describe_machine()
     assert here.cpu.strip() == here.cpu != ""
     assert 1 <= here.cores <= (os.cpu_count() or 1)
     assert 0.1 < here.memory_gib < 1e5
     assert platform.system() in here.operating_system
-    assert here == machine.describe_machine()
+    assert here == machine_info.describe_machine()
 
 
 def test_the_machine_does_not_tell_its_host_name():
     name = re.compile(rf"\b{re.escape(socket.gethostname())}\b")
-    assert not [value for value in astuple(machine.describe_machine()) if name.search(str(value))]
+    assert not [value for value in astuple(machine_info.describe_machine()) if name.search(str(value))]
 
 
 def test_the_id_depends_on_processor_cores_and_memory_alone():
-    here = machine.MachineInfo(cpu="a processor", cores=2, memory_gib=23.5, operating_system="a system")
+    here = machine_info.MachineInfo(cpu="a processor", cores=2, memory_gib=23.5, operating_system="a system")
     assert re.fullmatch(r"[0-9a-f]{12}", here.machine_id)
     assert replace(here, operating_system="another").machine_id == here.machine_id
     assert (
@@ -65,46 +64,46 @@ def test_the_id_depends_on_processor_cores_and_memory_alone():
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system has no affinity of processes")
 def test_the_cores_are_those_that_the_process_may_use():
     code = "import os; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))]); "
-    code += "from harness.base import machine; print(machine.describe().cores)"
+    code += "from springbench.harness.execution import machine; print(machine.describe().cores)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout == b"1\n"
 
 
 def test_the_versions_name_python_and_the_numeric_libraries():
-    found = machine.collect_versions()
+    found = machine_info.collect_versions()
     assert found["python"] == platform.python_version()
     assert {"numpy", "scipy", "numba"} <= found.keys()
     assert all(re.match(r"\d+\.\d+", version) for version in found.values())
 
 
 def test_a_clean_checkout_gives_its_commit(checkout: Path):
-    assert machine.read_commit(checkout) == git(checkout, "rev-parse", "HEAD")
+    assert machine_info.read_commit(checkout) == git(checkout, "rev-parse", "HEAD")
 
 
 def test_a_tag_does_not_hide_the_commit(checkout: Path):
     git(checkout, "tag", "-a", "v1", "-m", "one")
-    assert machine.read_commit(checkout) == git(checkout, "rev-parse", "HEAD")
+    assert machine_info.read_commit(checkout) == git(checkout, "rev-parse", "HEAD")
 
 
 def test_a_changed_file_makes_the_commit_dirty(checkout: Path):
     (checkout / "harness" / "one.py").write_text("x = 2\n")
-    assert machine.read_commit(checkout) == git(checkout, "rev-parse", "HEAD") + "-dirty"
+    assert machine_info.read_commit(checkout) == git(checkout, "rev-parse", "HEAD") + "-dirty"
 
 
 def test_a_folder_inside_a_foreign_checkout_has_an_unknown_commit(checkout: Path):
-    assert machine.read_commit(checkout / "harness") == "unknown"
+    assert machine_info.read_commit(checkout / "harness") == "unknown"
 
 
 def test_without_git_the_commit_is_unknown(checkout: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("PATH", str(checkout))
-    assert machine.read_commit(checkout) == "unknown"
+    assert machine_info.read_commit(checkout) == "unknown"
 
 
 def test_the_commit_is_the_projects_wherever_the_process_was_started(checkout: Path, monkeypatch: pytest.MonkeyPatch):
     foreign = git(checkout, "rev-parse", "HEAD")
     monkeypatch.chdir(checkout)
     monkeypatch.setenv("GIT_DIR", str(checkout / ".git"))
-    machine.read_commit.cache_clear()
-    assert foreign not in machine.read_commit()
+    machine_info.read_commit.cache_clear()
+    assert foreign not in machine_info.read_commit()
 
 
 def test_the_code_hash_follows_names_and_contents_of_the_sources(tmp_path: Path):
@@ -114,16 +113,16 @@ def test_the_code_hash_follows_names_and_contents_of_the_sources(tmp_path: Path)
         for package in ("harness", "solvers"):
             (root / package).mkdir(parents=True)
         (root / "solvers" / f"{name}.py").write_text(text)
-        seen.append(machine.hash_sources(root))
+        seen.append(machine_info.hash_sources(root))
         (root / "solvers" / "notes.txt").write_text("not a source")
-        machine.hash_sources.cache_clear()
-        assert machine.hash_sources(root) == seen[-1]
+        machine_info.hash_sources.cache_clear()
+        assert machine_info.hash_sources(root) == seen[-1]
     assert len(set(seen)) == 4
     assert all(re.fullmatch(r"[0-9a-f]{12}", each) for each in seen)
 
 
 PINNED = """
-from harness.base.machine import pinned_threads
+from springbench.harness.base.machine import pinned_threads
 from threadpoolctl import threadpool_info
 with pinned_threads({threads}):
     import numba, numpy, scipy.linalg
@@ -150,7 +149,7 @@ def test_pinned_threads_are_restored_even_after_a_failure():
         return [numba.get_num_threads(), *(pool["num_threads"] for pool in threadpool_info())]
 
     def fail() -> None:
-        with machine.limit_threads(1):
+        with machine_info.limit_threads(1):
             assert numba.get_num_threads() == 1
             raise ZeroDivisionError
 
@@ -162,7 +161,7 @@ def test_pinned_threads_are_restored_even_after_a_failure():
 
 @pytest.mark.parametrize("threads", [0, -1, CORES + 1])
 def test_more_threads_than_usable_cores_are_the_users_mistake(threads: int):
-    with pytest.raises(InputError, match=rf"from 1 to {CORES}, .* not {threads}"), machine.limit_threads(threads):
+    with pytest.raises(InputError, match=rf"from 1 to {CORES}, .* not {threads}"), machine_info.limit_threads(threads):
         pass
 
 
@@ -171,13 +170,13 @@ def looked(monkeypatch: pytest.MonkeyPatch):
     """Says how busy four cores are [%]; what was found of them is forgotten before and after."""
 
     def pretend(*busy: float) -> None:
-        monkeypatch.setattr(machine, "_usable", lambda: 4)
-        monkeypatch.setattr(machine.os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
+        monkeypatch.setattr(machine_info, "_usable", lambda: 4)
+        monkeypatch.setattr(machine_info.os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
         monkeypatch.setattr(psutil, "cpu_percent", lambda _, percpu: list(busy))
 
-    machine._count_idle_cores.cache_clear()
+    machine_info._count_idle_cores.cache_clear()
     yield pretend
-    machine._count_idle_cores.cache_clear()
+    machine_info._count_idle_cores.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -186,18 +185,18 @@ def looked(monkeypatch: pytest.MonkeyPatch):
 )
 def test_threads_are_as_many_as_there_are_idle_cores(looked, busy: tuple[float, ...], number: int):
     looked(*busy)
-    found = machine.choose_threads("auto")
+    found = machine_info.choose_threads("auto")
     assert found.count == number
     assert f"{number} of 4" in found.reason
 
 
 def test_a_number_that_was_given_stays(looked):
     looked(100, 100, 100, 100)
-    assert machine.choose_threads(3) == machine.ThreadChoice(3)
+    assert machine_info.choose_threads(3) == machine_info.ThreadChoice(3)
 
 
 def test_the_choice_stays_the_same_all_the_process_long(looked):
     looked(0, 0, 0, 0)
-    first = machine.choose_threads("auto")
+    first = machine_info.choose_threads("auto")
     looked(100, 100, 100, 100)
-    assert machine.choose_threads("auto") is first
+    assert machine_info.choose_threads("auto") is first

@@ -13,14 +13,18 @@ from pathlib import Path
 from time import monotonic
 
 import pytest
-
-from harness.base.asides import WAITING, parse_activity_end, parse_activity_start
-from harness.base.crew import PoolTask, run_tasks
-from harness.base.errors import InputError
-from harness.base.files import open_lock_file
-from harness.base.holding import UnitClaims, lock_folder_shared
-from harness.base.machine_lock import TimingSession, lock_timing_exclusive, lock_timing_shared, reserve_cores
-from harness.base.workers import ProgressCallback, TaskLimits
+from springbench.harness.atomic_files import open_lock_file
+from springbench.harness.errors import InputError
+from springbench.harness.execution.folder_locks import UnitClaims, lock_folder_shared
+from springbench.harness.execution.isolated_worker import ProgressCallback, TaskLimits
+from springbench.harness.execution.progress_events import WAITING, parse_activity_end, parse_activity_start
+from springbench.harness.execution.timing_lock import (
+    TimingSession,
+    lock_timing_exclusive,
+    lock_timing_shared,
+    reserve_cores,
+)
+from springbench.harness.execution.worker_pool import PoolTask, run_tasks
 
 SOON, PATIENCE = 0.1, 60.0
 

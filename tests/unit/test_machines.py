@@ -9,21 +9,21 @@ from typing import Any
 import pyarrow as pa
 import pytest
 from rich.console import Console
+from springbench.harness.atomic_files import user_cache_dir
+from springbench.harness.cli.main import app
+from springbench.harness.execution.machine_info import compute_node_id, describe_machine
+from springbench.harness.experiments import machine_calibration
+from springbench.harness.report.machine_footer import COMPARISON_NOTE
+from springbench.harness.report.median_times import write_medians
+from springbench.harness.report.robustness import build_score_table
+from springbench.harness.report.sweep_summary import summarise_sweep
+from springbench.harness.report.timing_table import build_summary_table, label_runs, read_run_times
+from springbench.harness.results import parquet_rows
+from springbench.harness.results.run_schema import RUN_SCHEMA
 from typer.testing import CliRunner
 
-from harness.base import rows
-from harness.base.columns import RUN_SCHEMA
-from harness.base.files import user_cache_dir
-from harness.base.machine import compute_node_id, describe_machine
-from harness.cli import app
-from harness.experiments import ability
-from harness.report.learned import summarise_sweep
-from harness.report.machines import COMPARISON_NOTE
-from harness.report.medians import write_medians
-from harness.report.robustness import build_score_table
-from harness.report.timing_table import build_summary_table, label_runs, read_run_times
 from tests.contracts.hostile import scene
-from tests.dummies import build_dummy_rows
+from tests.synthetic_run_rows import build_dummy_rows
 
 ABLE = {"machine_bandwidth": 12.0e9, "machine_flops": 40.0e9, "machine_step": 3.1e-3}
 
@@ -98,7 +98,7 @@ def test_list_query_and_merge_say_it(tmp_path: Path):
     )
     for name, told in zip("ab", (two_machines()[:2], two_machines()[2:]), strict=True):
         (tmp_path / name / "sweep" / "rows").mkdir(parents=True)
-        rows.write_rows(tmp_path / name / "sweep" / "rows" / f"{name}.parquet", told)
+        parquet_rows.write_rows(tmp_path / name / "sweep" / "rows" / f"{name}.parquet", told)
     question = "SELECT machine, median(seconds) FROM rows GROUP BY ALL"
     assert COMPARISON_NOTE in command("query", question, "--results", tmp_path / "a")
     assert COMPARISON_NOTE not in command("query", question, "--results", tmp_path / "a", "--csv"), (
@@ -116,26 +116,26 @@ def test_a_report_says_that_its_counts_may_be_compared():
 
 def test_what_a_machine_can_do_is_found_once_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(ability, "_KNOWN", {})
-    monkeypatch.setattr(ability, "_OWN", 0.0)  # whatever else runs here
-    found = ability.calibrate_machine(lambda said: None)
-    assert set(found) == set(ability.CALIBRATION_COLUMNS)
+    monkeypatch.setattr(machine_calibration, "_KNOWN", {})
+    monkeypatch.setattr(machine_calibration, "_OWN", 0.0)  # whatever else runs here
+    found = machine_calibration.calibrate_machine(lambda said: None)
+    assert set(found) == set(machine_calibration.CALIBRATION_COLUMNS)
     assert 1e7 < found["machine_bandwidth"] < 1e13
     assert 1e7 < found["machine_flops"] < 1e13
     assert 1e-6 < found["machine_step"] < 10.0
     (kept,) = user_cache_dir("machine").iterdir()
     assert kept.stem == compute_node_id()
     for name in ("bandwidth", "flops", "step"):
-        monkeypatch.delattr(ability, name)  # what is kept is not found again
-    monkeypatch.setattr(ability, "_KNOWN", {})
-    assert ability.calibrate_machine(lambda said: None) == found
+        monkeypatch.delattr(machine_calibration, name)  # what is kept is not found again
+    monkeypatch.setattr(machine_calibration, "_KNOWN", {})
+    assert machine_calibration.calibrate_machine(lambda said: None) == found
 
 
 def test_what_a_busy_machine_can_do_is_told_and_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(ability, "_KNOWN", {})
-    monkeypatch.setattr(ability, "_OWN", 2.0)  # more than any thread can have
-    assert set(ability.calibrate_machine(lambda said: None)) == set(ability.CALIBRATION_COLUMNS)
+    monkeypatch.setattr(machine_calibration, "_KNOWN", {})
+    monkeypatch.setattr(machine_calibration, "_OWN", 2.0)  # more than any thread can have
+    assert set(machine_calibration.calibrate_machine(lambda said: None)) == set(machine_calibration.CALIBRATION_COLUMNS)
     assert not user_cache_dir("machine").exists()
 
 
@@ -144,6 +144,6 @@ def test_a_run_without_the_memory_for_it_is_done_all_the_same(tmp_path: Path, mo
         raise MemoryError
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(ability, "_KNOWN", {})
-    monkeypatch.setattr(ability, "bandwidth", full)
-    assert ability.calibrate_machine(lambda said: None) == {}
+    monkeypatch.setattr(machine_calibration, "_KNOWN", {})
+    monkeypatch.setattr(machine_calibration, "bandwidth", full)
+    assert machine_calibration.calibrate_machine(lambda said: None) == {}

@@ -9,16 +9,15 @@ import numpy as np
 import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import spsolve
-
-from harness.base.errors import InputError
-from harness.scenes.material import SCALING_RULES, compute_spring_stiffness
-from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.generator import MeshGenerator
-from harness.scenes.mesh.grid import GridMesh, NetMesh
-from harness.scenes.mesh.solids import BlockMesh, TowerMesh
-from harness.scenes.mesh.surfaces import BalloonMesh, SkirtMesh
-from harness.scenes.weave import OrthotropicStiffness
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh, NetMesh
+from springbench.harness.scenes.mesh.mesh import BEND, SHEAR, STRETCH, Mesh
+from springbench.harness.scenes.mesh.mesh_generator import MeshGenerator
+from springbench.harness.scenes.mesh.solid_meshes import BlockMesh, TowerMesh
+from springbench.harness.scenes.mesh.surface_meshes import BalloonMesh, SkirtMesh
+from springbench.harness.scenes.orthotropic_cloth import OrthotropicStiffness
+from springbench.harness.scenes.spring_stiffness import SCALING_RULES, compute_spring_stiffness
 
 ROUND_OFF = 1e-9
 """Relative error of a sparse solve with a few thousand unknowns and a condition number below 1e6."""

@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
-
-from solvers import matrices
-from solvers.energies.springs import Springs
-from solvers.problem import DirichletPins, NotPositiveDefinite, System
+from springbench.solvers.model import system_matrix_assembly
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.step_problem import DirichletPins, NotPositiveDefinite, System
 
 EXACT = 0.0
 """Both sides do the same few additions of the same numbers."""
@@ -32,16 +31,32 @@ BY_HAND = {
 
 def dense_matrices(springs, stiffness, mass, time_step, pinned, weight):
     n = len(mass)
-    A, M = matrices.signed_incidence_matrix_dense(springs, n), matrices.mass_matrix_dense(mass)
-    C = matrices.selection_matrix_dense(pinned, n)
-    return {"A": A, "M": M, "C": C, "Q": matrices.system_matrix_dense(A, stiffness, M, time_step, C, weight)}
+    A, M = (
+        system_matrix_assembly.signed_incidence_matrix_dense(springs, n),
+        system_matrix_assembly.mass_matrix_dense(mass),
+    )
+    C = system_matrix_assembly.selection_matrix_dense(pinned, n)
+    return {
+        "A": A,
+        "M": M,
+        "C": C,
+        "Q": system_matrix_assembly.system_matrix_dense(A, stiffness, M, time_step, C, weight),
+    }
 
 
 def sparse_matrices(springs, stiffness, mass, time_step, pinned, weight):
     n = len(mass)
-    A, M = matrices.signed_incidence_matrix_sparse(springs, n), matrices.mass_matrix_sparse(mass)
-    C = matrices.selection_matrix_sparse(pinned, n)
-    return {"A": A, "M": M, "C": C, "Q": matrices.system_matrix_sparse(A, stiffness, M, time_step, C, weight)}
+    A, M = (
+        system_matrix_assembly.signed_incidence_matrix_sparse(springs, n),
+        system_matrix_assembly.mass_matrix_sparse(mass),
+    )
+    C = system_matrix_assembly.selection_matrix_sparse(pinned, n)
+    return {
+        "A": A,
+        "M": M,
+        "C": C,
+        "Q": system_matrix_assembly.system_matrix_sparse(A, stiffness, M, time_step, C, weight),
+    }
 
 
 @st.composite
@@ -109,7 +124,7 @@ def test_no_explicit_zeros_are_stored_for_zero_mass_zero_stiffness_twins_and_loo
 
 
 def test_a_loop_has_an_empty_row_in_the_incidence():
-    assert matrices.signed_incidence_matrix_sparse(np.array([[1, 1], [0, 1]]), 2).toarray().tolist() == [
+    assert system_matrix_assembly.signed_incidence_matrix_sparse(np.array([[1, 1], [0, 1]]), 2).toarray().tolist() == [
         [0, 0],
         [1, -1],
     ]
@@ -125,7 +140,9 @@ def test_one_number_stands_for_the_stiffness_of_every_spring_and_the_weight_of_e
 
 def test_rest_lengths_are_the_distances_of_the_ends():
     rest = np.array([[0.0, 0, 0], [3, 4, 0], [3, 4, 12]])
-    np.testing.assert_array_equal(matrices.rest_lengths(rest, np.array([[0, 1], [2, 1], [1, 1]])), [5, 12, 0])
+    np.testing.assert_array_equal(
+        system_matrix_assembly.rest_lengths(rest, np.array([[0, 1], [2, 1], [1, 1]])), [5, 12, 0]
+    )
 
 
 @given(networks())
@@ -137,7 +154,7 @@ def test_the_matrix_of_a_system_is_the_assignments_without_exact_pins(network):
     system = System(mass, time_step, (energy,), DirichletPins(pinned, mixed))
     soft = np.isfinite(mixed)
     wanted = dense_matrices(springs, stiffness, mass, time_step, pinned[soft], weight[soft])["Q"]
-    made = matrices.assemble_system_matrix(system, [energy])
+    made = system_matrix_assembly.assemble_system_matrix(system, [energy])
     np.testing.assert_allclose(made.toarray(), wanted, rtol=0, atol=ROUND_OFF * np.abs(wanted).max())
     assert made.nnz == len(mass) + 2 * len(springs)
 
@@ -150,7 +167,7 @@ def test_the_energy_norm_is_a_number_where_round_off_makes_its_square_negative()
     for Q in (dense_matrices(*network)["Q"], sparse_matrices(*network)["Q"]):
         assert min(np.einsum("ij,ij->", e, Q @ e) for e in shifts) < 0.0
         # Springs do not feel a shift: the square is zero but for round-off of some 1e-15.
-        assert all(0.0 <= matrices.energy_norm(Q, e) < 1e-6 for e in shifts)
+        assert all(0.0 <= system_matrix_assembly.energy_norm(Q, e) < 1e-6 for e in shifts)
 
 
 LOOSE = {
@@ -180,7 +197,7 @@ def test_vertices_that_nothing_determines_are_named(case):
     springs, stiffness, mass, pinned, named = LOOSE[case]
     system, energy = bare_system(springs, stiffness, mass, pinned)
     with pytest.raises(NotPositiveDefinite) as raised:
-        matrices.assemble_system_matrix(system, [energy])
+        system_matrix_assembly.assemble_system_matrix(system, [energy])
     assert named in str(raised.value)
 
 
@@ -189,4 +206,7 @@ def test_vertices_that_nothing_determines_are_named(case):
 def test_a_mass_or_a_pin_determines_all_that_springs_tie_to_it(case, weight):
     springs, stiffness, mass, pinned = HELD[case]
     system, energy = bare_system(springs, stiffness, mass, pinned, weight)
-    assert matrices.assemble_system_matrix(system, [energy]).shape == (system.num_vertices, system.num_vertices)
+    assert system_matrix_assembly.assemble_system_matrix(system, [energy]).shape == (
+        system.num_vertices,
+        system.num_vertices,
+    )

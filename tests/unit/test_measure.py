@@ -14,13 +14,12 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-
-from harness.base.errors import RunFailed
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.simulation import times
-from harness.simulation.clock import PhaseWatch
-from harness.simulation.measure import (
+from springbench.harness.errors import RunFailed
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.simulation import timing_rows
+from springbench.harness.simulation.stopwatch import PhaseWatch
+from springbench.harness.simulation.timing_pass import (
     ITERATION_PHASE,
     PHASE_REPEATS,
     RunMeasurement,
@@ -28,8 +27,9 @@ from harness.simulation.measure import (
     TimingSample,
     measure_run,
 )
-from solvers.problem import Positions, Solution, StepProblem, StopRule, System
-from tests.scenes import build_test_scene
+from springbench.solvers.model.step_problem import Positions, Solution, StepProblem, StopRule, System
+
+from tests.scene_builders import build_test_scene
 
 FRAMES, ROUNDS, ITERATIONS = 3, 2, 4
 MADE = build_test_scene(ChainMesh(), GravityEffect(), size=4)
@@ -134,12 +134,16 @@ def test_every_time_lies_within_what_its_watch_saw(seen):
 
 def test_rows_tell_both_clocks_and_that_a_solver_which_sleeps_was_interrupted(seen):
     _, measured, _ = seen
-    for row in times.build_timing_rows(measured):
+    for row in timing_rows.build_timing_rows(measured):
         assert row["summed_seconds"] <= row["pass_seconds"] * (1 + 5e-4)
         assert row["cpu_seconds"] < row["pass_seconds"]
         assert row["interrupted"]
     by_round = [
-        {r["summed_seconds"] for r in times.build_timing_rows(measured) if r["round"] == k and r["phase"] == "step"}
+        {
+            r["summed_seconds"]
+            for r in timing_rows.build_timing_rows(measured)
+            if r["round"] == k and r["phase"] == "step"
+        }
         for k in (0, 1)
     ]
     for round, told in enumerate(by_round):
@@ -162,7 +166,7 @@ def test_no_row_is_made_of_times_that_are_scaled(seen, phase: str):
         key: PhaseWatch(1, walls[key], watch.entered, walls[key], walls[key]) for key, watch in measured.watches.items()
     }
     with pytest.raises(RunFailed, match=f"the times of {phase} add up to"):
-        times.build_timing_rows(RunMeasurement(measured.prepared, scaled, busy, measured.final_positions))
+        timing_rows.build_timing_rows(RunMeasurement(measured.prepared, scaled, busy, measured.final_positions))
 
 
 PARTS = {
@@ -190,6 +194,6 @@ def test_rows_say_whether_phases_add_up_to_an_iteration(phases: dict[str, float]
         watch.wall_seconds = watch.process_seconds = watch.thread_seconds = watch.wall_seconds + t.seconds * t.num_calls
     found = {
         row["phase"]: row["adds_up"]
-        for row in times.build_timing_rows(RunMeasurement(Sleeper(), timings, watches, np.zeros((4, 3))))
+        for row in timing_rows.build_timing_rows(RunMeasurement(Sleeper(), timings, watches, np.zeros((4, 3))))
     }
     assert found == {"step": None, ITERATION_PHASE: expected} | dict.fromkeys(phases, expected)

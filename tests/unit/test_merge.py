@@ -6,12 +6,12 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from springbench.harness.errors import InputError
+from springbench.harness.experiments.archive.compaction import compact_results
+from springbench.harness.experiments.archive.result_merge import MergeReport, merge_results
+from springbench.harness.results import parquet_rows, row_store
 
-from harness.base import rows, shelf
-from harness.base.errors import InputError
-from harness.experiments.archive.compact import compact_results
-from harness.experiments.archive.merge import MergeReport, merge_results
-from tests.dummies import build_dummy_rows, write_dummy_runs
+from tests.synthetic_run_rows import build_dummy_rows, write_dummy_runs
 
 
 def merged(folder: Path, *names: str) -> MergeReport:
@@ -20,7 +20,7 @@ def merged(folder: Path, *names: str) -> MergeReport:
 
 def rewritten(unit: Path, **changed: Any) -> None:
     """A unit's rows with other values."""
-    rows.write_rows(unit, [row | changed for row in build_dummy_rows(int(unit.stem[-12:], 16))])
+    parquet_rows.write_rows(unit, [row | changed for row in build_dummy_rows(int(unit.stem[-12:], 16))])
 
 
 @pytest.fixture
@@ -39,8 +39,8 @@ def two(tmp_path: Path) -> Path:
 def test_all_runs_are_there_once_with_their_recordings_and_again_changes_nothing(two: Path):
     found = merged(two, "a", "b")
     assert found == MergeReport(5, 1, [], [], found.machine_summary)
-    units = shelf.list_units(two / "all" / "sweep" / "rows")
-    assert sorted(set(map(str, rows.read_rows(units)["run_id"].to_pylist()))) == [f"{k:012x}" for k in range(5)]
+    units = row_store.list_units(two / "all" / "sweep" / "rows")
+    assert sorted(set(map(str, parquet_rows.read_rows(units)["run_id"].to_pylist()))) == [f"{k:012x}" for k in range(5)]
     for part in ("recordings", "pictures"):
         assert [path.stem for path in sorted((two / "all" / "sweep" / part).iterdir())] == [u.stem for u in units]
     before = {path: path.stat().st_mtime_ns for path in two.rglob("*") if path.is_file()}
@@ -49,23 +49,23 @@ def test_all_runs_are_there_once_with_their_recordings_and_again_changes_nothing
 
 
 def test_a_run_that_was_done_twice_keeps_both_rows_and_the_newer_its_name(two: Path):
-    (unit,) = (unit for unit in shelf.list_units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
+    (unit,) = (unit for unit in row_store.list_units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
     rewritten(unit, started="2027-01-01T00:00:00+00:00", seconds=9.0)
     for order in (("a", "b"), ("b", "a")):
         found = merge_results([two / name for name in order], two / f"all-{order[0]}", lambda line: None)
         assert found == MergeReport(6, 0, [], [], found.machine_summary)
-        there = [u for u in shelf.list_units(two / f"all-{order[0]}" / "sweep" / "rows") if unit.stem in u.stem]
-        assert [rows.read_rows([u])["seconds"][0].as_py() for u in there] == [9.0, 0.003]
+        there = [u for u in row_store.list_units(two / f"all-{order[0]}" / "sweep" / "rows") if unit.stem in u.stem]
+        assert [parquet_rows.read_rows([u])["seconds"][0].as_py() for u in there] == [9.0, 0.003]
         assert there[0].stem == unit.stem
         assert there[1].stem.startswith(f"{unit.stem}~")
 
 
 def test_positions_that_differ_are_a_conflict_on_one_machine_and_told_between_two(two: Path):
-    (unit,) = (unit for unit in shelf.list_units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
+    (unit,) = (unit for unit in row_store.list_units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
     rewritten(unit, digest="f" * 64)
     found = merged(two, "a", "b")
     assert found.conflicts == found.cross_machine_differences == ["scene2 10 hybrid: from step 1"]
-    rows.write_rows(
+    parquet_rows.write_rows(
         unit.with_name("there.parquet"), [r | {"digest": "e" * 64, "run_id": "e"} for r in build_dummy_rows(2)]
     )
     unit.unlink()
@@ -77,7 +77,7 @@ def test_folders_that_look_like_columns_or_patterns_are_merged_as_all_are(two: P
     for name, other in (("a", "size=64"), ("b", "solver=x[1]")):
         (two / name).rename(two / other)
     merge_results([two / "size=64", two / "solver=x[1]"], two / "status=failed", lambda line: None)
-    found = rows.read_rows_by_file(shelf.list_units(two / "status=failed" / "sweep" / "rows"))
+    found = parquet_rows.read_rows_by_file(row_store.list_units(two / "status=failed" / "sweep" / "rows"))
     wanted = [row for number in range(5) for row in build_dummy_rows(number)]
     for name in ("run_id", "size", "solver", "status"):
         assert found[name].to_pylist() == [row[name] for row in wanted]
@@ -86,7 +86,7 @@ def test_folders_that_look_like_columns_or_patterns_are_merged_as_all_are(two: P
 def test_rows_that_are_not_written_as_they_were_replace_nothing(two: Path, monkeypatch: pytest.MonkeyPatch):
     merged(two, "a")
     before = {path: path.read_bytes() for path in (two / "all").rglob("*.parquet")}
-    (unit,) = (unit for unit in shelf.list_units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
+    (unit,) = (unit for unit in row_store.list_units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
     rewritten(unit, started="2027-01-01T00:00:00+00:00")
     write = pq.write_table
     monkeypatch.setattr(pq, "write_table", lambda table, file: write(table.slice(1), file))
@@ -96,7 +96,7 @@ def test_rows_that_are_not_written_as_they_were_replace_nothing(two: Path, monke
 
 
 def test_a_column_of_another_type_is_named_before_anything_is_written(two: Path):
-    unit = shelf.list_units(two / "a" / "sweep" / "rows")[1]
+    unit = row_store.list_units(two / "a" / "sweep" / "rows")[1]
     table = pq.read_table(unit)
     for name, values in (("size", ["large", "small"]), ("digest", [1.5, 2.5])):
         pq.write_table(table.set_column(table.schema.get_field_index(name), name, pa.array(values)), unit)
@@ -113,7 +113,7 @@ def test_what_cannot_be_merged_is_the_users_mistake(two: Path):
     (two / "empty").mkdir()
     with pytest.raises(InputError, match="holds no rows"):
         merged(two, "a", "empty")
-    unit = shelf.list_units(two / "a" / "sweep" / "rows")[0]
+    unit = row_store.list_units(two / "a" / "sweep" / "rows")[0]
     unit.write_bytes(b"PAR1")
     with pytest.raises(InputError, match=unit.name):
         merged(two, "a", "b")

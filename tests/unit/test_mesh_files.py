@@ -10,12 +10,11 @@ from pathlib import Path
 import meshio
 import numpy as np
 import pytest
-
-from harness.base.errors import InputError
-from harness.scenes.effects.gas import GasEffect
-from harness.scenes.mesh import cells as cells_module
-from harness.scenes.mesh.base import SHEAR, STRETCH
-from harness.scenes.mesh.files import FileMesh
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.effects.gas_effect import GasEffect
+from springbench.harness.scenes.mesh import spring_network as cells_module
+from springbench.harness.scenes.mesh.file_mesh import FileMesh
+from springbench.harness.scenes.mesh.mesh import SHEAR, STRETCH
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 SIDES = [[0, 1], [0, 3], [1, 2], [2, 3]]

@@ -7,16 +7,15 @@ from importlib import import_module
 
 import numpy as np
 import pytest
-
-from harness.base.errors import InputError
-from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
-from harness.scenes.mesh.chain import ChainMesh, RopeMesh
-from harness.scenes.mesh.generator import MAX_VERTICES, MeshGenerator
-from harness.scenes.mesh.grid import GridMesh, NetMesh
-from harness.scenes.mesh.mesh_names import MESH_CLASSES
-from harness.scenes.mesh.solids import BlockMesh, TowerMesh
-from harness.scenes.mesh.surfaces import BalloonMesh, SkirtMesh
-from solvers import memory
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh, RopeMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh, NetMesh
+from springbench.harness.scenes.mesh.mesh import BEND, SHEAR, STRETCH, Mesh
+from springbench.harness.scenes.mesh.mesh_generator import MAX_VERTICES, MeshGenerator
+from springbench.harness.scenes.mesh.mesh_table import MESH_CLASSES
+from springbench.harness.scenes.mesh.solid_meshes import BlockMesh, TowerMesh
+from springbench.harness.scenes.mesh.surface_meshes import BalloonMesh, SkirtMesh
+from springbench.solvers.linalg import memory
 
 ROUND_OFF = 1e-12
 """A few thousand additions of numbers of order one in float64."""

@@ -7,28 +7,34 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect as PinsEffect
-from harness.scenes.effects.springs import SpringsEffect as SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.simulation.step import prepare, simulate_scene
-from solvers.energies.springs import Springs
-from solvers.linear.near_kernel import (
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect as PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect as SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.linalg.multigrid.near_nullspace import (
     PreconditionedSolve,
     ProlongationHierarchy,
     VCycle,
     compute_near_nullspace,
     ordered_norm,
 )
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.methods.mgpbd import MultigridXpbd
-from solvers.methods.newton import NewtonSolver
-from solvers.methods.xpbd import Xpbd
-from solvers.problem import DirichletPins, StepProblem, StopRule, System, Unsupported
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.position_based.mgpbd import MultigridXpbd
+from springbench.solvers.methods.position_based.xpbd import Xpbd
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.step_problem import DirichletPins, StepProblem, StopRule, System, Unsupported
+
 from tests.bench.duals import course, mgpbd, xpbd
-from tests.scenes import build_cloth, build_first_problem, build_random_problem, build_step_start, build_test_scene
+from tests.scene_builders import (
+    build_cloth,
+    build_first_problem,
+    build_random_problem,
+    build_step_start,
+    build_test_scene,
+)
 from tests.unit.test_xpbd import Other, without_mass
 
 STIFF = build_first_problem(build_cloth(16, "exact", stretch=1e4))

@@ -9,12 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-
-from harness.config.load import load_scene
-from harness.reference.curvature import compute_curvature
-from harness.reference.frozen import StepSnapshot
-from harness.reference.judge import is_minimum
-from harness.reference.minimiser import (
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.reference.certified_minimum import (
     INACCURATE,
     SADDLE,
     VALLEY,
@@ -25,12 +21,16 @@ from harness.reference.minimiser import (
     find_minima,
     refine_minimum,
 )
-from harness.reference.store import ReferenceStore
-from solvers.energies.springs import Springs
-from solvers.integrators import Motion
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import DirichletPins, Positions, Solution, StepProblem, StopRule, System
-from tests.scenes import build_cloth, build_first_problem, build_random_problem, build_step_start
+from springbench.harness.reference.hessian_curvature import compute_curvature
+from springbench.harness.reference.reference_store import ReferenceStore
+from springbench.harness.reference.step_snapshot import StepSnapshot
+from springbench.harness.reference.step_verifier import is_minimum
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import DirichletPins, Positions, Solution, StepProblem, StopRule, System
+
+from tests.scene_builders import build_cloth, build_first_problem, build_random_problem, build_step_start
 
 PROBLEMS: dict[str, Callable[[], StepProblem]] = {
     "cloth": lambda: build_first_problem(build_cloth(6, "exact")),

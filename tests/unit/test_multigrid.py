@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky
+from springbench.solvers.linalg.multigrid.multigrid_kernels import build_aggregates, filter_weak_entries
+from springbench.solvers.linalg.multigrid.smoothed_aggregation import Multigrid
 
-from solvers.linear.multigrid import Multigrid
-from solvers.linear.multigrid_kernels import build_aggregates, filter_weak_entries
-from solvers.linear.supernodal import SupernodalCholesky
-from tests.networks import grid_matrix, grid_springs, network_matrix, random_right_hand_sides
+from tests.network_matrices import grid_matrix, grid_springs, network_matrix, random_right_hand_sides
 
 SHEET, SOLID = grid_matrix(70, 70), grid_matrix(14, 14, 14)
 

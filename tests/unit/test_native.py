@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.results.solver_metadata import read_solver_metadata
+from springbench.solvers.iteration.solver_info import LOCAL_GLOBAL_FAMILY
+from springbench.solvers.methods.local_global import cpp_backend
+from springbench.solvers.methods.local_global.prefactored import PreparedLocalGlobal
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.model.step_problem import NotPositiveDefinite, Positions, StopRule, System, Unsupported
+from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS, load_target
 
-from harness.base.stated import read_solver_metadata
-from harness.config.load import load_config
-from solvers.about import LOCAL_GLOBAL_FAMILY
-from solvers.core import native
-from solvers.core.prefactored import PreparedLocalGlobal
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import NotPositiveDefinite, Positions, StopRule, System, Unsupported
-from solvers.registry import OPTIONAL_SOLVERS, SOLVERS, load_target
-from tests.scenes import build_cloth, build_first_problem
+from tests.scene_builders import build_cloth, build_first_problem
 
 NATIVE = ("eigen", "cholmod")
 
@@ -67,7 +67,7 @@ def test_a_matrix_without_a_factor_is_refused(name: str):
 
 @pytest.mark.parametrize("name", NATIVE)
 def test_other_energies_are_refused_before_anything_is_compiled(name: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(native, "library", lambda *_: pytest.fail("compiled"))
+    monkeypatch.setattr(cpp_backend, "library", lambda *_: pytest.fail("compiled"))
     system = build_cloth(3).system
     with pytest.raises(Unsupported, match=f"{name}: knows springs only"):
         load_target(OPTIONAL_SOLVERS[name])().prepare(
@@ -88,10 +88,10 @@ class _Other:
 
 @pytest.mark.parametrize("name", NATIVE)
 def test_without_a_compiler_the_row_says_so(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from harness.experiments.plan import RunFiles
-    from harness.experiments.run import execute_run
+    from springbench.harness.experiments.run_pipeline import execute_run
+    from springbench.harness.experiments.sweep_plan import RunFiles
 
-    monkeypatch.setattr(native.shutil, "which", lambda _: None)
+    monkeypatch.setattr(cpp_backend.shutil, "which", lambda _: None)
     (tmp_path / "chain.yaml").write_text(SCENE)
     (run,) = load_config(tmp_path / "chain.yaml", solvers=[name]).list_runs()
     (tmp_path / "rows").mkdir()

@@ -7,23 +7,23 @@ from itertools import islice, pairwise
 
 import numpy as np
 import pytest
+from springbench.harness.reference.hessian_curvature import build_free_hessian
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect as PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect as SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.simulation.time_loop import build_problem
+from springbench.solvers.iteration.descent_method import PreparedDescent
+from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
+from springbench.solvers.methods.newton.negative_curvature import is_positive_definite
+from springbench.solvers.methods.newton.newton_cg import NewtonCG
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.step_problem import Positions, StepProblem, StopRule
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
 
-from harness.reference.curvature import build_free_hessian
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect as PinsEffect
-from harness.scenes.effects.springs import SpringsEffect as SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.simulation.step import build_problem
-from solvers.core.descent import PreparedDescent
-from solvers.core.fixed_objective import FixedObjective
-from solvers.core.objective import StepObjective
-from solvers.core.saddles import is_positive_definite
-from solvers.methods.hybrid import HybridNewton
-from solvers.methods.newton import NewtonSolver
-from solvers.methods.newton_cg import NewtonCG
-from solvers.problem import Positions, StepProblem, StopRule
-from tests.scenes import build_cloth, build_first_problem, build_random_problem, build_test_scene
+from tests.scene_builders import build_cloth, build_first_problem, build_random_problem, build_test_scene
 from tests.stability.test_hard_cases import CASES, resting
 
 SOLVERS = [NewtonSolver(), NewtonCG(), HybridNewton()]

@@ -7,21 +7,21 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from springbench.harness.scenes.effects.gas_effect import GasEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.surface_meshes import BalloonMesh
+from springbench.solvers.iteration.descent_method import PreparedDescent
+from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
+from springbench.solvers.methods.newton.negative_curvature import is_positive_definite
+from springbench.solvers.methods.newton.newton_cg import NewtonCG, TruncatedNewtonIteration
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.step_problem import StopRule
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
 
-from harness.scenes.effects.gas import GasEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.surfaces import BalloonMesh
-from solvers.core.descent import PreparedDescent
-from solvers.core.fixed_objective import FixedObjective
-from solvers.core.objective import StepObjective
-from solvers.core.saddles import is_positive_definite
-from solvers.methods.hybrid import HybridNewton
-from solvers.methods.newton import NewtonSolver
-from solvers.methods.newton_cg import NewtonCG, TruncatedNewtonIteration
-from solvers.problem import StopRule
-from tests.scenes import build_cloth, build_first_problem, build_random_problem, build_test_scene
+from tests.scene_builders import build_cloth, build_first_problem, build_random_problem, build_test_scene
 from tests.unit.test_objective import with_links
 
 OTHERS = pytest.mark.parametrize("solver", [NewtonSolver(), NewtonCG(), HybridNewton()], ids=lambda s: type(s).__name__)

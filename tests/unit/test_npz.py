@@ -10,10 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from harness.base.errors import InputError
-from harness.base.npz import MAX_NPZ_BYTES, read_npz_array
-from harness.config.load import load_scene
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.errors import InputError
+from springbench.harness.execution.npz_reader import MAX_NPZ_BYTES, read_npz_array
 
 FRAMES = np.arange(24.0).reshape(2, 4, 3) / 7.0
 

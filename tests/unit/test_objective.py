@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from scipy.sparse import csr_array, diags_array
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.step_problem import Positions, StepProblem
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
+from springbench.solvers.registry import SOLVERS, load_target
 
-from solvers.core.fixed_objective import FixedObjective
-from solvers.core.objective import StepObjective
-from solvers.energies.springs import Springs
-from solvers.problem import Positions, StepProblem
-from solvers.registry import SOLVERS, load_target
-from tests.scenes import build_cloth, build_first_problem, build_random_problem
+from tests.scene_builders import build_cloth, build_first_problem, build_random_problem
 
 SUMS = 1e-12
 """Two orders of adding some hundred terms, relative to the largest."""

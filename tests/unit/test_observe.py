@@ -5,14 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-
-from harness.config.load import load_config
-from harness.scenes.bind import build_scene
-from harness.simulation.measure import SteppingSettings, iterate_steps
-from harness.simulation.observe import collect_forces
-from harness.simulation.step import prepare
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import StopRule
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.simulation.instrumentation_pass import collect_forces
+from springbench.harness.simulation.time_loop import prepare
+from springbench.harness.simulation.timing_pass import SteppingSettings, iterate_steps
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.step_problem import StopRule
 
 SCENE = """
 mesh: {kind: network, positions: [[0, 0, 0], [1, 0, 0]], springs: [[0, 1]]}

@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.config import config_loader
+from springbench.harness.config.config_loader import SweepPlan, load_config
+from springbench.harness.config.run_options import RUN_OPTIONS
+from springbench.harness.config.sweep_config import IncludeEntry, RunSpec, VariedOptions
+from springbench.harness.errors import InputError
+from springbench.harness.results import parquet_rows
+from springbench.harness.results.run_schema import RUN_SCHEMA
 from typer.testing import CliRunner
 
-from harness.base import rows
-from harness.base.columns import RUN_SCHEMA
-from harness.base.errors import InputError
-from harness.cli import app
-from harness.config import load
-from harness.config.load import SweepPlan, load_config
-from harness.config.options import RUN_OPTIONS
-from harness.config.sweep import IncludeEntry, RunSpec, VariedOptions
 from tests.unit.test_spec import CLOTH
 
 
@@ -49,7 +49,7 @@ def test_a_value_on_the_command_line_means_what_it_means_in_a_file(
         asked["runs"] = load_config(path, sizes=[4], **options).list_runs()
         raise InputError("enough")
 
-    monkeypatch.setattr(load, "load_any", loaded)
+    monkeypatch.setattr(config_loader, "load_any", loaded)
     values = {"iterations": "7", "tolerance": "1e-3", "integrator": "bdf2", "time_step": "1/60", "frames": "0x3"}
     values |= {"first_guess": "inertial", "threads": "auto", "rounds": "1"}
     assert set(values) == set(RUN_OPTIONS) - {"accuracy"}, "which would choose most of them"
@@ -104,7 +104,7 @@ def test_a_sweep_keeps_to_an_error_and_its_rows_say_what_it_took(folder: Path) -
     assert done.exit_code == 1, done.output
     assert "xpbd: tells no error of its steps" in done.output
     (file,) = (folder / "results" / "sweep" / "rows").glob("*-dormand-prince-8-*.parquet")
-    found = [row for row in rows.read_rows([file]).to_pylist() if row["phase"] == "step"]
+    found = [row for row in parquet_rows.read_rows([file]).to_pylist() if row["phase"] == "step"]
     assert [row["frame"] for row in found] == [1, 2, 3, 4]
     assert all(0.0 < row["estimated"] <= row["asked"] == 1e-3 for row in found)
     assert all(row["accepted"] > 0 and row["seconds"] > 0 and row["integrator"] == "own" for row in found)

@@ -7,22 +7,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from harness.config.load import load_scene
-from harness.reference import oracle as oracle_module
-from harness.reference.judge import StepVerifier
-from harness.reference.minimiser import refine_minimum
-from harness.reference.oracle import (
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.reference import reference_evaluator as oracle_module
+from springbench.harness.reference.certified_minimum import refine_minimum
+from springbench.harness.reference.reference_evaluator import (
     ReferenceEvaluator,
     assemble_stiffness,
     measure_component_sizes,
     measure_graph_components,
 )
-from harness.scenes.bind import Scene, build_scene
-from harness.simulation.step import MotionState, SimulationStep, build_initial_state, build_problem
-from solvers.integrators import Motion
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import Positions, Solution, StepProblem, StopRule
+from springbench.harness.reference.step_verifier import StepVerifier
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.simulation.time_loop import MotionState, SimulationStep, build_initial_state, build_problem
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import Positions, Solution, StepProblem, StopRule
 
 HARD = Path(__file__).resolve().parents[2] / "configs" / "hard"
 SCENES = HARD.with_name("scenes")

@@ -8,10 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
-
-from solvers.linear.ordering import nested_dissection_order
-from solvers.linear.supernodes import COLUMN_LANES
-from solvers.linear.symbolic import analyse_with_order
+from springbench.solvers.linalg.cholesky.nested_dissection import nested_dissection_order
+from springbench.solvers.linalg.cholesky.supernode_amalgamation import COLUMN_LANES
+from springbench.solvers.linalg.cholesky.symbolic_factorisation import analyse_with_order
 
 
 def graph(ends, n):

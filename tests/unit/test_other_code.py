@@ -10,17 +10,22 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.config import solver_parameters
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.experiments import run_pipeline as run_module
+from springbench.harness.experiments.source_fingerprint import (
+    collect_source_parts,
+    compute_source_fingerprint,
+    list_source_files,
+)
+from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.solvers.iteration import device_interface
+from springbench.solvers.jit import source_digest
+from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS, load_target
 from typer.testing import CliRunner
 
-from harness.cli import app
-from harness.config import solvers
-from harness.config.load import load_config
-from harness.experiments import run as run_module
-from harness.experiments.code import collect_source_parts, compute_source_fingerprint, list_source_files
-from harness.experiments.plan import RunFiles
-from solvers import device, sources
-from solvers.registry import OPTIONAL_SOLVERS, SOLVERS, load_target
-from tests.own_solvers import SCENE_SOURCE, SWEEP_OPTIONS, PluginSweep, write_plugin_solver
+from tests.plugin_solvers import SCENE_SOURCE, SWEEP_OPTIONS, PluginSweep, write_plugin_solver
 
 
 @pytest.fixture
@@ -85,19 +90,19 @@ def test_a_run_depends_on_its_own_solver_and_effects_and_on_no_others(tmp_path: 
         path
         for part in collect_source_parts(run)
         for file in list_source_files(part)
-        for path in sources.find_dependencies(str(file))
+        for path in source_digest.find_dependencies(str(file))
     }
-    reached |= sources.find_dependencies(run_module.__file__)
+    reached |= source_digest.find_dependencies(run_module.__file__)
     names = {"/".join(Path(path).parts[-2:]) for path in reached}
     assert str(made.solver_path) in reached
     assert {"methods/local_global.py", "effects/springs.py", "effects/gravity.py", "mesh/grid.py"} <= names
     others = {
         str(file)
         for name in ("xpbd", "vbd", "newton")
-        for file in sources.find_class_sources(load_target(SOLVERS[name]))
+        for file in source_digest.find_class_sources(load_target(SOLVERS[name]))
     }
-    assert reached & others <= {device.__file__}  # which all ask whether a solver is on one
-    assert not names & {"effects/wind.py", "effects/gas.py", "mesh/chain.py", "harness/cli.py", "asked/search.py"}
+    assert reached & others <= {device_interface.__file__}  # which all ask whether a solver is on one
+    assert not names & {"effects/wind.py", "effects/gas.py", "mesh/chain.py", "harness/cli/main.py", "asked/search.py"}
     to_error = collect_source_parts(run.model_copy(update={"accuracy": 0.1}))
     assert {"kept.py"} == {
         file.name for part in to_error - collect_source_parts(run) for file in list_source_files(part)
@@ -111,14 +116,16 @@ def test_the_code_of_a_run_covers_what_its_solver_compiles_in_another_language(
     for name in ("another", made.solver_path.stem):
         before = compute_source_fingerprint(collect_source_parts(made.plugin_run()))
         made.solver_path.with_name(f"{name}.hpp").write_text("import what;\n")
-        sources.find_dependencies.cache_clear()
-        sources._find_imports.cache_clear()
-        sources._sorted_dependencies.cache_clear()
+        source_digest.find_dependencies.cache_clear()
+        source_digest._find_imports.cache_clear()
+        source_digest._sorted_dependencies.cache_clear()
         assert (compute_source_fingerprint(collect_source_parts(made.plugin_run())) != before) == (
             name == made.solver_path.stem
         )
-    (eigen,) = sources.find_class_sources(load_target(OPTIONAL_SOLVERS["eigen"]))
-    assert {str(eigen.with_suffix(ending)) for ending in (".cpp", ".hpp")} <= sources.find_dependencies(str(eigen))
+    (eigen,) = source_digest.find_class_sources(load_target(OPTIONAL_SOLVERS["eigen"]))
+    assert {str(eigen.with_suffix(ending)) for ending in (".cpp", ".hpp")} <= source_digest.find_dependencies(
+        str(eigen)
+    )
 
 
 def test_pictures_are_drawn_later_without_a_run_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -139,13 +146,13 @@ def test_parameters_by_other_sources_are_kept_beside_each_other_for_a_while(
     (tmp_path / "sweep.yaml").write_text("scenes: [scene.yaml]\nsolvers: [sparse]\n")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     for checkout in "ab":
-        monkeypatch.setattr(solvers, "_of_sources", lambda checkout=checkout: 16 * checkout)
+        monkeypatch.setattr(solver_parameters, "_of_sources", lambda checkout=checkout: 16 * checkout)
         load_config(tmp_path / "sweep.yaml", imports_code=False)
     kept = {path.stem: path for path in (tmp_path / "springbench" / "parameters").iterdir()}
     assert set(kept) == {f"sparse-{16 * checkout}" for checkout in "ab"}
 
     os.utime(kept.pop(f"sparse-{16 * 'a'}"), (0, 0))
-    monkeypatch.setattr(solvers, "_of_sources", lambda: 16 * "c")
+    monkeypatch.setattr(solver_parameters, "_of_sources", lambda: 16 * "c")
     load_config(tmp_path / "sweep.yaml", imports_code=False)
     assert {path.stem[-1] for path in (tmp_path / "springbench" / "parameters").iterdir()} == {"b", "c"}
 
@@ -158,8 +165,8 @@ def test_the_file_of_a_class_is_known_however_its_module_was_loaded(tmp_path: Pa
     assert by_hand.loader
     module = module_from_spec(by_hand)
     by_hand.loader.exec_module(module)
-    assert sources.find_class_sources(module.Mine) == {path}
+    assert source_digest.find_class_sources(module.Mine) == {path}
     monkeypatch.setitem(sys.modules, "by_hand", module)
-    monkeypatch.setattr(sources, "_INSTALLED", {str(tmp_path)})  # as a package that brings a solver is
-    sources.find_class_sources.cache_clear()
-    assert sources.find_class_sources(module.Mine) == {path}
+    monkeypatch.setattr(source_digest, "_INSTALLED", {str(tmp_path)})  # as a package that brings a solver is
+    source_digest.find_class_sources.cache_clear()
+    assert source_digest.find_class_sources(module.Mine) == {path}

@@ -9,20 +9,20 @@ from itertools import islice
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect as SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.methods.local_global.fused_local_global import PreparedCompiledLocalGlobal
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
+from springbench.solvers.model.energies.quadratic_energy import Quadratic
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.step_problem import Positions, Solver, StepProblem, StopRule
+from springbench.solvers.objective.spring_form import decompose_energies
 
-from harness.scenes.bind import Scene
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect as SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from solvers.core.compiled import PreparedCompiledLocalGlobal
-from solvers.core.parts import decompose_energies
-from solvers.energies.quadratic import Quadratic
-from solvers.energies.springs import Springs
-from solvers.methods.lbfgs import Lbfgs
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.problem import Positions, Solver, StepProblem, StopRule
-from tests.effects import (
+from tests.effect_scenes import (
     AIR_DRAG_EFFECT,
     ATTACHMENT_EFFECT,
     BENDING_EFFECT,
@@ -32,7 +32,7 @@ from tests.effects import (
     build_effect_cloth,
     build_moving_problem,
 )
-from tests.scenes import build_test_scene
+from tests.scene_builders import build_test_scene
 from tests.unit.test_xpbd import Other
 
 EXACT = PinsEffect.model_validate({"indices": [14, 33], "weight": "exact"})

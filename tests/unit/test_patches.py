@@ -7,21 +7,21 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.mesh.mesh import Mesh
+from springbench.harness.scenes.mesh.surface_meshes import BalloonMesh
+from springbench.solvers.contact.broad_phase import cluster_bounds
+from springbench.solvers.contact.broad_phase.bvh import BVH, find_candidate_pairs
+from springbench.solvers.contact.broad_phase.cluster_culling import ClusterCulling
+from springbench.solvers.contact.ccd import MIN_GAP_FRACTION, max_relative_displacement
+from springbench.solvers.contact.collision_mesh import CollisionMesh
+from springbench.solvers.contact.collisions import Candidates, pad_positions
+from springbench.solvers.contact.contact_potential import SelfContact
+from springbench.solvers.contact.geometry.aabb import CollisionQuery
+from springbench.solvers.contact.potentials.barrier import compute_distances
+from springbench.solvers.model.step_problem import Positions
 
-from harness.scenes.mesh.base import Mesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.mesh.surfaces import BalloonMesh
-from solvers.contact import flat
-from solvers.contact.barrier import compute_distances
-from solvers.contact.boxes import CollisionQuery
-from solvers.contact.contacts import Candidates, pad_positions
-from solvers.contact.patches import ClusterCulling
-from solvers.contact.self_contact import SelfContact
-from solvers.contact.surface import CollisionMesh
-from solvers.contact.trees import BVH, find_candidate_pairs
-from solvers.contact.ways import MIN_GAP_FRACTION, max_relative_displacement
-from solvers.problem import Positions
-from tests.self_contacts import unique_edges
+from tests.self_contact_scenes import unique_edges
 
 REACH = 0.06
 """Half of the spacing of the sheet below [m]."""
@@ -152,7 +152,7 @@ def test_patches_that_are_not_doubted_have_nothing_near_in_them(made):
         lies = [patches._fit_clusters(x, limits).lie for x in (p, q)]
         memory = patches.scratch
         doubted = np.empty((patches.num_rest_pairs, 2), np.int64)
-        count, near = flat.unresolved_cluster_pairs(
+        count, near = cluster_bounds.unresolved_cluster_pairs(
             *lies, patches.cluster_pairs, patches.num_rest_pairs, limits, REACH, memory.projection, memory.tile, doubted
         )
         known = {tuple(x) for x in patches.cluster_pairs.patches[: patches.num_rest_pairs].tolist()}

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 
 import pytest
 from scipy.sparse import csr_array
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.methods.quasi_newton.anderson import Anderson
+from springbench.solvers.methods.quasi_newton.chebyshev import Chebyshev
+from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.step_problem import Positions, Solver, System
 
-from solvers.energies.springs import Springs
-from solvers.methods.anderson import Anderson
-from solvers.methods.chebyshev import Chebyshev
-from solvers.methods.lbfgs import Lbfgs
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.problem import Positions, Solver, System
-from tests.scenes import build_cloth, build_first_problem
+from tests.scene_builders import build_cloth, build_first_problem
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from springbench.harness.errors import RunFailed
+from springbench.harness.recording.recorder_interface import RecordingReplay
+from springbench.harness.report import opengl_probe
+from springbench.harness.report.comparison_picture import draw_comparison_picture, find_reference_run
+from springbench.harness.report.drawable_frames import strain_scale_limit
+from springbench.harness.report.plot_style import PAGE_HEIGHT, PAGE_WIDTH
+from springbench.harness.report.run_picture import draw_run_picture, layout_frames
 
-from harness.base.errors import RunFailed
-from harness.record.base import RecordingReplay
-from harness.report import opengl
-from harness.report.comparison import draw_comparison_picture, find_reference_run
-from harness.report.frames import strain_scale_limit
-from harness.report.run_picture import draw_run_picture, layout_frames
-from harness.report.style import PAGE_HEIGHT, PAGE_WIDTH
 from tests.unit.test_report_pictures import broken, cloth
 
 
@@ -55,12 +55,14 @@ def test_distances_are_taken_from_the_lowest_residual_that_ends_finite() -> None
 
 
 def test_without_opengl_the_message_names_the_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(opengl, "_TRY", "import os; os.kill(os.getpid(), 11)")  # as VTK ends without the libraries
-    opengl.find_opengl_problem.cache_clear()
+    monkeypatch.setattr(
+        opengl_probe, "_TRY", "import os; os.kill(os.getpid(), 11)"
+    )  # as VTK ends without the libraries
+    opengl_probe.find_opengl_problem.cache_clear()
     try:
         for draw in (lambda at: draw_run_picture(cloth(), at), lambda at: draw_comparison_picture({"a": cloth()}, at)):
             with pytest.raises(RunFailed, match="apt-get install libegl1 libgl1-mesa-dri"):
                 draw(tmp_path / "run.png")
     finally:
-        opengl.find_opengl_problem.cache_clear()
+        opengl_probe.find_opengl_problem.cache_clear()
     assert not list(tmp_path.iterdir())

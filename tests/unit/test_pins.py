@@ -7,10 +7,10 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.model.step_problem import DirichletPins, StepProblem, StopRule
 
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import DirichletPins, StepProblem, StopRule
-from tests.scenes import LOCAL_GLOBAL_BACKENDS, build_cloth, build_first_problem, build_random_problem
+from tests.scene_builders import LOCAL_GLOBAL_BACKENDS, build_cloth, build_first_problem, build_random_problem
 
 backends = pytest.mark.parametrize("backend", LOCAL_GLOBAL_BACKENDS, ids=lambda b: type(b).__name__)
 

@@ -5,12 +5,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.results.remote_storage import RemoteStorage
 from typer.testing import CliRunner, Result
 
-from harness.base.places import RemoteStorage
-from harness.cli import app
 from tests.contracts.hostile import scene
-from tests.dummies import write_dummy_runs
+from tests.synthetic_run_rows import write_dummy_runs
 
 SWEEP = "{scenes: [cloth.yaml], sizes: [4], solvers: [sparse], options: {rounds: 1, record: false, pictures: false}}"
 

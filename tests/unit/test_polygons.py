@@ -7,13 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from harness.base.errors import InputError
-from harness.config.load import load_scene
-from harness.scenes.bind import build_scene
-from harness.scenes.mesh.files import FileMesh
-from harness.scenes.mesh.polygons import MAX_CONCAVE_CORNERS, compute_vertex_areas, triangulate_polygons
-from harness.simulation.opinion.second import verify_terms
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.mesh.file_mesh import FileMesh
+from springbench.harness.scenes.mesh.polygon_triangulation import (
+    MAX_CONCAVE_CORNERS,
+    compute_vertex_areas,
+    triangulate_polygons,
+)
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.verification.verify_scene import verify_terms
 
 ROUND_OFF = 1e-12
 """A few hundred additions of numbers of order one in float64."""

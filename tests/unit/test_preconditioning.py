@@ -9,23 +9,28 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.sparse import bsr_array, csr_array
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.iteration.descent_method import PreparedDescent, ResidualMetric
+from springbench.solvers.iteration.preconditioners import PreconditionerName, assemble_diagonal_blocks
+from springbench.solvers.linalg.additive_schwarz import (
+    SUBDOMAIN_SIZE,
+    AdditiveSchwarz,
+    SubdomainHierarchy,
+    order_into_subdomains,
+)
+from springbench.solvers.methods.newton.negative_curvature import is_positive_definite
+from springbench.solvers.methods.newton.newton_cg import NewtonCG
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.quasi_newton.nonlinear_cg import NonlinearCG
+from springbench.solvers.model.step_problem import Positions, StepProblem, StopRule, Unsupported
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import Hessian, StepObjective
 
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.simulation.step import prepare, simulate_scene
-from solvers.core.descent import PreparedDescent, ResidualMetric
-from solvers.core.fixed_objective import FixedObjective
-from solvers.core.objective import Hessian, StepObjective
-from solvers.core.preconditioning import PreconditionerName, assemble_diagonal_blocks
-from solvers.core.saddles import is_positive_definite
-from solvers.linear.schwarz import SUBDOMAIN_SIZE, AdditiveSchwarz, SubdomainHierarchy, order_into_subdomains
-from solvers.methods.newton import NewtonSolver
-from solvers.methods.newton_cg import NewtonCG
-from solvers.methods.pncg import NonlinearCG
-from solvers.problem import Positions, StepProblem, StopRule, Unsupported
-from tests.effects import EFFECT_SCENES, build_moving_problem
-from tests.scenes import build_cloth, build_first_problem, build_test_scene
+from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
+from tests.scene_builders import build_cloth, build_first_problem, build_test_scene
 from tests.unit.test_surface_contact import BALL, contact, count_intersections, draped
 
 OTHERS: list[PreconditionerName] = [name for name in get_args(PreconditionerName) if name != "factor"]

@@ -5,16 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.config.config_loader import load_config, load_scene
+from springbench.harness.console import get_error_console, print_message
+from springbench.harness.errors import InputError
+from springbench.harness.execution.progress_display import create_display
+from springbench.harness.experiments.ablation.iteration_overhead import list_measured_effects, select_effects
+from springbench.harness.experiments.ablation.overhead_unit import measure_all_overheads
+from springbench.harness.report.ablation_summary import build_overhead_table, read_ablation
 from typer.testing import CliRunner
-
-from harness.base.console import get_error_console, print_message
-from harness.base.errors import InputError
-from harness.base.progress import create_display
-from harness.cli import app
-from harness.config.load import load_config, load_scene
-from harness.experiments.ablation.price_unit import measure_all_overheads
-from harness.experiments.ablation.prices import list_measured_effects, select_effects
-from harness.report.ablation import build_overhead_table, read_ablation
 
 CLOTH = """
 mesh: {kind: grid}

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.step_problem import StepProblem
 
-from solvers.energies.springs import Springs
-from solvers.problem import StepProblem
-from tests.scenes import build_random_problem
+from tests.scene_builders import build_random_problem
 
 
 def named(name: str) -> StepProblem:

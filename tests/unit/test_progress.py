@@ -7,17 +7,22 @@ from collections.abc import Callable
 
 import pytest
 from rich.console import Console
-
-from harness.base import progress
-from harness.base.asides import COMPILING, POLL, report_activity
-from harness.base.progress import ProgressBars, ProgressDisplay, ProgressLines, RemainingTime, RunCost
+from springbench.harness.execution import progress_display
+from springbench.harness.execution.progress_display import (
+    ProgressBars,
+    ProgressDisplay,
+    ProgressLines,
+    RemainingTime,
+    RunCost,
+)
+from springbench.harness.execution.progress_events import COMPILING, POLL, report_activity
 
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """What the clock shows, in its only entry."""
     now = [0.0]
-    monkeypatch.setattr(progress, "monotonic", lambda: now[0])
+    monkeypatch.setattr(progress_display, "monotonic", lambda: now[0])
     return now
 
 

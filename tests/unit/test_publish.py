@@ -12,16 +12,21 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.console import get_error_console
+from springbench.harness.execution.progress_display import ProgressLines
+from springbench.harness.experiments.archive import archive_verification
+from springbench.harness.experiments.archive.archive_verification import (
+    ClaimVerdict,
+    PublishedRun,
+    ResultRow,
+    VerifiedClaim,
+)
+from springbench.harness.results import parquet_rows
 from typer.testing import CliRunner, Result
 
-from harness.base import rows
-from harness.base.console import get_error_console
-from harness.base.progress import ProgressLines
-from harness.cli import app
-from harness.experiments.archive import verify
-from harness.experiments.archive.verify import ClaimVerdict, PublishedRun, ResultRow, VerifiedClaim
 from tests.contracts.hostile import scene
-from tests.dummies import build_dummy_rows
+from tests.synthetic_run_rows import build_dummy_rows
 
 SWEEP = """
 scenes: [cloth.yaml]
@@ -68,15 +73,15 @@ def changed(archive: Path, into: Path, change: Callable[[dict[str, bytes]], None
 
 @pytest.mark.parametrize("name", ["x.zip", "packed.zip"])
 def test_what_was_published_comes_out_again(home: Path, name: str, tmp_path: Path):
-    with verify.unpack_archive(home / name) as folder:
+    with archive_verification.unpack_archive(home / name) as folder:
         subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=folder, check=True)
-        assert verify.verify_checksums(folder) == []
-        runs, wrong = verify.load_published_runs(folder, print, with_user_code=False)
+        assert archive_verification.verify_checksums(folder) == []
+        runs, wrong = archive_verification.load_published_runs(folder, print, with_user_code=False)
         assert [one.title for one in runs] == ["cloth 4 dense", "cloth 4 sparse"]
         assert wrong == []
-        taken = verify.sample_runs(runs, seed=1)
-        claims = verify.verify_reruns(
-            taken, verify.rerun_published(taken, tmp_path, ProgressLines(get_error_console()))
+        taken = archive_verification.sample_runs(runs, seed=1)
+        claims = archive_verification.verify_reruns(
+            taken, archive_verification.rerun_published(taken, tmp_path, ProgressLines(get_error_console()))
         )
         listed = command("list", folder / "configs" / "sweep" / "sweep.yaml", "--results", folder / "results")
         assert listed.output.count("done") == 2
@@ -114,9 +119,11 @@ def test_an_archive_that_was_changed_is_named_and_none_of_it_is_run(home: Path, 
 @pytest.fixture(scope="module")
 def repeated(home: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[PublishedRun], list[list[ResultRow]]]:
     """The published runs, dense and sparse, and what they leave when they are done again."""
-    with verify.unpack_archive(home / "x.zip") as folder:
-        runs, _ = verify.load_published_runs(folder, print, with_user_code=False)
-        return runs, verify.rerun_published(runs, tmp_path_factory.mktemp("again"), ProgressLines(get_error_console()))
+    with archive_verification.unpack_archive(home / "x.zip") as folder:
+        runs, _ = archive_verification.load_published_runs(folder, print, with_user_code=False)
+        return runs, archive_verification.rerun_published(
+            runs, tmp_path_factory.mktemp("again"), ProgressLines(get_error_console())
+        )
 
 
 def scaled(name: str, factor: float) -> Callable[[ResultRow], ResultRow]:
@@ -170,9 +177,11 @@ FORGED: dict[str, tuple[Callable[[ResultRow], ResultRow], str]] = {
 def claims_of(runs: list[PublishedRun], new: list[list[ResultRow]]) -> list[str]:
     """All claims that do not hold, where nothing here was interrupted."""
     undisturbed = [[row | {"interrupted": False} for row in found] for found in new]
-    named = [claim for one in runs if (claim := verify._verify_options(one))]
+    named = [claim for one in runs if (claim := archive_verification._verify_options(one))]
     return [
-        str(claim) for claim in (*named, *verify.verify_reruns(runs, undisturbed)) if claim.verdict is ClaimVerdict.FAIL
+        str(claim)
+        for claim in (*named, *archive_verification.verify_reruns(runs, undisturbed))
+        if claim.verdict is ClaimVerdict.FAIL
     ]
 
 
@@ -207,13 +216,13 @@ def test_elsewhere_what_differs_refutes_nothing_and_confirms_nothing(
     for change in (scaled("residual", 0.5), scaled("seconds", 1e-3), lambda row: row | {"digest": "0"}):
         there = [replace(one, rows=[change(row) | {"machine": "another"} for row in one.rows]) for one in runs]
         assert claims_of(there, new) == []
-        assert ClaimVerdict.INCONCLUSIVE in {claim.verdict for claim in verify.verify_reruns(there, new)}
+        assert ClaimVerdict.INCONCLUSIVE in {claim.verdict for claim in archive_verification.verify_reruns(there, new)}
 
 
 def test_runs_that_no_config_asks_for_cannot_be_told(home: Path, tmp_path: Path):
     def change(content: dict[str, bytes]) -> None:
         made_up = [row | {"run_id": "f" * 12, "solver": "magic"} for row in build_dummy_rows(1)]
-        content["results/sweep/rows/cloth-4-magic.parquet"] = rows.encode_rows(made_up)
+        content["results/sweep/rows/cloth-4-magic.parquet"] = parquet_rows.encode_rows(made_up)
 
     told = command("verify", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True), "--seed", "1")
     assert "1 of 3 runs of sweep: cannot tell (the config asks for none such)" in told.output
@@ -226,7 +235,9 @@ def test_rows_that_lie_under_true_checksums_do_not_hold(home: Path, tmp_path: Pa
         for name in [name for name in content if name.endswith(".parquet")]:
             (tmp_path / "x.parquet").write_bytes(content[name])
             lies = pq.read_table(tmp_path / "x.parquet").to_pylist()
-            rows.write_rows(tmp_path / "x.parquet", [row | {"digest": row["digest"] and "0" * 64} for row in lies])
+            parquet_rows.write_rows(
+                tmp_path / "x.parquet", [row | {"digest": row["digest"] and "0" * 64} for row in lies]
+            )
             content[name] = (tmp_path / "x.parquet").read_bytes()
 
     told = command("verify", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True))
@@ -267,13 +278,13 @@ def test_damaged_rows_are_not_published(home: Path, tmp_path: Path):
 
 def claim(home: Path, factor: float, *, interrupted: bool = False, machine: str = "00000000") -> VerifiedClaim:
     """What is said of a ratio that was 1 and is `factor`."""
-    with verify.unpack_archive(home / "x.zip") as folder:
-        run = verify.load_published_runs(folder, print, with_user_code=False)[0][0].run
+    with archive_verification.unpack_archive(home / "x.zip") as folder:
+        run = archive_verification.load_published_runs(folder, print, with_user_code=False)[0][0].run
     old = [row | {"interrupted": False} for row in build_dummy_rows(1)]
     there = (PublishedRun(old, run), PublishedRun(old, run.replace_options(size=5)))
     slower = [row | {"seconds": row["seconds"] * factor, "interrupted": interrupted} for row in old]
     here = [[row | {"machine": machine} for row in found] for found in (slower, old)]
-    return verify._verify_time_ratio(there, (here[0], here[1]))
+    return archive_verification._verify_time_ratio(there, (here[0], here[1]))
 
 
 def test_a_ratio_holds_or_not_or_cannot_be_told(home: Path):
@@ -285,12 +296,12 @@ def test_a_ratio_holds_or_not_or_cannot_be_told(home: Path):
 
 
 def test_a_tenth_is_chosen_and_each_has_another_solver_beside_it(home: Path):
-    with verify.unpack_archive(home / "x.zip") as folder:
-        (a, b), _ = verify.load_published_runs(folder, print, with_user_code=False)
+    with archive_verification.unpack_archive(home / "x.zip") as folder:
+        (a, b), _ = archive_verification.load_published_runs(folder, print, with_user_code=False)
     runs = [replace(one, run=one.run.replace_options(size=size)) for size in range(10) for one in (a, b)]
     for seed in range(20):
-        taken = verify.sample_runs(runs, seed)
+        taken = archive_verification.sample_runs(runs, seed)
         assert len(taken) in (2, 4)
         assert all(sum(other.comparison_group == one.comparison_group for other in taken) == 2 for one in taken)
-    assert len({one.title for seed in range(20) for one in verify.sample_runs(runs, seed)}) > 8
-    assert verify.sample_runs([], 0) == []
+    assert len({one.title for seed in range(20) for one in archive_verification.sample_runs(runs, seed)}) > 8
+    assert archive_verification.sample_runs([], 0) == []

@@ -8,11 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from springbench.harness.errors import InputError
+from springbench.harness.experiments.archive.publication import publish_results
 
-from harness.base.errors import InputError
-from harness.experiments.archive.publish import publish_results
 from tests.contracts.hostile import scene
-from tests.dummies import write_dummy_runs
+from tests.synthetic_run_rows import write_dummy_runs
 
 SWEEP = "scenes: [cloth.yaml]\nsizes: [4]\nsolvers: [sparse]\n"
 OWN = "{kind: './mine.py:Mesh', path: PATH}"

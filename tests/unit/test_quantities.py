@@ -15,23 +15,23 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
+from springbench.harness.recording.recorder_interface import RecordingReplay
+from springbench.harness.report import comparison_picture
+from springbench.harness.report.ablation_summary import build_ablation_table
+from springbench.harness.report.drawable_frames import max_recorded_strain, strain_extremes
+from springbench.harness.report.equal_accuracy import compare_runs
+from springbench.harness.report.equal_accuracy import describe_comparison as compared
+from springbench.harness.report.figures.timing_panels import timing_panels
+from springbench.harness.report.median_times import write_medians
+from springbench.harness.report.mesh_rendering import mean_rest_length
+from springbench.harness.report.robustness import CORRECT, OTHER_MINIMUM, classify_run
+from springbench.harness.report.site import update_page
+from springbench.harness.report.timing_table import build_summary_table, label_runs, read_run_times
+from springbench.harness.results.quantities import compute_max_strain as largest_of
+from springbench.harness.results.quantities import compute_ms_per_step, compute_slowdown
+from springbench.harness.results.run_schema import RUN_SCHEMA
 
-from harness.base.columns import RUN_SCHEMA
-from harness.base.quantities import compute_max_strain as largest_of
-from harness.base.quantities import compute_ms_per_step, compute_slowdown
-from harness.record.base import RecordingReplay
-from harness.report import comparison
-from harness.report.ablation import build_ablation_table
-from harness.report.equal_accuracy import compare_runs
-from harness.report.equal_accuracy import describe_comparison as compared
-from harness.report.figures.of_runs import timing_panels
-from harness.report.frames import max_recorded_strain, strain_extremes
-from harness.report.medians import write_medians
-from harness.report.render import mean_rest_length
-from harness.report.robustness import CORRECT, OTHER_MINIMUM, classify_run
-from harness.report.site import update_page
-from harness.report.timing_table import build_summary_table, label_runs, read_run_times
-from tests import site_results
+from tests import synthetic_site_rows
 
 MILLISECONDS = {"sparse": [1.0, 2.0, 9.0, 3.0, 4.0, 50.0], "numba": [1.5, 0.5, 0.25, 2.0, 40.0, 1.0]}
 """Of two rounds of three frames: medians 3.5 and 1.25, means 11.5 and 7.5, least 1 and 0.25."""
@@ -39,8 +39,8 @@ STRAINS = (0.389, 0.284, 0.2)
 
 
 def rows_of(solver: str) -> list[dict[str, Any]]:
-    number = site_results.SOLVER_NAMES.index(solver)
-    same = site_results.build_run_columns(number) | {
+    number = synthetic_site_rows.SOLVER_NAMES.index(solver)
+    same = synthetic_site_rows.build_run_columns(number) | {
         "phase": "step",
         "iterations": 5,
         "stopped": "tolerance",
@@ -83,7 +83,7 @@ def test_every_place_states_the_same_numbers_of_a_run(tmp_path: Path):
     assert re.search(r"8 sparse +– +– +3\.5 +1 .* 38\.9 % +10 %", console.export_text())
 
     for run in (sparse, numba):
-        facts = comparison._collect_facts(replay_of(run.solver), replay_of("sparse"))  # pyright: ignore[reportPrivateUsage]
+        facts = comparison_picture._collect_facts(replay_of(run.solver), replay_of("sparse"))  # pyright: ignore[reportPrivateUsage]
         assert facts["ms a step"] == {"sparse": "3.5", "numba": "1.25"}[run.solver]
         assert facts["largest strain"] == "38.9 %"
 
@@ -133,7 +133,7 @@ def test_a_distance_in_pictures_is_the_largest_in_mean_rest_lengths():
     best = replace(replay_of("sparse"), frames=np.array([3]), positions=line, springs=springs, rest_lengths=lengths)
     moved = replace(best, positions=line + np.array([[0, 0, 0], [0, 0, 0], [0, 2, 0], [0, 6, 0]], np.float32))
     assert mean_rest_length(best) == pytest.approx(4.0), "the mean of 1, 1 and 10; the median is 1"
-    assert comparison.format_distance(moved, best) == "1.5", "6 m of 4; the mean distance is 2"
+    assert comparison_picture.format_distance(moved, best) == "1.5", "6 m of 4; the mean distance is 2"
 
 
 def test_the_share_of_an_effect_is_of_the_whole_step():

@@ -3,11 +3,10 @@
 from pathlib import Path
 
 import pytest
-
-from harness.base import rows
-from harness.base.errors import InputError
-from harness.experiments.ablation.ablation_rows import ABLATION_SCHEMA
-from harness.report.query import run_query
+from springbench.harness.errors import InputError
+from springbench.harness.experiments.ablation.ablation_schema import ABLATION_SCHEMA
+from springbench.harness.report.sql_query import run_query
+from springbench.harness.results import parquet_rows
 
 
 @pytest.fixture
@@ -15,7 +14,7 @@ def results(tmp_path: Path) -> Path:
     """Two sweeps of one row each."""
     for sweep, seconds in (("first", 0.5), ("second", 0.25)):
         (tmp_path / sweep / "rows").mkdir(parents=True)
-        rows.write_rows(tmp_path / sweep / "rows" / "a.parquet", [{"sweep": sweep, "seconds": seconds}])
+        parquet_rows.write_rows(tmp_path / sweep / "rows" / "a.parquet", [{"sweep": sweep, "seconds": seconds}])
     return tmp_path
 
 
@@ -30,7 +29,7 @@ def test_a_query_sees_the_rows_of_all_ablations(results: Path):
     for scene, cost in (("cloth", 0.5), ("chain", 0.25)):
         (results / scene / "ablation").mkdir(parents=True)
         row = {"kind": "without", "name": "bending", "scene": scene, "cost": cost}
-        rows.write_rows(results / scene / "ablation" / "a.parquet", [row], ABLATION_SCHEMA)
+        parquet_rows.write_rows(results / scene / "ablation" / "a.parquet", [row], ABLATION_SCHEMA)
     found = run_query("SELECT scene, cost FROM ablation ORDER BY cost", results)
     assert found.values == [("chain", 0.25), ("cloth", 0.5)]
 

@@ -6,8 +6,7 @@ from typing import Any, cast
 
 import pytest
 import rerun as rr
-
-from harness.record import curves
+from springbench.harness.recording import curve_drawing
 
 
 class Logged:
@@ -25,6 +24,6 @@ def test_each_curve_and_its_name_have_its_colour(count: int) -> None:
     given = [0xE69F00FF, 0x56B4E9FF, 0x009E73FF, 0xCC79A7FF, 0xF0E442FF][:count]
     logged = Logged()
     drawn = {f"frame {k}": [1.0, 0.1 / (k + 1)] for k in range(count)}
-    curves.draw_curves(cast(rr.RecordingStream, logged), "/curves", drawn, curves.pack_colours(given))
+    curve_drawing.draw_curves(cast(rr.RecordingStream, logged), "/curves", drawn, curve_drawing.pack_colours(given))
     for entity in ("/curves/lines", "/curves/words"):
         assert logged.held[entity].colors.as_arrow_array().to_pylist()[-count:] == given

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from harness.record.blueprint import (
+from springbench.harness.recording.camera_view import ViewExtent
+from springbench.harness.recording.strain_shading import NUM_LEVELS
+from springbench.harness.recording.viewer_blueprint import (
     build_panels,
     build_plot,
     build_scene_view,
@@ -16,10 +17,9 @@ from harness.record.blueprint import (
     format_run_document,
     format_scale_name,
 )
-from harness.record.camera import ViewExtent
-from harness.record.shading import NUM_LEVELS
-from harness.scenes.mesh.grid import GridMesh
-from tests.recordings import MESHES_BY_KIND, build_recording_info
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+
+from tests.synthetic_recordings import MESHES_BY_KIND, build_recording_info
 
 CORNER = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 2.0]])
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from springbench.harness.recording.recording_reader import open_recording, read_replay
+from springbench.harness.report.obstacle_meshes import build_obstacle_meshes, points_to_frame
+from springbench.harness.scenes.key_frames import KeyFrame, KeyFrameMotion
+from springbench.harness.scenes.primitive_obstacles import BoxObstacle, CapsuleObstacle, PlaneObstacle, SphereObstacle
+from springbench.harness.scenes.surface_obstacles import parse_obstacles
 
-from harness.record.reader import open_recording, read_replay
-from harness.report.solids import build_obstacle_meshes, points_to_frame
-from harness.scenes.motion import KeyFrame, KeyFrameMotion
-from harness.scenes.obstacles import BoxObstacle, CapsuleObstacle, PlaneObstacle, SphereObstacle
-from harness.scenes.shapes import parse_obstacles
-from tests.recordings import TIME_STEP, build_recording_info, write_recording
+from tests.synthetic_recordings import TIME_STEP, build_recording_info, write_recording
 
 RISES = KeyFrameMotion(
     keys=(KeyFrame(time=0.0), KeyFrame(time=10 * TIME_STEP, offset=(0.0, 2.0, 0.0), turn=90.0)), axis=(1.0, 2.0, 0.0)
@@ -109,6 +109,6 @@ def test_a_recording_without_obstacles_has_no_trace_of_any(tmp_path: Path):
 
 
 def test_who_records_and_draws_scenes_without_obstacles_does_not_import_them():
-    imports = "import sys, harness.experiments.run, harness.report.run_picture"
-    script = f"{imports}; sys.exit('harness.scenes.obstacles' in sys.modules)"
+    imports = "import sys, springbench.harness.experiments.run_pipeline, springbench.harness.report.run_picture"
+    script = f"{imports}; sys.exit('springbench.harness.scenes.primitive_obstacles' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0

@@ -6,9 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from springbench.harness.recording.strain_shading import (
+    NEUTRAL_COLOUR,
+    NUM_LEVELS,
+    STRAIN_COLOURS,
+    StrainShading,
+    build_palette,
+)
 
-from harness.record.shading import NEUTRAL_COLOUR, NUM_LEVELS, STRAIN_COLOURS, StrainShading, build_palette
-from tests.recordings import MESHES_BY_KIND, build_recording_info
+from tests.synthetic_recordings import MESHES_BY_KIND, build_recording_info
 
 
 def rgba(packed: np.ndarray) -> np.ndarray:

@@ -6,11 +6,11 @@ import os
 from pathlib import Path
 
 import pytest
+from springbench.harness.errors import InputError
+from springbench.harness.recording import recording_integrity
+from springbench.harness.recording.recording_integrity import mark_verified, require_intact
 
-from harness.base.errors import InputError
-from harness.record import sound
-from harness.record.sound import mark_verified, require_intact
-from tests.recordings import write_recording
+from tests.synthetic_recordings import write_recording
 
 
 def refuse(path: Path) -> None:
@@ -19,8 +19,8 @@ def refuse(path: Path) -> None:
 
 
 def another_process() -> None:
-    sound._verified_states.clear()
-    sound._notes_offset.clear()
+    recording_integrity._verified_states.clear()
+    recording_integrity._notes_offset.clear()
 
 
 @pytest.fixture
@@ -48,10 +48,10 @@ def test_notes_that_come_meanwhile_are_seen(recording: Path):
     other = recording.with_name("b.rrd")
     other.write_bytes(recording.read_bytes())
     require_intact(recording, refuse)
-    known = sound._verified_states.copy()
+    known = recording_integrity._verified_states.copy()
     mark_verified(other)  # by another process, as it were
-    sound._verified_states.clear()
-    sound._verified_states.update(known)
+    recording_integrity._verified_states.clear()
+    recording_integrity._verified_states.update(known)
     require_intact(other, refuse)
 
 
@@ -71,9 +71,9 @@ def test_notes_that_cannot_be_kept_are_no_failure(recording: Path, monkeypatch: 
 
 
 def test_notes_begin_anew_before_they_are_many(recording: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(sound, "_NOTED", 64)
+    monkeypatch.setattr(recording_integrity, "_NOTED", 64)
     for _ in range(20):
         mark_verified(recording)
-    assert sound._notes_path().stat().st_size <= 64 + 16
+    assert recording_integrity._notes_path().stat().st_size <= 64 + 16
     another_process()
     require_intact(recording, refuse)

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from springbench.harness.errors import InputError, RunFailed
+from springbench.harness.recording import rerun_recorder
+from springbench.harness.recording.local_origin import compute_local_origin
+from springbench.harness.recording.recorder_interface import FrameSamples, RecordedFrame, RecordingInfo
+from springbench.harness.recording.recording_check import require_recorded_frames
+from springbench.harness.recording.recording_reader import read_replay
+from springbench.harness.recording.rerun_recorder import RerunRecorder
 
-from harness.base.errors import InputError, RunFailed
-from harness.record import rerun
-from harness.record.base import FrameSamples, RecordedFrame, RecordingInfo
-from harness.record.local_origin import compute_local_origin
-from harness.record.reader import read_replay
-from harness.record.rerun import RerunRecorder
-from harness.record.verify import require_recorded_frames
-from tests.recordings import MESHES_BY_KIND, build_recording_info, generate_waves, write_recording
+from tests.synthetic_recordings import MESHES_BY_KIND, build_recording_info, generate_waves, write_recording
 
 COUNT = 12
 TIME = 0.01 * (COUNT - 1)
@@ -161,7 +161,7 @@ def test_positions_far_from_zero_are_stored_relative_to_an_origin(tmp_path: Path
 def test_positions_rounded_far_from_zero_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Single precision resolves 2 m at 32,000 km; an origin of zero is consistent with that, and no excuse for it."""
     of = far_info()
-    monkeypatch.setattr(rerun, "local_origin", lambda rest: np.zeros(3))
+    monkeypatch.setattr(rerun_recorder, "local_origin", lambda rest: np.zeros(3))
     with pytest.raises(RunFailed, match=r"positions rounded by 1\.\d* m|positions rounded by 0\.\d+ m"):
         require_last(write_recording(tmp_path / "a.rrd", of, COUNT), of, COUNT - 1, TIME, whole(of)[COUNT - 1])
 

@@ -15,7 +15,7 @@ SCRIPT = """
 import sys
 from functools import partial
 from pathlib import Path
-from harness.base.workers import Limits, Workers
+from springbench.harness.base.workers import Limits, Workers
 from tests.recordings import record
 from tests.workers import threads_after
 

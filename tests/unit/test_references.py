@@ -4,11 +4,10 @@ import json
 from dataclasses import asdict
 
 import pytest
-
-from harness.base.stated import read_solver_metadata
-from harness.report.references import format_bibtex, format_citation
-from solvers.about import LIU_2013, Citation
-from solvers.registry import SOLVERS, load_target
+from springbench.harness.report.citations import format_bibtex, format_citation
+from springbench.harness.results.solver_metadata import read_solver_metadata
+from springbench.solvers.iteration.solver_info import LIU_2013, Citation
+from springbench.solvers.registry import SOLVERS, load_target
 
 
 def told(reference: Citation) -> str:

@@ -14,14 +14,13 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
-
-from harness.record.base import RecordingReplay
-from harness.record.framing import describe_outside
-from harness.record.shading import STRAIN_COLOURS
-from harness.report import comparison, opengl, page, run_picture
-from harness.report.comparison import draw_comparison_picture
-from harness.report.frames import find_drawable_frames
-from harness.report.render import (
+from springbench.harness.recording.camera_framing import describe_outside
+from springbench.harness.recording.recorder_interface import RecordingReplay
+from springbench.harness.recording.strain_shading import STRAIN_COLOURS
+from springbench.harness.report import comparison_picture, opengl_probe, page_layout, run_picture
+from springbench.harness.report.comparison_picture import draw_comparison_picture
+from springbench.harness.report.drawable_frames import find_drawable_frames
+from springbench.harness.report.mesh_rendering import (
     OffscreenRenderer,
     choose_view_angles,
     compute_area_vectors,
@@ -29,12 +28,14 @@ from harness.report.render import (
     compute_vertex_strain,
     fit_camera,
 )
-from harness.report.run_picture import PixelBox, draw_run_picture, layout_frames
-from harness.report.self_contact import describe_self_intersection
-from harness.report.solids import framed_vertex_mask, points_to_frame
-from harness.report.style import BACKGROUND_COLOUR, PAGE_HEIGHT, PAGE_WIDTH
+from springbench.harness.report.obstacle_meshes import framed_vertex_mask, points_to_frame
+from springbench.harness.report.plot_style import BACKGROUND_COLOUR, PAGE_HEIGHT, PAGE_WIDTH
+from springbench.harness.report.run_picture import PixelBox, draw_run_picture, layout_frames
+from springbench.harness.report.self_intersection_notes import describe_self_intersection
 
-needs_opengl = pytest.mark.skipif(opengl.find_opengl_problem() is not None, reason=opengl.find_opengl_problem() or "")
+needs_opengl = pytest.mark.skipif(
+    opengl_probe.find_opengl_problem() is not None, reason=opengl_probe.find_opengl_problem() or ""
+)
 
 STRETCHED = 0.1  # strain at the ends of the scale in these tests
 
@@ -99,9 +100,9 @@ def words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     def save(sheet: Figure, path: Path, **more: Any) -> None:
         written.extend(text.get_text() for text in sheet.texts)
-        page.save_page(sheet, path, **more)
+        page_layout.save_page(sheet, path, **more)
 
-    for module in (run_picture, comparison):
+    for module in (run_picture, comparison_picture):
         monkeypatch.setattr(module, "save", save)
     return written
 

@@ -15,24 +15,27 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
-
-from harness.base.columns import RUN_SCHEMA
-from harness.report import page, timing_plot
-from harness.report.labels import LABEL_SPACING, spread_heights
-from harness.report.learned import build_closing_lines, summarise_sweep
-from harness.report.style import PAGE_HEIGHT, PAGE_WIDTH, assign_solver_styles
-from harness.report.timing_plot import draw_timing_plot
-from harness.report.timing_table import (
+from springbench.harness.report import page_layout, timing_plot
+from springbench.harness.report.line_end_labels import LABEL_SPACING, spread_heights
+from springbench.harness.report.plot_style import PAGE_HEIGHT, PAGE_WIDTH, assign_solver_styles
+from springbench.harness.report.sweep_summary import build_closing_lines, summarise_sweep
+from springbench.harness.report.timing_plot import draw_timing_plot
+from springbench.harness.report.timing_table import (
     INCONSISTENT_NOTE,
     PREEMPTED_NOTE,
     build_summary_table,
     label_runs,
     read_run_times,
 )
-from harness.scenes.material import SCALING_RULES, compute_modulus_exponent, compute_spring_stiffness
-from harness.scenes.mesh.base import STRETCH
-from harness.scenes.mesh.mesh_names import MESH_CLASSES
-from solvers.registry import SOLVER_TABLE, load_target
+from springbench.harness.results.run_schema import RUN_SCHEMA
+from springbench.harness.scenes.mesh.mesh import STRETCH
+from springbench.harness.scenes.mesh.mesh_table import MESH_CLASSES
+from springbench.harness.scenes.spring_stiffness import (
+    SCALING_RULES,
+    compute_modulus_exponent,
+    compute_spring_stiffness,
+)
+from springbench.solvers.registry import SOLVER_TABLE, load_target
 
 ROOT = Path(__file__).parents[2]
 POWERS = {"sparse": 1.0, "dense": 2.0, "xpbd": 1.5}  # of the vertices, in the times of each solver
@@ -116,7 +119,7 @@ def sheets(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 
     def save(sheet: Figure, path: Path, **more: Any) -> None:
         drawn.append(sheet)
-        page.save_page(sheet, path, **more)
+        page_layout.save_page(sheet, path, **more)
 
     monkeypatch.setattr(timing_plot, "save", save)
     return drawn

@@ -6,10 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from harness.scenes.motion import KeyFrame, KeyFrameMotion
-from harness.scenes.obstacles import PlaneObstacle, SphereObstacle
-from harness.scenes.room import find_first_violation, largest_gap_radius, merge_key_times, sample_times
+from springbench.harness.scenes.clearance_checks import (
+    find_first_violation,
+    largest_gap_radius,
+    merge_key_times,
+    sample_times,
+)
+from springbench.harness.scenes.key_frames import KeyFrame, KeyFrameMotion
+from springbench.harness.scenes.primitive_obstacles import PlaneObstacle, SphereObstacle
 
 POINT = np.array([[0.0, 0.0, 0.0]])
 LIMIT = 0.01

@@ -8,13 +8,12 @@ from typing import Any
 
 import pyarrow as pa
 import pytest
-
-from harness.base.columns import RUN_SCHEMA
-from harness.base.errors import InputError
-from harness.config.load import load_config
-from harness.experiments.plan import RunFiles
-from harness.experiments.run import execute_run
-from harness.report.certificates import write_certificates
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.errors import InputError
+from springbench.harness.experiments.run_pipeline import execute_run
+from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.harness.report.intersection_certificates import write_certificates
+from springbench.harness.results.run_schema import RUN_SCHEMA
 
 SCENE = """
 mesh: {kind: grid}

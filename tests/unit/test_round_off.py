@@ -7,14 +7,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
+from springbench.solvers.kernels import objective_kernels
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.energies.strain_limit_energy import StrainLimits
+from springbench.solvers.model.rounding_bound import (
+    EPS,
+    RoundingBoundEnergy,
+    clip_to_roundoff,
+    gradient_roundoff,
+    row_norms,
+)
+from springbench.solvers.model.step_problem import Energy, Positions
 
-from solvers.energies.springs import Springs
-from solvers.energies.strain_limits import StrainLimits
-from solvers.kernels import objective
-from solvers.problem import Energy, Positions
-from solvers.round_off import EPS, RoundingBoundEnergy, clip_to_roundoff, gradient_roundoff, row_norms
-from tests.effects import EFFECT_SCENES, build_moving_problem
-from tests.scenes import build_random_problem, join_problems, shift_problem
+from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
+from tests.scene_builders import build_random_problem, join_problems, shift_problem
 
 NUDGES = 20
 """Of the last bit: as many ways to round the positions."""
@@ -105,8 +111,11 @@ def test_the_compiled_bound_is_the_plain_one(seed: int):
     (springs,) = problem.system.energies
     assert isinstance(springs, Springs)
     p, out = problem.current_positions.copy(), np.empty(problem.system.num_vertices)
-    objective.gradient_roundoff(
-        objective.ObjectiveTerms.from_system(problem.system, springs), objective.StepData.from_problem(problem), p, out
+    objective_kernels.gradient_roundoff(
+        objective_kernels.ObjectiveTerms.from_system(problem.system, springs),
+        objective_kernels.StepData.from_problem(problem),
+        p,
+        out,
     )
     out[problem.system.pins.vertices[problem.system.pins.exact_mask]] = 0.0
     np.testing.assert_allclose(out, gradient_roundoff(problem, p), rtol=1e-14)  # sums in another order

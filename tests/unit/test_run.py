@@ -4,15 +4,14 @@ import math
 from pathlib import Path
 
 import pytest
-
-from harness.base import machine
-from harness.config.load import load_config
-from harness.experiments import run
-from harness.experiments.plan import RunFiles
-from harness.experiments.run import execute_run
-from harness.record.reader import summarise_recording
-from harness.simulation.measure import StepError
-from harness.simulation.observe import require_finite
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.execution import machine_info
+from springbench.harness.experiments import run_pipeline
+from springbench.harness.experiments.run_pipeline import execute_run
+from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.harness.recording.recording_reader import summarise_recording
+from springbench.harness.simulation.instrumentation_pass import require_finite
+from springbench.harness.simulation.timing_pass import StepError
 
 
 def test_a_run_that_fails_now_keeps_nothing_of_when_it_did_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -26,12 +25,12 @@ def test_a_run_that_fails_now_keeps_nothing_of_when_it_did_not(tmp_path: Path, m
     files.picture_path.parent.mkdir()
     files.picture_path.touch()
     assert files.recording_path.exists()
-    assert files.recording_path.name == f"{spec.build_file_stem(machine.describe_machine().machine_id)}.rrd"
+    assert files.recording_path.name == f"{spec.build_file_stem(machine_info.describe_machine().machine_id)}.rrd"
 
     def broken(*_):
         raise ZeroDivisionError("nothing to divide by")
 
-    monkeypatch.setattr(run, "measure", broken)
+    monkeypatch.setattr(run_pipeline, "measure", broken)
     (row,) = execute_run(spec, files, lambda phase: None)
     assert row["status"] == "failed"
     assert "ZeroDivisionError: nothing to divide by (test_run.py:" in row["reason"]
@@ -62,8 +61,8 @@ def test_a_measured_column_that_is_no_number_fails_its_frame(name: str, value: f
     with pytest.raises(StepError) as caught:
         require_finite(columns, is_minimiser=True, has_rtol=True)
     assert caught.value.frame == 2
-    assert run.build_failure_columns(caught.value)["status"] == "diverged"
-    assert run.build_failure_columns(caught.value)["reason"].startswith(f"{name} is {value}")
+    assert run_pipeline.build_failure_columns(caught.value)["status"] == "diverged"
+    assert run_pipeline.build_failure_columns(caught.value)["reason"].startswith(f"{name} is {value}")
 
 
 @pytest.mark.parametrize("tolerance", [False, True])

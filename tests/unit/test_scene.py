@@ -7,19 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.effects.contact_effect import ContactEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.surface_meshes import SkirtMesh
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.simulation.instrumentation_pass import compute_penetration
+from springbench.harness.verification.verify_scene import verify_terms
 
-from harness.base.errors import InputError
-from harness.scenes.bind import build_scene
-from harness.scenes.effects.contact import ContactEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.surfaces import SkirtMesh
-from harness.scenes.spec import SceneSpec
-from harness.simulation.observe import compute_penetration
-from harness.simulation.opinion.second import verify_terms
-from tests.scenes import build_test_scene
+from tests.scene_builders import build_test_scene
 
 
 def test_the_total_mass_is_dealt_out_by_the_meshs_shares():

@@ -13,21 +13,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from springbench.harness.config.config_loader import load_config, load_scene
+from springbench.harness.experiments import run_pipeline as runs
+from springbench.harness.experiments import verification_status
+from springbench.harness.report.robustness import CORRECT, FORMULA_MISMATCH, classify_run
+from springbench.harness.scenes.effects.effect_interface import EffectContribution, PinGroup
+from springbench.harness.scenes.mesh.mesh import Mesh
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.schema.base_model import ConfigModel
+from springbench.harness.verification.verify_scene import verify_terms
+from springbench.solvers.model.energies.bending_energy import Bending
+from springbench.solvers.model.energies.quadratic_energy import Quadratic
+from springbench.solvers.model.integrators import INTEGRATORS
+from springbench.solvers.model.step_problem import Energy, Positions
 
-from harness.base.model import ConfigModel
-from harness.config.load import load_config, load_scene
-from harness.experiments import run as runs
-from harness.experiments import standing
-from harness.report.robustness import CORRECT, FORMULA_MISMATCH, classify_run
-from harness.scenes.bind import Scene
-from harness.scenes.effects.base import EffectContribution, PinGroup
-from harness.scenes.mesh.base import Mesh
-from harness.simulation.opinion.second import verify_terms
-from solvers.energies.bending import Bending
-from solvers.energies.quadratic import Quadratic
-from solvers.integrators import INTEGRATORS
-from solvers.problem import Energy, Positions
-from tests.lies import (
+from tests.formula_mutations import (
     AIR_DRAG_SPEC,
     ATTACHMENTS_SPEC,
     BALLOON_SPEC,
@@ -247,7 +247,7 @@ def test_a_run_that_is_disputed_is_not_right(tmp_path: Path, monkeypatch: pytest
         times.append(verify_terms(*given))
         return times[-1]
 
-    monkeypatch.setattr(standing, "second_opinion", counted)
+    monkeypatch.setattr(verification_status, "second_opinion", counted)
 
     def rows_of(run: Any) -> list[dict[str, Any]]:
         files = runs.RunFiles.for_run(run, tmp_path)
@@ -256,25 +256,25 @@ def test_a_run_that_is_disputed_is_not_right(tmp_path: Path, monkeypatch: pytest
         named = {"distance": None, "stationarity": None, "frame": None, "reason": None, "minimum": None}
         return [named | row for row in done if row["phase"] == "step"]
 
-    standing.verify_formulas.cache_clear()
+    verification_status.verify_formulas.cache_clear()
     for run in (newton, sparse):
         done = rows_of(run)
         assert {(row["status"], row["second_opinion"]) for row in done} == {("ok", "agrees")}
     assert classify_run(rows_of(newton))[0] is CORRECT
     assert times == ["agrees"]  # once for the scene
     mutate_energy(Bending, scale_fields(weight=2.0))(monkeypatch)
-    standing.verify_formulas.cache_clear()
+    verification_status.verify_formulas.cache_clear()
     done = rows_of(newton)
     assert {row["status"] for row in done} == {"disputed"}
     outcome, _, _, reason = classify_run(done)
     assert outcome is FORMULA_MISMATCH
     assert reason.startswith("the second opinion disagrees: effects[2] bending")
-    standing.verify_formulas.cache_clear()
+    verification_status.verify_formulas.cache_clear()
 
 
 def test_a_run_that_is_not_judged_asks_for_no_second_opinion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "scene.yaml").write_text(SCENE)
-    monkeypatch.setattr(standing, "second_opinion", lambda *given: pytest.fail("was asked"))
+    monkeypatch.setattr(verification_status, "second_opinion", lambda *given: pytest.fail("was asked"))
     (run,) = load_config(tmp_path / "scene.yaml", solvers=["sparse"], rounds=1, record=False).list_runs()
     files = runs.RunFiles.for_run(run, tmp_path)
     files.rows_path.parent.mkdir()

@@ -8,21 +8,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
+from springbench.harness.scenes import spring_stiffness
+from springbench.harness.scenes.key_frames import KeyFrameMotion
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.solvers.contact.half_space.half_space_potential import HalfSpaceContact
+from springbench.solvers.model.energies.attachment_energy import Attachments
+from springbench.solvers.model.energies.bending_energy import Bending
+from springbench.solvers.model.energies.dashpot_energy import Dashpots, RayleighDashpots
+from springbench.solvers.model.energies.gas_energy import Gas
+from springbench.solvers.model.energies.quadratic_energy import AirDrag, RayleighDamping
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.energies.strain_limit_energy import StrainLimits
+from springbench.solvers.model.integrators import SingleStageIntegrator
+from springbench.solvers.model.step_problem import StepProblem, System
 
-from harness.scenes import material
-from harness.scenes.bind import Scene
-from harness.scenes.motion import KeyFrameMotion
-from solvers.contact.energy import HalfSpaceContact
-from solvers.energies.attachments import Attachments
-from solvers.energies.bending import Bending
-from solvers.energies.dashpots import Dashpots, RayleighDashpots
-from solvers.energies.gas import Gas
-from solvers.energies.quadratic import AirDrag, RayleighDamping
-from solvers.energies.springs import Springs
-from solvers.energies.strain_limits import StrainLimits
-from solvers.integrators import SingleStageIntegrator
-from solvers.problem import StepProblem, System
-from tests.lies import (
+from tests.formula_mutations import (
     AIR_DRAG_SPEC,
     ATTACHMENTS_SPEC,
     BALLOON_SPEC,
@@ -75,7 +75,7 @@ LIES: dict[str, FormulaMutation] = {
         [SPRINGS_SPEC], "springs (Hessian)", scale_method(Springs, "hessian", 1.01)
     ),
     "skip-one springs that stiffen the cloth": FormulaMutation(
-        [BEND_SPRINGS_SPEC], "springs", patch_attribute(material, "_relieved", lambda true: lambda mesh, k: k)
+        [BEND_SPRINGS_SPEC], "springs", patch_attribute(spring_stiffness, "_relieved", lambda true: lambda mesh, k: k)
     ),
     "limits that are wider": FormulaMutation(
         [SPRINGS_SPEC, STRAIN_LIMITS_SPEC], "strain-limits", mutate_energy(StrainLimits, scale_fields(high=1.01))

@@ -6,20 +6,19 @@ import re
 from typing import Any
 
 import pytest
-
-from harness.scenes import touching
-from harness.scenes.bind import build_scene
-from harness.scenes.effects.self_contact import SelfContactEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.effects.surface_contact import SurfaceContactEffect
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.mesh.surfaces import BalloonMesh
-from harness.scenes.motion import KeyFrame, KeyFrameMotion
-from harness.scenes.obstacles import BoxObstacle, CapsuleObstacle, PlaneObstacle, SphereObstacle
-from harness.scenes.shapes import MeshObstacle
-from harness.scenes.spec import SceneSpec
-from harness.simulation.opinion.second import verify_terms
-from solvers.contact.self_contact import ObstacleContact
+from springbench.harness.scenes import collision_primitives
+from springbench.harness.scenes.effects.self_contact_effect import SelfContactEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.effects.surface_contact_effect import SurfaceContactEffect
+from springbench.harness.scenes.key_frames import KeyFrame, KeyFrameMotion
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.mesh.surface_meshes import BalloonMesh
+from springbench.harness.scenes.primitive_obstacles import BoxObstacle, CapsuleObstacle, PlaneObstacle, SphereObstacle
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.scenes.surface_obstacles import MeshObstacle
+from springbench.harness.verification.verify_scene import verify_terms
+from springbench.solvers.contact.contact_potential import ObstacleContact
 
 TURNS = KeyFrameMotion(
     keys=(KeyFrame(time=0.0), KeyFrame(time=0.1, offset=(0.01, 0.02, 0.0), turn=20.0)), axis=(0.1, 1.0, 0.2)
@@ -65,7 +64,7 @@ WRONG = r"disagrees: (objective \(gradient\), by \S+ of its size; )?effects\[1\]
 
 @pytest.mark.parametrize("name", OBSTACLES)
 def test_it_knows_another_stiffness(name: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(touching, "_STIFF", 0.1001)
+    monkeypatch.setattr(collision_primitives, "_STIFF", 0.1001)
     given = spec(*OBSTACLES[name])
     assert re.match(WRONG, verify_terms(given, build_scene(given, 3), "implicit-euler"))
 

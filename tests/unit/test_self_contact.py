@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from springbench.harness.scenes.edge_triangle_intersections import find_edge_triangle_intersections
+from springbench.solvers.contact.broad_phase.candidate_cache import CACHE_INFLATION
+from springbench.solvers.contact.collision_mesh import CollisionMesh
+from springbench.solvers.contact.collisions import Candidates, allocate_collisions, build_collisions, pad_positions
+from springbench.solvers.contact.contact_potential import SelfContact
+from springbench.solvers.contact.potentials.barrier import compute_distances, compute_normal_forces, energy_and_gradient
+from springbench.solvers.contact.potentials.hessian_blocks import ReusableBuffer
+from springbench.solvers.model.step_problem import StepProblem, StepStart, System
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
 
-from harness.scenes.intersections import find_edge_triangle_intersections
-from solvers.contact.barrier import compute_distances, compute_normal_forces, energy_and_gradient
-from solvers.contact.blocks import ReusableBuffer
-from solvers.contact.contacts import Candidates, allocate_collisions, build_collisions, pad_positions
-from solvers.contact.known import CACHE_INFLATION
-from solvers.contact.self_contact import SelfContact
-from solvers.contact.surface import CollisionMesh
-from solvers.core.fixed_objective import FixedObjective
-from solvers.core.objective import StepObjective
-from solvers.problem import StepProblem, StepStart, System
-from tests.self_contacts import (
+from tests.self_contact_scenes import (
     CONTACT_DHAT,
     CONTACT_THICKNESS,
     build_touching_sheets,

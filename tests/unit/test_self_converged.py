@@ -8,18 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from harness.reference import self_converged
-from harness.reference.frozen import build_exact_scene
-from harness.reference.self_converged import NotConverged
-from harness.reference.store import ReferenceStore
-from harness.reference.trajectory import REFERENCE_MARGIN, integrate_motion
-from harness.scenes.effects.contact import ContactEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.spec import SceneSpec
+from springbench.harness.reference import self_converged_trajectory
+from springbench.harness.reference.reference_store import ReferenceStore
+from springbench.harness.reference.reference_trajectory import REFERENCE_MARGIN, integrate_motion
+from springbench.harness.reference.self_converged_trajectory import NotConverged
+from springbench.harness.reference.step_snapshot import build_exact_scene
+from springbench.harness.scenes.effects.contact_effect import ContactEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.scene_spec import SceneSpec
 
 END = 0.2
 HELD = PinsEffect(at=("first",), weight="exact")
@@ -43,7 +42,7 @@ def test_where_nothing_touches_it_is_the_motion_that_is_integrated_and_is_found_
     assert (found.reference_kind, truth.reference_kind) == ("self-converged", "integrated")
     # Both integrators err by about what halving their steps moved them, and that is the most that either did.
     assert truth.measure_error(0, found.positions[0]) <= 1.5 * found.disagreement[0] <= 1.5 * REFERENCE_MARGIN * 0.1
-    monkeypatch.setattr(self_converged, "converge", None)
+    monkeypatch.setattr(self_converged_trajectory, "converge", None)
     again = ReferenceStore(tmp_path).load_trajectory(beside, 3, [END], error=0.2)
     assert (again.positions == found.positions).all()
     with pytest.raises(NotConverged, match=r"halving the steps further takes more than .* ask for an error of"):
@@ -55,9 +54,9 @@ def test_where_nothing_touches_it_is_the_motion_that_is_integrated_and_is_found_
 
 def test_an_impact_that_the_steps_do_not_resolve_has_no_truth(monkeypatch):
     """The end is as far off as the chain has moved: what it gave back is the integrator's."""
-    monkeypatch.setattr(self_converged, "SPENT", 0.3)
+    monkeypatch.setattr(self_converged_trajectory, "SPENT", 0.3)
     bouncing = thrown(SpringsEffect(stretch=400.0), floor(-0.05), velocity=(0.0, -2.0, 0.0))
-    found = self_converged.compute_self_converged(
+    found = self_converged_trajectory.compute_self_converged(
         lambda h, name: build_exact_scene(bouncing.with_time_step(h), 3, name), bouncing.time_step, [END], 0.1
     )
     with pytest.raises(NotConverged, match=r"contact has no certified reference, .* none can be had"):

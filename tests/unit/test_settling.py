@@ -6,16 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from harness.config.load import load_scene
-from harness.scenes.bind import Scene, build_scene
-from harness.simulation.step import prepare, simulate_scene
-from solvers.contact.settling import FrictionGaussSeidel
-from solvers.core.descent import PreparedDescent
-from solvers.core.fixed_objective import FixedObjective
-from solvers.core.objective import StepObjective
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import Solution, StepProblem, StopRule
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.iteration.descent_method import PreparedDescent
+from springbench.solvers.methods.newton.friction_gauss_seidel import FrictionGaussSeidel
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.step_problem import Solution, StepProblem, StopRule
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
 STOP = StopRule(500, 1e-9)

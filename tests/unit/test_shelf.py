@@ -11,13 +11,13 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from springbench.harness.errors import InputError
+from springbench.harness.experiments.archive import compaction as module
+from springbench.harness.experiments.archive.compaction import compact_results
+from springbench.harness.report.sql_query import run_query
+from springbench.harness.results import parquet_rows, row_store, row_union
 
-from harness.base import rows, shelf, union
-from harness.base.errors import InputError
-from harness.experiments.archive import compact as module
-from harness.experiments.archive.compact import compact_results
-from harness.report.query import run_query
-from tests.dummies import build_dummy_rows, write_dummy_runs
+from tests.synthetic_run_rows import build_dummy_rows, write_dummy_runs
 
 COUNT = 12
 
@@ -38,27 +38,27 @@ def told(table: pa.Table) -> list[str]:
 
 
 def one_by_one(units: list[Path]) -> pa.Table:
-    return pa.concat_tables([rows.read_rows([unit]) for unit in units], promote_options="default")
+    return pa.concat_tables([parquet_rows.read_rows([unit]) for unit in units], promote_options="default")
 
 
 def test_many_units_are_read_as_one_by_one_in_the_order_asked_for(sweep: Path):
-    units = shelf.list_units(sweep / "rows")
+    units = row_store.list_units(sweep / "rows")
     for asked in (units, units[::-1]):
-        assert told(rows.read_rows(asked)) == told(one_by_one(asked))
-        assert rows.read_rows(asked).schema.equals(one_by_one(asked).schema)
-    heads = rows.read_first_rows(units, ["status", "digest"], required_columns=("run_id",))
-    assert heads == {u: {"status": "ok", "digest": rows.read_rows([u])["digest"][0].as_py()} for u in units}
+        assert told(parquet_rows.read_rows(asked)) == told(one_by_one(asked))
+        assert parquet_rows.read_rows(asked).schema.equals(one_by_one(asked).schema)
+    heads = parquet_rows.read_first_rows(units, ["status", "digest"], required_columns=("run_id",))
+    assert heads == {u: {"status": "ok", "digest": parquet_rows.read_rows([u])["digest"][0].as_py()} for u in units}
 
 
 def test_all_damaged_units_of_many_are_named(sweep: Path):
-    units = shelf.list_units(sweep / "rows")
+    units = row_store.list_units(sweep / "rows")
     os.truncate(units[1], 1000)
-    rows.write_rows(units[4], [])
+    parquet_rows.write_rows(units[4], [])
     pq.write_table(pa.table({"status": ["ok"], "seconds": ["soon"]}), units[7])
     with pytest.raises(InputError) as caught:
-        rows.read_rows(units, required_columns=("status",))
+        parquet_rows.read_rows(units, required_columns=("status",))
     assert [mistake.file for mistake in caught.value.mistakes] == [units[k] for k in (1, 4, 7)]
-    heads = rows.read_first_rows(units, ["status"], required_columns=("status",))
+    heads = parquet_rows.read_first_rows(units, ["status"], required_columns=("status",))
     assert [u for u, head in heads.items() if isinstance(head, str)] == [units[k] for k in (1, 4, 7)]
     with pytest.raises(InputError, match=units[1].name):
         run_query("SELECT count(*) FROM rows", sweep.parent)
@@ -68,16 +68,16 @@ QUERY = "SELECT * FROM rows ORDER BY run_id, frame"
 
 
 def test_packed_rows_are_the_same_to_all_who_read(sweep: Path):
-    units = shelf.list_units(sweep / "rows")
-    before, asked = told(rows.read_rows(units)), repr(run_query(QUERY, sweep.parent).values)
-    heads = rows.read_first_rows(units, ["code"])
+    units = row_store.list_units(sweep / "rows")
+    before, asked = told(parquet_rows.read_rows(units)), repr(run_query(QUERY, sweep.parent).values)
+    heads = parquet_rows.read_first_rows(units, ["code"])
     assert compact_results(sweep.parent, lambda line: None) == COUNT
     assert list((sweep / "rows").iterdir()) == []
-    assert shelf.list_units(sweep / "rows") == units
-    assert told(rows.read_rows(units)) == before
+    assert row_store.list_units(sweep / "rows") == units
+    assert told(parquet_rows.read_rows(units)) == before
     assert repr(run_query(QUERY, sweep.parent).values) == asked
-    assert rows.read_first_rows(units, ["code"]) == heads
-    first = rows.read_first_row(units[2])
+    assert parquet_rows.read_first_rows(units, ["code"]) == heads
+    first = parquet_rows.read_first_row(units[2])
     assert isinstance(first, dict)
     assert first["run_id"] == units[2].stem[-12:]
     turned = run_query("PIVOT rows ON solver USING count(*) GROUP BY status", sweep.parent)
@@ -102,8 +102,8 @@ def test_no_name_of_a_folder_sets_a_column_or_leads_to_other_files(
     short = [tuple(build_dummy_rows(int(unit.stem[-12:], 16))[0][name] for name in SHORT) for unit in units]
 
     def check() -> None:
-        assert list(zip(*(rows.read_rows(units)[name].to_pylist() for name in SHORT), strict=True)) == short
-        heads: Any = rows.read_first_rows(units, SHORT)
+        assert list(zip(*(parquet_rows.read_rows(units)[name].to_pylist() for name in SHORT), strict=True)) == short
+        heads: Any = parquet_rows.read_first_rows(units, SHORT)
         assert [tuple(heads[unit][name] for name in SHORT) for unit in units] == short
         assert run_query(f"SELECT {', '.join(SHORT)} FROM rows ORDER BY ALL", results).values == sorted(short)
 
@@ -118,14 +118,14 @@ def test_nothing_is_removed_where_the_packed_rows_differ_from_the_originals(
 ):
     before = {path: path.read_bytes() for path in sweep.rglob("*.parquet")}
 
-    right = union.read_table
+    right = row_union.read_table
 
     def wrong(*arguments: Any, **named: Any) -> Any:
         table, number = right(*arguments, **named)
         return table.set_column(table.schema.get_field_index("size"), "size", pa.array([64] * len(table))), number
 
-    monkeypatch.setattr(union, "table", wrong)
-    monkeypatch.setattr(rows, "_FEW", 0)
+    monkeypatch.setattr(row_union, "table", wrong)
+    monkeypatch.setattr(parquet_rows, "_FEW", 0)
     with pytest.raises(InputError, match="nothing was removed"):
         compact_results(sweep, lambda line: None)
     assert {path: path.read_bytes() for path in sweep.rglob("*.parquet")} == before
@@ -136,15 +136,15 @@ def test_columns_that_duckdb_cannot_tell_apart_are_read_by_their_exact_names(tmp
     for name in ("SIZE", "file_index"):
         for number, unit in enumerate(units):
             pq.write_table(pq.read_table(unit).append_column(name, pa.array([number])), unit)
-        read = rows.read_rows(units)
+        read = parquet_rows.read_rows(units)
         assert (read[name].to_pylist(), read["size"].to_pylist()) == (list(range(9)), [8 + k for k in range(9)])
 
 
 def test_a_run_that_is_done_again_takes_the_place_of_its_packed_rows_and_packing_goes_on(sweep: Path):
     compact_results(sweep, lambda line: None)
-    unit = shelf.list_units(sweep / "rows")[0]
+    unit = row_store.list_units(sweep / "rows")[0]
     number = int(unit.stem[-12:], 16)
-    rows.write_rows(unit, [row | {"status": "failed"} for row in build_dummy_rows(number)])
+    parquet_rows.write_rows(unit, [row | {"status": "failed"} for row in build_dummy_rows(number)])
     write_dummy_runs(sweep, 1, first_number=COUNT)
     for _ in range(2):
         found = run_query("SELECT status, count(*) FROM rows GROUP BY ALL ORDER BY ALL", sweep.parent)
@@ -154,7 +154,7 @@ def test_a_run_that_is_done_again_takes_the_place_of_its_packed_rows_and_packing
 
 
 def test_damaged_and_recent_units_are_left_as_they_are(sweep: Path):
-    units = shelf.list_units(sweep / "rows")
+    units = row_store.list_units(sweep / "rows")
     os.truncate(units[1], 1000)
     said: list[str] = []
     assert compact_results(sweep, said.append, min_age_days=1.0) == 0
@@ -162,13 +162,13 @@ def test_damaged_and_recent_units_are_left_as_they_are(sweep: Path):
     assert any("1 damaged file left" in line for line in said)
     assert [path.name for path in (sweep / "rows").iterdir()] == [units[1].name]
     with pytest.raises(InputError, match=units[1].name):
-        rows.read_rows(shelf.list_units(sweep / "rows"))
+        parquet_rows.read_rows(row_store.list_units(sweep / "rows"))
 
 
 def test_a_packed_file_that_is_damaged_is_named(sweep: Path):
     compact_results(sweep, lambda line: None)
-    os.truncate(shelf.packed_path(sweep / "rows"), 1000)
-    for look in (lambda: shelf.list_units(sweep / "rows"), lambda: run_query("SELECT 1", sweep.parent)):
+    os.truncate(row_store.packed_path(sweep / "rows"), 1000)
+    for look in (lambda: row_store.list_units(sweep / "rows"), lambda: run_query("SELECT 1", sweep.parent)):
         with pytest.raises(InputError, match=r"rows\.parquet"):
             look()
 
@@ -194,25 +194,25 @@ def killed_at(call: int, sweep: Path) -> None:
 
 
 def test_packing_that_is_killed_at_any_moment_loses_and_doubles_nothing_and_goes_on(sweep: Path, tmp_path: Path):
-    units = shelf.list_units(sweep / "rows")
+    units = row_store.list_units(sweep / "rows")
     for unit in (*units[:2], *units[6:]):  # four are left, of three schemas
         unit.unlink()
-    before, moments = told(rows.read_rows(units[2:6])), 0
+    before, moments = told(parquet_rows.read_rows(units[2:6])), 0
     while True:
         copy = tmp_path / str(moments) / "sweep"
         shutil.copytree(sweep, copy)
         process = get_context("fork").Process(target=killed_at, args=(moments, copy))
         process.start()
         process.join()
-        left = shelf.list_units(copy / "rows")
+        left = row_store.list_units(copy / "rows")
         assert [unit.name for unit in left] == [unit.name for unit in units[2:6]]
-        assert told(rows.read_rows(left)) == before
+        assert told(parquet_rows.read_rows(left)) == before
         if process.exitcode == 0:  # it had done all before
             break
         assert process.exitcode == -signal.SIGKILL
         compact_results(copy, lambda line: None)
         assert {path.name for path in copy.iterdir()} == {"rows", "rows.parquet", ".lock"}
         assert list((copy / "rows").iterdir()) == []
-        assert told(rows.read_rows(left)) == before
+        assert told(parquet_rows.read_rows(left)) == before
         moments += 1
     assert moments == 2 + 3 + 1 + 4, "two batches, to sync, rename and sync, the partial file, and each unit"

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from PIL import Image
+from springbench.harness.cli.main import app
+from springbench.harness.report import opengl_probe
+from springbench.harness.report.plot_style import indexed_style
 from typer.testing import CliRunner
-
-from harness.cli import app
-from harness.report import opengl
-from harness.report.style import indexed_style
 
 SCENE = """
 mesh: {kind: grid, plane: vertical}
@@ -27,7 +26,7 @@ effects:
 """
 
 
-@pytest.mark.skipif(opengl.find_opengl_problem() is not None, reason=opengl.find_opengl_problem() or "")
+@pytest.mark.skipif(opengl_probe.find_opengl_problem() is not None, reason=opengl_probe.find_opengl_problem() or "")
 def test_what_is_chosen_is_said_and_drawn(tmp_path: Path):
     (tmp_path / "cloth.yaml").write_text(SCENE)
     picture = tmp_path / "cloth.png"

@@ -8,19 +8,25 @@ from time import perf_counter, sleep
 
 import numpy as np
 import pytest
+from springbench.harness.scenes.effects.constant_force_effect import ConstantForceEffect
+from springbench.harness.scenes.effects.ether_drag_effect import EtherDragEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.simulation.stopwatch import PhaseWatch, Stopwatch
+from springbench.harness.simulation.time_loop import (
+    INITIAL_GUESSES,
+    MotionState,
+    build_initial_state,
+    build_problem,
+    simulate_scene,
+)
+from springbench.harness.simulation.timing_pass import SteppingSettings, iterate_steps
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import Positions, Solution, StepProblem, StopRule
 
-from harness.scenes.effects.constant_force import ConstantForceEffect
-from harness.scenes.effects.ether_drag import EtherDragEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.simulation.clock import PhaseWatch, Stopwatch
-from harness.simulation.measure import SteppingSettings, iterate_steps
-from harness.simulation.step import INITIAL_GUESSES, MotionState, build_initial_state, build_problem, simulate_scene
-from solvers.integrators import Motion
-from solvers.problem import Positions, Solution, StepProblem, StopRule
-from tests.scenes import LOCAL_GLOBAL_BACKENDS, SCENE_BUILDERS, build_test_scene, simulate_trajectory
+from tests.scene_builders import LOCAL_GLOBAL_BACKENDS, SCENE_BUILDERS, build_test_scene, simulate_trajectory
 
 DT = 1 / 30
 VELOCITY = (1.0, -2.0, 0.5)

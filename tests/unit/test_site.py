@@ -12,19 +12,19 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from springbench.harness.errors import InputError
+from springbench.harness.report.site import page_build, refresh_results_page, update_page
+from springbench.harness.report.site.data_scripts import encode_column
+from springbench.harness.report.site.failure_causes import FailedRun, group_failures
+from springbench.harness.report.site.run_findings import describe_runs
+from springbench.harness.report.site.run_table import build_run_table
+from springbench.harness.report.site.sweep_folders import locate_folder
+from springbench.harness.report.site.sweep_overview import _select_pictures
+from springbench.harness.results import parquet_rows
+from springbench.harness.results.run_schema import RUN_SCHEMA
 
-from harness.base import rows
-from harness.base.columns import RUN_SCHEMA
-from harness.base.errors import InputError
-from harness.report.site import build, refresh_results_page, update_page
-from harness.report.site.failures import FailedRun, group_failures
-from harness.report.site.folders import locate_folder
-from harness.report.site.overview import _select_pictures
-from harness.report.site.runs import build_run_table
-from harness.report.site.script import encode_column
-from harness.report.site.sentences import describe_runs
-from tests import accuracy_rows, figure_results, gate_results, site_results
-from tests.site_results import build_run_columns, is_failing_run
+from tests import synthetic_accuracy_rows, synthetic_benchmarks, synthetic_results, synthetic_site_rows
+from tests.synthetic_site_rows import build_run_columns, is_failing_run
 
 COUNT = 40
 
@@ -32,13 +32,14 @@ COUNT = 40
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("results")
-    made = site_results.write_site_results(folder, COUNT)
-    site_results.write_foreign_picture(made / "pictures" / f"{build_run_columns(0)['file']}.png")
-    small = accuracy_rows.build_snapshot_rows("net", 6, "early") + list(
-        accuracy_rows.build_curve_rows("net", 6, "early", "numba")
+    made = synthetic_site_rows.write_site_results(folder, COUNT)
+    synthetic_site_rows.write_foreign_picture(made / "pictures" / f"{build_run_columns(0)['file']}.png")
+    small = synthetic_accuracy_rows.build_snapshot_rows("net", 6, "early") + list(
+        synthetic_accuracy_rows.build_curve_rows("net", 6, "early", "numba")
     )
-    accuracy_rows.write_accuracy_rows(
-        folder / "study", [*small, accuracy_rows.build_failure_row("net", 6, "early", "dense", "failed", "why")]
+    synthetic_accuracy_rows.write_accuracy_rows(
+        folder / "study",
+        [*small, synthetic_accuracy_rows.build_failure_row("net", 6, "early", "dense", "failed", "why")],
     )
     update_page(folder)
     return folder
@@ -53,7 +54,7 @@ def read(results: Path, name: str) -> Any:
 
 def test_the_overview_shows_times_beside_what_was_simulated(tmp_path: Path):
     for name in ("timing", "net-9-numba-0123456789ab", "net-9-solvers", "net-5-solvers", "net-3-solvers"):
-        site_results.write_foreign_picture(tmp_path / "made" / "pictures" / f"{name}.png")
+        synthetic_site_rows.write_foreign_picture(tmp_path / "made" / "pictures" / f"{name}.png")
     shown = _select_pictures(locate_folder(tmp_path / "made", tmp_path))
     assert [one["words"] for one in shown] == ["net 9 solvers", "net 5 solvers", "timing"]
 
@@ -70,7 +71,7 @@ def test_every_run_is_a_line_of_the_table(results: Path):
     first = cells(table, "run_id").index(build_run_columns(0)["run_id"])
     # Steps of 1 and 1.1 times 3.2 ms, and 2 % more a frame: the median of frames 3 and 4.
     assert cells(table, "step")[first] == pytest.approx(3.2 * (1.05 + 0.07), rel=1e-3)
-    assert cells(table, "residual")[first] == pytest.approx(1e-3 / site_results.FRAME_COUNT, rel=1e-4), (
+    assert cells(table, "residual")[first] == pytest.approx(1e-3 / synthetic_site_rows.FRAME_COUNT, rel=1e-4), (
         "of the last frame"
     )
     assert cells(table, "largest_strain")[first] == pytest.approx(0.3)
@@ -91,7 +92,7 @@ def test_one_cause_is_told_once_with_the_number_of_its_runs(results: Path):
     (cause,) = made["failures"]
     assert cause["count"] == sum(is_failing_run(k) for k in range(COUNT)) == 2
     assert cause["varied"], "their reasons differ in a number"
-    assert site_results.UNSUPPORTED_REASON in cause["reason"]
+    assert synthetic_site_rows.UNSUPPORTED_REASON in cause["reason"]
     assert made["statuses"] == {"ok": COUNT - 2, "unsupported": 2}
     study = next(sweep for sweep in index["sweeps"] if sweep["name"] == "study")
     assert [(cause["status"], cause["reason"]) for cause in study["failures"]] == [("failed", "why")]
@@ -116,7 +117,7 @@ def test_all_that_is_shown_says_by_which_code_and_where(results: Path):
 
 
 def test_the_fastest_is_told_among_those_that_are_equally_accurate():
-    told = site_results.build_run_rows(0)
+    told = synthetic_site_rows.build_run_rows(0)
     made = []
     for name, ms, residual in (("slow", 4.0, 1e-6), ("fair", 2.0, 5e-6), ("hasty", 1.0, 1e-2), ("blind", 0.5, None)):
         own = {"run_id": name, "parameters": json.dumps({"kind": name})}
@@ -136,10 +137,10 @@ def test_the_fastest_is_told_among_those_that_are_equally_accurate():
 
 def test_a_run_s_frames_are_a_script_of_their_own(results: Path):
     frames = read(results, f"made/runs/{build_run_columns(0)['run_id']}")
-    assert frames["frame"] == list(range(1, site_results.FRAME_COUNT + 1))
+    assert frames["frame"] == list(range(1, synthetic_site_rows.FRAME_COUNT + 1))
     assert frames["least"][0] == pytest.approx(3.2 * 1.02, rel=1e-5)
     assert frames["ms"][0] == pytest.approx(3.2 * 1.07, rel=1e-5), "the median of both rounds"
-    assert frames["distance"] == [None] * site_results.FRAME_COUNT, "what is not in the rows is missing"
+    assert frames["distance"] == [None] * synthetic_site_rows.FRAME_COUNT, "what is not in the rows is missing"
 
 
 def test_the_table_comes_as_parquet_too(results: Path):
@@ -157,8 +158,11 @@ def test_accuracy_s_charts_are_there_with_the_solvers_marks(results: Path):
 
 
 def test_stored_gates_are_a_chart_with_their_changes(tmp_path: Path):
-    gates = {"solve": gate_results.build_ratio_series(2, 12, (6, 1.2)), "step": gate_results.build_ratio_series(3, 12)}
-    there = gate_results.write_benchmark_files(tmp_path / "bench" / "Linux-CPython-3.11-64bit", gates)
+    gates = {
+        "solve": synthetic_benchmarks.build_ratio_series(2, 12, (6, 1.2)),
+        "step": synthetic_benchmarks.build_ratio_series(3, 12),
+    }
+    there = synthetic_benchmarks.write_benchmark_files(tmp_path / "bench" / "Linux-CPython-3.11-64bit", gates)
     (there / "0099_damaged.json").write_text("{")
     told: list[str] = []
     update_page(tmp_path, print_message=told.append)
@@ -176,14 +180,16 @@ def test_stored_gates_are_a_chart_with_their_changes(tmp_path: Path):
 
 
 def test_points_of_other_code_than_the_newest_are_told_in_every_chart(tmp_path: Path):
-    rows = accuracy_rows.build_snapshot_rows("net", 6, "early") + accuracy_rows.build_snapshot_rows("net", 12, "early")
+    rows = synthetic_accuracy_rows.build_snapshot_rows("net", 6, "early") + synthetic_accuracy_rows.build_snapshot_rows(
+        "net", 12, "early"
+    )
     for solver, code, day in (("numba", "new", "2"), ("newton", "old", "1")):
         known: dict[str, Any] = {"code": code, "started": f"2026-11-0{day}T10:00:00+00:00"}
         for size in (6, 12):
-            rows += accuracy_rows.build_curve_rows("net", size, "early", solver, **known)
-        rows += [row | known for row in accuracy_rows.build_work_rows("net", 6, (solver,))]
-    accuracy_rows.write_accuracy_rows(tmp_path / "study", rows)
-    figure_results.write_speed_results(tmp_path / "speed")
+            rows += synthetic_accuracy_rows.build_curve_rows("net", size, "early", solver, **known)
+        rows += [row | known for row in synthetic_accuracy_rows.build_work_rows("net", 6, (solver,))]
+    synthetic_accuracy_rows.write_accuracy_rows(tmp_path / "study", rows)
+    synthetic_results.write_speed_results(tmp_path / "speed")
     update_page(tmp_path)
     for name in ("study/convergence", "study/times", "study/work", "study/growth"):
         told = {item["label"] for item in read(tmp_path, name)["items"] if np.any(item["older"])}
@@ -196,11 +202,13 @@ def test_points_of_other_code_than_the_newest_are_told_in_every_chart(tmp_path: 
 
 def test_only_what_is_new_is_written_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for name in ("one", "other"):
-        site_results.write_site_results(tmp_path, 3, name)
+        synthetic_site_rows.write_site_results(tmp_path, 3, name)
     update_page(tmp_path)
     seen: list[str] = []
-    told = build.build_overview
-    monkeypatch.setattr(build, "overview", lambda folder, *a, **k: (seen.append(folder.name), told(folder, *a, **k))[1])
+    told = page_build.build_overview
+    monkeypatch.setattr(
+        page_build, "overview", lambda folder, *a, **k: (seen.append(folder.name), told(folder, *a, **k))[1]
+    )
     update_page(tmp_path)
     assert not seen
     frames = tmp_path / "site" / "data" / "one" / "runs" / f"{build_run_columns(0)['run_id']}.js"
@@ -219,13 +227,13 @@ def test_only_what_is_new_is_written_again(tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.long
 def test_a_new_run_comes_to_the_page_of_a_thousand_within_its_time(tmp_path: Path):
     goal, room = 0.3, 2.0  # seconds of a processor; where others compute too caches are theirs as well
-    made = site_results.write_site_results(tmp_path, 1000)
+    made = synthetic_site_rows.write_site_results(tmp_path, 1000)
     update_page(tmp_path)
     took: list[float] = []
     for number in range(1000, 1003):
         unit = made / "rows" / f"{build_run_columns(number)['file']}.parquet"
         unit.parent.mkdir(exist_ok=True)
-        found = site_results.build_run_rows(number)
+        found = synthetic_site_rows.build_run_rows(number)
         columns = {field.name: [row.get(field.name) for row in found] for field in RUN_SCHEMA}
         pq.write_table(pa.table(columns, schema=RUN_SCHEMA), unit)
         before = time.process_time()
@@ -237,7 +245,7 @@ def test_a_new_run_comes_to_the_page_of_a_thousand_within_its_time(tmp_path: Pat
 
 def test_sweeps_that_were_never_taken_in_are_named(tmp_path: Path):
     for name in ("one", "other"):
-        site_results.write_site_results(tmp_path, 3, name)
+        synthetic_site_rows.write_site_results(tmp_path, 3, name)
     update_page(tmp_path, changed_folders=[tmp_path / "one"])
     index = read(tmp_path, "index")
     assert [sweep["name"] for sweep in index["sweeps"]] == ["one"]
@@ -245,7 +253,7 @@ def test_sweeps_that_were_never_taken_in_are_named(tmp_path: Path):
 
 
 def test_one_sweep_s_folder_has_a_page_of_its_own(tmp_path: Path):
-    folder = site_results.write_site_results(tmp_path, 3)
+    folder = synthetic_site_rows.write_site_results(tmp_path, 3)
     assert update_page(folder) == folder / "index.html"
     (sweep,) = read(folder, "index")["sweeps"]
     assert (sweep["slug"], sweep["up"], sweep["name"]) == ("this", "./", "made")
@@ -275,17 +283,17 @@ def test_words_are_kept_once():
 
 
 def test_a_run_alone_is_on_the_page(tmp_path: Path):
-    same = {key: value for key, value in site_results.build_run_rows(12)[0].items() if key != "file"}
+    same = {key: value for key, value in synthetic_site_rows.build_run_rows(12)[0].items() if key != "file"}
     (tmp_path / "sweep" / "rows").mkdir(parents=True)
-    rows.write_rows(tmp_path / "sweep" / "rows" / "a-failed-run.parquet", [same])
+    parquet_rows.write_rows(tmp_path / "sweep" / "rows" / "a-failed-run.parquet", [same])
     update_page(tmp_path)
     assert cells(read(tmp_path, "sweep/runs"), "status") == ["unsupported"]
 
 
 def test_figures_of_what_blew_up_are_shown_as_large_as_a_page_can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    normal = site_results.build_run_rows
-    monkeypatch.setattr(site_results, "rows", lambda k: [row | {"largest_strain": 5.2e39} for row in normal(k)])
-    site_results.write_site_results(tmp_path, 1)
+    normal = synthetic_site_rows.build_run_rows
+    monkeypatch.setattr(synthetic_site_rows, "rows", lambda k: [row | {"largest_strain": 5.2e39} for row in normal(k)])
+    synthetic_site_rows.write_site_results(tmp_path, 1)
     update_page(tmp_path)
     found = read(tmp_path, f"made/runs/{build_run_columns(0)['run_id']}")
     assert found["strain"] == pytest.approx([3e38] * len(found["frame"]))

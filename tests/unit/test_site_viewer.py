@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from springbench.harness.recording.recording_reader import read_replay
+from springbench.harness.report.site import rerun_viewer
 
-from harness.record.reader import read_replay
-from harness.report.site import viewer
-from tests.browser import launch_chromium
-from tests.recordings import write_recording
+from tests.headless_browser import launch_chromium
+from tests.synthetic_recordings import write_recording
 
-REPLAY = Path(viewer.__file__).parent / "static" / "replay.js"
+REPLAY = Path(rerun_viewer.__file__).parent / "static" / "replay.js"
 PAGE = (
     '<!doctype html><html lang="en" data-theme=""><title>t</title>'
     '<body><script src="site/replay.js"></script></body></html>'
@@ -28,21 +28,21 @@ PAGE = (
 
 def test_the_viewer_is_the_one_that_the_page_was_written_for():
     words = "open recordings in it (pytest -m long tests/unit/test_site_viewer.py), then raise VERSION"
-    assert version("rerun-sdk") == viewer.RERUN_VERSION, words
+    assert version("rerun-sdk") == rerun_viewer.RERUN_VERSION, words
 
 
 def test_a_script_holds_its_recording_and_is_written_once(tmp_path: Path):
     recording = write_recording(tmp_path / "a.rrd", frame_count=3)
-    script = viewer.write_recording(recording, tmp_path / "site" / "a.js", 'cloth "6"')
+    script = rerun_viewer.write_recording(recording, tmp_path / "site" / "a.js", 'cloth "6"')
     name, value = script.read_text().removesuffix(";\n").split(" = ", 1)
     told = json.loads(value)
     assert (name, told["title"]) == ("springbench.taken", 'cloth "6"')
-    assert gzip.decompress(b64decode(told["rrd"])) == viewer.move_layout_first(recording.read_bytes())
+    assert gzip.decompress(b64decode(told["rrd"])) == rerun_viewer.move_layout_first(recording.read_bytes())
     made = script.stat().st_mtime_ns
-    viewer.write_recording(recording, script, "other")
+    rerun_viewer.write_recording(recording, script, "other")
     assert script.stat().st_mtime_ns == made
     os.utime(recording, ns=(made + 1, made + 1))
-    viewer.write_recording(recording, script, "newer")
+    rerun_viewer.write_recording(recording, script, "newer")
     assert '"newer"' in script.read_text()
 
 
@@ -60,12 +60,12 @@ def messages(data: bytes) -> list[bytes]:
 def test_a_script_has_the_layout_first_all_that_was_recorded_and_no_index(tmp_path: Path):
     whole = write_recording(tmp_path / "a.rrd", frame_count=12).read_bytes()
     *parts, index = messages(whole)
-    turned = messages(viewer.move_layout_first(whole))
+    turned = messages(rerun_viewer.move_layout_first(whole))
     assert sorted(turned) == sorted(parts)
     assert index[0] == 0
     complete = next(k for k, message in enumerate(turned) if message[0] == 3)
     assert all(b"scene/mesh" not in message[:600] for message in turned[:complete])
-    (tmp_path / "b.rrd").write_bytes(viewer.move_layout_first(whole))
+    (tmp_path / "b.rrd").write_bytes(rerun_viewer.move_layout_first(whole))
     a, b = (read_replay(tmp_path / name) for name in ("a.rrd", "b.rrd"))
     np.testing.assert_array_equal(a.positions, b.positions)
 
@@ -74,7 +74,7 @@ def site(folder: Path) -> Path:
     """A page that can replay, without the viewer."""
     (folder / "site").mkdir()
     shutil.copy(REPLAY, folder / "site")
-    viewer.write_recording(write_recording(folder / "a.rrd"), folder / "site" / "a.js", "cloth 6")
+    rerun_viewer.write_recording(write_recording(folder / "a.rrd"), folder / "site" / "a.js", "cloth 6")
     (folder / "index.html").write_text(PAGE)
     return folder / "index.html"
 
@@ -114,7 +114,7 @@ def test_a_page_replays_recordings_from_the_file_system_and_says_what_it_lacks(t
         tab.keyboard.press("Escape")
         said.clear()  # the browser's own word of the file that is missing
 
-        viewer.write_viewer(tmp_path / "site")
+        rerun_viewer.write_viewer(tmp_path / "site")
         assert not tab.evaluate(ask, ["site/none.js", "a.rrd"])
         assert tab.get_by_text("This recording is not part of the report").is_visible()
         said.clear()

@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 import pytest
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.experiments import run_pipeline as runs
+from springbench.harness.experiments.run_pipeline import execute_run
+from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.harness.report.sweep_summary import SOLVED_RESIDUAL, summarise_sweep
+from springbench.harness.report.timing_table import read_run_times as runs_of
+from springbench.harness.results.run_schema import RUN_SCHEMA
 
-from harness.base.columns import RUN_SCHEMA
-from harness.config.load import load_config
-from harness.experiments import run as runs
-from harness.experiments.plan import RunFiles
-from harness.experiments.run import execute_run
-from harness.report.learned import SOLVED_RESIDUAL, summarise_sweep
-from harness.report.timing_table import read_run_times as runs_of
-from tests.own_solvers import SWEEP_OPTIONS, PluginSweep, write_plugin_solver
+from tests.plugin_solvers import SWEEP_OPTIONS, PluginSweep, write_plugin_solver
 
 
 def rows_of(made: PluginSweep, folder: Path) -> list[dict[str, Any]]:
@@ -70,7 +70,9 @@ WRONG = {
         "gave positions as float64 of shape (48,); wanted float64 of shape (16, 3)",
     ),
     "a list": Wrong("return replace(found, positions=[])", "def solve", "gave positions as a list; wanted float64"),
-    "no answer": Wrong("return None", "def solve", "gave a NoneType; wanted a solvers.problem.Solution"),
+    "no answer": Wrong(
+        "return None", "def solve", "gave a NoneType; wanted a springbench.solvers.model.step_problem.Solution"
+    ),
     "writes to the target": Wrong("problem.target[:] += 0.1", "problem.target", "wrote to problem.target"),
     "writes to the velocity": Wrong(
         "problem.start.velocity[0] = 3.0", "problem.start", "wrote to problem.start.velocity"

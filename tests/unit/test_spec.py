@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from harness.api import Simulation
-from harness.base.errors import InputError
-from harness.config.load import SweepPlan, load_config, load_scene, load_sweep
-from harness.config.options import DEFAULT_SOLVER, DEFAULT_STOP_RULE
-from harness.config.schema import build_json_schema
-from harness.config.sweep import RunSpec
-from harness.scenes.bind import build_scene
+from springbench.harness.api import Simulation
+from springbench.harness.config.config_loader import SweepPlan, load_config, load_scene, load_sweep
+from springbench.harness.config.json_schema import build_json_schema
+from springbench.harness.config.run_options import DEFAULT_SOLVER, DEFAULT_STOP_RULE
+from springbench.harness.config.sweep_config import RunSpec
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.scene_builder import build_scene
 
 ROOT = Path(__file__).resolve().parents[2]
 ASSIGNMENT = ROOT.parent / "shared" / "scenes"
@@ -242,14 +241,18 @@ def test_the_schema_describes_every_key_of_a_scene_and_a_sweep() -> None:
 
 def test_a_scene_imports_the_effects_that_it_names_and_no_others(folder: Path) -> None:
     code = (
-        "import json, sys; from pathlib import Path; from harness.config.load import load_scene;"
+        "import json, sys; from pathlib import Path; from springbench.harness.config.config_loader import load_scene;"
         "load_scene(Path(sys.argv[1]));"
-        "print(json.dumps([m for m in sys.modules if m.startswith('harness.scenes.effects.')]))"
+        "print(json.dumps([m for m in sys.modules if m.startswith('springbench.harness.scenes.effects.')]))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, str(folder / "cloth.yaml")], capture_output=True, text=True, check=True, cwd=ROOT
     )
-    expected = {"harness.scenes.effects.base", "harness.scenes.effects.effect_names", "harness.scenes.effects.springs"}
+    expected = {
+        "springbench.harness.scenes.effects.effect_interface",
+        "springbench.harness.scenes.effects.effect_table",
+        "springbench.harness.scenes.effects.springs_effect",
+    }
     assert set(json.loads(done.stdout)) == expected
 
 

@@ -10,31 +10,31 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-
-from harness.base import machine
-from harness.base.errors import InputError, RunFailed
-from harness.base.holding import lock_folder_exclusive
-from harness.config.load import load_config, load_sweep
-from harness.config.sweep import RunSpec, SolverSpec
-from harness.experiments.speed import candidates, limits, round_robin
-from harness.experiments.speed.candidates import CandidateTiming, compute_call_seconds
-from harness.experiments.speed.comparison import run_roofline
-from harness.experiments.speed.rest import compute_precision_error, find_converged_problem
-from harness.experiments.speed.round_robin import (
+from springbench.harness.config.config_loader import load_config, load_sweep
+from springbench.harness.config.sweep_config import RunSpec, SolverSpec
+from springbench.harness.errors import InputError, RunFailed
+from springbench.harness.execution import machine_info
+from springbench.harness.execution.folder_locks import lock_folder_exclusive
+from springbench.harness.experiments.roofline import benchmark_candidates, round_robin, stream_probes
+from springbench.harness.experiments.roofline.benchmark_candidates import CandidateTiming, compute_call_seconds
+from springbench.harness.experiments.roofline.precision_error import compute_precision_error, find_converged_problem
+from springbench.harness.experiments.roofline.roofline_comparison import run_roofline
+from springbench.harness.experiments.roofline.round_robin import (
     NUM_PREPARATIONS,
     PastTiming,
     format_candidate_name,
     measure_round_robin,
     predict_seconds,
 )
-from harness.report.speed.counts import count_operations
-from harness.report.speed.figures import compute_speed_figures
-from harness.report.speed.speed_table import build_speed_table, describe_speed
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.problem import Unsupported
-from tests.displays import SilentDisplay
-from tests.scenes import build_cloth, build_first_problem
-from tests.undisturbed import retry_if_preempted
+from springbench.harness.report.speed.operation_counts import count_operations
+from springbench.harness.report.speed.speed_figures import compute_speed_figures
+from springbench.harness.report.speed.speed_table import build_speed_table, describe_speed
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.model.step_problem import Unsupported
+
+from tests.preemption_retry import retry_if_preempted
+from tests.progress_displays import SilentDisplay
+from tests.scene_builders import build_cloth, build_first_problem
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = ROOT / "configs" / "scenes" / "yardstick-cloth.yaml"
@@ -170,14 +170,14 @@ def test_an_entry_that_is_read_is_a_multiply_and_an_add_for_each_of_three_sides(
 
 
 def test_the_probes_do_what_they_count():
-    found = list(limits.build_probes((1 << 14, 1 << 16)))
+    found = list(stream_probes.build_probes((1 << 14, 1 << 16)))
     assert [p.name for p in found] == ["read", "triad"] * 2 + ["fma float64", "fma float32"]
     assert all(p.bytes_moved % p.working_set_bytes == 0 for p in found if p.name == "read")
     total = found[0].call()
     # The array holds ones: every entry that was counted was read.
     assert 8 * total == found[0].bytes_moved
     b, c, a = np.full(8, 2.0), np.full(8, 5.0), np.empty(8)
-    limits._triad(a, b, c, 1, 1)
+    stream_probes._triad(a, b, c, 1, 1)
     assert (a == 17.0).all()
     assert found[4].flops == found[5].flops / 2
 
@@ -196,9 +196,9 @@ def sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "small.yaml").write_text(SWEEP)
     (tmp_path / SCENE.name).write_bytes(SCENE.read_bytes())
     monkeypatch.setattr(shutil, "which", lambda _: None)
-    monkeypatch.setattr(limits, "WORKING_SETS", (1 << 14, 1 << 16))
-    monkeypatch.setattr(limits.build_probes, "__defaults__", ((1 << 14, 1 << 16),))
-    monkeypatch.setattr(candidates.compute_call_seconds, "__defaults__", (0.0,))
+    monkeypatch.setattr(stream_probes, "WORKING_SETS", (1 << 14, 1 << 16))
+    monkeypatch.setattr(stream_probes.build_probes, "__defaults__", ((1 << 14, 1 << 16),))
+    monkeypatch.setattr(benchmark_candidates.compute_call_seconds, "__defaults__", (0.0,))
     return load_sweep(tmp_path / "small.yaml")
 
 
@@ -237,7 +237,7 @@ def test_a_report_is_complete_and_done_once(sweep, tmp_path: Path, monkeypatch: 
     assert done().equals(table)
     assert (display.titles, said) == (titles, ["2 of 2 sizes are there already"])
     # What other code measured is shown, and said to be so.
-    monkeypatch.setattr(machine, "code_hash", lambda: "another")
+    monkeypatch.setattr(machine_info, "code_hash", lambda: "another")
     done()
     assert said[2] == f"2 of them by other code than today's: {', '.join(titles)}"
     assert all((tmp_path / "out" / "rows").glob("*.parquet"))
@@ -250,11 +250,11 @@ def test_a_time_that_another_clock_does_not_bear_out_is_a_failure(monkeypatch: p
             pass
 
     def timed() -> tuple[list[dict[str, Any]], float]:
-        calls = candidates.RepeatedCall(busy)
+        calls = benchmark_candidates.RepeatedCall(busy)
         found = compute_call_seconds(calls)
         return [{"interrupted": calls.preempted}], found
 
     assert timed()[1] >= 0.005
-    monkeypatch.setattr(candidates, "perf_counter", lambda: perf_counter() / 1000)
+    monkeypatch.setattr(benchmark_candidates, "perf_counter", lambda: perf_counter() / 1000)
     with pytest.raises(RunFailed, match="the times of calls add up to"):
         retry_if_preempted(timed)

@@ -6,11 +6,10 @@ from typing import Any
 
 import pyarrow as pa
 import pytest
-
-from harness.base.columns import RUN_SCHEMA
-from harness.report.speed.counts import count_operations
-from harness.report.speed.figures import MachineLimits, SpeedFigures, compute_speed_figures
-from harness.report.speed.speed_table import describe_speed, fit_exponents
+from springbench.harness.report.speed.operation_counts import count_operations
+from springbench.harness.report.speed.speed_figures import MachineLimits, SpeedFigures, compute_speed_figures
+from springbench.harness.report.speed.speed_table import describe_speed, fit_exponents
+from springbench.harness.results.run_schema import RUN_SCHEMA
 
 
 def machine_row(phase: str, seconds: float, *, bytes: float = 0.0, flops: float = 0.0, working_set: float = 0.0):

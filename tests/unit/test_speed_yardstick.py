@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from springbench.harness.errors import RunFailed
+from springbench.harness.experiments.roofline.cpp_baseline import MALLOC_TUNABLES, CppBaseline, compile_baseline
+from springbench.harness.report.plot_style import PAGE_HEIGHT, PAGE_WIDTH
+from springbench.harness.report.speed.size_plot import CandidateLine, draw_size_plot
+from springbench.solvers.methods.local_global import cpp_backend
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.model.step_problem import StopRule, Unsupported
 
-from harness.base.errors import RunFailed
-from harness.experiments.speed.yardstick import MALLOC_TUNABLES, CppBaseline, compile_baseline
-from harness.report.speed.size_plot import CandidateLine, draw_size_plot
-from harness.report.style import PAGE_HEIGHT, PAGE_WIDTH
-from solvers.core import native
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import StopRule, Unsupported
-from tests.scenes import build_cloth, build_first_problem
+from tests.scene_builders import build_cloth, build_first_problem
 
 ECHO = f"""#!{sys.executable}
 import sys
@@ -40,7 +40,7 @@ def echo(tmp_path: Path) -> Path:
 
 
 def test_without_a_compiler_it_is_unsupported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(native.shutil, "which", lambda _: None)
+    monkeypatch.setattr(cpp_backend.shutil, "which", lambda _: None)
     with pytest.raises(Unsupported, match=r"no C\+\+ compiler"):
         compile_baseline(tmp_path)
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from springbench.solvers.model.energies.spring_energy import ZERO_LENGTH, Springs
 
-from solvers.energies.springs import ZERO_LENGTH, Springs
-from tests.scenes import build_random_network
+from tests.scene_builders import build_random_network
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -5,16 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydantic import TypeAdapter
-
-from harness.base.errors import InputError
-from harness.config.load import load_config, load_scene
-from harness.scenes.bind import build_scene
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.mesh.network import NetworkMesh
-from harness.scenes.mesh.star import StarMesh
-from harness.scenes.start import AnyStart
-from harness.simulation.step import build_initial_state
+from springbench.harness.config.config_loader import load_config, load_scene
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.mesh.network_mesh import NetworkMesh
+from springbench.harness.scenes.mesh.star_mesh import StarMesh
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.scenes.start_positions import AnyStart
+from springbench.harness.simulation.time_loop import build_initial_state
 
 REST = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 4.0, 0.0], [0.0, 4.0, 8.0]])
 MEAN = [1.0, 2.0, 2.0]

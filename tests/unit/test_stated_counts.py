@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from harness.config.load import load_config
-from solvers.about import ENGINE_FAMILY
-from solvers.integrators import INTEGRATORS, SUBSTEPPING
-from solvers.registry import OPTIONAL_SOLVERS, SOLVER_TABLE, SOLVERS, find_solver_info, load_target
+from springbench.harness.config.config_loader import load_config
+from springbench.solvers.iteration.solver_info import ENGINE_FAMILY
+from springbench.solvers.model.integrators import INTEGRATORS, SUBSTEPPING
+from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVER_TABLE, SOLVERS, find_solver_info, load_target
 
 ROOT = Path(__file__).parents[2]
 WORDS = {

@@ -2,8 +2,12 @@
 
 import numpy as np
 import pytest
-
-from harness.base.statistics import compute_min_seconds, estimate_added_time, estimate_ratio, estimate_slowdown
+from springbench.harness.results.bootstrap_statistics import (
+    compute_min_seconds,
+    estimate_added_time,
+    estimate_ratio,
+    estimate_slowdown,
+)
 
 
 def test_the_interval_holds_the_ratio_and_is_the_same_each_time():

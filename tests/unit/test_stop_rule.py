@@ -9,22 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect as PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect as SpringsEffect
+from springbench.harness.scenes.mesh.grid_mesh import NetMesh
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.simulation.convergence_trace import EnergyNorm, trace_convergence
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.local_global.prefactored import require_only_springs
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
+from springbench.solvers.model.rounding_bound import ROUNDOFF_FACTOR, gradient_roundoff, is_gradient_roundoff, row_norms
+from springbench.solvers.model.step_problem import StepProblem, StopRule
 
-from harness.config.load import load_scene
-from harness.scenes.bind import Scene, build_scene
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect as PinsEffect
-from harness.scenes.effects.springs import SpringsEffect as SpringsEffect
-from harness.scenes.mesh.grid import NetMesh
-from harness.simulation.step import prepare, simulate_scene
-from harness.simulation.trace import EnergyNorm, trace_convergence
-from solvers.core.prefactored import require_only_springs
-from solvers.methods.lbfgs import Lbfgs
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import StepProblem, StopRule
-from solvers.round_off import ROUNDOFF_FACTOR, gradient_roundoff, is_gradient_roundoff, row_norms
-from tests.scenes import (
+from tests.scene_builders import (
     LOCAL_GLOBAL_BACKENDS,
     build_cloth,
     build_first_problem,

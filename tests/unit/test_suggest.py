@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from springbench.harness.experiments.ablation import effect_suggestions
+from springbench.harness.experiments.ablation.effect_suggestions import EffectSuggestion
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.scene_builder import Scene
 
-from harness.experiments.ablation import suggest
-from harness.experiments.ablation.suggest import EffectSuggestion
-from harness.scenes.bind import Scene
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.mesh.grid import GridMesh
-from tests.effects import build_effect_cloth
-from tests.scenes import build_test_scene
+from tests.effect_scenes import build_effect_cloth
+from tests.scene_builders import build_test_scene
 
 
 def asked(
@@ -21,8 +21,8 @@ def asked(
 ) -> list[EffectSuggestion]:
     """What a motion calls for that passes through positions (n, 3) for 12 frames."""
     places = np.tile(positions, (12, 1, 1))
-    return suggest.suggest_effects(
-        suggest.build_evidence(made, kinds, places, np.broadcast_to(velocities, places.shape)), kinds
+    return effect_suggestions.suggest_effects(
+        effect_suggestions.build_evidence(made, kinds, places, np.broadcast_to(velocities, places.shape)), kinds
     )
 
 

@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from scipy.sparse import block_diag, csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
-
-from solvers.linear import supernodal
-from solvers.linear.supernodal import SupernodalCholesky
-from solvers.matrices import diagonal_matrix, drop_zeros, signed_incidence_matrix_sparse
-from solvers.problem import NotPositiveDefinite
+from springbench.solvers.linalg.cholesky import supernodal_cholesky
+from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky
+from springbench.solvers.model.step_problem import NotPositiveDefinite
+from springbench.solvers.model.system_matrix_assembly import diagonal_matrix, drop_zeros, signed_incidence_matrix_sparse
 
 
 def network(springs, stiffness, held):
@@ -211,7 +210,7 @@ def threads():
 
 @pytest.mark.parametrize("precision", ["float64", "float32", "float16"])
 def test_gives_the_same_bits_whatever_the_number_of_threads(precision, threads, monkeypatch):
-    monkeypatch.setattr(supernodal, "_WORTH_THREADS", 0)
+    monkeypatch.setattr(supernodal_cholesky, "_WORTH_THREADS", 0)
     Q, b = sheet(64), right_hand_sides(4096)
     factor = SupernodalCholesky(Q, precision=precision)
     results = []

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numba import njit  # noqa: TID251
-
-from solvers.linear.supernodal_solve import backward_substitution, forward_substitution
-from solvers.memory import allocate_aligned
+from springbench.solvers.linalg.cholesky.triangular_solve import backward_substitution, forward_substitution
+from springbench.solvers.linalg.memory import allocate_aligned
 
 TYPES = {"float64": (np.float64, 1e-12), "float32": (np.float32, 1e-5), "float16": (np.float32, 1e-5)}
 """The work vector's type for panels of each precision, and the round-off to allow in sums of some 40 numbers of 1."""

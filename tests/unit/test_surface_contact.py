@@ -8,34 +8,45 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from springbench.harness.errors import InputError
+from springbench.harness.recording.obstacle_shapes import build_obstacles_property
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.self_contact_effect import SelfContactEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.effects.surface_contact_effect import SurfaceContactEffect
+from springbench.harness.scenes.key_frames import KeyFrame, KeyFrameMotion
+from springbench.harness.scenes.mesh.body_mesh import BodyMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.mesh.mesh import Mesh
+from springbench.harness.scenes.mesh.stack_mesh import StackMesh
+from springbench.harness.scenes.mesh.surface_meshes import BalloonMesh
+from springbench.harness.scenes.primitive_obstacles import BoxObstacle, CapsuleObstacle, PlaneObstacle, SphereObstacle
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.scenes.surface_obstacles import (
+    MeshObstacle,
+    TriangleSurface,
+    build_obstacle_surface,
+    parse_obstacles,
+)
+from springbench.harness.simulation.instrumentation_pass import count_intersections
+from springbench.harness.simulation.time_loop import (
+    MotionState,
+    build_initial_state,
+    build_problem,
+    prepare,
+    simulate_scene,
+)
+from springbench.harness.verification.verify_scene import verify_terms
+from springbench.solvers.contact.contact_potential import ObstacleContact
+from springbench.solvers.contact.obstacle_advancement import NoClearance
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import Positions, StopRule
+from springbench.solvers.registry import SOLVERS, load_target
 
-from harness.base.errors import InputError
-from harness.record.obstacles import build_obstacles_property
-from harness.scenes.bind import Scene, build_scene
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.self_contact import SelfContactEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.effects.surface_contact import SurfaceContactEffect
-from harness.scenes.mesh.base import Mesh
-from harness.scenes.mesh.body import BodyMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.mesh.stack import StackMesh
-from harness.scenes.mesh.surfaces import BalloonMesh
-from harness.scenes.motion import KeyFrame, KeyFrameMotion
-from harness.scenes.obstacles import BoxObstacle, CapsuleObstacle, PlaneObstacle, SphereObstacle
-from harness.scenes.shapes import MeshObstacle, TriangleSurface, build_obstacle_surface, parse_obstacles
-from harness.scenes.spec import SceneSpec
-from harness.simulation.observe import count_intersections
-from harness.simulation.opinion.second import verify_terms
-from harness.simulation.step import MotionState, build_initial_state, build_problem, prepare, simulate_scene
-from solvers.contact.self_contact import ObstacleContact
-from solvers.core.clearing import NoClearance
-from solvers.integrators import Motion
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import Positions, StopRule
-from solvers.registry import SOLVERS, load_target
-from tests.scenes import build_test_scene
-from tests.self_contacts import random_displacement
+from tests.scene_builders import build_test_scene
+from tests.self_contact_scenes import random_displacement
 
 BALL = MeshObstacle(mesh=BalloonMesh(radius=0.3), size=4, offset=(0.02, -0.33, 0.01))
 RULE = StopRule(100, 1e-4)

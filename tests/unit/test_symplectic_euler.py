@@ -7,20 +7,24 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect as PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect as SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import MotionState, simulate_scene
+from springbench.solvers.methods.time_stepping.symplectic_euler import (
+    PreparedSymplecticEuler,
+    SymplecticEuler,
+    bound_max_frequency,
+)
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import DirichletPins, StopRule, System, Unsupported
+from springbench.solvers.model.system_matrix_assembly import diagonal_matrix
 
-from harness.scenes.bind import Scene
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect as PinsEffect
-from harness.scenes.effects.springs import SpringsEffect as SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.simulation.step import MotionState, simulate_scene
-from solvers.energies.springs import Springs
-from solvers.integrators import Motion
-from solvers.matrices import diagonal_matrix
-from solvers.methods.symplectic_euler import PreparedSymplecticEuler, SymplecticEuler, bound_max_frequency
-from solvers.problem import DirichletPins, StopRule, System, Unsupported
-from tests.scenes import (
+from tests.scene_builders import (
     SCENE_BUILDERS,
     build_cloth,
     build_first_problem,

@@ -6,9 +6,8 @@ from threading import Thread
 
 import numpy as np
 import pytest
-
-from solvers.compiling import jit_kernel
-from solvers.linear.team import (
+from springbench.solvers.jit.kernel_compilation import jit_kernel
+from springbench.solvers.linalg.cholesky.thread_team import (
     ThreadTeam,
     complete_task,
     finish_phases,

@@ -7,13 +7,13 @@ from itertools import islice, pairwise
 
 import numpy as np
 import pytest
+from springbench.harness.simulation.convergence_trace import EnergyNorm, trace_convergence
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.methods.local_global.prefactored import require_only_springs
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix
 
-from harness.simulation.trace import EnergyNorm, trace_convergence
-from solvers.core.prefactored import require_only_springs
-from solvers.matrices import assemble_system_matrix
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from tests.scenes import build_cloth, build_first_problem, build_random_problem, make_read_only
+from tests.scene_builders import build_cloth, build_first_problem, build_random_problem, make_read_only
 
 
 def test_the_norm_is_the_square_root_of_the_quadratic_form_without_pins():

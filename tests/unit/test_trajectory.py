@@ -7,29 +7,32 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from harness.base.errors import RunFailed
-from harness.config.load import load_scene
-from harness.reference import motion, store
-from harness.reference.frozen import build_exact_scene
-from harness.reference.motion import NotIntegrable, OdeField
-from harness.reference.store import ReferenceStore
-from harness.reference.trajectory import ReferenceTrajectory, UnpredictableMotion, integrate_motion
-from harness.scenes.bind import Scene
-from harness.scenes.effects.air_drag import AirDragEffect
-from harness.scenes.effects.base import SceneEffect
-from harness.scenes.effects.dashpots import DashpotsEffect
-from harness.scenes.effects.ether_drag import EtherDragEffect
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect
-from harness.scenes.effects.springs import SpringsEffect
-from harness.scenes.effects.wind import WindEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.scenes.spec import MeshSource, SceneSpec
-from harness.simulation.step import prepare, simulate_scene
-from solvers.methods.newton import NewtonSolver
-from solvers.problem import StopRule
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.errors import RunFailed
+from springbench.harness.reference import equations_of_motion, reference_store
+from springbench.harness.reference.equations_of_motion import NotIntegrable, OdeField
+from springbench.harness.reference.reference_store import ReferenceStore
+from springbench.harness.reference.reference_trajectory import (
+    ReferenceTrajectory,
+    UnpredictableMotion,
+    integrate_motion,
+)
+from springbench.harness.reference.step_snapshot import build_exact_scene
+from springbench.harness.scenes.effects.air_drag_effect import AirDragEffect
+from springbench.harness.scenes.effects.dashpots_effect import DashpotsEffect
+from springbench.harness.scenes.effects.effect_interface import SceneEffect
+from springbench.harness.scenes.effects.ether_drag_effect import EtherDragEffect
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.effects.wind_effect import WindEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.scenes.scene_spec import MeshSource, SceneSpec
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.step_problem import StopRule
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "scenes"
 G = 9.81
@@ -204,7 +207,7 @@ SWING = (SPRING, HELD, GravityEffect(), EtherDragEffect(rate=C))
 def test_a_trajectory_is_integrated_once_for_all_time_steps(tmp_path, monkeypatch):
     kept = ReferenceStore(tmp_path)
     found = kept.load_trajectory(spec(ChainMesh(), *SWING), 3, TIMES, error=1e-3)
-    monkeypatch.setattr(store, "integrate", None)
+    monkeypatch.setattr(reference_store, "integrate", None)
     for time_step in (1 / 30, 1 / 240):
         again = kept.load_trajectory(spec(ChainMesh(), *SWING, time_step=time_step), 3, TIMES, error=1e-3)
         for f in fields(ReferenceTrajectory):
@@ -233,7 +236,7 @@ def test_a_trajectory_of_equations_that_have_changed_is_integrated_anew(tmp_path
     kept, asked = ReferenceStore(tmp_path), spec(ChainMesh(), *SWING)
     before = kept.load_trajectory(asked, 3, TIMES, error=1e-3)
     stiffer = build_exact_scene(spec(ChainMesh(), SpringsEffect(rule="fixed", stretch=K + 1.0), *SWING[1:]), 3)
-    monkeypatch.setattr(motion, "bind", lambda *question: stiffer)
+    monkeypatch.setattr(equations_of_motion, "bind", lambda *question: stiffer)
     after = kept.load_trajectory(asked, 3, TIMES, error=1e-3)
     assert np.abs(after.positions - before.positions).max() > 1e-4
     np.testing.assert_array_equal(after.positions, integrate_motion(stiffer, TIMES).positions)

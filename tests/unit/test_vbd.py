@@ -7,15 +7,15 @@ from itertools import islice, pairwise
 
 import numpy as np
 import pytest
+from springbench.harness.simulation.time_loop import INITIAL_GUESSES
+from springbench.solvers.contact.half_space.half_space_potential import ContactPlanes
+from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.methods.vertex_block.vbd import PreparedVertexBlockDescent, SweepState, VertexBlockDescent
+from springbench.solvers.model.step_problem import NotPositiveDefinite, StepProblem, StopRule, Unsupported
 
-from harness.simulation.step import INITIAL_GUESSES
-from solvers.contact.energy import ContactPlanes
-from solvers.contact.touching import without_vertex_contact
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.methods.vbd import PreparedVertexBlockDescent, SweepState, VertexBlockDescent
-from solvers.problem import NotPositiveDefinite, StepProblem, StopRule, Unsupported
-from tests.contacts import OBSTACLE_SPECS, build_contact, build_sheet, collect_steps
-from tests.scenes import SCENE_BUILDERS, build_cloth, build_first_problem, build_random_problem
+from tests.contact_scenes import OBSTACLE_SPECS, build_contact, build_sheet, collect_steps
+from tests.scene_builders import SCENE_BUILDERS, build_cloth, build_first_problem, build_random_problem
 from tests.unit.test_xpbd import Other
 
 METHODS = {"plain": VertexBlockDescent(0.0), "accelerated": VertexBlockDescent()}

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from springbench.solvers.jit.kernel_compilation import jit_kernel
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.vertex_block.incident_elements import ElementKind, VertexFunctions
+from springbench.solvers.methods.vertex_block.vbd import PreparedVertexBlockDescent, VertexBlockDescent
+from springbench.solvers.methods.vertex_block.vertex_elements import VertexElements
+from springbench.solvers.model.step_problem import StopRule, Unsupported
 
-from solvers.compiling import jit_kernel
-from solvers.core.vertex_elements import VertexElements
-from solvers.kernels.stencils import ElementKind, VertexFunctions
-from solvers.methods.newton import NewtonSolver
-from solvers.methods.vbd import PreparedVertexBlockDescent, VertexBlockDescent
-from solvers.problem import StopRule, Unsupported
-from tests.effects import (
+from tests.effect_scenes import (
     BENDING_EFFECT,
     DASHPOT_EFFECT,
     EFFECT_SCENES,

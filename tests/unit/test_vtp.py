@@ -8,15 +8,14 @@ from pathlib import Path
 import meshio
 import numpy as np
 import pytest
+from springbench.harness.errors import InputError
+from springbench.harness.scenes.mesh import vtp_reader
+from springbench.harness.scenes.mesh.file_mesh import FileMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
 from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
 from vtkmodules.vtkCommonCore import vtkPoints
 from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
 from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
-
-from harness.base.errors import InputError
-from harness.scenes.mesh import vtp
-from harness.scenes.mesh.files import FileMesh
-from harness.scenes.mesh.grid import GridMesh
 
 MESH = GridMesh().build_mesh(5)
 HEAT = np.arange(25) / 7
@@ -57,7 +56,7 @@ def written(path: Path, mode: str, compressor: str, wide: bool) -> Path:
 @pytest.mark.parametrize("mode", ["ascii", "binary", "base64", "raw"])
 def test_every_form_holds_the_same(tmp_path, mode):
     for compressor, wide in product(("None", "ZLib", "LZMA"), (False, True)):
-        read = vtp.read_vtp(written(tmp_path / "mesh.vtp", mode, compressor, wide).read_bytes())
+        read = vtp_reader.read_vtp(written(tmp_path / "mesh.vtp", mode, compressor, wide).read_bytes())
         np.testing.assert_array_equal(read.points, MESH.rest_positions)
         corners = [polygon.tolist() for polygon in read.polygons]
         assert corners == [[0, 1, 6, 5], [1, 2, 7], [10, 11, 15], [11, 16, 15], [15, 16, 20]]

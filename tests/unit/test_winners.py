@@ -7,17 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from springbench.harness.report.accuracy.accuracy_findings import summarise_findings
+from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
+from springbench.harness.report.accuracy.winner_map import NO_WINNER, WinnerCell, build_winner_cells, method_family
+from springbench.harness.report.figures.accuracy_panels import work_precision_panels
+from springbench.harness.report.figures.figure_panels import CellMap, CurvePlot
+from springbench.harness.report.figures.winner_panels import winner_panels
+from springbench.harness.report.site.accuracy_charts import build_accuracy_charts
+from springbench.harness.report.site.winner_chart import build_winner_chart
 
-from harness.report.accuracy.findings import summarise_findings
-from harness.report.accuracy.reading import read_accuracy
-from harness.report.accuracy.winners import NO_WINNER, WinnerCell, build_winner_cells, method_family
-from harness.report.figures.of_accuracy import work_precision_panels
-from harness.report.figures.of_winners import winner_panels
-from harness.report.figures.panel import CellMap, CurvePlot
-from harness.report.site.accuracy import build_accuracy_charts
-from harness.report.site.winners import build_winner_chart
-from tests import accuracy_rows as made
-from tests import figure_results
+from tests import synthetic_accuracy_rows as made
+from tests import synthetic_results
 
 
 def row(solver: str, integrator: str, error: float, cpu: float, **other: Any) -> dict[str, Any]:
@@ -98,7 +98,7 @@ def test_an_integrator_from_outside_is_a_family_by_its_name(tmp_path):
 def test_each_number_of_vertices_is_a_grid_of_errors_by_stiffness(tmp_path):
     panels = [
         panel
-        for entry in winner_panels(figure_results.write_winner_results(tmp_path))
+        for entry in winner_panels(synthetic_results.write_winner_results(tmp_path))
         if isinstance(panel := entry.build_panel(), CellMap)
     ]
     assert [panel.title for panel in panels] == ["81 vertices", "289 vertices", "1\u2009089 vertices"]

@@ -11,11 +11,17 @@ from typing import NamedTuple
 
 import psutil
 import pytest
+from springbench.harness.atomic_files import WriteError
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.execution.isolated_worker import (
+    IsolatedWorker,
+    ProgressCallback,
+    TaskFailure,
+    TaskFunction,
+    TaskLimits,
+)
 
-from harness.base.errors import InputError, InputMistake
-from harness.base.files import WriteError
-from harness.base.workers import IsolatedWorker, ProgressCallback, TaskFailure, TaskFunction, TaskLimits
-from tests import workers as does
+from tests import worker_tasks as does
 
 NONE = TaskLimits()
 

@@ -8,21 +8,27 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.pins_effect import PinsEffect as PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect as SpringsEffect
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.methods.position_based.xpbd import Xpbd, XpbdSmallSteps
+from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.step_problem import DirichletPins, StepProblem, StopRule, System, Unsupported
 
-from harness.scenes.bind import Scene
-from harness.scenes.effects.gravity import GravityEffect
-from harness.scenes.effects.pins import PinsEffect as PinsEffect
-from harness.scenes.effects.springs import SpringsEffect as SpringsEffect
-from harness.scenes.mesh.chain import ChainMesh
-from harness.scenes.mesh.grid import GridMesh
-from harness.simulation.step import prepare, simulate_scene
-from solvers.energies.springs import Springs
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.methods.vbd import VertexBlockDescent
-from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
-from solvers.problem import DirichletPins, StepProblem, StopRule, System, Unsupported
 from tests.bench.primal_dual import MOST, hanging, iterations
-from tests.scenes import SCENE_BUILDERS, build_cloth, build_first_problem, build_random_problem, build_test_scene
+from tests.scene_builders import (
+    SCENE_BUILDERS,
+    build_cloth,
+    build_first_problem,
+    build_random_problem,
+    build_test_scene,
+)
 
 G, DT = 9.81, 1 / 30
 methods = pytest.mark.parametrize("method", [Xpbd(), XpbdSmallSteps()], ids=lambda m: type(m).__name__)

@@ -20,7 +20,7 @@ from math import inf
 from time import monotonic
 from typing import Any
 
-from harness.config.accuracy import WorkSpec
+from springbench.harness.config.accuracy_config import WorkSpec
 
 SLOWER = 1.5
 """Multiple of the best cost above which a method is given up; shorter steps may need fewer iterations each."""

@@ -5,17 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from harness.report.accuracy.convergence import draw_convergence
-from harness.report.accuracy.findings import list_failures, summarise_findings, write_findings, write_summary
-from harness.report.accuracy.growth import draw_scalings
-from harness.report.accuracy.measured import without_short_curves
-from harness.report.accuracy.paper import draw_liu2013
-from harness.report.accuracy.pictures import draw_snapshot_meshes
-from harness.report.accuracy.profiles import draw_profiles
-from harness.report.accuracy.reading import read_accuracy
-from harness.report.accuracy.time_plot import draw_times_to_accuracy
-from harness.report.accuracy.work_plot import draw_work_precision
-from harness.report.references import write_bibtex
+from springbench.harness.report.accuracy.accuracy_data import without_short_curves
+from springbench.harness.report.accuracy.accuracy_findings import (
+    list_failures,
+    summarise_findings,
+    write_findings,
+    write_summary,
+)
+from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
+from springbench.harness.report.accuracy.convergence_plot import draw_convergence
+from springbench.harness.report.accuracy.liu2013_comparison import draw_liu2013
+from springbench.harness.report.accuracy.performance_profiles import draw_profiles
+from springbench.harness.report.accuracy.size_scaling import draw_scalings
+from springbench.harness.report.accuracy.snapshot_pictures import draw_snapshot_meshes
+from springbench.harness.report.accuracy.time_to_accuracy_plot import draw_times_to_accuracy
+from springbench.harness.report.accuracy.work_precision_plot import draw_work_precision
+from springbench.harness.report.citations import write_bibtex
 
 
 def draw_accuracy_report(folder: Path, files: Iterable[Path] | None = None) -> list[Path]:

@@ -14,6 +14,6 @@ Data files are scripts, because a page from the file system cannot load anything
 
 from __future__ import annotations
 
-from harness.report.site.build import refresh_results_page, update_page
+from springbench.harness.report.site.page_build import refresh_results_page, update_page
 
 __all__ = ["refresh_results_page", "update_page"]

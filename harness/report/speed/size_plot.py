@@ -16,8 +16,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, LogLocator, MultipleLocator, NullLocator
-
-from harness.report.page import (
+from springbench.harness.report.page_layout import (
     add_axes,
     draw_header,
     format_count,
@@ -27,7 +26,13 @@ from harness.report.page import (
     shorten_words,
     tick_formatter,
 )
-from harness.report.style import BACKGROUND_COLOUR, PAGE_HEIGHT, PAGE_RC, PAGE_WIDTH, assign_label_styles
+from springbench.harness.report.plot_style import (
+    BACKGROUND_COLOUR,
+    PAGE_HEIGHT,
+    PAGE_RC,
+    PAGE_WIDTH,
+    assign_label_styles,
+)
 
 _PANEL_LEFT, _PANEL_TOP, _NAME_WIDTH, _MARGIN_BELOW = 110, 130, 400, 70
 

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
-
-from harness.base.statistics import ConfidenceInterval
-from harness.report.page import format_count, format_quantity
-from harness.report.speed.figures import STEP_ITERATIONS, SpeedFigures
+from springbench.harness.report.page_layout import format_count, format_quantity
+from springbench.harness.report.speed.speed_figures import STEP_ITERATIONS, SpeedFigures
+from springbench.harness.results.bootstrap_statistics import ConfidenceInterval
 
 _NUMBER_HEADINGS = (
     "prepare\ncold ms",

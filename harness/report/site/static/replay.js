@@ -4,7 +4,7 @@
 //
 // script: URL of the recording as a script; title: heading above it; file: URL of the recording itself.
 // The viewer, `viewer.js` next to this file, is loaded at the first call. Each script passes its content as
-// `springbench.taken`. The start of the viewer is undocumented: harness/report/site/viewer.py pins its version.
+// `springbench.taken`. The start of the viewer is undocumented: harness/report/site/rerun_viewer.py pins its version.
 "use strict";
 window.springbench ??= {};
 (() => {

@@ -1,0 +1,6 @@
+"""`python -m springbench`: the command line."""
+
+from springbench.harness.__main__ import main
+
+if __name__ == "__main__":
+    main()

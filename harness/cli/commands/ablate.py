@@ -1,0 +1,113 @@
+"""Command `springbench ablate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from springbench.harness.cli.shared_options import InProcessOption, RerunOption, RerunStaleOption, ResultsOption
+from springbench.harness.console import get_error_console, get_output_console, print_message, split_wide_table
+
+DEFAULT_ABLATION_SOLVER, DEFAULT_ABLATION_TOLERANCE = "hybrid", 1e-4
+"""Default solver, which supports all effects, and its tolerance.
+
+It converges far enough that the solver's own error does not hide the change from an effect.
+"""
+
+DEFAULT_OVERHEAD_TOLERANCE = 1e-6
+"""Default tolerance of --all-solvers: it includes iterations far from the minimum and close to it."""
+
+DEFAULT_NUM_ROUNDS = 5
+"""Default number of times that each step is timed."""
+
+
+def ablate(
+    context: typer.Context,
+    scene: Annotated[Path, typer.Argument(help="A scene (YAML), or an assignment's scene (JSON).")],
+    results: ResultsOption = Path("results"),
+    solver: Annotated[
+        str | None, typer.Option(help=f"{DEFAULT_ABLATION_SOLVER}, to {DEFAULT_ABLATION_TOLERANCE:g}, if left out.")
+    ] = None,
+    size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default if left out.")] = None,
+    pairs: Annotated[bool, typer.Option("--pairs", help="Leave out each pair of effects too.")] = False,
+    all_solvers: Annotated[
+        bool, typer.Option("--all-solvers", help="What each effect alone adds to an iteration, by every solver.")
+    ] = False,
+    again: RerunOption = False,
+    changed: RerunStaleOption = False,
+    in_process: InProcessOption = False,
+) -> None:
+    """Measure the cost and the influence of each effect, and suggest missing ones."""
+    from springbench.harness.config.config_loader import load_config
+    from springbench.harness.execution.progress_display import create_display
+    from springbench.harness.experiments.ablation.ablation_unit import run_ablation
+    from springbench.harness.report.ablation_plot import draw_ablation_plot
+    from springbench.harness.report.ablation_summary import build_ablation_table, read_ablation, summarise_ablation
+    from springbench.harness.report.site import refresh_results_page
+    from springbench.harness.results.folder_ownership import claim_folder
+
+    if all_solvers:
+        _measure_overheads(context, scene, results, solver, size, pairs, again, changed, in_process)
+        return
+    usual = {"rounds": DEFAULT_NUM_ROUNDS, "threads": 1} | ({} if solver else {"tolerance": DEFAULT_ABLATION_TOLERANCE})
+    sweep = load_config(
+        scene, solvers=[solver or DEFAULT_ABLATION_SOLVER], sizes=[size] if size else [], **usual | context.obj
+    )
+    folder = claim_folder(results / sweep.name, scene)
+    how = {"pairs": pairs, "again": again, "changed": changed, "isolated": not in_process}
+    path = run_ablation(sweep, folder, create_display(get_error_console()), print_message, **how)
+    rows, picture = read_ablation(path), folder / "pictures" / f"ablation-{path.stem}.png"
+    if rows[0]["status"] != "ok":  # of the whole scene, with which all others are compared
+        print_message(f"{sweep.name}: {rows[0]['status']}: {rows[0]['reason']}")
+        raise typer.Exit(1)
+    get_output_console().print(split_wide_table(build_ablation_table(rows)))
+    for line in summarise_ablation(rows):
+        print_message(line)
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    draw_ablation_plot(rows, picture)
+    print_message(f"rows are in {path}, the picture is {picture}")
+    refresh_results_page(results, folder, print_message)
+
+
+def _measure_overheads(
+    context: typer.Context,
+    scene: Path,
+    results: Path,
+    solver: str | None,
+    size: int | None,
+    pairs: bool,
+    again: bool,
+    changed: bool,
+    in_process: bool,
+) -> None:
+    """Run `--all-solvers`."""
+    from springbench.harness.config.config_loader import load_config
+    from springbench.harness.errors import InputError
+    from springbench.harness.execution.progress_display import create_display
+    from springbench.harness.experiments.ablation.overhead_unit import measure_all_overheads
+    from springbench.harness.report.ablation_summary import build_overhead_table, read_ablation
+    from springbench.harness.report.site import refresh_results_page
+    from springbench.harness.results.folder_ownership import claim_folder
+    from springbench.solvers.registry import SOLVERS, load_target
+
+    if solver is not None or pairs:
+        raise InputError("--all-solvers: takes neither --solver nor --pairs; leave them out, or do without it")
+    minimising = [name for name, target in SOLVERS.items() if load_target(target).minimises]
+    usual = {"rounds": DEFAULT_NUM_ROUNDS, "threads": 1, "tolerance": DEFAULT_OVERHEAD_TOLERANCE}
+    sweep = load_config(scene, solvers=minimising, sizes=[size] if size else [], **usual | context.obj)
+    folder = claim_folder(results / sweep.name, scene)
+    paths = measure_all_overheads(
+        sweep,
+        folder,
+        create_display(get_error_console()),
+        print_message,
+        rerun=again,
+        rerun_stale=changed,
+        isolated=not in_process,
+    )
+    get_output_console().print(
+        split_wide_table(build_overhead_table([row for path in paths for row in read_ablation(path)]))
+    )
+    print_message(f"rows are in {paths[0].parent}")
+    refresh_results_page(results, folder, print_message)

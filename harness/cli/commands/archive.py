@@ -1,0 +1,113 @@
+"""Commands of `springbench` on existing results: compact, merge, publish, verify."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from springbench.harness.console import print_message
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.results import remote_storage
+
+_FOLDER_ARGUMENT: Any = {
+    "parser": remote_storage.parse_location,
+    "metavar": "PATH|URL",
+    "help": "A folder of results, or that of one sweep.",
+}
+ResultsFolder = Annotated[Path, typer.Argument(callback=remote_storage.sync_results, **_FOLDER_ARGUMENT)]
+
+
+def compact(
+    results: ResultsFolder,
+    days: Annotated[float, typer.Option(help="Pack what was written so many days ago or more; 0 is all.")] = 0.0,
+) -> None:
+    """Pack the rows of many runs into one file.
+
+    All commands read the same rows before and after.
+    """
+    from springbench.harness.experiments.archive.compaction import compact_results as pack
+
+    if not 0.0 <= days < 1e6:
+        raise InputError(InputMistake(f"came {days:g}; wanted a number of days, 0 or more", key="--days"))
+    pack(results, print_message, min_age_days=days)
+
+
+def merge(
+    sources: Annotated[list[Path], typer.Argument(help="Folders of results, or those of sweeps.")],
+    into: Annotated[Path, typer.Option("-o", "--into", help="The folder that has all of them afterwards.")],
+) -> None:
+    """Merge folders of results.
+
+    Exit code 1: runs of one machine and source code ended at different positions.
+    """
+    from springbench.harness.experiments.archive.result_merge import merge_results as bring_together
+
+    found = bring_together(sources, into, print_message)
+    print_message(f"{found.num_written} units of rows written, {found.num_existing} were there")
+    for line in found.conflicts:
+        print_message(f"conflict, on one machine and by one code: {line} positions differ")
+    for line in [line for line in found.cross_machine_differences if line not in found.conflicts]:
+        print_message(f"differs between machines or codes: {line}")
+    for line in found.machine_summary:
+        print_message(line)
+    raise typer.Exit(1 if found.conflicts else 0)
+
+
+def publish(
+    results: ResultsFolder,
+    output: Annotated[Path, typer.Option("-o", "--output", help="The archive to write (.zip).")],
+    license: Annotated[str, typer.Option(help="What others may do with it: a name or a URL.")] = "",
+) -> None:
+    """Write results, their configs and checksums to one archive.
+
+    Others can cite and verify it.
+    """
+    from springbench.harness.experiments.archive.publication import publish_results as put_together
+
+    count = put_together(results, output, print_message, license_text=license)
+    print_message(f"{output} holds {count} files; `springbench verify {output}` does a tenth of its runs again")
+
+
+def verify_archive(
+    archive: Annotated[Path, typer.Argument(help="What `springbench publish` wrote (.zip).")],
+    seed: Annotated[int | None, typer.Option(help="Chooses the runs; another each time if left out.")] = None,
+    own_code: Annotated[
+        bool, typer.Option("--own-code", help="Do also runs that need code from the archive: read it first.")
+    ] = False,
+) -> None:
+    """Verify the checksums of an archive, and repeat a random tenth of its runs.
+
+    Exit code 1: a claim fails; 3: a claim is inconclusive.
+    """
+    from secrets import randbelow
+    from tempfile import TemporaryDirectory
+
+    from springbench.harness.console import get_error_console
+    from springbench.harness.execution.progress_display import create_display
+    from springbench.harness.experiments.archive import archive_verification as checks
+
+    with checks.unpack_archive(archive) as folder, TemporaryDirectory() as scratch:
+        if wrong := checks.verify_checksums(folder):
+            for claim in wrong:
+                print_message(str(claim))
+            print_message(f"{archive} is not what was published; nothing of it was run")
+            raise typer.Exit(1)
+        print_message("all checksums hold")
+        found, claims = checks.load_published_runs(folder, print_message, with_user_code=own_code)
+        runs = checks.select_runnable(found, print_message)
+        chance = randbelow(10**6) if seed is None else seed
+        taken = checks.sample_runs(runs, chance)
+        print_message(f"{len(taken)} of {len(runs)} runs are done again (--seed {chance})")
+        claims += checks.verify_reruns(
+            taken, checks.rerun_published(taken, Path(scratch), create_display(get_error_console()))
+        )
+    for claim in claims:
+        print_message(str(claim))
+    print_message(f"no repeat confirms these columns: {', '.join(sorted(checks.IRREPRODUCIBLE_COLUMNS))}")
+    states = {claim.verdict for claim in claims}
+    bad, unknown = checks.ClaimVerdict.FAIL in states, checks.ClaimVerdict.INCONCLUSIVE in states or not claims
+    print_message(
+        "something does not hold" if bad else "not all can be told here" if unknown else "all that was done again holds"
+    )
+    raise typer.Exit(1 if bad else 3 if unknown else 0)

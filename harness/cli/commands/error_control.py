@@ -1,0 +1,292 @@
+"""Run `springbench run SCENE --error 1e-3`: simulate a scene to an error.
+
+It writes a row and a recording.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.errors import InputError, InputMistake, RunFailed
+from springbench.harness.execution import machine_info
+from springbench.harness.execution.isolated_call import run_isolated
+from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
+from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
+from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget, format_method_name
+from springbench.harness.experiments.error_control.method_search import (
+    SearchResult,
+    compute_predictability_horizon,
+    search_cheapest_method,
+)
+from springbench.harness.experiments.error_control.stored_trials import (
+    ResultRow,
+    build_trial_rows,
+    format_problem_id,
+    read_stored_trials,
+    select_promising_methods,
+)
+from springbench.harness.experiments.error_control.third_party_comparison import compare_third_party as peers_of
+from springbench.harness.experiments.provenance import build_provenance_columns
+from springbench.harness.experiments.run_pipeline import save_positions
+from springbench.harness.recording.recorder_interface import RecordedFrame, RecordingInfo
+from springbench.harness.recording.rerun_recorder import RerunRecorder
+from springbench.harness.recording.strain_shading import compute_strain_range
+from springbench.harness.reference.perturbation_growth import PerturbationGrowth
+from springbench.harness.results import parquet_rows
+from springbench.harness.results.folder_ownership import claim_folder
+from springbench.harness.results.solver_metadata import read_solver_metadata
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.solvers.model.step_problem import Positions
+
+PrintMessage = Callable[[str], None]
+_SHARED_COLUMNS = ("sweep", "scene", "size", "vertices", "threads", "horizon", "asked")
+"""Columns that the rows of third-party integrators share."""
+
+
+def run_error_control(
+    config: Path,
+    error: float,
+    results: Path,
+    print_message: PrintMessage,
+    *,
+    t_end: float | None = None,
+    sizes: Sequence[int] = (),
+    check: bool = False,
+    peers: bool = False,
+    positions: Path | None = None,
+    rerun: bool = False,
+    rejected_options: Mapping[str, Any] | None = None,
+) -> bool:
+    """Simulate the scene in a file to a relative error, and print the cost.
+
+    Args:
+        config: file of the scene.
+        error: relative error at t_end.
+        results: folder of results.
+        print_message: prints a remark.
+        t_end: simulated time [s]; that of the scene if None.
+        sizes: mesh sizes, at most one.
+        verify: whether to compare with the reference solution.
+        compare_third_party: whether to time third-party integrators too.
+        positions: where to store the positions of the frames; None for not at all.
+        rerun: whether to try all methods, even those that were expensive according to stored rows.
+        rejected_options: other options on the command line, which are not supported here.
+
+    Returns: whether the verification passes; True without verification.
+
+    Raises:
+        InputError: an option is invalid.
+        RunFailed: no method reaches the error.
+    """
+    _check_options(error, t_end, {**(rejected_options or {}), "second --size": sizes[1:]})
+    scene = load_scene(config)
+    given = config, scene, error, results, t_end, sizes[0] if sizes else None, check, peers, positions, rerun
+    return run_isolated(
+        partial(_execute_error_control, *given), [plugin for plugin, _ in scene.own.values()], print_message
+    )
+
+
+def _execute_error_control(
+    config: Path,
+    scene: SceneSpec,
+    error: float,
+    results: Path,
+    t_end: float | None,
+    size: int | None,
+    check: bool,
+    peers: bool,
+    positions: Path | None,
+    rerun: bool,
+    print_message: PrintMessage,
+) -> bool:
+    asked = ErrorTarget.from_scene(scene, size, t_end, print_message)
+    folder = claim_folder(results / config.stem, config)
+    with machine_info.limit_threads(1):
+        seen = compute_predictability_horizon(asked, error, print_message)
+        before = read_stored_trials(folder / "accuracy", asked)
+        answer = _search_method(asked, error, seen, [] if rerun else before, print_message)
+    path, best = answer.best_trial.trajectory, answer.best_trial
+    print_message(f"asked {error:g}, estimated {best.error_estimated:.1g}, {path.cpu_seconds:.3g} s of processor time")
+    factors = f", {path.num_factorisations} factorisations" if path.num_factorisations else ""
+    print_message(
+        f"by {best.method}: {path.num_accepted_steps} steps, {path.num_rejected_steps} rejected{factors}"
+        + (f"; more exact than asked, for {answer.note}" if answer.note else "")
+    )
+    print_message(f"choosing, and a closer motion for the estimate, took {answer.search_seconds:.3g} s besides")
+    measured = _verify_error(asked, error, path.positions[-1], results, print_message) if check else None
+    label = f"{config.stem}-{asked.size}-asked-{error:g}-{asked.t_end:g}"
+    recording = _record_motion(folder / "recordings" / f"{label}.rrd", config.stem, asked, answer)
+    row = _build_row(config.stem, asked, error, answer) | {
+        "error": measured,
+        "recording": f"recordings/{recording.name}",
+    }
+    (folder / "accuracy").mkdir(exist_ok=True)
+    found = [row, *(_build_third_party_rows(row, asked, error, answer, print_message) if peers else ())]
+    shared = {name: row[name] for name in (*_SHARED_COLUMNS, "problem")} | build_provenance_columns()
+    found += [shared | way for way in build_trial_rows(answer, before, error)]
+    parquet_rows.write_rows(
+        folder / "accuracy" / f"{label}.parquet", [one | {"unit": label} for one in found], ACCURACY_SCHEMA
+    )
+    if positions:
+        save_positions(positions, path.positions[1:])
+    print_message(f"the row is in {folder / 'accuracy'}, the recording is {recording}")
+    return not check or (measured is not None and measured <= error)
+
+
+def _search_method(
+    error_target: ErrorTarget,
+    error: float,
+    growth: PerturbationGrowth,
+    stored_trials: Sequence[ResultRow],
+    print_message: PrintMessage,
+) -> SearchResult:
+    """Search the cheapest method, first among those that were cheap for a similar error.
+
+    Raises RunFailed.
+    """
+    nearest, pairs = select_promising_methods(stored_trials, error)
+    if not pairs:
+        return search_cheapest_method(error_target, error, growth, print_message)
+    names = ", ".join(format_method_name(integrator, solver.name) for integrator, solver in pairs)
+    print_message(f"worth trying by rows measured before, for an error of {nearest:g}: {names}; --again tries all ways")
+    try:
+        return search_cheapest_method(error_target, error, growth, print_message, pairs)
+    except RunFailed as failed:
+        print_message(f"{failed}; so all ways are tried")
+        return search_cheapest_method(error_target, error, growth, print_message)
+
+
+def _verify_error(
+    error_target: ErrorTarget, error: float, p: Positions, results: Path, print_message: PrintMessage
+) -> float | None:
+    """Print and return the error of positions p (n, 3) [m] against the reference.
+
+    The result is None if there is none.
+    """
+    try:
+        trajectory = open_reference_store(results).load_trajectory(
+            error_target.scene, error_target.size, [error_target.t_end], error=error
+        )
+    except RunFailed as failed:
+        print_message(f"the reference cannot grade it: {failed}")
+        return None
+    measured = trajectory.measure_error(-1, p)
+    print_message(f"by the reference it errs by {measured:.2g}, {'as' if measured <= error else 'not as'} asked")
+    return measured
+
+
+def _check_options(error: float, t_end: float | None, rejected_options: Mapping[str, Any]) -> None:
+    """Raise InputError for invalid options."""
+    mistakes = [
+        InputMistake("with --error, solver and steps are chosen; leave it out", key=f"--{name.replace('_', '-')}")
+        for name, value in rejected_options.items()
+        if value
+    ]
+    if not 0.0 < error < 1.0:
+        mistakes.append(InputMistake(f"came {error:g}; wanted a number between 0 and 1", key="--error"))
+    if t_end is not None and not (isfinite(t_end) and 0.0 < t_end <= 1e4):
+        mistakes.append(InputMistake(f"came {t_end:g}; wanted seconds above 0, at most 10,000", key="--horizon"))
+    if mistakes:
+        raise InputError(mistakes)
+
+
+def _build_row(name: str, error_target: ErrorTarget, error: float, search_result: SearchResult) -> dict[str, Any]:
+    best, path = search_result.best_trial, search_result.best_trial.trajectory
+    return {
+        "kind": "asked",
+        "status": "ok",
+        "reason": search_result.note,
+        "sweep": name,
+        "scene": name,
+        "problem": format_problem_id(error_target),
+        "size": error_target.size,
+        "vertices": path.positions.shape[1],
+        "solver": best.method.solver,
+        "parameters": json.dumps({}),
+        **read_solver_metadata(best.method.solver),
+        "time_step": error_target.frame_seconds,
+        "threads": 1,
+        "horizon": error_target.t_end,
+        "asked": error,
+        **best.columns,
+        "iterations_done": path.num_iterations,
+        "seconds": [path.wall_seconds],
+        "cpu_seconds": path.cpu_seconds,
+        "seconds_per_simulated": path.wall_seconds / error_target.t_end,
+        "estimate_seconds": search_result.search_seconds,
+        **build_provenance_columns(),
+    }
+
+
+def _build_third_party_rows(
+    row: dict[str, Any],
+    error_target: ErrorTarget,
+    error: float,
+    search_result: SearchResult,
+    print_message: PrintMessage,
+) -> list[dict[str, Any]]:
+    """Build the rows of third-party integrators, and print their relative times."""
+    shared = {name: row[name] for name in _SHARED_COLUMNS} | build_provenance_columns()
+    found = list[dict[str, Any]]()
+    print_message("beside it, on the same machine in the same process, to the same error:")
+    for peer in peers_of(error_target, error, search_result):
+        told = f"{peer.cpu_time_ratio:.3g} times the processor time, an error of {peer.error_estimated:.1g}"
+        print_message(f"  {peer.name}: {peer.reason or told}")
+        became = {"status": "failed", "reason": peer.reason} if peer.reason else {"status": "ok"}
+        times = (
+            {}
+            if peer.reason
+            else {"seconds": [peer.wall_seconds], "seconds_per_simulated": peer.wall_seconds / error_target.t_end}
+        )
+        estimated = {} if peer.reason else {"estimated": peer.error_estimated}
+        found.append(shared | became | times | estimated | {"kind": "peer", "solver": peer.name})
+    return found
+
+
+def _record_motion(path: Path, name: str, error_target: ErrorTarget, search_result: SearchResult) -> Path:
+    """Write the recording of the motion, with the requested error as a property."""
+    scene, best, here = (
+        error_target.build_scene(error_target.frame_seconds, "own"),
+        search_result.best_trial,
+        machine_info.describe_machine(),
+    )
+    properties = {
+        "scene": name,
+        "size": error_target.size,
+        "solver": best.method.solver,
+        "integrator": best.method.integrator,
+    }
+    info = RecordingInfo(
+        title=f"{name} {error_target.size or ''}".strip()
+        + f" - {best.method}, estimated error {best.error_estimated:.1g}",
+        run_id=f"{path.stem}-{here.machine_id}",
+        mesh=scene.mesh,
+        springs=scene.all_springs.edges,
+        rest_lengths=scene.all_springs.rest_length,
+        pinned_vertices=scene.system.pins.vertices,
+        time_step=error_target.frame_seconds,
+        strain_range=compute_strain_range(
+            best.trajectory.positions[-1:], scene.all_springs.edges, scene.all_springs.rest_length
+        ),
+        properties={
+            **properties,
+            "status": "ok",
+            "estimated": best.error_estimated,
+            "cpu": here.cpu,
+            "commit": machine_info.read_commit(),
+        },
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    recorder = RerunRecorder(path, info)
+    try:
+        for k, p in enumerate(best.trajectory.positions):
+            recorder.record_frame(RecordedFrame(k, k * error_target.frame_seconds, p, {}, float("nan"), 0))
+        return recorder.finish_recording({})
+    finally:
+        recorder.abandon_recording()

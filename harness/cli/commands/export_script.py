@@ -1,0 +1,103 @@
+"""Command `springbench repeat`: export a simulation as a script for an external engine.
+
+The simulation is a point of an accuracy config.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from springbench.harness.console import format_plain_table, print_message
+from springbench.harness.errors import InputError, InputMistake, RunFailed
+
+if TYPE_CHECKING:
+    from springbench.harness.config.accuracy_config import WorkSpec
+    from springbench.harness.scenes.scene_builder import Scene
+
+
+def export_script(
+    config: Annotated[Path, typer.Argument(help="An accuracy config (YAML).")],
+    point: Annotated[str, typer.Argument(help="A point's name, or its last letters; all are listed if left out.")] = "",
+    output: Annotated[Path, typer.Option("-o", "--output", help="The folder for the script and its data.")] = Path(),
+) -> None:
+    """Export a script that repeats one simulation with an external engine alone."""
+    from springbench.harness.config.accuracy_loader import load_accuracy
+    from springbench.solvers.registry import SOLVER_TABLE, load_target
+
+    engines = {spec.build_file_stem(): spec for spec in load_accuracy(config).work}
+    engines = {
+        label: spec for label, spec in engines.items() if hasattr(load_target(SOLVER_TABLE[spec.solver.name]), "script")
+    }
+    if not point:
+        for line in format_plain_table(
+            [("point", "scene", "integrator", "substeps", "parameters"), *map(_format_point, engines.values())]
+        ):
+            print(line)
+        return
+    found = [label for label in engines if label.endswith(point)]
+    if len(found) != 1:
+        problem = (
+            f"came {point!r}, which {len(found)} points of outside engines end with; `springbench repeat {config}` "
+        )
+        raise InputError(InputMistake(f"{problem}lists them", key="POINT"))
+    if output.exists() and not output.is_dir():
+        raise InputError(
+            InputMistake(f"{output} is a file; expected a folder, which is made if it is missing", key="--output")
+        )
+    texts = _write_script(found[0], engines[found[0]], output)
+    print(texts[f"{found[0]}.py"], end="")
+    print_message(f"{', '.join(texts)} and {found[0]}.npz are in {output.resolve()}: run `python {found[0]}.py` there")
+
+
+def _format_point(spec: WorkSpec) -> tuple[str, ...]:
+    words = " ".join(f"{key}={value}" for key, value in spec.solver.parameters.items())
+    return spec.build_file_stem(), spec.case.title, spec.case.integrator, str(spec.options["iterations"]), words
+
+
+def _write_script(name: str, spec: WorkSpec, folder: Path) -> dict[str, str]:
+    """Write the script's files next to their data, and return their texts by name."""
+    import numpy as np
+    from springbench.harness.execution import machine_info
+    from springbench.harness.reference.step_snapshot import build_exact_scene
+    from springbench.harness.simulation.time_loop import build_initial_state, build_problem, prepare, simulate_scene
+    from springbench.solvers.external.external_engine import EngineNetwork, ExternalEngine
+    from springbench.solvers.model.step_problem import StopRule, Unsupported
+    from springbench.solvers.registry import SOLVER_TABLE, load_target
+
+    scene = build_exact_scene(spec.case.scene, spec.case.size, spec.case.integrator)
+    if acts := _list_external_changes(scene):
+        raise RunFailed(f"{name}: between frames springbench sets {' and '.join(acts)}; take another point")
+    engine: ExternalEngine = load_target(SOLVER_TABLE[spec.solver.name])(**spec.solver.parameters)
+    frames, substeps = round(spec.horizon / spec.case.scene.time_step), int(spec.options["iterations"])
+    begun = build_problem(scene, build_initial_state(scene), "current")
+    try:
+        network = EngineNetwork.from_system(scene.system, engine.solver_name, supports_damping=engine.supports_damping)
+        texts = engine.write_script(name, network, begun, substeps, frames)
+        with machine_info.limit_threads(1):
+            run = simulate_scene(
+                scene, prepare(scene, engine), StopRule(substeps), initial_guess="current", frames=frames
+            )
+            end = [step.positions for step in run][-1]
+    except Unsupported as refused:
+        raise RunFailed(str(refused)) from refused
+    arrays: dict[str, Any] = {**network.export_arrays(begun), "end": end}
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez(folder / f"{name}.npz", **arrays)
+    for file, text in texts.items():
+        (folder / file).write_text(text)
+    return texts
+
+
+def _list_external_changes(scene: Scene) -> list[str]:
+    """List the quantities that springbench changes in the engine before each frame."""
+    there = (
+        (
+            "velocities that drag has slowed (with the integrator own it is a force of the engine's)",
+            scene.velocity_filters,
+        ),
+        ("forces that change", scene.varying_forces),
+        ("pins that move", scene.pin_motions),
+    )
+    return [what for what, some in there if some]

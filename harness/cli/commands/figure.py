@@ -1,0 +1,50 @@
+"""Command `springbench figure`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from springbench.harness.console import print_message
+from springbench.harness.errors import InputError, InputMistake
+
+
+def figure(
+    kind: Annotated[str, typer.Argument(help="What to draw: convergence, times, timing, hard, run and others.")],
+    results: Annotated[Path, typer.Argument(help="The results of a config, such as results/accuracy.")],
+    width: Annotated[str, typer.Option(help="The figure's width: 85mm, 8.5cm, 3.35in, 241pt.")] = "85mm",
+    formats: Annotated[str, typer.Option("--format", help="Any of pdf, svg, png.")] = "pdf,svg,png",
+    size: Annotated[
+        float, typer.Option("--font-size", help="Points; ticks have one less, and never less than 6.")
+    ] = 8.0,
+    panels: Annotated[str, typer.Option(help="Parts of panels' names: gap:time, or two by a comma.")] = "",
+    without_title: Annotated[
+        bool, typer.Option("--without-title", help="Leave title and origin to the caption; the files keep them.")
+    ] = False,
+    transparent: Annotated[bool, typer.Option("--transparent", help="Draw no background.")] = False,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="The folder; RESULTS/figures if left out.")
+    ] = None,
+) -> None:
+    """Draw a figure for print, with its data as CSV and a script."""
+    from springbench.harness.report.figures.figure_kinds import find_figure_kind as find
+    from springbench.harness.report.figures.figure_options import parse_figure_options
+
+    wanted = parse_figure_options(width, formats, size, panels, has_title=not without_title, is_transparent=transparent)
+    found = find(kind)
+    if not results.is_dir():
+        raise InputError(InputMistake(f"is no folder; wanted one with {found.required_rows}", results))
+
+    from springbench.harness.experiments.stale_results import find_stale_runs
+    from springbench.harness.report.figures.figure_maker import make_figure
+
+    folder = output or results / "figures"
+    made = make_figure(kind, found, results, lambda table: find_stale_runs(results, table), folder, wanted)
+    across, up = made.size_mm
+    print_message(f"{across:g} mm x {up:.0f} mm: {', '.join(made.panel_names)}")
+    if made.other_panel_count:
+        print_message(
+            f"there are {made.other_panel_count} more panels; name others by --panels: {made.other_panel_example}"
+        )
+    print_message(f"drawn in {', '.join(path.name for path in made.paths)}, in {folder}")

@@ -1,0 +1,140 @@
+"""Command `springbench list`: runs with status, or all solvers, integrators, effects and meshes."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from importlib.util import find_spec
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from springbench.harness.cli.shared_options import ResultsOption
+from springbench.harness.console import format_plain_table
+
+if TYPE_CHECKING:
+    from springbench.harness.config.sweep_config import RunSpec
+
+_FIXED_COLUMNS = ("iterations", "frames", "threads")
+"""Options that always have a column, even if all runs agree in them."""
+
+
+def list_command(
+    config: Annotated[
+        Path | None,
+        typer.Argument(help="A sweep or a scene (YAML), or an assignment's scene (JSON); all names if left out."),
+    ] = None,
+    results: ResultsOption = Path("results"),
+) -> None:
+    """Check a config and list its runs with their status.
+
+    Without a config, list all solvers, effects and meshes.
+    """
+    if config is None:
+        _print_names()
+    else:
+        _print_runs(config, results)
+
+
+def _print_runs(config: Path, results: Path) -> None:
+    from springbench.harness.config.config_loader import load_config
+    from springbench.harness.execution.machine_info import describe_machine
+    from springbench.harness.experiments.sweep_plan import plan_runs
+
+    sweep = load_config(config, imports_code=False)
+    planned = plan_runs(sweep.list_runs(), results / sweep.name)
+    columns = collect_varied_settings([p.run for p in planned])
+    lines: list[tuple[str, ...]] = [("run", "scene", "size", "solver", *columns, "state")]
+    for number, p in enumerate(planned):
+        there = p.completion_status
+        state = (
+            there.status
+            + (" (by other code)" if there.is_stale else "")
+            + (" (damaged)" if there.damage_reason else "")
+        )
+        values = (values[number] for values in columns.values())
+        what = p.run.scene_name, str(p.run.size), p.run.solver.name
+        lines.append((p.files.rows_path.stem[-12:], *what, *values, state))
+    for line in format_plain_table(lines):
+        print(line)
+    print(f"states are those on this machine, {describe_machine().machine_id:.6}; settings hold on any")
+
+
+def collect_varied_settings(runs: Sequence[RunSpec]) -> dict[str, list[str]]:
+    """Return the options and solver parameters that distinguish runs of one scene, size and solver.
+
+    Args:
+        runs: runs of one sweep.
+
+    Returns: a value for each run by column; empty for a parameter that the run's solver does not have.
+    """
+    from springbench.harness.config.run_options import RUN_OPTIONS
+
+    alike: dict[tuple[str, int, str], list[RunSpec]] = {}
+    for run in runs:
+        alike.setdefault((run.scene_name, run.size, run.solver.name), []).append(run)
+
+    def differ(value: Callable[[RunSpec], Any]) -> bool:
+        return any(len({repr(value(run)) for run in group}) > 1 for group in alike.values())
+
+    values: dict[str, Callable[[RunSpec], Any]] = {name: attrgetter(name) for name in RUN_OPTIONS}
+    columns = {name: value for name, value in values.items() if name in _FIXED_COLUMNS or differ(value)}
+    for key in sorted({key for run in runs for key in run.solver.parameters}):
+        parameter = partial(_get_parameter, key)
+        if differ(parameter):
+            columns[key] = parameter
+    return {
+        name: ["" if (cell := value(run)) is None else str(cell) for run in runs] for name, value in columns.items()
+    }
+
+
+def _get_parameter(key: str, run: RunSpec) -> Any:
+    return run.solver.parameters.get(key)
+
+
+def _print_names() -> None:
+    from springbench.harness.scenes.effects.effect_table import EFFECT_TABLE as EFFECTS
+    from springbench.harness.scenes.mesh.mesh_table import MESH_TABLE as MESHES
+    from springbench.solvers.model.integrators import INTEGRATOR_TABLE as INTEGRATORS
+    from springbench.solvers.registry import SOLVER_TABLE as SOLVERS
+
+    kinds: dict[str, Mapping[str, Any]] = {
+        "solvers": SOLVERS,
+        "integrators": INTEGRATORS,
+        "effects": EFFECTS,
+        "meshes": MESHES,
+    }
+    for heading, table in kinds.items():
+        print(f"\n{heading}, {len(table)}")
+        lines = [(f"  {name}", _read_summary(target)) for name, target in table.items()]
+        width = max(len(name) for name, _ in lines)
+        for name, summary in lines:
+            print(f"{name:{width}}  {summary}".rstrip())
+    print("\nsolvers/README.md and configs/README.md describe each; `springbench schema` has all parameters")
+
+
+def _read_summary(target: Any) -> str:
+    """Read the first sentence on a class from its source.
+
+    Importing a solver would compile kernels.
+    """
+    if not isinstance(target, str):
+        from springbench.solvers.model.integrators import SUBSTEPPING
+
+        return "for solvers that integrate a step by themselves" if target is SUBSTEPPING else f"order {target.order}"
+    module, _, name = target.partition(":")
+    spec = find_spec(module)
+    if spec is None or not spec.origin:
+        return ""
+    tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
+    classes = (node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+    said = next((ast.get_docstring(node) or "" for node in classes), "")
+    # A class docstring that starts with its parameters leaves the description to the module docstring.
+    return _extract_first_sentence(ast.get_docstring(tree) or "" if said[:1].islower() else said)
+
+
+def _extract_first_sentence(text: str) -> str:
+    return re.split(r"(?<!et al)\.(?=\s|$)|[:;]\s|\s\(", " ".join(text.split()), maxsplit=1)[0]

@@ -1,0 +1,109 @@
+"""Command `springbench show`: preview a scene with the vertices that its effects select."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from springbench.harness.console import print_message
+from springbench.harness.errors import InputError
+from springbench.harness.execution.isolated_call import run_isolated
+
+if TYPE_CHECKING:
+    from springbench.harness.config.sweep_config import RunSpec
+    from springbench.harness.execution.worker_process import ProgressCallback
+
+
+def preview(
+    scene: Annotated[Path, typer.Argument(help="A scene (YAML), or an assignment's scene (JSON).")],
+    size: Annotated[int | None, typer.Option(help="The mesh's size; the scene's default size if left out.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="The picture to write (.png); SCENE.png here if left out.")
+    ] = None,
+) -> None:
+    """Draw a scene at its start, and list selected vertices and possible selectors."""
+    path = output or Path(f"{scene.stem}.png")
+    if path.suffix != ".png" or not path.parent.is_dir() or path.is_dir():
+        raise InputError(f"--output: came {path}; wanted a file that ends in .png, in a folder that exists")
+
+    from springbench.harness.config.config_loader import load_config
+
+    run = load_config(scene, sizes=() if size is None else (size,)).list_runs()[0]
+    for line in run_isolated(partial(_draw_preview, run, path), run.find_plugins()):
+        print_message(line)
+
+
+def _draw_preview(run: RunSpec, path: Path, tick: ProgressCallback) -> list[str]:
+    """Draw the scene of a run at its start, and return the messages about it."""
+    import numpy as np
+    from springbench.harness.execution import machine_info
+    from springbench.harness.recording.local_origin import compute_local_origin, store_relative
+    from springbench.harness.recording.obstacle_shapes import build_obstacles_property, list_obstacles
+    from springbench.harness.recording.recorder_interface import RecordingReplay
+    from springbench.harness.recording.strain_shading import DEFAULT_STRAIN_RANGE
+    from springbench.harness.report.scene_preview import VertexSelection, draw_scene_preview
+    from springbench.harness.scenes.scene_builder import build_scene
+    from springbench.harness.scenes.vertex_selectors import find_selections
+    from springbench.harness.simulation.time_loop import build_initial_state
+
+    scene, told = run.scene.load_plugins(), list[str]()
+    made = build_scene(scene, run.size)
+    mesh, choices = made.mesh, list[VertexSelection]()
+    for k, effect in enumerate(scene.effects):
+        for key, selection in find_selections(effect):
+            name = f"effects[{k}] {effect.kind}{f': {key}' if key else ''}"
+            choices.append(VertexSelection(name, selection.describe_selection(), selection.select_vertices(mesh, name)))
+    notes = _list_selectors(mesh)
+    for one in choices:
+        some = ", ".join(map(str, one.vertices[:8].tolist())) + (", ..." if len(one.vertices) > 8 else "")
+        told.append(f"{one.name}: {len(one.vertices)} vertices ({one.description}): {some}")
+    for kind, words in notes:
+        told.append(f"{kind}: {words}")
+    origin = compute_local_origin(mesh.rest_positions)
+    replay = RecordingReplay(
+        title=f"{run.scene_name}, size {run.size}" if run.size else run.scene_name,
+        run_id="",
+        frames=np.zeros(1, np.int64),
+        times=np.zeros(1),
+        positions=store_relative(build_initial_state(made).motion.positions, origin)[None],
+        triangles=mesh.triangles,
+        springs=made.all_springs.edges,
+        rest_lengths=made.all_springs.rest_length,
+        pinned_vertices=np.empty(0, np.int64),
+        strain_range=run.strain_range or DEFAULT_STRAIN_RANGE,
+        scalars={},
+        properties={
+            **build_obstacles_property(list_obstacles(scene.effects)),
+            "cpu": machine_info.describe_machine().cpu,
+            "commit": machine_info.read_commit(),
+        },
+        origin=origin,
+    )
+    facts = [
+        f"{len(mesh.rest_positions):,} vertices, {len(mesh.triangles):,} triangles, {len(made.all_springs.edges):,} springs",
+        f"{made.system.mass.sum():.4g} kg",
+        "at the start",
+    ]
+    named = [i for one in choices for i in one.vertices.tolist()]
+    facts += ["what is chosen twice has the later colour"] if len(set(named)) < len(named) else []
+    camera = scene.camera
+    draw_scene_preview(
+        replay, choices, facts, notes, path, camera=(camera.azimuth, camera.elevation) if camera else None
+    )
+    return [*told, f"the picture is {path}"]
+
+
+def _list_selectors(mesh: Any) -> list[tuple[str, str]]:
+    """List a mesh's selectors: parts, boundary loops with lengths, holes, numbers of its file."""
+    from springbench.harness.scenes.mesh.boundary_loops import find_boundary_loops
+
+    rims = find_boundary_loops(mesh)
+    found = {
+        "parts (at)": [f"{name} {len(part):,}" for name, part in sorted(mesh.parts.items())],
+        "boundary loops (loops)": [f"{k}: {rim.length:.3g} m" for k, rim in enumerate(rims)],
+        "holes": [f"{k}: {rim.length:.3g} m" for k, rim in enumerate(rim for rim in rims if rim.is_hole)],
+        "numbers (attribute)": [f"{name} {x.min():.3g} to {x.max():.3g}" for name, x in mesh.attributes.items()],
+    }
+    return [(kind, ", ".join(words)) for kind, words in found.items() if words]

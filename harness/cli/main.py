@@ -1,0 +1,310 @@
+"""Command line: `springbench run`, `speed`, `accuracy`, `recommend`, `list`, `query`, `schema`, `inspect` and more.
+
+Exit codes: 0 success, 1 a failed run or a performance regression, 2 a mistake of the user, 3 an inconclusive regression
+test, 130 stopped by Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from copy import copy
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from springbench.harness.cli.commands.ablate import ablate
+from springbench.harness.cli.commands.archive import compact, merge, publish, verify_archive
+from springbench.harness.cli.commands.export_script import export_script
+from springbench.harness.cli.commands.figure import figure
+from springbench.harness.cli.commands.gallery import gallery
+from springbench.harness.cli.commands.list_runs import list_command
+from springbench.harness.cli.commands.preview import preview
+from springbench.harness.cli.commands.recommend import recommend
+from springbench.harness.cli.commands.regress import regress
+from springbench.harness.cli.commands.regress_history import regress_history
+from springbench.harness.cli.commands.regress_study import regress_study
+from springbench.harness.cli.commands.roofline import roofline
+from springbench.harness.cli.commands.targets import targets
+from springbench.harness.cli.shared_options import (
+    CompareOption,
+    EndTimeOption,
+    ErrorOption,
+    ErrorReportingGroup,
+    InProcessOption,
+    RerunOption,
+    RerunStaleOption,
+    ResultsOption,
+    RowsOption,
+    VerifyOption,
+)
+from springbench.harness.config.cli_options import build_command_class
+from springbench.harness.console import get_error_console, get_output_console, split_wide_table
+from springbench.harness.console import print_message as _say
+from springbench.harness.errors import InputError, InputMistake
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from springbench.harness.config.config_loader import SweepPlan
+
+app = typer.Typer(
+    cls=ErrorReportingGroup,
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+ConfigArgument = Annotated[Path, typer.Argument(help="A sweep or a scene (YAML), or an assignment's scene (JSON).")]
+RecordingsArgument = Annotated[list[Path], typer.Argument(help="Recordings (.rrd), or folders of them.")]
+
+
+def _print_version(requested: bool) -> None:
+    if requested:
+        from importlib.metadata import version
+
+        print(f"springbench {version('springbench')}")
+        raise typer.Exit
+
+
+@app.callback()
+def main_options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """A laboratory for implicit time stepping of mass-spring systems."""
+
+
+@app.command(cls=build_command_class())
+def run(
+    context: typer.Context,
+    config: ConfigArgument,
+    results: ResultsOption = Path("results"),
+    solver: Annotated[
+        list[str] | None, typer.Option(help="For a scene: solvers, the recommended one if left out; repeatable.")
+    ] = None,
+    size: Annotated[list[int] | None, typer.Option(help="For a scene: mesh sizes; repeatable.")] = None,
+    error_target: ErrorOption = None,
+    horizon: EndTimeOption = None,
+    check: VerifyOption = False,
+    peers: CompareOption = False,
+    positions: Annotated[
+        Path | None, typer.Option(help="Store the positions after every step (float64, .npz) of one run.")
+    ] = None,
+    again: RerunOption = False,
+    changed: RerunStaleOption = False,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=1024, help="How many processes do runs; one is timed at a time.")
+    ] = None,
+    on: Annotated[
+        str | None, typer.Option(help="Do runs by Dask: a scheduler's address, local:N, or a batch system's file.")
+    ] = None,
+    in_process: InProcessOption = False,
+) -> None:
+    """Run what is missing of a sweep, or of the one scene in a file."""
+    from springbench.harness.config.config_loader import load_config
+    from springbench.harness.execution.progress_display import create_display
+    from springbench.harness.experiments.sweep_runner import run_sweep
+    from springbench.harness.results.folder_ownership import claim_folder
+
+    _check_positions_path(positions)
+    of_error = {"horizon": horizon, "check": check, "peers": peers}
+    if error_target is not None:
+        from springbench.harness.cli.commands.error_control import run_error_control
+
+        others = {"solver": solver, "on": on, "workers": workers, **context.obj}
+        wanted: dict[str, Any] = {"sizes": size or (), "positions": positions, "again": again, "others": others}
+        raise typer.Exit(0 if run_error_control(config, error_target, results, _say, **of_error, **wanted) else 1)
+    if unfit := next((key for key, value in of_error.items() if value), None):
+        raise InputError(InputMistake("is of a run with --error; leave it out", key=f"--{unfit}"))
+    sweep = load_config(config, solvers=solver or (), sizes=size or (), **context.obj)
+    folder = claim_folder(results / sweep.name, config)
+    how: dict[str, Any] = {"again": again, "changed": changed, "positions": positions, "isolated": not in_process}
+    how |= {"at_once": workers, "on": on, "meanwhile": _preload_reports}
+    table = run_sweep(sweep.name, sweep.list_runs(), folder, create_display(get_error_console()), _say, **how)
+    raise typer.Exit(1 if _report_sweep(sweep, table, config, results, folder) else 0)
+
+
+def _preload_reports() -> None:
+    """Import the modules of `_report_sweep`, which takes as long as drawing a picture."""
+    from springbench.harness.execution.timing_lock import lock_timing_shared
+
+    with lock_timing_shared(lambda said: None):
+        import_module("springbench.harness.report.sweep_summary")
+        import_module("springbench.harness.report.site")
+
+
+def _report_sweep(sweep: SweepPlan, table: pa.Table, config: Path, results: Path, folder: Path) -> list[str]:
+    """Report the results of a sweep, and return its failures.
+
+    It prints the summary and draws the reports. The failures are one line for each failed run.
+    """
+    from springbench.harness.experiments.sweep_plan import find_stale_run_ids
+    from springbench.harness.experiments.sweep_runner import list_failed_runs
+    from springbench.harness.report.report_plugins import run_reports
+    from springbench.harness.report.site import refresh_results_page
+    from springbench.harness.report.sweep_summary import build_closing_lines
+    from springbench.harness.report.timing_table import build_summary_table
+
+    get_output_console().print(build_summary_table(table, find_stale_run_ids(sweep.list_runs(), table)))
+    _say(f"rows, recordings and pictures are in {folder}")
+    for path in run_reports(sweep.reports, table, folder, sweep.options.time_limit):
+        _say(f"reported in {path}")
+    refresh_results_page(results, folder, _say, is_quiet=True)
+    failed = list_failed_runs(table)
+    for line in (*failed, *build_closing_lines(table, config, results, folder)):
+        _say(line)
+    return failed
+
+
+@app.command()
+def accuracy(
+    config: Annotated[Path, typer.Argument(help="An accuracy config (YAML).")],
+    results: ResultsOption = Path("results"),
+    again: RerunOption = False,
+    changed: RerunStaleOption = False,
+    in_process: InProcessOption = False,
+) -> None:
+    """Measure work and precision: convergence on single steps, and errors of whole simulations."""
+    from springbench.harness.config.accuracy_loader import load_accuracy
+    from springbench.harness.execution.progress_display import create_display
+    from springbench.harness.experiments.accuracy.accuracy_study import list_failed_units, run_accuracy_study
+    from springbench.harness.report.accuracy import draw_accuracy_report
+    from springbench.harness.report.site import refresh_results_page
+    from springbench.harness.results.folder_ownership import claim_folder
+
+    asked = load_accuracy(config)
+    folder = claim_folder(results / asked.name, config)
+    files = run_accuracy_study(
+        asked,
+        folder,
+        create_display(get_error_console()),
+        _say,
+        rerun=again,
+        rerun_stale=changed,
+        isolated=not in_process,
+    )
+    drawn = draw_accuracy_report(folder, files)
+    _say(f"rows are in {folder / 'accuracy'}; {len(drawn)} pictures and tables tell of them")
+    refresh_results_page(results, folder, _say)
+    failed = list_failed_units(files)
+    for line in failed:
+        _say(line)
+    raise typer.Exit(1 if failed else 0)
+
+
+@app.command()
+def report(
+    results: Annotated[Path, typer.Argument(help="A folder of results, or that of one sweep.")] = Path("results"),
+    viewer: Annotated[
+        bool, typer.Option("--viewer/--without-viewer", help="Put Rerun's viewer into the page, 19 MB.")
+    ] = True,
+) -> None:
+    """Write the page of all results, `index.html`, and maps of solvers x cases.
+
+    The maps show the verified runs. Runs on a device also get a picture of the time that the device saves.
+    """
+    from springbench.harness.experiments.stale_results import find_stale_runs_in_folder
+    from springbench.harness.report.device_speedup_plot import draw_device_speedups
+    from springbench.harness.report.robustness import build_score_table
+    from springbench.harness.report.robustness_map import draw_robustness_maps
+    from springbench.harness.report.site import update_page
+
+    for picture, words in draw_device_speedups(results):
+        for line in words:
+            _say(line)
+        if picture:
+            _say(f"what a device saves is drawn in {picture}")
+    page = update_page(results, with_recordings=True, with_viewer=viewer, print_message=_say)
+    for picture, cells in draw_robustness_maps(results, find_stale_runs_in_folder):
+        get_output_console().print(split_wide_table(build_score_table(cells)))
+        _say(f"the map is {picture}")
+    _say(f"the page is {page}; a browser opens it, and needs no network for it")
+
+
+app.command(cls=build_command_class("frames", "iterations", "tolerance", "rounds"))(ablate)
+app.command("list")(list_command)
+app.command()(roofline)
+app.command()(recommend)
+app.command()(export_script)
+app.command()(targets)
+app.command()(compact)
+app.command()(merge)
+app.command()(publish)
+app.command()(verify_archive)
+app.command()(figure)
+app.command()(gallery)
+app.command()(preview)
+app.command()(regress)
+app.command()(regress_history)
+app.add_typer(regress_study, name="gate-study")
+
+
+@app.command()
+def query(
+    sql: Annotated[str, typer.Argument(help="A query over the tables `rows`, `accuracy`, `ablation`.")],
+    results: RowsOption = Path("results"),
+    csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
+    seconds: Annotated[float, typer.Option(help="Processor time that the answer may take.")] = 15.0,
+) -> None:
+    """Run an SQL query over the rows of all sweeps."""
+    from springbench.harness.report.machine_footer import COMPARISON_NOTE
+    from springbench.harness.report.sql_query import MAX_CSV_ROWS, MAX_SHOWN_ROWS, run_query
+
+    found = run_query(sql, results, max_rows=MAX_CSV_ROWS if csv else MAX_SHOWN_ROWS, cpu_seconds=seconds)
+    if found.is_truncated:
+        more = "" if csv else "; --csv prints more"
+        _say(f"only the first {len(found.values):,} rows of the answer are shown{more}")
+    if csv:
+        found.write_csv(sys.stdout)
+    else:
+        get_output_console().print(found.build_table())
+        get_output_console().print(f"columns machine and node: {COMPARISON_NOTE}")
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON Schema of scenes and sweeps."""
+    from springbench.harness.config.json_schema import build_json_schema as config_schema
+
+    print(json.dumps(config_schema(), indent=2))
+
+
+@app.command()
+def inspect(
+    recordings: RecordingsArgument,
+    frame: Annotated[int | None, typer.Option(help="The frame to export; the last one if left out.")] = None,
+    export: Annotated[Path | None, typer.Option(help="Write one frame's mesh to this file (.vtp, ...).")] = None,
+    csv: Annotated[Path | None, typer.Option(help="Write the scalars to this file.")] = None,
+) -> None:
+    """Print the content of recordings without a viewer, or compare two of them."""
+    from springbench.harness.report.recording_inspection import inspect_recordings as inspect_recordings
+
+    inspect_recordings(recordings, frame=frame, export=export, csv=csv, console=get_output_console())
+
+
+@app.command()
+def view(recordings: RecordingsArgument) -> None:
+    """Open recordings in the Rerun viewer."""
+    from springbench.harness.report.recording_inspection import view_recordings as view_recordings
+
+    view_recordings(recordings)
+
+
+def _check_positions_path(path: Path | None) -> None:
+    if path and (path.suffix != ".npz" or not path.parent.is_dir() or (path.exists() and not path.is_file())):
+        raise InputError(f"--positions: came {path}; wanted a file that ends in .npz, in a folder that exists")
+
+
+def main() -> None:
+    """Run the command that the arguments name."""
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it would look for some in every installed package
+    # Typer builds the parsers of all registered commands, which takes a tenth of the time of `list`.
+    one = copy(app)
+    asked = [c for c in app.registered_commands if c.callback and (c.name or c.callback.__name__) in sys.argv[1:2]]
+    one.registered_commands = asked or app.registered_commands
+    one(prog_name="springbench")

@@ -1,0 +1,134 @@
+"""Options of a run, defined once.
+
+`RunOptions` determines the lists of a sweep and of an accuracy study, the options of the command line, and the keys
+that entries of a sweep match. It also determines the short descriptions of runs, columns of their rows, and their hash.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final, Literal, NamedTuple, get_type_hints
+
+from pydantic import Field, create_model
+from springbench.harness.scenes.scene_spec import FrameCount, InitialGuess, IntegratorName, TimeStep
+from springbench.harness.schema.base_model import ConfigModel, OneOrMany, read_field_descriptions
+
+AUTO: Literal["auto"] = "auto"
+
+IterationLimit = Annotated[int, Field(ge=1, le=100_000)]
+RelativeTolerance = Annotated[float, Field(gt=0, lt=1)] | None
+RelativeError = Annotated[float, Field(gt=0, lt=1)] | None
+ThreadCount = Annotated[int, Field(ge=1, le=1024)]
+RoundCount = Annotated[int, Field(ge=1, le=1000)]
+
+
+class RunOption(NamedTuple):
+    """Attributes of an option in addition to its type and description.
+
+    short_format: format of its value in short descriptions.
+    column: column of rows, "" for none.
+    null_meaning: meaning of null, for options that a scene defines otherwise.
+    """
+
+    short_format: str
+    column: str = ""
+    null_meaning: str = ""
+
+
+_NULL_IS_SCENE_VALUE = "null takes the scene's"
+
+
+class RunOptions(ConfigModel):
+    """Options of a run that can be varied, one value of each."""
+
+    iterations: Annotated[IterationLimit, RunOption("{} it.", "max_iterations")] = 50
+    """Iteration limit of a step."""
+    tolerance: Annotated[RelativeTolerance | Literal["auto"], RunOption("tol. {}", "tolerance")] = None
+    """Relative tolerance of a step's iterations; null performs all of them. auto: the remaining residual adds at most a
+    tenth to the step's own local error, estimated by an embedded method or by differences of the velocity.
+    """
+    integrator: Annotated[IntegratorName, RunOption("{}", "integrator")] = "implicit-euler"
+    """Time integrator."""
+    time_step: Annotated[TimeStep, RunOption("dt {:.3g}", "time_step", _NULL_IS_SCENE_VALUE)]
+    """Time step [s]."""
+    first_guess: Annotated[
+        InitialGuess,
+        RunOption(
+            "{}",
+            "first_guess",
+            "null is `assignment` for JSON scenes, `motion` (extrapolated positions) for integrators that evaluate "
+            "forces at their stages, else `current`",
+        ),
+    ]
+    """Initial guess of a step's iteration. coarse: the solution of the same step on a mesh of half the size, which is
+    solved first, within the step's time.
+    """
+    threads: Annotated[ThreadCount | Literal["auto"], RunOption("{} thr.", "threads")] = 1
+    """Threads of Numba and of BLAS; auto: the number of idle cores."""
+    frames: Annotated[FrameCount, RunOption("{} frames", "", _NULL_IS_SCENE_VALUE)]
+    """Number of steps."""
+    rounds: Annotated[RoundCount, RunOption("{} rounds")] = 2
+    """Number of repetitions of the timed part."""
+    accuracy: Annotated[RelativeError, RunOption("error {}", "asked")] = None
+    """Target for the relative error of the final positions. It selects integrator, steps and tolerance for the solver;
+    null uses the given values.
+    """
+
+
+DEFAULT_SOLVER: Final = "hybrid"
+DEFAULT_STOP_RULE: dict[str, Any] = {"iterations": 500, "tolerance": 1e-4}
+"""Default stop rule of a single scene, without a sweep and in Python: the recommended solver is run to a tolerance. The
+defaults of a sweep, those of `RunOptions`, are the assignment's.
+"""
+
+ERROR_TARGET_OPTIONS: tuple[str, ...] = ("integrator", "iterations", "tolerance", "first_guess")
+"""Options that an error target selects."""
+
+
+RUN_OPTIONS: dict[str, RunOption] = {
+    name: option
+    for name, field in RunOptions.model_fields.items()
+    for option in field.metadata
+    if isinstance(option, RunOption)
+}
+"""The options by name."""
+
+SCENE_OPTIONS = tuple(name for name, option in RUN_OPTIONS.items() if option.null_meaning)
+"""Options whose default the scene defines."""
+
+
+STEP_OPTIONS: tuple[str, ...] = ("first_guess", "iterations", "tolerance")
+"""Options that define how a step is solved, for any kind of step."""
+
+_TYPE_HINTS, _DESCRIPTIONS = get_type_hints(RunOptions, include_extras=True), read_field_descriptions(RunOptions)
+
+
+def describe_option(name: str) -> str:
+    """Describe an option in one sentence."""
+    said, null = _DESCRIPTIONS[name].removesuffix("."), RUN_OPTIONS[name].null_meaning
+    return f"{said}; {null}." if null else f"{said}."
+
+
+def build_list_model(*names: str, **usual: tuple[Any, ...]) -> Any:
+    """Build a model with a value or a list of values for each option.
+
+    Args:
+        names: options with their usual defaults.
+        usual: more options, with the defaults given here.
+    """
+    fields: dict[str, Any] = {}
+    for name in dict.fromkeys((*names, *usual)):
+        of_scene = name in SCENE_OPTIONS and name not in usual
+        values = usual.get(name, (None if of_scene else RunOptions.model_fields[name].default,))
+        item = _TYPE_HINTS[name] | None if of_scene else _TYPE_HINTS[name]
+        says = describe_option(name) if of_scene else _DESCRIPTIONS[name]
+        fields[name] = (OneOrMany[item], Field(default=values, description=says))
+    return create_model("Lists", __base__=ConfigModel, **fields)
+
+
+def build_single_model(**usual: Any) -> Any:
+    """Build a model with one value of each option, with the defaults given here."""
+    fields: dict[str, Any] = {
+        name: (_TYPE_HINTS[name], Field(default=value, description=_DESCRIPTIONS[name]))
+        for name, value in usual.items()
+    }
+    return create_model("Single", __base__=ConfigModel, **fields)

@@ -1,0 +1,1 @@
+"""Worker processes, locks, progress and interrupts."""

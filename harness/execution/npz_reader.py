@@ -1,0 +1,108 @@
+"""Reader of numeric arrays in untrusted .npz files, in a sandboxed subprocess within limits.
+
+The whole array is read, so that its checksum is verified. Pickles, other types, NaN and infinities are rejected.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from math import prod
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.harness.atomic_files import HEAD_BYTES, describe_cause, describe_misnamed_file
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.execution import sandbox
+
+MAX_NPZ_BYTES = 100_000_000
+"""Maximum size of an array in float64, and of a file [bytes]. A scene writes such numbers as text, which takes 17 times
+as much.
+"""
+_BASE_SECONDS, _BYTES_PER_SECOND = 5.0, 2e7
+_MEMORY_LIMIT = 2**28 + 3 * MAX_NPZ_BYTES
+
+
+def read_npz_array(path: Path, name: str) -> NDArray[np.float64]:
+    """Read one array of an .npz file as float64.
+
+    Args:
+        path: the .npz file.
+        name: name of the array.
+    Returns: C-contiguous array of finite numbers.
+    Raises:
+        InputError: if the file or the array is invalid; it names the file.
+    """
+    try:
+        if not path.is_file():
+            raise InputError(InputMistake("is no file; give the path of an .npz file", path))
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            problem = describe_misnamed_file(file.read(HEAD_BYTES), size)
+    except (OSError, ValueError) as error:
+        raise InputError(InputMistake(f"cannot be read: {describe_cause(error)}", path)) from None
+    if size > MAX_NPZ_BYTES:
+        problem = f"has {size:,} bytes; at most {MAX_NPZ_BYTES:,} are read"
+    if problem:
+        raise InputError(InputMistake(problem, path))
+    limits = sandbox.CallLimits(_BASE_SECONDS + MAX_NPZ_BYTES / _BYTES_PER_SECOND, _MEMORY_LIMIT)
+    try:
+        return sandbox.call_in_sandbox(_extract_array, path, name, limits=limits)
+    except sandbox.SandboxError as error:
+        raise InputError(
+            InputMistake(f"cannot be read as an .npz file with an array `{name}`: {error}", path)
+        ) from None
+
+
+def _extract_array(path: Path, name: str) -> NDArray[np.float64]:
+    """Extract an array in the sandbox.
+
+    Raise InputError, or errors of the standard library for a broken file.
+    """
+    try:
+        with zipfile.ZipFile(path) as packed:
+            names = [info.filename.removesuffix(".npy") for info in packed.infolist()]
+            found = [info for info in packed.infolist() if info.filename == f"{name}.npy"]
+            if len(found) != 1:
+                there = f"; it holds {', '.join(x[:40] for x in names[:5])}" if names else ""
+                raise InputError(InputMistake(f"holds {len(found)} arrays `{name}`, wanted one{there}", path))
+            if found[0].flag_bits & 1:
+                raise InputError(InputMistake("is encrypted; store it without a password", path))
+            if found[0].file_size > MAX_NPZ_BYTES:
+                problem = f"its array `{name}` takes {found[0].file_size:,} bytes; at most {MAX_NPZ_BYTES:,} are read"
+                raise InputError(InputMistake(problem, path))
+            content = packed.read(found[0])  # to its end, where the check sum is compared
+    except zipfile.BadZipFile as error:
+        raise InputError(InputMistake(f"is no whole .npz file ({error}); write it once more", path)) from None
+    return _parse_npy(content, InputMistake(f"its array `{name}`", path))
+
+
+def _parse_npy(content: bytes, what: InputMistake) -> NDArray[np.float64]:
+    """Parse the content of an .npy file; raise InputError if it is invalid."""
+
+    def refuse(problem: str) -> InputError:
+        return InputError(InputMistake(f"{what.problem} {problem}", what.file))
+
+    file = io.BytesIO(content)
+    try:
+        version = np.lib.format.read_magic(file)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, is_fortran, dtype = read_header(file)
+    except ValueError as error:
+        raise refuse(f"has no head of an array ({error})") from None
+    if dtype.kind not in "fiu":
+        raise refuse(f"holds values of type {dtype}; wanted real numbers")
+    if any(not isinstance(n, int) or n < 0 for n in shape):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise refuse(f"has the shape {shape}; wanted whole numbers")
+    count, begun = prod(shape), file.tell()
+    if count * dtype.itemsize != len(content) - begun:
+        raise refuse(f"promises {count * dtype.itemsize:,} bytes, and {len(content) - begun:,} are there")
+    if 8 * count > MAX_NPZ_BYTES:
+        raise refuse(f"has {count:,} numbers; at most {MAX_NPZ_BYTES // 8:,} are read")
+    with np.errstate(over="ignore"):
+        numbers = np.frombuffer(content, dtype, count, begun).astype(np.float64)
+    if not np.isfinite(numbers).all():
+        at = int(np.flatnonzero(~np.isfinite(numbers))[0])
+        raise refuse(f"holds {numbers[at]} (number {at:,} from 0); wanted finite numbers")
+    return np.ascontiguousarray(numbers.reshape(shape, order="F" if is_fortran else "C"))

@@ -1,0 +1,122 @@
+"""Worker pool: run several tasks concurrently, each in its own worker process, from one thread.
+
+Where possible a worker runs tasks of one group one after the other, because they share cached data such as a reference
+trajectory or a mesh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import chain
+from multiprocessing.connection import Connection, wait
+from typing import Any, NamedTuple
+
+from springbench.harness.execution.isolated_worker import (
+    IsolatedWorker,
+    ProgressCallback,
+    RunningTask,
+    TaskFailure,
+    TaskFunction,
+    TaskLimits,
+)
+
+_POLL_INTERVAL = 0.1
+"""Seconds between two polls of busy workers."""
+
+
+class PoolTask(NamedTuple):
+    """One task: function, progress callback, limits, group, and the user code that it runs."""
+
+    function: TaskFunction
+    tick: ProgressCallback
+    limits: TaskLimits
+    group: Hashable = None
+    user_code: frozenset[Hashable] = frozenset()
+
+
+TaskFactory = Callable[[int], PoolTask | None]
+"""Create the task of a given index; None if it is finished already or runs elsewhere."""
+
+
+@dataclass
+class _PoolWorker:
+    workers: IsolatedWorker
+    group: Hashable = None
+    number: int = -1
+    running_task: RunningTask | None = None
+
+    def stop_worker(self) -> None:
+        """Stop the running task and the worker."""
+        if self.running_task:
+            self.running_task.close()
+        self.workers.stop_worker()
+
+
+def run_tasks(
+    num_workers: int,
+    initialiser: Callable[[], object],
+    groups: Iterable[Hashable],
+    create_task: TaskFactory,
+    background_call: Callable[[], object] | None = None,
+) -> Iterator[tuple[int, Any]]:
+    """Run tasks in a pool of workers and yield each result as it is completed.
+
+    Args:
+        num_workers: maximum number of concurrent workers.
+        initialiser: called first in each worker.
+        groups: group of each task, by index.
+        create_task: called with the index of a task when a worker is available for it.
+        background_call: called once in this process after the workers have started. No worker is polled until it
+            returns.
+    Yields: (index, value or TaskFailure) in order of completion.
+    Raises: the SpringbenchError that a task raises.
+
+    Closing the generator stops the workers.
+    """
+    left = dict(enumerate(groups))
+    with ExitStack() as cleanup:
+        crew = [_PoolWorker(IsolatedWorker(initialiser)) for _ in range(min(num_workers, len(left)))]
+        for member in crew:
+            cleanup.callback(member.stop_worker)
+        while True:
+            for member in crew:
+                while member.running_task is None and left:
+                    number = _select_task(left, member, [other.group for other in crew if other is not member])
+                    member.number, member.group = number, left.pop(number)
+                    if task := create_task(number):
+                        member.running_task = member.workers.start_task(
+                            task.function, task.tick, task.limits, task.user_code
+                        )
+            going = [member for member in crew if member.running_task]
+            if not going:
+                return
+            pipes = list[Connection]()
+            for member in going:
+                assert member.running_task
+                try:
+                    pipes.append(next(member.running_task))
+                    continue
+                except StopIteration as done:
+                    outcome = done.value
+                except TaskFailure as lost:
+                    outcome = lost
+                member.running_task = None
+                yield member.number, outcome
+            if background_call:
+                background_call()
+                background_call = None
+            elif len(pipes) == len(going):
+                wait(pipes, _POLL_INTERVAL)
+
+
+def _select_task(left: dict[int, Hashable], member: _PoolWorker, others: list[Hashable]) -> int:
+    """Select the next task for a worker.
+
+    A task of the worker's own group comes first, then one of a group that no other worker runs, then any.
+    """
+    grouped = {number: group for number, group in left.items() if group is not None}
+    own = (number for number, group in grouped.items() if group == member.group)
+    new = (number for number, group in grouped.items() if group not in others)
+    return next(chain(own, new, left))

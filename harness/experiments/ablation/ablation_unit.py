@@ -1,0 +1,215 @@
+"""Ablation unit: the full scene, the scene without each effect, and two more accurate solutions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from springbench.harness.config.config_loader import SweepPlan
+from springbench.harness.config.sweep_config import RunSpec
+from springbench.harness.execution import folder_locks, machine_info
+from springbench.harness.execution.isolated_worker import ProgressCallback
+from springbench.harness.execution.progress_display import ProgressDisplay
+from springbench.harness.experiments.ablation.effect_suggestions import build_evidence, suggest_effects
+from springbench.harness.experiments.ablation.effect_unit import EffectUnit, ResultRow
+from springbench.harness.experiments.ablation.interleaved_variants import (
+    VariantRun,
+    compute_cost,
+    compute_step_seconds,
+    simulate_motion,
+    time_interleaved,
+)
+from springbench.harness.experiments.ablation.motion_difference import (
+    MotionStates,
+    compute_mean_rest_length,
+    compute_motion_difference,
+)
+from springbench.harness.experiments.ablation.scene_variants import build_variants
+from springbench.harness.experiments.completion_status import select_missing_units
+from springbench.harness.experiments.experiment_units import execute_units
+from springbench.harness.experiments.failure_columns import build_failure_columns
+from springbench.harness.experiments.provenance import build_provenance_columns, build_specification_columns
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.simulation.auto_tolerance import build_stop_rule
+from springbench.harness.simulation.timing_pass import SteppingSettings
+from springbench.solvers.model.step_problem import Solver, StopRule
+from springbench.solvers.registry import SOLVER_TABLE, SOLVERS, load_target
+
+_REFERENCE_KINDS = ("solver", "time-step")
+"""What is improved in each of the more accurate solutions."""
+
+REFERENCE_SOLVER = "newton"
+"""Solver whose solution determines the distance of the scene's own solver from the minimum."""
+CONVERGED_STOP_RULE = StopRule(200, 1e-8)
+"""Its tolerance is far below any difference that an effect makes."""
+
+
+@dataclass(frozen=True, slots=True)
+class AblationUnit(EffectUnit):
+    """Run of a scene, in full and without its effects, timed interleaved in one process.
+
+    `with_pairs` selects variants without each pair of effects, too.
+    """
+
+    with_pairs: bool
+
+    @property
+    def title(self) -> str:
+        """Title of the unit, for messages."""
+        return f"{self.run.title}: without each effect"
+
+    @property
+    def num_progress_steps(self) -> int:
+        """Number of variants, timed rounds and more accurate solutions."""
+        return len(build_variants(self.run.scene, with_pairs=self.with_pairs)) + self.run.rounds + len(_REFERENCE_KINDS)
+
+    def file_suffix(self) -> str:
+        """Return the suffix of the file: `-pairs` with pairs of effects."""
+        return "-pairs" if self.with_pairs else ""
+
+    def measure_rows(self, tick: ProgressCallback) -> list[ResultRow]:
+        """Measure all variants and return the rows."""
+        return _measure_ablation(self.run, self.with_pairs, tick)
+
+    def build_failure_rows(self, status: str, reason: str) -> list[ResultRow]:
+        """Build the row of a failed unit: without the full scene no comparison is possible."""
+        why = {"kind": "whole", "name": "", "status": status, "reason": reason}
+        return [build_specification_columns(self.run) | build_provenance_columns() | why]
+
+
+def run_ablation(
+    sweep: SweepPlan,
+    folder: Path,
+    display: ProgressDisplay,
+    print_message: Callable[[str], None],
+    *,
+    with_pairs: bool,
+    rerun: bool = False,
+    rerun_stale: bool = False,
+    isolated: bool = True,
+) -> Path:
+    """Execute the ablation of the only run of a scene's sweep, if it is missing.
+
+    The rounds of the run are those of the timing. Where the full scene has no solution, the file has one row.
+
+    Args:
+        sweep: sweep with one run.
+        folder: folder of the results.
+        display: shows progress.
+        print_message: prints a remark.
+        with_pairs: whether to leave out each pair of effects, too.
+        rerun: whether to repeat the ablation.
+        rerun_stale: whether to repeat it if it was measured by other source code.
+        isolated: see `springbench.harness.experiments.experiment_units.execute_units`.
+
+    Returns: the file of rows.
+
+    Raises:
+        InputError: the scene or an option is invalid.
+    """
+    (run,) = sweep.list_runs()
+    run.scene.require_fixed_time_step()
+    unit = AblationUnit(run, folder, with_pairs)
+    folder.mkdir(parents=True, exist_ok=True)
+    with folder_locks.lock_folder_exclusive(folder):
+        execute_units(
+            select_missing_units([unit], "ablations", print_message, rerun=rerun, rerun_stale=rerun_stale),
+            display,
+            isolated=isolated,
+        )
+    return unit.rows_path
+
+
+def _measure_ablation(run: RunSpec, with_pairs: bool, tick: ProgressCallback) -> list[ResultRow]:
+    """Measure all variants and build the rows. Errors for the full scene are raised unchanged."""
+    settings = SteppingSettings(build_stop_rule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
+    solver: Solver = load_target(SOLVER_TABLE[run.solver.name])(**run.solver.parameters)
+    with machine_info.limit_threads(machine_info.choose_threads(run.threads).count):
+        found = time_interleaved(
+            build_variants(run.scene, with_pairs=with_pairs), run.size, run.integrator, solver, settings, tick
+        )
+        whole = found[0]
+        assert whole.scene is not None
+        told = [_build_full_row(whole), *(_build_variant_row(whole, turn) for turn in found[1:])]
+        told += _measure_reference_errors(run, whole, settings, tick)
+        kinds = {effect.kind for effect in run.scene.effects}
+        motion_seen = build_evidence(whole.scene, kinds, whole.positions, whole.velocities)
+        told += [
+            {"kind": "suggestion", "name": s.effect_kind, "reason": s.evidence}
+            for s in suggest_effects(motion_seen, kinds)
+        ]
+    return _add_shared_columns(run, whole.scene, told)
+
+
+def _build_full_row(full: VariantRun) -> ResultRow:
+    return {"kind": "whole", "name": "", "status": "ok", "seconds": compute_step_seconds(full)} | _build_size_columns(
+        full
+    )
+
+
+def _build_variant_row(full: VariantRun, variant_run: VariantRun) -> ResultRow:
+    row: ResultRow = {"kind": "without", "name": variant_run.variant.name}
+    if variant_run.failure_reason:
+        return row | {"status": "impossible", "reason": variant_run.failure_reason}
+    assert full.scene is not None
+    middle, low, high = compute_cost(full, variant_run)
+    costs = {"seconds": compute_step_seconds(variant_run), "cost": middle, "cost_low": low, "cost_high": high}
+    apart = compute_motion_difference(
+        full.scene, (full.positions, full.velocities), (variant_run.positions, variant_run.velocities)
+    )
+    return row | {"status": "ok"} | costs | _build_size_columns(variant_run) | apart
+
+
+def _build_size_columns(variant_run: VariantRun) -> ResultRow:
+    assert variant_run.prepared is not None
+    facts = variant_run.prepared.stats
+    factor = facts.get("nnz_hessian_factor", facts.get("nnz_factor"))
+    counts = {"nnz_system": facts.get("nnz_system"), "nnz_factor": factor}
+    return {
+        "bytes": variant_run.memory_bytes,
+        **{name: None if value is None else int(value) for name, value in counts.items()},
+    }
+
+
+def _measure_reference_errors(
+    run: RunSpec, full: VariantRun, settings: SteppingSettings, tick: ProgressCallback
+) -> list[ResultRow]:
+    """Measure the error of the full scene's solver, and that of its time step.
+
+    These are the distance from the minima of the steps, and the distance of those from half the time step.
+    """
+    assert full.scene is not None
+    settings = replace(settings, stop_criterion=CONVERGED_STOP_RULE)
+    found: list[ResultRow] = []
+    finer: MotionStates = (full.positions, full.velocities)
+    for every, name in enumerate(_REFERENCE_KINDS, start=1):
+        row: ResultRow = {"kind": "error", "name": name}
+        try:
+            scene = build_scene(run.scene.with_time_step(run.scene.time_step / every), run.size, run.integrator)
+            coarser, finer = (
+                finer,
+                simulate_motion(scene, load_target(SOLVERS[REFERENCE_SOLVER])(), settings, stride=every),
+            )
+            found.append(row | {"status": "ok"} | compute_motion_difference(full.scene, coarser, finer))
+        except Exception as error:  # the better solver may fail in any way: then the error is not known
+            told = build_failure_columns(error)
+            found += [
+                {"kind": "error", "name": n, "status": "unknown", "reason": told["reason"]}
+                for n in _REFERENCE_KINDS[every - 1 :]
+            ]
+            break
+        tick(f"error of the {name}")
+    return found
+
+
+def _add_shared_columns(run: RunSpec, scene: Scene, told: list[ResultRow]) -> list[ResultRow]:
+    """Add the columns that all rows share."""
+    shared = build_specification_columns(run) | {
+        "vertices": len(scene.mesh.rest_positions),
+        "springs": len(scene.all_springs.edges),
+        "frames": run.frames,
+        "rounds": run.rounds,
+        "extent": scene.mesh.bounding_box_diagonal / compute_mean_rest_length(scene),
+    }
+    return [shared | build_provenance_columns() | row for row in told]

@@ -1,0 +1,394 @@
+"""Find the cheapest method to simulate a scene up to an error.
+
+It is selected from stored rows or new measurements.
+
+An error is that of a whole simulation up to a horizon (`springbench.harness.experiments.accuracy.work_precision`). A
+cost is the
+wall time per simulated second. The result is the cheapest measured method that meets the error; one more simulation
+checks it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from springbench.harness.config.accuracy_config import AccuracyConfig, BenchmarkCase, MeasurementSettings, WorkSpec
+from springbench.harness.config.accuracy_loader import AccuracyPlan, expand_studies
+from springbench.harness.config.config_loader import find_scene_mistakes, load_scene
+from springbench.harness.config.run_options import STEP_OPTIONS
+from springbench.harness.config.solver_parameters import read_solvers
+from springbench.harness.config.sweep_config import SolverSpec
+from springbench.harness.errors import InputError, InputMistake, RunFailed
+from springbench.harness.execution import machine_info
+from springbench.harness.execution.progress_display import ProgressDisplay
+from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
+from springbench.harness.experiments.accuracy.accuracy_study import measuring
+from springbench.harness.experiments.accuracy.accuracy_units import load_reference_trajectory, open_reference_store
+from springbench.harness.experiments.accuracy.best_first import SLOWER, Omitted, search
+from springbench.harness.experiments.accuracy.work_precision import build_work_rows
+from springbench.harness.reference.reference_store import ReferenceStore
+from springbench.harness.reference.self_converged_trajectory import describe_self_convergence, has_contact
+from springbench.harness.reference.step_snapshot import build_exact_scene
+from springbench.harness.results import parquet_rows, row_store
+from springbench.harness.results.folder_ownership import claim_folder
+from springbench.harness.scenes.mesh.mesh_generator import MeshGenerator
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.schema.config_document import ConfigDocument
+from springbench.solvers.iteration.solver_info import LOCAL_GLOBAL_FAMILY
+from springbench.solvers.registry import SOLVER_TABLE, SOLVERS, find_solver_info, is_minimiser, load_target
+
+TIME_STEP_REFINEMENTS = (0.5, 1, 2, 4, 8)
+"""Numbers of steps up to the horizon, relative to those at the scene's own time step."""
+
+DEFAULT_T_END = 1.0
+"""Default simulated time at which the error counts [s]."""
+BUDGET = 60.0
+"""Default limit for the wall time of all measurements together [s]."""
+_MESSAGE_INTERVAL = 2.0
+"""Interval between two messages about the reference [s]."""
+_ERROR_RTOL, _MAX_TIME_RATIO = 1e-6, 1.3
+"""Relative difference of two errors of one simulation that compilers may cause; accepted ratio of its two times."""
+
+CANDIDATE_INTEGRATORS = ["implicit-euler", "bdf2", "midpoint", "sdirk-4"]
+"""Integrators to try: one of each order and kind."""
+
+
+def build_candidate_grid() -> list[dict[str, Any]]:
+    """Return the grid that is measured where no rows exist.
+
+    The first solver of each family runs with steps solved to a tolerance, or with 50 iterations or substeps. All
+    adaptive
+    solvers with their own integrator are included.
+    """
+    made = {name: load_target(target) for name, target in SOLVERS.items()}
+    told = {name: find_solver_info(solver, name) for name, solver in made.items()}
+    own = [name for name, of in told.items() if of.is_substepping and of.supports_error_control]
+    first = {name: made[name] for name, of in told.items() if of.is_family_default}
+    implicit = [name for name, solver in first.items() if is_minimiser(solver)]
+    fixed = [
+        name for name, solver in first.items() if not is_minimiser(solver) or told[name].family == LOCAL_GLOBAL_FAMILY
+    ]
+    return [
+        {"solver": implicit, "tolerance": [1e-1, 1e-2, 1e-3], "iterations": 500, "integrator": CANDIDATE_INTEGRATORS},
+        {"solver": fixed, "iterations": 50},
+        {"solver": own, "iterations": 1, "integrator": ["own"]},
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredMethod:
+    """Method that was measured on the scene.
+
+    Attributes:
+        work_spec: the simulation.
+        error: relative error.
+        seconds_per_simulated_second: wall time per simulated second.
+        reference_kind: kind of the reference solution for the error.
+        solver_description: what the solver selected automatically.
+        sweep: name of the study that measured it.
+    """
+
+    work_spec: WorkSpec
+    error: float
+    seconds_per_simulated_second: float
+    reference_kind: str
+    solver_description: str
+    sweep: str = ""
+
+    def __str__(self) -> str:
+        u = self.work_spec
+        if find_solver_info(load_target(SOLVER_TABLE[u.solver.name]), u.solver.name).is_substepping:
+            return f"solver {u.solver.name}, {self.solver_description}, in each frame of {u.case.scene.time_step:.6g} s"
+        tolerance = u.options["tolerance"]
+        stop = f"{u.options['iterations']} iterations" if tolerance is None else f"tolerance {tolerance:g}"
+        return f"{u.case.integrator}, time step {u.case.scene.time_step:.6g} s, {stop}, solver {u.solver.name}"
+
+    def format_command(self, scene: Path) -> str:
+        """Return the command line for this method; empty where the solver's parameters need a sweep."""
+        u, made = self.work_spec, load_target(SOLVER_TABLE[self.work_spec.solver.name])
+        if made(**u.solver.parameters) != made():
+            return ""
+        steps = round(u.horizon / u.case.scene.time_step)
+        given: dict[str, Any] = {"size": u.case.size or None, "solver": u.solver.name, "integrator": u.case.integrator}
+        given |= {"time-step": repr(u.case.scene.time_step), "frames": steps, **u.options}
+        said = ((name.replace("_", "-"), value) for name, value in given.items() if value is not None)
+        options = (part for name, value in said for part in (f"--{name}", str(value)))
+        return shlex.join(["springbench", "run", str(scene), *options])
+
+
+@dataclass(frozen=True, slots=True)
+class MethodRecommendation:
+    """Result of a recommendation.
+
+    Attributes:
+        measured_methods: all measured methods, cheapest first.
+        best_method: cheapest of those that meet the error.
+        checked_method: a repeated measurement of it.
+    """
+
+    measured_methods: tuple[MeasuredMethod, ...]
+    best_method: MeasuredMethod
+    checked_method: MeasuredMethod
+
+    @property
+    def verdict(self) -> str:
+        """Comparison of the predicted with the repeated measurement, as text."""
+        before, now = self.best_method, self.checked_method
+        if not math.isclose(now.error, before.error, rel_tol=_ERROR_RTOL):
+            return (
+                f"not as predicted: the error is {now.error:.3g}, not {before.error:.3g}; what was measured before is "
+                "not this simulation, so remove it and repeat the command"
+            )
+        ratio = now.seconds_per_simulated_second / before.seconds_per_simulated_second
+        if not 1.0 / _MAX_TIME_RATIO <= ratio <= _MAX_TIME_RATIO:
+            return (
+                f"the error is as predicted, the time {ratio:.2g} times that: other programs ran beside one of the "
+                "two, so repeat the command on an idle machine before you rely on the time"
+            )
+        return f"as predicted: the same error, {ratio:.2g} times the time"
+
+
+def recommend_method(
+    path: Path,
+    max_error: float,
+    *,
+    size: int | None,
+    t_end: float | None,
+    time_limit: float,
+    results: Path,
+    display: ProgressDisplay,
+    print_message: Callable[[str], None],
+    budget: float = BUDGET,
+) -> MethodRecommendation:
+    """Return the cheapest method for a relative error at `t_end`.
+
+    Args:
+        path: file of the scene.
+        max_error: relative error to reach.
+        size: mesh size; the scene's default if None.
+        t_end: simulated time [s]. If None, DEFAULT_T_END, or the longest time at which the error can be measured, if
+            that
+            is shorter.
+        time_limit: wall-time limit of a simulation [s].
+        results: folder that contains a folder for each config.
+        display: shows progress.
+        print_message: prints a remark.
+        budget: limit for the wall time of all measurements together [s].
+
+    Raises:
+        InputError: an option is invalid.
+        RunFailed: no method meets the error.
+    """
+    asked_for = {"--error": max_error, "--horizon": t_end, "--time-limit": time_limit, "--budget": budget}
+    for key, value in asked_for.items():
+        if value is not None and not 0 < value < math.inf:
+            raise InputError(InputMistake(f"came {value:g}; wanted a number above 0", key=key))
+    scene = load_scene(path)
+    scene.require_fixed_time_step()
+    size = (size or scene.default_size or 0) if isinstance(scene.mesh, MeshGenerator) else 0
+    store = open_reference_store(results)
+    if t_end is None:
+        t_end = _find_longest_t_end(path, scene, size, max_error, store, print_message)
+    try:
+        asked = _build_study(path, scene, size, t_end, time_limit)
+    except InputError as refused:  # the studies are ours; what is wrong came with an option
+        raise InputError(list(dict.fromkeys(map(_convert_to_option, refused.mistakes)))) from refused
+    _compute_reference(scene, size, max_error, t_end, store, print_message)
+    ways, reasons = _read_measured_methods(path.stem, scene, size, t_end, results)
+    omitted: Omitted | None = None
+    if not any(way.error <= max_error and way.sweep != asked.name for way in ways):
+        omitted = _measured(
+            asked, ways, reasons, max_error, claim_folder(results / asked.name, path), display, print_message, budget
+        )
+        print_message(f"{path.stem} {size or ''}: {omitted}")
+        ways, reasons = _read_measured_methods(path.stem, scene, size, t_end, results)
+    within = [way for way in ways if way.error <= max_error]
+    if not within:
+        raise RunFailed(_explain_no_method(ways, reasons, max_error, t_end, omitted))
+    best = within[0]
+    print_message(f"checking {best}")
+    return MethodRecommendation(tuple(ways), best, _check_method(best, store))
+
+
+def _find_longest_t_end(
+    path: Path,
+    scene: SceneSpec,
+    size: int,
+    max_error: float,
+    reference_store: ReferenceStore,
+    print_message: Callable[[str], None],
+) -> float:
+    """Return the default end time [s]. Raises InputError, Unpredictable."""
+    if mistakes := find_scene_mistakes(scene, [size]):
+        raise InputError(mistakes)
+    if has_contact(build_exact_scene(scene, size).system):
+        return DEFAULT_T_END
+    seen = reference_store.load_growth(scene, size, DEFAULT_T_END)
+    if seen.min_error <= max_error:
+        return DEFAULT_T_END
+    longest = seen.compute_longest_horizon(max_error)
+    if not longest:
+        seen.require_predictable(max_error)
+    print_message(
+        f"{path.stem} {size or ''}: an error of {max_error:g} can be measured up to {longest:g} s, for a perturbation of "
+        f"1e-12 of the size grows to {seen.growth_factor[-1]:.1e} of the displacement after {DEFAULT_T_END:g} s"
+    )
+    return longest
+
+
+def _compute_reference(
+    scene: SceneSpec,
+    size: int,
+    max_error: float,
+    t_end: float,
+    reference_store: ReferenceStore,
+    print_message: Callable[[str], None],
+) -> None:
+    """Compute the reference, or report without delay why there is none. Raises RunFailed."""
+    if has_contact(build_exact_scene(scene, size).system):
+        print_message(describe_self_convergence(scene.path.stem))
+    print_message(f"the reference first, the motion up to {t_end:g} s, which is made once")
+    last = [monotonic()]
+
+    def told(motion: int, time: float) -> None:
+        if monotonic() - last[0] > _MESSAGE_INTERVAL:
+            last[0] = monotonic()
+            print_message(f"  motion {motion} of 2, at {time:.3g} of {t_end:g} s")
+
+    reference_store.load_trajectory(scene, size, [t_end], error=max_error, report_progress=told)
+
+
+def _measured(
+    asked: AccuracyPlan,
+    ways: list[MeasuredMethod],
+    without: list[dict[str, Any]],
+    error: float,
+    folder: Path,
+    display: ProgressDisplay,
+    say: Callable[[str], None],
+    budget: float,
+) -> Omitted:
+    """Measure the methods that may be the cheapest and have no rows. Raises InputError, CannotWrite."""
+    known: dict[str, dict[str, Any]] = {
+        way.work_spec.build_file_stem(): {
+            "status": "ok",
+            "error": way.error,
+            "seconds_per_simulated": way.seconds_per_simulated_second,
+        }
+        for way in ways
+    }
+    failed, here = {row["unit"]: row for row in without}, machine_info.describe_machine().machine_id
+    say(
+        f"measuring up to {len(asked.work)} settings, cheap ones first, for at most {budget:g} s (--budget); a "
+        f"simulation ends once it is {SLOWER:g} times as slow as the best that keeps to the error"
+    )
+    with measuring(asked.work, folder, display) as measure:
+
+        def look_up(spec: WorkSpec) -> dict[str, Any]:
+            return known.get(spec.build_file_stem()) or failed.get(spec.compute_unit_id(here)) or measure(spec)
+
+        best = min((way.seconds_per_simulated_second for way in ways if way.error <= error), default=math.inf)
+        return search(asked.work, error, best, look_up, budget)
+
+
+def _build_study(path: Path, scene: SceneSpec, size: int, t_end: float, time_limit: float) -> AccuracyPlan:
+    """Build the study that is measured where no rows exist."""
+    steps = max(1, round(t_end / scene.time_step))
+    time_steps = [t_end / round(steps * factor) for factor in TIME_STEP_REFINEMENTS if round(steps * factor)]
+    shared = {"horizon": t_end, "time_step": time_steps, "time_limit": time_limit} | ({"size": size} if size else {})
+    work: list[dict[str, Any]] = [shared | way for way in build_candidate_grid()]
+    solvers = list(dict.fromkeys(name for way in work for name in way["solver"]))
+    data = {"scenes": [path.name], "solvers": solvers, "work": work}
+    document = ConfigDocument(path, data)
+    fields = document.validate_data(AccuracyConfig, data)
+    solvers = read_solvers(document)
+    if fields is None or document.mistakes:
+        raise document.build_error()
+    return replace(expand_studies(document, fields, {path.stem: scene}, solvers), name=f"recommend-{path.stem}")
+
+
+def _convert_to_option(mistake: InputMistake) -> InputMistake:
+    """Convert a mistake in a study to one in a command-line option."""
+    return InputMistake(mistake.problem, key="--" + mistake.key.rpartition(".")[2].replace("_", "-"))
+
+
+def _read_measured_methods(
+    name: str, scene: SceneSpec, size: int, t_end: float, results: Path
+) -> tuple[list[MeasuredMethod], list[dict[str, Any]]]:
+    """Read the rows of this scene on this machine.
+
+    Returns the methods that have an error, cheapest first, and the rows of those that have none.
+    """
+    here, ways, without = machine_info.describe_machine().machine_id, list[MeasuredMethod](), list[dict[str, Any]]()
+    units = (
+        unit
+        for folder in row_store.find_row_folders(results, "accuracy", "*/")
+        for unit in row_store.list_units(folder)
+    )
+    for path in sorted(unit for unit in units if unit.name.startswith(f"{name}-{size}-work-")):
+        row = parquet_rows.read_rows([path], ACCURACY_SCHEMA).to_pylist()[0]
+        spec = _build_work_spec(row, name, scene)
+        if path.stem != spec.build_file_stem() or row["machine"] != here or row["horizon"] != t_end:
+            continue  # the scene was another then, or the machine, or the question
+        if row["status"] == "ok":
+            ways.append(_build_measured_method(spec, row))
+        else:
+            without.append(row)
+    return sorted(ways, key=lambda way: way.seconds_per_simulated_second), without
+
+
+def _build_work_spec(row: dict[str, Any], name: str, scene: SceneSpec) -> WorkSpec:
+    """Build the specification that a row was measured with, assuming an unchanged scene."""
+    case = BenchmarkCase(name, scene.with_time_step(row["time_step"]), row["size"], row["integrator"])
+    solver = SolverSpec(row["solver"], json.loads(row["parameters"]))
+    how = MeasurementSettings(row["threads"], rounds=1, time_limit=float("inf"))
+    return WorkSpec(case, row["horizon"], solver, {name: row[name] for name in STEP_OPTIONS}, how)
+
+
+def _check_method(best: MeasuredMethod, reference_store: ReferenceStore) -> MeasuredMethod:
+    """Repeat the measurement of a method."""
+    row = build_work_rows(best.work_spec, load_reference_trajectory(best.work_spec, reference_store), lambda: None)[0]
+    if row["status"] != "ok":
+        raise RunFailed(f"the check of {best} ended otherwise than before: {row['status']}: {row['reason']}")
+    return _build_measured_method(best.work_spec, row)
+
+
+def _build_measured_method(spec: WorkSpec, row: dict[str, Any]) -> MeasuredMethod:
+    return MeasuredMethod(
+        spec,
+        row["error"],
+        row["seconds_per_simulated"],
+        row["truth"] or "integrated",
+        row["choice"] or "",
+        row.get("sweep") or "",
+    )
+
+
+def _explain_no_method(
+    methods: list[MeasuredMethod],
+    failed_rows: list[dict[str, Any]],
+    max_error: float,
+    t_end: float,
+    omitted: Omitted | None,
+) -> str:
+    """Explain why no method meets the error, and suggest what to change."""
+    if omitted and not omitted.complete:
+        return (
+            f"nothing that was measured keeps to an error of {max_error:g} over {t_end:g} s, and settings remain "
+            f"({omitted}): the same command with a larger --budget goes on where this one ended"
+        )
+    if methods:
+        nearest = min(methods, key=lambda way: way.error)
+        return (
+            f"nothing that was measured keeps to an error of {max_error:g} over {t_end:g} s; the nearest is {nearest}, "
+            f"which errs by {nearest.error:.2g}: ask for a larger --error or a shorter --horizon"
+        )
+    reasons = {row["reason"] for row in failed_rows}
+    return f"no error over {t_end:g} s could be measured: {'; '.join(sorted(reasons)) or 'nothing was simulated'}"

@@ -1,0 +1,538 @@
+"""Verify that an archive is unchanged, and that its numbers are reproducible.
+
+All checksums are compared, and the names and options of all runs with those of their configs. Then a random tenth of
+the runs is repeated here, each with another solver's run on the same scene and size. Positions after every step, and
+all columns except IRREPRODUCIBLE_COLUMNS, must be bitwise identical. A step's time must match the published one within
+a factor of MAX_SECONDS_RATIO. The ratio of the two solvers' times is compared step by step
+(`springbench.harness.results.bootstrap_statistics.estimate_slowdown`). It must match within MAX_RATIO_SAME_MACHINE
+on the published
+machine type, within MAX_RATIO_OTHER_MACHINE on others. With another machine, other libraries or other source code, a
+difference is inconclusive. So is a run that no config requests.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import random
+import shutil
+import struct
+import zipfile
+import zlib
+from collections import defaultdict
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.config.run_options import AUTO
+from springbench.harness.config.sweep_config import RunSpec
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.execution import machine_info
+from springbench.harness.execution.progress_display import ProgressDisplay
+from springbench.harness.experiments.archive.publication import CHECKSUM_FILE
+from springbench.harness.experiments.archive.result_merge import list_sweep_folders
+from springbench.harness.experiments.experiment_units import execute_units
+from springbench.harness.experiments.provenance import build_specification_columns
+from springbench.harness.experiments.run_unit import RunUnit
+from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.harness.results import bootstrap_statistics, parquet_rows, row_store, run_schema
+from springbench.harness.results.folder_ownership import read_owner
+from springbench.harness.results.solver_metadata import read_solver_metadata
+
+MAX_RATIO_SAME_MACHINE, MAX_RATIO_OTHER_MACHINE, MAX_SECONDS_RATIO = 1.25, 2.0, 3.0
+"""Accepted ratios of times.
+
+Minima of two runs of the same code differ by up to 4 % on an idle machine, ratios far more on busy ones. Another
+processor has other vector units and caches. Times themselves depend on the entire load of the machine.
+"""
+
+IRREPRODUCIBLE_COLUMNS = frozenset(
+    (
+        *("seconds", "pass_seconds", "summed_seconds", "cpu_seconds", "interrupted", "adds_up", "estimate_seconds"),
+        *("kernel_seconds", "transfer_seconds", "load", "started", "machine", "node", "cpu", "cores", "memory_gib"),
+        *("machine_bandwidth", "machine_flops", "machine_step", "system", "versions", "commit", "code", "device"),
+        *("device_memory_gib", "device_driver", "device_versions", "sm_clock_mhz"),
+        *("memory_clock_mhz", "power_w", "power_limit_w", "performance_state", "temperature_c", "sweep", "recorded"),
+        *("time_limit", "memory_limit", "timing", "at_once", "pinned"),
+    )
+)
+"""Columns that a repeated run cannot confirm.
+
+These are times, state and type of the machine, the sweep's name, how the run was limited and timed, and the recording,
+which is not repeated.
+"""
+
+_MAX_FILES, _MAX_CHECKSUM_BYTES, _MAX_COMPRESSION_RATIO = 200_000, 2**26, 200
+"""Largest number of files in an archive, of bytes of its checksums, and ratio of unpacked to packed size."""
+_MAX_LOADED_CONFIGS = 200
+"""Largest number of different option sets with which configs are read."""
+
+ResultRow = dict[str, Any]
+
+
+class ClaimVerdict(Enum):
+    """Verdict on a published claim: pass, fail or inconclusive."""
+
+    PASS = "holds"
+    FAIL = "does not hold"
+    INCONCLUSIVE = "cannot tell"
+
+
+@dataclass(frozen=True, slots=True)
+class VerifiedClaim:
+    """Published claim with its verdict and an explanation."""
+
+    subject: str
+    verdict: ClaimVerdict
+    explanation: str
+
+    def __str__(self) -> str:
+        return f"{self.subject}: {self.verdict.value}{f' ({self.explanation})' if self.explanation else ''}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PublishedRun:
+    """Run of an archive: its rows, and the specification to repeat it."""
+
+    parquet_rows: list[ResultRow]
+    run: RunSpec
+
+    @property
+    def title(self) -> str:
+        """Title of the run, for messages."""
+        return self.run.title
+
+    @property
+    def comparison_group(self) -> tuple[str, str, int]:
+        """Key of runs whose times are compared: sweep, scene and size."""
+        return self.run.sweep, self.run.scene_name, self.run.size
+
+    @property
+    def step_rows(self) -> list[ResultRow]:
+        """Rows of the run's steps."""
+        return [row for row in self.rows if row["phase"] == "step"]
+
+
+@contextmanager
+def unpack_archive(archive: Path) -> Generator[Path]:
+    """Unpack an archive to a temporary folder. Raises InputError for a damaged or oversized archive."""
+    wanted = "wanted an archive that `springbench publish` wrote (.zip)"
+    if not archive.is_file():  # a device or a pipe would be read for ever
+        raise InputError(InputMistake(f"is {'no plain file' if archive.exists() else 'not there'}; {wanted}", archive))
+    with TemporaryDirectory() as scratch:
+        try:
+            with zipfile.ZipFile(archive) as packed:
+                if why := _explain_excess(packed.infolist(), archive.stat().st_size, shutil.disk_usage(scratch).free):
+                    raise InputError(InputMistake(f"{why}; {wanted}", archive))
+                packed.extractall(scratch)  # names that lead out of the folder are made to stay in it
+        except (*_DAMAGED_ARCHIVE_ERRORS, OSError) as error:
+            raise InputError(InputMistake(f"cannot be unpacked ({error}); {wanted}", archive)) from error
+        yield Path(scratch)
+
+
+_DAMAGED_ARCHIVE_ERRORS = (
+    zipfile.BadZipFile,
+    RuntimeError,
+    NotImplementedError,
+    ValueError,
+    EOFError,
+    zlib.error,
+    struct.error,
+)
+"""Errors that zipfile raises for damaged or forged archives."""
+
+
+def _explain_excess(files: Sequence[zipfile.ZipInfo], size: int, free: int) -> str:
+    """Return why an archive is not unpacked; empty if it is.
+
+    Args:
+        files: entries of the archive.
+        size: size of the archive [B].
+        free: free space on the disk [B].
+    """
+    unpacked = sum(info.file_size for info in files)
+    if len(files) > _MAX_FILES:
+        return f"holds {len(files):,} files, and at most {_MAX_FILES:,} are unpacked"
+    if unpacked > free:
+        return f"takes {unpacked:,} bytes unpacked; there are {free:,}"
+    if unpacked > _MAX_COMPRESSION_RATIO * size or sum(info.compress_size for info in files) > size:
+        return f"takes {unpacked:,} bytes unpacked of {size:,}, which no results do"
+    if any(info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for info in files):
+        return "is compressed by another method"
+    return ""
+
+
+def verify_checksums(folder: Path) -> list[VerifiedClaim]:
+    """Return a failed claim for each file that differs from the published one.
+
+    The result is empty if all match. Raises InputError if there are no checksums.
+    """
+    sums = folder / CHECKSUM_FILE
+    if not sums.is_file() or sums.stat().st_size > _MAX_CHECKSUM_BYTES:
+        raise InputError(
+            InputMistake(f"holds no {CHECKSUM_FILE}; wanted an archive that `springbench publish` wrote", folder)
+        )
+    lines = [line.partition("  ") for line in os.fsdecode(sums.read_bytes()).splitlines()]
+    stated = {name: digest for digest, _, name in lines if name}
+    there = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
+    del there[CHECKSUM_FILE]
+    wrong = dict.fromkeys(stated.keys() - there.keys(), "missing")
+    wrong |= dict.fromkeys(there.keys() - stated.keys(), "was not published")
+    wrong |= {n: "was changed" for n in there.keys() & stated.keys() if _compute_digest(there[n]) != stated[n]}
+    return [VerifiedClaim(name, ClaimVerdict.FAIL, why) for name, why in sorted(wrong.items())]
+
+
+def _compute_digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def load_published_runs(
+    folder: Path, print_message: Callable[[str], None], *, with_user_code: bool
+) -> tuple[list[PublishedRun], list[VerifiedClaim]]:
+    """Load the runs of an archive that can be repeated, according to its configs.
+
+    Args:
+        folder: the unpacked archive.
+        print_message: prints a remark.
+        with_user_code: whether to include runs that need code from the archive.
+
+    Returns: the runs, and failed or inconclusive claims on the names of runs.
+    """
+    runs: list[PublishedRun] = []
+    claims: list[VerifiedClaim] = []
+    _LOADED_RUNS.clear()
+    for sweep in list_sweep_folders(folder / "results"):
+        config = read_owner(sweep)
+        if config and not config.is_relative_to(folder.resolve()):
+            raise InputError(InputMistake("leads out of the archive; nothing of it was run", sweep / ".config"))
+        by_run: dict[str, list[ResultRow]] = defaultdict(list)
+        for row in _read_rows(sweep):
+            by_run[row["run_id"]].append(row)
+        specs = {
+            name: _find_run_spec(config, of_run, with_user_code=with_user_code) if config else None
+            for name, of_run in by_run.items()
+        }
+        found = [PublishedRun(by_run[name], spec) for name, spec in specs.items() if spec]
+        claims += [claim for one in found if (claim := _verify_options(one))]
+        if unknown := len(specs) - len(found):
+            why = "the config asks for none such" if config else "there is no config"
+            claims.append(
+                VerifiedClaim(f"{unknown} of {len(specs)} runs of {sweep.name}", ClaimVerdict.INCONCLUSIVE, why)
+            )
+        repeated = [one for one in found if all(row["status"] in _REPRODUCIBLE_STATUSES for row in one.rows)]
+        if left := len(found) - len(repeated):
+            print_message(
+                f"{sweep.name}: {left} runs failed, which depends on more than their config: they are not done again"
+            )
+        safe = [one for one in repeated if with_user_code or not one.run.find_plugins()]
+        if left := len(repeated) - len(safe):
+            print_message(f"{sweep.name}: {left} runs need code from the archive: read it, then give --own-code")
+        runs += safe
+    return runs, claims
+
+
+_REPRODUCIBLE_STATUSES = ("ok", "unsupported", "diverged", "disputed")
+"""Statuses that depend on the config of a run only."""
+
+
+def _read_rows(sweep: Path) -> list[ResultRow]:
+    """Return the rows of a sweep. Raises InputError if they need too much memory."""
+    units = row_store.list_units(sweep / "rows")
+    with parquet_rows.limit_read_memory(units):
+        return parquet_rows.read_rows(units, required_columns=("run_id", "status")).to_pylist()
+
+
+def _find_run_spec(config: Path, run_rows: Sequence[ResultRow], *, with_user_code: bool) -> RunSpec | None:
+    """Find the run specification that produced these rows.
+
+    The run id is a hash of its content.
+
+    The result is None where the config requests no such run.
+    """
+    steps = [row for row in run_rows if row["phase"] == "step"]
+    first = (steps or run_rows)[0]
+    names = {"iterations": "max_iterations"} | {n: n for n in ("tolerance", "integrator", "time_step", "first_guess")}
+    options = {name: first[column] for name, column in names.items()}
+    options |= {"frames": _find_max(steps, "frame"), "rounds": 1 + _find_max(steps, "round")}
+    options["tolerance"] = AUTO if options["tolerance"] == 0.0 else options["tolerance"]
+    if first["asked"] is not None:
+        options = {name: options[name] for name in ("time_step", "frames", "rounds")} | {"accuracy": first["asked"]}
+    sizes = [first["size"]] if first["size"] else []
+    scene = {"solvers": [first["solver"]], "sizes": sizes, **options}
+    for given in ({}, scene | {"threads": "auto"}, scene | {"threads": first["threads"]}):
+        for opens in (False, True) if with_user_code else (False,):
+            for run in _load_runs(config, json.dumps(given, sort_keys=True), opens):
+                if run.compute_run_id(str(first["machine"])) == first["run_id"] and (
+                    opens or not with_user_code or not run.find_plugins()
+                ):
+                    return run
+    return None
+
+
+def _find_max(steps: Sequence[ResultRow], name: str) -> int:
+    return max((row[name] for row in steps if row[name] is not None), default=0)
+
+
+def _load_runs(config: Path, options_json: str, imports_code: bool) -> list[RunSpec]:
+    """Load the runs of a config with options, given as JSON.
+
+    The result is empty if they are invalid.
+
+    `imports_code` states whether code that the config names is imported.
+    """
+    key = config, options_json, imports_code
+    if key not in _LOADED_RUNS:
+        if len(_LOADED_RUNS) >= _MAX_LOADED_CONFIGS:
+            return []
+        try:
+            _LOADED_RUNS[key] = load_config(config, imports_code=imports_code, **json.loads(options_json)).list_runs()
+        except InputError:
+            _LOADED_RUNS[key] = []
+    return _LOADED_RUNS[key]
+
+
+_LOADED_RUNS: dict[tuple[Path, str, bool], list[RunSpec]] = {}
+
+
+def _verify_options(published_run: PublishedRun) -> VerifiedClaim | None:
+    """Return a failed claim if a run's names or options differ from its config."""
+    left_out = {"threads", *read_solver_metadata(published_run.run.solver.name)}  # of the machine, and of the code
+    if published_run.run.accuracy is not None:
+        left_out |= {"integrator", "time_step", "tolerance", "max_iterations", "first_guess"}  # are chosen
+    asked_for = {
+        name: value for name, value in build_specification_columns(published_run.run).items() if name not in left_out
+    }
+    wrong = _find_differences([(row, asked_for) for row in published_run.rows], asked_for)
+    return (
+        VerifiedClaim(f"{published_run.title}, names and options", ClaimVerdict.FAIL, _format_differences(wrong))
+        if wrong
+        else None
+    )
+
+
+def sample_runs(runs: Sequence[PublishedRun], seed: int, fraction: float = 0.1) -> list[PublishedRun]:
+    """Select a random fraction of the runs, at least one.
+
+    A second solver on the same scene and size is added to each where possible.
+
+    Args:
+        runs: runs of the archive.
+        seed: seed of the selection.
+        fraction: fraction of the runs.
+    """
+    chance = random.Random(seed)
+    taken = chance.sample(list(runs), max(1, math.ceil(fraction * len(runs)))) if runs else []
+    for one in list(taken):
+        rivals = [run for run in runs if run.comparison_group == one.comparison_group and run not in taken]
+        if rivals and sum(run.comparison_group == one.comparison_group for run in taken) == 1:
+            taken.append(chance.choice(rivals))
+    return taken
+
+
+def rerun_published(runs: Sequence[PublishedRun], folder: Path, display: ProgressDisplay) -> list[list[ResultRow]]:
+    """Repeat runs in a folder, and return the rows of each. Raises InputError."""
+    for part in ("rows", "recordings", "pictures"):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    bare = [one.run.replace_options(record=False, pictures=False) for one in runs]
+    units = [RunUnit(run, RunFiles.for_run(run, folder)) for run in bare]
+    execute_units(units, display)
+    return [parquet_rows.read_rows([unit.files.rows_path]).to_pylist() for unit in units]
+
+
+def verify_reruns(runs: Sequence[PublishedRun], rerun_rows: Sequence[list[ResultRow]]) -> list[VerifiedClaim]:
+    """Verify repeated runs, and return the claims.
+
+    Args:
+        runs: published runs.
+        rerun_rows: rows of the repetition of each.
+    """
+    claims: list[VerifiedClaim] = []
+    for one, here in zip(runs, rerun_rows, strict=True):
+        claims += _verify_rerun(one, here)
+    for k, one in enumerate(runs):
+        for j in range(k):
+            ended = (runs[j].rows, one.rows, rerun_rows[j], rerun_rows[k])
+            if runs[j].comparison_group == one.comparison_group and all(
+                row["status"] == "ok" for found in ended for row in found
+            ):
+                claims.append(_verify_time_ratio((runs[j], one), (rerun_rows[j], rerun_rows[k])))
+                break
+    return claims
+
+
+def _verify_rerun(original: PublishedRun, rerun_rows: list[ResultRow]) -> list[VerifiedClaim]:
+    """Verify the end, the positions, the other columns and the times of a repeated run."""
+    ended, here = ({(row["status"], row["reason"]) for row in found} for found in (original.rows, rerun_rows))
+    if {status for status, _ in here} != {status for status, _ in ended}:
+        status, reason = next(iter(here - ended), next(iter(here)))
+        return [VerifiedClaim(f"{original.title}, end", ClaimVerdict.FAIL, f"here it ended as {status}: {reason}")]
+    if {status for status, _ in here} != {"ok"}:
+        return [
+            VerifiedClaim(f"{original.title}, end", ClaimVerdict.PASS, f"here it ended as {next(iter(here))[0]}, too")
+        ]
+    return [
+        _verify_positions(original, rerun_rows),
+        _verify_columns(original, rerun_rows),
+        *_verify_seconds(original, rerun_rows),
+    ]
+
+
+def _verify_positions(original: PublishedRun, rerun_rows: list[ResultRow]) -> VerifiedClaim:
+    what = f"{original.title}, positions"
+    now = {row["frame"]: row["digest"] for row in rerun_rows if row["phase"] == "step"}
+    others = {row["frame"] for row in original.step_rows if row["digest"] != now.get(row["frame"])}
+    others |= now.keys() - {row["frame"] for row in original.step_rows}
+    if not others:
+        return VerifiedClaim(what, ClaimVerdict.PASS, f"{len(now)} steps, to the bit")
+    first = min(others, key=lambda frame: -1 if frame is None else frame)
+    return _build_failed_claim(what, f"they differ from step {first} of {len(now)} on", original, rerun_rows)
+
+
+def _verify_columns(original: PublishedRun, rerun_rows: list[ResultRow]) -> VerifiedClaim:
+    """Verify the columns that a repetition determines; an empty published column claims nothing."""
+    what = f"{original.title}, other columns"
+    of_place = {_row_key(row): row for row in rerun_rows}
+    if lost := [_row_key(row) for row in original.rows if _row_key(row) not in of_place]:
+        phase, frame, round = lost[0]
+        return _build_failed_claim(
+            what, f"a repeat has no {phase} of step {frame} in round {round}", original, rerun_rows
+        )
+    if fewer := {place for place in of_place if place[0] == "step"} - {_row_key(row) for row in original.step_rows}:
+        return _build_failed_claim(what, f"{len(fewer)} steps are missing", original, rerun_rows)
+    names = [name for name in run_schema.RUN_SCHEMA.names if name not in IRREPRODUCIBLE_COLUMNS | {"digest"}]
+    wrong = _find_differences([(row, of_place[_row_key(row)]) for row in original.rows], names)
+    filled = [name for name in names if any(row[name] is not None for row in original.rows)]
+    return (
+        _build_failed_claim(what, _format_differences(wrong), original, rerun_rows)
+        if wrong
+        else VerifiedClaim(what, ClaimVerdict.PASS, f"{len(filled)} in {len(original.rows)} rows, to the bit")
+    )
+
+
+def _row_key(row: ResultRow) -> tuple[Any, ...]:
+    return row["phase"], row["frame"], row["round"]
+
+
+def _find_differences(
+    pairs: Sequence[tuple[ResultRow, ResultRow]], names: Iterable[str]
+) -> dict[str, tuple[ResultRow, Any, Any]]:
+    """Return the columns whose published values differ: the first such row, and both values."""
+    wrong: dict[str, tuple[ResultRow, Any, Any]] = {}
+    for row, here in pairs:
+        for name in names:
+            was, now = row[name], here[name]
+            if was is not None and was != now and not (was != was and now != now):  # what is no number equals itself
+                wrong.setdefault(name, (row, was, now))
+    return wrong
+
+
+def _format_differences(differences: Mapping[str, tuple[ResultRow, Any, Any]]) -> str:
+    told = [f"{name} is {was!r:.60}, here {now!r:.60}" for name, (_, was, now) in list(differences.items())[:5]]
+    more = f", and {len(differences) - len(told)} more columns" if len(differences) > len(told) else ""
+    return "; ".join(told) + more
+
+
+def _build_failed_claim(
+    subject: str, explanation: str, original: PublishedRun, rerun_rows: list[ResultRow]
+) -> VerifiedClaim:
+    """Build the claim for a difference.
+
+    It is a failure only with the same source code on such a machine.
+    """
+    if elsewhere := _describe_environment_change(original.rows[0], rerun_rows[0]):
+        return VerifiedClaim(subject, ClaimVerdict.INCONCLUSIVE, f"{explanation}; {elsewhere}")
+    return VerifiedClaim(subject, ClaimVerdict.FAIL, explanation)
+
+
+def _verify_seconds(original: PublishedRun, rerun_rows: list[ResultRow]) -> list[VerifiedClaim]:
+    """Verify the time of a step; no claim where another machine may explain the difference."""
+    what = f"{original.title}, time of a step"
+    was, now = _read_step_seconds(original.rows), _read_step_seconds(rerun_rows)
+    if was.keys() != now.keys():
+        return [_build_failed_claim(what, "a step has no time", original, rerun_rows)]
+    times = bootstrap_statistics.estimate_slowdown(now, was).estimate
+    why = f"here {times:.3g} times as long"
+    elsewhere = _describe_environment_change(original.rows[0], rerun_rows[0])
+    if 1 / MAX_SECONDS_RATIO <= times <= MAX_SECONDS_RATIO:
+        return [VerifiedClaim(what, ClaimVerdict.PASS, why)]
+    if elsewhere and 1 / _MAX_MACHINE_RATIO <= times <= _MAX_MACHINE_RATIO:
+        return []
+    if not elsewhere and (share := _compute_preempted_share([*original.rows, *rerun_rows])) > 0.1:
+        return [
+            VerifiedClaim(what, ClaimVerdict.INCONCLUSIVE, f"{why}; {100 * share:.0f} % of the steps were interrupted")
+        ]
+    return [_build_failed_claim(what, why, original, rerun_rows)]
+
+
+_MAX_MACHINE_RATIO = 20.0
+"""Ratio of speeds that is plausible between two machines."""
+
+
+def _compute_preempted_share(result_rows: Sequence[ResultRow]) -> float:
+    """Compute the fraction of steps that were preempted."""
+    steps = [row for row in result_rows if row["phase"] == "step"]
+    return sum(bool(row["interrupted"]) for row in steps) / len(steps)
+
+
+def _describe_environment_change(old: ResultRow, new: ResultRow) -> str:
+    """Describe the differences of machine, libraries, source code and threads."""
+    differ = [f"{told}" for name, told in _ENVIRONMENT_COLUMNS.items() if old[name] != new[name]]
+    return f"other {' and '.join(differ)}" if differ else ""
+
+
+_ENVIRONMENT_COLUMNS = {"machine": "machine", "versions": "libraries", "code": "code", "threads": "threads"}
+
+
+def _verify_time_ratio(
+    old: tuple[PublishedRun, PublishedRun], new: tuple[list[ResultRow], list[ResultRow]]
+) -> VerifiedClaim:
+    was, now = ([_read_step_seconds(run) for run in pair] for pair in ((old[0].rows, old[1].rows), new))
+    what = f"{old[0].title} beside {old[1].run.solver.name}, ratio of times"
+    if not was[0].keys() & was[1].keys() & now[0].keys() & now[1].keys():
+        return VerifiedClaim(what, ClaimVerdict.INCONCLUSIVE, "they have no step in common that has a time")
+    published, here = (bootstrap_statistics.estimate_slowdown(*pair).estimate for pair in (was, now))
+    apart = bootstrap_statistics.estimate_slowdown(*(_compute_step_ratios(*pair) for pair in (now, was))).estimate
+    what = f"{old[0].title} takes {published:.3g} times as long as {old[1].run.solver.name}"
+    why = f"here {here:.3g} times"
+    elsewhere = _describe_environment_change(old[0].rows[0], new[0][0])
+    limit = MAX_RATIO_OTHER_MACHINE if elsewhere else MAX_RATIO_SAME_MACHINE
+    if 1 / limit <= apart <= limit:
+        return VerifiedClaim(what, ClaimVerdict.PASS, why)
+    share = _compute_preempted_share([row for found in (old[0].rows, old[1].rows, *new) for row in found])
+    if elsewhere or share > 0.1:
+        return VerifiedClaim(
+            what,
+            ClaimVerdict.INCONCLUSIVE,
+            f"{why}; {elsewhere or f'{100 * share:.0f} % of the steps were interrupted'}",
+        )
+    return VerifiedClaim(what, ClaimVerdict.FAIL, why)
+
+
+def _read_step_seconds(run: Sequence[ResultRow]) -> dict[int, float]:
+    """Read the times of a run's steps by frame, where there are any [s]."""
+    timed = [row for row in run if row["phase"] == "step" and row["frame"] is not None and row["seconds"] is not None]
+    return bootstrap_statistics.compute_min_seconds(
+        (row["frame"], row["seconds"]) for row in timed if 0.0 < row["seconds"] < math.inf
+    )
+
+
+def _compute_step_ratios(ours: Mapping[int, float], theirs: Mapping[int, float]) -> dict[int, float]:
+    """Compute the ratio of the two times of each frame."""
+    return {frame: taken / theirs[frame] for frame, taken in ours.items() if frame in theirs}
+
+
+def select_runnable(runs: Sequence[PublishedRun], print_message: Callable[[str], None]) -> list[PublishedRun]:
+    """Return the runs for which this machine has enough cores."""
+    usable = machine_info.describe_machine().cores
+    found = [one for one in runs if machine_info.choose_threads(one.run.threads).count <= usable]
+    if left := len(runs) - len(found):
+        print_message(f"{left} of {len(runs)} runs need more cores than this machine has: they are not done again")
+    return found

@@ -1,0 +1,155 @@
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyarrow's stubs are incomplete for columns, and for file objects that Parquet is read from.
+"""Pack the rows of many units into one file next to their folder.
+
+Readers get the same rows before and after.
+
+The packed file is written under a partial name, including the rows that were packed before. It is compared with the
+originals, which an independent reader reads file by file, and renamed. Then the units' own files are removed. Readers
+prefer a unit's own file to its packed rows (`springbench.harness.results.row_store`). An interruption therefore
+leaves, at any
+moment,
+all rows visible exactly once, and the next call completes the work.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from time import time
+from typing import BinaryIO
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from springbench.harness.atomic_files import atomic_write
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.execution import folder_locks
+from springbench.harness.results import parquet_rows, row_store, run_schema
+
+TABLE_FOLDERS = ("rows", "accuracy", "ablation")
+"""Folders of rows in a folder of results."""
+
+_BATCH_SIZE = 2_000
+"""Number of units that are in memory at a time."""
+_SECONDS_PER_DAY = 86_400.0
+_EMPTY_SCHEMA = pa.schema([])
+_FILE_FIELD = pa.field(row_store.FILE_COLUMN, pa.string())
+_STARTED_SCHEMA = pa.schema([run_schema.RUN_SCHEMA.field("started")])
+
+
+def compact_results(results: Path, print_message: Callable[[str], None], *, min_age_days: float = 0.0) -> int:
+    """Pack the old units of all folders of rows, and return their number.
+
+    Args:
+        results: folder of results, or of one sweep.
+        print_message: called with a remark on each folder.
+        min_age_days: smallest age of a unit's file [days].
+
+    Raises:
+        InputError: there are no rows, a sweep is running, or the schemas of rows do not match.
+    """
+    folders = [folder for table in TABLE_FOLDERS for folder in row_store.find_row_folders(results, table)]
+    if not folders:
+        raise InputError(InputMistake("holds no rows; wanted a folder of results, or that of a sweep", results))
+    count = 0
+    for folder in folders:
+        with folder_locks.lock_folder_exclusive(folder.parent):
+            count += _compact_folder(folder, time() - _SECONDS_PER_DAY * min_age_days, print_message)
+    return count
+
+
+def _compact_folder(folder: Path, max_modified_time: float, print_message: Callable[[str], None]) -> int:
+    for left in folder.parent.glob(f".{folder.name}.*.partial.parquet"):
+        left.unlink()
+    packed = row_store.packed_path(folder)
+    names = sorted(row_store.list_unit_files(folder))
+    old = [
+        unit
+        for name in names
+        if (unit := folder / f"{name}.parquet").is_file() and unit.stat().st_mtime <= max_modified_time
+    ]
+    heads = parquet_rows.read_first_rows(old, ["started"], _STARTED_SCHEMA)
+    whole = [unit for unit in old if isinstance(heads.get(unit), dict) and _is_utf8(unit.stem)]
+    if damaged := len(old) - len(whole):
+        print_message(
+            f"{folder}: {damaged} damaged file{'s' * (damaged > 1)} left as {'they are' if damaged > 1 else 'it is'}"
+        )
+    if not whole:
+        print_message(f"{folder}: nothing to pack; {len(row_store.list_packed_units(folder))} units are packed")
+        return 0
+    stays = sorted(row_store.list_packed_units(folder) - {unit.stem for unit in whole})
+    asked = sorted([*whole, *(folder / f"{name}.parquet" for name in stays)])
+    schema = unify_schemas(asked)
+    if row_store.FILE_COLUMN in schema.names:
+        raise InputError(
+            InputMistake(f"rows have a column {row_store.FILE_COLUMN!r} of their own; they cannot be packed", packed)
+        )
+    with atomic_write(packed) as partial:
+        with partial.open("wb") as into, pq.ParquetWriter(into, schema.append(_FILE_FIELD)) as writer:
+            for batch in _iterate_batches(asked):
+                table = parquet_rows.read_rows(batch, schema, with_unit_names=True)
+                writer.write_table(table, row_group_size=len(table))
+        with partial.open("rb") as written:
+            os.fsync(written.fileno())
+            _check_compacted_rows(written, asked, schema)
+    _sync_folder(packed.parent)
+    for unit in whole:
+        unit.unlink()
+    print_message(f"{folder}: {len(whole)} units packed into {packed.name}, which holds {len(asked)}")
+    return len(whole)
+
+
+def _is_utf8(name: str) -> bool:
+    """Return whether a name is valid UTF-8, which the names of packed units must be."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def unify_schemas(units: Sequence[Path], schema: pa.Schema = _EMPTY_SCHEMA) -> pa.Schema:
+    """Return the common schema of all units; columns of `schema` come first.
+
+    Raises:
+        InputError: a file has columns of other types; the message names it.
+    """
+    found, _ = row_store.group_units(units)
+    for part in found:
+        try:
+            schema = pa.unify_schemas([schema, row_store.read_group_schema(part)]).remove_metadata()
+        except (pa.ArrowException, OSError) as error:
+            why = f"rows do not fit those of other files ({error}); take it out of the results"
+            raise InputError(InputMistake(why, Path(part.files[0]))) from error
+    return schema
+
+
+def _iterate_batches(units: Sequence[Path]) -> Iterator[Sequence[Path]]:
+    return (units[start : start + _BATCH_SIZE] for start in range(0, len(units), _BATCH_SIZE))
+
+
+def _check_compacted_rows(written: BinaryIO, units: Sequence[Path], schema: pa.Schema) -> None:
+    """Compare the packed rows with the originals.
+
+    Raises InputError if they differ; nothing is removed then.
+    """
+    with pq.ParquetFile(written) as file:
+        for group, batch in enumerate(_iterate_batches(units)):
+            if not parquet_rows.is_bitwise_equal(
+                file.read_row_group(group), parquet_rows.read_rows_by_file(batch, schema, with_unit_names=True)
+            ):
+                why = f"the packed rows differ from those in the {len(batch)} files from here on; nothing was removed"
+                raise InputError(InputMistake(why, batch[0]))
+
+
+def _sync_folder(folder: Path) -> None:
+    """Flush a folder to the disk.
+
+    A rename is then durable before the replaced files are removed.
+    """
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

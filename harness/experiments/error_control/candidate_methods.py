@@ -1,0 +1,203 @@
+"""Methods for error-controlled runs: adaptive solvers, and integrators combined with solvers of their steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from springbench.harness.config.config_loader import find_scene_mistakes
+from springbench.harness.config.sweep_config import SolverSpec
+from springbench.harness.errors import InputError, RunFailed
+from springbench.harness.experiments.error_control.step_doubling import estimate_by_step_doubling
+from springbench.harness.reference.step_snapshot import build_exact_scene
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.simulation.adaptive_stepping import AdaptiveImplicitStepper, Stepper
+from springbench.harness.simulation.fixed_stepping import FixedImplicitStepper
+from springbench.harness.simulation.substepping import AdaptiveSubstepper, FixedSubstepper
+from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
+from springbench.solvers.model.integrators import INTEGRATORS, RungeKutta, SingleStageIntegrator, find_integrator
+from springbench.solvers.model.step_problem import NotPositiveDefinite, Unsupported
+from springbench.solvers.registry import SOLVER_TABLE, SOLVERS, find_solver_info, is_minimiser, load_target
+
+_WARMUP_TOLERANCE = 1e-2
+"""Tolerance of the warm-up run, which only compiles, as a fraction of the mesh size."""
+_STEP_DOUBLING_SECONDS = 30.0
+"""Wall time for the step-doubling estimate where error control is not possible [s]."""
+_CONTACT_MESSAGE = (
+    "contact begins and ends within steps, where every method has order 1, so errors cannot be controlled; use a fixed "
+    "step size (--integrator, --time-step), and halve it until the motion does not change"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorTarget:
+    """Scene of one size up to an end time, split into frames.
+
+    Dirichlet conditions are exact, as in the reference.
+
+    Attributes:
+        scene: the scene.
+        size: size of the mesh.
+        t_end: simulated time [s].
+        num_frames: number of frames of equal length up to t_end.
+    """
+
+    scene: SceneSpec
+    size: int
+    t_end: float
+    num_frames: int
+
+    @classmethod
+    def from_scene(
+        cls, scene: SceneSpec, size: int | None, t_end: float | None, print_message: Callable[[str], None] | None = None
+    ) -> ErrorTarget:
+        """Return the target for a scene.
+
+        A frame is about as long as the scene's time step.
+
+        Args:
+            scene: the scene.
+            size: size of the mesh; the scene's default if None.
+            t_end: simulated time [s]; that of the scene if None.
+            print_message: prints a remark.
+
+        Raises:
+            InputError: the size or the time step does not fit the scene.
+            RunFailed: the scene has contact.
+        """
+        scene.require_fixed_time_step()
+        t_end = t_end or scene.frames * scene.time_step
+        size = size or scene.default_size or 0
+        frames = max(1, round(t_end / scene.time_step))
+        if mistakes := find_scene_mistakes(scene, [size]):
+            raise InputError(mistakes)
+        asked = cls(scene, size, t_end, frames)
+        system = asked.build_scene(asked.frame_seconds, "implicit-euler").system
+        if without_vertex_contact(system) is not system:
+            if print_message:
+                print_message(
+                    f"no error can be promised with contact; halving steps for {_STEP_DOUBLING_SECONDS:g} s to tell what can be had"
+                )
+            raise RunFailed(
+                f"{_CONTACT_MESSAGE}; {estimate_by_step_doubling(asked.build_scene, t_end, frames, time_budget=_STEP_DOUBLING_SECONDS)}"
+            )
+        return asked
+
+    def build_scene(self, time_step: float, integrator: str) -> Scene:
+        """Build the scene with a time step [s] and an integrator by name."""
+        return build_exact_scene(self.scene.with_time_step(time_step), self.size, integrator, show_warnings=False)
+
+    @property
+    def frame_seconds(self) -> float:
+        """Length of a frame [s]."""
+        return self.t_end / self.num_frames
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """Integrator and solver by name, and the stepper that combines them."""
+
+    integrator: str
+    solver: str
+    stepper: Stepper
+
+    def __str__(self) -> str:
+        return format_method_name(self.integrator, self.solver)
+
+
+def format_method_name(integrator: str, solver: str) -> str:
+    """Return the name of a method for messages."""
+    return solver if integrator == "own" else f"{integrator} with {solver}"
+
+
+def list_candidate_methods() -> list[tuple[str, SolverSpec]]:
+    """Return the integrators (by name) and solvers that a search tries by default.
+
+    Solvers with their own adaptive integrator come first. The others are solvers that minimise the step's objective.
+    They
+    are combined with the embedded Runge-Kutta integrator of the highest order, and among equals of the highest stage
+    order.
+    They are also combined with the one-step integrator of fixed step size that has the highest order.
+    """
+    pairs = {name: one for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded_order}
+    best = max(pairs, key=lambda name: (pairs[name].order, pairs[name].needs_start_acceleration))
+    told = {name: find_solver_info(load_target(target), name) for name, target in SOLVERS.items()}
+    single = {
+        name: one.order
+        for name, one in INTEGRATORS.items()
+        if isinstance(one, SingleStageIntegrator) and not one.needs_history
+    }
+    even = max((name for name in single if name != "own"), key=single.__getitem__)
+    tried = {
+        name: ("own",) if one.is_substepping else (best, even)
+        for name, one in told.items()
+        if one.supports_error_control
+    }
+    found = [(integrator, SolverSpec(name, {})) for name, several in tried.items() for integrator in several]
+    return sorted(found, key=lambda pair: pair[0] != "own")
+
+
+def list_methods_of_solver(solver: SolverSpec) -> list[tuple[str, SolverSpec]]:
+    """Return all methods of one solver: its own integrator, or all embedded Runge-Kutta integrators.
+
+    Raises:
+        Unsupported: the solver has no error estimate and does not minimise the steps of an integrator.
+    """
+    one = find_solver_info(load_target(SOLVER_TABLE[solver.name]), solver.name)
+    if one.is_substepping:
+        return [("own", solver)]
+    if not is_minimiser(load_target(SOLVER_TABLE[solver.name])):
+        raise Unsupported(f"{solver.name}: tells no error of its steps and does not minimise those of an integrator")
+    return [(name, solver) for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded_order]
+
+
+def prepare_candidate_methods(
+    error_target: ErrorTarget, print_message: Callable[[str], None], candidates: Sequence[tuple[str, SolverSpec]] = ()
+) -> list[Method]:
+    """Return the methods that support the scene, warmed up so that timings exclude compilation.
+
+    Args:
+        error_target: the scene and its end time.
+        print_message: prints the methods that do not support the scene, with the reason.
+        candidates: integrators and solvers; `list_candidate_methods` if empty.
+
+    Raises:
+        RunFailed: no method supports the scene.
+    """
+    found, reasons = list[Method](), list[str]()
+    for integrator, solver in candidates or list_candidate_methods():
+        way = Method(integrator, solver.name, _build_stepper(error_target, integrator, solver))
+        try:
+            _warm_up(error_target, integrator, solver)
+            found.append(way)
+        except (Unsupported, NotPositiveDefinite) as error:
+            reasons.append(f"{way}: {str(error).removeprefix(f'{solver.name}: ')}")
+            print_message(f"  not by {reasons[-1]}")
+    if not found:
+        raise RunFailed(f"no method that keeps to an error knows this scene: {'; '.join(reasons)}")
+    return found
+
+
+def _build_stepper(
+    error_target: ErrorTarget, integrator: str, solver: SolverSpec, frames: int | None = None
+) -> Stepper:
+    made, frames = load_target(SOLVER_TABLE[solver.name])(**solver.parameters), frames or error_target.num_frames
+    if integrator == "own":
+        scene, even = (
+            error_target.build_scene(error_target.frame_seconds, integrator),
+            find_solver_info(load_target(SOLVER_TABLE[solver.name]), solver.name).has_fixed_step,
+        )
+        return (
+            FixedSubstepper(scene, made, frames, lambda h: error_target.build_scene(h, integrator))
+            if even
+            else AdaptiveSubstepper(scene, made, frames)
+        )
+    way = AdaptiveImplicitStepper if isinstance(find_integrator(integrator), RungeKutta) else FixedImplicitStepper
+    return way(lambda h: error_target.build_scene(h, integrator), made, error_target.frame_seconds * frames, frames)
+
+
+def _warm_up(error_target: ErrorTarget, integrator: str, solver: SolverSpec) -> None:
+    size = error_target.build_scene(error_target.frame_seconds, "own").mesh.bounding_box_diagonal or 1.0
+    once = _build_stepper(error_target, integrator, solver, 1)
+    once.integrate_motion(once.initial_setting(_WARMUP_TOLERANCE * size))

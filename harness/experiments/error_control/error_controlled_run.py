@@ -1,0 +1,129 @@
+"""Error-controlled run of a sweep (`accuracy`) with a given solver.
+
+Integrator and step size are chosen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from springbench.harness.config.sweep_config import RunSpec
+from springbench.harness.errors import RunFailed
+from springbench.harness.execution.worker_process import ProgressCallback
+from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget, list_methods_of_solver
+from springbench.harness.experiments.error_control.method_search import (
+    SearchResult,
+    compute_predictability_horizon,
+    search_cheapest_method,
+)
+from springbench.harness.results.quantities import compute_ms_per_step
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.adaptive_stepping import Trajectory
+from springbench.harness.simulation.instrumentation_pass import compute_strain_columns, count_intersections
+from springbench.harness.simulation.timing_pass import hash_positions
+from springbench.solvers.model.step_problem import Positions
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ErrorControlledRun:
+    """Result of an error-controlled run.
+
+    Attributes:
+        scene: the scene, built with the frame as its time step.
+        search_result: method, setting and error estimate.
+        error_requested: requested relative error.
+        timed_trajectories: the same motion, timed again in each round.
+        messages: remarks, stored in the rows.
+    """
+
+    scene: Scene
+    search_result: SearchResult
+    error_requested: float
+    timed_trajectories: tuple[Trajectory, ...]
+    messages: list[str] = field(default_factory=list[str])
+
+    @property
+    def positions(self) -> Positions:
+        """Positions at the start and after each frame, (frames + 1, n, 3) [m]."""
+        return self.timed_trajectories[0].positions
+
+    @property
+    def ms_per_step(self) -> float:
+        """Time per step [ms], where each frame counts as one step."""
+        return compute_ms_per_step([seconds for path in self.timed_trajectories for seconds in path.frame_seconds])
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Build a row for each frame of each round."""
+        best, scene = self.search_result.best_trial, self.scene
+        shared = {
+            "phase": "step",
+            "status": "ok",
+            "reason": self.search_result.note or None,
+            "vertices": scene.system.num_vertices,
+            "springs": len(scene.all_springs.edges),
+            "max_iterations": None,
+            "first_guess": None,
+            "asked": self.error_requested,
+            **best.columns,
+            "estimate_seconds": self.search_result.search_seconds,
+            "choice": "; ".join([f"{best.method} of {len(self.search_result.trials)} ways", *self.messages]),
+        }
+        seen = [self._build_frame_columns(k, p) for k, p in enumerate(self.positions) if k]
+        return [
+            shared
+            | columns
+            | {
+                "round": number,
+                "seconds": seconds,
+                "pass_seconds": one.wall_seconds,
+                "summed_seconds": sum(one.frame_seconds),
+            }
+            for number, one in enumerate(self.timed_trajectories)
+            for columns, seconds in zip(seen, one.frame_seconds, strict=True)
+        ]
+
+    def _build_frame_columns(self, frame: int, p: Positions) -> dict[str, Any]:
+        crossed = count_intersections(self.scene, p, self.scene.compute_time(frame))
+        return {
+            "frame": frame,
+            **compute_strain_columns(self.scene, p),
+            "intersections": crossed,
+            "digest": hash_positions(p),
+        }
+
+
+def run_error_controlled(run: RunSpec, error: float, tick: ProgressCallback) -> ErrorControlledRun:
+    """Find the cheapest method of the run's solver, and repeat it.
+
+    It is repeated for all rounds of the run.
+
+    Args:
+        run: specification of the run.
+        error: relative error at the end of the run.
+        tick: called with the name of the phase as the run progresses.
+
+    Raises:
+        RunFailed: no setting reaches the error, or a round ends at positions that are not bitwise identical.
+        Unsupported: the solver does not support error control. Errors of the solver are raised unchanged.
+    """
+    pairs = list_methods_of_solver(run.solver)
+    asked = ErrorTarget.from_scene(run.scene, run.size, run.frames * run.scene.time_step)
+    said = list[str]()
+    tick("choosing steps")
+    answer = search_cheapest_method(
+        asked,
+        error,
+        compute_predictability_horizon(asked, error, said.append),
+        lambda line: tick("choosing steps"),
+        pairs,
+    )
+    best, rounds = answer.best_trial, list[Trajectory]()
+    for _ in range(run.rounds):
+        rounds.append(best.rerun_trial())
+        if not np.array_equal(rounds[-1].positions, best.trajectory.positions):
+            raise RunFailed("a round ended at other positions than the one before")
+        for _ in range(run.frames):
+            tick("timed pass")
+    return ErrorControlledRun(asked.build_scene(asked.frame_seconds, "own"), answer, error, tuple(rounds), said)

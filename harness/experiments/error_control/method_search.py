@@ -1,0 +1,435 @@
+"""Find the cheapest method for an error.
+
+All methods are run, then the setting of the best one is tuned.
+
+    estimate = |p(T) - q(T)| / |q(T) - p(0)|,    q: reference trial of a much smaller error
+
+in Frobenius norms over the free vertices. The cost of a method depends on its error through its order: the step size is
+proportional to error^(1/order). The order is measured where two settings were run, for a scene may reduce it. Methods
+are compared by CPU seconds, including preparation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import inf, log, sqrt
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.harness.config.sweep_config import SolverSpec
+from springbench.harness.errors import RunFailed
+from springbench.harness.experiments.error_control.candidate_methods import (
+    ErrorTarget,
+    Method,
+    prepare_candidate_methods,
+)
+from springbench.harness.reference.perturbation_growth import PerturbationGrowth, estimate_growth
+from springbench.harness.simulation.adaptive_stepping import StepSizeUnderflow, TimeBudgetExceeded, Trajectory
+from springbench.solvers.model.step_problem import Positions
+
+ERROR_AIM = 0.65
+"""Fraction of the target error at which a setting aims, because estimates scatter."""
+_ERROR_AIM_FIXED_STEPS = 0.85
+"""The same fraction for fixed step sizes, whose error follows their order."""
+MIN_ERROR_FRACTION = 1 / 3
+"""Smallest fraction of the target error that is accepted if a cheaper setting is stable.
+
+Estimated errors are compared with ESTIMATE_SAFETY times this fraction.
+"""
+REFERENCE_ERROR_FRACTION = 1 / 50
+"""Local error of the reference trial, as a fraction of that of the trial."""
+ESTIMATE_SAFETY = 1.25
+"""Safety factor on error estimates, because the reference trial has an error too.
+
+That error is a tenth of the estimate. It is a sixth where stability limits the step size, so that the reference trial
+has hardly shorter steps.
+"""
+_MIN_REFERENCE_REFINEMENT = 10.0
+"""Factor of accuracy, by order and number of steps, above which a trial may serve as reference."""
+_MAX_SETTING_CHANGES, _MAX_STALLS, _MAX_REFERENCE_TRIALS = 6, 2, 3
+_MIN_TIMED_SECONDS = 0.05
+"""CPU time below which a trial is run twice, and the smaller time counts [s]."""
+_INITIAL_TIME_LIMIT, _TIME_LIMIT_FACTOR = 1.0, 4.0
+"""First time limit of a method [s of CPU time]; factor on the limit if no method finishes, and on the cheapest time."""
+_MAX_COST_RATIO = 2.0
+"""Factor on the predicted cost of the next method, above which that method is tried first."""
+_MIN_ORDER = 0.5
+"""Lower bound of measured orders; a method whose error decreases more slowly is given up."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """Run of a method at one setting.
+
+    Attributes:
+        method: the method.
+        setting: setting of its stepper.
+        trajectory: the computed motion.
+        error_estimated: estimated relative error.
+        order: order at which the error decreases with the step size: that of the method, or less if two settings show
+            it.
+    """
+
+    method: Method
+    setting: float
+    trajectory: Trajectory
+    error_estimated: float
+    order: float
+
+    @property
+    def step_atol(self) -> float | None:
+        """Tolerance on the local error [m]; None for fixed step sizes."""
+        return None if self.method.stepper.has_fixed_step else self.setting
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """Columns of this trial, common to several tables."""
+        return {
+            "integrator": self.method.integrator,
+            "estimated": self.error_estimated,
+            "local_tolerance_m": self.step_atol,
+            "accepted": self.trajectory.num_accepted_steps,
+            "rejected": self.trajectory.num_rejected_steps,
+            "factorisations": self.trajectory.num_factorisations,
+        }
+
+    def rerun_trial(self) -> Trajectory:
+        """Run the method again at the same setting."""
+        return self.method.stepper.integrate_motion(self.setting)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SearchResult:
+    """Result of a search.
+
+    Attributes:
+        best_trial: cheapest trial that meets the error.
+        trials: first trials of all methods with the CPU seconds predicted for the target error, cheapest first.
+        step_atol: tolerance of the first trials [m].
+        reference_trial: trial from which errors are estimated.
+        search_seconds: wall time of everything except the best trial.
+        note: why the best trial is much more accurate than requested; empty otherwise.
+    """
+
+    best_trial: Trial
+    trials: tuple[tuple[Trial, float], ...]
+    step_atol: float
+    reference_trial: Trial
+    search_seconds: float
+    note: str
+
+    def compute_error(self, p: Positions, free_vertices: NDArray[np.int64]) -> float:
+        """Return the error of end positions p (n, 3) [m] against the reference trial.
+
+        The error is relative to the displacement and taken over the free vertices.
+        """
+        q = self.reference_trial.trajectory.positions
+        away, moved = (float(np.linalg.norm((x - q[-1])[free_vertices])) for x in (p, q[0]))
+        return away / moved
+
+
+def compute_predictability_horizon(
+    error_target: ErrorTarget, max_error: float, print_message: Callable[[str], None]
+) -> PerturbationGrowth:
+    """Compute how far ahead the motion is predictable.
+
+    The smallest error that can be reached is printed.
+
+    Args:
+        error_target: the scene and its end time.
+        max_error: relative error to reach.
+        print_message: prints a remark.
+
+    Raises:
+        Unpredictable: the error cannot be reached at t_end (the message states one that can), or nothing moves.
+    """
+    seen = estimate_growth(error_target.scene, error_target.size, error_target.t_end)
+    seen.require_predictable(max_error)
+    print_message(
+        f"a perturbation of 1e-12 of the size grows to {seen.growth_factor[-1]:.1e} of the displacement after "
+        f"{error_target.t_end:g} s: an error of {max_error:g} can be reached there, of {seen.min_error:.0e} at the least"
+    )
+    return seen
+
+
+def search_cheapest_method(
+    error_target: ErrorTarget,
+    max_error: float,
+    growth: PerturbationGrowth,
+    print_message: Callable[[str], None],
+    candidates: Sequence[tuple[str, SolverSpec]] = (),
+) -> SearchResult:
+    """Find the cheapest method whose relative error at t_end is at most `max_error`.
+
+    Args:
+        error_target: the scene and its end time.
+        max_error: relative error to reach.
+        growth: growth of perturbations (`compute_predictability_horizon`).
+        print_message: prints a remark.
+        candidates: integrators and solvers to try; the default candidates if empty.
+
+    Raises:
+        RunFailed: no method reaches the error.
+    """
+    return _MethodSearch(error_target, max_error, growth, print_message).find_cheapest(candidates)
+
+
+class _MethodSearch:
+    def __init__(
+        self, error_target: ErrorTarget, error: float, growth: PerturbationGrowth, print_message: Callable[[str], None]
+    ) -> None:
+        self._error_target, self._max_error, self._growth, self._print_message = (
+            error_target,
+            error,
+            growth,
+            print_message,
+        )
+        self._free_vertices = error_target.build_scene(error_target.frame_seconds, "own").system.free_vertices
+
+    def find_cheapest(self, candidates: Sequence[tuple[str, SolverSpec]]) -> SearchResult:
+        self._print_message("ways to the error:")
+        tolerance = 0.2 * self._max_error * self._growth.scale
+        known = prepare_candidate_methods(self._error_target, self._print_message, candidates)
+        began = perf_counter()
+        raced = self._run_first_trials(known, tolerance)
+        closer = self._find_reference_trial(raced)
+        graded = sorted((self._estimate_error_and_order(one, closer) for one in raced), key=self._predict_cost)
+        for one in graded:
+            self._print_message(
+                f"  {one.method}: {self._predict_cost(one):.3g} s predicted; {one.trajectory.cpu_seconds:.3g} s for an error of "
+                f"{one.error_estimated:.1e}, of order {one.order:.2g}"
+            )
+        best, note = self._find_first_reaching(graded, closer)
+        besides = perf_counter() - began - best.trajectory.wall_seconds
+        promised = tuple((one, self._predict_cost(one)) for one in graded)
+        return SearchResult(best, promised, tolerance, closer, besides, note)
+
+    @staticmethod
+    def _run_trial(method: Method, setting: float, time_limit: float = inf) -> Trial:
+        """Run a method at a setting.
+
+        The method is run twice where the first run is too short to be timed.
+        """
+        paths = [method.stepper.integrate_motion(setting, cpu_limit=time_limit)]
+        if paths[0].cpu_seconds < _MIN_TIMED_SECONDS:
+            paths.append(method.stepper.integrate_motion(setting, cpu_limit=time_limit))
+        return Trial(method, setting, min(paths, key=lambda path: path.cpu_seconds), inf, method.stepper.order)
+
+    def _run_first_trials(self, methods: list[Method], step_atol: float) -> list[Trial]:
+        """Run all methods and return the trials that are fast enough.
+
+        The time limit is a multiple of the fastest time.
+        """
+        found, stuck, limit = list[Trial](), list[StepSizeUnderflow](), _INITIAL_TIME_LIMIT
+        while methods and not found:
+            late = list[tuple[Method, float]]()
+            for way in methods:
+                try:
+                    found.append(self._run_trial(way, way.stepper.initial_setting(step_atol), limit))
+                    limit = max(
+                        _INITIAL_TIME_LIMIT, _TIME_LIMIT_FACTOR * min(one.trajectory.cpu_seconds for one in found)
+                    )
+                except StepSizeUnderflow as error:
+                    stuck.append(error)
+                except TimeBudgetExceeded:
+                    late.append((way, limit))
+            methods, limit = [way for way, _ in late], _TIME_LIMIT_FACTOR * limit
+            for way, given in late if found else ():
+                self._print_message(f"  {way}: given up after {given:.3g} s, for it is slower than others")
+        if not found:
+            raise stuck[0]
+        return found
+
+    def _find_reference_trial(self, trials: list[Trial]) -> Trial:
+        """Run the reference trial: a motion whose error is much smaller than the target error.
+
+        The method that is predicted to be the cheapest at that accuracy computes it; adaptive methods are preferred.
+        """
+        best = min(
+            trials,
+            key=lambda one: (
+                one.method.stepper.has_fixed_step,
+                self._predict_scaled_cost(one, REFERENCE_ERROR_FRACTION),
+            ),
+        )
+        follower, found = best.method.stepper, best
+        order = self._estimate_order(best) if follower.has_fixed_step else float(follower.order)
+        part = REFERENCE_ERROR_FRACTION ** (order / (order + 1.0))
+        for _ in range(
+            _MAX_REFERENCE_TRIALS
+        ):  # where frames or stability rule the steps, a closer tolerance may change nothing
+            found = self._run_trial(best.method, follower.scale_setting(found.setting, part, order))
+            if (
+                found.trajectory.num_accepted_steps / best.trajectory.num_accepted_steps
+            ) ** order >= _MIN_REFERENCE_REFINEMENT:
+                break
+        begun = self._estimate_error(best, found)
+        if ERROR_AIM * self._max_error < begun.error_estimated < inf:
+            found = self._run_trial(
+                best.method,
+                follower.scale_setting(found.setting, ERROR_AIM * self._max_error / begun.error_estimated, order),
+            )
+        return found
+
+    def _estimate_order(self, trial: Trial) -> float:
+        """Estimate the order of fixed step sizes by doubling the step twice (Richardson)."""
+        two, four = (
+            self._run_trial(trial.method, parts * trial.setting).trajectory.positions[-1] for parts in (2.0, 4.0)
+        )
+        first, second = self._compute_distance(trial.trajectory.positions[-1], two), self._compute_distance(two, four)
+        fell = log(first / second, 2.0) if 0.0 < first < inf and 0.0 < second < inf else inf
+        return min(float(trial.method.stepper.order), max(_MIN_ORDER, fell))
+
+    @staticmethod
+    def _predict_scaled_cost(trial: Trial, error_fraction: float) -> float:
+        """Predict the CPU seconds at a fraction of the local error; preparation counts once."""
+        stepping = min(trial.trajectory.wall_seconds, trial.trajectory.cpu_seconds)
+        return trial.trajectory.cpu_seconds - stepping + stepping * error_fraction ** (-1.0 / trial.order)
+
+    def _estimate_error(self, trial: Trial, reference_trial: Trial) -> Trial:
+        p, q = trial.trajectory.positions, reference_trial.trajectory.positions
+        moved = self._compute_distance(q[-1], q[0])
+        least = (reference_trial.step_atol or 0.0) / self._growth.scale
+        estimated = max(ESTIMATE_SAFETY * self._compute_distance(p[-1], q[-1]) / moved, least) if moved else inf
+        return replace(trial, error_estimated=estimated if estimated < inf else inf)
+
+    def _estimate_error_and_order(self, trial: Trial, reference_trial: Trial) -> Trial:
+        """Estimate the error of a trial, and its order where necessary.
+
+        The order is measured where fixed steps are not accurate enough.
+        """
+        trial = self._estimate_error(trial, reference_trial)
+        if not trial.method.stepper.has_fixed_step or trial.error_estimated <= self._max_error:
+            return trial
+        try:
+            return _update_order(
+                trial, self._estimate_error(self._run_trial(trial.method, 2.0 * trial.setting), reference_trial)
+            )
+        except StepSizeUnderflow:
+            return trial
+
+    def _compute_distance(self, p: Positions, q: Positions) -> float:
+        return float(np.linalg.norm((p - q)[self._free_vertices]))
+
+    def _predict_cost(self, trial: Trial) -> float:
+        """Predict the CPU seconds of a trial's method at the target error.
+
+        The measured time counts where the trial is more accurate, since explicit steps may have reached the stability
+        limit.
+        """
+        return (
+            self._predict_scaled_cost(trial, min(1.0, self._choose_error_aim(trial) / trial.error_estimated))
+            if trial.error_estimated < inf
+            else inf
+        )
+
+    def _choose_error_aim(self, trial: Trial) -> float:
+        """Return the error for which a setting is chosen."""
+        return (_ERROR_AIM_FIXED_STEPS if trial.method.stepper.has_fixed_step else ERROR_AIM) * self._max_error
+
+    def _find_first_reaching(self, trials: list[Trial], reference_trial: Trial) -> tuple[Trial, str]:
+        """Return the first trial that reaches the error, and a note.
+
+        The note states why the trial is much more accurate, if it is.
+
+        A method that exceeds the predicted time of the next one by far is tried again after all others.
+        """
+        nearest, times = list[Trial](), _MAX_COST_RATIO
+        while trials:
+            late = list[Trial]()
+            for one, after in zip(trials, [*trials[1:], trials[-1]], strict=True):
+                limit = times * max(_MIN_TIMED_SECONDS, self._predict_cost(one), self._predict_cost(after))
+                try:
+                    found, note = self._tune_setting(one, reference_trial, limit)
+                except TimeBudgetExceeded:
+                    self._print_message(f"  {one.method}: takes more than {limit:.3g} s")
+                    late.append(one)
+                    continue
+                if found.error_estimated <= self._max_error:
+                    return found, note
+                nearest.append(found)
+                self._print_message(
+                    f"  {one.method}: reaches {found.error_estimated:.1e}, and shorter steps come no nearer"
+                )
+            trials, times = late, _TIME_LIMIT_FACTOR * times
+        raise self._build_no_method_error(min(nearest, key=lambda one: one.error_estimated))
+
+    def _tune_setting(self, trial: Trial, reference_trial: Trial, time_limit: float) -> tuple[Trial, str]:
+        """Tune the setting of a method towards the target error, and return the nearest trial.
+
+        The second result says why the trial is much more accurate. Raises TooSlow beyond a limit of CPU seconds.
+        """
+        best, above = None if trial.error_estimated > self._max_error else trial, None
+        nearest, stalled = trial, 0
+        for _ in range(_MAX_SETTING_CHANGES):
+            if best and best.error_estimated >= ESTIMATE_SAFETY * MIN_ERROR_FRACTION * self._max_error:
+                return best, ""
+            setting = self._choose_next_setting(trial, best, above)
+            if setting == trial.setting:
+                return trial, _STABILITY_NOTE
+            before = trial
+            try:
+                trial = _update_order(
+                    before, self._estimate_error(self._run_trial(trial.method, setting, time_limit), reference_trial)
+                )
+            except StepSizeUnderflow:
+                break
+            nearest = min(nearest, trial, key=lambda found: found.error_estimated)
+            if trial.error_estimated > self._max_error:
+                shorter = (
+                    setting < 0.1 * before.setting
+                    or trial.trajectory.num_accepted_steps > 4 * before.trajectory.num_accepted_steps
+                )
+                stalled = (
+                    stalled + 1
+                    if best is None and trial.error_estimated > 0.5 * before.error_estimated and shorter
+                    else 0
+                )
+                if stalled == _MAX_STALLS:
+                    break
+                above = trial
+            elif best and trial.trajectory.cpu_seconds > 0.9 * best.trajectory.cpu_seconds:
+                return best, _STABILITY_NOTE
+            else:
+                best = trial
+        if best is None:
+            return nearest, ""
+        return (
+            best,
+            _STABILITY_NOTE if best.error_estimated < ESTIMATE_SAFETY * MIN_ERROR_FRACTION * self._max_error else "",
+        )
+
+    def _choose_next_setting(self, trial: Trial, best: Trial | None, above: Trial | None) -> float:
+        """Return the next setting to try; between two settings where they bracket the error."""
+        if best and above:
+            return sqrt(best.setting * above.setting)
+        aim = self._choose_error_aim(trial)
+        ratio = aim / max(trial.error_estimated, 1e-3 * aim)
+        return trial.method.stepper.scale_setting(trial.setting, min(30.0, max(1e-3, ratio)), trial.order)
+
+    def _build_no_method_error(self, nearest: Trial) -> RunFailed:
+        at = (
+            f" at {nearest.step_atol:.1e} m a step"
+            if nearest.step_atol
+            else f" with {nearest.trajectory.num_accepted_steps} steps"
+        )
+        return RunFailed(
+            f"no steps keep to an error of {self._max_error:g}: {nearest.method} came nearest and reached "
+            f"{nearest.error_estimated:.1g}{at}, and shorter ones come no nearer; ask for a larger --error or a shorter "
+            "--horizon"
+        )
+
+
+def _update_order(before: Trial, after: Trial) -> Trial:
+    """Return the second trial with the observed order, at most that of its method."""
+    shorter = log(after.trajectory.num_accepted_steps / before.trajectory.num_accepted_steps)
+    if not (0.0 < before.error_estimated < inf and 0.0 < after.error_estimated < inf and abs(shorter) > 0.1):
+        return after
+    fell = log(before.error_estimated / after.error_estimated) / shorter
+    return replace(after, order=min(float(after.method.stepper.order), max(_MIN_ORDER, fell)))
+
+
+_STABILITY_NOTE = "longer steps are unstable, or cost as much"

@@ -1,0 +1,147 @@
+"""Git worktrees of revisions, with an own environment if the required libraries differ.
+
+Worktrees stay in the user's cache, so that a revision is compiled once. Only the most recently used ones remain.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from springbench.harness.atomic_files import open_lock_file, user_cache_dir
+from springbench.harness.errors import InputError
+from springbench.harness.experiments.regression.revision_process import GitRevision
+
+MAX_WORKTREES = 6
+"""Maximum number of worktrees in the cache."""
+
+
+def worktree_cache() -> Path:
+    """Return the cache folder of worktrees."""
+    return user_cache_dir("revisions")
+
+
+def find_checkout(folder: Path) -> Path:
+    """Return the git checkout that contains a folder; raise InputError if there is none."""
+    told = _run_git(folder, "rev-parse", "--show-toplevel")
+    if told.returncode:
+        raise InputError(f"--against: {folder} is in no git checkout ({_last_line(told.stderr)}); go to one")
+    return Path(told.stdout.strip())
+
+
+def resolve_commit(checkout: Path, revision: str) -> str:
+    """Return the commit that a revision names; raise InputError if it is unknown."""
+    told = _run_git(checkout, "rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}")
+    if told.returncode:
+        wanted = "wanted a commit, a branch or a tag, such as HEAD~1; `git log --oneline` lists them"
+        raise InputError(f"--against: unknown revision {revision!r}; {wanted}")
+    return told.stdout.strip()
+
+
+def open_revisions(checkout: Path, revision: str) -> tuple[GitRevision, GitRevision]:
+    """Open the checkout with its uncommitted changes, and a revision; raise InputError on failure.
+
+    Args:
+        checkout: folder of the checkout.
+        revision: commit, branch or tag.
+    Returns: the checkout and the revision.
+    """
+    commit = resolve_commit(checkout, revision)
+    tree = prepare_worktree(checkout, commit)
+    name = f"revision {revision}" if commit.startswith(revision) else f"revision {revision} ({commit[:10]})"
+    return GitRevision("this checkout", checkout), GitRevision(
+        name, tree, _prepare_python(checkout, tree, name), checkout
+    )
+
+
+def prepare_worktree(checkout: Path, commit: str) -> Path:
+    """Return a clean worktree of a commit, from the cache or newly created.
+
+    Raises:
+        InputError: on failure.
+    """
+    tree = worktree_cache() / commit[:16]
+    with _lock_exclusive(worktree_cache()):
+        _run_git(checkout, "worktree", "prune")
+        if tree.exists():
+            clean = _run_git(tree, "status", "--porcelain", "--untracked-files=no")
+            if (
+                _run_git(tree, "rev-parse", "HEAD").stdout.strip() == commit
+                and not clean.returncode
+                and not clean.stdout
+            ):
+                os.utime(tree)
+                return tree
+            shutil.rmtree(tree)
+            _run_git(checkout, "worktree", "prune")
+        told = _run_git(checkout, "worktree", "add", "--detach", "--force", str(tree), commit)
+        if told.returncode:
+            raise InputError(f"--against: no worktree of {commit[:10]}: {_last_line(told.stderr)}")
+        for old in sorted(worktree_cache().glob("[0-9a-f]*"), key=lambda path: path.stat().st_mtime)[:-MAX_WORKTREES]:
+            shutil.rmtree(old, ignore_errors=True)
+    return tree
+
+
+def _prepare_python(checkout: Path, tree: Path, name: str) -> Path:
+    """Prepare the Python interpreter of a revision.
+
+    It is this interpreter if the required libraries are equal, else that of the revision's own environment.
+    """
+    if _read_requirements(checkout) == _read_requirements(tree):
+        return Path(sys.executable)
+    own = tree / ".venv"
+    python, whole = own / "bin" / "python", own / "whole"
+    if whole.exists():  # what was killed on the way is built again
+        return python
+    shutil.rmtree(own, ignore_errors=True)
+    for command in (
+        [sys.executable, "-m", "venv", str(own)],
+        [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "-e", str(tree)],
+    ):
+        told = subprocess.run(command, cwd=tree, capture_output=True, text=True)
+        if told.returncode:
+            shutil.rmtree(own, ignore_errors=True)
+            raise InputError(f"{name}: does not build: {_last_line(told.stderr or told.stdout)}")
+    whole.touch()
+    return python
+
+
+def _read_requirements(tree: Path) -> Any:
+    """Read the requirements of a worktree that determine its libraries."""
+    try:
+        project = tomllib.loads((tree / "pyproject.toml").read_text())["project"]
+    except (OSError, KeyError, tomllib.TOMLDecodeError):
+        return None
+    return sorted(project.get("dependencies", ())), project.get("requires-python")
+
+
+def _run_git(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True)
+    except OSError as error:
+        raise InputError(f"--against: git cannot be run ({error}); install it") from error
+
+
+def _last_line(said: str) -> str:
+    """Return the last line of a program's output."""
+    return next((line.strip() for line in reversed(said.splitlines()) if line.strip()), "it does not say why")
+
+
+@contextmanager
+def _lock_exclusive(folder: Path) -> Generator[None]:
+    """Lock the cache so that one process at a time creates worktrees."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = open_lock_file(folder / ".lock")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(lock)

@@ -1,0 +1,221 @@
+"""Plugin for pytest with performance tests, based on pytest-benchmark.
+
+    def test_mine_is_no_slower(race):
+        race(mine, theirs, limit=1.03)                                  # two functions of no arguments
+
+    def test_my_solver_is_no_slower(race):
+        race.solvers("cloth.yaml", Mine(), "numba", limit=1.0, agree=1e-6)      # on a scene
+
+Both must give the same answer, in every test run. With pytest-benchmark enabled they are then timed in interleaved
+blocks, and pytest-benchmark's JSON has the result. An inconclusive test is neither passed nor failed: it is counted as
+`undecided`. A session without failures then ends with the exit code 13, because 3 is pytest's code of internal errors.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Generator
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+import pytest
+
+if TYPE_CHECKING:
+    from pytest_benchmark.fixture import BenchmarkFixture
+    from springbench.harness.experiments.regression.abba_benchmark import BenchmarkResult
+    from springbench.harness.experiments.regression.solver_pair import SolverInput, WorkFunction
+
+INCONCLUSIVE_KEY = pytest.StashKey[bool]()
+EXIT_INCONCLUSIVE = 13
+MAX_ROUNDS = 10**9
+"""Number of rounds requested from pytest-benchmark; the benchmark ends earlier."""
+
+
+class _BenchmarkDecided(BaseException):
+    """Ends the rounds of pytest-benchmark; an Exception would mark the benchmark as failed."""
+
+
+class PairedBenchmark:
+    """Fixture that compares two programs, or two solvers on a scene; one comparison per test."""
+
+    def __init__(self, benchmark: BenchmarkFixture, item: pytest.Item) -> None:
+        self._benchmark, self._item = benchmark, item
+        self._budget: float = item.config.option.race_budget
+
+    def __call__(
+        self,
+        candidate: WorkFunction,
+        baseline: WorkFunction,
+        *,
+        max_ratio: float,
+        clock: Literal["cpu", "wall"] = "cpu",
+        agreement_rtol: float | None = 0.0,
+        budget: float | None = None,
+        alpha: float | None = None,
+        **extra_info: Any,
+    ) -> BenchmarkResult | None:
+        """Fail the test if the candidate is too slow compared with the baseline.
+
+        It may take at most max_ratio times as long.
+
+        Args:
+            candidate: function without arguments.
+            baseline: function without arguments.
+            max_ratio: limit of the ratio of times.
+            clock: "cpu" for the CPU time of the process, "wall" for elapsed time.
+            agreement_rtol: tolerance of the difference of the answers, relative to their size; None if there are none.
+            budget: seconds; --race-budget by default.
+            alpha: probability of a wrong verdict; 0.1 % by default.
+            extra_info: stored in the benchmark's JSON.
+        Returns: the result, or None if nothing is timed.
+        """
+        from springbench.harness.experiments.regression.abba_benchmark import iterate_paired_benchmark
+        from springbench.harness.experiments.regression.answer_agreement import describe_difference
+        from springbench.harness.experiments.regression.confidence_sequence import (
+            DEFAULT_ALPHA,
+            SequentialTest,
+            SequentialVerdict,
+        )
+        from springbench.harness.experiments.regression.solver_pair import build_timer, choose_num_calls
+
+        rule, benchmark = SequentialTest(max_ratio, alpha or DEFAULT_ALPHA), cast(Any, self._benchmark)
+        answer: Any = benchmark.pedantic(candidate) if benchmark.disabled else candidate()
+        if agreement_rtol is not None:
+            said = describe_difference(answer, baseline(), agreement_rtol)
+            if said:
+                pytest.fail(f"the answers differ, so nothing was timed: {said}", pytrace=False)
+        elif not benchmark.disabled:
+            baseline()
+        if benchmark.disabled:
+            return None
+        calls = choose_num_calls(candidate, baseline)
+        a, b = (build_timer(work, calls, clock) for work in (candidate, baseline))
+        found: list[BenchmarkResult] = []
+        last: list[float] = []
+        game = iterate_paired_benchmark(b, rule, time_budget=budget or self._budget)
+
+        def before() -> None:
+            try:
+                game.send(last.pop()) if last else next(game)
+            except StopIteration as done:
+                found.append(done.value)
+                raise _BenchmarkDecided from None
+
+        with suppress(_BenchmarkDecided):
+            benchmark.pedantic(lambda: last.append(a()), setup=before, rounds=MAX_ROUNDS)
+        (result,) = found
+        benchmark.extra_info |= extra_info | _build_extra_info(result, calls, clock)
+        if result.verdict is SequentialVerdict.INCONCLUSIVE:
+            self._item.stash[INCONCLUSIVE_KEY] = True
+            pytest.skip(str(result))
+        if result.verdict is SequentialVerdict.FAIL:
+            pytest.fail(str(result), pytrace=False)
+        return result
+
+    def compare_solvers(
+        self,
+        scene: str | os.PathLike[str],
+        solver: SolverInput,
+        baseline: SolverInput,
+        *,
+        max_ratio: float,
+        agreement_rtol: float | None = 1e-9,
+        clock: Literal["cpu", "wall"] = "cpu",
+        budget: float | None = None,
+        size: int | None = None,
+        **options: Any,
+    ) -> BenchmarkResult | None:
+        """Compare two solvers on a scene.
+
+        Args:
+            scene: file of the scene, relative to the test's file.
+            solver: the candidate: a name, a mapping of name and parameters, or a solver object.
+            baseline: solver to compare with, in the same form.
+            max_ratio: limit of the ratio of times.
+            agreement_rtol: tolerance of the difference of the positions, relative to the scene's size.
+            clock: "cpu" or "wall".
+            budget: seconds; --race-budget by default.
+            size: mesh size; the scene's default if omitted.
+            options: options of a run: iterations, tolerance, frames, integrator, time_step, first_guess.
+        Returns: the result, or None if nothing is timed.
+        """
+        from springbench.harness.execution.machine_info import limit_threads
+        from springbench.harness.experiments.regression.solver_pair import prepare_solver_pair
+
+        with limit_threads(1):
+            both = prepare_solver_pair(self._item.path.parent / Path(scene), solver, baseline, size=size, **options)
+            return self(*both, max_ratio=max_ratio, clock=clock, agreement_rtol=agreement_rtol, budget=budget)
+
+
+def _build_extra_info(result: BenchmarkResult, num_calls: int, clock: str) -> dict[str, Any]:
+    """Build the entries of the benchmark's `extra_info`."""
+    found = result.interval
+    return {
+        "ratio": {"median": found.ratio, "low": max(found.low, 1e-300), "high": min(found.high, 1e300)},  # no inf
+        "limit": result.sequential_test.max_ratio,
+        "answer": result.verdict.name.lower(),
+        "error": result.sequential_test.alpha,
+        "turns": len(result.blocks),
+        "calls": num_calls,
+        "clock": clock,
+        "load": round(result.load_average, 2),
+    }
+
+
+@pytest.fixture
+def paired_benchmark(benchmark: BenchmarkFixture, request: pytest.FixtureRequest) -> PairedBenchmark:
+    """Compare the times of two programs, or of two solvers on a scene.
+
+    Their answers are checked first.
+    """
+    return PairedBenchmark(benchmark, request.node)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the plugin's command-line options."""
+    group = parser.getgroup("springbench")
+    group.addoption("--race-budget", type=float, default=60.0, help="Seconds that a race may take; 60.")
+
+
+class _InconclusiveCounter:
+    """Counts inconclusive tests; with xdist in the process that reports."""
+
+    def __init__(self) -> None:
+        self.num_inconclusive = 0
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self.num_inconclusive += getattr(report, "undecided", False)
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_sessionfinish(self, session: pytest.Session, exitstatus: int) -> None:
+        if exitstatus == 0 and self.num_inconclusive:
+            session.exitstatus = EXIT_INCONCLUSIVE
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Register the counter of inconclusive tests."""
+    config.pluginmanager.register(_InconclusiveCounter(), "springbench-undecided")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Mark the report of an inconclusive test."""
+    report = yield
+    if report.when == "call" and report.skipped and item.stash.get(INCONCLUSIVE_KEY, False):
+        report.undecided = True  # type: ignore[attr-defined]
+    return report
+
+
+def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, tuple[str, dict[str, bool]]] | None:
+    """Report an inconclusive test as `?`."""
+    if getattr(report, "undecided", False):
+        return "undecided", "?", ("UNDECIDED", {"yellow": True})
+    return None
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Print the inconclusive tests with their reasons."""
+    for report in terminalreporter.stats.get("undecided", []):
+        said = report.longrepr[2].removeprefix("Skipped: ")
+        terminalreporter.write_line(f"UNDECIDED {report.nodeid}: {said}")

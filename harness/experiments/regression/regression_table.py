@@ -1,0 +1,153 @@
+"""Table of performance tests in a YAML file: `springbench gate gates.yaml`.
+
+gates:
+  - {scene: cloth.yaml, size: 32, solver: numba, against: sparse, limit: 0.6, agree: 1e-6}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+from springbench.harness.config.run_options import IterationLimit, RelativeTolerance
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.harness.experiments.regression.abba_benchmark import (
+    BenchmarkResult,
+    ClockName,
+    ProgramPair,
+    run_confirmed_benchmark,
+)
+from springbench.harness.experiments.regression.answer_agreement import DEFAULT_AGREEMENT_RTOL, describe_difference
+from springbench.harness.experiments.regression.confidence_sequence import DEFAULT_ALPHA, SequentialTest
+from springbench.harness.experiments.regression.solver_pair import build_timer, choose_num_calls, prepare_solver_pair
+from springbench.harness.scenes.scene_spec import FrameCount, IntegratorName, MeshSize
+from springbench.harness.schema.base_model import ConfigModel
+from springbench.harness.schema.config_document import ConfigDocument
+from springbench.harness.schema.yaml_loader import read_yaml
+from springbench.solvers.model.step_problem import NotPositiveDefinite, Unsupported
+
+
+class RegressionTest(ConfigModel):
+    """A performance test of a solver against a baseline on a scene's steps.
+
+    The solver may take at most a given multiple of the baseline's time.
+    """
+
+    scene: str
+    """The scene's file (*.yaml, or *.json of the assignment), relative to the table."""
+    solver: str | dict[str, Any]
+    """The tested solver: a name, or a mapping of `name` and the solver's parameters."""
+    against: str | dict[str, Any]
+    """The baseline, in the same form."""
+    limit: float = Field(gt=0, le=1e6)
+    """The largest ratio of times, the solver's over the baseline's."""
+    agree: float = Field(default=DEFAULT_AGREEMENT_RTOL, ge=0, le=1)
+    """Tolerance of the difference of their positions, relative to the scene's size; nothing is timed if it is
+    exceeded."""
+    size: MeshSize | None = None
+    """Mesh size; the scene's default if left out."""
+    iterations: IterationLimit = 50
+    """Iteration limit of a step."""
+    tolerance: RelativeTolerance = None
+    """Relative tolerance of a step's iterations; null performs all of them."""
+    integrator: IntegratorName = "implicit-euler"
+    """Time integrator."""
+    frames: FrameCount | None = None
+    """Maximum number of steps; null uses the scene's."""
+    clock: ClockName = "cpu"
+    """cpu: CPU time, which other programs hardly affect; wall: elapsed time."""
+    budget: float | None = Field(default=None, gt=0, le=86400)
+    """Seconds until the test is inconclusive; null uses the command's."""
+
+    @property
+    def title(self) -> str:
+        """Description of the test."""
+        size = f" {self.size}" if self.size else ""
+        return f"{Path(self.scene).stem}{size}, {_format_solver(self.solver)} against {_format_solver(self.against)}"
+
+
+class RegressionTable(ConfigModel):
+    """A table of performance tests."""
+
+    description: str = Field(default="", max_length=1000)
+    """One sentence about what the tests protect."""
+    gates: tuple[RegressionTest, ...] = Field(min_length=1)
+    """The tests."""
+
+
+def run_regression_table(
+    path: Path, budget: float, print_message: Callable[[str], None], alpha: float = DEFAULT_ALPHA
+) -> list[tuple[RegressionTest, BenchmarkResult]]:
+    """Run all tests of a table, and print each result at once.
+
+    Args:
+        path: the table.
+        budget: seconds of a test without a budget of its own.
+        print_message: receives one line per result.
+        alpha: error probability of all tests together.
+    Raises:
+        InputError: for a mistake in the table, or if the answers differ.
+    """
+    document = read_yaml(path)
+    table = document.validate_data(RegressionTable, document.data)
+    if table is None:
+        raise document.build_error()
+    for i, gate in enumerate(table.gates):
+        if not (path.parent / gate.scene).is_file():
+            document.add_mistake(f"there is no file {path.parent / gate.scene}", ("gates", i, "scene"))
+    if document.mistakes:
+        raise document.build_error()
+    found: list[tuple[RegressionTest, BenchmarkResult]] = []
+    for i, gate in enumerate(table.gates):
+        rule = SequentialTest(gate.limit, alpha / len(table.gates))
+        result = run_confirmed_benchmark(
+            partial(_start_solvers, document, i, gate), rule, time_budget=gate.budget or budget
+        )
+        print_message(f"{gate.title}: {result}")
+        found.append((gate, result))
+    return found
+
+
+@contextmanager
+def _start_solvers(document: ConfigDocument, index: int, test: RegressionTest) -> Generator[ProgramPair]:
+    """Prepare both solvers again, warm them up, and check that their answers agree."""
+    options = {key: getattr(test, key) for key in ("iterations", "tolerance", "integrator", "frames")}
+    with limit_threads(1):
+        try:
+            candidate, yardstick = prepare_solver_pair(
+                document.path.parent / test.scene, test.solver, test.against, size=test.size, **options
+            )
+            said = describe_difference(candidate(), yardstick(), test.agree)
+        except (Unsupported, NotPositiveDefinite) as error:
+            document.add_mistake(f"cannot be run: {error}", ("gates", index))
+            raise document.build_error() from error
+        except InputError as error:
+            # Mistakes of a scene or a solver are reported at the line of the test that uses it.
+            line = document.lines.get(("gates", index))
+            raise InputError(
+                [_add_location(mistake, document.path, line, index) for mistake in error.mistakes]
+            ) from error
+        if said:
+            document.add_mistake(f"the answers differ, so nothing was timed: {said}", ("gates", index))
+            raise document.build_error()
+        calls = choose_num_calls(candidate, yardstick)
+        yield ProgramPair(build_timer(candidate, calls, test.clock), build_timer(yardstick, calls, test.clock))
+
+
+def _add_location(mistake: InputMistake, path: Path, line: int | None, index: int) -> InputMistake:
+    if mistake.file and mistake.line:
+        return mistake
+    return replace(mistake, file=path, line=line, key=f"gates[{index}]")
+
+
+def _format_solver(solver_input: str | dict[str, Any]) -> str:
+    """Describe a solver by its name and parameters."""
+    if isinstance(solver_input, str):
+        return solver_input
+    return " ".join([str(solver_input.get("name", "?")), *(f"{k}={v}" for k, v in solver_input.items() if k != "name")])

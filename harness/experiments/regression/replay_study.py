@@ -1,0 +1,302 @@
+"""Error rates of the performance tests, by replay of recorded blocks.
+
+A record has the four times of each block of two processes of the same code, for several process pairs. A replay draws
+stretches of successive blocks, so that bursts of load are preserved, and concatenates them up to the budget. It
+multiplies the candidate's times by the slowdown and evaluates the test after every block. Every RESTART_SECONDS it
+continues with the blocks of another process pair. It confirms failures with further blocks, as the test itself does.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Generator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from random import Random
+from time import perf_counter, process_time, sleep
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from scipy.stats import mannwhitneyu
+from springbench.harness.errors import InputError
+from springbench.harness.execution.worker_process import tie_to_parent
+from springbench.harness.experiments.regression.abba_benchmark import (
+    CONFIRMATION_ALPHA,
+    RESTART_SECONDS,
+    LayoutRandomiser,
+    draw_block_orders,
+)
+from springbench.harness.experiments.regression.confidence_sequence import SequentialTest, SequentialVerdict
+from springbench.harness.experiments.regression.revision_comparison import (
+    ComparisonOptions,
+    WorkRequest,
+    start_revisions,
+)
+from springbench.harness.experiments.regression.revision_process import GitRevision
+from springbench.harness.results import parquet_rows, run_schema
+
+RECORD_COLUMNS = (
+    run_schema.ColumnSpec("gate", pa.string(), "", "what takes turns"),
+    run_schema.ColumnSpec("condition", pa.string(), "", "what was run beside it: nothing, busy or bursty"),
+    run_schema.ColumnSpec("start", pa.int64(), "", "which pair of processes, from 0"),
+    run_schema.ColumnSpec("order", pa.string(), "", "ABBA or BAAB"),
+    *(run_schema.ColumnSpec(f"call_{k}", pa.float64(), "s", f"time of the turn's call {k}") for k in range(4)),
+    run_schema.ColumnSpec(
+        "wall", pa.float64(), "s", "wall time of the whole turn, and of making the work anew after it"
+    ),
+    run_schema.ColumnSpec("load", pa.float64(), "", "load average over a minute"),
+    run_schema.ColumnSpec("planted", pa.float64(), "", "extra work of A, as a part of its iterations"),
+)
+RECORD_SCHEMA = run_schema.build_schema(RECORD_COLUMNS)
+
+BACKGROUND_LOADS = ("nothing", "busy", "bursty")
+REPLAY_STRETCH = 25
+"""Number of successive blocks of a stretch: some seconds, the duration of most bursts."""
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedBlocks:
+    """Recorded blocks of one process pair.
+
+    log_ratios: (n,).
+    a, b: times of A and of B (n, 2) [s].
+    wall_seconds: mean wall time of a block [s].
+    load_average: median load average of the machine.
+    """
+
+    log_ratios: FloatArray
+    a: FloatArray
+    b: FloatArray
+    wall_seconds: float
+    load_average: float
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayRates:
+    """Rates of the three verdicts of many replays, and the median duration [s]."""
+
+    fail_rate: float
+    pass_rate: float
+    inconclusive_rate: float
+    median_seconds: float
+
+
+def record_blocks(
+    path: Path,
+    checkout: Path,
+    requests: Sequence[WorkRequest],
+    background_load: str,
+    *,
+    duration: float,
+    num_process_pairs: int,
+    injected_slowdown: float = 0.0,
+) -> None:
+    """Record blocks of the requests, alternating between them, under a background load.
+
+    The file is written after each process pair. Its earlier rows remain, and the numbering of the pairs continues.
+
+    Args:
+        path: Parquet file of the blocks.
+        checkout: folder of the checkout, which both programs run.
+        requests: work to record.
+        background_load: "nothing", "busy" or "bursty".
+        duration: total time [s].
+        num_process_pairs: number of starts of both processes.
+        injected_slowdown: extra work of A, as a fraction of its iterations.
+    """
+    found = parquet_rows.read_rows([path], RECORD_SCHEMA).to_pylist() if path.exists() else []
+    first = max((row["start"] for row in found), default=-1) + 1
+    sides = GitRevision("the one", checkout, injected_slowdown=injected_slowdown), GitRevision("the other", checkout)
+    with run_background_load(background_load):
+        for start in range(first, first + num_process_pairs):
+            with ExitStack() as alive:
+                pairs = [
+                    alive.enter_context(start_revisions(sides, request, ComparisonOptions(duration), lambda line: None))
+                    for request in requests
+                ]
+                renewing = [LayoutRandomiser(racers.rebuild_work) for racers in pairs]
+                until = perf_counter() + duration / num_process_pairs
+                for order in draw_block_orders():
+                    for request, racers, renewed in zip(requests, pairs, renewing, strict=True):
+                        at = perf_counter()
+                        calls = [{"A": racers.a, "B": racers.b}[who]() for who in order]
+                        renewed.rebuild_after(perf_counter() - at)
+                        row = {"gate": request.title, "condition": background_load, "start": start, "order": order}
+                        row |= {f"call_{k}": call for k, call in enumerate(calls)}
+                        took = perf_counter() - at
+                        found.append(row | {"wall": took, "load": os.getloadavg()[0], "planted": injected_slowdown})
+                    if perf_counter() > until:
+                        break
+            parquet_rows.write_rows(path, found, RECORD_SCHEMA)
+
+
+@contextmanager
+def run_background_load(background_load: str) -> Generator[None]:
+    """Run a background load on each core inside the block.
+
+    It is constant (busy), intermittent (bursty) or absent (nothing).
+    """
+    if background_load not in BACKGROUND_LOADS:
+        raise InputError(f"--condition: came {background_load}; wanted one of {', '.join(BACKGROUND_LOADS)}")
+    with ExitStack() as cleanup:
+        for core in os.sched_getaffinity(0) if background_load != "nothing" else ():
+            process = get_context("spawn").Process(
+                target=_generate_load, args=(background_load == "bursty", core, os.getpid()), daemon=True
+            )
+            process.start()
+            cleanup.callback(process.join)
+            cleanup.callback(process.terminate)
+        yield
+
+
+def _generate_load(is_bursty: bool, seed: int, parent_pid: int) -> None:
+    """Sweep over 16 MB repeatedly.
+
+    Bursts last 0.5 to 3 s, with pauses of 1 to 6 s.
+    """
+    tie_to_parent(parent_pid)
+    rng, memory = Random(seed), np.ones(2**21)
+    while True:
+        until = process_time() + (rng.uniform(0.5, 3.0) if is_bursty else 60.0)
+        while process_time() < until:
+            memory *= 1.0
+        if is_bursty:
+            sleep(rng.uniform(1.0, 6.0))
+
+
+def read_recorded_blocks(paths: Sequence[Path]) -> dict[tuple[str, str], list[RecordedBlocks]]:
+    """Read the recorded process pairs by test and background load; raise InputError."""
+    table = parquet_rows.read_rows(paths, RECORD_SCHEMA).to_pylist()
+    by: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
+    for row in table:
+        by.setdefault((row["gate"], row["condition"], row["start"]), []).append(row)
+    found: dict[tuple[str, str], list[RecordedBlocks]] = {}
+    for (gate, condition, _), turns in by.items():
+        times = np.array([[row[f"call_{k}"] for k in range(4)] for row in turns])
+        abba = np.array([row["order"] == "ABBA" for row in turns])[:, None]
+        outer, inner = times[:, [0, 3]], times[:, 1:3]
+        a, b = np.where(abba, outer, inner), np.where(abba, inner, outer)
+        wall = float(np.mean([row["wall"] for row in turns]))
+        load = float(np.median([row["load"] for row in turns]))
+        start = RecordedBlocks(np.log(a.sum(axis=1) / b.sum(axis=1)), a, b, wall, load)
+        found.setdefault((gate, condition), []).append(start)
+    return found
+
+
+def replay_tests(
+    recorded_blocks: Sequence[RecordedBlocks],
+    slowdown: float,
+    sequential_test: SequentialTest,
+    budget: float,
+    num_replays: int,
+    seed: int = 0,
+) -> ReplayRates:
+    """Replay tests with A slowed down by a factor.
+
+    Args:
+        recorded_blocks: recorded process pairs.
+        slowdown: factor on A's times.
+        sequential_test: test to evaluate.
+        budget: seconds of a test.
+        num_replays: number of replays.
+        seed: seed of the random generator.
+    Returns: rates of the verdicts.
+    """
+    rng, answers, seconds = np.random.default_rng(seed), list[SequentialVerdict](), list[float]()
+    for _ in range(num_replays):
+        answer, spent = _replay_test(rng, recorded_blocks, slowdown, sequential_test, budget)
+        if answer is SequentialVerdict.FAIL:  # which is believed when it comes twice
+            again, more = _replay_test(
+                rng, recorded_blocks, slowdown, replace(sequential_test, alpha=CONFIRMATION_ALPHA), budget - spent
+            )
+            answer, spent = (
+                (SequentialVerdict.FAIL if again is SequentialVerdict.FAIL else SequentialVerdict.INCONCLUSIVE),
+                spent + more,
+            )
+        answers.append(answer)
+        seconds.append(spent)
+    fails, holds, undecided = (
+        answers.count(a) / num_replays
+        for a in (SequentialVerdict.FAIL, SequentialVerdict.PASS, SequentialVerdict.INCONCLUSIVE)
+    )
+    return ReplayRates(fails, holds, undecided, float(np.median(seconds)))
+
+
+def _replay_test(
+    rng: np.random.Generator,
+    recorded_blocks: Sequence[RecordedBlocks],
+    slowdown: float,
+    sequential_test: SequentialTest,
+    budget: float,
+) -> tuple[SequentialVerdict, float]:
+    """Replay one test, and return its verdict and its duration [s].
+
+    It draws another process pair every RESTART_SECONDS.
+    """
+    drawn, walls, left = list[FloatArray](), list[FloatArray](), budget
+    while left > 0.0 or not drawn:
+        start = recorded_blocks[int(rng.integers(len(recorded_blocks)))]
+        turns = _draw_stretches(
+            rng, len(start.log_ratios), max(1, int(min(RESTART_SECONDS, left) / start.wall_seconds))
+        )
+        drawn.append(start.log_ratios[turns])
+        walls.append(np.full(len(turns), start.wall_seconds))
+        left -= RESTART_SECONDS
+    answer, used = sequential_test.decide_first_verdict(np.log(slowdown) + np.concatenate(drawn))
+    return answer, float(np.concatenate(walls)[:used].sum())
+
+
+def _draw_stretches(rng: np.random.Generator, length: int, num_blocks: int) -> NDArray[np.int64]:
+    """Draw indices of stretches of successive blocks, num_blocks in total; a record is periodic."""
+    begins = rng.integers(length, size=max(1, -(-num_blocks // REPLAY_STRETCH)))
+    return ((begins[:, None] + np.arange(REPLAY_STRETCH)) % length).ravel()[:num_blocks]
+
+
+def _is_slower_by_asv(new: FloatArray, old: FloatArray) -> bool:
+    """Apply the rule of asv continuous with a factor of 1.05.
+
+    The medians differ by that factor, and the Mann-Whitney test gives p < .002.
+    """
+    return float(np.median(new)) > 1.05 * float(np.median(old)) and float(mannwhitneyu(new, old).pvalue) < 0.002
+
+
+OTHER_COMPARISONS: dict[str, Callable[[FloatArray, FloatArray], bool]] = {
+    "pytest-benchmark min:5%": lambda new, old: float(new.min()) > 1.05 * float(old.min()),
+    "pytest-benchmark mean:5%": lambda new, old: float(new.mean()) > 1.05 * float(old.mean()),
+    "asv continuous 1.05": _is_slower_by_asv,
+}
+"""Comparisons of two sessions that ran one after the other: whether the new one is classified as slower."""
+
+
+def replay_comparison(
+    is_slower: Callable[[FloatArray, FloatArray], bool],
+    recorded_blocks: Sequence[RecordedBlocks],
+    slowdown: float,
+    duration: float,
+    num_replays: int,
+) -> float:
+    """Compute the fraction of comparisons that classify A as slower.
+
+    Each comparison has two sessions of equal duration, A's and then B's.
+
+    Args:
+        is_slower: rule of the comparison, for the times of A and of B.
+        recorded_blocks: recorded process pairs.
+        slowdown: factor on A's times.
+        duration: seconds of one session.
+        num_replays: number of comparisons.
+    """
+    rng, said = np.random.default_rng(0), 0
+    for _ in range(num_replays):
+        start = recorded_blocks[int(rng.integers(len(recorded_blocks)))]
+        turns = max(1, min(int(duration / start.wall_seconds), len(start.a) // 2))
+        at = int(rng.integers(len(start.a)))
+        first, second = ((at + k * turns + np.arange(turns)) % len(start.a) for k in range(2))
+        said += is_slower(slowdown * start.a[first].ravel(), start.b[second].ravel())
+    return said / num_replays

@@ -1,0 +1,226 @@
+"""Comparison of this checkout with a git revision.
+
+`springbench gate --against REVISION` runs it, in one run on one machine. Both must give the same answer before anything
+is timed. Deterministic counts (iterations, entries, bytes) are compared exactly. Then two processes are benchmarked by
+interleaved blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache, partial
+from math import ceil
+from pathlib import Path
+from random import sample
+from typing import Any
+
+from springbench.harness.errors import InputError
+from springbench.harness.experiments.regression.abba_benchmark import (
+    MIN_CALL_SECONDS,
+    BenchmarkResult,
+    ProgramPair,
+    run_confirmed_benchmark,
+)
+from springbench.harness.experiments.regression.answer_agreement import describe_difference
+from springbench.harness.experiments.regression.confidence_sequence import (
+    DEFAULT_ALPHA,
+    SequentialTest,
+    SequentialVerdict,
+)
+from springbench.harness.experiments.regression.revision_process import (
+    GitRevision,
+    PreparedWork,
+    RevisionProcess,
+    describe_changes,
+    start_workers,
+)
+
+DEFAULT_MAX_RATIO = 1.03
+"""Default of the ratio of times from which a program counts as slower."""
+
+
+@dataclass(frozen=True, slots=True)
+class WorkRequest:
+    """Work that both revisions prepare.
+
+    title: description in messages.
+    command: request of `revision_worker.py`, with its arguments.
+    config: file of the run, in each revision's version; None for a performance test of the checkout.
+    """
+
+    title: str
+    command: str
+    arguments: dict[str, Any]
+    config: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ComparisonOptions:
+    """Options of a comparison.
+
+    budget: seconds per test.
+    max_ratio: ratio of times from which the checkout counts as slower.
+    alpha: error probability of all tests of a command together.
+    clock: cpu or wall; None selects it by the work.
+    """
+
+    budget: float
+    max_ratio: float = DEFAULT_MAX_RATIO
+    alpha: float = DEFAULT_ALPHA
+    clock: str | None = None
+
+
+def build_config_requests(revisions: Sequence[GitRevision], config: Path, options: dict[str, Any]) -> list[WorkRequest]:
+    """Build a request for each run of a scene or sweep.
+
+    Both revisions must list the same runs.
+
+    Args:
+        revisions: the two revisions.
+        config: file of the scene or sweep.
+        options: options of the runs.
+    Raises:
+        InputError: if a revision fails, or if the lists differ.
+    """
+    config = config.resolve()
+    with start_workers(*revisions) as alive:
+        listed = [
+            worker.send_request("runs", config=str(worker.revision.resolve_file(config)), asked=options)["runs"]
+            for worker in alive
+        ]
+    if listed[0] != listed[1]:
+        raise InputError(
+            f"{config}: {revisions[0].name} and {revisions[1].name} read different runs out of it: {_find_first_difference(listed)}"
+        )
+    return [WorkRequest(title, "run", {"asked": options, "index": i}, config) for i, title in enumerate(listed[0])]
+
+
+def build_test_requests(revisions: Sequence[GitRevision], name: str) -> list[WorkRequest]:
+    """Build a request for each performance test of the checkout whose name contains `name`.
+
+    Args:
+        revisions: the two revisions.
+        name: part of the names.
+    Raises:
+        InputError: if no test matches, or if one revision lacks it.
+    """
+    with start_workers(*revisions) as alive:
+        listed = [worker.send_request("gates")["gates"] for worker in alive]
+    found = [[gate for gate in gates if name in gate] for gates in listed]
+    if not any(found):
+        raise InputError(f"-k {name}: neither has such a gate; they have {', '.join(listed[0])}")
+    for one, other, side in ((*found, revisions[1]), (*found[::-1], revisions[0])):
+        if missing := sorted(set(one) - set(other)):
+            raise InputError(f"-k {name}: {side.name} has no gate {', '.join(missing)}; name others")
+    return [WorkRequest(gate, "gate", {"name": gate}) for gate in found[0]]
+
+
+def compare_revisions(
+    revisions: tuple[GitRevision, GitRevision],
+    requests: Sequence[WorkRequest],
+    options: ComparisonOptions,
+    print_message: Callable[[str], None],
+) -> list[tuple[WorkRequest, BenchmarkResult]]:
+    """Benchmark this checkout against the revision, and print each result at once.
+
+    Args:
+        revisions: this checkout, then the revision.
+        requests: work to compare.
+        options: limits of the comparison.
+        print_message: receives one line per result.
+    Raises:
+        InputError: if the work fails, or if the answers differ.
+    """
+    rule = SequentialTest(options.max_ratio, options.alpha / len(requests))
+    found: list[tuple[WorkRequest, BenchmarkResult]] = []
+    told = cache(print_message)  # what differs is found at each start, and told once
+    for request in requests:
+        result = run_confirmed_benchmark(
+            partial(start_revisions, revisions, request, options, told), rule, time_budget=options.budget
+        )
+        print_message(f"{request.title}: {result}")
+        found.append((request, result))
+    return found
+
+
+def choose_exit_code(verdicts: Sequence[SequentialVerdict]) -> int:
+    """Return 1 for any failure, else 3 for any inconclusive verdict, else 0."""
+    return next((a.value for a in (SequentialVerdict.FAIL, SequentialVerdict.INCONCLUSIVE) if a in verdicts), 0)
+
+
+@contextmanager
+def start_revisions(
+    revisions: tuple[GitRevision, GitRevision],
+    request: WorkRequest,
+    options: ComparisonOptions,
+    print_message: Callable[[str], None],
+) -> Generator[ProgramPair]:
+    """Start both revisions, warm them up, and check that their answers agree.
+
+    Each runs in its own process.
+
+    Args:
+        revisions: this checkout, then the revision.
+        request: work to prepare.
+        options: limits of the comparison.
+        print_message: receives differences of deterministic counts.
+    Yields: the two programs.
+    Raises:
+        InputError: if the work fails, or if the answers differ.
+    """
+    with start_workers(*revisions) as alive:
+        held = _prepare_work(alive, request, 1)
+        clock = options.clock or held[0].clock
+        once = min(worker.time_calls(1, clock) for worker in alive)
+        if request.config and once < MIN_CALL_SECONDS:
+            held = _prepare_work(alive, request, ceil(MIN_CALL_SECONDS / max(once, 1e-6)))
+            once = min(worker.time_calls(1, clock) for worker in alive)
+        if said := describe_difference(held[0].answer, held[1].answer):
+            named = f"{request.title}: {revisions[0].name} and {revisions[1].name}"
+            raise InputError(f"{named} answer differently: {said}; nothing was timed")
+        facts = [one.stats | _count_instructions(worker) for one, worker in zip(held, alive, strict=True)]
+        for change in describe_changes(*facts):
+            print_message(f"{request.title}: {change}")
+        calls = max(1, ceil(MIN_CALL_SECONDS / max(once, 1e-6)))
+        a, b = (partial(worker.time_calls, calls, clock) for worker in alive)
+        yield ProgramPair(a, b, partial(_rebuild_work, alive))
+
+
+def _prepare_work(processes: Sequence[RevisionProcess], request: WorkRequest, num_frames: int) -> list[PreparedWork]:
+    """Prepare the request's work in both processes; for a run it has num_frames steps."""
+    held: list[PreparedWork] = []
+    for worker in processes:
+        more: dict[str, Any] = {}
+        if request.config:
+            more = {
+                "config": str(worker.revision.resolve_file(request.config)),
+                "frames": num_frames,
+                "extra": worker.revision.injected_slowdown,
+            }
+        held.append(worker.prepare_work(request.command, **request.arguments, **more))
+    return held
+
+
+def _rebuild_work(processes: Sequence[RevisionProcess]) -> None:
+    """Rebuild the work of both processes and run it once.
+
+    The order is random because the last process to run has the warmest caches.
+    """
+    chance = sample(processes, len(processes))
+    for worker in chance:
+        worker.rebuild_work()
+    for worker in chance:
+        worker.time_calls(1, "cpu")
+
+
+def _count_instructions(worker: RevisionProcess) -> dict[str, int]:
+    counted = worker.count_instructions()
+    return {} if counted is None else {"instructions": counted}
+
+
+def _find_first_difference(run_titles: Sequence[Sequence[str]]) -> str:
+    """Find the first run that only one of the revisions lists."""
+    pairs = zip(*run_titles, strict=False)
+    return next((f"{a} | {b}" for a, b in pairs if a != b), f"{len(run_titles[0])} and {len(run_titles[1])} of them")

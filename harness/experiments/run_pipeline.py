@@ -1,0 +1,438 @@
+"""Execute one run: build its objects, run all passes, write the files.
+
+The timed passes come first and record nothing. Recording, energies and pictures come from an instrumentation pass. Its
+final positions must be bitwise identical to the timed ones. The rows are written last: where they exist, the run is
+complete.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Generator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.harness.atomic_files import atomic_write
+from springbench.harness.config.sweep_config import RunSpec
+from springbench.harness.errors import InputError, RunFailed
+from springbench.harness.execution import machine_info
+from springbench.harness.execution.timing_lock import (
+    TimingSession,
+    lock_timing_exclusive,
+    lock_timing_shared,
+    reserve_cores,
+)
+from springbench.harness.execution.worker_process import ProgressCallback
+from springbench.harness.experiments.failure_columns import build_energy_growth_columns, build_failure_columns
+from springbench.harness.experiments.machine_calibration import calibrate_machine
+from springbench.harness.experiments.provenance import build_run_columns, build_specification_columns, convert_tolerance
+from springbench.harness.experiments.source_fingerprint import (
+    ERROR_CONTROL_TARGET,
+    collect_source_parts,
+    compute_source_fingerprint,
+    load_solver_class,
+)
+from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.harness.recording.obstacle_shapes import list_obstacles
+from springbench.harness.recording.recorder_interface import (
+    INTERSECTIONS_ENTITY,
+    FrameSamples,
+    RecordedFrame,
+    RecordingInfo,
+)
+from springbench.harness.recording.recording_check import require_recorded_frames
+from springbench.harness.recording.rerun_recorder import RerunRecorder
+from springbench.harness.recording.strain_shading import compute_strain_range
+from springbench.harness.reference.residual_audit import AuditedSolver
+from springbench.harness.reference.step_verifier import StepVerifier, compute_reference_positions
+from springbench.harness.results import parquet_rows
+from springbench.harness.results.quantities import compute_ms_per_step
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.scenes.spring_stiffness import compute_modulus_exponent
+from springbench.harness.simulation import timing_rows
+from springbench.harness.simulation.auto_tolerance import build_stop_rule
+from springbench.harness.simulation.device_stepping import build_device_columns as device_columns
+from springbench.harness.simulation.energy_balance import EnergyGrowth
+from springbench.harness.simulation.instrumentation_pass import observe_run, require_finite
+from springbench.harness.simulation.stopwatch import retry_on_mismatch
+from springbench.harness.simulation.time_loop import prepare
+from springbench.harness.simulation.timing_pass import (
+    RunMeasurement,
+    StepError,
+    SteppingSettings,
+    hash_positions,
+    measure_run,
+    prepare_untimed,
+)
+from springbench.solvers.jit import source_digest
+from springbench.solvers.model.step_problem import Positions, Solver
+from springbench.solvers.registry import SOLVERS, is_minimiser, load_target
+
+
+def execute_run(
+    run: RunSpec,
+    files: RunFiles,
+    tick: ProgressCallback,
+    *,
+    positions: Path | None = None,
+    num_concurrent_runs: int = 1,
+) -> list[dict[str, Any]]:
+    """Execute one run, write its files and return its rows.
+
+    A failure is a row with status and reason.
+
+    Args:
+        run: specification of the run.
+        files: paths of its files.
+        tick: called with the name of the pass after each step.
+        positions: where to store the positions after every step, (frames, n, 3) [m], float64; None for not at all.
+        num_concurrent_runs: number of runs that may be timed concurrently.
+
+    Raises:
+        InputError: the input is invalid, and the run has no user code.
+        CannotWrite: the files cannot be written; there are then no rows.
+    """
+    shared: dict[str, Any] = {"at_once": num_concurrent_runs, **calibrate_machine(tick)}
+    threads = machine_info.choose_threads(run.threads)
+    with machine_info.limit_threads(threads.count), TimingSession(tick, exclusive=run.timing == "exclusive") as turn:
+        with turn.lock_for_preparation():
+            shared |= build_run_columns(run) | {"code": compute_source_fingerprint(collect_source_parts(run))}
+        try:
+            run = run.replace_options(scene=run.scene.load_plugins())
+            found = _run_passes(run, files, tick, positions, turn)
+        except Exception as error:  # a solver may fail in any way; the sweep goes on, and the row says where it was
+            if isinstance(error, InputError) and not run.find_plugins():
+                raise
+            turn.finish_timing()
+            own = _list_solver_files(run)
+            found = [_find_first_diverged_frame(run, build_failure_columns(error, own), own)]
+            for earlier in (
+                files.recording_path,
+                files.picture_path,
+            ):  # of a time when it did not fail; they would hide this
+                earlier.unlink(missing_ok=True)
+            if run.record and "frame" in found[0]:
+                _record_before_failure(run, files, found[0])
+        if threads.reason:
+            for row in found:
+                row["choice"] = "; ".join(filter(None, [row.get("choice"), threads.reason]))
+        result = [shared | row for row in found]
+        content = parquet_rows.encode_rows(result)
+    parquet_rows.write_durably(
+        files.rows_path, content
+    )  # who waits for the disk computes nothing, and disturbs nobody who is timed
+    return result
+
+
+def _run_passes(
+    run: RunSpec, files: RunFiles, tick: ProgressCallback, positions: Path | None, timing_session: TimingSession
+) -> list[dict[str, Any]]:
+    """Run all passes and return the rows.
+
+    The timing session is checked for disturbances at the end.
+    """
+    if run.accuracy is not None:
+        return _run_error_controlled(run, run.accuracy, files, tick, positions, timing_session)
+    with timing_session.lock_for_preparation():
+        scene = build_scene(run.scene, run.size, run.integrator)
+    counts = {"vertices": len(scene.mesh.rest_positions), "springs": len(scene.all_springs.edges)}
+    settings = _build_settings(run)
+    with _hold_timing_lock(run, tick) as how:
+        if run.timing == "rough":
+            measured, told = prepare_untimed(scene, _build_solver(run)), None
+        else:
+            measured, told = _measure_rows(scene, _build_solver(run), settings, tick)
+        where = device_columns(measured.prepared)
+    timing_session.finish_timing()
+    by_frame = _run_instrumentation_pass(run, files, scene, measured, settings, tick, positions)
+    told = told or timing_rows.build_timing_rows(measured)
+    require_finite(by_frame, is_minimiser=is_minimiser(_build_solver(run)), has_rtol=isinstance(run.tolerance, float))
+    stands = _build_status_columns(run, by_frame)
+    facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.stats.items()}
+    facts |= {"choice": measured.prepared.description, "modulus_exponent": _find_modulus_exponent(run, scene)}
+    facts |= where | stands | how
+    return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in told]
+
+
+def _find_modulus_exponent(run: RunSpec, scene: Scene) -> int | None:
+    """Return how the spring stiffness scales with mesh size.
+
+    The result is None without springs or with several rules.
+    """
+    rules = {effect.rule for effect in run.scene.effects if isinstance(effect, SpringsEffect)}
+    found = {compute_modulus_exponent(rule, scene.mesh.dimension) for rule in rules}
+    return found.pop() if len(found) == 1 else None
+
+
+def _build_status_columns(run: RunSpec, by_frame: Mapping[int, Mapping[str, Any]]) -> dict[str, str]:
+    stands = {"status": "ok"}
+    if run.judge:
+        from springbench.harness.experiments.verification_status import (
+            build_verification_columns,
+        )  # for which those whom nobody judges need not wait
+
+        stands = build_verification_columns(run)
+    growth = EnergyGrowth.from_rows(by_frame) if stands["status"] == "ok" else None
+    return stands | (build_energy_growth_columns(run, growth, by_frame) if growth else {})
+
+
+@retry_on_mismatch
+def _measure_rows(
+    scene: Scene, solver: Solver, settings: SteppingSettings, tick: ProgressCallback
+) -> tuple[RunMeasurement, list[dict[str, Any]]]:
+    measured = measure_run(scene, solver, settings, tick)
+    return measured, timing_rows.build_timing_rows(measured)
+
+
+def _run_error_controlled(
+    run: RunSpec,
+    max_error: float,
+    files: RunFiles,
+    tick: ProgressCallback,
+    positions: Path | None,
+    timing_session: TimingSession,
+) -> list[dict[str, Any]]:
+    """Return the rows of an error-controlled run, whose integrator and step size are chosen first."""
+    with _hold_timing_lock(run, tick) as how:
+        found = load_target(ERROR_CONTROL_TARGET)(run, max_error, tick)
+    told, seen, last = found.rows(), found.positions, dict[str, Any]()
+    timing_session.finish_timing()
+    if positions:
+        save_positions(positions, seen[1:])
+    if run.record:
+        chosen = {name: told[0][name] for name in ("status", "integrator", "estimated")}
+        recorder = _open_recorder(
+            run, files, found.scene, chosen | {"milliseconds_per_step": found.ms_per_step}, seen[-1]
+        )
+        try:
+            for k, p in enumerate(seen):
+                recorder.record_frame(RecordedFrame(k, found.scene.time(k), p, {}, float("nan"), 0))
+            recorder.finish_recording({})
+        finally:
+            recorder.abandon_recording()
+        chosen = sorted(FrameSamples(run.frames).frames)
+        due = {k: found.scene.time(k) for k in chosen}
+        last = {
+            "recorded": require_recorded_frames(files.recording_path, recorder.info, due, {k: seen[k] for k in chosen})
+        }
+    return [how | row | (last if row["frame"] == run.frames else {}) for row in told]
+
+
+@contextmanager
+def _hold_timing_lock(run: RunSpec, tick: ProgressCallback) -> Generator[dict[str, Any]]:
+    """Hold the run's timing lock (exclusive, shared, own cores), and yield its columns."""
+    if run.timing != "shared":
+        with (lock_timing_exclusive if run.timing == "exclusive" else lock_timing_shared)(tick):
+            yield {}
+    else:
+        with reserve_cores(machine_info.choose_threads(run.threads).count, tick) as cores:
+            yield {"pinned": " ".join(map(str, cores))}
+
+
+def _run_instrumentation_pass(
+    run: RunSpec,
+    files: RunFiles,
+    scene: Scene,
+    measured: RunMeasurement,
+    settings: SteppingSettings,
+    tick: ProgressCallback,
+    positions: Path | None,
+) -> dict[int, dict[str, Any]]:
+    """Repeat the simulation and observe energies, convergence, positions and the recording."""
+    stored = np.empty((run.frames, len(scene.mesh.rest_positions), 3)) if positions else None
+    samples = FrameSamples(run.frames)
+    with ExitStack() as cleanup:
+        recorder = None
+        if run.record:
+            assert measured.final_positions is not None  # a sweep that is rough and records is refused
+            seconds = [t.seconds for t in measured.timings if t.phase == "step"]
+            facts = {"status": "ok", "milliseconds_per_step": compute_ms_per_step(seconds)}
+            recorder = _open_recorder(run, files, scene, facts, measured.final_positions)
+            cleanup.callback(recorder.abandon_recording)
+        graded = AuditedSolver(measured.prepared, _build_solver(run), {1, (run.frames + 1) // 2, run.frames})
+        found = observe_run(
+            scene,
+            graded,
+            settings,
+            recorder=recorder,
+            convergence_frames={1, (run.frames + 1) // 2, run.frames}
+            if run.convergence_frames is None
+            else run.convergence_frames,
+            positions_out=stored,
+            sample_frame=samples.add_frame if recorder else None,
+            verify_step=_build_verifier(run, scene),
+            tick=lambda: tick("second pass"),
+            clock=measured.clock,
+        )
+        if measured.final_positions is not None and found[run.frames]["digest"] != hash_positions(
+            measured.final_positions
+        ):
+            raise RunFailed("the recorded pass ended at other positions than the timed pass")
+        if recorder and measured.final_positions is not None:
+            stands = _build_status_columns(run, found)
+            ended = {name: stands[name] for name in ("status", "reason")} if stands["status"] != "ok" else None
+            recorder.finish_recording(timing_rows.compute_milliseconds(measured, run.frames), ended)
+            due = {frame: scene.compute_time(frame) for frame in samples.frames}
+            motion = samples.positions | {run.frames: measured.final_positions}
+            found[run.frames]["recorded"] = require_recorded_frames(files.recording_path, recorder.info, due, motion)
+    if positions and stored is not None:
+        save_positions(positions, stored)
+    return {frame: graded.found.get(frame, {}) | columns for frame, columns in found.items()}
+
+
+def _find_first_diverged_frame(
+    run: RunSpec, failure_row: dict[str, Any], solver_files: Collection[Path]
+) -> dict[str, Any]:
+    """Return the row of a failed run; after divergence, that of the first diverged frame.
+
+    Timed passes detect only positions that are not finite, which may occur later.
+    """
+    if failure_row["status"] != "diverged" or "frame" not in failure_row:
+        return failure_row
+    settings = replace(_build_settings(run), frames=failure_row["frame"] - 1)
+    try:
+        scene = build_scene(run.scene, run.size, run.integrator)
+        observe_run(
+            scene,
+            prepare(scene, _build_solver(run)),
+            settings,
+            recorder=None,
+            convergence_frames=(),
+            positions_out=None,
+            verify_step=None,
+            tick=lambda: None,
+        )
+    except StepError as earlier:
+        return build_failure_columns(earlier, solver_files)
+    except Exception:  # what went wrong is known already
+        return failure_row
+    return failure_row
+
+
+def _record_before_failure(run: RunSpec, files: RunFiles, failure_row: dict[str, Any]) -> None:
+    """Record the frames before the failed one and mark the recording.
+
+    Nothing is recorded if they fail too.
+    """
+    facts = {"status": failure_row["status"], "reason": failure_row["reason"], "failed_frame": failure_row["frame"]}
+    settings = replace(_build_settings(run), frames=failure_row["frame"] - 1)
+    with ExitStack() as cleanup, suppress(Exception):  # what went wrong is told already
+        scene = build_scene(run.scene, run.size, run.integrator)
+        prepared = prepare(scene, _build_solver(run))
+        recorder = _open_recorder(run, files, scene, facts)
+        cleanup.callback(recorder.abandon_recording)
+        observe_run(
+            scene,
+            prepared,
+            settings,
+            recorder=recorder,
+            convergence_frames=(),
+            positions_out=None,
+            verify_step=None,
+            tick=lambda: None,
+        )
+        recorder.finish_recording({})
+
+
+def _list_solver_files(run: RunSpec) -> frozenset[Path]:
+    """Return the source files of the solver, in which an error is located first."""
+    try:
+        return source_digest.find_class_sources(load_solver_class(run))
+    except Exception:  # it is somebody's own, and cannot be imported; that is the error
+        return frozenset()
+
+
+def _build_settings(run: RunSpec) -> SteppingSettings:
+    return SteppingSettings(build_stop_rule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
+
+
+def _build_solver(run: RunSpec) -> Solver:
+    return load_solver_class(run)(**run.solver.parameters)
+
+
+@dataclass(frozen=True, slots=True)
+class _MotionKey:
+    """Cache key: a run's scene and the other settings that determine its motion."""
+
+    key: tuple[str | int, ...]
+    run: RunSpec = field(compare=False)
+
+
+def _build_verifier(run: RunSpec, scene: Scene) -> StepVerifier | None:
+    if not run.judge:
+        return None
+    key = (run.scene.scene_digest, run.size, run.integrator, run.first_guess, run.frames)
+    return StepVerifier(scene, _compute_reference(_MotionKey(key, run)), is_minimiser=is_minimiser(_build_solver(run)))
+
+
+@lru_cache(maxsize=1)
+def _compute_reference(motion: _MotionKey) -> NDArray[np.float64] | None:
+    """Return the reference motion of a scene; None where Newton's method fails.
+
+    One entry is cached, for the runs of a scene are consecutive.
+    """
+    run = motion.run
+    scene = build_scene(run.scene, run.size, run.integrator)
+    try:
+        return compute_reference_positions(
+            scene, load_target(SOLVERS["newton"])(), initial_guess=run.first_guess, frames=run.frames
+        )
+    except Exception:  # the row of Newton's method itself says what it was
+        return None
+
+
+def _open_recorder(
+    run: RunSpec, files: RunFiles, scene: Scene, outcome: Mapping[str, Any], *final_positions: Positions
+) -> RerunRecorder:
+    """Open the recording of a run.
+
+    `outcome` is how the run ended, stored among the recording's properties. `final_positions` set the colour scale.
+    """
+    files.recording_path.parent.mkdir(parents=True, exist_ok=True)
+    here = machine_info.describe_machine()
+    properties = {
+        "sweep": run.sweep,
+        **{
+            name: value for name, value in build_specification_columns(run).items() if value is not None
+        },  # a property has no null
+        "tolerance": convert_tolerance(run.tolerance) or 0.0,
+        "vertices": len(scene.mesh.rest_positions),
+        "springs": len(scene.all_springs.edges),
+        "frames": run.frames,
+        **outcome,
+        INTERSECTIONS_ENTITY: scene.has_self_contact,
+        "cpu": here.cpu,
+        "cores": here.cores,
+        "memory_gib": here.memory_gib,
+        "system": here.operating_system,
+        "commit": machine_info.read_commit(),
+        **{f"version_{name}": version for name, version in machine_info.collect_versions().items()},
+    }
+    size = f" {run.size}" if run.size else ""
+    return RerunRecorder(
+        files.recording_path,
+        RecordingInfo(
+            title=f"{run.scene_name}{size} - {run.solver.name}",
+            run_id=run.compute_run_id(here.machine_id),
+            mesh=scene.mesh,
+            springs=scene.all_springs.edges,
+            rest_lengths=scene.all_springs.rest_length,
+            pinned_vertices=scene.system.pins.vertices,
+            time_step=run.scene.time_step,
+            strain_range=run.strain_range
+            or compute_strain_range(final_positions, scene.all_springs.edges, scene.all_springs.rest_length),
+            properties=properties,
+            obstacles=list_obstacles(run.scene.effects),
+        ),
+    )
+
+
+def save_positions(path: Path, positions: np.ndarray) -> None:
+    """Store positions (frames, n, 3) [m] in a partial file and rename it. Raises CannotWrite."""
+    with atomic_write(path) as partial:
+        np.savez_compressed(partial, positions=positions)

@@ -1,0 +1,170 @@
+"""Execute the missing runs of a sweep, then draw the pictures that compare them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pyarrow as pa
+from springbench.harness.config.sweep_config import RunSpec
+from springbench.harness.errors import InputError, InputMistake, RunFailed
+from springbench.harness.execution import folder_locks, machine_info
+from springbench.harness.execution.folder_locks import UnitClaims
+from springbench.harness.execution.isolated_worker import IsolatedWorker, TaskFailure, TaskLimits
+from springbench.harness.execution.progress_display import ProgressDisplay
+from springbench.harness.execution.progress_events import is_step_event
+from springbench.harness.experiments.completion_status import select_missing_units
+from springbench.harness.experiments.experiment_units import (
+    choose_num_workers,
+    execute_unclaimed,
+    execute_units,
+    require_threads,
+)
+from springbench.harness.experiments.run_unit import RunUnit
+from springbench.harness.experiments.sweep_plan import REQUIRED_COLUMNS, RunFiles, find_stale_run_ids, plan_runs
+from springbench.harness.results import parquet_rows
+
+if TYPE_CHECKING:
+    from springbench.harness.experiments.dask_cluster import DaskCluster
+
+
+_MAX_RUNS_TO_PRELOAD = 100
+"""Largest number of runs for which the start-up time of the drawing code matters and the rows are small enough to send.
+"""
+
+
+def _connect_cluster(
+    scheduler_address: str, runs: Sequence[RunSpec], print_message: Callable[[str], None]
+) -> AbstractContextManager[DaskCluster]:
+    try:
+        from springbench.harness.experiments.dask_cluster import connect_cluster
+    except ModuleNotFoundError as error:
+        raise InputError(InputMistake(f"needs {error.name}: pip install 'springbench[cluster]'", key="--on")) from None
+    return connect_cluster(scheduler_address, runs, print_message)
+
+
+def run_sweep(
+    name: str,
+    runs: Sequence[RunSpec],
+    folder: Path,
+    display: ProgressDisplay,
+    print_message: Callable[[str], None],
+    *,
+    rerun: bool = False,
+    rerun_stale: bool = False,
+    positions: Path | None = None,
+    isolated: bool = True,
+    num_workers: int | None = None,
+    scheduler_address: str | None = None,
+    background_call: Callable[[], object] = int,
+) -> pa.Table:
+    """Execute the missing runs of a sweep, draw its pictures and return all rows.
+
+    Args:
+        name: name of the sweep.
+        runs: its runs.
+        folder: its folder in the results.
+        display: shows progress.
+        print_message: prints a remark.
+        rerun: whether to repeat all runs; `positions` implies it.
+        rerun_stale: whether to repeat runs whose rows come from other source code.
+        positions: where to store the positions of the sweep's only run.
+        isolated: whether runs are executed in worker processes with limits, or in this process.
+        num_workers: number of worker processes; chosen by cores and memory if left out.
+        scheduler_address: where else to execute the runs (`springbench.harness.experiments.dask_cluster`).
+        background_call: called while another process draws.
+
+    Raises:
+        InputError: the options contradict each other, or the input is invalid.
+        RunFailed: the drawing process was lost.
+    """
+    if scheduler_address and (positions or not isolated):
+        raise InputError("--positions and --here are of this machine; leave --on out")
+    if positions and len(runs) != 1:
+        raise InputError(f"--positions stores the positions of one run; this is {len(runs)} runs")
+    if not scheduler_address:
+        require_threads({machine_info.choose_threads(run.threads).count for run in runs})
+    for part in ("rows", "recordings", "pictures"):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    with ExitStack() as held:
+        held.enter_context(folder_locks.lock_folder_shared(folder))
+        away = (
+            held.enter_context(_connect_cluster(scheduler_address, runs, print_message)) if scheduler_address else None
+        )
+        machines = away.machine_ids if away else (None,)
+        claims = held.enter_context(
+            closing(UnitClaims(folder, [RunFiles.for_run(r, folder, m).rows_path for r in runs for m in machines]))
+        )
+        planned = plan_runs(runs, folder, machines)
+        todo = select_missing_units(
+            planned, "runs", print_message, rerun=rerun or positions is not None, rerun_stale=rerun_stale
+        )
+        drawing: IsolatedWorker | None = None
+        here = isolated and not away
+        if here and len(runs) <= _MAX_RUNS_TO_PRELOAD and any(p.run.record and p.run.pictures for p in todo):
+            drawing = IsolatedWorker(_preload_drawing)
+            held.callback(drawing.stop_worker)
+            drawing.start_worker()
+        if todo and not away:
+            import_module(
+                "springbench.harness.experiments.run_pipeline"
+            )  # here, for workers that are forks of this process
+            if any(p.run.judge for p in todo):
+                import_module("springbench.harness.experiments.verification_status")
+        many = min(num_workers or choose_num_workers(), max(1, len(todo)))
+        units = [RunUnit(p.run, p.files, positions, 1 if p.run.timing == "exclusive" else many) for p in todo]
+        if away:
+            execute_unclaimed(units, claims, partial(away.execute_units, folder, display), print_message)
+            planned = plan_runs(runs, folder, machines)
+        else:
+            do_here = partial(execute_units, display=display, isolated=isolated, num_workers=many)
+            execute_unclaimed(
+                units, claims, lambda some, skip_reason: do_here(some, skip_reason=skip_reason), print_message
+            )
+        from springbench.harness.report.sweep_pictures import PictureJob, draw_sweep_pictures
+
+        table = parquet_rows.read_rows((p.files.rows_path for p in planned), required_columns=REQUIRED_COLUMNS)
+        pictured = [PictureJob(p.run, p.files.recording_path, p.files.picture_path) for p in planned]
+        draw = partial(
+            draw_sweep_pictures,
+            name,
+            pictured,
+            folder,
+            table,
+            num_concurrent=many,
+            stale_ids=find_stale_run_ids(runs, table),
+        )
+        if drawing is None:
+            draw(print_message)
+            return table
+        try:
+            drawing.run_task(
+                draw, lambda said: print_message(said) if is_step_event(said) else None, TaskLimits(), background_call
+            )
+        except TaskFailure as lost:
+            raise RunFailed(
+                f"the process that draws {lost}; what was measured is kept, and the same command draws it"
+            ) from None
+    return table
+
+
+def _preload_drawing() -> None:
+    """In the drawing process of a small sweep: load the drawing code.
+
+    This takes 1 to 2 s, during the runs.
+    """
+    from springbench.harness.report.sweep_pictures import preload_drawing
+
+    preload_drawing()
+
+
+def list_failed_runs(table: pa.Table) -> list[str]:
+    """Return a line for each failed run: scene, size, solver, status and reason."""
+    ended = table.select(["scene", "size", "solver", "status", "reason"]).to_pylist()
+    failed = [row for row in ended if row["status"] != "ok"]
+    lines = [f"{r['scene']} {r['size']} {r['solver']}: {r['status']}: {r['reason']}" for r in failed]
+    return list(dict.fromkeys(lines))  # a run that was done to its end has a row for each step

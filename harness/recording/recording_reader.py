@@ -1,0 +1,327 @@
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyarrow's stubs do not state the column types of a schema.
+"""Reader of recordings without a viewer, for pictures and for `springbench inspect`.
+
+A complete file is read through the index in its footer. A file without one (its run was killed) is scanned up to the
+last complete message. A file that this process has not written is first read in a separate process
+(see `springbench.harness.recording.recording_integrity`).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import warnings
+from collections.abc import Collection, Generator, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from rerun.chunk import Chunk, LazyStore, RrdReader
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.recording import chunk_cells
+from springbench.harness.recording.chunk_cells import read_cell
+from springbench.harness.recording.local_origin import read_origin
+from springbench.harness.recording.recorder_interface import LAYOUT_VERSION, RecordingReplay
+from springbench.harness.recording.recording_integrity import mark_verified, require_intact, scan_messages
+
+_MAGIC = b"RRF2"
+_ROW_ID = "rerun.controls.RowId"
+_POSITION_COMPONENTS = ("Mesh3D:vertex_positions", "Points3D:positions")
+_SCALAR_COMPONENT = "Scalars:scalars"
+_NAME_COMPONENT = "RecordingInfo:name"
+
+SCALAR_SCHEMA = pa.schema(
+    [
+        ("entity", pa.string()),
+        ("frame", pa.int64()),
+        ("iteration", pa.int64()),
+        ("time", pa.float64()),
+        ("value", pa.float64()),
+    ]
+)
+"""Scalars in long form: entity, frame, iteration (null where there is none), simulated time [s], value."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordingSummary:
+    """Contents of a recording without its positions.
+
+    Attributes:
+      path: path of the file.
+      is_complete: whether the run closed the file.
+      title: title as recorded.
+      run_id: identifier of the run.
+      application: application name.
+      properties: metadata as recorded.
+      frames: indices of the recorded frames (k,).
+      timelines: (first, last) by timeline name.
+      entities: entity paths.
+      scalars: table with schema SCALAR_SCHEMA.
+    """
+
+    path: Path
+    is_complete: bool
+    title: str
+    run_id: str
+    application: str
+    properties: dict[str, Any]
+    frames: NDArray[np.int64]
+    timelines: dict[str, tuple[float, float]]
+    entities: tuple[str, ...]
+    scalars: pa.Table
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingSource:
+    """An open recording, whose chunks can be iterated repeatedly."""
+
+    path: Path
+    store: LazyStore | RrdReader
+    is_complete: bool
+    application: str
+    run_id: str
+
+    def iterate_chunks(self, *, content: str, components: Sequence[str] | None = None) -> Iterator[Chunk]:
+        """Iterate over the chunks of the entities that match `content`, with the given components only."""
+        return iter(self.store.stream().filter(content=content, components=components))
+
+
+def read_replay(path: Path, frames: Collection[int] | None = None) -> RecordingReplay:
+    """Read a recording with all frames or a selection of them, in order.
+
+    Args:
+      path: path of the recording.
+      frames: indices of the frames, -1 for the last; all if omitted.
+
+    Raises:
+      InputError: the file is not the recording of a run or lacks a selected frame.
+    """
+    with open_recording(path) as source:
+        springs = read_network(source)
+        wanted = None
+        if frames is not None:
+            known = np.array([index for index, _, _ in iterate_positions(source)])
+            wanted = {_resolve_frame(path, frame, known) for frame in frames}
+        found = {index: (time, p.copy()) for index, time, p in iterate_positions(source, wanted)}
+        order = sorted(found)
+        times = np.array([found[index][0] for index in order])
+        stacked = np.empty((len(order), len(found[order[0]][1]) if order else 0, 3), np.float32)
+        for k, index in enumerate(order):
+            stacked[k] = found.pop(index)[1]  # so that memory never holds all frames twice
+        title, facts = read_properties(source)
+        return RecordingReplay(
+            title=title,
+            run_id=source.run_id,
+            frames=np.array(order, np.int64),
+            times=times,
+            positions=stacked,
+            triangles=read_triangles(source),
+            springs=springs["springs"].reshape(-1, 2).astype(np.int64),
+            rest_lengths=springs["rest_lengths"].astype(np.float64),
+            pinned_vertices=springs["pinned"].astype(np.int64),
+            strain_range=float(springs["strain_range"][0]),
+            scalars=_group_by_frame(_read_scalars(source)),
+            properties=facts,
+            origin=read_origin(facts),
+        )
+
+
+def summarise_recording(path: Path) -> RecordingSummary:
+    """Read the contents of a recording, of one or several runs, without positions.
+
+    Raises:
+      InputError: the file is not a Rerun recording.
+    """
+    with open_recording(path) as source:
+        entities: set[str] = set()
+        times: dict[str, list[float]] = {}
+        for chunk in source.iterate_chunks(content="/**"):
+            entities.add(chunk.entity_path)
+            batch = chunk.to_record_batch()
+            for name in chunk.timeline_names:
+                values = chunk_cells.read_timeline(batch, name)
+                times.setdefault(name, []).extend((values.min(), values.max()))
+        title, facts = read_properties(source)
+        frames = {index for index, _, _ in iterate_positions(source)}
+        return RecordingSummary(
+            path=path,
+            is_complete=source.is_complete,
+            title=title,
+            run_id=source.run_id,
+            application=source.application,
+            properties=facts,
+            frames=np.array(sorted(frames), np.int64),
+            timelines={name: (float(min(values)), float(max(values))) for name, values in sorted(times.items())},
+            entities=tuple(sorted(entities)),
+            scalars=_read_scalars(source),
+        )
+
+
+def _try_reading(path: Path) -> None:
+    """Read all of a recording; damage raises an exception or ends the process."""
+    mark_verified(path, shared=False)
+    with open_recording(path) as source:
+        for chunk in source.iterate_chunks(content="/**"):
+            chunk.to_record_batch().validate(full=True)
+    summarise_recording(path)
+    with suppress(InputError):  # of a recording that is not of one run
+        read_replay(path)
+
+
+@contextmanager
+def open_recording(path: Path) -> Generator[RecordingSource]:
+    """Open the recording at `path` for the duration of the context.
+
+    Raises:
+      InputError: the file is not a Rerun recording, is damaged, or contains no readable data.
+    """
+    if not path.is_file():
+        raise InputError(InputMistake("there is no such file; a Rerun recording (.rrd) was expected", file=path))
+    with path.open("rb") as file:
+        start = file.read(len(_MAGIC))
+    if start != _MAGIC:
+        came = f"begins with {start!r}" if start else "is empty"
+        raise InputError(InputMistake(f"{came} and so is not a Rerun recording (.rrd)", file=path))
+    require_intact(path, _try_reading)
+    with ExitStack() as kept, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of files without a footer: `complete` says so
+        complete, end = scan_messages(path)
+        readable = path
+        if not complete and end < path.stat().st_size:  # the library reads nothing of a file cut within a message
+            readable = Path(kept.enter_context(tempfile.TemporaryDirectory())) / path.name
+            shutil.copyfile(path, readable)
+            os.truncate(readable, end)
+        try:
+            reader = RrdReader(readable)
+            runs = reader.recordings()
+            store = reader.store() if complete else reader
+        except (RuntimeError, ValueError) as error:
+            raise InputError(InputMistake(f"cannot be read as a Rerun recording: {error}", file=path)) from error
+        if not runs:
+            raise InputError(InputMistake("has nothing in it that can be read: it was cut at its start", file=path))
+        yield RecordingSource(path, store, complete, runs[0].application_id, runs[0].recording_id)
+
+
+def read_network(source: RecordingSource) -> dict[str, NDArray[Any]]:
+    """Return the constant arrays: springs (2m,), rest_lengths (m,), pinned (q,), strain_range (1,), time_step (1,)."""
+    for chunk in source.iterate_chunks(content="/network"):
+        batch = chunk.to_record_batch()
+        names = [name for name in batch.schema.names if name != _ROW_ID]
+        # Rerun writes no column for an empty array: a mesh without springs, or without pins.
+        none = dict.fromkeys(("springs", "rest_lengths", "pinned"), np.empty(0))
+        if "layout" not in names or int(read_cell(batch, "layout")[0]) != LAYOUT_VERSION:
+            problem = "is laid out as another version of springbench did it; do its run again, with --again"
+            raise InputError(InputMistake(problem, file=source.path))
+        return none | {name: read_cell(batch, name) for name in names}
+    names = f"application {source.application!r}"
+    problem = f"is a Rerun recording ({names}) but not of one run: it has no /network and /scene/mesh"
+    raise InputError(InputMistake(problem, file=source.path))
+
+
+def iterate_positions(
+    source: RecordingSource, frames: Collection[int] | None = None
+) -> Iterator[tuple[int, float, NDArray[np.float32]]]:
+    """Iterate over the positions (n, 3) [m] of the selected frames, in file order.
+
+    Args:
+      source: open recording.
+      frames: indices of the frames; all if omitted.
+
+    Returns: tuples of frame, time [s] and positions, which are relative to the origin.
+    """
+    for chunk in source.iterate_chunks(content="/scene/mesh", components=_POSITION_COMPONENTS):
+        batch = chunk.to_record_batch()
+        (name,) = set(_POSITION_COMPONENTS) & set(batch.schema.names)
+        for k, index in enumerate(chunk_cells.read_timeline(batch, "frame")):
+            if frames is None or index in frames:
+                yield (
+                    int(index),
+                    float(chunk_cells.read_timeline(batch, "time")[k]),
+                    read_cell(batch, name, k).reshape(-1, 3),
+                )
+
+
+def read_triangles(source: RecordingSource) -> NDArray[np.int64]:
+    """Return the mesh's triangles, shape (f, 3)."""
+    for chunk in source.iterate_chunks(content="/scene/mesh", components=["Mesh3D:triangle_indices"]):
+        return read_cell(chunk.to_record_batch(), "Mesh3D:triangle_indices").reshape(-1, 3).astype(np.int64)
+    return np.empty((0, 3), np.int64)
+
+
+def read_properties(source: RecordingSource) -> tuple[str, dict[str, Any]]:
+    """Return the title and the recorded metadata of the run and its machine."""
+    title, facts = "", dict[str, Any]()
+    for chunk in source.iterate_chunks(content="/__properties/**"):
+        batch = chunk.to_record_batch()
+        values: dict[str, Any] = {
+            name: chunk_cells.get_scalar(batch, name, 0).as_py()[0] for name in batch.schema.names if name != _ROW_ID
+        }
+        if chunk.entity_path == "/__properties/run":
+            facts |= values  # what changed at the end comes last
+        title = values.get(_NAME_COMPONENT, title)
+    return title, facts
+
+
+def _read_scalars(source: RecordingSource) -> pa.Table:
+    tables = [SCALAR_SCHEMA.empty_table()]
+    for chunk in source.iterate_chunks(content="/**", components=[_SCALAR_COMPONENT]):
+        batch = chunk.to_record_batch()
+        known: dict[str, Any] = {
+            name: chunk_cells.read_timeline(batch, name) for name in chunk.timeline_names if name in SCALAR_SCHEMA.names
+        }
+        values = chunk_cells.get_column(batch, _SCALAR_COMPONENT).flatten()
+        if chunk.entity_path.rpartition("/")[0].endswith("/convergence"):  # a value for each of the frames
+            frames, times = read_convergence_frames(source, chunk.entity_path)
+            known = {
+                "frame": np.tile(frames, batch.num_rows),
+                "iteration": np.repeat(known["iteration"], len(frames)),
+                "time": np.tile(times, batch.num_rows),
+            }
+        columns: dict[str, Any] = {
+            "entity": [chunk.entity_path] * len(values),
+            "frame": known.get("frame"),
+            "iteration": known.get("iteration"),
+            "time": known.get("time"),
+            "value": values,
+        }
+        arrays: list[Any] = [
+            pa.nulls(len(values), SCALAR_SCHEMA.field(name).type)
+            if columns[name] is None
+            else pa.array(columns[name], SCALAR_SCHEMA.field(name).type)
+            for name in SCALAR_SCHEMA.names
+        ]
+        tables.append(pa.Table.from_arrays(arrays, schema=SCALAR_SCHEMA))
+    order: Any = [(name, "ascending") for name in ("entity", "frame", "iteration")]
+    return pa.concat_tables(tables).sort_by(order)
+
+
+def read_convergence_frames(source: RecordingSource, entity: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the frames with recorded convergence, and their times [s], in stored order."""
+    for chunk in source.iterate_chunks(content=entity.rpartition("/")[0]):
+        batch = chunk.to_record_batch()
+        return read_cell(batch, "frames").astype(np.int64), read_cell(batch, "times").astype(float)
+    raise InputError(InputMistake(f"does not say which frames {entity} is of", file=source.path))
+
+
+def _group_by_frame(table: pa.Table) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """Return the scalars that have one value per frame: entity -> (frames, values)."""
+    entities, frames, values = (table[name].to_numpy() for name in ("entity", "frame", "value"))
+    once = table["iteration"].is_null().to_numpy()
+    entities, frames, values = entities[once], frames[once].astype(np.int64), values[once]
+    return {str(entity): (frames[of], values[of]) for entity in np.unique(entities) for of in [entities == entity]}
+
+
+def _resolve_frame(path: Path, frame: int, known: NDArray[np.int64]) -> int:
+    """Return the index of a frame among the recorded ones; -1 is the last."""
+    if frame == -1 and len(known):
+        return int(known[-1])
+    if frame in known:
+        return frame
+    have = f"frames {known[0]} to {known[-1]} are" if len(known) else "no frame is"
+    raise InputError(InputMistake(f"there is no frame {frame}; {have} recorded", file=path, key="frame"))

@@ -1,0 +1,292 @@
+"""Store of references on disk, indexed by a digest of the scene and the request.
+
+    run-SCENE-SIZE-INTEGRATOR.npz             decrease of the objective in each step of a reference run
+    problem-SCENE-SIZE-INTEGRATOR-FRAME.npz   a step snapshot
+    minima-PROBLEM.npz                        its known minima
+    trajectory-SCENE-SIZE-TIMES.npz           positions and velocities at some times; SCENE without its step size
+    growth-SCENE-SIZE-HORIZON.npz             growth of a perturbation of the start up to an end time
+    converged-SCENE-SIZE-TIMES.npz            positions and velocities of a scene with contact, self-converged
+
+Files have a temporary name until they are complete, and contain arrays only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from springbench.harness.atomic_files import atomic_write
+from springbench.harness.reference.certified_minimum import (
+    MINIMUM,
+    KnownMinima,
+    MinimumCertificate,
+    find_minima,
+    refine_minimum,
+)
+from springbench.harness.reference.equations_of_motion import OdeField, build_ode_scene
+from springbench.harness.reference.perturbation_growth import PerturbationGrowth, estimate_growth
+from springbench.harness.reference.reference_trajectory import ProgressFunction, ReferenceTrajectory, integrate_motion
+from springbench.harness.reference.self_converged_trajectory import (
+    SelfConvergedTrajectory,
+    compute_self_converged,
+    has_contact,
+)
+from springbench.harness.reference.step_snapshot import (
+    Arrays,
+    StepSnapshot,
+    build_exact_scene,
+    is_equal_to_roundoff,
+    restore_snapshot,
+    run_reference,
+    save_snapshot,
+    select_snapshot_frames,
+)
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.scenes.scene_spec import IntegratorName, SceneSpec
+from springbench.harness.simulation.time_loop import SimulationStep
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.step_problem import Positions, Solver
+
+_CERTIFICATE_FIELDS = ("positions", "g", "error", "smallest_eigenvalue", "doubt", "near")
+"""Stored fields of a minimum: the complete certificate of the stored point."""
+_TRAJECTORY_FIELDS = tuple(f.name for f in fields(ReferenceTrajectory) if f.name != "growth")
+"""Stored fields of a trajectory; the growth of perturbations has its own file."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceStore:
+    """Store of all references in one folder, shared by all users of the same scenes.
+
+    Attributes:
+      folder: folder of the files.
+      solver: solver of reference runs, Newton's method.
+    """
+
+    folder: Path
+    solver: Solver = field(default_factory=NewtonSolver)
+
+    def load_snapshots(
+        self, spec: SceneSpec, size: int, integrator: IntegratorName = "implicit-euler"
+    ) -> dict[str, StepSnapshot]:
+        """Load or compute the snapshots SNAPSHOT_NAMES of the scene's `frames` steps.
+
+        Args:
+          spec: specification of the scene.
+          size: size of the scene.
+          integrator: name of the integrator.
+
+        Raises:
+          InputError: the scene cannot be built.
+          RunFailed: a step of the reference run does not converge.
+        """
+        asked = _ReferenceRequest(spec, size, integrator)
+        path = self.folder / f"run-{asked.name}.npz"
+        violence = _read_arrays(path)["violence"] if path.exists() else np.empty(0)
+        moments = select_snapshot_frames(violence, spec.frames)
+        known = self._load_known_snapshots(asked, moments.values()) if len(violence) == spec.frames else {}
+        if not set(moments.values()) <= set(known):
+            steps, violence = run_reference(asked.scene, self.solver, spec.frames)
+            _write_arrays(path, {"violence": violence})
+            known, moments = self._save_steps(asked, steps), select_snapshot_frames(violence, spec.frames)
+        return {moment: known[frame] for moment, frame in moments.items()}
+
+    def load_frames(
+        self, spec: SceneSpec, size: int, frames: Collection[int], integrator: IntegratorName = "implicit-euler"
+    ) -> dict[int, StepSnapshot]:
+        """Load or compute the snapshots of given frames.
+
+        A run continues from the last stored snapshot before the first missing one.
+
+        Args:
+          spec: specification of the scene.
+          size: size of the scene.
+          frames: frames, counted from 1.
+          integrator: name of the integrator.
+
+        Raises:
+          InputError: the scene cannot be built.
+          RunFailed: a step of the reference run does not converge.
+        """
+        asked = _ReferenceRequest(spec, size, integrator)
+        known = self._load_known_snapshots(asked, frames)
+        if missing := set(frames) - set(known):
+            there = range(min(missing) - 1, 0, -1)
+            before = next((one for frame in there for one in self._load_known_snapshots(asked, [frame]).values()), None)
+            state = before.state if before else None
+            steps, _ = run_reference(asked.scene, self.solver, max(missing), missing, state)
+            known |= self._save_steps(asked, steps)
+        return {frame: known[frame] for frame in frames}
+
+    def find_minima(self, frozen: StepSnapshot) -> KnownMinima:
+        """Load the known minima of a problem, or find them.
+
+        `lowest` of the result raises UncertifiedError if there is none.
+        """
+        path = self.folder / f"minima-{frozen.digest}.npz"
+        if path.exists() and (stored := _read_arrays(path)).keys() >= set(
+            _CERTIFICATE_FIELDS
+        ):  # else by code that certified less
+            return _build_minima(stored)
+        found = find_minima(frozen.problem, self.solver)
+        if found.minima:
+            self._save_minima(frozen, found)
+        return found
+
+    def classify_minimum(self, frozen: StepSnapshot, p: Positions) -> MinimumCertificate:
+        """Find the minimum in whose basin p (n, 3) [m] is.
+
+        A new certified minimum is added to the known ones, and becomes the reference if it is the lowest. Its index is
+        `find_minima(snapshot).find_index(minimum)` where it is certified.
+        """
+        found, known = refine_minimum(frozen.problem, p, self.solver), self.find_minima(frozen)
+        joined = known.add_minimum(found)
+        if joined is not known:
+            self._save_minima(frozen, joined)
+        return joined.minima[joined.find_index(found)] if found.is_certified else found
+
+    def load_trajectory(
+        self,
+        spec: SceneSpec,
+        size: int,
+        times: Sequence[float],
+        *,
+        error: float,
+        report_progress: ProgressFunction | None = None,
+    ) -> ReferenceTrajectory:
+        """Load or compute a reference trajectory at given times.
+
+        It is the same for every step size of the scene. With contact it is self-converged, starting with steps of about
+        the scene's own step size.
+
+        Args:
+          spec: specification of the scene.
+          size: size of the scene.
+          times: ascending times [s].
+          error: smallest relative error to be measured.
+          report_progress: called with the progress of an integration.
+
+        Raises:
+          InputError: the scene cannot be built.
+          NotIntegrable: the scene has no equations of motion.
+          UnpredictableMotion: the reference would not be accurate enough.
+        """
+        name = _build_motion_name(spec, size, times)
+        if has_contact(build_exact_scene(spec, size).system):
+            return self._load_self_converged(self.folder / f"converged-{name}.npz", spec, size, times, error)
+        seen = self.load_growth(spec, size, times[-1])
+        seen.require_predictable(error, times)
+        scene = build_ode_scene(spec, size)
+        witness, path = OdeField(scene).evaluate_fingerprint(), self.folder / f"trajectory-{name}.npz"
+        stored: dict[str, Any] = dict(_read_arrays(path)) if path.exists() else {}
+        if stored and is_equal_to_roundoff(stored.pop("witness"), witness):
+            found = ReferenceTrajectory(
+                **{key: stored[key] for key in _TRAJECTORY_FIELDS}, growth=seen.interpolate_growth(times)
+            )
+        else:
+            found = replace(integrate_motion(scene, times, report_progress), growth=seen.interpolate_growth(times))
+            _write_arrays(path, {key: getattr(found, key) for key in _TRAJECTORY_FIELDS} | {"witness": witness})
+        found.require_accuracy(error)
+        return found
+
+    def load_growth(self, spec: SceneSpec, size: int, t_end: float) -> PerturbationGrowth:
+        """Load or estimate the growth of a perturbation up to an end time [s].
+
+        Args:
+          spec: specification of the scene.
+          size: size of the scene.
+          t_end: end time [s].
+
+        Raises:
+          UnpredictableMotion: nothing moves, or the motion is not finite.
+          NotIntegrable: the scene has no equations of motion.
+        """
+        witness = OdeField(build_ode_scene(spec, size)).evaluate_fingerprint()
+        path = self.folder / f"growth-{_build_motion_name(spec, size, [t_end])}.npz"
+        stored: dict[str, Any] = dict(_read_arrays(path)) if path.exists() else {}
+        if stored and is_equal_to_roundoff(stored.pop("witness"), witness):
+            return PerturbationGrowth(scale=float(stored.pop("scale")), **stored)
+        found = estimate_growth(spec, size, t_end)
+        arrays = {f.name: np.asarray(getattr(found, f.name)) for f in fields(PerturbationGrowth)}
+        _write_arrays(path, arrays | {"witness": witness})
+        return found
+
+    def _load_self_converged(
+        self, path: Path, spec: SceneSpec, size: int, times: Sequence[float], error: float
+    ) -> SelfConvergedTrajectory:
+        """Load the self-converged trajectory if stored for such an error, else compute it.
+
+        Its fingerprint is its first step.
+        """
+        witness = next(iter(run_reference(build_exact_scene(spec, size), self.solver, 1, [1])[0].values())).positions
+        stored: dict[str, Any] = dict(_read_arrays(path)) if path.exists() else {}
+        known = bool(stored) and is_equal_to_roundoff(stored.pop("witness"), witness)
+        if known and float(stored.pop("error")) <= error:
+            plain = {key: stored.pop(key).item() for key in ("step", "moved_last")}
+            found = SelfConvergedTrajectory(**stored, **plain)
+        else:
+            found = compute_self_converged(
+                lambda h, name: build_exact_scene(spec.with_time_step(h), size, name), spec.time_step, times, error
+            )
+            arrays = {f.name: np.asarray(getattr(found, f.name)) for f in fields(SelfConvergedTrajectory)}
+            _write_arrays(path, arrays | {"witness": witness, "error": np.asarray(error)})
+        found.require_accuracy(error)
+        return found
+
+    def _load_known_snapshots(self, asked: _ReferenceRequest, frames: Iterable[int]) -> dict[int, StepSnapshot]:
+        """Load those of the snapshots that are on disk and match the present scene."""
+        paths = [path for path in (self._snapshot_path(asked, frame) for frame in frames) if path.exists()]
+        thawed = [restore_snapshot(_read_arrays(path), asked.scene) for path in paths]
+        return {one.frame: one for one in thawed if one}
+
+    def _snapshot_path(self, asked: _ReferenceRequest, frame: int) -> Path:
+        return self.folder / f"problem-{asked.name}-{frame}.npz"
+
+    def _save_steps(self, asked: _ReferenceRequest, steps: dict[int, SimulationStep]) -> dict[int, StepSnapshot]:
+        kept: dict[int, StepSnapshot] = {}
+        for frame, step in steps.items():
+            kept[frame], arrays = save_snapshot(step, asked.name)
+            _write_arrays(self._snapshot_path(asked, frame), arrays)
+        return kept
+
+    def _save_minima(self, frozen: StepSnapshot, known: KnownMinima) -> None:
+        arrays = {name: np.array([getattr(minimum, name) for minimum in known.minima]) for name in _CERTIFICATE_FIELDS}
+        _write_arrays(self.folder / f"minima-{frozen.digest}.npz", arrays)
+
+
+class _ReferenceRequest:
+    """A scene of one size with one integrator, and its name in file names."""
+
+    def __init__(self, spec: SceneSpec, size: int, integrator: IntegratorName) -> None:
+        self.scene: Scene = build_exact_scene(spec, size, integrator)
+        self.name = f"{spec.scene_digest[:12]}-{size}-{integrator}"
+
+
+def _build_motion_name(spec: SceneSpec, size: int, times: Sequence[float]) -> str:
+    """Return the part of a file name that identifies a motion.
+
+    It consists of the scene without its step size, its size, and the times.
+    """
+    return f"{spec.with_time_step(1.0).scene_digest[:12]}-{size}-{'-'.join(f'{t:.9g}' for t in times)}"
+
+
+def _build_minima(arrays: Arrays) -> KnownMinima:
+    numbers = (arrays[name].tolist() for name in ("g", "error", "smallest_eigenvalue", "doubt"))
+    columns = zip(arrays["positions"], *numbers, arrays["near"], strict=True)
+    return KnownMinima(tuple(MinimumCertificate(*values, kind=MINIMUM) for values in columns))
+
+
+def _read_arrays(path: Path) -> Arrays:
+    with np.load(path, allow_pickle=False) as stored:
+        arrays = dict(stored)
+    for array in arrays.values():
+        array.flags.writeable = False
+    return arrays
+
+
+def _write_arrays(path: Path, arrays: Arrays) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(path) as partial:
+        np.savez(partial, allow_pickle=False, **arrays)

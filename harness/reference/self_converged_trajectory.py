@@ -1,0 +1,203 @@
+"""Self-converged reference for scenes with contact: steps are halved until the motion no longer changes.
+
+    |p_h(T) - p_(h/2)(T)| and |p(T) - q(T)| <= REFERENCE_MARGIN error |q(T) - p(0)|
+
+Here p is the motion by implicit Euler and q the one by BDF2. Norms are Frobenius norms over the free vertices; steps
+are solved by Newton's method. Contact has no equation of motion that could be integrated instead, and its limit may
+depend on the integrator, which determines the restitution of an impact and the velocity that lagged friction opposes.
+Where the limits differ, there is no reference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from time import thread_time
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.harness.reference.reference_trajectory import (
+    REFERENCE_MARGIN,
+    ReferenceTrajectory,
+    UnpredictableMotion,
+)
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import build_initial_state, prepare, simulate_scene
+from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.step_problem import Positions, StopRule, System
+
+LIMIT_INTEGRATORS = ("implicit-euler", "bdf2")
+"""Integrators that support contact."""
+MAX_SECONDS = 60.0
+"""Limit on the processor time [s] for a reference."""
+MAX_RELATIVE_ERROR = 0.05
+"""Relative error for which a reference is always accurate enough."""
+_SOLVED_STOP_RULE = StopRule(100, 1e-6)
+_DISAGREEMENT_FACTOR = 4.0
+"""Ratio of the distance between two limits to the last change by step halving above which the limits differ."""
+
+SceneBuilder = Callable[[float, str], Scene]
+"""Builds the scene from a step size [s] and the name of an integrator."""
+
+
+class NotConverged(UnpredictableMotion):
+    """The motion has no limit that is known accurately enough."""
+
+
+def has_contact(system: System) -> bool:
+    """Return whether a system has contact."""
+    return without_vertex_contact(system) is not system
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SelfConvergedTrajectory(ReferenceTrajectory):
+    """Self-converged reference trajectory.
+
+    Attributes:
+      disagreement: difference (k,) of the two integrators, or the last change of either by step halving, if larger.
+      step: last step size [s].
+      last_change: last change by step halving alone, at the end, relative to the displacement.
+    """
+
+    step: float
+    last_change: float
+
+    @property
+    def reference_kind(self) -> str:
+        """The kind of the reference."""
+        return "self-converged"
+
+    @property
+    def has_disagreement(self) -> bool:
+        """Whether the integrators differ by more than step halving explains."""
+        return float(self.disagreement[-1]) > _DISAGREEMENT_FACTOR * self.last_change
+
+    def require_accuracy(self, error: float) -> None:
+        """Raise NotConverged where a relative error cannot be measured at one of the times."""
+        for t, apart in zip(self.times, self.disagreement, strict=True):
+            if apart <= REFERENCE_MARGIN * error:
+                continue
+            why = (
+                "the limits of implicit Euler and BDF2 differ: what an impact gives back, and what friction acts "
+                "against, depend on the integrator"
+                if self.has_disagreement
+                else f"halving the steps further takes more than {MAX_SECONDS:g} s"
+            )
+            least = apart / REFERENCE_MARGIN
+            can = f"ask for an error of {least:.1g} or more, or a shorter horizon" if least < 1.0 else "none can be had"
+            raise NotConverged(
+                f"contact has no certified reference, and after {t:g} s its self-converged one is known to {apart:.1e} "
+                f"of the displacement, by steps of {self.step:.2g} s: an error of {error:.1e} cannot be measured; "
+                f"{why}; {can}"
+            )
+
+
+def compute_self_converged(
+    bound: SceneBuilder, frame: float, times: Sequence[float], error: float
+) -> SelfConvergedTrajectory:
+    """Compute a self-converged motion at given times.
+
+    Args:
+      bound: builds the scene from a step size and an integrator.
+      frame: approximate first step size [s].
+      times: ascending times [s], each a multiple of the step size.
+      error: smallest relative error to be measured, if that takes no longer than MAX_SECONDS.
+
+    Raises:
+      NotConverged: not even two step sizes could be compared.
+    """
+    steps, began = max(1, round(times[-1] / frame)), thread_time()
+    before: dict[str, _SampledMotion] | None = None
+    found: SelfConvergedTrajectory | None = None
+    while True:
+        motions = {
+            name: _sample_motion(bound(times[-1] / steps, name), times, began + MAX_SECONDS)
+            for name in LIMIT_INTEGRATORS
+        }
+        if any(motion is None for motion in motions.values()):
+            break
+        ends = {name: motion for name, motion in motions.items() if motion}
+        if before:
+            found = _compare_motions(ends, before, times, times[-1] / steps)
+            wanted = REFERENCE_MARGIN * min(error, MAX_RELATIVE_ERROR)
+            if found.disagreement.max() <= wanted or (found.has_disagreement and found.last_change <= wanted):
+                break
+        before, steps = ends, 2 * steps
+    if found is None:
+        raise NotConverged(f"contact has no certified reference, and two motions take longer than {MAX_SECONDS:g} s")
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _SampledMotion:
+    """A sampled motion.
+
+    Attributes:
+      free_vertices: indices of the free vertices.
+      start_positions: positions at the start (n, 3) [m].
+      positions: positions (k, n, 3) [m].
+      velocities: velocities (k, n, 3) [m/s].
+    """
+
+    free_vertices: NDArray[np.int64]
+    start_positions: Positions
+    positions: Positions
+    velocities: Positions
+
+
+def _sample_motion(scene: Scene, times: Sequence[float], until: float) -> _SampledMotion | None:
+    """Sample the motion at the given times; None if the time limit is exceeded."""
+    h = scene.system.time_step
+    wanted = [round(t / h) for t in times]
+    if any(abs(k * h - t) > 1e-9 * times[-1] for k, t in zip(wanted, times, strict=True)):
+        raise NotConverged("the times are no whole numbers of steps")
+    kept: dict[int, tuple[Positions, Positions]] = {}
+    run = simulate_scene(
+        scene, prepare(scene, NewtonSolver()), _SOLVED_STOP_RULE, initial_guess="current", frames=wanted[-1]
+    )
+    for step in run:
+        if not np.isfinite(step.positions).all():
+            raise NotConverged(f"the motion is not finite from {step.index * h:.3g} s on")
+        if step.index in wanted:
+            kept[step.index] = step.positions.copy(), step.state.motion.velocity.copy()
+        if thread_time() > until and step.index < wanted[-1]:
+            return None
+    p, v = (np.array([kept[k][i] for k in wanted]) for i in (0, 1))
+    return _SampledMotion(scene.system.free_vertices, build_initial_state(scene).motion.positions, p, v)
+
+
+def _compare_motions(
+    now: dict[str, _SampledMotion], before: dict[str, _SampledMotion], times: Sequence[float], step: float
+) -> SelfConvergedTrajectory:
+    first, second = (now[name] for name in LIMIT_INTEGRATORS)
+    free = second.free_vertices
+
+    def size(x: Positions) -> NDArray[np.float64]:
+        return np.linalg.norm(x[:, free], axis=(1, 2))
+
+    moved = size(second.positions - second.start_positions)
+    if not moved.all():
+        raise NotConverged("nothing moves, and errors are relative to what does")
+    halved = [size(now[name].positions - before[name].positions) for name in LIMIT_INTEGRATORS]
+    apart = size(first.positions - second.positions)
+    most = np.max([*halved, apart], axis=0) / moved
+    return SelfConvergedTrajectory(
+        times=np.array(times, float),
+        free_vertices=free,
+        positions=second.positions,
+        velocities=second.velocities,
+        displacement=moved,
+        disagreement=most,
+        growth=np.zeros(len(times)),
+        step=step,
+        last_change=float(np.max(halved, axis=0)[-1] / moved[-1]),
+    )
+
+
+def describe_self_convergence(name: str) -> str:
+    """Return the note that is shown for a scene with contact before anything is measured."""
+    return (
+        f"{name}: contact has no certified reference; errors are by a self-converged motion (implicit Euler and BDF2, "
+        "steps halved until they agree), and rejected where that does not converge"
+    )

@@ -1,0 +1,205 @@
+"""Snapshots of single steps of a reference run, so that all solvers solve the same problem.
+
+The reference run takes converged steps (Newton's method), with all pins exact whatever the scene states. Accuracy is
+measured on three snapshots:
+
+    early     a tenth of the run, and the second step at least, before which BDF2 has no history
+    middle    half of the run
+    violent   the step with the largest decrease g(current positions) - g(minimum), which is about the kinetic energy
+              in free motion, and more where the motion is stopped by springs or contact
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.harness.errors import RunFailed
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.simulation.time_loop import (
+    MotionState,
+    SimulationStep,
+    apply_initial_guess,
+    prepare,
+    simulate_scene,
+)
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import DirichletPins, Positions, Solver, StepProblem, StepStart, StopRule
+
+SNAPSHOT_NAMES = ("early", "middle", "violent")
+REFERENCE_STOP_RULE = StopRule(500, 1e-12)
+"""Stop rule of the reference run: Newton's method reaches the last digits in one more iteration."""
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepSnapshot:
+    """One step of a reference run.
+
+    Attributes:
+      frame: step number, from 1.
+      problem: step problem with exact pins, whose initial guess is the current positions.
+      end_motion: motion at the step's end.
+      digest: 12 hex digits of a hash of the problem's arrays, of the gradient at the current positions, which
+        represents the energies, and of the origin of the snapshot.
+      acceleration: acceleration at the step's end (n, 3) [m/s^2], None where the integrator provides none.
+    """
+
+    frame: int
+    problem: StepProblem
+    end_motion: Motion
+    digest: str
+    acceleration: Positions | None = None
+
+    @property
+    def state(self) -> MotionState:
+        """The state from which the reference run continues."""
+        begun = self.problem.step_start
+        return MotionState(self.end_motion, Motion(begun.positions, begun.velocity), self.frame, self.acceleration)
+
+    def build_problem(self, initial_guess: str) -> StepProblem:
+        """Return the problem with an initial guess by name (`springbench.harness.simulation.time_loop`)."""
+        return apply_initial_guess(self.problem, initial_guess)
+
+
+def build_exact_scene(
+    spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, show_warnings: bool = True
+) -> Scene:
+    """Build the scene with all of its pins exact.
+
+    Args:
+      spec: specification of the scene.
+      size: size of the scene.
+      integrator: name of the integrator.
+      show_warnings: whether warnings of the scene are shown.
+
+    Raises:
+      InputError: the scene cannot be built.
+    """
+    scene = build_scene(spec, size, integrator, log_warnings=show_warnings)
+    vertices = scene.system.pins.vertices
+    return replace(scene, system=replace(scene.system, pins=DirichletPins(vertices, np.full(len(vertices), np.inf))))
+
+
+def run_reference(
+    scene: Scene, solver: Solver, num_steps: int, frames: Collection[int] = (), initial_state: MotionState | None = None
+) -> tuple[dict[int, SimulationStep], NDArray[np.float64]]:
+    """Take converged steps up to a number of steps.
+
+    Args:
+      scene: scene with exact pins.
+      solver: solver of the steps.
+      num_steps: number of the last step.
+      frames: steps to return; the snapshot steps if empty.
+      initial_state: state from which to continue; the start of the scene if omitted.
+
+    Returns: the steps by frame, and for all steps (num_steps,) the decrease of the objective [J] from the current
+      positions to the solution, nan before the initial state.
+
+    Raises:
+      RunFailed: a step does not converge.
+    """
+    kept: dict[int, SimulationStep] = {}
+    violence, keep = np.full(num_steps, np.nan), set(frames)
+    run = simulate_scene(
+        scene,
+        prepare(scene, solver),
+        REFERENCE_STOP_RULE,
+        initial_guess="current",
+        frames=num_steps,
+        initial_state=initial_state,
+    )
+    for step in run:
+        if step.solution.termination_reason == "iterations" or not np.isfinite(step.positions).all():
+            raise RunFailed(f"step {step.index} of the reference run does not converge")
+        stated = step.problem
+        violence[step.index - 1] = stated.value(stated.current_positions) - stated.value(step.solution.positions)
+        if not frames:
+            keep = set(select_snapshot_frames(violence[: step.index], num_steps).values())
+        kept[step.index] = step
+        kept = {frame: one for frame, one in kept.items() if frame in keep}
+    return kept, violence
+
+
+def select_snapshot_frames(violence: NDArray[np.float64], num_steps: int) -> dict[str, int]:
+    """Select the frames of SNAPSHOT_NAMES in a run.
+
+    Args:
+      violence: decrease of the objective [J] of the first steps (frames,).
+      num_steps: number of steps of the run.
+    """
+    first = min(2, num_steps)
+    return {
+        "early": max(first, -(-num_steps // 10)),
+        "middle": max(first, (num_steps + 1) // 2),
+        "violent": first + int(np.argmax(violence[first - 1 :])) if len(violence) >= first else 1,
+    }
+
+
+_ARRAYS = ("target", "force", "pin_targets", "current")
+_OPTIONAL_FIELDS = ("lagged", "acceleration", "kept", "pressed")
+_START_FIELDS = tuple(field.name for field in fields(StepStart) if field.name not in _OPTIONAL_FIELDS)
+
+
+def save_snapshot(step: SimulationStep, origin: str) -> tuple[StepSnapshot, Arrays]:
+    """Convert a step to a snapshot and to the arrays that are saved.
+
+    Args:
+      step: step of the reference run.
+      origin: description of the source of the step.
+    """
+    problem, now = step.problem, step.state.motion
+    system, start = problem.system, problem.step_start
+    arrays: dict[str, Any] = {name: getattr(problem, name) for name in _ARRAYS}
+    arrays |= {f"start_{name}": getattr(start, name) for name in _START_FIELDS}
+    arrays |= {f"start_{name}": known for name in _OPTIONAL_FIELDS if (known := getattr(start, name)) is not None}
+    arrays |= {
+        "mass": system.mass,
+        "pins": system.pins.vertices,
+        "gradient": problem.gradient(problem.current_positions),
+    }
+    arrays |= {"time_step": system.time_step, "factor": system.inertia_factor, "frame": step.index}
+    arrays = {name: np.asarray(value) for name, value in arrays.items()}
+    content = hashlib.sha256(origin.encode())
+    for name, array in arrays.items():
+        content.update(f"{name} {array.dtype} {array.shape} ".encode() + array.tobytes())
+    digest = content.hexdigest()[:12]
+    ends = {"after_positions": now.positions, "after_velocity": now.velocity, "digest": np.asarray(digest)}
+    if (acceleration := step.state.acceleration) is not None:
+        ends["after_acceleration"] = acceleration
+    return StepSnapshot(step.index, problem, now, digest, acceleration), arrays | ends
+
+
+def restore_snapshot(arrays: Arrays, scene: Scene) -> StepSnapshot | None:
+    """Restore a saved snapshot for a scene; None where the problem has changed."""
+    if any(f"start_{name}" not in arrays for name in _START_FIELDS):
+        return None
+    system = replace(scene.system, inertia_factor=float(arrays["factor"]))
+    begun: dict[str, Any] = {
+        name: arrays[f"start_{name}"] for name in (*_START_FIELDS, *_OPTIONAL_FIELDS) if f"start_{name}" in arrays
+    }
+    begun |= {name: float(value) for name, value in begun.items() if not value.ndim}
+    given = {name: arrays[name] for name in _ARRAYS}
+    problem = StepProblem(system, **given, initial_guess=given["current"], step_start=StepStart(**begun))
+    same = (
+        system.time_step == arrays["time_step"]
+        and np.array_equal(system.mass, arrays["mass"])
+        and np.array_equal(system.pins.vertices, arrays["pins"])
+        and is_equal_to_roundoff(problem.gradient(problem.current_positions), arrays["gradient"])
+    )
+    after = Motion(arrays["after_positions"], arrays["after_velocity"])
+    told = str(arrays["digest"]), arrays.get("after_acceleration")
+    return StepSnapshot(int(arrays["frame"]), problem, after, *told) if same else None
+
+
+def is_equal_to_roundoff(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool:
+    """Return whether two arrays are equal up to processor-dependent summation order."""
+    if found.shape != wanted.shape:
+        return False
+    return bool(np.abs(found - wanted).max(initial=0.0) <= 1e-9 * np.abs(wanted).max(initial=0.0))

@@ -1,0 +1,230 @@
+"""Reader of the rows of an accuracy measurement, as objects of `springbench.harness.report.accuracy.accuracy_data`."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.report.accuracy.accuracy_data import (
+    AccuracyData,
+    ConvergenceCurve,
+    FloatArray,
+    SnapshotProblem,
+    WorkPoint,
+)
+from springbench.harness.report.provenance_words import describe_commits, describe_processors
+from springbench.harness.results import row_store
+from springbench.harness.results.parquet_rows import read_rows as read_rows
+
+ROUNDOFF_FACTOR = 100 * float(np.finfo(np.float64).eps)
+"""Energy difference, relative to the terms' magnitude, beyond which a value below g* is a lower minimum.
+
+Smaller differences are round-off: sums of up to 1e5 terms have errors of some tens of eps.
+"""
+
+LIU2013_SWEEP = "liu2013"
+"""The config that reproduces Liu et al. 2013; its g0 is taken at the inertial target."""
+
+_ResultRow = dict[str, Any]
+_RowLabeller = Callable[[_ResultRow], str]
+
+
+def read_accuracy(
+    folder: Path, files: Iterable[Path] | None = None, on_invalid: Callable[[InputMistake], None] | None = None
+) -> AccuracyData:
+    """Read the rows of an accuracy measurement.
+
+    Args:
+        folder: folder of the results.
+        files: files of rows; None for all under `folder`/accuracy.
+        on_invalid: called for each invalid unit, see `springbench.harness.results.parquet_rows.read_rows`.
+    Raises:
+        InputError: if there are no rows.
+    """
+    units = row_store.list_units(folder / "accuracy") if files is None else sorted(files)
+    if not units:
+        raise InputError(InputMistake("holds no accuracy rows; run `springbench accuracy CONFIG` first", folder))
+    kinds: dict[str, list[_ResultRow]] = defaultdict(list)
+    # Columns that older rows do not have.
+    missing = dict.fromkeys(("family", "reference", "minimises", "own_steps", "code", "started", "commit"))
+    table = read_rows(units, pa.schema([]), required_columns=("kind",), promote="permissive", on_invalid=on_invalid)
+    for row in table.to_pylist():
+        kinds[row["kind"]].append(missing | row)
+    for rows in kinds.values():  # files come by their names, 122 before 22
+        rows.sort(key=lambda row: (row["scene"], row["size"]))
+    label = _build_row_labeller(kinds["curve"] + kinds["work"])
+    problems = _build_snapshots(kinds)
+    return AccuracyData(
+        tuple(problems.values()),
+        tuple(_build_curves(kinds, problems, label)),
+        tuple(_build_work_point(row, label) for row in kinds["work"]),
+        _describe_machine(kinds["curve"] + kinds["work"]),
+        max(((row["started"] or "", row["code"] or "") for row in kinds["curve"] + kinds["work"]), default=("", ""))[1],
+    )
+
+
+def _build_snapshots(kinds: dict[str, list[_ResultRow]]) -> dict[str, SnapshotProblem]:
+    """Build the snapshots by digest.
+
+    An energy below all certified minima shows that they are not the lowest.
+    """
+    lowest: dict[str, float] = {}
+    for row in kinds["curve"]:
+        if row["g"] is not None and row["g"] < lowest.get(row["problem"], np.inf):
+            lowest[row["problem"]] = row["g"]
+    minima: dict[str, list[_ResultRow]] = defaultdict(list)
+    for row in kinds["minimum"]:
+        if row["g"] is not None:
+            minima[row["problem"]].append(row)
+    found: dict[str, SnapshotProblem] = {}
+    for row in kinds["problem"]:
+        digest = row["problem"]
+        if digest is None or row["g0"] is None:
+            continue
+        known = sorted(minima[digest], key=lambda m: m["g"])
+        energies, names = [m["g"] for m in known], [m["minimum"] for m in known]
+        noise = ROUNDOFF_FACTOR * (row["magnitude"] or 0.0)
+        doubt = "" if known and known[0]["certified"] else "the lowest known minimum is not certified"
+        seen = lowest.get(digest, np.inf)
+        if not known:
+            doubt = "no minimum is known; gaps refer to the lowest energy that a solver reached"
+        elif seen < energies[0] - noise:
+            doubt = "a solver went below the lowest minimum that is certified; gaps refer to what it reached"
+        if doubt and seen < (energies or [np.inf])[0] - noise:
+            energies.insert(0, seen)
+            names.insert(0, "")
+        paper = row["sweep"] == LIU2013_SWEEP
+        found[digest] = SnapshotProblem(
+            scene=row["scene"],
+            size=row["size"],
+            vertices=row["vertices"],
+            snapshot=row["moment"],
+            integrator=row["integrator"],
+            time_step=row["time_step"],
+            stiffness_ratio=_float_or_nan(row["stiffness_ratio"]),
+            mean_rest_length=_float_or_nan(row["mean_rest_length"]),
+            objective_magnitude=_float_or_nan(row["magnitude"]),
+            problem_digest=digest,
+            frame=row["frame"] or 0,
+            objective_initial=_float_or_nan(row["g0_inertial" if paper else "g0"]),
+            minima=tuple(energies),
+            minimum_ids=tuple(names),
+            uncertified_reason=doubt,
+            is_liu2013=paper,
+        )
+    return found
+
+
+_SOLVE_COLUMNS = ("problem", "solver", "parameters", "threads")
+
+
+def _build_curves(
+    kinds: dict[str, list[_ResultRow]], problems: dict[str, SnapshotProblem], label: _RowLabeller
+) -> Iterable[ConvergenceCurve]:
+    prepared = {tuple(row[key] for key in _SOLVE_COLUMNS): row for row in kinds["prepare"]}
+    groups: dict[tuple[Any, ...], list[_ResultRow]] = defaultdict(list)
+    for row in kinds["curve"]:
+        groups[*(row[key] for key in _SOLVE_COLUMNS), row["first_guess"]].append(row)
+    for key, rows in groups.items():
+        problem = problems.get(key[0])
+        if problem is not None:
+            yield _build_curve(problem, rows, prepared.get(key[:-1], {}), label(rows[0]))
+
+
+def _build_curve(
+    problem: SnapshotProblem, rows: Sequence[_ResultRow], prepared: _ResultRow, label: str
+) -> ConvergenceCurve:
+    points = sorted((row for row in rows if row["iteration"] is not None), key=lambda row: row["iteration"])
+    bad = next((row for row in rows if row["status"] != "ok"), rows[0])
+
+    def column(name: str) -> FloatArray:
+        return np.array([_float_or_nan(row[name]) for row in points], float)
+
+    rounds = min((len(row["seconds"] or ()) for row in points), default=0)
+    seconds = np.array([row["seconds"][:rounds] for row in points], float).reshape(len(points), rounds).T
+    warm = prepared.get("seconds") or [np.nan]
+    return ConvergenceCurve(
+        problem=problem,
+        solver=rows[0]["solver"],
+        family=rows[0]["family"] or "",
+        citation=rows[0]["reference"] or "",
+        label=label,
+        parameters=rows[0]["parameters"] or "{}",
+        initial_guess=rows[0]["first_guess"] or "",
+        threads=rows[0]["threads"] or 1,
+        iterations=column("iteration"),
+        gap=problem.compute_gap(column("g")),
+        max_vertex_error=column("largest_error") / problem.mean_rest_length,
+        stationarity=column("stationarity"),
+        seconds=seconds if rounds else np.full((1, len(points)), np.nan),
+        warm_seconds=float(np.median(warm)),
+        cold_seconds=_float_or_nan(prepared.get("cold")),
+        minimum_index=problem.minimum_index(rows[0]["minimum"]) if rows[0]["branch"] is not None else None,
+        status=bad["status"],
+        reason=bad["reason"] or "",
+        recording_path=next((row["recording"] for row in rows if row["recording"]), ""),
+        source_fingerprint=rows[0]["code"] or "",
+    )
+
+
+def _build_work_point(row: _ResultRow, label: _RowLabeller) -> WorkPoint:
+    names = ("scene", "size", "solver", "parameters", "integrator", "time_step", "tolerance", "iterations")
+    return WorkPoint(
+        **{name: row[name] for name in (*names, "first_guess", "status")},
+        family=row["family"] or "",
+        citation=row["reference"] or "",
+        is_minimiser=row["minimises"] is not False,
+        is_substepping=bool(row["own_steps"]),
+        label=label(row),
+        t_end=_float_or_nan(row["horizon"]),
+        error=_float_or_nan(row["error"]),
+        reference_kind=row["truth"] or "",
+        end_error_rms=_float_or_nan(row["error_rms_m"]),
+        seconds_per_simulated_second=_float_or_nan(row["seconds_per_simulated"]),
+        cpu_seconds_per_simulated_second=_float_or_nan(row["cpu_seconds"]) / _float_or_nan(row["horizon"]),
+        vertices=row["vertices"] or 0,
+        stiffness=_float_or_nan(row["stiffness_ratio"]) / row["time_step"] ** 2,
+        reason=row["reason"] or "",
+        source_fingerprint=row["code"] or "",
+    )
+
+
+def _build_row_labeller(rows: Sequence[_ResultRow]) -> _RowLabeller:
+    """Return a function that labels a row by its solver and varying settings.
+
+    These are the parameters and threads in which the solver's rows differ.
+    """
+    values: dict[tuple[str, str], set[str]] = defaultdict(set)
+
+    def settings(row: _ResultRow) -> _ResultRow:
+        return {**json.loads(row["parameters"] or "{}"), "threads": row["threads"]}
+
+    stated: dict[str, set[str]] = defaultdict(set)
+    for row in rows:
+        stated[row["solver"]] |= settings(row).keys()
+    for row in rows:
+        own = settings(row)
+        for key in stated[row["solver"]]:  # some state what others leave out, for they have it as usual
+            values[row["solver"], key].add(str(own.get(key)))
+
+    def label(row: _ResultRow) -> str:
+        told = [f"{key} {value}" for key, value in settings(row).items() if len(values[row["solver"], key]) > 1]
+        return ", ".join([row["solver"], *told])
+
+    return label
+
+
+def _describe_machine(rows: Sequence[_ResultRow]) -> tuple[str, ...]:
+    threads = sorted({row["threads"] for row in rows if row["threads"] is not None})
+    count = [f"{', '.join(map(str, threads))} thread{'s' if threads != [1] else ''}"] if threads else []
+    return (*describe_processors(row["cpu"] for row in rows), *count, *describe_commits(row["commit"] for row in rows))
+
+
+def _float_or_nan(value: Any) -> float:
+    return np.nan if value is None else float(value)

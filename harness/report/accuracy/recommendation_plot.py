@@ -1,0 +1,107 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs do not type most keywords.
+"""Plot of a recommendation: all measured candidates, the requested error, and the runners-up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from springbench.harness.report.accuracy.plot_sheet import (
+    PANEL_LEFT,
+    PANEL_RIGHT,
+    PANEL_TOP,
+    add_panel,
+    draw_legend,
+    draw_notes,
+    format_log_axis,
+    log_limits,
+    marker_style,
+    notes_top,
+    sheet_paths,
+)
+from springbench.harness.report.accuracy.plot_sheet import marker_scale as sized
+from springbench.harness.report.accuracy.plot_sheet import plot_sheet as page_of
+from springbench.harness.report.accuracy.time_to_accuracy import format_duration
+from springbench.harness.report.page_layout import format_quantity
+from springbench.harness.report.plot_style import MUTED_COLOUR, RULE_COLOUR, TEXT_COLOUR, assign_solver_styles
+
+MAX_RUNNERS_UP = 4
+"""Number of runners-up that are described in words."""
+
+
+class CandidatePoint(NamedTuple):
+    """A candidate: solver, relative error, wall seconds per simulated second, and its description."""
+
+    solver: str
+    error: float
+    seconds_per_simulated_second: float
+    description: str
+
+
+def draw_recommendation(
+    stem: Path, title: str, facts: Sequence[str], points: Sequence[CandidatePoint], error_requested: float
+) -> list[Path]:
+    """Draw the candidates of a recommendation, and return the files.
+
+    The recommended candidate is the first one within the requested error.
+
+    Args:
+        stem: path of the files without suffix.
+        title: title of the picture.
+        facts: phrases below the title.
+        points: candidates, the cheapest first.
+        error_requested: relative error.
+    """
+    within = [point for point in points if point.error <= error_requested]
+    words = [f"recommended: {_describe_candidate(within[0])}"] if within else []
+    words += [
+        f"{k}. runner-up: {_describe_candidate(point, within[0])}"
+        for k, point in enumerate(within[1 : MAX_RUNNERS_UP + 1], 1)
+    ]
+    looks = assign_solver_styles(point.solver for point in points)
+    with page_of(stem, title, facts) as page:
+        ax = add_panel(page, PANEL_LEFT + 62, PANEL_TOP + 30, PANEL_RIGHT - PANEL_LEFT - 82, notes_top(words) - PANEL_TOP - 96,
+                   "error of the positions, relative to the way from the start")  # fmt: skip
+        down = log_limits([*(point.error for point in points), error_requested], margin=1.8)
+        ax.axhspan(down[0], error_requested, color=RULE_COLOUR, alpha=0.45, zorder=0, lw=0)
+        for point in points:
+            look = looks[point.solver]
+            style: dict[str, Any] = marker_style(look, is_stale=False) | {
+                "alpha": 1.0 if point.error <= error_requested else 0.35
+            }
+            style |= {"marker": look.marker, "ls": "", "color": look.color, "ms": 6.5 * sized(look)}
+            ax.plot(point.seconds_per_simulated_second, point.error, zorder=3, **style)
+        for k, point in enumerate(within[: MAX_RUNNERS_UP + 1]):
+            ring: dict[str, Any] = (
+                {"mec": TEXT_COLOUR, "mew": 1.8, "ms": 18} if not k else {"mec": MUTED_COLOUR, "mew": 0.9, "ms": 14}
+            )
+            ax.plot(point.seconds_per_simulated_second, point.error, "o", mfc="none", zorder=4, **ring)
+            ax.annotate(
+                "recommended" if not k else str(k), (point.seconds_per_simulated_second, point.error), (0, 10 if k else -22),
+                textcoords="offset points", ha="center", fontsize=9, color=TEXT_COLOUR if not k else MUTED_COLOUR,
+            )  # fmt: skip
+        format_log_axis(
+            ax.xaxis, *log_limits([point.seconds_per_simulated_second for point in points], margin=1.8), unit="time"
+        )
+        format_log_axis(ax.yaxis, *down, unit="percent")
+        ax.set_xlabel("wall time a simulated second", fontsize=9, loc="left")
+        ax.annotate(
+            f"asked: {100 * error_requested:.3g} %", (1.0, error_requested), (-6, 4), xycoords=("axes fraction", "data"),
+            textcoords="offset points", ha="right", fontsize=9, color=MUTED_COLOUR,
+        )  # fmt: skip
+        draw_legend(
+            page, {solver: looks[solver]._replace(dash="") for solver in dict.fromkeys(p.solver for p in points)}
+        )
+        draw_notes(page, words)
+    return sheet_paths(stem)
+
+
+def _describe_candidate(point: CandidatePoint, best: CandidatePoint | None = None) -> str:
+    times = (
+        f", {format_quantity(point.seconds_per_simulated_second / best.seconds_per_simulated_second)} times as long"
+        if best
+        else ""
+    )
+    return f"{point.description}: an error of {100 * point.error:.2g} % for {format_duration(point.seconds_per_simulated_second)} a simulated second{times}"

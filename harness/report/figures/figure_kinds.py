@@ -1,0 +1,185 @@
+"""Kinds of figures: the rows that each needs, its panels, and how they are prepared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from springbench.harness.config.sweep_config import REPORT_TABLE
+from springbench.harness.errors import InputError, InputMistake, RunFailed, SpringbenchError, suggest_name
+from springbench.harness.report.figures import (
+    ablation_panels,
+    accuracy_panels,
+    benchmark_panels,
+    engine_panels,
+    mesh_panels,
+    robustness_panels,
+    timing_panels,
+    winner_panels,
+)
+from springbench.harness.report.figures.figure_panels import CellMap, FigurePanel, MeshPicture
+from springbench.harness.report.figures.panel_selection import PanelEntry, entries_from_panels
+from springbench.solvers.plugins.plugin_discovery import load_target
+
+
+class FigureKind(NamedTuple):
+    """A kind of figure.
+
+    Attributes:
+        title: title of the figure.
+        required_rows: description of the rows that it is drawn from.
+        list_panels: returns the panels of a folder of results by name, given a function that finds stale runs.
+        default_panels: selectors that apply if the command line gives none.
+        prepare_panels: builds the panels from the selected entries.
+    """
+
+    title: str
+    required_rows: str
+    list_panels: Callable[[Path, timing_panels.StaleFinder], list[PanelEntry]]
+    default_panels: tuple[tuple[str, ...], ...] = ((),)
+    prepare_panels: Callable[[Sequence[PanelEntry]], list[FigurePanel]] = lambda entries: [
+        entry.build_panel() for entry in entries
+    ]
+
+
+def _align_mesh_pictures(entries: Sequence[PanelEntry]) -> list[FigurePanel]:
+    pictures = [panel for panel in (entry.build_panel() for entry in entries) if isinstance(panel, MeshPicture)]
+    return [
+        one
+        for _, of in groupby(pictures, lambda picture: picture.subject)
+        for one in mesh_panels.align_pictures(list(of))
+    ]
+
+
+def _prepare_scene_sheet(entries: Sequence[PanelEntry]) -> list[FigurePanel]:
+    return [
+        *mesh_panels.build_scene_sheet(
+            [panel for panel in (e.build_panel() for e in entries) if isinstance(panel, MeshPicture)]
+        )
+    ]
+
+
+def _merge_cell_maps(entries: Sequence[PanelEntry]) -> list[FigurePanel]:
+    """Merge the families of hard cases into one map."""
+    panels = [entry.build_panel() for entry in entries]
+    grids = [panel for panel in panels if isinstance(panel, CellMap)]
+    rest = [panel for panel in panels if not isinstance(panel, CellMap)]
+    return [*rest, *([robustness_panels.merge_cell_maps(grids)] if grids else [])]
+
+
+def _without_stale(
+    panels: Callable[[Path], list[PanelEntry]],
+) -> Callable[[Path, timing_panels.StaleFinder], list[PanelEntry]]:
+    def read(folder: Path, older: timing_panels.StaleFinder) -> list[PanelEntry]:
+        return panels(folder)
+
+    return read
+
+
+_ACCURACY_ROWS, _SWEEP_ROWS = accuracy_panels.REQUIRED_ROWS, "rows of `springbench run CONFIG`"
+_GAP_PANELS = (("gap", "time"), ("gap", "iterations"))
+_PROFILE_PANELS = tuple(("performance", gap) for gap in ("1e-1", "1e-3", "1e-6"))
+
+FIGURE_KINDS: dict[str, FigureKind] = {
+    "convergence": FigureKind(
+        "Convergence", _ACCURACY_ROWS, _without_stale(accuracy_panels.convergence_panels), _GAP_PANELS
+    ),
+    "times": FigureKind(
+        "Time to accuracy",
+        _ACCURACY_ROWS,
+        _without_stale(accuracy_panels.time_to_accuracy_panels),
+        (("alone",), ("over-1",)),
+    ),
+    "winners": FigureKind("The cheapest way to an error", _ACCURACY_ROWS, _without_stale(winner_panels.winner_panels)),
+    "engines": FigureKind(
+        "Outside engines beside ours", f"{_ACCURACY_ROWS}, with engines", _without_stale(engine_panels.engine_panels)
+    ),
+    "work": FigureKind("Work and precision", _ACCURACY_ROWS, _without_stale(accuracy_panels.work_precision_panels)),
+    "profiles": FigureKind("Profiles", _ACCURACY_ROWS, _without_stale(accuracy_panels.profile_panels), _PROFILE_PANELS),
+    "growth": FigureKind("Growth with size", _ACCURACY_ROWS, _without_stale(accuracy_panels.scaling_panels)),
+    "liu2013": FigureKind(
+        "Liu et al. 2013, reproduced",
+        f"{_ACCURACY_ROWS}, of liu2013.yaml",
+        _without_stale(accuracy_panels.liu2013_panels),
+    ),
+    "timing": FigureKind("Time a step", _SWEEP_ROWS, timing_panels.timing_panels, (("step",), ("prepare",))),
+    "hard": FigureKind(
+        "Hard cases",
+        f"{_SWEEP_ROWS} with `judge: true`",
+        robustness_panels.robustness_panels,
+        (("shares",),),
+        _merge_cell_maps,
+    ),
+    "ablation": FigureKind(
+        "What effects cost", "rows of `springbench ablate SCENE`", _without_stale(ablation_panels.effect_cost_panels)
+    ),
+    "prices": FigureKind(
+        "The price of effects",
+        "rows of `springbench ablate SCENE --all-solvers`",
+        _without_stale(ablation_panels.overhead_panels),
+        (("map",),),
+    ),
+    "speed": FigureKind(
+        "Speed",
+        "rows of `springbench speed CONFIG`",
+        _without_stale(timing_panels.speed_panels),
+        (("step",), ("global",)),
+    ),
+    "run": FigureKind(
+        "The mesh at the end",
+        f"{_SWEEP_ROWS} with recordings",
+        _without_stale(mesh_panels.last_frame_panels),
+        prepare_panels=_align_mesh_pictures,
+    ),
+    "comparison": FigureKind(
+        "Solvers side by side",
+        f"{_SWEEP_ROWS} with recordings",
+        _without_stale(mesh_panels.solver_comparison_panels),
+        prepare_panels=_align_mesh_pictures,
+    ),
+    "scenes": FigureKind(
+        "Scenes at their end",
+        f"{_SWEEP_ROWS} with recordings",
+        _without_stale(mesh_panels.scene_panels),
+        prepare_panels=_prepare_scene_sheet,
+    ),
+    "history": FigureKind(
+        "Results of a gate, by commit",
+        benchmark_panels.REQUIRED_RESULTS,
+        _without_stale(benchmark_panels.benchmark_panels),
+    ),
+}
+
+
+def find_figure_kind(name: str) -> FigureKind:
+    """Find the kind of figure with this name.
+
+    An installed report with a `panels` attribute is a kind too.
+
+    Raises:
+        InputError: if there is no such kind.
+    """
+    if name in FIGURE_KINDS:
+        return FIGURE_KINDS[name]
+    known = {*FIGURE_KINDS, *(other for other in REPORT_TABLE if other not in REPORT_TABLE.builtin_tables[0])}
+    if name not in known:
+        raise InputError(InputMistake(f"came {name!r}; wanted {suggest_name(name, known)}", key="KIND"))
+    report: Any = load_target(REPORT_TABLE[name])
+    if not callable(getattr(report, "panels", None)):
+        why = f"the report {name!r} draws no figure; wanted one that has `panels(rows)`, which returns panels"
+        raise InputError(InputMistake(why, key="KIND"))
+    return FigureKind(name, _SWEEP_ROWS, _without_stale(partial(_plugin_entries, name, report)))
+
+
+def _plugin_entries(name: str, report: Any, folder: Path) -> list[PanelEntry]:
+    table = timing_panels.read_sweep_rows(folder)
+    try:
+        panels: Iterable[FigurePanel] = report.panels(table)
+        return entries_from_panels(panels)
+    except (SpringbenchError, OSError):
+        raise
+    except Exception as error:  # it is somebody's own
+        raise RunFailed(f"the report {name} failed: {type(error).__name__}: {error}") from error

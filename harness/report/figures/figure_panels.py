@@ -1,0 +1,219 @@
+"""Panels of a figure as plain data: plots, cell maps and mesh pictures.
+
+The same panel is drawn, written as CSV, and reproduced by the script next to the CSV file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.harness.report.plot_style import SeriesStyle
+
+FloatArray = NDArray[np.float64]
+CsvRow = dict[str, str | float | int | bool]
+
+
+class AxisScale(NamedTuple):
+    """An axis.
+
+    Attributes:
+        label: quantity with its unit.
+        division: scale of the axis; `sizes` is `log` with a tick at each value.
+        tick_format: format of the tick labels.
+        place_names: names of the positions 0, 1, ... if `division` is `names`.
+    """
+
+    label: str
+    division: Literal["log", "sizes", "linear", "iterations", "names"] = "log"
+    tick_format: Literal["power", "time", "plain", "percent", "strain"] = "plain"
+    place_names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CurveSeries:
+    """One curve: ordered points x, y (k,); nan is a gap.
+
+    Attributes:
+        lower, upper: interval (k,) of y, or of x if `is_horizontal`.
+        stale: which points (k,) other code measured; they are drawn hollow.
+        is_stepped: whether the curve is constant between points.
+        is_connected: whether a line connects the points.
+        labels_points: whether `label` is drawn at each point.
+        setting: distinguishes curves of the same label in the data.
+        marker_scale: marker size relative to other curves.
+    """
+
+    label: str
+    style: SeriesStyle
+    x: FloatArray
+    y: FloatArray
+    lower: FloatArray | None = None
+    upper: FloatArray | None = None
+    is_horizontal: bool = False
+    stale: NDArray[np.bool_] | None = None
+    is_stepped: bool = False
+    is_connected: bool = True
+    labels_points: bool = False
+    setting: str = ""
+    marker_scale: float = 1.0
+
+
+class ShadedBand(NamedTuple):
+    """A shaded range of y, and its meaning."""
+
+    low: float
+    high: float
+    label: str
+
+
+class MarkedValue(NamedTuple):
+    """A value of y that a line marks, and its meaning."""
+
+    y: float
+    label: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CurvePlot:
+    """Curves in one frame.
+
+    Attributes:
+        group: parts of the name that identify the measurement, such as scene and size.
+        name: parts of the name that identify the panel within the group; `--panels` selects by group and name.
+        subject, title: the same in words.
+        notes: sentences at the foot of the figure.
+        machine_words: provenance of the data.
+    """
+
+    group: tuple[str, ...]
+    name: tuple[str, ...]
+    subject: str
+    title: str
+    x: AxisScale
+    y: AxisScale
+    series: Sequence[CurveSeries]
+    bands: Sequence[ShadedBand] = ()
+    lines: Sequence[MarkedValue] = ()
+    notes: Sequence[str] = ()
+    machine_words: str = ""
+    aspect: float = 0.72
+    """Height / width of the frame."""
+
+    def csv_rows(self) -> list[CsvRow]:
+        """Return the data as rows of a CSV file, all with the same keys."""
+        return [row for series in self.series for row in _series_rows(":".join((*self.group, *self.name)), series)]
+
+
+class MapCell(NamedTuple):
+    """One cell of a map: row, column, outcome, colour and value.
+
+    `is_stale` states whether other code measured it.
+    """
+
+    row: str
+    column: str
+    outcome: str
+    color: str
+    value_text: str
+    is_stale: bool = False
+
+
+def describe_stale_cells(cells: Sequence[MapCell]) -> list[str]:
+    """Describe the dots in cells; there are no dots if other code measured all cells."""
+    if cells and all(cell.is_stale for cell in cells):
+        return ["Measured by other code than today's."]
+    return ["Dot: measured by other code than today's."] if any(cell.is_stale for cell in cells) else []
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CellMap:
+    """Coloured cells in rows and columns.
+
+    `outcomes` are pairs of meaning and colour, in the order of the legend.
+    """
+
+    group: tuple[str, ...]
+    name: tuple[str, ...]
+    subject: str
+    title: str
+    cells: Sequence[MapCell]
+    outcomes: Sequence[tuple[str, str]]
+    notes: Sequence[str] = ()
+    machine_words: str = ""
+
+    def csv_rows(self) -> list[CsvRow]:
+        """Return the data as rows of a CSV file."""
+        return [{"panel": ":".join((*self.group, *self.name)), **cell._asdict()} for cell in self.cells]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeshPicture:
+    """A rendered mesh.
+
+    Attributes:
+        p: vertex positions (n, 3) [m].
+        springs: vertex indices (m, 2); drawn if there are no triangles.
+        triangles: vertex indices (f, 3).
+        strain: strain of each vertex (n,).
+        strain_limit: end of the strain scale.
+        aspect: width / height of the picture.
+        render: returns the pixels, given width [pixels] and background.
+    """
+
+    group: tuple[str, ...]
+    name: tuple[str, ...]
+    subject: str
+    title: str
+    p: FloatArray
+    springs: NDArray[np.int64]
+    triangles: NDArray[np.int64]
+    strain: FloatArray
+    strain_limit: float
+    aspect: float
+    render: MeshRenderer
+    facts: Sequence[str] = ()
+    style: SeriesStyle | None = None
+    notes: Sequence[str] = ()
+    machine_words: str = ""
+    mesh: str = field(default="")
+
+    def csv_rows(self) -> list[CsvRow]:
+        """Return the vertices as rows of a CSV file."""
+        panel = ":".join((*self.group, *self.name))
+        table = zip(*self.p.T.tolist(), self.strain.tolist(), strict=True)
+        return [{"panel": panel, "x": x, "y": y, "z": z, "strain": e} for x, y, z, e in table]
+
+
+class MeshRenderer:
+    """Draws a picture at a width [pixels] on a background colour, or transparently for None."""
+
+    def __call__(self, width: int, background: str | None) -> NDArray[np.uint8]:
+        """Return the pixels (height, width, 3 or 4)."""
+        raise NotImplementedError
+
+
+FigurePanel = CurvePlot | CellMap | MeshPicture
+
+
+def _series_rows(panel: str, series: CurveSeries) -> list[CsvRow]:
+    nothing = np.full(len(series.x), np.nan)
+    low, high = (nothing if end is None else end for end in (series.lower, series.upper))
+    older = np.zeros(len(series.x), bool) if series.stale is None else series.stale
+    table = zip(series.x, series.y, low, high, older, strict=True)
+    return [
+        {
+            "panel": panel,
+            "series": series.label,
+            "setting": series.setting,
+            "x": float(x),
+            "y": float(y),
+            "low": float(a),
+            "high": float(b),
+            "other_code": bool(old),
+        }
+        for x, y, a, b, old in table
+    ]

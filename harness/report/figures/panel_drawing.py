@@ -1,0 +1,199 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs do not type most keywords.
+"""Drawing of panels in their frames: curves, cells, pictures.
+
+Sizes are in points of the printed figure.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
+from matplotlib.transforms import ScaledTranslation
+from springbench.harness.report.accuracy.plot_sheet import marker_scale as enlarged
+from springbench.harness.report.figures.axis_scales import frame_size_points, set_axis_scales
+from springbench.harness.report.figures.figure_options import FigureOptions
+from springbench.harness.report.figures.figure_panels import CellMap, CurvePlot, CurveSeries, FloatArray, MeshPicture
+from springbench.harness.report.plot_style import MUTED_COLOUR, RULE_COLOUR, TEXT_COLOUR, SeriesStyle
+
+_LINE_WIDTH, _MARKER_SIZE, _MAX_MARKERS = 1.1, 3.6, 12
+"""Width of curves and size of markers [points]; curves of at most this many points get a marker at each."""
+_DOT_INSET = 2.2
+"""Distance from a cell's corner to the dot in it [points]."""
+RASTER_DPI = 300
+"""Resolution of images in vector formats [dots per inch]."""
+
+
+def draw_curve_plot(ax: Axes, panel: CurvePlot, options: FigureOptions) -> None:
+    """Draw curves with their intervals, shaded bands and lines at marked values.
+
+    Args:
+        ax: axes.
+        panel: panel to draw.
+        options: options of the figure.
+    """
+    set_axis_scales(ax, panel)
+    for band in panel.bands:
+        low, high = max(band.low, ax.get_ylim()[0]), min(band.high, ax.get_ylim()[1])
+        if low < high:
+            ax.axhspan(low, high, color=RULE_COLOUR, alpha=0.7, linewidth=0, zorder=0.5)
+    for marked in panel.lines:
+        ax.axhline(marked.y, color=MUTED_COLOUR, linewidth=0.6, linestyle=(0, (4, 2.5)), zorder=1)
+        place: Any = {"xycoords": ("axes fraction", "data"), "xytext": (-1, 2), "textcoords": "offset points"}
+        ax.annotate(
+            marked.label, (1.0, marked.y), ha="right", fontsize=options.small_font_size, color=MUTED_COLOUR, **place
+        )
+    if panel.x.division == "linear" and ax.get_xlim()[0] < 0.0 < ax.get_xlim()[1]:
+        ax.axvline(0.0, color=MUTED_COLOUR, linewidth=0.5, zorder=1)
+    for series in panel.series:
+        _draw_curve(ax, series)
+    ax.grid(axis="x" if panel.y.division == "names" else "y", linewidth=0.4)
+    ax.set_axisbelow(True)
+    ax.set_xlabel(panel.x.label, loc="left", fontsize=options.small_font_size, labelpad=2)
+
+
+def _draw_curve(ax: Axes, series: CurveSeries) -> None:
+    look = series.style
+    how: Any = {"drawstyle": "steps-post"} if series.is_stepped else {}
+    if series.lower is not None and series.upper is not None:
+        _draw_interval(ax, series, series.lower, series.upper)
+    if series.is_connected and len(series.x) > 1:
+        ax.plot(
+            series.x, series.y, color=look.color, linestyle=look.dash, linewidth=_LINE_WIDTH, label=series.label, **how
+        )
+    older = np.zeros(len(series.x), bool) if series.stale is None else series.stale
+    many = series.is_connected and len(series.x) > _MAX_MARKERS
+    for chosen, hollow in ((~older, False), (older, True)):
+        if chosen.any():
+            (marks,) = ax.plot(
+                series.x[chosen],
+                series.y[chosen],
+                linestyle="none",
+                **marker_style(look, series.marker_scale, is_stale=hollow),
+            )
+            if series.is_stepped:
+                marks.set_markevery((0.1, 0.3))  # a step is no measurement: marks but tell the curves apart
+            elif many:
+                marks.set_markevery(0.14)
+
+
+def marker_style(style: SeriesStyle, marker_scale: float = 1.0, *, is_stale: bool = False) -> dict[str, Any]:
+    """Return the style of a solver's marker.
+
+    Args:
+        style: style of the solver.
+        marker_scale: size relative to other markers.
+        is_stale: whether other code measured it; such markers are hollow.
+    """
+    face = "white" if is_stale else style.color
+    edge, width = (style.color, 0.9) if is_stale else ("white", 0.35)
+    size = marker_scale * _MARKER_SIZE * enlarged(style)
+    return {
+        "marker": style.marker,
+        "color": style.color,
+        "ms": size,
+        "mfc": face,
+        "mec": edge,
+        "mew": width,
+        "zorder": 3,
+    }
+
+
+def _draw_interval(ax: Axes, series: CurveSeries, low: FloatArray, high: FloatArray) -> None:
+    color = series.style.color
+    if series.is_horizontal and series.is_connected:
+        ax.fill_betweenx(series.y, low, high, color=color, alpha=0.18, linewidth=0)
+    elif series.is_connected and len(series.x) > 1:
+        ax.fill_between(series.x, low, high, color=color, alpha=0.18, linewidth=0)
+    elif series.is_horizontal:
+        ax.hlines(series.y, low, high, color=color, alpha=0.6, linewidth=1.0)
+    else:
+        ax.vlines(series.x, low, high, color=color, alpha=0.6, linewidth=1.0)
+
+
+def legend_handle(series: CurveSeries) -> Line2D:
+    """Build a curve's entry in the legend."""
+    look = series.style
+    line = "none" if not series.is_connected else look.dash
+    return Line2D([], [], linestyle=line, linewidth=_LINE_WIDTH, label=series.label, **marker_style(look))
+
+
+def draw_cell_map(ax: Axes, panel: CellMap, options: FigureOptions) -> None:
+    """Draw the cells of a map with row and column names.
+
+    Row names are at the left, column names above. Cells measured by other code have a dot in the corner, unless that
+    holds for all.
+
+    Args:
+        ax: axes.
+        panel: map to draw.
+        options: options of the figure.
+    """
+    rows, columns = cell_map_names(panel)
+    ax.set_xlim(0, len(columns))
+    ax.set_ylim(len(rows), 0)
+    for spine in ax.spines.values():
+        spine.set_visible(False)
+    mixed = not all(cell.is_stale for cell in panel.cells)
+    corner = ax.transData + ScaledTranslation(_DOT_INSET / 72.0, -_DOT_INSET / 72.0, ax.figure.dpi_scale_trans)
+    for cell in panel.cells:
+        x, y = columns.index(cell.column), rows.index(cell.row)
+        ax.add_patch(Rectangle((x + 0.04, y + 0.06), 0.92, 0.88, facecolor=cell.color, linewidth=0))
+        if cell.is_stale and mixed:
+            ax.plot(x + 0.04, y + 0.06, "o", mfc="white", mec=TEXT_COLOUR, ms=2.6, mew=0.7, zorder=4, transform=corner)
+    ax.set_yticks(np.arange(len(rows)) + 0.5, rows, fontsize=options.small_font_size)
+    ax.set_xticks(np.arange(len(columns)) + 0.5, columns, fontsize=options.small_font_size, rotation=90)
+    ax.tick_params(length=0, pad=2, labeltop=True, labelbottom=False, labelcolor=TEXT_COLOUR)
+
+
+def write_cell_values(ax: Axes, panel: CellMap, options: FigureOptions) -> None:
+    """Write the values of all cells if the longest one fits.
+
+    The frame must have its final size.
+    """
+    rows, columns = cell_map_names(panel)
+    longest = max((len(cell.value_text) for cell in panel.cells), default=0)
+    width, _ = frame_size_points(ax)
+    if longest and longest * 0.64 * options.small_font_size < 0.9 * width / len(columns):
+        for cell in panel.cells:
+            at = columns.index(cell.column) + 0.5, rows.index(cell.row) + 0.53
+            ax.text(
+                *at,
+                cell.value_text,
+                ha="center",
+                va="center",
+                fontsize=options.small_font_size,
+                color=contrasting_text_colour(cell.color),
+            )
+
+
+def cell_map_names(panel: CellMap) -> tuple[list[str], list[str]]:
+    """Return the names of rows and of columns, in their order."""
+    return list(dict.fromkeys(c.row for c in panel.cells)), list(dict.fromkeys(c.column for c in panel.cells))
+
+
+def contrasting_text_colour(color: str) -> str:
+    """Return a text colour that is readable on the given colour."""
+    red, green, blue = to_rgb(color)
+    return TEXT_COLOUR if 0.3 * red + 0.6 * green + 0.1 * blue > 0.47 else "white"
+
+
+def draw_mesh_picture(ax: Axes, panel: MeshPicture, options: FigureOptions, width: float) -> None:
+    """Draw the mesh, rendered at the resolution of its place in print.
+
+    Args:
+        ax: axes.
+        panel: picture to draw.
+        options: options of the figure.
+        width: width of the place [inches].
+    """
+    ax.imshow(
+        panel.render(round(width * RASTER_DPI), None if options.is_transparent else "white"),
+        interpolation="antialiased",
+    )
+    ax.set_axis_off()

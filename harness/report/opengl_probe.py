@@ -1,0 +1,66 @@
+"""Check whether this process can draw with OpenGL.
+
+VTK crashes with a segmentation fault where the system has no OpenGL libraries, so a child process tries first.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from functools import cache
+
+from springbench.harness.errors import RunFailed
+
+_PROBE_SCRIPT = """
+from vtkmodules.vtkRenderingCore import vtkRenderWindow
+import vtkmodules.vtkRenderingOpenGL2
+window = vtkRenderWindow()
+window.SetOffScreenRendering(1)
+window.SetSize(8, 8)
+window.Render()
+raise SystemExit(not window.SupportsOpenGL())
+"""
+_PROBE_TIMEOUT = 60
+
+_PROBES = list["subprocess.Popen[bytes]"]()
+"""The child process of the probe, if it was started."""
+
+
+def start_opengl_probe() -> None:
+    """Start the probe in the background."""
+    if _PROBES or find_opengl_problem.cache_info().currsize:
+        return
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+    nowhere = subprocess.DEVNULL
+    _PROBES.append(subprocess.Popen([sys.executable, "-c", _PROBE_SCRIPT], stdout=nowhere, stderr=nowhere))
+
+
+@cache
+def find_opengl_problem() -> str | None:
+    """Return why scenes cannot be drawn and how to fix it; None if drawing works.
+
+    Without a display VTK is configured to draw through EGL. The result is computed once per process.
+    """
+    start_opengl_probe()
+    child = _PROBES.pop()
+    try:
+        ended = f"exit code {child.wait(_PROBE_TIMEOUT)}"
+    except subprocess.TimeoutExpired:
+        child.kill()
+        child.wait()
+        ended = f"no answer within {_PROBE_TIMEOUT} s"
+    if child.returncode == 0:
+        return None
+    return (
+        f"pictures need OpenGL, and a trial drawing failed ({ended}); on Debian and Ubuntu install it with "
+        "`apt-get install libegl1 libgl1-mesa-dri` (no display is needed)"
+    )
+
+
+def require_opengl() -> None:
+    """Raise RunFailed, with the command that installs what is missing, if OpenGL cannot draw."""
+    message = find_opengl_problem()
+    if message is not None:
+        raise RunFailed(message)

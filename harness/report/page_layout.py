@@ -1,0 +1,185 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs do not type most keywords.
+"""Layout of a picture: title, strain scale, text and images at pixel positions.
+
+The page has PAGE_WIDTH x PAGE_HEIGHT pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+from matplotlib.ticker import FuncFormatter
+from numpy.typing import NDArray
+from PIL import Image
+from springbench.harness.atomic_files import atomic_write
+from springbench.harness.recording.recorder_interface import RecordingReplay
+from springbench.harness.recording.strain_shading import PIN_COLOUR, format_percent
+from springbench.harness.report.plot_style import (
+    BACKGROUND_COLOUR,
+    MUTED_COLOUR,
+    PAGE_DPI,
+    PAGE_HEIGHT,
+    PAGE_WIDTH,
+    STRAIN_MAP,
+    TEXT_COLOUR,
+)
+
+
+def new_page() -> Figure:
+    """Create an empty page, to be drawn on within `matplotlib.rc_context(RC)`."""
+    page = Figure(figsize=(PAGE_WIDTH / PAGE_DPI, PAGE_HEIGHT / PAGE_DPI), dpi=PAGE_DPI, facecolor=BACKGROUND_COLOUR)
+    FigureCanvasAgg(page)
+    return page
+
+
+def draw_text(
+    page: Figure, x: float, y: float, words: str, *, size: float, color: str = TEXT_COLOUR, **text_options: Any
+) -> None:
+    """Draw text with its baseline at pixel (x, y) from the upper left corner.
+
+    Args:
+        page: figure to draw on.
+        x: distance from the left edge [pixels].
+        y: distance of the baseline from the top [pixels].
+        words: text.
+        size: font size [points].
+        color: colour of the text.
+        **text_options: further keywords of `Figure.text`.
+    """
+    page.text(x / PAGE_WIDTH, 1 - y / PAGE_HEIGHT, words, size=size, color=color, **text_options)
+
+
+def add_axes(page: Figure, left: float, top: float, width: float, height: float) -> Axes:
+    """Add axes in a rectangle given in pixels from the upper left corner."""
+    return page.add_axes(
+        (left / PAGE_WIDTH, 1 - (top + height) / PAGE_HEIGHT, width / PAGE_WIDTH, height / PAGE_HEIGHT)
+    )
+
+
+def tick_formatter(format_value: Callable[[float], str]) -> FuncFormatter:
+    """Build a tick formatter from a function that formats a value."""
+
+    def written(value: float, _: int | None) -> str:
+        return format_value(value)
+
+    return FuncFormatter(written)
+
+
+def paste_picture(page: Figure, pixels: NDArray[np.uint8], left: int, top: int) -> None:
+    """Paste a picture pixel for pixel, with its upper left corner at (left, top)."""
+    page.figimage(pixels, xo=left, yo=PAGE_HEIGHT - top - pixels.shape[0], origin="upper")
+
+
+def save_page(page: Figure, path: Path, *, used_height: float = PAGE_HEIGHT) -> None:
+    """Write the page as PNG atomically: an interrupted run leaves the whole file or none.
+
+    Args:
+        page: figure to write.
+        path: target file.
+        used_height: height that is drawn on [pixels from the top]; the empty part below is cropped.
+    Raises:
+        CannotWrite: if the file cannot be written.
+    """
+    with atomic_write(path) as partial:
+        page.savefig(partial, format="png", dpi=PAGE_DPI)
+        if used_height < PAGE_HEIGHT:
+            with Image.open(partial) as whole:
+                part = whole.crop((0, 0, PAGE_WIDTH, ceil(used_height)))
+            part.save(partial, format="png")
+
+
+def draw_header(page: Figure, headline: str, facts: Sequence[str], *, max_letters: int = 56) -> None:
+    """Draw the title in the upper left corner and a line of facts below.
+
+    The title is shortened to `max_letters`.
+    """
+    draw_text(page, 40, 50, shorten_words(headline, max_letters), size=21, weight="bold")
+    draw_text(page, 41, 82, "   ·   ".join(facts), size=11.5, color=MUTED_COLOUR)
+
+
+def draw_strain_scale(page: Figure, limit: float, ends: tuple[float, float], *, pins: bool) -> None:
+    """Draw the colour bar of strains in the upper right corner.
+
+    Ticks in percent are below it, labels above.
+
+    Args:
+        page: figure to draw on.
+        limit: strain at the ends of the bar.
+        ends: smallest and largest spring strain of all frames, stated above the bar; an end outside the bar gets an
+            arrow tip.
+        pins: whether to draw the legend entry of pinned vertices.
+    """
+    left, top, width = 1180, 50, 380
+    bar = add_axes(page, left, top, width, 12)
+    bar.imshow(np.linspace(0, 1, 512)[None], cmap=STRAIN_MAP, aspect="auto", interpolation="bilinear")
+    bar.set_axis_off()
+    for place, word, end, align in ((0.0, "compressed", ends[0], "left"), (1.0, "stretched", ends[1], "right")):
+        told = f"{word}, to {format_percent(end)}" if end else f"{word}: none"
+        draw_text(page, left + place * width, top - 8, told, size=9.5, ha=align)
+    draw_text(page, left + width / 2, top - 8, "at rest", size=9.5, ha="center")
+    for place, beyond, tip in ((0.0, ends[0] < -limit, -14), (1.0, ends[1] > limit, 14)):
+        if beyond:
+            at = left + place * width
+            corners = [(at, top), (at, top + 12), (at + tip, top + 6)]
+            shape = [(x / PAGE_WIDTH, 1 - y / PAGE_HEIGHT) for x, y in corners]
+            page.add_artist(Polygon(shape, closed=True, color=STRAIN_MAP(place), transform=page.transFigure))
+    for place in (0.0, 0.25, 0.5, 0.75, 1.0):
+        align = {0.0: "left", 1.0: "right"}.get(place, "center")
+        label = format_percent(limit * (2 * place - 1)) if place != 0.5 else "0"
+        draw_text(page, left + place * width, top + 31, label, size=9, color=MUTED_COLOUR, ha=align)
+    if pins:
+        draw_text(page, left - 40, top + 12, "pinned", size=10, ha="right")
+        draw_text(page, left - 100, top + 11, "●", size=11, color=PIN_COLOUR, ha="right")
+
+
+def scene_headline(replay: RecordingReplay) -> str:
+    """Return the scene and its size as a headline."""
+    scene, size = replay.properties.get("scene"), replay.properties.get("size")
+    if scene is None:
+        return replay.title
+    return f"{scene}, size {size}" if size else str(scene)
+
+
+def format_frame_time(replay: RecordingReplay, frame: int) -> str:
+    """Format the time of a recorded frame."""
+    return f"{replay.times[frame]:.2f} s"
+
+
+def format_count(number: int) -> str:
+    """Format an integer with thin spaces between thousands."""
+    return f"{number:,}".replace(",", "\u2009")
+
+
+def format_quantity(value: float) -> str:
+    """Format a number to three significant digits, with an exponent only from 1e7 on."""
+    if value >= 1e7:
+        return f"{value:.1e}"
+    return f"{value:.3g}" if value < 1000 else format_count(round(value))
+
+
+def format_factor(value: float) -> str:
+    """Format a ratio to two significant digits, or to an integer from 100 on."""
+    return f"{value:.2g}" if value < 100 else format_quantity(value)
+
+
+def shorten_words(words: str, limit: int) -> str:
+    """Shorten text to `limit` characters, with an ellipsis at the end."""
+    return words if len(words) <= limit else words[: limit - 1].rstrip() + "…"
+
+
+def format_time_step(dt: float) -> str:
+    """Format a time step [s], such as 1/30 s.
+
+    It is given in milliseconds if it is not the inverse of an integer.
+    """
+    whole = round(1 / dt)
+    return f"1/{whole} s" if abs(whole * dt - 1) < 1e-9 else f"{1e3 * dt:.3g} ms"

@@ -1,0 +1,249 @@
+"""Visual style of all pictures: page size, colours, strain scale, solver styles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
+from hashlib import sha256
+from typing import Any, NamedTuple
+
+from matplotlib.colors import LinearSegmentedColormap, to_hex, to_rgb
+from springbench.harness.recording.strain_shading import STRAIN_COLOURS
+from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS, find_solver_info, load_target
+
+PAGE_WIDTH, PAGE_HEIGHT, PAGE_DPI = 1600, 900, 100
+"""Size of every picture [pixels], and the dots per inch that convert it into the size of a Matplotlib figure."""
+
+BACKGROUND_COLOUR, TEXT_COLOUR, MUTED_COLOUR, RULE_COLOUR = "#fcfbf9", "#23262b", "#6c7078", "#dcdad5"
+"""Colours of background, text, secondary text and hairlines."""
+
+STALE_NOTE = "Hollow marks: measured by other code than today's."
+"""Meaning of hollow marks in all pictures; the results page defines its own relative to the newest rows."""
+
+WARNING_COLOUR = "#b3261e"
+"""Colour of text that a reader must not miss."""
+
+SLOWER_COLOUR, FASTER_COLOUR = WARNING_COLOUR, "#1b7f5c"
+"""Colours of benchmark changes."""
+
+STRAIN_MAP = LinearSegmentedColormap.from_list("strain", STRAIN_COLOURS, N=512)
+"""Colour map of strains in recordings, from -strain_range to strain_range."""
+
+PAGE_RC: Any = {
+    "font.family": "DejaVu Sans",
+    "font.size": 10,
+    "text.color": TEXT_COLOUR,
+    "figure.facecolor": BACKGROUND_COLOUR,
+    "axes.facecolor": BACKGROUND_COLOUR,
+    "axes.edgecolor": MUTED_COLOUR,
+    "axes.labelcolor": MUTED_COLOUR,
+    "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.color": MUTED_COLOUR,
+    "ytick.color": MUTED_COLOUR,
+    "grid.color": RULE_COLOUR,
+    "grid.linewidth": 0.8,
+}
+
+
+class SeriesStyle(NamedTuple):
+    """Style of one solver: a colour, a Matplotlib marker and a Matplotlib line style."""
+
+    color: str
+    marker: Any
+    dash: Any = "-"
+
+
+DASHED_LINE, DOTTED_LINE, DASH_DOTTED_LINE = (0, (5, 2)), (0, (1, 1.6)), (0, (6, 2, 1, 2))
+_LINE_STYLES = ("-", DASHED_LINE, DOTTED_LINE, DASH_DOTTED_LINE)
+
+STAR_MARKERS: tuple[Any, ...] = ((4, 1, 0), (6, 1, 0), (3, 1, 0), (8, 1, 0), (3, 1, 180))
+"""Stars with four, six, three, eight and three points, the last upside down."""
+CORNER_MARKERS: tuple[Any, ...] = ((3, 0, 45), (3, 0, -45), (3, 0, 135), (3, 0, -135))
+"""Triangles that point to the upper left, upper right, lower left and lower right."""
+HOURGLASS_MARKER: Any = ((-1, 1), (1, 1), (-1, -1), (1, -1), (-1, 1))
+BOWTIE_MARKER: Any = ((-1, -1), (-1, 1), (1, -1), (1, 1), (-1, -1))
+"""Two triangles that touch at their tips, one above the other and side by side."""
+LOZENGE_MARKER: Any = ((-1, 0), (0, 0.5), (1, 0), (0, -0.5), (-1, 0))
+"""A diamond, wider than high."""
+ARROWHEAD_MARKER: Any = ((0, 1), (0.9, -0.8), (0, -0.25), (-0.9, -0.8), (0, 1))
+"""A triangle that points up, with a notch below."""
+ARROW_BAR_MARKERS: tuple[Any, ...] = (
+    ((-0.9, 1), (0.9, 1), (0.9, 0.6), (0.2, 0.6), (0.9, -0.9), (-0.9, -0.9), (-0.2, 0.6), (-0.9, 0.6), (-0.9, 1)),
+    ((-0.9, -1), (0.9, -1), (0.9, -0.6), (0.2, -0.6), (0.9, 0.9), (-0.9, 0.9), (-0.2, -0.6), (-0.9, -0.6), (-0.9, -1)),
+)
+"""Triangles that point up and down, with a bar at the tip."""
+CHEVRON_MARKER: Any = ((-1, -0.7), (0, 0.1), (1, -0.7), (1, 0), (0, 0.8), (-1, 0), (-1, -0.7))
+"""A broad chevron that points up."""
+SPEARHEAD_MARKERS: tuple[Any, ...] = (
+    ((1, 0), (-1, 0.5), (-1, -0.5), (1, 0)),
+    ((-1, 0), (1, 0.5), (1, -0.5), (-1, 0)),
+    ((0, -1), (0.5, 1), (-0.5, 1), (0, -1)),
+    ((0, 1), (0.5, -1), (-0.5, -1), (0, 1)),
+)
+"""Slim triangles that point right, left, down and up."""
+_ALL_MARKERS: tuple[Any, ...] = (
+    "s",
+    "o",
+    "D",
+    "^",
+    "v",
+    "P",
+    "X",
+    "p",
+    "*",
+    "<",
+    ">",
+    "h",
+    "d",
+    "H",
+    "8",
+    *STAR_MARKERS,
+    *CORNER_MARKERS,
+    HOURGLASS_MARKER,
+    BOWTIE_MARKER,
+    LOZENGE_MARKER,
+    ARROWHEAD_MARKER,
+    *ARROW_BAR_MARKERS,
+    CHEVRON_MARKER,
+    *SPEARHEAD_MARKERS,
+)
+
+# For families in the order of the registry: four colours of Okabe and Ito's palette, and six more.
+_FAMILY_COLOURS = (
+    "#0072b2",
+    "#00a878",
+    "#e69f00",
+    "#d55e00",
+    "#9a86e0",
+    "#cc79a7",
+    "#a8326e",
+    "#858585",
+    "#8a994c",
+    "#99634c",
+)
+_MEMBER_STYLES: tuple[tuple[float, Any], ...] = (
+    *((0.0, "-"), (-0.27, DASHED_LINE), (0.3, (0, (14, 2))), (0.2, DASH_DOTTED_LINE), (-0.12, (0, (1, 3)))),
+)
+"""Lightening of a family's members (darkening where negative), and their line styles."""
+_LARGE_FAMILY_STYLES: tuple[tuple[float, Any], ...] = (
+    *((0.0, "-"), (-0.3, DOTTED_LINE), (0.3, (0, (10, 3))), (-0.48, (0, (3, 1, 1, 1, 1, 1)))),
+    *((0.15, (0, (8, 2, 2, 2, 2, 2))), (-0.16, (0, (1, 3))), (0.42, (0, (12, 2, 1, 2)))),
+)
+"""Shades and line styles for families of more than five members, and for engines; other families rarely use these."""
+_VARIANT_LINE_STYLES: tuple[Any, ...] = (*_LINE_STYLES, *(dash for _, dash in _LARGE_FAMILY_STYLES[2:]))
+"""Line styles of variants that differ from a solver only in their settings."""
+_PLUGIN_COLOURS = (
+    *("#8a8a00", "#00a0a0", "#8c564b", "#4c6ef5", "#5a9e2f", "#c9506b", "#b8860b", "#6a3d9a", "#1f8a70", "#e377c2"),
+    *("#3b7a9e", "#d97b66", "#7a9a01", "#9c4f96"),
+)
+
+
+def assign_solver_styles(solvers: Iterable[str] = ()) -> dict[str, SeriesStyle]:
+    """Return the style of each solver of the registry, and of these others.
+
+    Styles are stable and distinct. The style of a solver outside the registry follows from a hash of its name. If two
+    would get the same colour, the later one in alphabetical order gets the next free colour, and if there is none, the
+    next free style.
+    """
+    looks = dict(_shipped_solver_styles((*SOLVERS, *OPTIONAL_SOLVERS)))
+    free = [
+        SeriesStyle(color, marker, dash)
+        for dash in _LINE_STYLES
+        for color in _PLUGIN_COLOURS
+        for marker in _ALL_MARKERS
+    ]
+    taken: set[str | SeriesStyle] = set()
+    for name in sorted({*SOLVERS, *OPTIONAL_SOLVERS, *solvers} - set(looks)):
+        place = int(sha256(name.encode()).hexdigest(), 16) % (len(free) // len(_LINE_STYLES))
+        order = [*free[place:], *free[:place]]
+        unused = (look for look in order if look.color not in taken)
+        looks[name] = next(unused, None) or next(look for look in order if look not in taken)
+        taken |= {looks[name].color, looks[name]}
+    return looks
+
+
+@cache
+def _shipped_solver_styles(names: tuple[str, ...]) -> dict[str, SeriesStyle]:
+    """Return the styles of the registry's solvers.
+
+    A style has the colour of the solver's family, and a marker of its own. Solvers beyond the number of markers get no
+    style here.
+    """
+    families: dict[str, list[str]] = {}
+    for name in names:
+        families.setdefault(find_solver_info(load_target((SOLVERS | OPTIONAL_SOLVERS)[name]), name).family, []).append(
+            name
+        )
+    markers = dict(zip(names, _ALL_MARKERS, strict=False))
+    return {
+        name: SeriesStyle(shade_colour(color, by), markers[name], dash)
+        for color, members in zip(_FAMILY_COLOURS, families.values(), strict=False)
+        for name, (by, dash) in zip(members, _family_member_styles(members), strict=False)
+        if name in markers
+    }
+
+
+def _family_member_styles(family: Sequence[str]) -> Sequence[tuple[float, Any]]:
+    """Return the shades and line styles of a family's members.
+
+    For engines one style is skipped: their solid light brown would look like a green of others to some readers, and
+    their darkest brown like black.
+    """
+    if not set(family) & SOLVERS.keys():
+        return *_LARGE_FAMILY_STYLES[:3], *_LARGE_FAMILY_STYLES[4:]
+    return _LARGE_FAMILY_STYLES if len(family) > len(_MEMBER_STYLES) else _MEMBER_STYLES
+
+
+def shade_colour(color: str, amount: float) -> str:
+    """Mix a colour with white, or with black if `amount` is negative."""
+    end = 1.0 if amount > 0.0 else 0.0
+    red, green, blue = ((1.0 - abs(amount)) * part + abs(amount) * end for part in to_rgb(color))
+    return to_hex((red, green, blue))
+
+
+def assign_label_styles(label_solver_pairs: Iterable[tuple[str, str]]) -> dict[str, SeriesStyle]:
+    """Assign a style to each (label, solver) pair.
+
+    All labels of a solver have its colour and marker, and the first one also its line style.
+    """
+
+    def dashed(own: SeriesStyle, k: int) -> SeriesStyle:
+        styles = [own.dash, *(dash for dash in _VARIANT_LINE_STYLES if dash != own.dash)]
+        return own._replace(dash=styles[k % len(styles)])
+
+    return _assign_variants(label_solver_pairs, dashed)
+
+
+def assign_label_shades(label_solver_pairs: Iterable[tuple[str, str]]) -> dict[str, SeriesStyle]:
+    """Assign a shade to each (label, solver) pair, for charts without line styles.
+
+    The first label has its solver's colour, the others have lighter and darker shades of it.
+    """
+
+    def shaded(own: SeriesStyle, k: int) -> SeriesStyle:
+        step = 0.22 * ((k + 1) // 2) * (1.0 if k % 2 else -1.0)
+        return own._replace(color=shade_colour(own.color, max(-0.7, min(step, 0.7))) if k else own.color)
+
+    return _assign_variants(label_solver_pairs, shaded)
+
+
+def _assign_variants(
+    label_solver_pairs: Iterable[tuple[str, str]], vary: Callable[[SeriesStyle, int], SeriesStyle]
+) -> dict[str, SeriesStyle]:
+    pairs = sorted(set(label_solver_pairs))
+    own, found = assign_solver_styles(solver for _, solver in pairs), dict[str, SeriesStyle]()
+    for solver, mark in own.items():
+        labels = [label for label, its in pairs if its == solver]
+        found |= {label: vary(mark, k) for k, label in enumerate(labels)}
+    return found
+
+
+def indexed_style(number: int) -> SeriesStyle:
+    """Return the style of something that is not a solver, by its index.
+
+    There are 64 styles from index 0 on, the first 8 in distinct colours.
+    """
+    # The marker is shifted by one with each pass through the colours.
+    return SeriesStyle(_FAMILY_COLOURS[number % 8], _ALL_MARKERS[(number + number // 8) % 8], (0, (3, 1.2)))

@@ -1,0 +1,65 @@
+"""Provenance of rows in words: code version and machine, for pictures, figures and the page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from matplotlib.figure import Figure
+from springbench.harness.recording.recorder_interface import RecordingReplay
+from springbench.harness.report.page_layout import draw_text, shorten_words
+from springbench.harness.report.plot_style import MUTED_COLOUR, PAGE_WIDTH
+
+_DIRTY_SUFFIX = "-dirty"
+PROVENANCE_COLUMNS = ("cpu", "threads", "commit", "code")
+"""The columns that `describe_provenance` reads."""
+
+
+def abbreviate_commit(commit: str) -> str:
+    """Abbreviate a commit.
+
+    A suffix marks modified files, because no checkout contains the code that was run.
+    """
+    return f"{commit:.7}{_DIRTY_SUFFIX if commit.endswith(_DIRTY_SUFFIX) else ''}"
+
+
+def describe_commits(values: Iterable[object]) -> list[str]:
+    """Return the common commit in words, or the number of commits.
+
+    The result is empty if none is known.
+    """
+    found = sorted({str(commit) for commit in values if commit})
+    return [f"commit {abbreviate_commit(found[0])}" if len(found) == 1 else f"{len(found)} commits"] if found else []
+
+
+def describe_processors(values: Iterable[object]) -> list[str]:
+    """Describe the processors, or their number if there are more than two."""
+    found = sorted({str(cpu) for cpu in values if cpu})
+    return [shorten_words(cpu, 60) for cpu in found] if len(found) <= 2 else [f"{len(found)} kinds of processors"]
+
+
+def describe_machine_and_commit(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Describe processor and commit of rows, or of the properties of recordings."""
+    return [*describe_processors(row.get("cpu") for row in rows), *describe_commits(row.get("commit") for row in rows)]
+
+
+def describe_provenance(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Describe processor, threads, commit and source fingerprint of rows."""
+    threads, codes = (sorted({row[key] for row in rows if row.get(key)}) for key in ("threads", "code"))
+    words = [*describe_processors(row.get("cpu") for row in rows)]
+    words += [f"{', '.join(map(str, threads))} thread{'s' if threads != [1] else ''}"] if threads else []
+    words += describe_commits(row.get("commit") for row in rows)
+    words += [f"code {', '.join(codes)}" if len(codes) <= 2 else f"{len(codes)} codes"] if codes else []
+    return ", ".join(words)
+
+
+def draw_provenance(page: Figure, replays: Iterable[RecordingReplay], y: float) -> None:
+    """Draw machine and code version of recordings, right-aligned.
+
+    Args:
+        page: figure to draw on.
+        replays: recordings.
+        y: distance of the baseline from the top [pixels].
+    """
+    words = describe_machine_and_commit([replay.properties for replay in replays])
+    draw_text(page, PAGE_WIDTH - 36, y, "   ·   ".join(words), size=9, color=MUTED_COLOUR, ha="right")

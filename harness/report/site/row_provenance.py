@@ -1,0 +1,66 @@
+"""Provenance of rows for the results page: code, machine and config."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from springbench.harness.report.table_queries import query_table
+from springbench.harness.results.folder_ownership import OWNER_FILE as CLAIM
+
+_MACHINE_COLUMNS = ("machine", "cpu", "cores", "memory_gib", "system", "commit")
+
+_PROVENANCE_QUERY = f"""
+select {", ".join(f'"{name}"' for name in _MACHINE_COLUMNS)}, list(distinct code order by code), min(started), max(started),
+    count(distinct {{unit}})
+from rows_of where machine is not null group by all order by max(started) desc
+"""
+
+
+def collect_provenance(table: pa.Table, unit: str) -> list[dict[str, Any]]:
+    """Collect machines and commits of rows, the newest first.
+
+    Args:
+        table: rows.
+        unit: column whose distinct values are counted.
+    """
+    lacking = [name for name in (*_MACHINE_COLUMNS, "code", "started", unit) if name not in table.column_names]
+    for name in lacking:
+        table = table.append_column(name, pa.nulls(len(table), pa.string()))
+    names = (*_MACHINE_COLUMNS, "codes", "from", "to", "count")
+    return [dict(zip(names, row, strict=True)) for row in query_table(_PROVENANCE_QUERY.format(unit=unit), table)]
+
+
+def find_config(folder: Path) -> str:
+    """Find the config of a sweep's folder, as a path for a command line.
+
+    It is "" if the config is unknown or deleted.
+    """
+    note = folder / CLAIM
+    said = note.read_text(errors="replace").strip() if note.is_file() else ""
+    path = folder / said
+    if not said or "\0" in said or not path.is_file():
+        return ""
+    there = path.resolve()
+    for above in (Path.cwd(), *there.parents):  # as it is called from the folder that holds `configs/`
+        if there.is_relative_to(above) and (above == Path.cwd() or (above / "configs").is_dir()):
+            return there.relative_to(above).as_posix()
+    return there.name
+
+
+def find_scene_files(folder: Path) -> dict[str, str]:
+    """Find the scene files that a sweep's config lists, by scene name.
+
+    Paths are relative to the same folder as that of the config.
+    """
+    from springbench.harness.schema.yaml_loader import read_yaml
+
+    called = find_config(folder)
+    if not called:
+        return {}
+    data = read_yaml(folder / (folder / CLAIM).read_text().strip()).data
+    if "mesh" in data:
+        return {Path(called).stem: called}
+    listed = [str(scene) for scene in data.get("scenes") or ()]
+    return {Path(scene).stem: (Path(called).parent / scene).as_posix() for scene in listed}

@@ -1,0 +1,35 @@
+"""Sentences on the runs of a sweep: fastest at equal accuracy, unconverged runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from springbench.harness.report import equal_accuracy
+from springbench.harness.report.timing_table import RunTimes
+
+RunRecord = dict[str, Any]
+
+
+def describe_runs(run_records: Sequence[RunRecord]) -> list[dict[str, Any]]:
+    """Describe runs in sentences, each with the ids of its runs (`equal_accuracy`)."""
+    names = {run["run_id"]: run["label"] for run in run_records}
+    told = [
+        {"words": words, "runs": runs}
+        for compared in equal_accuracy.compare_runs(map(_to_run_times, run_records))
+        for words, runs in equal_accuracy.describe_comparison(compared, names)
+    ]
+    return told + list(_describe_unconverged(run_records))
+
+
+def _to_run_times(run: RunRecord) -> RunTimes:
+    return RunTimes(*(run["global" if name == "global_" else name] for name in RunTimes._fields))
+
+
+def _describe_unconverged(run_records: Sequence[RunRecord]) -> Iterator[dict[str, Any]]:
+    """Describe how many runs ended a step at the iteration limit."""
+    done = [run for run in run_records if run["status"] == "ok" and run["stopped"]]
+    short = [run for run in done if run["stopped"] == "iterations"]
+    if short:
+        words = f"{len(short)} of {len(done)} runs ended a step at the limit of iterations: look at residuals."
+        yield {"words": words, "runs": [short[0]["run_id"]], "filter": {"stopped": "iterations"}}

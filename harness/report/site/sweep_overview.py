@@ -1,0 +1,302 @@
+# pyright: reportUnknownMemberType=false
+# pyarrow's stubs do not type every kind of file that Parquet is written to.
+"""Data of one sweep for the results page.
+
+These are its entry in the index, and the scripts with its runs and charts.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from springbench.harness.atomic_files import atomic_write
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.report.device_speedup import summarise_table as of_devices
+from springbench.harness.report.site import (
+    ablation_charts,
+    frame_scripts,
+    robustness_chart,
+    row_provenance,
+    run_table,
+    speed_chart,
+)
+from springbench.harness.report.site.failure_causes import FailedRun, group_failures
+from springbench.harness.report.site.run_findings import describe_runs
+from springbench.harness.report.site.sweep_folders import SweepFolder, find_benchmark_files
+from springbench.harness.results import parquet_rows, row_store
+
+PrintMessage = Callable[[str], None]
+
+_MAX_PICTURES = 3
+"""Maximum number of pictures of a sweep in the overview."""
+
+_HASH_SUFFIX = re.compile(r"-[0-9a-f]{12}$")
+
+
+class SweepOverview(NamedTuple):
+    """The sweep's entry in the index (`summary`), and its other data by name (`scripts`)."""
+
+    summary: dict[str, Any]
+    scripts: dict[str, Any]
+
+
+_SectionBuilder = Callable[[SweepFolder, Path, bool, PrintMessage], "SweepOverview"]
+
+
+class _PageSection(NamedTuple):
+    """The contribution of one kind of rows to a sweep's data."""
+
+    scripts: dict[str, Any]
+    plots: list[tuple[str, str]]
+    findings: list[dict[str, Any]]
+    failures: list[dict[str, Any]]
+    row_provenance: list[dict[str, Any]]
+    summary_fields: dict[str, Any]
+
+
+def build_overview(
+    folder: SweepFolder, data_folder: Path, *, with_recordings: bool, print_message: PrintMessage
+) -> SweepOverview:
+    """Build the data of a sweep from its rows.
+
+    Args:
+        folder: folder of the sweep's results.
+        data_folder: folder of the page's data, where scripts of single runs are written.
+        with_recordings: whether meshes and recordings are converted to scripts, which takes longer.
+        print_message: prints a remark.
+    """
+    kinds = {
+        "rows": _build_run_section,
+        "accuracy": _build_accuracy_section,
+        "ablation": _build_ablation_section,
+        "gates": _build_benchmark_section,
+    }
+    there = [kind for kind in kinds if kind != "gates" and row_store.list_units(folder.path / kind)]
+    there += ["gates"] if find_benchmark_files(folder.path) else []
+    told = [_build_section(kind, kinds[kind], folder, data_folder, with_recordings, print_message) for kind in there]
+    made = [one for each in told for one in each.provenance]
+    summary: dict[str, Any] = {
+        "slug": folder.slug,
+        "name": folder.name,
+        "up": folder.relative_url,
+        "kinds": there,
+        "config": row_provenance.find_config(folder.path),
+        "scenes": row_provenance.find_scene_files(folder.path),
+        "made": made,
+        "from": min((one["from"] or "" for one in made), default=""),
+        "to": max((one["to"] or "" for one in made), default=""),
+        "plots": [{"id": name, "title": title} for each in told for name, title in each.plots],
+        "findings": [said for each in told for said in each.findings],
+        "failures": [cause for each in told for cause in each.failures],
+        "pictures": _select_pictures(folder),
+    }
+    for each in told:
+        summary |= each.summary_fields
+    return SweepOverview(summary, {name: value for each in told for name, value in each.scripts.items()})
+
+
+def _build_section(
+    kind: str,
+    read: _SectionBuilder,
+    folder: SweepFolder,
+    data_folder: Path,
+    with_recordings: bool,
+    print_message: PrintMessage,
+) -> _PageSection:
+    """Build the section of one kind of rows.
+
+    Raises:
+        InputError: if the rows are inconsistent.
+    """
+    try:
+        return read(folder, data_folder, with_recordings, print_message)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        problem = f"holds rows of the kind {kind} that do not fit together ({type(error).__name__}: {error})"
+        raise InputError(InputMistake(f"{problem}; take them out of the results", folder.path)) from error
+
+
+def _build_run_section(
+    folder: SweepFolder, data_folder: Path, with_recordings: bool, print_message: PrintMessage
+) -> _PageSection:
+    table = run_table.read_run_rows(folder, _report_skipped(print_message))
+    found = run_table.build_run_table(folder, table)
+    scripts: dict[str, Any] = {}
+    findings = [
+        {"words": words} for words in of_devices(table, row_provenance.find_config(folder.path))
+    ] + describe_runs(found)
+    if speed_chart.has_machine_limits(table):
+        scripts["speed"], said = speed_chart.build_speed_chart(table)
+        findings = [{"words": words} for words in said]
+    outcomes: dict[str, Any] = {}
+    if robustness_chart.has_verification(table):
+        scripts["hard"] = robustness_chart.build_robustness_chart(folder)
+        outcomes = robustness_chart.outcomes_by_run(scripts["hard"])
+        findings = [{"words": f"{scripts['hard']['headline']}.", "plot": "hard"}, *findings[-1:]]
+    plots = [(name, chart["title"]) for name, chart in scripts.items()]
+    _mark_recordings(folder, data_folder, found, with_recordings, print_message)
+    scripts["runs"] = run_table.build_run_script(folder, found, outcomes)
+    _write_run_parquet(data_folder / "runs.parquet", found)
+    frame_scripts.write_frame_scripts(folder, table, data_folder, _find_outdated_runs(folder, data_folder, found))
+    failed = [FailedRun(r["scene"], r["label"], r["status"], r["reason"] or "", r["run_id"]) for r in found]
+    facts = {
+        "runs": len(found),
+        "statuses": Counter(run["status"] for run in found),
+        "took": sum(run["took"] or 0.0 for run in found),
+        "solvers": sorted({run["solver"] for run in found}),
+        "sizes": sorted({run["size"] for run in found if run["size"]}),
+        "other": sum(run["by"] == "other code" for run in found),
+    }
+    bad = group_failures(one for one in failed if one.status != "ok")
+    return _PageSection(scripts, plots, findings, bad, row_provenance.collect_provenance(table, "run_id"), facts)
+
+
+def _mark_recordings(
+    folder: SweepFolder,
+    data_folder: Path,
+    run_records: Sequence[dict[str, Any]],
+    include_missing: bool,
+    print_message: PrintMessage,
+) -> None:
+    """Mark whether each run's last frame and recording are in the page's data.
+
+    With `include_missing`, missing ones are added.
+    """
+    there = {part: {path.stem for path in (data_folder / part).glob("*.js")} for part in ("meshes", "recordings")}
+    if include_missing and (recorded := {run["unit"]: run_title(run) for run in run_records if run["recording"]}):
+        from springbench.harness.report.site.mesh_scripts import write_last_frames, write_recordings
+
+        there["meshes"] = write_last_frames(folder, data_folder, list(recorded), print_message)
+        kept = {f"recordings/{unit}.rrd": words for unit, words in recorded.items()}
+        there["recordings"] = {Path(name).stem for name in write_recordings(folder, data_folder, kept)}
+    for run in run_records:
+        run |= {name: int(run["unit"] in there[part]) for name, part in (("mesh", "meshes"), ("replay", "recordings"))}
+
+
+def _find_outdated_runs(folder: SweepFolder, data_folder: Path, run_records: Sequence[dict[str, Any]]) -> list[str]:
+    """Find the runs whose script is missing or older than their rows."""
+    scripts, rows_of = _modification_times(data_folder / "runs"), _modification_times(folder.path / "rows")
+    packed = row_store.packed_path(folder.path / "rows")
+    otherwise = packed.stat().st_mtime_ns if packed.exists() else 0
+    return [r["run_id"] for r in run_records if scripts.get(r["run_id"], -1) < rows_of.get(r["unit"], otherwise)]
+
+
+def _modification_times(folder: Path) -> dict[str, int]:
+    """Return the modification time [ns] of each file in a folder by its stem."""
+    if not folder.is_dir():
+        return {}
+    with os.scandir(folder) as entries:
+        return {os.path.splitext(entry.name)[0]: entry.stat().st_mtime_ns for entry in entries}
+
+
+def _write_run_parquet(path: Path, run_records: Sequence[dict[str, Any]]) -> None:
+    """Write the table of runs as a Parquet file for other programs."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(path) as partial:
+        pq.write_table(
+            pa.Table.from_pylist([{k: v for k, v in r.items() if k != "settings"} for r in run_records]), partial
+        )
+
+
+def _build_accuracy_section(
+    folder: SweepFolder, data_folder: Path, with_recordings: bool, print_message: PrintMessage
+) -> _PageSection:
+    from springbench.harness.report.accuracy.accuracy_data import without_short_curves
+    from springbench.harness.report.accuracy.accuracy_findings import list_failures, summarise_findings
+    from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
+    from springbench.harness.report.site.accuracy_charts import build_accuracy_charts
+
+    table = read_accuracy(folder.path, on_invalid=_report_skipped(print_message))
+    scripts, facts = build_accuracy_charts(table, folder.path), dict[str, Any]()
+    if with_recordings:
+        from springbench.harness.report.site.mesh_scripts import write_recordings, write_solves
+
+        facts["solves"] = write_solves(folder, data_folder, without_short_curves(table), print_message)
+        kept = {
+            c.recording_path: f"{c.label}, {c.problem.problem_label}"
+            for c in table.curves
+            if c.recording_path in facts["solves"]
+        }
+        facts["replays"] = write_recordings(folder, data_folder, kept)
+    chapters = summarise_findings(table)
+    told = [{"words": w, "chapter": name} for name, some in chapters.items() if name != "Methods" for w in some]
+    failed = [FailedRun(row["where"], row["solver"], row["status"], row["reason"]) for row in list_failures(table)]
+    plots = [(name, chart["title"]) for name, chart in scripts.items()]
+    facts |= {"curves": len(table.curves), "works": len(table.work_points)}
+    return _PageSection(
+        scripts,
+        plots,
+        told,
+        group_failures(failed),
+        row_provenance.collect_provenance(_read_rows(folder, "accuracy"), "unit"),
+        facts,
+    )
+
+
+def _build_ablation_section(
+    folder: SweepFolder, data_folder: Path, with_recordings: bool, print_message: PrintMessage
+) -> _PageSection:
+    table = _read_rows(folder, "ablation", print_message)
+    scripts, words = ablation_charts.build_ablation_charts(table.to_pylist())
+    plots = [(name, chart["title"]) for name, chart in scripts.items()]
+    said = [{"words": f"{one}.", "chapter": "Effects"} for one in words]
+    return _PageSection(
+        dict(scripts),
+        plots,
+        said,
+        [],
+        row_provenance.collect_provenance(table, row_store.FILE_COLUMN),
+        {"ablations": len(words)},
+    )
+
+
+def _build_benchmark_section(
+    folder: SweepFolder, data_folder: Path, with_recordings: bool, print_message: PrintMessage
+) -> _PageSection:
+    from springbench.harness.report.site import benchmark_charts
+
+    known = benchmark_charts.read_benchmark_files(find_benchmark_files(folder.path), print_message)
+    scripts, found = benchmark_charts.build_benchmark_charts(known)
+    plots = [(name, chart["title"]) for name, chart in scripts.items()]
+    facts = {"gates": len({item["gate"] for chart in scripts.values() for item in chart["items"]})}
+    return _PageSection(scripts, plots, found, [], benchmark_charts.collect_provenance(known), facts)
+
+
+def _read_rows(folder: SweepFolder, kind: str, print_message: PrintMessage = lambda words: None) -> pa.Table:
+    units = row_store.list_units(folder.path / kind)
+    return parquet_rows.read_rows(
+        units, pa.schema([]), with_unit_names=True, promote="permissive", on_invalid=_report_skipped(print_message)
+    )
+
+
+def _report_skipped(print_message: PrintMessage) -> Callable[[InputMistake], None]:
+    """Return a function that prints a remark on each skipped unit of rows."""
+    return lambda mistake: print_message(f"not on the page: {mistake}")
+
+
+def run_title(run: dict[str, Any]) -> str:
+    """Return the scene, size and label of a run."""
+    return f"{run['scene']}{' ' + str(run['size']) if run['size'] else ''}, {run['label']}"
+
+
+def _select_pictures(folder: SweepFolder) -> list[dict[str, str]]:
+    """Select pictures of a sweep: solver comparisons before single runs, large meshes before small ones."""
+    found = sorted((folder.path / "pictures").glob("*.png"), key=_picture_rank, reverse=True)
+    found += [p for name in ("convergence", "work") for p in sorted((folder.path / "report").glob(f"{name}/*.png"))][:2]
+    times = [path for path in found if path.stem == "timing"]
+    shown = [*[path for path in found if path.stem != "timing"][: _MAX_PICTURES - len(times)], *times]
+    return [
+        {"path": p.relative_to(folder.path).as_posix(), "words": _HASH_SUFFIX.sub("", p.stem).replace("-", " ")}
+        for p in shown
+    ]
+
+
+def _picture_rank(path: Path) -> tuple[bool, int, str]:
+    sizes = [int(part) for part in path.stem.split("-") if part.isdigit()]
+    return path.stem.endswith("-solvers"), max(sizes, default=0), path.stem

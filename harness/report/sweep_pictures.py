@@ -1,0 +1,229 @@
+"""Pictures of a sweep: runs, solver comparisons, and run times.
+
+Side-by-side recordings are made too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pyarrow as pa
+from springbench.harness.config.run_options import RUN_OPTIONS
+from springbench.harness.config.sweep_config import RunSpec
+from springbench.harness.execution.isolated_worker import ProgressCallback, TaskFailure, TaskLimits
+from springbench.harness.execution.progress_display import ThrottledMessages
+from springbench.harness.execution.timing_lock import lock_timing_shared
+from springbench.harness.execution.worker_pool import PoolTask, run_tasks
+from springbench.harness.report.citations import write_bibtex
+
+
+class PictureJob(NamedTuple):
+    """A run, and the paths of its recording and its picture."""
+
+    run: RunSpec
+    recording_path: Path
+    picture_path: Path
+
+
+def draw_sweep_pictures(
+    name: str,
+    jobs: Sequence[PictureJob],
+    folder: Path,
+    table: pa.Table,
+    print_message: Callable[[str], None],
+    *,
+    num_concurrent: int = 1,
+    stale_ids: Collection[str] = (),
+) -> None:
+    """Draw the pictures and comparisons that are missing or older than one of their recordings.
+
+    Args:
+        name: name of the sweep.
+        jobs: runs with their recordings and pictures.
+        folder: folder of the sweep's results.
+        table: rows of all runs.
+        print_message: prints a remark.
+        num_concurrent: number of drawing processes.
+        stale_ids: ids of runs that were executed by other code than the current version.
+    """
+    write_bibtex(folder / "references.bib", table["reference"].to_pylist())
+    drawn = [p for p in jobs if p.run.record and p.recording_path.exists()]
+    wanting = [p for p in drawn if p.run.pictures and _is_outdated(p.picture_path, [p.recording_path])]
+    groups = [group for group in group_by_scene(drawn, folder) if group.needs_recording or group.needs_picture]
+
+    def times() -> None:
+        if any(p.run.pictures for p in jobs):
+            from springbench.harness.report.timing_plot import draw_timing_plot
+
+            with lock_timing_shared(_ignore_progress):
+                draw_timing_plot(table, folder / "pictures" / "timing.png", name, stale_ids)
+
+    missing = _load_drawing() if wanting or any(group.needs_picture for group in groups) else None
+    if missing:
+        print_message(missing)
+    if wanting and not missing:
+        print_message(f"drawing the pictures of {len(wanting)} runs")
+        _draw_run_pictures(wanting, print_message, num_concurrent, times)
+    else:
+        times()
+    _draw_group_comparisons(groups, print_message, pictures=not missing)
+
+
+def preload_drawing() -> None:
+    """Load the drawing modules in this process, in parts.
+
+    No part is loaded while a timing runs.
+    """
+    from springbench.harness.report import opengl_probe
+
+    with lock_timing_shared(_ignore_progress):
+        opengl_probe.start_opengl_probe()
+        import_module("springbench.harness.report.timing_plot")  # with Matplotlib
+        opengl_probe.find_opengl_problem()
+    for name in ("springbench.harness.recording.recording_reader", "pyvista", "springbench.harness.report.run_picture"):
+        with lock_timing_shared(_ignore_progress):
+            import_module(name)
+
+
+def _load_drawing() -> str | None:
+    """Load the drawing modules for forked processes; return why drawing is impossible, or None."""
+    from springbench.harness.report import opengl_probe
+
+    opengl_probe.start_opengl_probe()
+    import_module("springbench.harness.report.run_picture")
+    return opengl_probe.find_opengl_problem()
+
+
+def _draw_run_pictures(
+    pending_jobs: Sequence[PictureJob],
+    print_message: Callable[[str], None],
+    num_concurrent: int,
+    run_meanwhile: Callable[[], None],
+) -> None:
+    """Draw the pictures of runs in parallel processes, and report why a process was lost."""
+    done, remarks = 0, ThrottledMessages(print_message)
+
+    def tick(said: str) -> None:
+        remarks(f"{done} of {len(pending_jobs)} pictures are drawn")
+
+    tasks = [PoolTask(partial(_draw_job, p), tick, TaskLimits()) for p in pending_jobs]
+    for number, outcome in run_tasks(
+        num_concurrent, int, [None] * len(tasks), lambda number: tasks[number], run_meanwhile
+    ):
+        done += 1
+        if isinstance(outcome, TaskFailure):
+            print_message(f"{pending_jobs[number].picture_path} is not drawn: its process {outcome}")
+
+
+def _draw_group_comparisons(
+    groups: Sequence[SolverGroup], print_message: Callable[[str], None], *, pictures: bool
+) -> None:
+    """Create the side-by-side recordings of groups, and their pictures if `pictures` is true."""
+    if not groups:
+        return
+    from springbench.harness.recording.recording_reader import read_replay
+    from springbench.harness.recording.side_by_side import LineStyle, write_side_by_side
+    from springbench.harness.report.comparison_picture import draw_comparison_picture
+    from springbench.harness.report.plot_style import assign_label_shades
+
+    remarks = ThrottledMessages(print_message)
+    for number, group in enumerate(groups):
+        remarks(f"{number} of {len(groups)} comparisons of solvers are drawn")
+        with lock_timing_shared(_ignore_progress):
+            if group.needs_recording:
+                found = assign_label_shades((name, p.run.solver.name) for name, p in group.jobs_by_label.items())
+                looks = {name: LineStyle(mark.color) for name, mark in found.items()}
+                write_side_by_side(
+                    group.recording_path, group.recording_paths, group.group_label.replace("-", " "), looks
+                )
+            if group.needs_picture and pictures:
+                draw_comparison_picture(
+                    {name: read_replay(path) for name, path in group.recording_paths.items()}, group.picture_path
+                )
+
+
+def _draw_job(p: PictureJob, tick: ProgressCallback) -> None:
+    from springbench.harness.recording.recording_reader import read_replay
+    from springbench.harness.report.run_picture import draw_run_picture
+
+    camera = p.run.scene.camera
+    with lock_timing_shared(tick):
+        draw_run_picture(
+            read_replay(p.recording_path), p.picture_path, camera=(camera.azimuth, camera.elevation) if camera else None
+        )
+
+
+def _ignore_progress(message: str) -> None:
+    pass
+
+
+def _is_outdated(target: Path, sources: Iterable[Path]) -> bool:
+    """Return whether a file is missing, or older than one of its sources."""
+    return not target.exists() or any(target.stat().st_mtime_ns < source.stat().st_mtime_ns for source in sources)
+
+
+@dataclass(frozen=True, slots=True)
+class SolverGroup:
+    """Runs that differ only in their solver or its settings.
+
+    `jobs_by_label` has them by these differences; the paths are those of the files that compare them.
+    """
+
+    group_label: str
+    jobs_by_label: dict[str, PictureJob]
+    recording_path: Path
+    picture_path: Path
+
+    @property
+    def recording_paths(self) -> dict[str, Path]:
+        """The recordings of the runs by label."""
+        return {name: p.recording_path for name, p in self.jobs_by_label.items()}
+
+    @property
+    def needs_recording(self) -> bool:
+        """Whether the side-by-side recording has to be made."""
+        return _is_outdated(self.recording_path, self.recording_paths.values())
+
+    @property
+    def needs_picture(self) -> bool:
+        """Whether the comparison picture has to be drawn."""
+        return next(iter(self.jobs_by_label.values())).run.pictures and _is_outdated(
+            self.picture_path, self.recording_paths.values()
+        )
+
+
+def group_by_scene(drawn: list[PictureJob], folder: Path) -> list[SolverGroup]:
+    """Group runs by scene and size; only groups of two or more runs are returned."""
+    alike: dict[str, list[PictureJob]] = {}
+    for p in drawn:
+        alike.setdefault(f"{p.run.scene_name}-{p.run.size}", []).append(p)
+    return [
+        SolverGroup(
+            label,
+            {_distinct_label(p, some): p for p in some},
+            folder / "recordings" / f"{label}-solvers.rrd",
+            folder / "pictures" / f"{label}-solvers.png",
+        )
+        for label, some in alike.items()
+        if len(some) > 1
+    ]
+
+
+def _distinct_label(p: PictureJob, group: list[PictureJob]) -> str:
+    """Return the solver's name with its varying parameters and options.
+
+    These are the ones in which the group's runs of this solver differ.
+    """
+
+    def settings(run: RunSpec) -> dict[str, Any]:
+        return {**run.solver.parameters, **{option: getattr(run, option) for option in RUN_OPTIONS}}
+
+    own = [settings(other.run) for other in group if other.run.solver.name == p.run.solver.name]
+    varied = [(k, v) for k, v in settings(p.run).items() if any(k not in other or other[k] != v for other in own)]
+    short = {name: option.short_format for name, option in RUN_OPTIONS.items()}
+    return ", ".join([p.run.solver.name, *(short.get(k, f"{k} {{}}").format(v) for k, v in varied)])

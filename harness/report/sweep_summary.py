@@ -1,0 +1,169 @@
+"""Summary at the end of a sweep: findings in sentences, and suggested commands."""
+
+from __future__ import annotations
+
+import shlex
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from glob import escape
+from pathlib import Path
+from textwrap import wrap
+
+import pyarrow as pa
+from springbench.harness.report import equal_accuracy
+from springbench.harness.report.equal_accuracy import compare_runs
+from springbench.harness.report.timing_table import TABLE_WIDTH, RunTimes, label_runs, read_run_times
+
+SOLVED_RESIDUAL = 1e-2
+"""Share of a step's initial residual above which a remainder of a method that does not minimise is reported."""
+
+STRAIN_GROWTH_FACTOR = 1.5
+"""Factor by which the largest strain has to grow to be reported, and to exceed the growth of the 99th percentile."""
+
+
+def build_closing_lines(table: pa.Table, config: Path, results: Path, folder: Path) -> list[str]:
+    """Build the last lines of a sweep: findings, commands, and the page's address.
+
+    No line is longer than TABLE_WIDTH, except for paths.
+
+    Args:
+        table: rows of the sweep.
+        config: config that was run.
+        results: folder of the results of all sweeps.
+        folder: folder of this sweep's results.
+    """
+    found, page = read_run_times(table), results / "index.html"
+    told = summarise_sweep(found)
+    lines = ["what was learned:", *(f"  {line}" for line in told)] if told else []
+    lines += ["what to do next:", *suggest_commands(found, config, results, folder / "recordings")]
+    return [*lines, f"everything on one page: {page.resolve().as_uri()}"] if page.is_file() else lines
+
+
+def summarise_sweep(timed_runs: Sequence[RunTimes]) -> list[str]:
+    """Summarise the fastest solvers, the termination reasons and the strains of runs, in lines."""
+    fine, names = [run for run in timed_runs if run.status == "ok"], label_runs(timed_runs)
+    told = [
+        *_describe_fastest(fine, names),
+        *_describe_iteration_limits(fine),
+        *_describe_unsolved(fine, names),
+        *_describe_strain_growth(fine, names),
+    ]
+    return [line for sentence in told for line in wrap(sentence, TABLE_WIDTH - 2, subsequent_indent="  ")]
+
+
+def suggest_commands(timed_runs: Sequence[RunTimes], config: Path, results: Path, recordings: Path) -> list[str]:
+    """Suggest commands, each with a comment.
+
+    They replay a run, find the fastest solver at equal accuracy, and update the page.
+
+    Args:
+        timed_runs: runs of the sweep.
+        config: config that was run.
+        results: folder of the results of all sweeps.
+        recordings: folder of this sweep's recordings.
+    """
+    told: list[tuple[str, Path | str, str]] = []
+    if best := _choose_recording(timed_runs, recordings):
+        told.append(("springbench view", best, "replay a run of the largest mesh"))
+    scenes = {run.scene: None for run in timed_runs}
+    if scene := next(filter(None, (_find_scene_file(config, name) for name in scenes)), None):
+        told.append(("springbench recommend --error 1e-2", scene, "the cheapest way to an error of 1 %"))
+    told.append(("springbench report", results, "bring the page up to date, with recordings that it replays"))
+    return [line for words, path, why in told for line in (f"  # {why}", f"  {words} {shlex.quote(str(path))}")]
+
+
+def _describe_fastest(timed_runs: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[str]:
+    return (
+        words
+        for compared in compare_runs(timed_runs)
+        for words, _ in equal_accuracy.describe_comparison(compared, names)
+    )
+
+
+def _describe_iteration_limits(ok_runs: Sequence[RunTimes]) -> Iterator[str]:
+    """Describe how many runs the iteration limit stopped above round-off."""
+    limited = [run for run in ok_runs if run.termination_reason == "iterations" and not _is_at_roundoff(run)]
+    if limited:
+        many = f"All {len(ok_runs)} runs" if len(limited) == len(ok_runs) else f"{len(limited)} of {len(ok_runs)} runs"
+        yield f"{many} stopped at the limit of iterations, at no tolerance: where they agree, all may be wrong alike."
+
+
+def _is_at_roundoff(run: RunTimes) -> bool:
+    return run.worst_residual is not None and run.worst_residual <= (run.roundoff_residual or 0.0)
+
+
+def _describe_unsolved(ok_runs: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[str]:
+    """Describe the remaining residual of methods that do not minimise.
+
+    It is the one that the independent check measured.
+    """
+    for run in ok_runs:
+        if run.max_stationarity_audit is not None and run.max_stationarity_audit > SOLVED_RESIDUAL:
+            yield (
+                f"{names[run.run_id]} on {run.scene} {run.size or ''}".rstrip()
+                + f" does not converge to the minimum of a step's objective: up to {run.max_stationarity_audit:.1e} of the residual at a "
+                "step's start is left (column `graded`); more iterations need not lower it."
+            )
+
+
+def _describe_strain_growth(ok_runs: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[str]:
+    """Describe how the largest strain and the material change with the mesh.
+
+    Only runs that differ in nothing else and were solved to a tolerance or to round-off are compared.
+    """
+    sizes: dict[str, dict[str, dict[int, RunTimes]]] = defaultdict(lambda: defaultdict(dict))
+    for run in ok_runs:
+        solved = run.termination_reason in ("tolerance", "floor") or _is_at_roundoff(run)
+        if solved and run.max_strain is not None and run.strain_p99:
+            sizes[run.scene][names[run.run_id]][run.size] = run
+    for scene, by_name in sizes.items():
+        of_one = max(by_name.values(), key=len)
+        coarse, fine_one = of_one[min(of_one)], of_one[max(of_one)]
+        if words := _compare_strains(coarse, fine_one):
+            yield f"{scene}: {words}"
+
+
+def _compare_strains(coarse_run: RunTimes, ok_runs: RunTimes) -> str:
+    """Compare the strains of two sizes in words; empty if they do not differ notably."""
+    largest, finest = coarse_run.max_strain or 0.0, ok_runs.max_strain or 0.0
+    most, below = coarse_run.strain_p99 or 1.0, ok_runs.strain_p99 or 1.0
+    change = f"from {100 * largest:.3g} to {100 * finest:.3g} %, from size {coarse_run.size} to {ok_runs.size}"
+    if (
+        coarse_run.modulus_exponent
+        and not 1 / STRAIN_GROWTH_FACTOR <= finest / (largest or 1.0) <= STRAIN_GROWTH_FACTOR
+    ):
+        power = "" if coarse_run.modulus_exponent == 1 else f"^{coarse_run.modulus_exponent}"
+        return (
+            f"the largest strain changes {change}, and so does the material: by the springs' rule its modulus is "
+            f"proportional to h{power}, h the spacing of the mesh; `rule: continuum` does not change it."
+        )
+    if finest <= STRAIN_GROWTH_FACTOR * largest:
+        return ""
+    same = "the material is the same, but " if coarse_run.modulus_exponent == 0 else ""
+    bound = f"where 99 % of the springs stay below {100 * most:.3g} and {100 * below:.3g} %"
+    if finest / largest > STRAIN_GROWTH_FACTOR * below / most:
+        return (
+            f"the largest strain grows with the mesh, {change}, {bound}: {same}a single vertex that bears a load, such "
+            "as a pin, is a point load, near which strain has no limit."
+        )
+    return (
+        f"the largest strain grows with the mesh, {change}, {bound}: {same}strains have not converged by these sizes."
+    )
+
+
+def _choose_recording(timed_runs: Sequence[RunTimes], recordings: Path) -> Path | None:
+    """Return a recording of the largest mesh.
+
+    It is that of the fastest run at equal accuracy, where runs were compared.
+    """
+    best = {compared.equal_runs[0].run_id for compared in compare_runs(timed_runs) if compared.equal_runs}
+    timed = [run for run in timed_runs if run.step]
+    order = sorted(timed, key=lambda run: (-(run.vertices or 0), run.run_id not in best, run.step))
+    there = (next(recordings.glob(f"*-{escape(run.run_id)}.rrd"), None) for run in order)
+    return next(filter(None, there), None)
+
+
+def _find_scene_file(config: Path, name: str) -> Path | None:
+    """Return the scene's file if it is in one of the usual folders, else None."""
+    known = (config, *(folder / f"{name}.yaml" for folder in (config.parent, config.parent / "scenes")))
+    return next((path for path in known if path.stem == name and path.is_file()), None)

@@ -1,0 +1,1 @@
+"""Result rows: schema, Parquet store, queries, remote storage."""

@@ -1,0 +1,63 @@
+"""Ownership of results folders: each belongs to one config.
+
+Two configs of one name therefore cannot overwrite each other's results. The folder stores the relative path of its
+config. A config that was moved together with its results remains the owner, and so does one that is still at its old
+path.
+"""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from pathlib import Path
+
+from springbench.harness.atomic_files import atomic_write
+from springbench.harness.errors import InputError, InputMistake
+
+OWNER_FILE = ".config"
+
+
+_MAX_PATH_BYTES = 4096
+"""Maximum length of a config path [bytes]; no path is longer."""
+
+
+def read_owner(folder: Path) -> Path | None:
+    """Return the config that owns a folder, or None if it cannot be found.
+
+    All symbolic links of the path are resolved.
+    """
+    note = folder / OWNER_FILE
+    with suppress(OSError, ValueError):  # what a folder from elsewhere says may be no path at all
+        if note.is_file():
+            with note.open("rb") as file:
+                said = os.fsdecode(file.read(_MAX_PATH_BYTES).strip())
+            if said and (folder / said).is_file():
+                return (folder / said).resolve()
+    return None
+
+
+def claim_folder(folder: Path, config: Path) -> Path:
+    """Create the results folder of a config if needed, and record its owner.
+
+    Args:
+        folder: results folder.
+        config: file of the config, which must exist.
+    Returns: the folder.
+    Raises:
+        InputError: if the folder belongs to another config.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    owner = read_owner(folder)
+    if owner and not owner.samefile(config):
+        raise InputError(
+            InputMistake(
+                f"holds the results of another file of this name, {owner}; rename one of the two, or choose another "
+                "folder with --results",
+                folder,
+            )
+        )
+    if owner != config.resolve():
+        way = os.path.relpath(config.resolve(), folder.resolve())
+        with atomic_write(folder / OWNER_FILE) as partial:
+            partial.write_bytes(os.fsencode(way) + b"\n")
+    return folder

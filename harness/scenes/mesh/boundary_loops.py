@@ -1,0 +1,56 @@
+"""The boundary of a surface: loops of edges with one triangle, and their classification as holes."""
+
+from __future__ import annotations
+
+from itertools import groupby
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.harness.scenes.mesh.mesh import Mesh
+
+IndexArray = NDArray[np.int64]
+
+_COMPARED_DIGITS = 9
+"""Number of compared digits of loop lengths, so that round-off does not affect the order."""
+
+
+class BoundaryLoop(NamedTuple):
+    """A connected piece of the boundary.
+
+    Attributes:
+        vertices: (k,), sorted.
+        length: [m].
+        is_hole: whether the same connected surface has a longer loop.
+    """
+
+    vertices: IndexArray
+    length: float
+    is_hole: bool
+
+
+def find_boundary_loops(mesh: Mesh) -> list[BoundaryLoop]:
+    """Find the boundary loops of a mesh at rest, longest first; ties by the lowest vertex."""
+    if not len(mesh.triangles):
+        return []
+    from scipy.sparse import coo_array  # for those who ask
+    from scipy.sparse.csgraph import connected_components
+
+    n = len(mesh.rest_positions)
+    sides = np.sort(np.concatenate([mesh.triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
+    edges, count = np.unique(sides, axis=0, return_counts=True)
+    open_ = edges[count == 1]
+
+    def pieces(pairs: IndexArray) -> IndexArray:
+        graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+        return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+
+    surface, of = pieces(edges), pieces(open_)
+    long = np.linalg.norm(mesh.rest_positions[open_[:, 0]] - mesh.rest_positions[open_[:, 1]], axis=1)
+    length = np.bincount(of[open_[:, 0]], long, minlength=n)
+    found = [np.flatnonzero(of == k) for k in np.unique(of[open_[:, 0]]).tolist()]
+    rounded = {int(x[0]): float(f"{length[of[x[0]]]:.{_COMPARED_DIGITS}g}") for x in found}
+    found.sort(key=lambda x: (-rounded[int(x[0])], int(x[0])))
+    by_surface = groupby(sorted(found, key=lambda x: int(surface[x[0]])), key=lambda x: int(surface[x[0]]))
+    rims = {int(next(of_one)[0]) for _, of_one in by_surface}  # sorting keeps the order: the longest is first
+    return [BoundaryLoop(x, float(length[of[x[0]]]), int(x[0]) not in rims) for x in found]

@@ -1,0 +1,136 @@
+"""Meshes from files: OBJ, the assignment's JSON scenes, PLY, VTP, and all formats that meshio reads."""
+
+from __future__ import annotations
+
+import logging
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.execution import sandbox
+from springbench.harness.scenes.mesh.assignment_json import read_assignment_json
+from springbench.harness.scenes.mesh.mesh import Mesh
+from springbench.harness.scenes.mesh.mesh_file_reader import FACE_KINDS, MeshFileContent, read_mesh_file
+from springbench.harness.scenes.mesh.mesh_topology import NO_PAIRS, IndexArray
+from springbench.harness.scenes.mesh.obj_reader import read_obj
+from springbench.harness.scenes.mesh.spring_network import (
+    MAX_COORDINATE,
+    MeshCells,
+    SpringRule,
+    build_spring_network,
+    check_mesh_file,
+)
+from springbench.harness.schema.base_model import ConfigModel
+
+_CELL_KINDS = ("line", *FACE_KINDS, "tetra")
+"""Kinds of cells that yield springs; the kind `vertex` is ignored."""
+
+_MAX_NAMED_POINTS = 3
+_LOG = logging.getLogger("springbench")
+
+MIN_READ_SECONDS, READ_BYTES_PER_SECOND = 5.0, 1e6
+"""Time limit of reading: meshio reads text at 1 MB/s or more, and does not terminate on some broken files."""
+MIN_READ_MEMORY, READ_MEMORY_PER_BYTE = 2**29, 20
+"""Memory limit of reading [bytes]: Python lists, with numbers of two characters in the worst case."""
+
+
+class FileMesh(ConfigModel):
+    """A mesh from a file, of fixed size.
+
+    Parts: the sides of its bounding box, and the groups named in the file. Attributes: point data of the file.
+    """
+
+    kind: Literal["file"] = "file"
+    path: Path
+    """Path of an OBJ, a JSON scene of the assignment (its OBJ is read), a PLY, a VTP, or a meshio format (VTK, ...)."""
+    springs: SpringRule | None = None
+    """Springs along `edges` of faces only, or between all corners of a face (`face_pairs`); by default face_pairs for
+    JSON scenes, and edges for all other files."""
+
+    def build_mesh(self, size: int = 0) -> Mesh:
+        """Build the file's mesh, ignoring the size; `mesh.spring_network` defines springs and masses.
+
+        Raises:
+            InputError: for a file that is missing, malformed, empty or too large.
+        """
+        path, suffix = self.path, self.path.suffix.lower()
+        rule = self.springs or ("face_pairs" if suffix == ".json" else "edges")
+        if suffix == ".json":
+            path = path.parent / read_assignment_json(path).obj
+            suffix = path.suffix.lower()
+        return build_spring_network(read_obj(path) if suffix == ".obj" else _read_cells(path), rule, path)
+
+
+def _read_cells(path: Path) -> MeshCells:
+    """Read cells with meshio in a subprocess; raise InputError on any failure."""
+    check_mesh_file(path)
+    state = path.stat()
+    found = _read_cached(path, state.st_mtime_ns, state.st_size)
+    points, blocks = found.points, found.cell_blocks
+    problem = _find_cell_problem(points, blocks) or _find_group_problem(found)
+    if problem:
+        raise InputError(InputMistake(problem, path))
+    if len(found.unused_points):
+        where = ", ".join(f"({x:g}, {y:g}, {z:g})" for x, y, z in found.unused_points[:_MAX_NAMED_POINTS].tolist())
+        more = ", ..." if len(found.unused_points) > _MAX_NAMED_POINTS else ""
+        problem = f"{len(found.unused_points):,} points belong to no cell and are left out: at {where}{more} m"
+        _LOG.warning("%s", InputMistake(problem, path))
+    polygons: dict[int, list[IndexArray]] = {}
+    places: dict[int, list[IndexArray]] = {}
+    for (kind, data), numbers in zip(blocks, found.face_locations, strict=True):
+        if kind in FACE_KINDS:
+            polygons.setdefault(data.shape[1], []).append(data)
+            places.setdefault(data.shape[1], []).append(numbers)
+    return MeshCells(
+        points=np.pad(points, ((0, 0), (0, 3 - points.shape[1]))),
+        polygons={corners: np.concatenate(polygons[corners]) for corners in sorted(polygons)},
+        polygon_locations={corners: np.concatenate(places[corners]) for corners in sorted(places)},
+        location_unit=found.location_unit,
+        segments=np.concatenate([NO_PAIRS, *(data for kind, data in blocks if kind == "line")]),
+        tetrahedra=np.concatenate([np.empty((0, 4), np.int64), *(data for kind, data in blocks if kind == "tetra")]),
+        vertex_groups=found.vertex_groups,
+        attributes=found.attributes,
+    )
+
+
+@lru_cache(maxsize=2)  # a scene builds its mesh several times, and a child takes a while to start
+def _read_cached(path: Path, mtime_ns: int, size: int) -> MeshFileContent:
+    """Read a mesh file, cached by path, modification time [ns] and size [bytes]."""
+    limits = sandbox.CallLimits(
+        MIN_READ_SECONDS + size / READ_BYTES_PER_SECOND, MIN_READ_MEMORY + READ_MEMORY_PER_BYTE * size
+    )
+    try:
+        return sandbox.call_in_sandbox(read_mesh_file, path, limits=limits)
+    except sandbox.SandboxError as error:
+        raise InputError(InputMistake(f"cannot be read as a mesh: {error}", path)) from None
+
+
+def _find_group_problem(found: MeshFileContent) -> str:
+    """Describe what is wrong with the groups; empty if they are valid."""
+    for name, group in found.vertex_groups.items():
+        if group[0] < 0 or group[-1] >= len(found.points):
+            return f"its group {name[:40]!r} names the point {group[-1]}; wanted 0 to {len(found.points) - 1}"
+    return ""
+
+
+def _find_cell_problem(points: np.ndarray, blocks: list[tuple[str, IndexArray]]) -> str:
+    """Describe what is wrong with meshio's points and cells; empty if they are valid."""
+    if points.ndim != 2 or not 1 <= points.shape[1] <= 3:
+        return f"has points of shape {points.shape}; wanted 1 to 3 coordinates each"
+    if not np.all(np.abs(points) <= MAX_COORDINATE):
+        row = int(np.flatnonzero(~np.all(np.abs(points) <= MAX_COORDINATE, axis=1))[0])
+        return f"point {row} (from 0) is {points[row]}; wanted finite numbers up to {MAX_COORDINATE:g} m"
+    for kind, data in blocks:
+        if kind not in _CELL_KINDS:
+            return f"has cells of type {kind}; wanted {', '.join(_CELL_KINDS)}"
+        if data.ndim != 2 or data.shape[1] < 2:
+            return f"has a {kind} of fewer than 2 points"
+        ordered = np.sort(data, axis=1)
+        wrong = (ordered[:, 0] < 0) | (ordered[:, -1] >= len(points))
+        wrong |= np.any(ordered[:, 1:] == ordered[:, :-1], axis=1)
+        if wrong.any():
+            cell = data[np.flatnonzero(wrong)[0]].tolist()
+            return f"a {kind} names the points {cell}; wanted different ones from 0 to {len(points) - 1}"
+    return ""

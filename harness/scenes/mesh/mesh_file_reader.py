@@ -1,0 +1,276 @@
+# pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
+# meshio has no types.
+"""Mesh file readers that run in a subprocess: meshio's formats, and own readers of PLY and .vtp.
+
+The subprocess is that of `springbench.harness.execution.sandbox`. meshio accepts some truncated files as complete.
+Hence the
+sections of a .msh must be closed, and a text STL must have its end marker.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import sys
+import warnings
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, redirect_stdout
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Protocol, cast
+
+import meshio
+import numpy as np
+from meshio.gmsh import _gmsh40, _gmsh41
+from numpy.typing import NDArray
+from springbench.harness.scenes.mesh import ply_reader, vtp_reader
+
+CellBlock = tuple[str, NDArray[np.int64]]
+"""Cells of one kind: its meshio name, and the point indices of each cell."""
+
+FACE_KINDS = ("triangle", "quad", "polygon")
+_CELL_KIND_BY_CORNERS = {2: "line", 3: "triangle", 4: "quad"}
+"""Kind of a cell by its number of corners; others are polygons."""
+_GMSH_PHYSICAL = "gmsh:physical"
+
+
+class MeshFileContent(NamedTuple):
+    """Contents of a mesh file.
+
+    Attributes:
+        points: (n, 3).
+        vertex_groups: points by group name.
+        attributes: point data (n,); components of vectors have a number in their name, `normal.0`.
+        face_locations: line or number of each cell of a block.
+        unused_points: points that no cell uses, of formats that store others besides the mesh, (k, 3).
+    """
+
+    points: NDArray[np.float64]
+    cell_blocks: list[CellBlock]
+    vertex_groups: dict[str, NDArray[np.int64]]
+    attributes: dict[str, NDArray[np.float64]]
+    face_locations: list[NDArray[np.int64]]
+    location_unit: Literal["line", "face"] = "face"
+    unused_points: NDArray[np.float64] = np.empty((0, 3))
+
+
+class _MeshioCells(Protocol):
+    type: str
+    data: NDArray[Any]
+
+
+class _MeshioMesh(Protocol):
+    """The part of meshio's result that is used."""
+
+    points: NDArray[Any]
+    cells: list[_MeshioCells]
+    point_data: dict[str, NDArray[Any]]
+    cell_data: dict[str, list[NDArray[Any]]]
+    field_data: dict[str, NDArray[Any]]
+    point_sets: dict[str, Any]
+    cell_sets: dict[str, list[Any]]
+
+
+def read_mesh_file(path: Path) -> MeshFileContent:
+    """Read a mesh file.
+
+    Raises:
+        ValueError: for a truncated file.
+        PermissionError: if the file refers to a file outside of its folder.
+        Exception: of any type, for other broken files.
+    """
+    with _restrict_file_access(path):
+        return _read_by_suffix(path)
+
+
+def _read_by_suffix(path: Path) -> MeshFileContent:
+    suffix = path.suffix.lower()
+    if suffix == ".vtp":
+        return _convert_vtp(vtp_reader.read_vtp(path.read_bytes()))
+    if suffix == ".ply":
+        return _convert_ply(ply_reader.read_ply(path.read_bytes()))
+    content = path.read_bytes() if suffix in (".msh", ".stl") else b""
+    if suffix == ".msh" and _GMSH_PARAMETRIC.search(content):
+        raise ValueError("it has parametric nodes; save it without them (Mesh.SaveParametric = 0 in Gmsh)")
+    raw = _read_with_meshio(path)
+    missing = _TRUNCATION_CHECKS.get(suffix)
+    if missing and (what := missing(content, raw)):
+        raise ValueError(f"{what}; the file was cut before its end, so write it once more")
+    blocks = [(block.type, np.array(block.data, np.int64)) for block in raw.cells if len(block.data)]
+    kept = [(kind, data) for kind, data in blocks if kind != "vertex"]
+    points = np.array(raw.points, np.float64)
+    found = MeshFileContent(
+        points, kept, _collect_groups(raw), _split_columns(raw.point_data, len(points)), _number_faces(kept)
+    )
+    return _drop_unused_points(found) if suffix == ".msh" else found
+
+
+class _FileAccessGuard:
+    """Audit hook that restricts opened files to some folders, read-only, while it is active."""
+
+    def __init__(self) -> None:
+        self.folders: tuple[Path, ...] = ()
+        sys.addaudithook(self._check_event)
+
+    def _check_event(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if event != "open" or not self.folders or isinstance(arguments[0], int):
+            return
+        name, mode, flags = arguments
+        path = Path(os.fsdecode(name)).resolve()
+        writes = set(mode or "") & set("wax+") or (flags or 0) & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
+        is_code = path.suffix in (".py", ".pyc")
+        if writes or not (is_code or any(path.is_relative_to(folder) for folder in self.folders)):
+            raise PermissionError(f"it refers to {path}, which lies outside of its folder")
+
+
+@cache
+def _file_access_guard() -> _FileAccessGuard:
+    return _FileAccessGuard()
+
+
+@contextmanager
+def _restrict_file_access(path: Path) -> Generator[None]:
+    """Restrict file access to the folder of a file, and to what Python imports."""
+    installed = (Path(sys.prefix).resolve(), Path(sys.base_prefix).resolve())
+    _file_access_guard().folders = (path.resolve(), path.parent.resolve(), *installed)
+    try:
+        yield
+    finally:
+        _file_access_guard().folders = ()
+
+
+def _read_with_meshio(path: Path) -> _MeshioMesh:
+    """Read a file with meshio; raise ValueError with the reason if meshio prints it and exits."""
+    said = io.StringIO()
+    try:
+        with warnings.catch_warnings(), redirect_stdout(said):
+            warnings.simplefilter("ignore")
+            return cast(_MeshioMesh, meshio.read(path))
+    except SystemExit:
+        reason = "; ".join(filter(None, map(str.strip, said.getvalue().splitlines())))
+        raise ValueError(reason or f"it does not hold what a {path.suffix} file begins with") from None
+
+
+def _tag_ungrouped_entities(read_entities: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap a reader of Gmsh entities so that entities without a physical group get the tag 0, which means none.
+
+    meshio counts blocks of cells incorrectly if some entities have no tag at all.
+    """
+
+    def read(*arguments: Any) -> Any:
+        found = read_entities(*arguments)
+        for of_dimension in found[0] if isinstance(found[0], tuple) else found:
+            for entity, tags in of_dimension.items():
+                of_dimension[entity] = tags or [0]
+        return found
+
+    return read
+
+
+for _module in (_gmsh40, _gmsh41):
+    setattr(_module, "_read_entities", _tag_ungrouped_entities(_module._read_entities))  # noqa: B010
+
+
+def _number_faces(blocks: list[CellBlock]) -> list[NDArray[np.int64]]:
+    """Number each face among all faces, from 0; the numbers of other cells are unused."""
+    faces = [0, *np.cumsum([len(data) if kind in FACE_KINDS else 0 for kind, data in blocks]).tolist()]
+    return [first + np.arange(len(data)) for first, (_, data) in zip(faces, blocks, strict=False)]
+
+
+def _drop_unused_points(found: MeshFileContent) -> MeshFileContent:
+    """Remove points without cells: Gmsh saves the points of a geometry, such as the centres of circles."""
+    used = np.zeros(len(found.points), np.bool_)
+    for _, data in found.cell_blocks:
+        if len(data) and (data.min() < 0 or data.max() >= len(used)):
+            return found  # the caller names the cell
+        used[data.ravel()] = True
+    if used.all():
+        return found
+    number = np.cumsum(used) - 1
+    groups = {name: number[group[used[group]]] for name, group in found.vertex_groups.items()}
+    return found._replace(
+        points=found.points[used],
+        cell_blocks=[(kind, number[data]) for kind, data in found.cell_blocks],
+        vertex_groups={name: group for name, group in groups.items() if len(group)},
+        attributes={name: column[used] for name, column in found.attributes.items()},
+        unused_points=found.points[~used],
+    )
+
+
+def _convert_ply(read: ply_reader.PlyContent) -> MeshFileContent:
+    blocks = [(_CELL_KIND_BY_CORNERS.get(k, "polygon"), rows) for k, (rows, _) in read.faces.items()]
+    places = [read.first_face_line + which for _, which in read.faces.values()]
+    counted: Literal["line", "face"] = "line" if read.first_face_line else "face"
+    return MeshFileContent(read.points, blocks, {}, read.vertex_attributes, places, counted)
+
+
+def _convert_vtp(read: vtp_reader.VtpContent) -> MeshFileContent:
+    """Convert VTP content, with faces grouped by their number of corners."""
+    groups = dict[int, list[NDArray[np.int64]]]()
+    for polygon in read.polygons:
+        groups.setdefault(len(polygon), []).append(polygon)
+    blocks = [(_CELL_KIND_BY_CORNERS.get(k, "polygon"), np.array(group)) for k, group in sorted(groups.items())]
+    pairs = [np.column_stack([line[:-1], line[1:]]) for line in read.lines]
+    if pairs:
+        blocks.append(("line", np.concatenate(pairs)))
+    return MeshFileContent(
+        read.points, blocks, {}, _split_columns(read.point_attributes, len(read.points)), _number_faces(blocks)
+    )
+
+
+def _collect_groups(raw: _MeshioMesh) -> dict[str, NDArray[np.int64]]:
+    """Collect the points of named point sets and cell sets, and of Gmsh's physical groups."""
+    found: dict[str, list[NDArray[Any]]] = {name: [np.asarray(some)] for name, some in raw.point_sets.items()}
+    for name, sets in raw.cell_sets.items():
+        if name.startswith("gmsh:"):  # numbers of bounding entities, of no cells
+            continue
+        for block, some in zip(raw.cells, sets, strict=True):
+            if some is not None:
+                found.setdefault(name, []).append(np.asarray(block.data)[np.asarray(some, np.int64)])
+    for name, (tag, _) in raw.field_data.items():
+        for block, tags in zip(raw.cells, raw.cell_data.get(_GMSH_PHYSICAL, []), strict=False):
+            found.setdefault(name, []).append(np.asarray(block.data)[np.asarray(tags) == tag])
+    joined = {name: np.unique(np.concatenate([x.ravel() for x in some])) for name, some in found.items() if some}
+    return {name: points.astype(np.int64) for name, points in joined.items() if len(points)}
+
+
+def _split_columns(numbers: dict[str, NDArray[Any]], n: int) -> dict[str, NDArray[np.float64]]:
+    """Split point data of n points into columns."""
+    found: dict[str, NDArray[np.float64]] = {}
+    for name, values in numbers.items():
+        if len(values) != n:
+            continue
+        columns = np.asarray(values, np.float64).reshape(n, -1).T
+        found |= {name: columns[0]} if len(columns) == 1 else {f"{name}.{k}": x for k, x in enumerate(columns)}
+    return {name: np.ascontiguousarray(column) for name, column in found.items()}
+
+
+_GMSH_SECTION = re.compile(
+    rb"^\$(End)?((?:MeshFormat|PhysicalNames|Entities|Nodes|Elements|Periodic)\b|\w+Data\b)", re.M
+)
+_GMSH_PARAMETRIC = re.compile(rb"^\$ParametricNodes\b", re.M)
+
+
+def _find_unclosed_section(content: bytes, raw: _MeshioMesh) -> str:
+    """Find an unclosed section of a Gmsh .msh.
+
+    The ANSYS format of the same suffix has no sections.
+    """
+    begun: dict[bytes, int] = {}
+    for end, name in _GMSH_SECTION.findall(content):
+        begun[name] = begun.get(name, 0) + (-1 if end else 1)
+    left = next((name.decode() for name, count in begun.items() if count > 0), "")
+    return f"the section ${left} has no $End{left}" if left else ""
+
+
+def _find_truncated_stl(content: bytes, raw: _MeshioMesh) -> str:
+    """Detect a truncated STL; a binary one contains its number of triangles."""
+    text = content.lstrip().startswith(b"solid") and b"facet" in content
+    return "it has no endsolid" if text and b"endsolid" not in content else ""
+
+
+_TRUNCATION_CHECKS: dict[str, Callable[[bytes, _MeshioMesh], str]] = {
+    ".msh": _find_unclosed_section,
+    ".stl": _find_truncated_stl,
+}

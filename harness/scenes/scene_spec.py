@@ -1,0 +1,220 @@
+"""A validated scene specification."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, cast
+
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, SkipValidation, ValidationInfo, WithJsonSchema
+from springbench.harness.errors import InputError, InputMistake, suggest_name
+from springbench.harness.scenes.effects.effect_interface import SceneEffect
+from springbench.harness.scenes.mesh.mesh import Mesh
+from springbench.harness.scenes.mesh.mesh_generator import MAX_VERTICES
+from springbench.harness.scenes.scene_plugins import PluginEffect, PluginMesh
+from springbench.harness.scenes.start_positions import AnyStart
+from springbench.harness.schema.base_model import ConfigModel
+from springbench.solvers.model import integrators
+from springbench.solvers.plugins import plugin_discovery
+from springbench.solvers.plugins.plugin_discovery import PluginName, PluginTable
+
+NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+"""Pattern of the names of scenes and sweeps; they become file names in the results."""
+
+InitialGuess = Literal["assignment", "current", "inertial", "motion", "coarse"]
+
+
+def registered_name(table: PluginTable) -> Any:
+    """Return the type of a registered name or a plug-in (see
+    `springbench.solvers.plugins.plugin_discovery.plugin_discovery`).
+
+    The validation context provides the folder of the config.
+    """
+
+    def checked(value: str, info: ValidationInfo) -> str:
+        name = table.resolve_name(value, Path(cast(Mapping[str, Any], info.context or {}).get("folder", ".")))
+        if name not in table:
+            raise ValueError(f"came {json.dumps(value)[:60]}; should be {suggest_name(value, table)}")
+        return name
+
+    shipped = [name for one in table.builtin_tables for name in one]
+    schema = {
+        "anyOf": [{"enum": shipped, "type": "string"}, {"pattern": plugin_discovery.PLUGIN_PATTERN, "type": "string"}]
+    }
+    return Annotated[str, AfterValidator(checked), WithJsonSchema(schema)]
+
+
+if TYPE_CHECKING:
+    IntegratorName = str
+else:
+    IntegratorName = registered_name(integrators.INTEGRATOR_TABLE)
+
+
+def _parse_seconds(value: Any) -> Any:
+    """Convert a fraction such as "1/30" to a number."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return float(Fraction(value))
+    except (ValueError, ZeroDivisionError, OverflowError) as error:
+        raise ValueError(f'should be a number or a fraction such as "1/30", not {value[:40]!r}') from error
+
+
+TimeStep = Annotated[
+    float,
+    Field(ge=1e-9, le=1e3),
+    BeforeValidator(_parse_seconds),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "number", "minimum": 1e-9, "maximum": 1e3},
+                {"type": "string", "pattern": r"^[0-9]+(/[0-9]+)?$"},
+            ]
+        }
+    ),
+]
+SpeedComponent = Annotated[float, Field(ge=-1e6, le=1e6)]
+MeshSize = Annotated[int, Field(ge=2, le=MAX_VERTICES)]
+FrameCount = Annotated[int, Field(ge=1, le=1_000_000)]
+
+
+class CameraView(ConfigModel):
+    """View direction of pictures; the camera aims at the centre of the mesh."""
+
+    azimuth: float = Field(default=0.0, ge=-360, le=360)
+    """Angle about the vertical axis [degrees], 0 is a view along -z."""
+    elevation: float = Field(default=0.0, ge=-90, le=90)
+    """Angle above the horizon [degrees]."""
+
+
+class SceneFields(ConfigModel):
+    """Fields of a scene that are the same in its file and in memory."""
+
+    description: str = Field(default="", max_length=1000)
+    """Description of the scene in one sentence."""
+    mass: float | None = Field(default=None, gt=0, le=1e12)
+    """Total mass [kg]; optional if the mesh provides masses."""
+    mass_per_area: float | None = Field(default=None, gt=0, le=1e12)
+    """Area density of the mesh's triangles at rest [kg/m^2], instead of `mass`."""
+    time_step: TimeStep
+    """Time step [s], a number or a fraction such as "1/30"."""
+    alternate_time_step: TimeStep | None = None
+    """Time step [s] of every second step; equal to `time_step` by default."""
+    frames: FrameCount
+    """Number of steps to simulate."""
+    velocity: tuple[SpeedComponent, SpeedComponent, SpeedComponent] = (0.0, 0.0, 0.0)
+    """Initial velocity of every vertex [m/s]."""
+    start: AnyStart | None = None
+    """Deviation of the initial state from the rest state."""
+    default_size: MeshSize | None = None
+    """Mesh size if neither a sweep nor the command line gives sizes."""
+    camera: CameraView | None = None
+    """View direction of pictures; chosen from the shape of the mesh by default."""
+
+
+class SceneFile(SceneFields):
+    """A scene: a mesh, its mass and time step, and the effects that act on it."""
+
+    mesh: Any  # checked, like the effects, by the class that its kind names
+    """The mesh; `kind` selects its type."""
+    effects: Any = ()
+    """Effects on the mesh; only listed effects are simulated."""
+
+
+class MeshSource(Protocol):
+    """A mesh as declared by a scene: a pydantic model with a literal `kind`."""
+
+    def build_mesh(self, size: int) -> Mesh:
+        """Build the mesh of a size; raise InputError if that size is not supported."""
+        ...
+
+
+class SceneSpec(SceneFields):
+    """A validated scene."""
+
+    model_config = ConfigDict(arbitrary_types_allowed=True)
+
+    mesh: SkipValidation[MeshSource]
+    """The mesh; `kind` selects its type."""
+    mesh_digest: str = ""
+    """SHA-256 of a mesh from a file; empty for a generated mesh, which its parameters and size determine."""
+    effects: SkipValidation[tuple[SceneEffect, ...]] = ()
+    """Effects on the mesh; only listed effects are simulated."""
+    first_guess: InitialGuess = "current"
+    """Initial guess of a step unless a sweep sets it; see `choose_initial_guess`."""
+    path: Path
+    """Source file of the scene, for messages."""
+    own: SkipValidation[Mapping[str, tuple[PluginName, Mapping[str, Any]]]] = Field(default_factory=dict)
+    """Plug-ins by location (`mesh`, `effects[0]`, ...), with the parameters from the scene file."""
+    key_lines: SkipValidation[Mapping[str, int]] = Field(default_factory=dict)
+    """Line numbers of the keys in that file, for messages."""
+
+    def choose_initial_guess(self, integrator: str) -> InitialGuess:
+        """Return the default initial guess for an integrator: extrapolated for multi-stage integrators."""
+        method = integrators.INTEGRATORS.get(integrator, integrators.IMPLICIT_EULER)
+        says = self.first_guess != "current" or isinstance(method, integrators.SingleStageIntegrator)
+        return self.first_guess if says else "motion"
+
+    def keep_effects(self, effect_indices: Sequence[int]) -> dict[str, Any]:
+        """Return the fields `effects` and `plugins` of the scene restricted to effects with these indices."""
+        own = {place: told for place, told in self.own.items() if place == "mesh"}
+        places = {f"effects[{i}]": f"effects[{k}]" for k, i in enumerate(effect_indices)}
+        own |= {places[place]: told for place, told in self.own.items() if place in places}
+        return {"effects": tuple(self.effects[i] for i in effect_indices), "own": own}
+
+    def load_plugins(self) -> SceneSpec:
+        """Return the scene with plug-ins loaded, which imports their code; raise InputError on failure."""
+        parts = (self.mesh, *self.effects)
+        if not any(isinstance(part, PluginEffect | PluginMesh) for part in parts):
+            return self
+        made = [_load_part(part, f"effects[{i}]" if i >= 0 else "mesh") for i, part in enumerate(parts, -1)]
+        values: dict[str, Any] = {key: getattr(self, key) for key in SceneSpec.model_fields}
+        return SceneSpec.model_construct(None, **values | {"mesh": made[0], "effects": tuple(made[1:])})
+
+    def with_time_step(self, time_step: float) -> SceneSpec:
+        """Return the scene with another time step [s], the same for all steps."""
+        if time_step == self.time_step:
+            return self
+        values: dict[str, Any] = {key: getattr(self, key) for key in SceneSpec.model_fields}
+        return SceneSpec.model_construct(None, **values | {"time_step": time_step, "alternate_time_step": None})
+
+    def require_fixed_time_step(self) -> None:
+        """Raise InputError if the steps differ in length."""
+        if self.alternate_time_step is not None:
+            key, wanted = "alternate_time_step", "what is measured here depends on one time step; leave it out"
+            raise InputError(InputMistake(wanted, self.path, self.key_lines.get(key), key))
+
+    @cached_property
+    def scene_digest(self) -> str:
+        """SHA-256 of everything that determines a run; mesh files count by content, not by name."""
+        content = self.model_dump(mode="json", include={"mass", "time_step", "velocity", "camera", "mesh", "effects"})
+        content["mesh"] = self.mesh_digest or content["mesh"]
+        for place, (plugin, given) in self.own.items():  # which need not be imported to be told apart
+            told = [plugin.identify_code(), dict(given)]
+            if place == "mesh":
+                content["mesh"] = told
+            else:
+                content["effects"][int(place[len("effects[") : -1])] = told
+        if self.start:
+            content["start"] = self.start.model_dump(mode="json")
+        if self.mass_per_area is not None:
+            content["mass_per_area"] = self.mass_per_area
+        if self.alternate_time_step is not None:
+            content["alternate_time_step"] = self.alternate_time_step
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _load_part(part: Any, at: str) -> Any:
+    if not isinstance(part, PluginEffect | PluginMesh):
+        return part
+    try:
+        return part.load_effect() if isinstance(part, PluginEffect) else part.load_mesh()
+    except InputError as error:
+        found = [replace(one, key=".".join(filter(None, [at, one.key]))) for one in error.mistakes]
+        raise InputError(found) from error

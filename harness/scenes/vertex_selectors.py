@@ -1,0 +1,178 @@
+"""Vertex selection: named parts, indices, regions, boundary loops, attributes of a file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Self, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import (
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
+from springbench.harness.errors import InputError, suggest_name
+from springbench.harness.scenes.mesh.boundary_loops import BoundaryLoop, find_boundary_loops
+from springbench.harness.scenes.mesh.mesh import Mesh, sort_unique_vertices
+from springbench.harness.schema.base_model import ConfigModel, Vector3
+
+IndexArray = NDArray[np.int64]
+
+
+class BoxRegion(ConfigModel):
+    """An axis-parallel box, its faces included."""
+
+    low: Vector3
+    """Corner with the smallest coordinates [m]."""
+    high: Vector3
+    """Corner with the largest coordinates [m]."""
+
+
+class BallRegion(ConfigModel):
+    """A ball, its surface included."""
+
+    center: Vector3
+    """Centre [m]."""
+    radius: PositiveFloat
+    """Radius [m]."""
+
+
+class AttributeRange(ConfigModel):
+    """A range, ends included, of a vertex attribute from the mesh's file."""
+
+    name: str
+    """Name in the file; a component of a vector is `name.0`, `name.1`, ..."""
+    low: float | None = None
+    """Smallest value; unbounded by default."""
+    high: float | None = None
+    """Largest value; unbounded by default."""
+
+
+class VertexSelection(ConfigModel):
+    """All vertices that at least one of the selectors names."""
+
+    at: tuple[str, ...] = ()
+    """Named parts of the mesh, such as corners, top or left, and groups of its file."""
+    indices: tuple[NonNegativeInt, ...] = ()
+    """Zero-based vertex indices."""
+    box: BoxRegion | None = None
+    """All vertices with rest positions in this box."""
+    sphere: BallRegion | None = None
+    """All vertices with rest positions in this ball."""
+    nearest: tuple[Vector3, ...] = ()
+    """For each of these points [m] the vertex with the nearest rest position, the first one of equals."""
+    loops: tuple[NonNegativeInt, ...] = ()
+    """Boundary loops of the mesh's triangles; the longest is 0."""
+    holes: tuple[NonNegativeInt, ...] = ()
+    """Holes: boundary loops except the longest of each connected surface; the longest hole is 0."""
+    attribute: AttributeRange | None = None
+    """All vertices with an attribute in this range."""
+    every: PositiveInt = 1
+    """Every k-th of the vertices selected so far, from the first; of all vertices if there is no other selector."""
+
+    @model_validator(mode="after")
+    def _check_selectors(self) -> Self:
+        if not (self.has_selectors or self.every > 1):
+            raise ValueError(
+                "names no vertices; give at, indices, box, sphere, nearest, loops, holes, attribute or every"
+            )
+        return self
+
+    @model_serializer(mode="wrap")
+    def _dump_used_selectors(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Dump without unused optional selectors: run identities depend on this dump, older ones lack them."""
+        told: dict[str, Any] = dump(self)
+        return {key: value for key, value in told.items() if value or key not in _OPTIONAL_SELECTORS}
+
+    @property
+    def has_selectors(self) -> bool:
+        """Whether any selector except the stride is used."""
+        given = self.at, self.indices, self.box, self.sphere, self.nearest, self.loops, self.holes, self.attribute
+        return any(map(bool, given))
+
+    def describe_selection(self) -> str:
+        """Describe the used selectors in words."""
+        given = self.model_dump(mode="json", include=set(VertexSelection.model_fields), exclude_none=True)
+        used = (
+            f"{key} {_describe_value(value)}" for key, value in given.items() if value and (key, value) != ("every", 1)
+        )
+        return ", ".join(used)
+
+    def select_vertices(self, mesh: Mesh, name: str) -> IndexArray:
+        """Return the selected vertices (q,), sorted.
+
+        Args:
+            mesh: the mesh.
+            name: name of the selection in messages.
+
+        Raises:
+            InputError: for parts, vertices and attributes that the mesh lacks.
+        """
+        n, rest = len(mesh.rest_positions), mesh.rest_positions
+        for part in self.at:
+            if part not in mesh.parts:
+                raise InputError(f"{name}: at: came {part!r}; this mesh has {suggest_name(part, mesh.parts)}")
+        outside = [i for i in self.indices if i >= n]
+        if outside:
+            raise InputError(f"{name}: indices: came {outside[0]}; the mesh has the vertices 0 to {n - 1}")
+        sets = [mesh.parts[part] for part in self.at] + [np.array(self.indices, np.int64)]
+        if self.box:
+            inside = (rest >= self.box.low) & (rest <= self.box.high)
+            sets.append(np.flatnonzero(inside.all(axis=1)))
+        if self.sphere:
+            away = ((rest - self.sphere.center) ** 2).sum(axis=1)
+            sets.append(np.flatnonzero(away <= self.sphere.radius**2))
+        sets += [np.argmin(((rest - point) ** 2).sum(axis=1), keepdims=True) for point in self.nearest]
+        if self.loops or self.holes:
+            every = find_boundary_loops(mesh)
+            sets += _select_loops(every, self.loops, f"{name}: loops", "boundary loops")
+            sets += _select_loops([loop for loop in every if loop.is_hole], self.holes, f"{name}: holes", "holes")
+        if self.attribute:
+            sets.append(_select_by_attribute(mesh, self.attribute, f"{name}: attribute"))
+        vertices = (
+            sort_unique_vertices(np.concatenate(sets), n)[:: self.every]
+            if self.has_selectors
+            else np.arange(0, n, self.every)
+        )
+        if not len(vertices):
+            raise InputError(f"{name}: no vertex of the mesh lies in the {self.describe_selection()}")
+        return vertices
+
+
+_OPTIONAL_SELECTORS = {"sphere", "nearest", "loops", "holes", "attribute"}
+
+
+def find_selections(effect: Any) -> Iterator[tuple[str, VertexSelection]]:
+    """Yield the selections of an effect: itself, with an empty name, and its fields."""
+    if isinstance(effect, VertexSelection):
+        yield "", effect
+    for key, value in effect:
+        if isinstance(value, VertexSelection):
+            yield key, value
+
+
+def _describe_value(value: Any) -> str:
+    if isinstance(value, dict):
+        return " ".join(f"{key} {_describe_value(one)}" for key, one in cast(dict[str, Any], value).items())
+    if isinstance(value, list):
+        return "(" + ", ".join(_describe_value(one) for one in cast(list[Any], value)) + ")"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _select_loops(found: list[BoundaryLoop], wanted: tuple[int, ...], name: str, what: str) -> list[IndexArray]:
+    if missing := [k for k in wanted if k >= len(found)]:
+        raise InputError(f"{name}: came {missing[0]}; the mesh has {len(found)} {what}, counted from 0")
+    return [found[k].vertices for k in wanted]
+
+
+def _select_by_attribute(mesh: Mesh, wanted: AttributeRange, name: str) -> IndexArray:
+    if wanted.name not in mesh.attributes:
+        known = suggest_name(wanted.name, mesh.attributes) if mesh.attributes else "none; meshes from files may"
+        raise InputError(f"{name}: came {wanted.name!r}; this mesh has {known}")
+    values = mesh.attributes[wanted.name]
+    low, high = (end if end is not None else sign * np.inf for end, sign in ((wanted.low, -1), (wanted.high, 1)))
+    return np.flatnonzero((values >= low) & (values <= high))

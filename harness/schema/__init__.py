@@ -1,0 +1,1 @@
+"""Configuration documents: YAML loader, base models, key paths for error messages."""

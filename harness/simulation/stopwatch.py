@@ -1,0 +1,156 @@
+"""Cross-check of times: wall time and CPU time by other clocks around the timed work.
+
+    pass_seconds = wall time of all work of a phase, by the kernel's raw clock
+    lost         = pass_seconds - CPU time             the process was preempted or stopped
+    |pass_seconds - sum of the phase's times| <= max(3 % of it, 1 ms)
+
+The sum may be less than pass_seconds by another 1.5 times the lost time, since caches are cold after a preemption.
+
+The times themselves are measured by `perf_counter`, call by call, elsewhere, so that an error in one place shows in the
+other. A delay between two calls is in pass_seconds alone. It is then in `lost` as well and is no error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import wraps
+from time import CLOCK_MONOTONIC_RAW, clock_gettime, perf_counter, process_time, thread_time
+from typing import Any, ParamSpec, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.harness.errors import RunFailed
+from springbench.solvers.model.step_problem import PreparedSolver, StepProblem
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+CLOCK_RTOL, CLOCK_ATOL_SECONDS, CALL_OVERHEAD_SECONDS = 0.03, 1e-3, 5e-6
+"""Relative and absolute [s] difference allowed between two clocks, and time [s] to read them once, including the call
+in between: a tenth of the shortest steps."""
+PREEMPTED_FACTOR = 1.5
+"""Time that may be missing, relative to the lost time: caches are cold after a preemption."""
+
+PHASE_SUM_RTOL = 0.15
+"""Relative difference between an iteration's time and the sum of its phases from which on their rows are flagged."""
+
+
+class ClockMismatch(RunFailed):
+    """Two clocks measured different times."""
+
+
+def retry_on_mismatch(measure: Callable[P, T]) -> Callable[P, T]:
+    """Repeat a measurement once if its clocks disagree; a second ClockMismatch is raised."""
+
+    @wraps(measure)
+    def twice(*arguments: P.args, **named: P.kwargs) -> T:
+        try:
+            return measure(*arguments, **named)
+        except ClockMismatch:
+            return measure(*arguments, **named)
+
+    return twice
+
+
+@dataclass
+class PhaseWatch:
+    """Sum of wall and CPU time over repeated contexts.
+
+    Attributes:
+      num_threads: number of threads that may compute. While all of them do, the process uses this many CPU seconds per
+        second; while one does, it is the calling thread, which uses one.
+      wall_seconds: total wall time [s].
+      num_entries: number of contexts.
+      process_seconds: total CPU time [s] of the process.
+      thread_seconds: total CPU time [s] of the calling thread.
+      start_times: the three clocks at the start of the present context [s].
+    """
+
+    num_threads: int = 1
+    wall_seconds: float = 0.0
+    num_entries: int = 0
+    process_seconds: float = 0.0
+    thread_seconds: float = 0.0
+    start_times: list[float] = field(default_factory=list[float])
+
+    def __enter__(self) -> None:
+        self.start_times = [process_time(), thread_time(), clock_gettime(CLOCK_MONOTONIC_RAW)]
+
+    def __exit__(self, *_: object) -> None:
+        wall, thread, process = clock_gettime(CLOCK_MONOTONIC_RAW), thread_time(), process_time()
+        self.process_seconds += process - self.start_times[0]
+        self.thread_seconds += thread - self.start_times[1]
+        self.wall_seconds += wall - self.start_times[2]
+        self.num_entries += 1
+
+    @property
+    def preempted_seconds(self) -> float:
+        """Seconds in which the process did not compute."""
+        return max(0.0, self.wall_seconds - max(self.thread_seconds, self.process_seconds / self.num_threads))
+
+    @property
+    def max_difference(self) -> float:
+        """Difference [s] allowed to another clock."""
+        return max(CLOCK_RTOL * self.wall_seconds, CLOCK_ATOL_SECONDS, CALL_OVERHEAD_SECONDS * self.num_entries)
+
+    def build_columns(self, what: str, seconds: Iterable[float]) -> dict[str, Any]:
+        """Build the check columns of the rows with given times; raises ClockMismatch."""
+        told = sum(seconds)
+        if (
+            not -self.max_difference
+            <= self.wall_seconds - told
+            <= self.max_difference + PREEMPTED_FACTOR * self.preempted_seconds
+        ):  # so that NaN fails too
+            raise ClockMismatch(
+                f"the times of {what} add up to {told:.6g} s, where another clock saw {self.wall_seconds:.6g} s go by, "
+                f"{self.preempted_seconds:.3g} s of them without computing: one of the two does not measure what it says"
+            )
+        return {
+            "pass_seconds": self.wall_seconds,
+            "summed_seconds": told,
+            "cpu_seconds": self.process_seconds,
+            "interrupted": self.preempted_seconds > max(CLOCK_RTOL * self.wall_seconds, CLOCK_ATOL_SECONDS),
+        }
+
+
+class Stopwatch:
+    """Stopwatch for successive pieces of work, each also timed by a watch.
+
+    `seconds` is the time of the last one [s].
+    """
+
+    def __init__(self, watch: PhaseWatch) -> None:
+        self.watch, self.seconds, self._began = watch, 0.0, 0.0
+
+    def __enter__(self) -> None:
+        self.watch.__enter__()
+        self._began = perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self.seconds = perf_counter() - self._began
+        self.watch.__exit__()
+
+
+def check_phases(prepared: PreparedSolver, problem: StepProblem) -> dict[str, Callable[[], object]]:
+    """Return a solver's phases after checking that each computes.
+
+    The returned array of each phase is overwritten with NaN, and a second call must restore it.
+
+    Raises:
+      RunFailed: a phase does nothing.
+    """
+    phases = prepared.iteration_phases(problem)
+    for phase, call in phases.items():
+        given: Any = call()
+        if not isinstance(given, np.ndarray):
+            does = given is not None
+        else:
+            array = cast(NDArray[Any], given)
+            known = np.isfinite(array).any()
+            array.fill(np.nan)
+            again = call()
+            does = bool(np.isfinite(np.asarray(again)).any()) or not known or not len(problem.system.free_vertices)
+        if not does:
+            raise RunFailed(f"the phase {phase} does nothing; it should compute, and return the array that it wrote")
+    return phases

@@ -1,0 +1,174 @@
+"""Time stepping to an error tolerance by a solver with substeps within frames (`own_steps` in its metadata).
+
+The substeps are adaptive, or have a fixed size: the largest stable one or a smaller one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import ceil, inf
+from time import perf_counter, thread_time
+from typing import ClassVar, Protocol, runtime_checkable
+
+import numpy as np
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.adaptive_stepping import (
+    Stepper,
+    StepSizeUnderflow,
+    TimeBudgetExceeded,
+    Trajectory,
+    share_frame_seconds,
+)
+from springbench.harness.simulation.time_loop import MotionState, build_initial_state, build_problem
+from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.step_problem import Positions, Solver, StepProblem, Unsupported
+
+
+class _SubsteppingSolver(Protocol):
+    """A prepared solver with substeps."""
+
+    @property
+    def order(self) -> int:
+        """The order of convergence of the error."""
+        ...
+
+    @property
+    def num_evaluations(self) -> int:
+        """The number of force evaluations in a step."""
+        ...
+
+    @property
+    def num_factorisations(self) -> int:
+        """The number of factorisations in a tried step, 0 for explicit methods."""
+        ...
+
+    def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, Sequence[float]]:
+        """Integrate one frame.
+
+        Args:
+          problem: step problem of the frame.
+          h: first step size [s].
+
+        Returns: positions [m] and velocities [m/s] at the frame's end, and the number of accepted steps, the number of
+          rejected steps and the last step size [s].
+        """
+        ...
+
+
+@runtime_checkable
+class AdaptiveSubstepping(_SubsteppingSolver, Protocol):
+    """A solver with adaptive steps within a frame."""
+
+    def with_tolerance(self, tolerance: float) -> AdaptiveSubstepping:
+        """Return the solver with an error tolerance [m] of each step.
+
+        Raises:
+          Unsupported: the method has no error estimate.
+        """
+        ...
+
+
+@runtime_checkable
+class FixedSubstepping(_SubsteppingSolver, Protocol):
+    """A solver with fixed steps within a frame, of the largest stable size."""
+
+    def with_refined_substeps(self, refinement_factor: float) -> FixedSubstepping:
+        """Return the solver with the number of steps multiplied by a factor."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class AdaptiveSubstepper(Stepper):
+    """Stepping by a solver with adaptive substeps within frames.
+
+    The step of the scene is a frame, and its integrator is `own`.
+    """
+
+    scene: Scene
+    solver: Solver
+    frames: int
+
+    @property
+    def order(self) -> int:
+        """The order of convergence of the solver."""
+        return self._convergence_order
+
+    @cached_property
+    def _convergence_order(self) -> int:
+        return self._prepare_pieces(1.0)[1].order
+
+    def integrate_motion(self, setting: float, *, cpu_limit: float = inf) -> Trajectory:
+        """Integrate the motion.
+
+        Raises Unsupported as the solver does, and for quantities that change within a frame where the error estimate
+        would not detect it.
+        """
+        cpu = thread_time()
+        scene, ready, pieces = self._prepare_pieces(setting)
+        state, began = build_initial_state(scene), perf_counter()
+        reached = list[float]()
+        seen, h, told = [state.motion.positions], None, np.zeros((self.frames * pieces, 3))
+        for k in range(len(told)):
+            stated = build_problem(scene, state, "current")
+            try:
+                p, v, each = ready.step(stated, h)
+            except RuntimeError as error:
+                raise StepSizeUnderflow(
+                    f"frame {k // pieces + 1}, after {scene.compute_time(k):.6g} s: {error}"
+                ) from error
+            told[k] = each[:3]
+            h, state = float(told[k, 2]), MotionState(Motion(p, v), None, k + 1)
+            if (k + 1) % pieces == 0:
+                seen.append(p)
+                reached.append(perf_counter() - began)
+            if thread_time() - cpu > cpu_limit:
+                raise TimeBudgetExceeded
+        accepted, rejected = (int(count) for count in told[:, :2].sum(axis=0))
+        evaluations = (accepted + rejected) * ready.num_evaluations
+        mean = scene.system.time_step * len(told) / accepted
+        counts = accepted, rejected, (accepted + rejected) * ready.num_factorisations, evaluations
+        return Trajectory(
+            np.array(seen), *counts, (mean, mean), reached[-1], share_frame_seconds(reached), thread_time() - cpu
+        )
+
+    def _prepare_pieces(self, setting: float) -> tuple[Scene, _SubsteppingSolver, int]:
+        """Return the scene, the prepared solver and the number of pieces of each frame."""
+        if changes := _list_time_dependence(self.scene):
+            raise Unsupported(f"takes {' and '.join(changes)} as even within a frame, which is of order 1")
+        ready = self.solver.prepare(self.scene.system)
+        if not isinstance(ready, AdaptiveSubstepping):
+            raise Unsupported("the method chooses no steps by an error")
+        return self.scene, ready.with_tolerance(setting), 1
+
+
+@dataclass(frozen=True, eq=False)
+class FixedSubstepper(AdaptiveSubstepper):
+    """Stepping by a solver with a fixed substep size.
+
+    Quantities that change within a frame are taken as constant within each of a number of pieces, which is of order 1.
+    `build_scene` builds the scene with a given step size [s].
+    """
+
+    build_scene: Callable[[float], Scene]
+
+    has_fixed_step: ClassVar[bool] = True
+
+    @cached_property
+    def _convergence_order(self) -> int:
+        return 1 if _list_time_dependence(self.scene) else self._prepare_pieces(1.0)[1].order
+
+    def _prepare_pieces(self, setting: float) -> tuple[Scene, _SubsteppingSolver, int]:
+        pieces = ceil(setting) if _list_time_dependence(self.scene) else 1
+        scene = self.build_scene(self.scene.system.time_step / pieces) if pieces > 1 else self.scene
+        ready = self.solver.prepare(scene.system)
+        if not isinstance(ready, FixedSubstepping):
+            raise Unsupported("the number of its steps in a frame cannot be set")
+        return scene, ready.with_refined_substeps(setting if pieces == 1 else 1.0), pieces
+
+
+def _list_time_dependence(scene: Scene) -> list[str]:
+    """List the quantities that substepping solvers take as constant within a frame although they change."""
+    there = ("forces of place, speed and time", scene.varying_forces), ("moving pins", scene.pin_motions)
+    return [what for what, some in there if some]

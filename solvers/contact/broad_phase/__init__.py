@@ -1,0 +1,1 @@
+"""Candidate pairs: bounding volume hierarchy, cluster culling, candidate cache."""

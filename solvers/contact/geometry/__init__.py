@@ -1,0 +1,1 @@
+"""Distances of primitives and axis-aligned bounding boxes."""

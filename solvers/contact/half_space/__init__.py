@@ -1,0 +1,1 @@
+"""Unilateral penalty contact of vertices with half-spaces."""

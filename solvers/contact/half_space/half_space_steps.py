@@ -1,0 +1,287 @@
+"""Newton steps of single vertices with half-space contact, one vertex after another.
+
+    k/2 min(0, n.x - d)^2 + F h(|u|),   u = (I - nn')(x - a)     a half-space (see `half_space_potential`)
+
+The block and gradient of a vertex are those of its springs, of active half-spaces and of friction. Half-spaces that
+become active along the step are found by a few repetitions, each from the end of the last one. A step that increases
+the energy is replaced by one with a larger block, finally one that majorises all terms. Two functions provide all other
+energies of the vertices (see `springbench.solvers.methods.vertex_block.incident_elements`).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.solvers.jit.kernel_compilation import jit_closure, jit_inner
+from springbench.solvers.kernels.spring_local_step import ZERO_LENGTH_SQUARED
+from springbench.solvers.simd.spring_packets import LANES, RHS_STRIDE
+
+_MAX_ACTIVE_SET_PASSES = 4
+EXACT_BLOCK, _FRICTION_MAJORANT, SPRING_MAJORANT, _FULL_MAJORANT = range(4)
+"""The blocks: exact except for compressed springs; majorant of friction; also of springs; also of inactive contact."""
+
+_PIVOT_ROUNDOFF = 1e-14
+"""Pivots up to this fraction of the trace are round-off."""
+
+
+class HalfSpaces(NamedTuple):
+    """Half-spaces by the rows of their vertices.
+
+    Attributes:
+        row_starts: first half-space of each row (rows + 1,).
+        has_half_space: whether a packet has a vertex with a half-space (b,).
+        normal, friction_anchor: n and a (k, 3).
+        offset: d [m] (k,).
+        stiffness: k [N/m] (k,).
+        friction_limit: friction limit F [N] (k,).
+        smoothing_length: smoothing length [m] (k,).
+        is_two_sided: whether they act on both sides, as planes do.
+    """
+
+    row_starts: NDArray[np.int64]
+    has_half_space: NDArray[np.bool_]
+    normal: NDArray[np.float64]
+    friction_anchor: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    stiffness: NDArray[np.float64]
+    friction_limit: NDArray[np.float64]
+    smoothing_length: NDArray[np.float64]
+    is_two_sided: bool
+
+
+@jit_inner
+def _penetration_depth(s, gap):
+    return gap if s.is_two_sided else min(0.0, gap)
+
+
+@jit_inner
+def _huber_norm(u, slip):
+    return 0.5 * u * u / slip if u <= slip else u - 0.5 * slip
+
+
+@jit_inner
+def _tangential_displacement(s, k, x):
+    """Return u and |u| of a half-space at x."""
+    n0, n1, n2 = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2]
+    u0, u1, u2 = x[0] - s.friction_anchor[k, 0], x[1] - s.friction_anchor[k, 1], x[2] - s.friction_anchor[k, 2]
+    along = n0 * u0 + n1 * u1 + n2 * u2
+    u0, u1, u2 = u0 - along * n0, u1 - along * n1, u2 - along * n2
+    return u0, u1, u2, np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
+
+
+@jit_inner
+def half_space_energy(s, p):
+    """Return the half-spaces' energy [J] at positions in rows of four; 0 without half-spaces."""
+    if s is None:
+        return 0.0
+    total = 0.0
+    for i in range(len(s.row_starts) - 1):
+        x = p[4 * i], p[4 * i + 1], p[4 * i + 2]
+        for k in range(s.row_starts[i], s.row_starts[i + 1]):
+            depth = _penetration_depth(
+                s, s.normal[k, 0] * x[0] + s.normal[k, 1] * x[1] + s.normal[k, 2] * x[2] - s.offset[k]
+            )
+            total += 0.5 * s.stiffness[k] * depth * depth
+            if s.friction_limit[k] > 0.0:
+                total += s.friction_limit[k] * _huber_norm(_tangential_displacement(s, k, x)[3], s.smoothing_length[k])
+    return total
+
+
+@jit_inner
+def _spring_gradient_and_block(bundles, b, lane, p, x, held, load):
+    """Return the gradient and the block's upper triangle of a vertex's springs, inertia and pins."""
+    g0, g1, g2 = -load[0], -load[1], -load[2]
+    a00, a01, a02, a11, a12, a22 = held, 0.0, 0.0, held, 0.0, held
+    for entry in range(bundles.packet_start[b], bundles.packet_start[b + 1]):
+        e, w = LANES * entry + lane, bundles.weight_offset[entry] + lane
+        j, k, pull = bundles.neighbour_offset[e], bundles.weights[w + LANES], bundles.weights[w]
+        if k == 0.0:
+            continue
+        v0, v1, v2 = x[0] - p[j], x[1] - p[j + 1], x[2] - p[j + 2]
+        squared = v0 * v0 + v1 * v1 + v2 * v2
+        if squared <= ZERO_LENGTH_SQUARED:
+            length, name = 0.0, bundles.spring_index[e]
+            sign = -1.0 if name < 0 else 1.0
+            name = ~name if name < 0 else name
+            n0, n1, n2 = bundles.rest_direction[name]
+            n0, n1, n2 = sign * n0, sign * n1, sign * n2
+            lateral = 0.0 if pull > 0.0 else k
+        else:
+            length = np.sqrt(squared)
+            n0, n1, n2 = v0 / length, v1 / length, v2 / length
+            lateral = max(k - pull / length, min(k, 0.0))
+        tension, axial = k * length - pull, k - lateral
+        g0, g1, g2 = g0 + tension * n0, g1 + tension * n1, g2 + tension * n2
+        a00, a01, a02 = a00 + axial * n0 * n0 + lateral, a01 + axial * n0 * n1, a02 + axial * n0 * n2
+        a11, a12, a22 = a11 + axial * n1 * n1 + lateral, a12 + axial * n1 * n2, a22 + axial * n2 * n2 + lateral
+    return (g0, g1, g2), (a00, a01, a02, a11, a12, a22)
+
+
+@jit_inner
+def _add_outer_product(block, weight, n0, n1, n2):
+    a00, a01, a02, a11, a12, a22 = block
+    return (
+        a00 + weight * n0 * n0, a01 + weight * n0 * n1, a02 + weight * n0 * n2,
+        a11 + weight * n1 * n1, a12 + weight * n1 * n2, a22 + weight * n2 * n2,
+    )  # fmt: skip
+
+
+@jit_inner
+def add_half_spaces(s, i, x, d, level, gradient, block):
+    """Add active half-spaces and friction at x, or after a step d, to gradient and block.
+
+    Returns the active set as bits.
+    """
+    who = 0
+    for k in range(s.row_starts[i], s.row_starts[i + 1]):
+        n0, n1, n2, weight = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2], s.stiffness[k]
+        gap = n0 * x[0] + n1 * x[1] + n2 * x[2] - s.offset[k]
+        if s.is_two_sided or gap < 0.0 or level == _FULL_MAJORANT or gap + n0 * d[0] + n1 * d[1] + n2 * d[2] < 0.0:
+            who |= 1 << (k - s.row_starts[i])
+            block = _add_outer_product(block, weight, n0, n1, n2)
+            force = weight * (_penetration_depth(s, gap) if level == _FULL_MAJORANT else gap)
+            gradient = gradient[0] + force * n0, gradient[1] + force * n1, gradient[2] + force * n2
+        if s.friction_limit[k] > 0.0:
+            u0, u1, u2, length = _tangential_displacement(s, k, x)
+            weight = s.friction_limit[k] / max(s.smoothing_length[k], length)
+            gradient = gradient[0] + weight * u0, gradient[1] + weight * u1, gradient[2] + weight * u2
+            a00, a01, a02, a11, a12, a22 = _add_outer_product(block, -weight, n0, n1, n2)
+            block = a00 + weight, a01, a02, a11 + weight, a12, a22 + weight
+            if level == EXACT_BLOCK and length > s.smoothing_length[k]:
+                block = _add_outer_product(block, -weight, u0 / length, u1 / length, u2 / length)
+    return gradient, block, who
+
+
+@jit_inner
+def solve_block(block, g):
+    """Return -B^-1 g, and whether B is positive definite."""
+    a, b, c, d, e, f = block
+    least = _PIVOT_ROUNDOFF * (a + d + f)
+    if not a > least:
+        return (0.0, 0.0, 0.0), False
+    l1, l2 = b / a, c / a
+    second, below = d - l1 * b, e - l2 * b
+    if not second > least:
+        return (0.0, 0.0, 0.0), False
+    l3 = below / second
+    third = f - l2 * c - l3 * below
+    if not third > least:
+        return (0.0, 0.0, 0.0), False
+    y1 = g[1] - l1 * g[0]
+    x2 = -(g[2] - l2 * g[0] - l3 * y1) / third
+    x1 = -y1 / second - l3 * x2
+    return (-g[0] / a - l1 * x1 - l2 * x2, x1, x2), True
+
+
+@jit_inner
+def _energy_change(bundles, b, lane, p, x, d, held, load):
+    """Return the change of a vertex's energy [J] of springs, inertia and pins by a step d, without cancellation."""
+    total = 0.0
+    for c in range(3):
+        total += d[c] * (0.5 * held * d[c] - load[c])
+    for entry in range(bundles.packet_start[b], bundles.packet_start[b + 1]):
+        j, w = bundles.neighbour_offset[LANES * entry + lane], bundles.weight_offset[entry] + lane
+        stiffness, before, after, change = bundles.weights[w + LANES], 0.0, 0.0, 0.0
+        if stiffness == 0.0:
+            continue
+        for c in range(3):
+            v = x[c] - p[j + c]
+            before += v * v
+            after += (v + d[c]) * (v + d[c])
+            change += d[c] * (2.0 * v + d[c])
+        both = np.sqrt(before) + np.sqrt(after)
+        if both > 0.0:
+            total += change * (0.5 * stiffness - bundles.weights[w] / both)
+    return total
+
+
+@jit_inner
+def add_half_space_change(s, i, x, d, total):
+    """Add to a change that of the half-spaces' energy [J] by a step d of row i from x."""
+    end = x[0] + d[0], x[1] + d[1], x[2] + d[2]
+    for k in range(s.row_starts[i], s.row_starts[i + 1]):
+        n0, n1, n2 = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2]
+        gap = n0 * x[0] + n1 * x[1] + n2 * x[2] - s.offset[k]
+        depth, deep = _penetration_depth(s, gap), _penetration_depth(s, gap + n0 * d[0] + n1 * d[1] + n2 * d[2])
+        total += 0.5 * s.stiffness[k] * (deep - depth) * (deep + depth)
+        if s.friction_limit[k] > 0.0:
+            u0, u1, u2, length = _tangential_displacement(s, k, x)
+            w0, w1, w2, longer = _tangential_displacement(s, k, end)
+            both = (w0 - u0) * (w0 + u0) + (w1 - u1) * (w1 + u1) + (w2 - u2) * (w2 + u2)
+            if length <= s.smoothing_length[k] and longer <= s.smoothing_length[k]:
+                total += 0.5 * s.friction_limit[k] * both / s.smoothing_length[k]
+            elif length > s.smoothing_length[k] and longer > s.smoothing_length[k]:
+                total += s.friction_limit[k] * both / (longer + length)
+            else:
+                total += s.friction_limit[k] * (
+                    _huber_norm(longer, s.smoothing_length[k]) - _huber_norm(length, s.smoothing_length[k])
+                )
+    return total
+
+
+def build_block_step(energy_change: Any) -> Any:
+    """Build a function that finds a step of row i from x that does not increase its energy.
+
+    It tries increasingly large blocks; if none succeeds, the step is zero. A device compiles it separately.
+
+    Args:
+        energy_change: function (d, where) that returns the change by a step of the other energies of the row; `where`
+            is passed to it unchanged.
+    """
+
+    @jit_closure
+    def lowering(s, i, x, majorant, first, gradient, block, where):
+        """Return the step; begin with the block `first`; majorant, gradient and block exclude the half-spaces."""
+        for level in range(first, _FULL_MAJORANT + 1):
+            if level == SPRING_MAJORANT:
+                block = majorant
+            d, definite, before = (0.0, 0.0, 0.0), True, -1
+            for _ in range(_MAX_ACTIVE_SET_PASSES):
+                slope, whole, who = add_half_spaces(s, i, x, d, level, gradient, block)
+                if who == before:
+                    break
+                before = who
+                d, definite = solve_block(whole, slope)
+            if definite and add_half_space_change(s, i, x, d, energy_change(d, where)) <= 0.0:
+                return d
+        return 0.0, 0.0, 0.0
+
+    return lowering
+
+
+def build_vertex_move(add_gradient_block: Any, energy_change: Any) -> Any:
+    """Build a function that moves the vertices of a packet to lower energies one after another.
+
+    No two of them are coupled.
+
+    Args:
+        add_gradient_block: function (beside, i, p, gradient, block) that adds the other energies of row i.
+        energy_change: function (beside, i, p, d) that returns their change by a step d.
+    """
+
+    @jit_closure
+    def rise(d, where):
+        bundles, beside, b, lane, i, p, x, held, load = where
+        return _energy_change(bundles, b, lane, p, x, d, held, load) + energy_change(beside, i, p, d)
+
+    lowering = build_block_step(rise)
+
+    @jit_closure
+    def move(bundles, s, beside, b, unknowns, p, right, majorant):
+        for lane in range(LANES):
+            i = bundles.row_offset[LANES * b + lane] // 4
+            if i >= unknowns:
+                continue
+            at, most = RHS_STRIDE * b + lane, majorant[LANES * b + lane]
+            h = right[at + 3 * LANES]
+            x = p[4 * i], p[4 * i + 1], p[4 * i + 2]
+            load = right[at] - h * x[0], right[at + LANES] - h * x[1], right[at + 2 * LANES] - h * x[2]
+            gradient, block = _spring_gradient_and_block(bundles, b, lane, p, x, h, load)
+            gradient, block = add_gradient_block(beside, i, p, gradient, block)
+            majorant_block, where = (most, 0.0, 0.0, most, 0.0, most), (bundles, beside, b, lane, i, p, x, h, load)
+            d = lowering(s, i, x, majorant_block, EXACT_BLOCK, gradient, block, where)
+            p[4 * i], p[4 * i + 1], p[4 * i + 2] = x[0] + d[0], x[1] + d[1], x[2] + d[2]
+
+    return move

@@ -1,0 +1,1 @@
+"""Barrier and friction potentials with derivatives."""

@@ -1,0 +1,186 @@
+"""Lagged Coulomb friction of collisions with given normal forces: a convex function of positions within the step.
+
+    E(p) = sum over pairs of mu F h(|u|),     u = (I - nn') sum_i c_i (x_i - x_i^t)
+
+F: the barrier's normal force at `start.pressed`, an iterate of this step, or at the step's start if that is None; c, n:
+coefficients and direction of the closest points there; x^t: positions at the step's start (Li et al. 2020, "Incremental
+potential contact", section 5; `springbench.solvers.contact.lagged_friction` iterates them to convergence). h is the
+length,
+smoothed where a pair slips by less than s in a step; its slope is continuous, and below 1 there:
+
+    h(u) = u^2/s - u^3/(3 s^2)  for u < s,     u - s/3 beyond
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.solvers.contact.collisions import Collisions
+from springbench.solvers.contact.potentials import barrier
+from springbench.solvers.contact.potentials.hessian_blocks import BLOCK_ENTRIES, PackedBlocks, row_offset
+from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.model.step_problem import Positions
+
+FloatArray = NDArray[np.float64]
+
+
+class TangentialCollisions(NamedTuple):
+    """Collisions with friction.
+
+    Attributes:
+        vertices: (g, 4); missing vertices have zero coefficients.
+        coefficients: c (g, 4).
+        normal: unit normals (g, 3).
+        friction_anchor: sum_i c_i x_i^t [m], (g, 3).
+        friction_limit: mu F [N], (g,).
+        smoothing_length: s [m].
+    """
+
+    vertices: NDArray[np.int64]
+    coefficients: FloatArray
+    normal: FloatArray
+    friction_anchor: FloatArray
+    friction_limit: FloatArray
+    smoothing_length: float
+
+    @classmethod
+    def from_collisions(
+        cls, collisions: Collisions, start: Positions, friction: float, smoothing_length: float
+    ) -> Self:
+        """Build the friction of collisions.
+
+        Args:
+            collisions: active collisions.
+            start: positions of all vertices at the step's start [m].
+            friction: friction coefficient mu.
+            smoothing_length: s [m].
+        """
+        between, force = collisions.distance_vector, np.empty(len(collisions.vertices))
+        barrier.compute_normal_forces(collisions, force)
+        normal = between / np.sqrt(np.einsum("ij,ij->i", between, between))[:, None]
+        vertices, weights, anchor = collisions.vertices.copy(), collisions.coefficients.copy(), np.empty_like(between)
+        combine_positions(vertices, weights, start, anchor)
+        return cls(vertices, weights, normal, anchor, friction * force, smoothing_length)
+
+    def value(self, p: Positions) -> float:
+        """Return the energy [J] at p (n, 3)."""
+        return friction_energy(self, p)
+
+    def add_gradient(self, p: Positions, out: Positions) -> None:
+        """Add the gradient [N] at p (n, 3) to `out`."""
+        add_friction_gradient(self, p, out)
+
+    def hessian_blocks(self, p: Positions) -> PackedBlocks:
+        """Return the Hessian blocks at p (n, 3), positive semidefinite."""
+        many = len(self.vertices)
+        packed = np.empty(BLOCK_ENTRIES * many)
+        write_friction_hessian(self, p, packed)
+        return PackedBlocks(self.vertices, BLOCK_ENTRIES * np.arange(many + 1), packed)
+
+
+@jit_inner
+def combine_coordinate(x, c, p, axis):
+    """Return sum_i c_i p_i [m] along an axis."""
+    return c[0] * p[x[0], axis] + c[1] * p[x[1], axis] + c[2] * p[x[2], axis] + c[3] * p[x[3], axis]
+
+
+@jit_kernel
+def combine_positions(vertices, weights, p, out):
+    """Write sum_i c_i p_i [m] of each collision to `out`."""
+    for e in range(len(vertices)):
+        for axis in range(3):
+            out[e, axis] = combine_coordinate(vertices[e], weights[e], p, axis)
+
+
+@jit_inner
+def tangential_displacement(tangential_collisions, p, e):
+    """Return the tangential displacement u and |u| [m] of collision e."""
+    x, c, n = tangential_collisions.vertices[e], tangential_collisions.coefficients[e], tangential_collisions.normal[e]
+    u0 = combine_coordinate(x, c, p, 0) - tangential_collisions.friction_anchor[e, 0]
+    u1 = combine_coordinate(x, c, p, 1) - tangential_collisions.friction_anchor[e, 1]
+    u2 = combine_coordinate(x, c, p, 2) - tangential_collisions.friction_anchor[e, 2]
+    along = u0 * n[0] + u1 * n[1] + u2 * n[2]
+    u0, u1, u2 = u0 - along * n[0], u1 - along * n[1], u2 - along * n[2]
+    return u0, u1, u2, np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
+
+
+@jit_inner
+def friction_f1_over_x(length, smoothing_length):
+    """Return h'(u)/u [1/m]."""
+    return (2.0 - length / smoothing_length) / smoothing_length if length < smoothing_length else 1.0 / length
+
+
+@jit_inner
+def friction_f0(length, smoothing_length):
+    """Return h [m] of a length."""
+    y = min(length / smoothing_length, 1.0)
+    return smoothing_length * (y * y - y * y * y / 3.0) + max(length - smoothing_length, 0.0)
+
+
+@jit_inner
+def friction_f2_terms(u0, u1, u2, length, smoothing_length):
+    """Return h'(u)/u, h''(u) minus that [1/m], and u/|u|."""
+    flat, least = friction_f1_over_x(length, smoothing_length), max(length, 1e-300)
+    return (
+        flat,
+        max(2.0 * (1.0 - length / smoothing_length) / smoothing_length, 0.0) - flat,
+        (u0 / least, u1 / least, u2 / least),
+    )
+
+
+@jit_inner
+def friction_hessian_entry(n, second, a, b):
+    """Return entry (a, b) of the Hessian of h [1/m], tangential to n (3,); second: from `friction_f2_terms`."""
+    flat, more, u = second
+    same = 1.0 if a == b else 0.0
+    return flat * (same - n[a] * n[b]) + more * u[a] * u[b]
+
+
+@jit_kernel
+def friction_energy(tangential_collisions, p):
+    """Return the friction energy [J] at p (n, 3)."""
+    total, s = 0.0, tangential_collisions.smoothing_length
+    for e in range(len(tangential_collisions.vertices)):
+        length = tangential_displacement(tangential_collisions, p, e)[3]
+        total += tangential_collisions.friction_limit[e] * friction_f0(length, s)
+    return total
+
+
+@jit_kernel
+def add_friction_gradient(tangential_collisions, p, out):
+    """Add the friction gradient [N] at p (n, 3) to `out`."""
+    for e in range(len(tangential_collisions.vertices)):
+        u0, u1, u2, length = tangential_displacement(tangential_collisions, p, e)
+        w = tangential_collisions.friction_limit[e] * friction_f1_over_x(length, tangential_collisions.smoothing_length)
+        for i in range(4):
+            v, c = tangential_collisions.vertices[e, i], tangential_collisions.coefficients[e, i]
+            out[v, 0] += c * (w * u0)
+            out[v, 1] += c * (w * u1)
+            out[v, 2] += c * (w * u2)
+
+
+@jit_kernel
+def write_friction_hessian(tangential_collisions, p, out):
+    """Write the packed Hessian block of each collision at p (n, 3) to `out`."""
+    for e in range(len(tangential_collisions.vertices)):
+        n, c, H = (
+            tangential_collisions.normal[e],
+            tangential_collisions.coefficients[e],
+            out[BLOCK_ENTRIES * e : BLOCK_ENTRIES * (e + 1)],
+        )
+        u0, u1, u2, length = tangential_displacement(tangential_collisions, p, e)
+        second = friction_f2_terms(u0, u1, u2, length, tangential_collisions.smoothing_length)
+        for a in range(3):
+            for b in range(3):
+                h = tangential_collisions.friction_limit[e] * friction_hessian_entry(n, second, a, b)
+                for i in range(4):
+                    for j in range(i + 1):
+                        H[row_offset(i, a) + 3 * j + b] = c[i] * c[j] * h
+
+
+_NO_VECTORS = np.empty((0, 3))
+NO_TANGENTIAL_COLLISIONS = TangentialCollisions(
+    np.empty((0, 4), np.int64), np.empty((0, 4)), _NO_VECTORS, _NO_VECTORS, np.empty(0), 1.0
+)

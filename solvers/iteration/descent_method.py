@@ -1,0 +1,243 @@
+"""The base of methods with exact gradients: points, and a line search that distinguishes descent from round-off.
+
+The line search halves a step until the objective decreases enough
+(`springbench.solvers.kernels.line_search_conditions`). The
+change of the objective is computed from differences (see `springbench.solvers.kernels.objective_kernels`), so that
+the search works
+until the gradient itself is round-off. The rounding error of other energies' values is taken into account; within it
+the slope must decrease instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
+from springbench.solvers.kernels.line_search_conditions import (
+    ARMIJO_FRACTION,
+    is_approximate_wolfe_step,
+    is_armijo_step,
+)
+from springbench.solvers.linalg.direct_solvers import DenseCholesky
+from springbench.solvers.linalg.solver_selection import build_linear_solver
+from springbench.solvers.model import system_matrix_assembly
+from springbench.solvers.model.step_problem import Positions, ProjectiveEnergy, StepProblem, System
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
+
+MAX_HALVINGS = 60
+"""Maximum number of halvings; after it a step has no significant digit left."""
+
+
+class DescentPoint(NamedTuple):
+    """An iterate: positions and gradient, (n, 3).
+
+    Attributes:
+        is_stalled: whether round-off prevents descent from here.
+        is_past_saddle: whether the previous point was a saddle point.
+    """
+
+    positions: Positions
+    gradient: Positions
+    is_stalled: bool = False
+    is_past_saddle: bool = False
+
+
+class DescentMethod(Protocol):
+    """A method that yields one point after another; it ends with a stalled one."""
+
+    def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
+        """Yield the points after `start`."""
+        ...
+
+    def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
+        """Return whether a stationary point may be a minimum, as far as the method can determine."""
+        ...
+
+    def iteration_phases(self, step: StepObjective, at: DescentPoint) -> dict[str, Callable[[], object]]:
+        """Return the phases of an iteration at a point, by name."""
+        ...
+
+
+def backtracking_line_search(
+    step: StepObjective,
+    at: DescentPoint,
+    direction: Positions,
+    *,
+    initial_step: float = 1.0,
+    directional_curvature: float = 0.0,
+    relax_locally: Callable[[Positions], Positions] | None = None,
+) -> DescentPoint | None:
+    """Return the first point at initial_step, initial_step/2, ... with sufficient decrease, or None.
+
+    No point is beyond the step size limit of the barrier energies (`springbench.solvers.model.barrier_energy`).
+
+    Args:
+        step: the objective.
+        at: current point.
+        direction: search direction (n, 3) [m].
+        initial_step: first step size.
+        directional_curvature: second derivative along the direction [J], if a decrease is expected from it.
+        relax_locally: relaxation that lowers the objective from given positions; its result is tried first at each
+            point.
+    """
+    slope = inner_product(at.gradient, direction)
+    t = step.max_step_size(at.positions, direction, initial_step)
+    for _ in range(MAX_HALVINGS if slope + directional_curvature < 0.0 < t else 0):
+        p = step.apply_exact_pins(at.positions + t * direction)
+        lower = relax_locally(p) if relax_locally else p
+        if lower is not p and step.objective_change(at.positions, lower)[0] <= ARMIJO_FRACTION * t * (
+            slope + 0.5 * t * directional_curvature
+        ):
+            return DescentPoint(lower, step.gradient(lower))
+        rise, noise = step.objective_change(at.positions, p)
+        if is_armijo_step(rise, t, slope, directional_curvature):
+            return DescentPoint(p, step.gradient(p))
+        if rise <= noise and 0.0 < noise < np.inf:
+            gradient = step.gradient(p)
+            if is_approximate_wolfe_step(abs(inner_product(gradient, direction)), slope, ARMIJO_FRACTION):
+                return DescentPoint(p, gradient)
+        t *= 0.5
+    return None
+
+
+def pick_lower_start(step: StepObjective, start: DescentPoint) -> DescentPoint:
+    """Return the lower one of a point and the inertial prediction, if the path to the latter is free of collisions."""
+    fall = step.inertial_prediction()
+    if step.barrier_energies and step.max_step_size(start.positions, fall - start.positions) < 1.0:
+        return start
+    return DescentPoint(fall, step.gradient(fall)) if step.objective_change(start.positions, fall)[0] < 0.0 else start
+
+
+def has_active_barrier(step: StepObjective, p: Positions) -> bool:
+    """Return whether a barrier energy is active at p."""
+    return any(energy.value(p) > 0.0 for energy in step.barrier_energies)
+
+
+def inner_product(a: Positions, b: Positions) -> float:
+    """Return the inner product of two fields, (n, 3)."""
+    return float(np.einsum("ij,ij->", a, b))
+
+
+class ResidualMetric:
+    """Q of a system's projective energies, factorised, which defines the norm of residuals.
+
+    Attributes:
+        unpinned_trace: trace of its unpinned part [N/m].
+        free_block: its free part (f, f).
+        free_diagonal: diagonal of the free part (f,) [N/m].
+        factor: factor of the free part.
+        description: description of the linear solver.
+        stats: exact counts.
+    """
+
+    def __init__(self, system: System) -> None:
+        """Assemble and factorise Q.
+
+        Raises:
+            NotPositiveDefinite: the positions of some vertices are not determined.
+            Unsupported: no linear solver fits in memory.
+        """
+        self.system = system
+        self._Q = system_matrix_assembly.assemble_system_matrix(
+            system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)]
+        )
+        self.free_block = csr_array(csr_array(self._Q[system.free_vertices])[:, system.free_vertices])
+        self.free_diagonal: NDArray[np.float64] = np.asarray(self.free_block.diagonal(), np.float64)
+        self.unpinned_trace = float(self._Q.diagonal()[system.unpinned_mask].sum())
+        self.stats = {"nnz_system": float(self._Q.nnz)}
+        free, nothing = system.free_vertices, (DenseCholesky(np.eye(0)), "nothing to solve for")
+        self.factor, self.description = build_linear_solver(self.free_block) if len(free) else nothing
+        if self.factor.nonzeros is not None:
+            self.stats["nnz_factor"] = float(self.factor.nonzeros)
+
+    def energy_roundoff(self, p: Positions) -> float:
+        """Return a bound of g H^-1 g [J] for a gradient g due to rounding of the positions p (n, 3)."""
+        return float(np.finfo(np.float64).eps * np.abs(p).max(initial=0.0)) ** 2 * self.unpinned_trace
+
+    def solve(self, b: Positions) -> Positions:
+        """Return Q^-1 b, (n, 3), zero at exactly pinned vertices."""
+        out, free = np.zeros_like(b), self.system.free_vertices
+        x = np.empty((len(free), 3))
+        self.factor.solve(np.ascontiguousarray(b[free]), x)
+        out[free] = x
+        return out
+
+    def residual(self, gradient: Positions) -> float:
+        """Return |Q^-1 g|_Q [J^(1/2)] over the unpinned vertices, of a gradient g (n, 3)."""
+        return self.correction_norm(self.solve(gradient), gradient)
+
+    def correction_norm(self, e: Positions, gradient: Positions) -> float:
+        """Return that residual for e = Q^-1 g, which is overwritten."""
+        pins = self.system.pins
+        if pins.exact_mask.all():  # then |Q^-1 g|_Q is what g does along it
+            return max(inner_product(e, gradient), 0.0) ** 0.5  # in this order, which keeps NaN
+        e[pins.vertices] = 0.0
+        return system_matrix_assembly.energy_norm(self._Q, e)
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedDescent(IterativeSolver):
+    """A descent method after the setup for a system.
+
+    If a barrier is active at the initial guess, the solve starts at the inertial prediction, if that is lower. A nearly
+    closed gap makes the Hessian so stiff that the direction of a common motion has no significant digits for the gap,
+    which limits the step size.
+    """
+
+    fixed_objective: FixedObjective
+    metric: ResidualMetric
+    method: DescentMethod
+    description: str
+    stats: dict[str, float]
+
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
+        """Start a solve from an initial guess (n, 3) [m]."""
+        step, start = self._build_step(problem, initial_guess)
+        return _DescentState(
+            self, step, pick_lower_start(step, start) if has_active_barrier(step, start.positions) else start
+        )
+
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """Return the residual [J^(1/2)] at p (n, 3) [m]."""
+        return self.metric.residual(StepObjective(self.fixed_objective, problem).gradient(p))
+
+    def residual_scale(self, problem: StepProblem) -> float:
+        """Return the residual scale [J^(1/2)] for the round-off check."""
+        return compute_max_coordinate(problem) * self.metric.unpinned_trace**0.5
+
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """Return the phases of an iteration at the initial guess."""
+        return self.method.iteration_phases(*self._build_step(problem, problem.initial_guess))
+
+    def _build_step(self, problem: StepProblem, guess: Positions) -> tuple[StepObjective, DescentPoint]:
+        step = StepObjective(self.fixed_objective, problem)
+        p = step.apply_exact_pins(guess)
+        return step, DescentPoint(p, step.gradient(p))
+
+
+class _DescentState(SolverState):
+    """The state of a solve; a stalled point has the previous positions."""
+
+    def __init__(self, prepared: PreparedDescent, step: StepObjective, start: DescentPoint) -> None:
+        self._metric, self._method, self._step = prepared.metric, prepared.method, step
+        self._points, self._point, self.positions = prepared.method.iterate_points(step, start), start, start.positions
+
+    def step_state(self) -> bool:
+        """Do one iteration; return False if round-off prevents descent."""
+        before, self._point = self._point, next(self._points, self._point)
+        self.positions = self._point.positions
+        return not self._point.is_stalled or self.positions is not before.positions
+
+    def residual(self) -> float:
+        """Return the residual [J^(1/2)] at the iterate."""
+        return self._metric.residual(self._point.gradient)
+
+    def can_terminate(self) -> bool:
+        """Return whether the iterate may be a minimum if it is stationary."""
+        return self._method.can_terminate(self._step, self._point)

@@ -1,0 +1,111 @@
+"""Options and interfaces for methods that run on the processor or on a device.
+
+A method that supports both inherits `DeviceOptions` or `PrecisionOptions`, and delegates its `prepare` to its file in
+`springbench.solvers.cuda`, which is imported only if a device is requested.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from springbench.solvers.model.step_problem import Positions, Solution, StepProblem
+
+DeviceName = Literal["cpu", "cuda"]
+SIMULATOR_NAME = "Numba's simulator, no device"
+"""Name of Numba's simulator in rows."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeviceOptions:
+    """The option where to compute.
+
+    Attributes:
+        device: processor or device.
+        omitted_defaults: parameters that rows and hashes omit at their default, so that they equal those from before
+            the parameter existed.
+    """
+
+    omitted_defaults: ClassVar[frozenset[str]] = frozenset({"device", "precision"})
+
+    device: DeviceName = "cpu"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrecisionOptions(DeviceOptions):
+    """The precision of device kernels, float32 by default, with residuals in float64; the processor uses float64."""
+
+    precision: Literal["float32", "float64"] | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for float32 on the processor."""
+        if self.precision == "float32" and self.device == "cpu":
+            raise ValueError("precision: float32 is for `device: cuda`; the processor computes in float64 here")
+
+    @property
+    def real_dtype(self) -> type[np.float32] | type[np.float64]:
+        """Floating-point type of device kernels."""
+        return np.float64 if self.precision == "float64" else np.float32
+
+
+class StreamEvent(Protocol):
+    """A point on a device's stream."""
+
+    def elapsed_time(self, event: Any) -> float:
+        """Return the milliseconds from this event to a later one on the stream."""
+        ...
+
+
+class SolveEvents(NamedTuple):
+    """The events of a solve: start, data uploaded (up), kernels finished (done), result downloaded (down)."""
+
+    start_event: StreamEvent
+    upload_event: StreamEvent
+    kernel_event: StreamEvent
+    download_event: StreamEvent
+
+
+@runtime_checkable
+class PreparedDeviceSolver(Protocol):
+    """A prepared solver on a device.
+
+    Its iterates are copied on request only; timings are taken of the same iterates without copies.
+    """
+
+    @property
+    def device_columns(self) -> Mapping[str, Any]:
+        """Columns of rows that describe the device."""
+        ...
+
+    def device_state(self) -> dict[str, float | None]:
+        """Return columns of the device's current clocks, power and temperature; None for unavailable ones."""
+        ...
+
+    def replay_iterations(self, problem: StepProblem, iterations: int) -> tuple[Solution, SolveEvents | None]:
+        """Return the solution of a host problem after n iterations, without residual, and its events.
+
+        The events are None for a device without a clock.
+        """
+        ...
+
+    def iterates_without_copy(self, problem: StepProblem) -> Iterator[Callable[[], Positions]]:
+        """Yield the iterates of `iterates` when computed, as callables that copy them."""
+        ...
+
+
+def device_columns_of(prepared: object) -> dict[str, Any]:
+    """Return the columns that describe a prepared solver's device; empty for one on the processor."""
+    usual = getattr(prepared, "usual", prepared)  # of two systems
+    return dict(usual.device_columns) if isinstance(usual, PreparedDeviceSolver) else {}
+
+
+_DEVICE_FAILURES: list[str] = []
+
+
+def is_device_lost(reason: str = "") -> bool:
+    """Return whether this process has lost its device permanently; a reason records such a loss."""
+    if reason:
+        _DEVICE_FAILURES.append(reason)
+    return bool(_DEVICE_FAILURES)

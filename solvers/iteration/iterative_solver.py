@@ -1,0 +1,248 @@
+"""The iteration loop of all methods, with the stop rule, its limits and the solution.
+
+    run = init_state(problem, guess);  step_state(run), step_state(run), ...  while residual(run) > rtol * residual_0
+
+A method supplies these three functions: an `IterativeSolver` has `init_state`, and a `SolverState` has `step_state` and
+`residual`. A method with a compiled loop overrides `run_iterations` and uses the kernel version in
+`springbench.solvers.kernels.iteration_loop`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from operator import methodcaller
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.solvers.kernels import iteration_loop
+from springbench.solvers.kernels.iteration_loop import LoopLimits, iteration_limit
+from springbench.solvers.model.rounding_bound import is_gradient_roundoff
+from springbench.solvers.model.step_problem import (
+    Positions,
+    ResidualIterate,
+    Solution,
+    StepProblem,
+    StopRule,
+    Unsupported,
+)
+
+_TERMINATION_REASONS = {
+    iteration_loop.REASON_ITERATIONS: "iterations",
+    iteration_loop.REASON_TOLERANCE: "tolerance",
+    iteration_loop.REASON_FLOOR: "floor",
+    iteration_loop.REASON_STALLED: "stalled",
+}
+
+_ROUNDOFF_CHECK_FRACTION = 1e-12
+"""Fraction of `IterativeSolver.residual_scale` that no rounding error reaches. It is thousands of units in the last
+place of any sum involved."""
+
+_FAR_ORIGIN_RATIO = 1e5
+"""Ratio of coordinates to extent beyond which round-off at rest is detected by the decrease of the residual."""
+
+_MINIMUM_CHECK_RTOL = 1e-5
+"""Largest rtol for which the last iterate is checked for a minimum; looser tolerances do not justify the check."""
+
+
+EXACT_LENGTHS_UNSUPPORTED = (
+    "supports finite stiffness only, and the scene has length constraints (a stiffness of `exact`): use "
+    "avbd, which supports them, or give springs and strain limits a finite stiffness"
+)
+"""Reason, after the method's name, why a method without length constraints does not support the scene."""
+
+
+_interpreted_loop = iteration_loop.build_loop(methodcaller("advance"), methodcaller("residual"))
+
+
+class SolverState(ABC):
+    """The state of a solve.
+
+    Attributes:
+        positions: the iterate (n, 3) [m], which the next iteration may overwrite.
+        velocity: velocity at the end of the step (n, 3) [m/s], for a method that computes its own.
+    """
+
+    positions: Positions
+    velocity: Positions | None = None
+
+    @property
+    def warm_start(self) -> NDArray[np.float64] | None:
+        """Data for the next solve, see `springbench.solvers.model.step_problem.Solution`."""
+        return None
+
+    @abstractmethod
+    def step_state(self) -> bool:
+        """Do one iteration; return False if round-off prevents descent and the positions do not change."""
+
+    def residual(self) -> float:
+        """Return |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices, at the iterate of `residual_iterate`.
+
+        It is nan for a method that does not minimise, and before the first iteration if it belongs to the previous
+        iterate.
+        """
+        return float("nan")
+
+    def can_terminate(self) -> bool:
+        """Return whether the iterate may be a minimum if it is stationary; a saddle point returns False."""
+        return True
+
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
+        """Iterate up to the limits; return count, residual and reason, see
+        `springbench.solvers.kernels.iteration_loop`."""
+        return _interpreted_loop(self, limits)
+
+
+class IterativeSolver(ABC):
+    """A method after the setup for a system; with `description` and `stats` it is a `PreparedSolver`.
+
+    Attributes:
+        residual_iterate: the iterate of the residuals. It is "previous" for a method that computes them in its
+            iteration as |p - LG(p)|, and "none" for a method that does not minimise, which does all iterations.
+        supports_length_constraints: whether length constraints are supported; if not, `iterates` and `solve` raise
+            Unsupported for a system that has any.
+    """
+
+    residual_iterate: ClassVar[ResidualIterate] = "returned"
+    supports_length_constraints: ClassVar[bool] = False
+
+    @abstractmethod
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
+        """Start a solve from an initial guess (n, 3) [m], which is not modified."""
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        """Yield the iterates from the initial guess; the next one may overwrite a yielded array."""
+        run = self._initial_state(problem)
+        while True:
+            run.step_state()
+            yield run.positions
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """Iterate until `stop` terminates the solve or no step decreases the objective.
+
+        Without a tolerance only the last residual is computed.
+        """
+        run = self._initial_state(problem)
+        limits, yardstick, close = iteration_limit(stop.max_iterations), float("nan"), False
+        if (stop.rtol is not None or stop.atol > 0.0) and self.residual_iterate != "none":
+            near, limit = (
+                _ROUNDOFF_CHECK_FRACTION * self.residual_scale(problem) if stop.roundoff_floor > 0.0 else 0.0,
+                stop.atol,
+            )
+            if stop.rtol is not None:
+                yardstick = self.residual_at(problem, problem.current_positions)
+                limit, close = max(limit, stop.rtol * yardstick), stop.rtol <= _MINIMUM_CHECK_RTOL
+            limits = LoopLimits(stop.max_iterations, limit, near, iteration_loop.RESIDUAL_EACH)
+        count, residual, ended = self._iterate_to_roundoff(run, problem, limits, stop.roundoff_floor)
+        while (
+            close
+            and ended in (iteration_loop.REASON_TOLERANCE, iteration_loop.REASON_FLOOR)
+            and not run.can_terminate()
+        ):
+            left = limits._replace(max_iterations=stop.max_iterations - count)
+            more, residual, ended = self._iterate_to_roundoff(run, problem, left, stop.roundoff_floor)
+            count += more
+            if not more and ended != iteration_loop.REASON_ITERATIONS:
+                ended = iteration_loop.REASON_STALLED
+        ended = _TERMINATION_REASONS[ended]
+        return Solution(
+            run.positions, count, residual, yardstick, ended, run.velocity, self.residual_iterate, run.warm_start
+        )
+
+    def _initial_state(self, problem: StepProblem) -> SolverState:
+        if problem.system.length_constraints and not self.supports_length_constraints:
+            raise Unsupported(EXACT_LENGTHS_UNSUPPORTED)
+        return self.init_state(problem, problem.initial_guess)
+
+    @staticmethod
+    def _iterate_to_roundoff(
+        run: SolverState, problem: StepProblem, limits: LoopLimits, roundoff_floor: float
+    ) -> tuple[int, float, int]:
+        """Call `run.run_iterations`, and return FLOOR only if the gradient is round-off at each vertex.
+
+        The gradient is checked once the residual is near round-off, then after one more iteration, and then whenever
+        the iterations since the first check have grown by half. Far from the origin the bound consists mostly of the
+        rounding of coordinates whose differences are exact; there the iterations continue while each halves the
+        residual.
+        """
+        count, residual, ended = run.run_iterations(limits)
+        since, gains = 0, True
+        while ended == iteration_loop.REASON_FLOOR:
+            rests = is_gradient_roundoff(problem, run.positions, roundoff_floor)
+            if rests and not (gains and is_far_from_origin(run.positions)):
+                break
+            some = min(1 if rests else 1 + since // 2, limits.max_iterations - count)
+            if some == 0:
+                return count, residual, iteration_loop.REASON_FLOOR if rests else iteration_loop.REASON_ITERATIONS
+            more, now, ended = run.run_iterations(limits._replace(max_iterations=some, residual_floor=0.0))
+            gains = gains and (not rests or now < 0.5 * residual)
+            count, since, residual = count + more, since + more, now
+            if ended == iteration_loop.REASON_ITERATIONS or (rests and ended == iteration_loop.REASON_STALLED):
+                ended = iteration_loop.REASON_FLOOR
+        return count, residual, ended
+
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """Return the residual [J^(1/2)] at p (n, 3) [m].
+
+        It costs one iteration if it belongs to the previous iterate.
+        """
+        if self.residual_iterate == "none":
+            return float("nan")
+        return self.init_state(problem, p).run_iterations(iteration_limit(int(self.residual_iterate == "previous")))[1]
+
+    def build_residual(self, problem: StepProblem) -> Callable[[Positions], float]:
+        """Build a function that returns `residual_at` for many positions of one step."""
+        return lambda p: self.residual_at(problem, p)
+
+    def residual_scale(self, problem: StepProblem) -> float:
+        """Return the residual [J^(1/2)] of a mean displacement as large as the initial guess's largest coordinate.
+
+        The check for round-off begins at a small fraction of it; 0 disables the check.
+        """
+        return 0.0
+
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """Return the phases of an iteration; none by default."""
+        return {}
+
+
+class SubsteppingState(SolverState):
+    """The whole step in 1, 2, ... substeps, each time from its start.
+
+    Iterates that are not needed are skipped.
+    """
+
+    def __init__(
+        self, step_in_substeps: Callable[[StepProblem, int], tuple[Positions, Positions]], problem: StepProblem
+    ) -> None:
+        """Create the state; `step_in_substeps(problem, n)` returns positions [m] and velocity [m/s]."""
+        self._step_in_substeps, self._problem, self._num_substeps = step_in_substeps, problem, 0
+        self.positions = problem.step_start.positions
+
+    def step_state(self) -> bool:
+        """Integrate the step with one more substep."""
+        self.run_iterations(iteration_loop.ONE_ITERATION)
+        return True
+
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
+        """Integrate the step once, with as many more substeps as the limit has iterations."""
+        self._num_substeps += limits.max_iterations
+        self.positions, self.velocity = self._step_in_substeps(self._problem, self._num_substeps)
+        return limits.max_iterations, float("nan"), iteration_loop.REASON_ITERATIONS
+
+
+def is_far_from_origin(p: Positions) -> bool:
+    """Return whether coordinates (n, 3) [m] are so large that their rounding dominates that of their differences."""
+    return (
+        bool(np.abs(p).max(initial=0.0) > _FAR_ORIGIN_RATIO * np.ptp(p, axis=0).max(initial=0.0)) if len(p) else False
+    )
+
+
+def compute_max_coordinate(problem: StepProblem) -> float:
+    """Return the largest coordinate [m] of the initial guess, with exactly pinned vertices on their targets."""
+    s, p = problem.system, problem.initial_guess
+    if len(s.free_vertices) < s.num_vertices:
+        p = p.copy()
+        p[s.pins.vertices[s.pins.exact_mask]] = problem.pin_targets[s.pins.exact_mask]
+    return float(np.abs(p).max(initial=0.0))

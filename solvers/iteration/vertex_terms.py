@@ -1,0 +1,70 @@
+"""The terms of a step that act on single vertices: inertia, force and penalty pins.
+
+    h_i/2 |p_i|^2 - y_i . p_i,      h = c m/dt^2 + w,      y = c m/dt^2 target + f + w p_pin
+
+They form one quadratic function per vertex. So methods that proceed vertex by vertex or spring by spring treat a pin of
+any weight exactly, by an increased weight of the vertex, without a further slowly converging constraint.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.solvers.model.step_problem import Positions, StepProblem, System, Unsupported
+
+
+def compute_anchor_stiffness(system: System) -> NDArray[np.float64]:
+    """Return the stiffness h (n,) [N/m] of inertia and pins, infinite for an exact pin."""
+    total = system.inertia_diagonal.copy()
+    total[system.pins.vertices] += system.pins.weight
+    return total
+
+
+def compute_anchor_force(problem: StepProblem) -> Positions:
+    """Return y (n, 3) [N]; at exact pins it is that of inertia and force."""
+    s = problem.system
+    y = s.inertia_diagonal[:, None] * problem.inertial_target + problem.external_force
+    soft, vertices, weight = s.penalty_pins
+    y[vertices] += weight[:, None] * problem.pin_targets[soft]
+    return y
+
+
+def compute_anchor_positions(problem: StepProblem) -> Positions:
+    """Return the minimum y/h (n, 3) [m] of these terms, with exact pins on their targets.
+
+    It is computed as target + (f + w (p_pin - target))/h, which avoids rounding if the force is small.
+    """
+    s = problem.system
+    weight, away = np.zeros(s.num_vertices), problem.external_force.copy()
+    soft, vertices, weights = s.penalty_pins
+    weight[vertices] = weights
+    away[vertices] += weights[:, None] * (problem.pin_targets[soft] - problem.inertial_target[vertices])
+    return apply_exact_pins(problem.inertial_target + away / compute_anchor_stiffness(s)[:, None], problem)
+
+
+def apply_exact_pins(p: Positions, problem: StepProblem) -> Positions:
+    """Return a copy of p (n, 3) with the exactly pinned vertices on their targets."""
+    out = np.array(p, np.float64, order="C")
+    exact = problem.system.pins.exact_mask
+    out[problem.system.pins.vertices[exact]] = problem.pin_targets[exact]
+    return out
+
+
+def require_mass(system: System, anchor_stiffness: NDArray[np.float64], solver: str) -> None:
+    """Raise Unsupported, with the vertices concerned, if a vertex has neither mass nor a pin."""
+    loose = np.flatnonzero(anchor_stiffness <= 0.0)
+    if len(loose):
+        named = ", ".join(map(str, loose[:5])) + (", ..." if len(loose) > 5 else "")
+        raise Unsupported(
+            f"{solver}: moves each vertex by its own mass; {len(loose)} of {system.num_vertices} have none and are not "
+            f"pinned ({named}): give them mass, or take a solver that minimises"
+        )
+
+
+def require_implicit_euler(system: System, solver: str) -> None:
+    """Raise Unsupported if the step is that of another integrator."""
+    if system.inertia_factor != 1.0:
+        raise Unsupported(
+            f"{solver}: divides the step by itself and keeps its own velocity, which takes the place of an integrator; "
+            "use the integrator implicit-euler"
+        )

@@ -1,0 +1,173 @@
+"""On-disk cache of compiled kernels, keyed by everything that they depend on.
+
+Numba's own cache considers the kernel's file only. It ignores kernels in other files that the kernel calls, constants
+from there, and the compile options. Two processes that compile for one index may also leave the code of one under the
+signature of the other. So a kernel is cached here by the digest of all sources that its module imports
+(`springbench.solvers.jit.source_digest`). The key also has the options, the signature, the processor and the
+versions; each
+signature has its own file. A cache entry is therefore what a compilation would produce, whichever module imports the
+kernel and in whatever order.
+
+    <folder>/<module>-<digest>/<kernel>-<digest of the key>.nbc
+
+The folder is `NUMBA_CACHE_DIR` if that is set, else `__pycache__` next to the source, else the user's cache folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import shutil
+import sys
+import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import numba
+import numpy as np
+from numba.core import config
+from numba.core.caching import _Cache
+from numba.core.compiler import CompileResult
+from numba.core.serialize import dumps
+from numba.misc.appdirs import AppDirs
+from springbench.solvers.jit import source_digest
+from springbench.solvers.jit.inline_linking import rebuild_result
+
+_STALE_SECONDS = 3600.0
+"""Age [s] of the last use after which the cache folder of other sources is removed; a process that still runs with such
+sources compiles and stores its kernels again."""
+
+_CODEGEN_SETTINGS = ("OPT", "BOUNDSCHECK", "LOOP_VECTORIZE", "SLP_VECTORIZE", "DEBUGINFO_DEFAULT", "ENABLE_AVX")
+"""Settings in Numba's environment that change the generated code."""
+
+
+_NUMBA_CONFIG: Any = config
+"""Untyped, because the names are defined from the environment."""
+
+_NUMBA_CACHE: Any = _Cache
+"""Untyped, because the declared signatures differ from those of its subclasses."""
+
+
+class KernelCache(_NUMBA_CACHE):
+    """The compiled code of one kernel, by signature."""
+
+    def __init__(self, function: Any, options: Mapping[str, Any]) -> None:
+        """Create the cache of a Python function with its compile options."""
+        self._source_file = function.__code__.co_filename
+        self._module_name, self._kernel_name = function.__module__, function.__qualname__
+        cells = tuple(_closure_key(cell.cell_contents) for cell in function.__closure__ or ())
+        chosen = sorted((key, sorted(v) if isinstance(v, (set, frozenset)) else v) for key, v in options.items())
+        self._fixed_key = (
+            repr(chosen),
+            hashlib.sha256(function.__code__.co_code).digest(),
+            hashlib.sha256(dumps(cells)).digest() if cells else b"",
+            (sys.version, numba.__version__, llvmlite.__version__, np.__version__),
+            tuple(str(getattr(_NUMBA_CONFIG, name, "")) for name in _CODEGEN_SETTINGS),
+        )
+
+    @property
+    def cache_path(self) -> str:
+        """Folder of the code compiled from the current sources."""
+        return str(
+            _cache_folder(
+                _writable_root(os.path.dirname(self._source_file)),
+                self._module_name,
+                source_digest.digest_sources([self._source_file]),
+            )
+        )
+
+    def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
+        """Return the cached code of a signature, or None if there is none."""
+        target_context.refresh()
+        key = (sig, target_context.codegen().magic_tuple(), self._fixed_key)
+        path = self._entry_path(key)
+        try:
+            there, kept = pickle.loads(path.read_bytes())
+        except Exception:  # nothing is there, or what is there cannot be read: it is compiled and written anew
+            return None
+        with suppress(OSError):
+            os.utime(path.parent)
+        return rebuild_result(target_context, kept) if there == key else None
+
+    def save_overload(self, sig: Any, data: CompileResult) -> None:
+        """Store the code compiled for a signature, if it is cacheable and the disk has space."""
+        if data.library.has_dynamic_globals or not all(lifted.can_cache for lifted in data.lifted):
+            return
+        for env in data._find_referenced_environments():  # of what it links in
+            data.library.codegen.set_env(env.env_name, env)
+        key = (sig, data.target_context.codegen().magic_tuple(), self._fixed_key)
+        path = self._entry_path(key)
+        with suppress(OSError):
+            if not path.parent.exists():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                _remove_stale(path.parent, self._module_name)
+            _write_atomically(path, dumps((key, data._reduce())))
+
+    def enable(self) -> None:
+        """Do nothing: the cache is always enabled."""
+
+    def disable(self) -> None:
+        """Do nothing: the cache cannot be disabled."""
+
+    def flush(self) -> None:
+        """Remove the cached code; `recompile` of a kernel calls this."""
+        shutil.rmtree(self.cache_path, ignore_errors=True)
+
+    def _entry_path(self, key: Any) -> Path:
+        name = self._kernel_name.replace("<", "").replace(">", "")
+        return Path(self.cache_path) / f"{name}-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
+
+
+def _closure_key(value: Any) -> Any:
+    """Return the cache key of a closed-over value: for a kernel its names, its sources and its own closure."""
+    function = getattr(value, "py_func", None)
+    if function is None:
+        return value
+    cells = (_closure_key(cell.cell_contents) for cell in function.__closure__ or ())
+    return (
+        function.__module__,
+        function.__qualname__,
+        source_digest.digest_sources([function.__code__.co_filename]),
+        *cells,
+    )
+
+
+def _cache_folder(home: Path, module: str, digest: str) -> Path:
+    return home / f"{module}-{digest[:16]}"
+
+
+@cache
+def _writable_root(source: str) -> Path:
+    """Return the first writable cache folder; `source` is the folder of the source file."""
+    users = Path(AppDirs("springbench", appauthor=False).user_cache_dir)
+    for folder in (Path(_NUMBA_CONFIG.CACHE_DIR or os.path.join(source, "__pycache__")), users):
+        with suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+            return folder
+    return users
+
+
+def _remove_stale(made: Path, module: str) -> None:
+    """Remove the code compiled from other sources of a module unless a process has used it recently."""
+    for other in made.parent.glob(f"{module}-*"):
+        with suppress(OSError):
+            if made.stat().st_mtime - other.stat().st_mtime > _STALE_SECONDS:
+                shutil.rmtree(other, ignore_errors=True)
+
+
+def _write_atomically(path: Path, content: bytes) -> None:
+    """Write the whole content or nothing."""
+    number, partial = tempfile.mkstemp(dir=path.parent, prefix=".")
+    try:
+        with os.fdopen(number, "wb") as file:
+            file.write(content)
+        os.replace(partial, path)
+    except OSError:
+        os.unlink(partial)
+        raise

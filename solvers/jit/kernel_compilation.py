@@ -1,0 +1,39 @@
+"""Numba options of the kernels: compiled code is cached on disk, and arrays are not reference-counted.
+
+Kernels neither create nor store arrays, so there is nothing to count. Counting took half of a step of a hundred
+vertices. Kernels release the GIL. Inner functions are called by kernels only: they need no Python wrapper and no
+machine code of their own (`springbench.solvers.jit.inline_linking`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from numba import njit  # noqa: TID251
+from springbench.solvers.jit.inline_linking import LinkedCompiler
+from springbench.solvers.jit.kernel_cache import KernelCache
+
+
+def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator like Numba's `njit` whose disk cache depends on all that the function depends on."""
+
+    def compiling(function: Callable[..., Any]) -> Any:
+        dispatcher: Any = njit(**options)(function)
+        dispatcher._cache = KernelCache(function, options)
+        return dispatcher
+
+    return compiling
+
+
+_bare_options: Any = {"_nrt": False, "nogil": True}
+_no_wrapper_options: Any = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_linked_options: Any = {**_no_wrapper_options, "pipeline_class": LinkedCompiler}
+jit_inner_options: Any = {**_bare_options, **_linked_options}
+
+jit_kernel: Any = cached_njit(**_bare_options, no_cfunc_wrapper=True)
+jit_inner: Any = cached_njit(**jit_inner_options)
+jit_inner_allocating: Any = cached_njit(**_linked_options)  # an inner one that makes arrays
+jit_closure: Any = njit(**jit_inner_options)  # has no name on disk; kept within what calls it
+jit_inlined_closure: Any = njit(**jit_inner_options, forceinline=True)  # for what takes more arrays than it has work
+jit_inner_parallel: Any = cached_njit(**_bare_options, **_no_wrapper_options, parallel=True)

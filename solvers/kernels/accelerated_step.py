@@ -1,0 +1,161 @@
+"""A whole accelerated step over a factor's own rows, without Python, for springs and spring-like energies.
+
+The plan is that of `springbench.solvers.kernels.local_global_iteration`, which corrects positions within the solve.
+Here a solve is
+separate, because the acceptance of a trial depends on its objective.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.kernels.accelerated_descent import (
+    TRIAL_AGAIN,
+    TRIAL_STALLED,
+    AccelerationWindow,
+    accept_trial,
+    init_window,
+    judge_trial,
+    propose_trial,
+)
+from springbench.solvers.kernels.edge_elements import add_edge_descent
+from springbench.solvers.kernels.iteration_loop import build_compiled_loop
+from springbench.solvers.kernels.local_global_iteration import IterationPlan
+from springbench.solvers.kernels.spring_local_step import SpringPackets, squared_norm
+from springbench.solvers.kernels.spring_objective import ObjectiveWeights, value_and_descent
+from springbench.solvers.kernels.step_setup import VertexRows, read_positions, write_positions, write_right_hand_side
+from springbench.solvers.linalg.cholesky.triangular_solve import backward_substitution, forward_substitution
+
+TERM_ROUNDOFF = 4.0 * np.finfo(np.float64).eps
+"""A bound on the relative rounding error of one term of a sum. The bound on the whole sum adds up those of its terms.
+The true errors partly cancel, so that for n terms the bound is about sqrt(n) times too large."""
+
+
+class AcceleratedStep(NamedTuple):
+    """The plan, packets, objective weights and rows of a system, with vectors of all rows.
+
+    The vectors are y, the solution (in the factor's type) and scratch (zero except in unknown rows). The objective
+    values (3,) [J] are the objective at the position, the scale of its cancellation, and its initial negative part.
+
+    The objective is a sum of squares a^2/2, where each a is a difference of two numbers of size A and so has the error
+    eps A. The sum has the error eps (sum of a A), at most eps sqrt(2 g size), with size the sum of A^2. If some squares
+    have a negative sign, g is the sum of the absolute terms.
+    """
+
+    iteration_plan: IterationPlan
+    spring_packets: SpringPackets
+    norm_packets: SpringPackets
+    objective_weights: ObjectiveWeights
+    vertex_rows: VertexRows
+    right_hand_side: NDArray[np.float64]
+    solution_rows: NDArray[Any]
+    displacement_rows: NDArray[np.float64]
+    objective_values: NDArray[np.float64]
+
+
+@jit_kernel
+def start_solve(step: AcceleratedStep, edges, window: AccelerationWindow, target, force, pin_targets, guess):
+    """Start the solve of a step; edges: strain limits and dashpots, or None."""
+    write_right_hand_side(step.vertex_rows, target, force, pin_targets, step.right_hand_side)
+    write_positions(step.vertex_rows, guess, pin_targets, window.trial_position)
+    step.objective_values[0] = _evaluate_trial(step, edges, window)
+    size = step.objective_weights.energy_scale
+    for k in range(len(window.direction)):
+        size += step.iteration_plan.anchor_stiffness[k // 4] * window.trial_position[k] ** 2
+    step.objective_values[1] = size
+    _solve_rows(step.iteration_plan, window.trial_descent, len(window.direction), step.solution_rows)
+    init_window(window, step.solution_rows)
+    window.window_state[0].objective_decrease = 0.0
+
+
+@jit_inner
+def _step_state(state):
+    step, edges, window = state
+    now, there, verdict = window.window_state[0], 0.0, TRIAL_AGAIN
+    propose_trial(window)
+    while verdict == TRIAL_AGAIN:
+        there = _evaluate_trial(step, edges, window)
+        before, size = abs(step.objective_values[0]) + 2.0 * step.objective_values[2], step.objective_values[1]
+        now.objective_change, now.roundoff = (
+            there - step.objective_values[0],
+            TERM_ROUNDOFF * (before + np.sqrt(2.0 * before * size)),
+        )
+        verdict = judge_trial(window)
+    if verdict == TRIAL_STALLED:
+        return False
+    step.objective_values[0] = there
+    _solve_rows(step.iteration_plan, window.trial_descent, len(window.direction), step.solution_rows)
+    accept_trial(window, step.solution_rows)
+    return True
+
+
+@jit_inner
+def _evaluate_trial(step, edges, window):
+    rows = len(window.direction) // 4
+    total = value_and_descent(
+        step.spring_packets, step.objective_weights, window.trial_position, step.right_hand_side, window.trial_descent
+    )
+    return total + add_edge_descent(edges, rows, window.trial_position, window.trial_descent)
+
+
+@jit_inner
+def _residual(state):
+    """Return |c|_Q [J^(1/2)] over the unpinned vertices."""
+    step, _, window = state
+    for i in range(len(window.correction) // 4):
+        for k in range(4 * i, 4 * i + 3):
+            step.displacement_rows[k] = step.iteration_plan.unpinned_mask[i] * window.correction[k]
+    return np.sqrt(
+        squared_norm(
+            step.norm_packets,
+            0,
+            len(step.norm_packets.packet_start) - 1,
+            step.displacement_rows,
+            step.iteration_plan.norm_diagonal,
+        )
+    )
+
+
+_iterate_loop = build_compiled_loop(_step_state, _residual)
+
+
+@jit_kernel
+def run_solve(step: AcceleratedStep, edges, window: AccelerationWindow, limits, out):
+    """Run the iteration loop (see `springbench.solvers.kernels.iteration_loop`) and write the positions to `out` (n,
+    3)."""
+    answer = _iterate_loop((step, edges, window), limits)
+    read_positions(step.vertex_rows, window.position, out)
+    return answer
+
+
+@jit_inner
+def _solve_rows(plan, b, size, x):
+    """Solve Q x = b in rows: groups forwards, the top, groups backwards (see `triangular_solve`)."""
+    top, top_end, groups = plan.top_range
+    copied = 4 * (top_end - top)
+    for k in range(size):
+        x[4 * plan.row_shift + k] = b[k]
+    for group in range(groups):
+        copy = 4 * top + (group + 1) * copied
+        for k in range(copied):
+            x[copy + k] = 0.0
+        for block in range(plan.group_blocks[group], plan.group_blocks[group + 1]):
+            _, _, _, _, chunk, end, _ = plan.block_table[block]
+            forward_substitution(plan.panels, plan.row_slots, plan.chunks, chunk, end, x)
+    for k in range(4 * top, 4 * top + copied):
+        for group in range(groups):
+            x[k] += x[k + (group + 1) * copied]
+    for block in range(plan.group_blocks[-2], plan.group_blocks[-1]):
+        _, _, _, _, chunk, middle, end = plan.block_table[block]
+        forward_substitution(plan.panels, plan.row_slots, plan.chunks, chunk, middle, x)
+        backward_substitution(plan.inverse_blocks, plan.panels, plan.row_slots, plan.chunks, chunk, end, x)
+    for group in range(groups):
+        copy = 4 * top + (group + 1) * copied
+        for k in range(copied):
+            x[copy + k] = x[4 * top + k]
+        for block in range(plan.group_blocks[group + 1] - 1, plan.group_blocks[group] - 1, -1):
+            _, _, _, _, chunk, _, end = plan.block_table[block]
+            backward_substitution(plan.inverse_blocks, plan.panels, plan.row_slots, plan.chunks, chunk, end, x)

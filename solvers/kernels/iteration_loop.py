@@ -1,0 +1,92 @@
+"""The iteration loop and the stop rule, as Python for the driver and compiled into kernels.
+
+    iterate until  residual <= limit  or  residual <= floor  or no step descends  or all iterations are done
+
+`build_loop` builds the loop from functions that advance and measure a state, `build_compiled_loop` that for kernels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba.extending import register_jitable
+from springbench.solvers.jit.kernel_compilation import jit_closure, jit_inner_options
+
+REASON_ITERATIONS, REASON_TOLERANCE, REASON_FLOOR, REASON_STALLED = range(4)
+"""The termination reason of a loop: maximum iterations, residual limit, round-off floor, or no descent."""
+
+RESIDUAL_NEVER, RESIDUAL_LAST, RESIDUAL_EACH = range(3)
+"""When residuals are computed."""
+
+
+class LoopLimits(NamedTuple):
+    """The limits of a loop.
+
+    Attributes:
+        max_iterations: maximum number of iterations.
+        residual_limit: residual [J^(1/2)] that ends the loop, if the residual is computed in each iteration.
+        residual_floor: residual [J^(1/2)] at which the loop ends for a check of round-off.
+        residual_mode: when residuals are computed.
+    """
+
+    max_iterations: int
+    residual_limit: float
+    residual_floor: float
+    residual_mode: int
+
+
+ONE_ITERATION = LoopLimits(1, 0.0, 0.0, RESIDUAL_NEVER)
+"""One iteration without a residual."""
+
+
+def iteration_limit(iterations: int) -> LoopLimits:
+    """Return limits of n iterations with the last residual."""
+    return LoopLimits(iterations, 0.0, 0.0, RESIDUAL_LAST)
+
+
+@register_jitable(**jit_inner_options)
+def check_residual(residual, limits):
+    """Return the termination reason of a residual; ITERATIONS if it does not end the loop."""
+    if limits.residual_mode != RESIDUAL_EACH:
+        return REASON_ITERATIONS
+    if residual <= limits.residual_limit:
+        return REASON_TOLERANCE
+    return REASON_FLOOR if residual <= limits.residual_floor else REASON_ITERATIONS
+
+
+def build_loop(step_state: Callable[..., Any], residual: Callable[..., Any]) -> Callable[..., Any]:
+    """Build the iteration loop of a state.
+
+    Args:
+        step_state: function of the state that does an iteration and returns whether it succeeded; a failed one does not
+            count.
+        residual: function of the state that returns the residual [J^(1/2)].
+
+    Returns:
+        A function (state, limits) that returns the number of iterations, the last residual (nan if none was computed)
+        and the termination reason.
+    """
+
+    def iterate(state: Any, limits: Any) -> Any:
+        count, found, ended = 0, np.nan, REASON_ITERATIONS
+        while ended == REASON_ITERATIONS and count < limits.max_iterations:
+            moved = step_state(state)
+            if moved:
+                count += 1
+            if limits.residual_mode == RESIDUAL_EACH:
+                found = residual(state)
+                ended = check_residual(found, limits)
+            if ended == REASON_ITERATIONS and not moved:
+                ended = REASON_STALLED
+        if limits.residual_mode == RESIDUAL_LAST or (limits.residual_mode == RESIDUAL_EACH and count == 0):
+            found = residual(state)
+        return count, found, ended
+
+    return iterate
+
+
+def build_compiled_loop(step_state: Callable[..., Any], residual: Callable[..., Any]) -> Any:
+    """Build the loop for kernels from inner functions."""
+    return jit_closure(build_loop(step_state, residual))

@@ -1,0 +1,170 @@
+"""The gradient of the objective and its change between two points, in one pass over springs and one over vertices.
+
+    grad g = sum_e k_e (1 - r_e/l_e) v_e + h (p - target) - f + w (p - pin)              h = c m/dt^2
+    g(q) - g(p) = sum_e k_e/2 (l'_e - l_e) (l'_e + l_e - 2 r_e) + ...,   l' - l = (v' - v)(v' + v) / (l' + l)
+
+The change is a sum of differences without cancellation, not the difference of two sums. It distinguishes descent from
+round-off as long as the gradient does, long after the values of the energies agree in all digits.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.model.energies.spring_energy import ZERO_LENGTH, Springs
+from springbench.solvers.model.rounding_bound import EPS
+from springbench.solvers.model.step_problem import Positions, StepProblem, System
+
+
+class ObjectiveTerms(NamedTuple):
+    """The constant data of a run: springs, inertia h (n,) [N/m], penalty pins and their weights [N/m]."""
+
+    edges: NDArray[np.int64]
+    stiffness: NDArray[np.float64]
+    rest_length: NDArray[np.float64]
+    rest_direction: NDArray[np.float64]
+    inertia_diagonal: NDArray[np.float64]
+    pinned_vertices: NDArray[np.int64]
+    pin_weight: NDArray[np.float64]
+
+    @classmethod
+    def from_system(cls, system: System, springs: Springs) -> ObjectiveTerms:
+        """Copy the terms of a system into arrays."""
+        _, pinned, weight = system.penalty_pins
+        s = springs
+        arrays: list[Any] = [
+            s.edges,
+            s.stiffness,
+            s.rest_length,
+            s.rest_direction,
+            system.inertia_diagonal,
+            pinned,
+            weight,
+        ]
+        return cls(*(np.array(a, order="C") for a in arrays))
+
+
+class StepData(NamedTuple):
+    """The data of a step: target (n, 3) [m], force (n, 3) [N], the penalty pins' targets (q, 3) [m]."""
+
+    inertial_target: Positions
+    external_force: Positions
+    pin_targets: Positions
+
+    @classmethod
+    def from_problem(cls, problem: StepProblem) -> StepData:
+        """Copy a step's arrays; the kernels are compiled for writable arrays."""
+        soft, _, _ = problem.system.penalty_pins
+        return cls(
+            *(
+                np.array(a, order="C")
+                for a in (problem.inertial_target, problem.external_force, problem.pin_targets[soft])
+            )
+        )
+
+
+@jit_inner
+def spring_direction(terms, e, p):
+    """Return the unit direction of spring e and its length [m]; at zero length that of the rest shape."""
+    i, j = terms.edges[e, 0], terms.edges[e, 1]
+    v0, v1, v2 = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2]
+    length = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
+    if length <= ZERO_LENGTH:
+        return terms.rest_direction[e, 0], terms.rest_direction[e, 1], terms.rest_direction[e, 2], 0.0
+    return v0 / length, v1 / length, v2 / length, length
+
+
+@jit_kernel
+def gradient(terms, step_data, p, out):
+    """Write the gradient [N] at p, both (n, 3), of springs, inertia, force and penalty pins to `out`."""
+    for v in range(len(p)):
+        for c in range(3):
+            out[v, c] = (
+                terms.inertia_diagonal[v] * (p[v, c] - step_data.inertial_target[v, c]) - step_data.external_force[v, c]
+            )
+    for q in range(len(terms.pinned_vertices)):
+        v = terms.pinned_vertices[q]
+        for c in range(3):
+            out[v, c] += terms.pin_weight[q] * (p[v, c] - step_data.pin_targets[q, c])
+    for e in range(len(terms.stiffness)):
+        i, j = terms.edges[e, 0], terms.edges[e, 1]
+        if i == j:
+            continue
+        n0, n1, n2, length = spring_direction(terms, e, p)
+        tension = terms.stiffness[e] * (length - terms.rest_length[e])
+        out[i, 0] += tension * n0
+        out[i, 1] += tension * n1
+        out[i, 2] += tension * n2
+        out[j, 0] -= tension * n0
+        out[j, 1] -= tension * n1
+        out[j, 2] -= tension * n2
+
+
+@jit_kernel
+def gradient_roundoff(terms, step_data, p, out):
+    """Write the bound (n,) [N] of the rounding error of `gradient` at p (n, 3) [m] to `out`.
+
+    It is that of `springbench.solvers.model.rounding_bound` for springs, inertia, force and penalty pins.
+    """
+    for v in range(len(p)):
+        out[v] = terms.inertia_diagonal[v] * (row_norm(p, v) + row_norm(step_data.inertial_target, v)) + row_norm(
+            step_data.external_force, v
+        )
+    for q in range(len(terms.pinned_vertices)):
+        out[terms.pinned_vertices[q]] += terms.pin_weight[q] * (
+            row_norm(p, terms.pinned_vertices[q]) + row_norm(step_data.pin_targets, q)
+        )
+    for e in range(len(terms.stiffness)):
+        i, j, rest = terms.edges[e, 0], terms.edges[e, 1], terms.rest_length[e]
+        if i == j:
+            continue
+        _, _, _, length = spring_direction(terms, e, p)
+        reach = row_norm(p, i) + row_norm(p, j)
+        turned = reach + 2.0 * rest / EPS
+        if length > 0.0:
+            turned = min(max(1.0, rest / length - 1.0) * reach, turned)
+        share = terms.stiffness[e] * (turned + length + rest)
+        out[i] += share
+        out[j] += share
+    for v in range(len(p)):
+        out[v] *= EPS
+
+
+@jit_inner
+def row_norm(x, v):
+    """Return the norm of row v of x (n, 3)."""
+    return np.sqrt(x[v, 0] * x[v, 0] + x[v, 1] * x[v, 1] + x[v, 2] * x[v, 2])
+
+
+@jit_kernel
+def objective_change(terms, step_data, p, q):
+    """Return g(q) - g(p) [J] of springs, inertia, force and penalty pins, p and q (n, 3)."""
+    total = 0.0
+    for v in range(len(p)):
+        for c in range(3):
+            middle = 0.5 * (p[v, c] + q[v, c])
+            total += (q[v, c] - p[v, c]) * (
+                terms.inertia_diagonal[v] * (middle - step_data.inertial_target[v, c]) - step_data.external_force[v, c]
+            )
+    for k in range(len(terms.pinned_vertices)):
+        v = terms.pinned_vertices[k]
+        for c in range(3):
+            middle = 0.5 * (p[v, c] + q[v, c])
+            total += terms.pin_weight[k] * (q[v, c] - p[v, c]) * (middle - step_data.pin_targets[k, c])
+    for e in range(len(terms.stiffness)):
+        i, j = terms.edges[e, 0], terms.edges[e, 1]
+        before = after = change = 0.0
+        for c in range(3):
+            v = p[i, c] - p[j, c]
+            s = (q[i, c] - p[i, c]) - (q[j, c] - p[j, c])
+            before += v * v
+            after += (v + s) * (v + s)
+            change += s * (2.0 * v + s)
+        before, after = np.sqrt(before), np.sqrt(after)
+        if before + after > ZERO_LENGTH:
+            both = before + after
+            total += terms.stiffness[e] * (change / both) * (0.5 * both - terms.rest_length[e])
+    return total

@@ -1,0 +1,241 @@
+"""The Hessian of springs, assembled directly into a matrix of 3 x 3 blocks, and its products.
+
+    H_e = k nn' + t/l (I - nn'),   t = k (l - r),   n the direction of a spring, l its length, t its tension
+
+A compressed spring (t < 0) has a negative transverse part. It is scaled by `negative_fraction`: 1 gives the exact
+Hessian, 0 makes it positive semidefinite spring by spring (Teran et al. 2005). The tensions are a separate argument,
+for methods that predict them (see `springbench.solvers.methods.newton.newton_direct.hybrid_newton`).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.kernels.objective_kernels import spring_direction
+from springbench.solvers.kernels.quadratic_form_kernels import add_product
+from springbench.solvers.kernels.quadratic_form_kernels import add_to_diagonal as hold_block
+from springbench.solvers.model.energies.element_energies import add_products
+from springbench.solvers.model.step_problem import System
+
+
+class BlockIndices(NamedTuple):
+    """Block indices of vertices and springs in a matrix over the free vertices.
+
+    Attributes:
+        free_vertices: free vertices (f,).
+        diagonal_block: diagonal block of each vertex (n,), -1 for a vertex that is not free.
+        off_diagonal: blocks of each spring from its first end to its second and back (m, 2), -1 if an end is not free.
+    """
+
+    free_vertices: NDArray[np.int64]
+    diagonal_block: NDArray[np.int64]
+    off_diagonal: NDArray[np.int64]
+
+    @classmethod
+    def from_graph(cls, system: System, edges: NDArray[np.int64], graph: csr_array) -> BlockIndices:
+        """Return the indices for a matrix with the block pattern `graph`, (f, f), sorted, over the free vertices."""
+        n, f = system.num_vertices, len(system.free_vertices)
+        key = np.repeat(np.arange(f), np.diff(graph.indptr)) * f + graph.indices
+        number = np.full(n, -1)
+        number[system.free_vertices] = np.arange(f)
+        diagonal = np.full(n, -1)
+        diagonal[system.free_vertices] = np.searchsorted(key, np.arange(f) * (f + 1))
+        i, j = number[edges].T
+        inside = (i >= 0) & (j >= 0) & (i != j)
+        across = np.full((len(edges), 2), -1)
+        for side, (a, b) in enumerate([(i, j), (j, i)]):
+            across[inside, side] = np.searchsorted(key, a[inside] * f + b[inside])
+        return cls(system.free_vertices, diagonal, across)
+
+
+@jit_kernel
+def locate_blocks(number, starts, columns, vertices, out):
+    """Write the block of each vertex pair within rows of vertices (m, k) to `out` (m, k^2).
+
+    It is -1 if one vertex is not free. Returns False if a block is missing. The matrix has sorted columns; `number` is
+    the index of each vertex among the free ones, or -1.
+    """
+    many = vertices.shape[1]
+    for e in range(len(vertices)):
+        for a in range(many):
+            i = number[vertices[e, a]]
+            for b in range(many):
+                j, at = number[vertices[e, b]], many * a + b
+                if i < 0 or j < 0:
+                    out[e, at] = -1
+                    continue
+                low, high = starts[i], starts[i + 1] - 1
+                while low < high:
+                    middle = (low + high) // 2
+                    if columns[middle] < j:
+                        low = middle + 1
+                    else:
+                        high = middle
+                if columns[low] != j:
+                    return False
+                out[e, at] = low
+    return True
+
+
+@jit_kernel
+def list_vertex_pairs(number, size, vertices, out):
+    """Write each pair of different free vertices of each row (m, k) to `out`, as lower index times `size` plus higher.
+
+    Returns the number of pairs; `number` is that of `locate_blocks`.
+    """
+    count = 0
+    for e in range(len(vertices)):
+        for a in range(vertices.shape[1]):
+            i = number[vertices[e, a]]
+            for b in range(a):
+                j = number[vertices[e, b]]
+                if i >= 0 and j >= 0 and i != j:
+                    out[count] = min(i, j) * size + max(i, j)
+                    count += 1
+    return count
+
+
+@jit_kernel
+def linearise_tensions(terms, p, d, out):
+    """Write the springs' tensions [N] at p, linearised for a displacement d (both (n, 3)), to out (m,)."""
+    for e in range(len(terms.stiffness)):
+        i, j = terms.edges[e, 0], terms.edges[e, 1]
+        n0, n1, n2, length = spring_direction(terms, e, p)
+        stretch = n0 * (d[i, 0] - d[j, 0]) + n1 * (d[i, 1] - d[j, 1]) + n2 * (d[i, 2] - d[j, 2])
+        out[e] = terms.stiffness[e] * (length - terms.rest_length[e] + stretch)
+
+
+@jit_inner
+def _lateral_stiffness(terms, e, length, tension, negative_fraction):
+    """Return the transverse stiffness [N/m] of spring e, at most k; 0 for zero length and positive rest length."""
+    if terms.rest_length[e] == 0.0:
+        return terms.stiffness[e]
+    if length <= 0.0:
+        return 0.0
+    lateral = min(tension / length, terms.stiffness[e])
+    return lateral * negative_fraction if lateral < 0.0 else lateral
+
+
+@jit_inner
+def _add_block(values, block, sign, xx, xy, xz, yy, yz, zz):
+    """Add sign times a symmetric block."""
+    values[block, 0, 0] += sign * xx
+    values[block, 0, 1] += sign * xy
+    values[block, 0, 2] += sign * xz
+    values[block, 1, 0] += sign * xy
+    values[block, 1, 1] += sign * yy
+    values[block, 1, 2] += sign * yz
+    values[block, 2, 0] += sign * xz
+    values[block, 2, 1] += sign * yz
+    values[block, 2, 2] += sign * zz
+
+
+@jit_kernel
+def write_constant_blocks(terms, places, values):
+    """Write the stiffness [N/m] of inertia and penalty pins to the blocks `values`, (b, 3, 3)."""
+    _write_constant_blocks(terms, places, values)
+
+
+@jit_inner
+def _write_constant_blocks(terms, places, values):
+    values[:] = 0.0
+    for v in places.free_vertices:
+        hold_block(values, places.diagonal_block[v], terms.inertia_diagonal[v])
+    for q in range(len(terms.pinned_vertices)):
+        hold_block(values, places.diagonal_block[terms.pinned_vertices[q]], terms.pin_weight[q])
+
+
+@jit_kernel
+def assemble_hessian(terms, places, constant, p, tension, negative_fraction, values):
+    """Write the Hessian [N/m] of springs, inertia and penalty pins at p (n, 3) to the blocks `values`, (b, 3, 3).
+
+    Args:
+        terms: objective terms.
+        places: block indices.
+        constant: blocks of inertia, pins and other terms independent of p; None if there are no other terms.
+        p: positions (n, 3) [m].
+        tension: tension of each spring (m,) [N].
+        negative_fraction: factor of the springs' negative transverse parts.
+        values: output (b, 3, 3) [N/m].
+    """
+    if constant is None:
+        _write_constant_blocks(terms, places, values)
+    else:
+        for block in range(len(values)):
+            for row in range(3):
+                for column in range(3):
+                    values[block, row, column] = constant[block, row, column]
+    for e in range(len(terms.stiffness)):
+        i, j = terms.edges[e, 0], terms.edges[e, 1]
+        if i == j:
+            continue
+        n0, n1, n2, length = spring_direction(terms, e, p)
+        lateral = _lateral_stiffness(terms, e, length, tension[e], negative_fraction)
+        a = terms.stiffness[e] - lateral
+        xx, xy, xz = a * n0 * n0 + lateral, a * n0 * n1, a * n0 * n2
+        yy, yz, zz = a * n1 * n1 + lateral, a * n1 * n2, a * n2 * n2 + lateral
+        if places.diagonal_block[i] >= 0:
+            _add_block(values, places.diagonal_block[i], 1.0, xx, xy, xz, yy, yz, zz)
+        if places.diagonal_block[j] >= 0:
+            _add_block(values, places.diagonal_block[j], 1.0, xx, xy, xz, yy, yz, zz)
+        if places.off_diagonal[e, 0] >= 0:
+            _add_block(values, places.off_diagonal[e, 0], -1.0, xx, xy, xz, yy, yz, zz)
+            _add_block(values, places.off_diagonal[e, 1], -1.0, xx, xy, xz, yy, yz, zz)
+
+
+@jit_kernel
+def linearise_springs(terms, p, out):
+    """Write the linearised springs at p (n, 3) to out (m, 4).
+
+    These are sqrt(k - lateral) n and lateral, the transverse stiffness.
+    """
+    for e in range(len(terms.stiffness)):
+        n0, n1, n2, length = spring_direction(terms, e, p)
+        k = terms.stiffness[e]
+        lateral = _lateral_stiffness(terms, e, length, k * (length - terms.rest_length[e]), 1.0)
+        root = np.sqrt(k - lateral)
+        out[e, 0], out[e, 1], out[e, 2], out[e, 3] = root * n0, root * n1, root * n2, lateral
+
+
+@jit_kernel
+def multiply_hessian(terms, linear, form, joined, curvature, x, out):
+    """Write the product [N] of the exact Hessian with x [m], (n, 3), to `out`.
+
+    Args:
+        terms: objective terms.
+        linear: output of `linearise_springs`.
+        form, joined, curvature: quadratic form, elements and their Hessians, or None.
+        x: (n, 3) [m].
+        out: output (n, 3) [N].
+    """
+    _multiply_springs(terms, linear, x, out)
+    add_product(form, x, out)
+    add_products(joined, curvature, x, out)
+
+
+@jit_inner
+def _multiply_springs(terms, linear, x, out):
+    for v in range(len(x)):
+        for c in range(3):
+            out[v, c] = terms.inertia_diagonal[v] * x[v, c]
+    for q in range(len(terms.pinned_vertices)):
+        v = terms.pinned_vertices[q]
+        for c in range(3):
+            out[v, c] += terms.pin_weight[q] * x[v, c]
+    for e in range(len(terms.stiffness)):
+        i, j = terms.edges[e, 0], terms.edges[e, 1]
+        s0, s1, s2 = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
+        stretch = linear[e, 0] * s0 + linear[e, 1] * s1 + linear[e, 2] * s2
+        f0 = linear[e, 3] * s0 + stretch * linear[e, 0]
+        f1 = linear[e, 3] * s1 + stretch * linear[e, 1]
+        f2 = linear[e, 3] * s2 + stretch * linear[e, 2]
+        out[i, 0] += f0
+        out[i, 1] += f1
+        out[i, 2] += f2
+        out[j, 0] -= f0
+        out[j, 1] -= f1
+        out[j, 2] -= f2

@@ -1,0 +1,248 @@
+"""The compiled local step of springs: packets of eight vertices, each vertex with its incident springs.
+
+    out_i += y_i + sum over springs (i, j) of k r (p_i - p_j) / |p_i - p_j|                         `add_projection`
+    out_i += y_i - h_i p_i + sum of (k r / |p_i - p_j| - k) (p_i - p_j),   minus the gradient       `add_descent`
+
+It is one pass, without A or d. Each spring is computed at both of its ends, so that no vertex adds to the sum of
+another one. The result is therefore bitwise independent of the number of threads.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.linalg.memory import allocate_aligned
+from springbench.solvers.model.energies.spring_energy import ZERO_LENGTH, Springs
+from springbench.solvers.simd import spring_forces as vectors
+from springbench.solvers.simd.spring_packets import LANES, RHS_STRIDE
+
+ZERO_LENGTH_SQUARED = ZERO_LENGTH * ZERO_LENGTH
+SORT_WINDOW = 128
+"""Number of neighbouring rows that are sorted by their springs; a larger window would scatter the memory access."""
+
+
+class SpringPackets(NamedTuple):
+    """Springs by their ends, in b packets of eight vertices.
+
+    A packet has as many entries as its vertex of largest degree, at least two. Padding lanes are vertex `nobody`, and
+    padding springs have zero stiffness and end at row `far`.
+
+    Attributes:
+        row_offset: offset of each lane's vertex (8 b,), four times its row.
+        packet_start: first entry of each packet (b + 1,).
+        neighbour_offset: of each entry, eight offsets of the other ends.
+        weight_offset: of each entry, the position in `weights` of eight times k r [N] and eight times k [N/m].
+        weights: these numbers, stored once for equal entries, which are nearly all in a regular mesh.
+        spring_index: of each entry, eight springs, ~spring at the second end.
+        rest_direction: unit directions at zero length (m, 3).
+    """
+
+    row_offset: NDArray[np.int32]
+    packet_start: NDArray[np.int64]
+    neighbour_offset: NDArray[np.int32]
+    weight_offset: NDArray[np.int32]
+    weights: NDArray[np.float64]
+    spring_index: NDArray[np.int32]
+    rest_direction: NDArray[np.float64]
+
+    @classmethod
+    def from_springs(
+        cls, springs: Springs, row: NDArray[np.int64], part: NDArray[np.int64], parts: int, nobody: int, far: int
+    ) -> tuple[SpringPackets, NDArray[np.int64]]:
+        """Build the packets of springs, and the first packet of each part of the rows (parts + 1,).
+
+        Self-loops, which have no extension, are omitted.
+
+        Args:
+            springs: the springs.
+            row: row of each vertex (n,).
+            part: part of each vertex (n,), ascending with its row; -1 for a vertex that does not move.
+            parts: number of parts.
+            nobody: row of padding lanes.
+            far: row of the ends of padding springs.
+        """
+        keep = np.flatnonzero(springs.edges[:, 0] != springs.edges[:, 1])
+        ends = springs.edges[keep]
+        degree = np.bincount(ends.ravel(), minlength=len(row))
+        vertices = np.flatnonzero(part >= 0)
+        vertices = vertices[np.argsort(row[vertices])]
+        count = np.bincount(part[vertices], minlength=parts)
+        rank = np.arange(len(vertices)) - np.repeat(np.cumsum(count) - count, count)
+        vertices = vertices[np.lexsort((-degree[vertices], rank // SORT_WINDOW, part[vertices]))]
+        first = np.concatenate([[0], np.cumsum(-(-count // LANES))])
+        place = np.full(len(row), -1)
+        place[vertices] = LANES * first[part[vertices]] + rank
+        own = np.full(LANES * first[-1], nobody, np.int32)
+        own[place[vertices]] = row[vertices]
+
+        at = np.zeros(len(own), np.int64)
+        at[place[vertices]] = degree[vertices]
+        start = np.concatenate([[0], np.cumsum(at.reshape(-1, LANES).max(axis=1, initial=2))])
+        here, there = ends.T.ravel(), ends[:, ::-1].T.ravel()
+        spring = np.concatenate([keep, ~keep])
+        k = springs.stiffness[np.maximum(spring, ~spring)]
+        pull = k * springs.rest_length[np.maximum(spring, ~spring)]
+        order = np.lexsort((pull, k, place[here]))  # so that lanes have equal springs side by side
+        order = order[np.searchsorted(place[here[order]], 0) :]
+        here, there, spring, k, pull = place[here[order]], row[there[order]], spring[order], k[order], pull[order]
+        nth = np.arange(len(here)) - np.searchsorted(here, here)
+        entry = LANES * (start[here // LANES] + nth) + here % LANES
+
+        def filled(values: NDArray[Any], filler: float) -> NDArray[Any]:
+            out = allocate_aligned(LANES * start[-1], values.dtype)
+            out[:] = filler
+            out[entry] = values
+            return out
+
+        return cls(
+            4 * own,
+            start,
+            filled(4 * there.astype(np.int32), 4 * far),
+            *deduplicate_packets(filled(pull, 0.0), filled(k, 0.0)),
+            filled(spring.astype(np.int32), 0),
+            np.array(springs.rest_direction, order="C"),
+        ), first
+
+    def entry_weights(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return k r and k of each entry's springs."""
+        pull, k = self.weights.reshape(-1, 2, LANES)[self.weight_offset // (2 * LANES)].transpose(1, 0, 2)
+        return pull.ravel(), k.ravel()
+
+    def gather_lanes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the values of the packets' vertices (8 b,), given one number per row."""
+        out = allocate_aligned(len(self.row_offset))
+        out[:] = values[self.row_offset // 4]
+        return out
+
+    def build_right_hand_side(
+        self, anchor_stiffness: NDArray[np.float64], y: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Build the constant right-hand side y of the packets, with the anchor stiffness of each row [N/m].
+
+        A packet has RIGHT numbers: eight x, y and z each, and eight stiffnesses. Rows in no packet follow at the end.
+
+        Args:
+            anchor_stiffness: anchor stiffness of each row [N/m].
+            y: in rows of four; zero, to be overwritten, if it is not given.
+        """
+        out = allocate_aligned(4 * len(self.row_offset) + RHS_STRIDE)
+        bundles = out[:-RHS_STRIDE].reshape(-1, 4, LANES)
+        bundles[:, 3] = self.gather_lanes(anchor_stiffness).reshape(-1, LANES)
+        if y is not None:
+            bundles[:, :3] = y.reshape(-1, 4)[self.row_offset // 4, :3].reshape(-1, LANES, 3).transpose(0, 2, 1)
+        return out
+
+    def right_hand_side_offset(self, rows: int) -> NDArray[np.int64]:
+        """Return the offset of the x coordinate of each row in the right-hand side."""
+        lane = np.arange(len(self.row_offset))
+        at = np.full(rows, 4 * len(lane))
+        at[self.row_offset // 4] = RHS_STRIDE * (lane // LANES) + lane % LANES
+        return at
+
+
+def deduplicate_packets(*numbers: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Return the offsets of each entry's numbers, eight per array, and the numbers without duplicates."""
+    rows = np.concatenate([array.reshape(-1, LANES) for array in numbers], axis=1)
+    mixing = np.random.default_rng(0).integers(2**63, size=rows.shape[1], dtype=np.uint64)
+    _, first, kind = np.unique(rows.view(np.uint64) @ mixing, return_index=True, return_inverse=True)
+    if not np.array_equal(rows[first[kind]], rows):  # two kinds were mixed to one number
+        first = kind = np.arange(len(rows))
+    kept = allocate_aligned(rows[first].size)
+    kept[:] = rows[first].ravel()
+    return (rows.shape[1] * kind).astype(np.int32), kept
+
+
+@jit_inner
+def add_projection(bundles, begin, end, p, right, out, shift):
+    """Add y + A'K d(p) to rows of `out` that are shifted by `shift`.
+
+    It is that of the packets from `begin` to `end`.
+    """
+    moved = out[4 * shift :]
+    for b in range(begin, end):
+        if vectors.add_spring_projection(bundles, b, p, right, moved):
+            add_degenerate_packet(bundles, b, p, right, moved, False)
+
+
+@jit_inner
+def add_descent(bundles, begin, end, p, right, out, shift):
+    """Add minus the gradient, y - Q p + A'K d(p), to rows of `out`.
+
+    It is that of the packets from `begin` to `end`.
+    """
+    moved = out[4 * shift :]
+    for b in range(begin, end):
+        if vectors.add_spring_forces(bundles, b, p, right, moved):
+            add_degenerate_packet(bundles, b, p, right, moved, True)
+
+
+@jit_inner
+def add_degenerate_packet(bundles, b, p, right, out, correct):
+    """Add either of them for a packet with a spring of zero length; `correct` selects minus the gradient."""
+    add_scalar_springs(bundles, b, p, out, correct)
+    for lane in range(LANES):
+        i, at = bundles.row_offset[LANES * b + lane], RHS_STRIDE * b + lane
+        for c in range(3):
+            out[i + c] += right[at + LANES * c]
+            if correct:
+                out[i + c] -= right[at + 3 * LANES] * p[i + c]
+
+
+@jit_inner
+def add_scalar_springs(bundles, b, p, out, correct):
+    """Add a packet's springs one by one.
+
+    One of zero length has the direction of its rest shape.
+    """
+    for lane in range(LANES):
+        i = bundles.row_offset[LANES * b + lane]
+        s0 = s1 = s2 = 0.0
+        for entry in range(bundles.packet_start[b], bundles.packet_start[b + 1]):
+            e, w = LANES * entry + lane, bundles.weight_offset[entry] + lane
+            j = bundles.neighbour_offset[e]
+            v0, v1, v2 = p[i] - p[j], p[i + 1] - p[j + 1], p[i + 2] - p[j + 2]
+            if correct:
+                k = bundles.weights[w + LANES]
+                s0, s1, s2 = s0 - k * v0, s1 - k * v1, s2 - k * v2
+            scale, squared = bundles.weights[w], v0 * v0 + v1 * v1 + v2 * v2
+            if squared <= ZERO_LENGTH_SQUARED:
+                name = bundles.spring_index[e]
+                if name < 0:
+                    scale, name = -scale, ~name
+                v0, v1, v2 = bundles.rest_direction[name]
+            else:
+                scale /= np.sqrt(squared)
+            s0, s1, s2 = s0 + scale * v0, s1 + scale * v1, s2 + scale * v2
+        out[i], out[i + 1], out[i + 2] = out[i] + s0, out[i + 1] + s1, out[i + 2] + s2
+
+
+@jit_inner
+def squared_norm(bundles, begin, end, e, measure):
+    """Return |e|_Q^2 [J] of displacements in rows of four, with half of each spring at each end.
+
+    `measure` is the diagonal part [N/m] of each lane.
+    """
+    total = 0.0
+    for b in range(begin, end):
+        total += vectors.spring_squared_norm(bundles, b, e, measure)
+    return total
+
+
+@jit_kernel
+def run_local_step(bundles, p, y, x, b, zero, out):
+    """Write y + A'K d(p), all (n, 3), to `out`.
+
+    Scratch are x and b (n + 2 rows of four) and `zero`, a right-hand side of zeros.
+    """
+    n = len(p)
+    for i in range(n):
+        for c in range(3):
+            x[4 * i + c] = p[i, c]
+            b[4 * i + c] = 0.0
+    add_projection(bundles, 0, len(bundles.packet_start) - 1, x, zero, b, 0)
+    for i in range(n):
+        for c in range(3):
+            out[i, c] = y[i, c] + b[4 * i + c]

@@ -1,0 +1,1 @@
+"""Sparse Cholesky factorisation: ordering, symbolic and numeric phase, triangular solves."""

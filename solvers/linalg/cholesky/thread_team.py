@@ -1,0 +1,151 @@
+"""Thread team: lock-free work sharing among threads within a step, by a few atomic integers.
+
+Threads claim tasks; none are assigned. The thread that completes the last task of a phase starts the next phase. A
+thread thus never waits for one that has not started, only for one that is processing a task. An idle thread spins until
+the next phase begins, and after some microseconds yields its core to other programs.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+from springbench.solvers.jit.kernel_compilation import jit_inner
+
+_PHASE_INDEX, _DONE_INDEX, _CLAIMS_INDEX = 0, 8, 16
+"""Indices into `signals`; the first two have separate cache lines."""
+
+_FINISHED = -1
+_MAX_SPINS = 2000
+"""Number of polls before a waiting thread yields its core between polls. They take about as long as an iteration on the
+smallest mesh on which a second thread pays off."""
+
+_yield_core: Any = types.ExternalFunction("sched_yield", types.intc())
+
+
+class ThreadTeam(NamedTuple):
+    """Shared state of the threads.
+
+    Attributes:
+        signals: the phase, the number of its completed tasks, and the last phase in which each task was claimed.
+        task_sums: results of the tasks.
+        results: final results of the step, (2,).
+    """
+
+    signals: NDArray[np.int64]
+    task_sums: NDArray[np.float64]
+    results: NDArray[np.float64]
+
+    @classmethod
+    def from_task_count(cls, tasks: int) -> ThreadTeam:
+        """Allocate the state for a number of tasks per phase."""
+        return cls(np.zeros(_CLAIMS_INDEX + tasks, np.int64), np.zeros(tasks), np.zeros(2))
+
+
+def _element_pointer(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
+    return builder.gep(context.make_array(kind)(context, builder, array).data, [index])
+
+
+def _compare_and_swap_code(typingctx: Any, signals: Any, place: Any, before: Any, after: Any) -> Any:
+    """Replace signals[place] by `after` if it equals `before`; return whether it did."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        at = _element_pointer(context, builder, signature.args[0], args[0], args[1])
+        return builder.extract_value(builder.cmpxchg(at, args[2], args[3], "acq_rel", "monotonic"), 1)
+
+    return types.boolean(signals, types.int64, types.int64, types.int64), generate
+
+
+def _fetch_add_code(typingctx: Any, signals: Any, place: Any) -> Any:
+    """Add one to signals[place], and return its previous value."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        at = _element_pointer(context, builder, signature.args[0], args[0], args[1])
+        return builder.atomic_rmw("add", at, ir.Constant(ir.IntType(64), 1), "acq_rel")
+
+    return types.int64(signals, types.int64), generate
+
+
+def _load_acquire_code(typingctx: Any, signals: Any, place: Any) -> Any:
+    """Return signals[place] with acquire ordering."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.load_atomic(
+            _element_pointer(context, builder, signature.args[0], args[0], args[1]), "acquire", 8
+        )
+
+    return types.int64(signals, types.int64), generate
+
+
+def _store_release_code(typingctx: Any, signals: Any, place: Any, value: Any) -> Any:
+    """Write signals[place] with release ordering."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        builder.store_atomic(
+            args[2], _element_pointer(context, builder, signature.args[0], args[0], args[1]), "release", 8
+        )
+        return context.get_dummy_value()
+
+    return types.void(signals, types.int64, types.int64), generate
+
+
+# Numba passes the first argument itself, which type checkers cannot see.
+_compare_and_swap: Any = intrinsic(_compare_and_swap_code)
+_fetch_add_one: Any = intrinsic(_fetch_add_code)
+_load_acquire: Any = intrinsic(_load_acquire_code)
+_store_release: Any = intrinsic(_store_release_code)
+
+
+@jit_inner
+def reset_team(team):
+    """Reset the state before the threads start: phase 0, with no task claimed."""
+    team.signals[:_CLAIMS_INDEX] = 0
+    team.signals[_CLAIMS_INDEX:] = -1
+
+
+@jit_inner
+def try_claim(team, task, phase):
+    """Return whether this thread has claimed the task of a phase."""
+    before = _load_acquire(team.signals, _CLAIMS_INDEX + task)
+    return before < phase and _compare_and_swap(team.signals, _CLAIMS_INDEX + task, before, phase)
+
+
+@jit_inner
+def complete_task(team):
+    """Mark a task as completed; return whether it was the last one of its phase.
+
+    The thread that gets True must end the phase.
+    """
+    if _fetch_add_one(team.signals, _DONE_INDEX) < len(team.task_sums) - 1:
+        return False
+    team.signals[_DONE_INDEX] = 0
+    return True
+
+
+@jit_inner
+def release_phase(team, phase):
+    """Release a later phase."""
+    _store_release(team.signals, _PHASE_INDEX, phase)
+
+
+@jit_inner
+def finish_phases(team):
+    """End the last phase."""
+    _store_release(team.signals, _PHASE_INDEX, _FINISHED)
+
+
+@jit_inner
+def wait_for_phase(team, phase):
+    """Wait for the end of a phase; return the next one, negative if there is none."""
+    looks = 0
+    now = _load_acquire(team.signals, _PHASE_INDEX)
+    while now == phase:
+        looks += 1
+        if looks > _MAX_SPINS:
+            _yield_core()
+        now = _load_acquire(team.signals, _PHASE_INDEX)
+    return now

@@ -1,0 +1,1 @@
+"""Local-global iterations over one prefactored matrix, and their variants."""

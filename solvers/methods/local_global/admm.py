@@ -1,0 +1,204 @@
+"""ADMM for the step problem (Overby, Brown, Li and Narain 2017, "ADMM contains projective dynamics").
+
+    min  U(z) + terms quadratic in p   subject to   A p = z,   weighted by W K
+
+    z <- argmin U(z) + W/2 |A p + u - z|_K^2
+    u <- u + A p - z
+    p <- argmin of the quadratic part + W/2 |A p - z + u|_K^2
+
+For a projective energy U(z) = |z - d(z)|_K^2/2, where d(z) is the nearest vector of zero energy,
+z = (d(v) + W v)/(1 + W) with v = A p + u. With W = 1 the matrix is Q and z - u = d(v). An iteration is then one of
+local-global, except that it projects A p + u, the edges extended by their accumulated error. The first iteration, with
+u = 0, equals local-global.
+
+Descent is not guaranteed. At a fixed point v has the length l + (l - r)/W. A spring shorter than r/(1 + W) has no
+fixed point, because its negative curvature exceeds the curvature of the weight. Small weights converge fast where no
+spring is compressed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
+from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.linalg.solver_selection import build_linear_solver
+from springbench.solvers.methods.local_global import admm_local_step as kernels
+from springbench.solvers.methods.local_global.prefactored import (
+    PreparedLocalGlobal,
+    prepare_local_global,
+    require_projective,
+)
+from springbench.solvers.model.energies.edge_energy import EdgeEnergy
+from springbench.solvers.model.energies.quadratic_energy import Quadratic
+from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.energies.strain_limit_energy import StrainLimits
+from springbench.solvers.model.step_problem import Energy, Positions, StepProblem, System, Unsupported, is_lagged
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
+
+
+@dataclass(frozen=True)
+class Admm:
+    """ADMM for springs, strain limits and constant quadratic forms.
+
+    Args:
+        weight: W, relative to the stiffness of each edge.
+    """
+
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = False
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
+        "accelerated local-global",
+        Citation(
+            "Overby, Matthew and Brown, George E. and Li, Jie and Narain, Rahul",
+            2017,
+            "ADMM ⊇ Projective Dynamics: Fast Simulation of Hyperelastic Models with Dynamic Constraints",
+            "10.1109/TVCG.2017.2730875",
+        ),
+    )
+
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Raise ValueError if a parameter is out of range."""
+        if not 0.0 < self.weight < np.inf:
+            raise ValueError(f"weight: should be positive and finite, not {self.weight}")
+
+    def prepare(self, system: System) -> PreparedAdmm:
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: if an energy has no projection along edges.
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+        """
+        others = {type(e).__name__ for e in system.energies if not isinstance(e, Springs | StrainLimits | Quadratic)}
+        if others:
+            raise Unsupported(
+                f"admm: projects springs and strain limits, and solves for quadratic forms; the scene has "
+                f"{', '.join(sorted(others))} as well"
+            )
+        energies = require_projective(system, "admm")
+        weighted = [
+            replace(e, stiffness=self.weight * e.stiffness) if isinstance(e, EdgeEnergy) else e for e in energies
+        ]
+        base = measure = prepare_local_global(system, weighted, lambda Q: build_linear_solver(Q))
+        if self.weight != 1.0:
+            measure = prepare_local_global(system, energies, lambda Q: build_linear_solver(Q))
+        return PreparedAdmm(
+            base, measure, FixedObjective(system), _ProjectedEdges.from_energies(system.energies), self.weight
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _ProjectedEdges:
+    """Edges of all springs and strain limits, with the lengths of zero energy.
+
+    Attributes:
+        edges: (m, 2) vertex indices.
+        stiffness: (m,) [N/m].
+        min_length, max_length: (m,) [m], bounds of the lengths at which an edge has no energy.
+        direction: (m, 3), unit vectors for edges of zero length.
+    """
+
+    edges: NDArray[np.int64]
+    stiffness: NDArray[np.float64]
+    min_length: NDArray[np.float64]
+    max_length: NDArray[np.float64]
+    rest_direction: NDArray[np.float64]
+
+    @classmethod
+    def from_energies(cls, energies: Sequence[Energy]) -> _ProjectedEdges:
+        springs = Springs.from_parts([energy for energy in energies if isinstance(energy, Springs)])
+        limits = [energy for energy in energies if isinstance(energy, StrainLimits)]
+        return cls(
+            np.concatenate([springs.edges, *(e.edges for e in limits)]),
+            np.concatenate([springs.stiffness, *(e.stiffness for e in limits)]),
+            np.concatenate([springs.rest_length, *(e.min_length for e in limits)]),
+            np.concatenate([springs.rest_length, *(e.max_length for e in limits)]),
+            np.concatenate([springs.rest_direction, *(e.rest_direction for e in limits)]),
+        )
+
+
+class PreparedAdmm(IterativeSolver):
+    """ADMM, prepared for a system.
+
+    Attributes:
+        local_global: the factorised ADMM matrix.
+        residual_metric: Q with its factor, for residuals.
+    """
+
+    def __init__(
+        self,
+        base: PreparedLocalGlobal,
+        measure: PreparedLocalGlobal,
+        objective: FixedObjective,
+        edges: _ProjectedEdges,
+        weight: float,
+    ) -> None:
+        self.local_global, self.residual_metric, self.fixed_objective, self.projected_edges, self.weight = (
+            base,
+            measure,
+            objective,
+            edges,
+            weight,
+        )
+        self.description, self.stats = base.description, base.stats
+
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
+        """Start a solve from an initial guess (n, 3) [m]."""
+        return _AdmmState(self, problem, initial_guess)
+
+    def residual_scale(self, problem: StepProblem) -> float:
+        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
+        return self.residual_metric.residual_scale(problem)
+
+
+class _AdmmState(SolverState):
+    """State of an ADMM solve: positions and scaled dual variables.
+
+    The scaled dual variable u (m, 3) [m] has a row per edge.
+    """
+
+    def __init__(self, prepared: PreparedAdmm, problem: StepProblem, guess: Positions) -> None:
+        self._local_global, self._residual_metric, edges = (
+            prepared.local_global,
+            prepared.residual_metric,
+            prepared.projected_edges,
+        )
+        if any(isinstance(energy, StrainLimits) and is_lagged(energy) for energy in problem.system.energies):
+            edges = _ProjectedEdges.from_energies(problem.energies)
+        self._edges = (
+            edges.edges,
+            edges.stiffness,
+            edges.min_length,
+            edges.max_length,
+            edges.rest_direction,
+            prepared.weight,
+        )
+        self._step = StepObjective(prepared.fixed_objective, problem)
+        self._constant_term = self._local_global.constant_right_hand_side(problem)
+        for energy in problem.energies:
+            if isinstance(energy, Quadratic):
+                energy.add_projection(problem.inertial_target, self._constant_term)
+        self.positions = self._local_global.apply_exact_pins(guess, problem)
+        self._right_hand_side, self._scaled_dual = np.empty_like(self.positions), np.zeros((len(edges.edges), 3))
+
+    def step_state(self) -> bool:
+        """Do one iteration; return False if round-off prevents any further change."""
+        kernels.run_local_step(
+            *self._edges, self.positions, self._constant_term, self._scaled_dual, self._right_hand_side
+        )
+        self._local_global.solve_correction(self._right_hand_side, self.positions)
+        return True
+
+    def residual(self) -> float:
+        """Return the residual; costs a gradient and a solve in addition to those of the iteration."""
+        gradient = self._step.gradient(self.positions)
+        return self._residual_metric.correction_residual(
+            self._residual_metric.solve_correction(gradient, np.zeros_like(gradient))
+        )

@@ -1,0 +1,68 @@
+"""Optimised C++ baseline: local-global iterations (`cholmod.cpp`) with CHOLMOD's ordering and factor.
+
+The second C++ baseline of the compiled solvers; the first is the plain program of `eigen_local_global`.
+"""
+
+from __future__ import annotations
+
+from ctypes import c_int64
+from dataclasses import dataclass
+from typing import ClassVar
+
+from springbench.solvers.iteration.solver_info import LIU_2013, LOCAL_GLOBAL_FAMILY, SolverInfo
+from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, RESIDUAL_EACH, LoopLimits
+from springbench.solvers.methods.local_global import cpp_backend
+from springbench.solvers.methods.local_global.prefactored import (
+    LocalGlobalState,
+    PreparedLocalGlobal,
+    require_only_springs,
+)
+from springbench.solvers.model.step_problem import Positions, StepProblem, System
+
+CHOLMOD_REQUIREMENTS = "CHOLMOD (Debian: libsuitesparse-dev) and C++17"
+
+
+@dataclass(frozen=True)
+class CholmodLocalGlobal:
+    """Local-global in C++ for springs: one loop over springs, and solves with CHOLMOD's simplicial factor."""
+
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(LOCAL_GLOBAL_FAMILY, LIU_2013)
+
+    def prepare(self, system: System) -> PreparedCholmod:
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: for energies other than springs, and if no C++ compiler is available.
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+        """
+        springs = require_only_springs(system, "cholmod")
+        library = cpp_backend.load_library(
+            cpp_backend.HEADER_FOLDER / "cholmod.cpp", CHOLMOD_REQUIREMENTS, ["-lcholmod"]
+        )
+        compiled = cpp_backend.CppBackend(library, system, springs)
+        return cpp_backend.prepare_cpp_backend(
+            PreparedCholmod, system, springs, compiled, "CHOLMOD's simplicial factor"
+        )
+
+
+class PreparedCholmod(PreparedLocalGlobal):
+    """CHOLMOD local-global, prepared; iterations without residual checks stay in C++."""
+
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> _CholmodState:
+        """Start a solve from an initial guess (n, 3) [m]."""
+        return _CholmodState(self, problem, initial_guess)
+
+
+class _CholmodState(LocalGlobalState):
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
+        """Run iterations within the limits; return their number, the residual and the reason of the end."""
+        if limits.residual_mode == RESIDUAL_EACH or limits.max_iterations < 2:
+            return super().run_iterations(limits)
+        compiled = self.base.factor
+        assert isinstance(compiled, cpp_backend.CppBackend)
+        given = map(cpp_backend.array_address, (self.positions, self.right_hand_side))
+        compiled.library.iterate(compiled.handle, c_int64(limits.max_iterations - 1), *given)
+        count, residual, _ = super().run_iterations(limits._replace(max_iterations=1))
+        return limits.max_iterations - 1 + count, residual, REASON_ITERATIONS

@@ -1,0 +1,111 @@
+"""A solver defined by one formula for the next iterate.
+
+    p' = next_iterate(p, p_before, Q^-1 grad g(p))
+
+Local-global is p - Q^-1 grad g(p). Q is assembled from the projective energies and factorised by SuperLU.
+"""
+
+from __future__ import annotations
+
+import inspect
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
+from springbench.solvers.linalg.direct_solvers import SparseLU
+from springbench.solvers.methods.local_global.prefactored import (
+    PreparedLocalGlobal,
+    prepare_local_global,
+    require_projective,
+)
+from springbench.solvers.model.step_problem import PluginContractError, Positions, ResidualIterate, StepProblem, System
+
+
+class FixedPointSolver(ABC):
+    """The base of such a solver, a frozen dataclass of its parameters."""
+
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = False
+
+    @abstractmethod
+    def next_iterate(self, p: Positions, before: Positions, correction: Positions) -> Positions:
+        """Return the next iterate (n, 3) [m].
+
+        No argument may be modified.
+
+        Args:
+            p: current positions (n, 3) [m].
+            before: positions of the previous iterate (n, 3) [m]; p itself in the first iteration.
+            correction: Q^-1 grad g(p) (n, 3) [m].
+        """
+
+    def prepare(self, system: System) -> PreparedFixedPoint:
+        """Return the prepared solver; raise Unsupported for other than projective energies, or NotPositiveDefinite."""
+        name = type(self).__name__
+        try:
+            inspect.signature(self.next_iterate).bind(None, None, None)
+        except TypeError:
+            raise PluginContractError(
+                f"{source_line_of(self.next_iterate)}: `formula` should take p, before and correction"
+            ) from None
+        return PreparedFixedPoint(
+            prepare_local_global(system, require_projective(system, name), lambda Q: (SparseLU(Q), "SuperLU")),
+            self.next_iterate,
+        )
+
+
+class PreparedFixedPoint(IterativeSolver):
+    """The formula with a factor of one system's Q."""
+
+    residual_iterate: ClassVar[ResidualIterate] = "previous"
+
+    def __init__(self, base: PreparedLocalGlobal, formula: Callable[..., Positions]) -> None:
+        self.base, self.next_iterate = base, formula
+        self.description, self.stats = base.description, base.stats
+
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
+        """Start a solve from an initial guess (n, 3) [m]."""
+        return _FixedPointState(self, problem, initial_guess)
+
+    def residual_scale(self, problem: StepProblem) -> float:
+        """Return the residual scale [J^(1/2)] for the round-off check."""
+        return self.base.residual_scale(problem)
+
+
+class _FixedPointState(SolverState):
+    def __init__(self, ready: PreparedFixedPoint, problem: StepProblem, guess: Positions) -> None:
+        self._ready, self._problem = ready, problem
+        self.positions = self._previous_positions = ready.base.apply_exact_pins(guess, problem)
+        self._correction = np.full_like(guess, np.nan)
+
+    def step_state(self) -> bool:
+        """Do one iteration; return False if round-off prevents descent."""
+        p, base = self.positions, self._ready.base
+        self._correction = base.solve_correction(self._problem.gradient(p), np.zeros_like(p))
+        self.positions, self._previous_positions = (
+            self._check_iterate(self._ready.next_iterate(p, self._previous_positions, self._correction)),
+            p,
+        )
+        return True
+
+    def _check_iterate(self, found: Any) -> Positions:
+        wanted = self._correction.shape
+        if isinstance(found, np.ndarray) and found.shape == wanted and found.dtype == np.float64:
+            return found
+        came = f"{found.dtype} of shape {found.shape}" if isinstance(found, np.ndarray) else f"a {type(found).__name__}"
+        raise PluginContractError(
+            f"{source_line_of(self._ready.next_iterate)}: `formula` gave {came}; wanted float64 of shape {wanted}"
+        )
+
+    def residual(self) -> float:
+        """Return |Q^-1 grad g|_Q of the previous iterate."""
+        return self._ready.base.correction_residual(self._correction.copy())
+
+
+def source_line_of(function: Callable[..., Any]) -> str:
+    """Return `file:line` of the definition of a function, or its name if it is not written in Python."""
+    code = getattr(function, "__code__", None)
+    return f"{Path(code.co_filename).name}:{code.co_firstlineno}" if code else getattr(function, "__qualname__", "")

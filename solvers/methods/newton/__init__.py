@@ -1,0 +1,1 @@
+"""Newton's method, Newton-CG and the hybrid of both with local-global iterations."""

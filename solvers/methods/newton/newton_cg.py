@@ -1,0 +1,259 @@
+"""Newton-CG: inexact Newton method with preconditioned conjugate gradients (Dembo and Steihaug 1983).
+
+    H d = -g to |H d + g| <= eta |g|,   |r|^2 = r' Q^-1 r,   eta = .9 (|g| / |g previous|)^2  Eisenstat and Walker 1996
+
+For springs Q majorises H, so the eigenvalues of Q^-1 H are at most 1. Conjugate gradients stop at a direction of
+negative curvature with their current iterate; at the first direction, that is -Q^-1 g, a local-global iteration.
+
+`springbench.solvers.methods.base.preconditioners` documents the other preconditioners, and the matrix that replaces
+Q with active
+contacts. An iteration converges friction, and may consist of several steps, as in Newton's method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from springbench.solvers.iteration.descent_method import (
+    DescentPoint,
+    PreparedDescent,
+    ResidualMetric,
+    backtracking_line_search,
+    inner_product,
+)
+from springbench.solvers.iteration.device_interface import PrecisionOptions
+from springbench.solvers.iteration.preconditioners import (
+    Preconditioner,
+    PreconditionerName,
+    ScaledPreconditioner,
+    build_preconditioner,
+)
+from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky
+from springbench.solvers.linalg.dense_inverse import DenseInverse
+from springbench.solvers.linalg.krylov import NEGATIVE_CURVATURE, ConjugateGradientIteration
+from springbench.solvers.methods.newton import newton_cg_kernel
+from springbench.solvers.methods.newton.newton_direct import make_friction_search
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, System
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import Hessian, StepObjective
+
+_MAX_ETA, _MIN_ETA = 0.5, 1e-10
+"""Upper and lower bound of eta."""
+
+_MAX_ETA_IN_CONTACT = 1e-4
+"""Upper bound of eta with active contacts: sticking friction acts within 1e-8 m, and a direction with a small error on
+that scale leads to where another quadratic model holds."""
+
+_MAX_CG_ITERATIONS = 1000
+"""Maximum number of conjugate gradient iterations: the stiffest springs need it for a few digits."""
+
+
+@dataclass(frozen=True)
+class NewtonCG(PrecisionOptions):
+    """Newton's method without a factorisation of the Hessian; needs as much memory as local-global.
+
+    Args:
+        preconditioner: of conjugate gradients (`springbench.solvers.methods.base.preconditioners`); a device
+        supports schwarz only.
+    """
+
+    omitted_defaults: ClassVar[frozenset[str]] = PrecisionOptions.omitted_defaults | {"preconditioner"}
+
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
+        "Newton",
+        Citation(
+            "Dembo, Ron S. and Steihaug, Trond",
+            1983,
+            "Truncated-Newton algorithms for large-scale unconstrained optimization",
+            "10.1007/BF02592055",
+        ),
+    )
+
+    preconditioner: PreconditionerName = "factor"
+
+    def prepare(self, system: System) -> PreparedSolver:
+        """Prepare the method for a system.
+
+        Raises:
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+            Unsupported: if Q does not fit in memory, and for block preconditioners with energies without elements.
+        """
+        if self.device == "cuda":
+            from springbench.solvers.cuda.cuda_device import require_device  # for those who ask for it
+
+            require_device("newton-cg")
+            from springbench.solvers.methods.newton.device_newton_cg import prepare_newton_cg
+
+            return prepare_newton_cg(
+                system, self.preconditioner, self.real_dtype, (_MAX_ETA, _MIN_ETA), _MAX_CG_ITERATIONS
+            )
+        metric = ResidualMetric(system)
+        objective = FixedObjective(system)
+        method = TruncatedNewtonIteration(metric, objective, self.preconditioner)
+        return PreparedDescent(
+            objective, metric, method, metric.description + objective.interpreted_energies, metric.stats
+        )
+
+
+class TruncatedNewtonIteration:
+    """The iteration for one system; `compiled_cg` is the fused CG kernel, None if unavailable."""
+
+    def __init__(
+        self, metric: ResidualMetric, objective: FixedObjective, preconditioner: PreconditionerName = "factor"
+    ) -> None:
+        self._metric, self._linearise_at = metric, build_preconditioner(preconditioner, metric, objective, "newton-cg")
+        factor = _compiled_factor(metric) if preconditioner == "factor" else None
+        self.compiled_cg = _CompiledCG(objective, factor) if factor else None
+        self._friction_search = make_friction_search(metric)
+
+    def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
+        """Yield the points after `start`."""
+        loose = _MAX_ETA_IN_CONTACT if step.has_contact_elements else _MAX_ETA
+        point, eta = (
+            self._friction_search.relax_initial_point(step, start)
+            if self._friction_search and step.has_contact_elements
+            else start,
+            loose,
+        )
+        hessian, solve = self._linearise_at(step, point.positions)
+        descent = solve(point.gradient)
+        while not point.is_stalled:
+            found = None
+            if inner_product(point.gradient, descent) > self._metric.energy_roundoff(point.positions):
+                direction = self._compute_direction(step, hessian, solve, point, descent, eta)
+                found = self._search_direction(step, point, direction, eta) or backtracking_line_search(
+                    step, point, -descent
+                )
+            if found is None:
+                yield point._replace(is_stalled=True)
+                return
+            hessian, solve = self._linearise_at(step, found.positions)
+            before, descent = inner_product(point.gradient, descent), solve(found.gradient)
+            # Safeguard of Eisenstat and Walker: eta decreases no faster than its own square.
+            following = 0.9 * inner_product(found.gradient, descent) / before
+            eta = min(loose, max(_MIN_ETA, following, 0.9 * eta**2 if 0.9 * eta**2 > 0.1 else 0.0))
+            point = found
+            yield point
+
+    def _search_direction(
+        self, step: StepObjective, at: DescentPoint, direction: Positions, eta: float
+    ) -> DescentPoint | None:
+        """Return a lower point along a direction, or None."""
+        if self._friction_search is None or not step.has_contact_elements:
+            return backtracking_line_search(step, at, direction)
+
+        def following(point: DescentPoint) -> Positions:
+            hessian, solve = self._linearise_at(step, point.positions)
+            return self._compute_direction(step, hessian, solve, point, solve(point.gradient), eta)
+
+        return self._friction_search.watchdog_search(step, at, direction, following)
+
+    def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
+        """Return True: without a factor, definiteness is unknown."""
+        return True
+
+    def iteration_phases(self, step: StepObjective, at: DescentPoint) -> dict[str, Callable[[], object]]:
+        """Return the gradient, a product with the Hessian and the preconditioner as callables."""
+        hessian, solve = self._linearise_at(step, at.positions)
+        return {
+            "gradient": lambda: step.gradient(at.positions),
+            "product": lambda: hessian.matvec(at.gradient),
+            "solve": lambda: solve(at.gradient),
+        }
+
+    def _compute_direction(
+        self,
+        step: StepObjective,
+        hessian: Hessian,
+        solve: Preconditioner,
+        at: DescentPoint,
+        descent: Positions,
+        eta: float,
+    ) -> Positions:
+        """Solve H d = -g approximately; `descent` is the preconditioned gradient."""
+        if self.compiled_cg and not step.other_energies:
+            return self.compiled_cg.compute_direction(hessian, solve, at, descent, eta)
+        product = inner_product(at.gradient, descent)
+        newton = _NewtonSystemCG(hessian, solve, at.gradient, descent, eta**2 * product)
+        count, ended = newton.run_iterations(product, _MAX_CG_ITERATIONS)
+        return newton.search_direction if ended == NEGATIVE_CURVATURE and count == 0 else newton.solution
+
+
+class _NewtonSystemCG(ConjugateGradientIteration):
+    """Conjugate gradients for H d = -g.
+
+    Args:
+        hessian: H.
+        solve: the preconditioner.
+        gradient: g (n, 3).
+        descent: the preconditioned gradient.
+        limit: tolerance of r'z [J].
+    """
+
+    def __init__(
+        self, hessian: Hessian, solve: Preconditioner, gradient: Positions, descent: Positions, limit: float
+    ) -> None:
+        self._hessian, self._solve, self._limit = hessian, solve, limit
+        self.solution, self.search_direction, self._residual, self._preconditioned_residual = (
+            np.zeros_like(descent),
+            np.zeros_like(descent),
+            -gradient,
+            -descent,
+        )
+
+    def update_direction(self, product: float, before: float) -> float:
+        """Update the search direction p; return p'Ap."""
+        self.search_direction *= product / before
+        self.search_direction += self._preconditioned_residual
+        self._product = self._hessian.matvec(self.search_direction)
+        return inner_product(self.search_direction, self._product)
+
+    def update_iterate(self, product: float, curvature: float) -> float:
+        """Update the iterate, r and z; return r'z."""
+        length = product / curvature
+        self.solution += length * self.search_direction
+        self._residual -= length * self._product
+        self._preconditioned_residual = self._solve(self._residual)
+        return inner_product(self._residual, self._preconditioned_residual)
+
+    def is_convex(self, curvature: float) -> bool:
+        """Return whether the curvature along p is positive."""
+        return not curvature <= 0.0
+
+    def is_converged(self, product: float) -> bool:
+        """Return whether r'z has reached the tolerance."""
+        return product <= self._limit
+
+
+def _compiled_factor(metric: ResidualMetric) -> SupernodalCholesky | None:
+    """Return a factor of the metric that kernels support, however small; None if Q has none."""
+    if isinstance(metric.factor, DenseInverse):
+        return SupernodalCholesky(metric.free_block)
+    return metric.factor if isinstance(metric.factor, SupernodalCholesky) else None
+
+
+class _CompiledCG:
+    """Conjugate gradients in one kernel, for springs, quadratic forms and elements."""
+
+    def __init__(self, objective: FixedObjective, factor: SupernodalCholesky) -> None:
+        system = objective.system
+        self._thread_count, self._exact_pins = factor.choose_num_threads, system.pins.vertices[system.pins.exact_mask]
+        self._factor = newton_cg_kernel.embed_factor(factor, system.free_vertices)
+        self._scratch = np.zeros((4, system.num_vertices, 3))
+
+    def compute_direction(
+        self, hessian: Hessian, solve: Preconditioner, at: DescentPoint, descent: Positions, eta: float
+    ) -> Positions:
+        """Solve H d = -g approximately; `descent` is the preconditioned gradient."""
+        d = np.empty_like(descent)
+        shrunk = solve.inverse_scaling if isinstance(solve, ScaledPreconditioner) else None
+        solving = self._factor, self._thread_count(), self._exact_pins, shrunk
+        newton = newton_cg_kernel.NewtonEquation(hessian.kernel_arguments, *solving, d, *self._scratch)
+        newton_cg_kernel.solve_direction(newton, at.gradient, descent, eta, _MAX_CG_ITERATIONS)
+        return d

@@ -1,0 +1,189 @@
+"""Newton's method with the exact Hessian and a direct factorisation (Nocedal and Wright 2006, section 3.4).
+
+    p <- p - t (H + E)^-1 grad g(p)
+
+The Hessian of compressed springs may be indefinite. It remains exact wherever it has a Cholesky factor, which preserves
+quadratic convergence. Where it has none, an increasing part of the springs' negative lateral stiffness is removed, and
+finally a multiple of the diagonal of Q is added. Other rules modify the eigenvalues of elements (`indefinite`, see
+`springbench.solvers.methods.newton.newton_direct.hessian_regularisation`); clamping all of them (Teran et al. 2005)
+converges linearly. Where the
+slope is small, none of these rules applies: the exact Hessian distinguishes a minimum from a saddle. From a stationary
+point whose exact Hessian has no factor, the method escapes
+(`springbench.solvers.methods.newton.newton_direct.negative_curvature`).
+
+With active contacts, an iteration converges friction and may consist of several steps
+(`springbench.solvers.methods.newton.newton_direct.friction_gauss_seidel`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.solvers.contact.half_space.vertex_contact import is_vertex_contact
+from springbench.solvers.iteration.descent_method import (
+    DescentPoint,
+    PreparedDescent,
+    ResidualMetric,
+    backtracking_line_search,
+    inner_product,
+)
+from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.methods.newton.hessian_regularisation import (
+    REGULARISATION_RULES,
+    SHIFT_SCHEDULE,
+    ContactScheduleRule,
+    IndefiniteStrategy,
+    RegularisationRule,
+    ShiftScheduleRule,
+)
+from springbench.solvers.methods.newton.negative_curvature import escape_saddle, is_positive_definite
+from springbench.solvers.model.barrier_energy import is_barrier_energy
+from springbench.solvers.model.step_problem import Positions, System, Unsupported
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
+
+if TYPE_CHECKING:
+    from springbench.solvers.methods.newton.friction_gauss_seidel import FrictionGaussSeidel
+
+_SADDLE_SLOPE_RATIO = 1e-12
+"""Fraction of the steepest slope of a solve below which an exact Hessian without a factor indicates a saddle."""
+
+
+@dataclass(frozen=True)
+class NewtonSolver:
+    """Newton's method; at convergence or stagnation, negative curvature is at the level of round-off.
+
+    Args:
+        indefinite_strategy: modification of indefinite Hessians (`hessian_regularisation`).
+    """
+
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
+        "Newton",
+        Citation("Nocedal, Jorge and Wright, Stephen J.", 2006, "Numerical Optimization", "10.1007/978-0-387-40065-5"),
+        is_family_default=True,
+        supports_error_control=True,
+    )
+
+    indefinite: IndefiniteStrategy = "graded"
+
+    def prepare(self, system: System) -> PreparedDescent:
+        """Prepare the method for a system.
+
+        Raises:
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+            Unsupported: if Q does not fit in memory, and for energies without an element-wise form that
+                `indefinite_strategy` requires.
+        """
+        metric, objective = ResidualMetric(system), FixedObjective(system)
+        whole = {
+            type(system.energies[k]).__name__
+            for k in objective.other_energy_indices
+            if not is_barrier_energy(system.energies[k])
+        }
+        if whole and self.indefinite != "graded":
+            raise Unsupported(
+                f"newton, indefinite: {self.indefinite}: changes second derivatives element by element, and there are "
+                f"none of {', '.join(sorted(whole))}; take indefinite: graded"
+            )
+        factor = objective.hessian_matrix.factor
+        facts = metric.stats | {"nnz_hessian_factor": float(factor.nonzeros)}
+        choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; residuals by {metric.description}"
+        choice += objective.interpreted_energies
+        return PreparedDescent(objective, metric, NewtonIteration(metric, self.indefinite), choice, facts)
+
+
+class NewtonIteration:
+    """The iteration of Newton's method for one system."""
+
+    def __init__(self, metric: ResidualMetric, indefinite: IndefiniteStrategy = "graded") -> None:
+        self._metric, self._modification_rule = metric, REGULARISATION_RULES[indefinite]
+        self._system_diagonal: NDArray[np.float64] = np.repeat(metric.free_diagonal, 3)
+        self._friction_search = make_friction_search(metric)
+
+    def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
+        """Yield the points after `start`."""
+        point, steepest, rule = start, 0.0, self._modification_rule()
+        if step.barrier_energies and type(rule) is ShiftScheduleRule:
+            rule = ContactScheduleRule()
+        if self._friction_search and step.has_contact_elements:
+            point = self._friction_search.relax_initial_point(step, point)
+        while not point.is_stalled:
+            point, steepest = self._next_point(step, point, steepest, rule)
+            yield point
+
+    def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
+        """Return whether the stationary point `at` is a minimum, as far as the method can determine."""
+        return is_positive_definite(step, at.positions)
+
+    def iteration_phases(self, step: StepObjective, at: DescentPoint) -> dict[str, Callable[[], object]]:
+        """Return the gradient, the Hessian with its factorisation, and a solve as callables."""
+        hessian, (keep, by) = (
+            step.hessian(at.positions),
+            SHIFT_SCHEDULE[-1],
+        )  # any other may have no factor to solve with
+        hessian.factorise(keep, by * self._system_diagonal)
+        return {
+            "gradient": lambda: step.gradient(at.positions),
+            "factor": lambda: hessian.factorise(keep, by * self._system_diagonal),
+            "solve": lambda: hessian.solve(at.gradient),
+        }
+
+    def _next_point(
+        self, step: StepObjective, at: DescentPoint, steepest: float, rule: RegularisationRule
+    ) -> tuple[DescentPoint, float]:
+        """Return the next point, and the steepest slope so far [J]."""
+        hessian = step.hessian(at.positions)
+        level = rule.factorise_hessian(hessian, at, self._system_diagonal)
+        if level is None:
+            return at._replace(is_stalled=True), steepest
+        direction = -hessian.solve(at.gradient)
+        fall = -inner_product(at.gradient, direction)
+        steepest = max(fall, steepest)
+        known = fall > self._metric.energy_roundoff(at.positions)
+        slight = fall <= _SADDLE_SLOPE_RATIO * steepest
+        if level > 0 and (slight or not known) and type(rule) is not ShiftScheduleRule:
+            return self._next_point(step, at, steepest, ShiftScheduleRule())
+        found = None
+        if known and not (slight and level > 0):
+            found = self._search_direction(step, at, direction, level == 0)
+        if found is None and level > 0:
+            found = escape_saddle(step, at, hessian, self._system_diagonal) or (
+                backtracking_line_search(step, at, direction) if known else None
+            )
+        if found is not None:
+            rule.record_step(step, hessian, at, found)
+        return found or at._replace(is_stalled=True), steepest
+
+    def _search_direction(
+        self, step: StepObjective, at: DescentPoint, direction: Positions, exact: bool
+    ) -> DescentPoint | None:
+        """Return a lower point along a direction, or None; `exact` means an unmodified Hessian."""
+        if self._friction_search is None or not exact or not step.has_contact_elements:
+            return backtracking_line_search(step, at, direction)
+        return self._friction_search.watchdog_search(
+            step, at, direction, lambda point: self._exact_newton_direction(step, point)
+        )
+
+    @staticmethod
+    def _exact_newton_direction(step: StepObjective, at: DescentPoint) -> Positions | None:
+        """Return the direction of the exact Hessian, None if it is not positive definite."""
+        hessian = step.hessian(at.positions)
+        return -hessian.solve(at.gradient) if hessian.factorise() else None
+
+
+def make_friction_search(metric: ResidualMetric) -> FrictionGaussSeidel | None:
+    """Return the friction search of Newton's methods; None without contact, and with surface contact."""
+    energies = metric.system.energies
+    if not any(is_vertex_contact(energy) for energy in energies) or any(
+        is_barrier_energy(energy) for energy in energies
+    ):
+        return None  # its sweeps know of no bounds
+    from springbench.solvers.methods.newton.friction_gauss_seidel import FrictionGaussSeidel  # for those who need it
+
+    return FrictionGaussSeidel(metric)

@@ -1,0 +1,1 @@
+"""Accelerated first-order and quasi-Newton methods."""

@@ -1,0 +1,174 @@
+"""Nonlinear conjugate gradients, preconditioned by Q^-1, without a Hessian matrix or factorisation.
+
+Shen et al. 2024; they precondition by the diagonal of the Hessian, as interior-point elasticity has no Q.
+
+    d = -z + beta d_previous,   z = Q^-1 grad g,   y = g - g_previous,   w = Q^-1 y
+    beta = (y z - (w y) (g d)/(d y)) / (d y)              Dai and Kou 2013
+    t = -(g d)/(d H d)                                    the minimum of the quadratic model along d
+
+H d is a product, element by element. If d is no descent direction, or the model has negative curvature along it, d is
+reset to -z: a local-global iteration. A step without sufficient decrease is halved, and the step size is
+collision-free. With active surface contacts, P = S Q S replaces Q
+(`springbench.solvers.methods.base.preconditioners`). Contact of
+single vertices is not supported: it activates abruptly and friction sticks within 1e-8 m, so no quadratic model
+holds for a step along d. Landing sheets took 340 to 2,600 iterations where L-BFGS took 23 to 135.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
+from springbench.solvers.iteration.descent_method import (
+    DescentPoint,
+    ResidualMetric,
+    backtracking_line_search,
+    inner_product,
+)
+from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
+from springbench.solvers.iteration.preconditioners import (
+    PreconditionerBuilder,
+    PreconditionerName,
+    build_preconditioner,
+)
+from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System, Unsupported
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
+
+
+@dataclass(frozen=True)
+class NonlinearCG:
+    """Preconditioned nonlinear conjugate gradients for all energies; needs as much memory as local-global.
+
+    Args:
+        preconditioner: see `springbench.solvers.methods.base.preconditioners`.
+    """
+
+    omitted_defaults: ClassVar[frozenset[str]] = frozenset({"preconditioner"})
+
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
+        "accelerated local-global",
+        Citation(
+            "Shen, Xing and Cai, Runyuan and Bi, Mengxiao and Lv, Tangjie",
+            2024,
+            "Preconditioned nonlinear conjugate gradient method for real-time interior-point hyperelasticity",
+            "10.1145/3641519.3657490",
+        ),
+    )
+
+    preconditioner: PreconditionerName = "factor"
+
+    def prepare(self, system: System) -> PreparedSolver:
+        """Prepare the method for a system.
+
+        Raises:
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+            Unsupported: for contact of single vertices, if Q does not fit in memory, and for block preconditioners with
+                energies without elements.
+        """
+        if without_vertex_contact(system) is not system:
+            raise Unsupported(
+                "pncg: does not support contact of single vertices (Contact), for which no quadratic model is valid "
+                "along a direction; use lbfgs or newton, or surface-contact"
+            )
+        metric, objective = ResidualMetric(system), FixedObjective(system)
+        at = build_preconditioner(self.preconditioner, metric, objective, "pncg")
+        return PreparedNonlinearCG(
+            metric, objective, at, metric.description + objective.interpreted_energies, metric.stats
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedNonlinearCG(IterativeSolver):
+    """Nonlinear conjugate gradients, prepared for a system."""
+
+    metric: ResidualMetric
+    fixed_objective: FixedObjective
+    linearise_at: PreconditionerBuilder
+    description: str
+    stats: dict[str, float]
+
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
+        """Start a solve from an initial guess (n, 3) [m]."""
+        return _NonlinearCGState(
+            self.metric, self.linearise_at, StepObjective(self.fixed_objective, problem), initial_guess
+        )
+
+    def residual_scale(self, problem: StepProblem) -> float:
+        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
+        return compute_max_coordinate(problem) * self.metric.unpinned_trace**0.5
+
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """Return the gradient, a Hessian product and the preconditioner as callables, at the initial guess."""
+        step = StepObjective(self.fixed_objective, problem)
+        p = step.apply_exact_pins(problem.initial_guess)
+        (hessian, solve), gradient = self.linearise_at(step, p), step.gradient(p)
+        return {
+            "gradient": lambda: step.gradient(p),
+            "product": lambda: hessian.matvec(gradient),
+            "solve": lambda: solve(gradient),
+        }
+
+
+class _NonlinearCGState(SolverState):
+    """State of a solve: the current point, and the direction that led to it."""
+
+    def __init__(
+        self, metric: ResidualMetric, linearise_at: PreconditionerBuilder, step: StepObjective, guess: Positions
+    ) -> None:
+        self._metric, self._linearise_at, self._step = metric, linearise_at, step
+        p = step.apply_exact_pins(guess)
+        self._previous_direction, self._beta = np.zeros_like(p), 0.0
+        self._set_point(DescentPoint(p, step.gradient(p)))
+
+    def _set_point(self, at: DescentPoint) -> None:
+        self._current_point, self.positions = at, at.positions
+        self._hessian, self._solve = self._linearise_at(self._step, at.positions)
+        self._z = self._solve(at.gradient)
+
+    def step_state(self) -> bool:
+        """Do one iteration; return False if round-off prevents any further change."""
+        at, z = self._current_point, self._z
+        if not inner_product(at.gradient, z) > self._metric.energy_roundoff(at.positions):
+            return False
+        direction = self._beta * self._previous_direction - z
+        found = self._search_quadratic_model(direction) if self._beta else None
+        if found is None:
+            direction = -z
+            found = self._search_quadratic_model(direction) or backtracking_line_search(self._step, at, direction)
+        if found is None:
+            return False
+        self._set_point(found)
+        y = found.gradient - at.gradient
+        change = inner_product(direction, y)
+        beta = (
+            inner_product(y, self._z)
+            - inner_product(self._z - z, y) * inner_product(found.gradient, direction) / change
+            if change > 0.0
+            else 0.0
+        )
+        self._previous_direction, self._beta = direction, beta / change if np.isfinite(beta) and change > 0.0 else 0.0
+        return True
+
+    def _search_quadratic_model(self, direction: Positions) -> DescentPoint | None:
+        """Return a lower point by the quadratic model; None without descent or with negative curvature."""
+        slope, curvature = (
+            inner_product(self._current_point.gradient, direction),
+            inner_product(direction, self._hessian.matvec(direction)),
+        )
+        if not (slope < 0.0 < curvature):
+            return None
+        return backtracking_line_search(self._step, self._current_point, direction, initial_step=-slope / curvature)
+
+    def residual(self) -> float:
+        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
+        gradient = self._current_point.gradient
+        if self._solve == self._metric.solve:
+            return self._metric.correction_norm(self._z.copy(), gradient)
+        return self._metric.residual(gradient)

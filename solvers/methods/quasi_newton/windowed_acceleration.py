@@ -1,0 +1,239 @@
+"""Accelerated first-order methods with one prefactored matrix: Anderson, Chebyshev and L-BFGS.
+
+They share the iteration (`springbench.solvers.kernels.accelerated_descent`) and differ in the coefficients of a
+direction. A step
+is fully compiled if the energies are springs, quadratic forms, strain limits and dashpots, and the factor's panels are
+supported by the kernels. Otherwise the kernels alternate with the energies' own values and gradients, and with the
+factor's own solve.
+
+No iteration raises the objective, except by round-off. A trial that would is shortened, or replaced by the plain
+correction, a local-global iteration, which descends by majorisation. If that does not descend either, within round-off,
+the solve terminates as "stalled" and its iterate stays unchanged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
+from springbench.solvers.iteration.iterative_solver import IterativeSolver, compute_max_coordinate
+from springbench.solvers.kernels import accelerated_step, step_setup
+from springbench.solvers.kernels.accelerated_descent import AccelerationWindow
+from springbench.solvers.kernels.acceleration_coefficients import require_history_size
+from springbench.solvers.kernels.edge_elements import EdgeElements
+from springbench.solvers.kernels.iteration_loop import ONE_ITERATION, LoopLimits, iteration_limit
+from springbench.solvers.kernels.spring_objective import ObjectiveWeights
+from springbench.solvers.linalg.memory import allocate_aligned
+from springbench.solvers.linalg.solver_selection import LinearSolverName, Precision, build_linear_solver
+from springbench.solvers.methods.local_global.accelerated_local_global import (
+    AcceleratedState,
+    AccelerationEngine,
+    AccelerationScheme,
+    InterpretedState,
+    allocate_window,
+)
+from springbench.solvers.methods.local_global.fused_local_global import (
+    PADDING_COORDINATE,
+    PreparedCompiledLocalGlobal,
+    compile_iterations,
+)
+from springbench.solvers.methods.local_global.prefactored import (
+    PreparedLocalGlobal,
+    prepare_local_global,
+    require_projective,
+)
+from springbench.solvers.model.barrier_energy import without_barriers
+from springbench.solvers.model.step_problem import Positions, ProjectiveEnergy, StepProblem, System
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.spring_form import SpringForm
+from springbench.solvers.objective.step_objective import StepObjective
+
+
+def prepare_accelerated(
+    system: System, scheme: AccelerationScheme, linear: LinearSolverName, precision: Precision
+) -> PreparedAccelerated:
+    """Factorise Q and compile the iteration.
+
+    Args:
+        system: the system.
+        scheme: coefficients of the acceleration.
+        linear_solver: solver of Q x = b.
+        precision: floating-point type of its stored entries.
+
+    Raises:
+        Unsupported: for energies that the method does not support.
+        NotPositiveDefinite: if the system leaves some positions undetermined.
+    """
+    bare = without_vertex_contact(system)
+    energies = (
+        require_projective(without_barriers(bare), scheme.name)
+        if scheme.needs_projective
+        else [energy for energy in bare.energies if isinstance(energy, ProjectiveEnergy)]
+    )
+    base = prepare_local_global(bare, energies, lambda Q: build_linear_solver(Q, linear, precision))
+    found = compile_iterations(base, use_corrections=True)
+    known = isinstance(found, PreparedCompiledLocalGlobal)
+    base = found.base if known else replace(base, description=f"{base.description}; {found}")
+    engine: AccelerationEngine = _CompiledEngine(scheme, found) if known else _InterpretedEngine(scheme, system, base)
+    if bare is not system:
+        from springbench.solvers.methods.quasi_newton.quasi_newton_contact import ContactEngine  # for those who need it
+
+        engine = ContactEngine(scheme, system, base, engine)
+    return PreparedAccelerated(base, engine)
+
+
+@dataclass(frozen=True)
+class WindowedAcceleration:
+    """Base class of methods with a history of recent iterations.
+
+    Args:
+        history_size: number of stored differences.
+        linear_solver: solver of Q x = b.
+        precision: floating-point type of its stored entries.
+    """
+
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+
+    pairs: int = 5
+    linear: LinearSolverName = "auto"
+    precision: Precision = "float64"
+
+    def __post_init__(self) -> None:
+        """Raise ValueError if a parameter is out of range."""
+        require_history_size(self.pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedAccelerated(IterativeSolver):
+    """An accelerated method, prepared: `local_global` has the prefactored Q, `acceleration_engine` iterates."""
+
+    local_global: PreparedLocalGlobal
+    acceleration_engine: AccelerationEngine
+
+    @property
+    def stats(self) -> dict[str, float]:
+        """Exact counts of the prepared data."""
+        return self.local_global.stats
+
+    @property
+    def description(self) -> str:
+        """Description of the linear solver."""
+        return self.local_global.description
+
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
+        """Start a solve from an initial guess (n, 3) [m]."""
+        return self.acceleration_engine.init_state(problem, initial_guess)
+
+    def residual_scale(self, problem: StepProblem) -> float:
+        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
+        return compute_max_coordinate(problem) * self.local_global.unpinned_trace**0.5
+
+
+class _CompiledEngine:
+    """Compiled iteration for springs and similar energies, with a factor that is split into blocks."""
+
+    def __init__(self, scheme: AccelerationScheme, compiled: PreparedCompiledLocalGlobal) -> None:
+        self._acceleration_scheme = scheme
+        self._spring_form, self._edges, self._form = compiled.spring_form, compiled.edges, compiled.norm_packets
+        plan, bundles, self._rows = compiled.iteration_plan, compiled.spring_packets, compiled.vertex_rows
+        pins = compiled.base.system.pins
+        self._block_entries = 4 * int(plan.block_table[:, 1].max())
+        self._plan, self._spring_packets, self._padding_row = plan, bundles, compiled.padding_row
+        self._shares = ObjectiveWeights.from_packets(
+            bundles, plan.anchor_stiffness, self._rows.row_of_vertex[pins.vertices[pins.exact_mask]]
+        )
+        self._free_states: list[_AccelerationMemory] = []
+
+    def _allocate_state(self) -> _AccelerationMemory:
+        whole = 4 * len(self._plan.anchor_stiffness)
+        window = allocate_window(self._acceleration_scheme, self._block_entries, whole, self._plan.inverse_blocks.dtype)
+        window.trial_position[4 * self._padding_row] = PADDING_COORDINATE
+        x = allocate_aligned(whole, self._plan.inverse_blocks.dtype)
+        vectors = (
+            self._spring_packets.build_right_hand_side(self._plan.anchor_stiffness),
+            x,
+            allocate_aligned(whole),
+            np.zeros(3),
+        )
+        return accelerated_step.AcceleratedStep(
+            self._plan, self._spring_packets, self._form, self._shares, self._rows, *vectors
+        ), window
+
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
+        """Start a solve from an initial guess (n, 3) [m]."""
+        state = self._free_states.pop() if self._free_states else self._allocate_state()
+        edges, given = self._spring_form.update_edges(self._edges, problem), (problem, initial_guess)
+        return _CompiledAccelerationState(self._free_states, state, self._spring_form, edges, *given)
+
+
+_AccelerationMemory = tuple[accelerated_step.AcceleratedStep, AccelerationWindow]
+"""Work arrays of a solve."""
+
+
+class _CompiledAccelerationState(AcceleratedState):
+    """State of a compiled solve; `free_states` receives its work arrays when it is deleted."""
+
+    def __init__(
+        self,
+        free_states: list[_AccelerationMemory],
+        state: _AccelerationMemory,
+        parts: SpringForm,
+        edges: EdgeElements | None,
+        problem: StepProblem,
+        guess: Positions,
+    ) -> None:
+        self._free_states, self._memory = free_states, state
+        step, window = state
+        self._state = step, edges, window
+        # The kernels are compiled for writable arrays.
+        given = [
+            np.array(x, order="C")
+            for x in (problem.inertial_target, parts.compute_force(problem), problem.pin_targets, guess)
+        ]
+        step.objective_values[2] = parts.negative_energy(guess)
+        self.positions = np.empty_like(guess)
+        accelerated_step.start_solve(*self._state, *given)
+        step.objective_values[1] += parts.edge_energy_scale(guess)
+
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
+        """Run iterations within the limits; return their number, the residual and the reason of the end."""
+        return accelerated_step.run_solve(*self._state, limits, self.positions)
+
+    def step_state(self) -> bool:
+        """Do one iteration; return False if round-off prevents any further change."""
+        return self.run_iterations(ONE_ITERATION)[0] == 1
+
+    def residual(self) -> float:
+        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
+        return self.run_iterations(iteration_limit(0))[1]
+
+    @property
+    def objective_decrease(self) -> float:
+        """Decrease of the objective so far [J], unless round-off hides it."""
+        return float(self._state[-1].window_state["fallen"][0])
+
+    def gradient(self) -> Positions:
+        """Return the gradient of the objective (n, 3) [N] at the current point."""
+        step, _, window = self._state
+        out = np.empty_like(self.positions)
+        step_setup.read_positions(step.vertex_rows, window.descent, out)
+        return np.negative(out, out=out)
+
+    def __del__(self) -> None:
+        self._free_states.append(self._memory)
+
+
+class _InterpretedEngine:
+    """Interpreted iteration for all energies and all factors."""
+
+    def __init__(self, scheme: AccelerationScheme, system: System, base: PreparedLocalGlobal) -> None:
+        self._acceleration_scheme, self._local_global, self._fixed_objective = scheme, base, FixedObjective(system)
+
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
+        """Start a solve from an initial guess (n, 3) [m]."""
+        return InterpretedState(
+            self._local_global, self._acceleration_scheme, StepObjective(self._fixed_objective, problem), initial_guess
+        )

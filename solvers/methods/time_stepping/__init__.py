@@ -1,0 +1,1 @@
+"""Explicit, linearly implicit and Rosenbrock time stepping."""

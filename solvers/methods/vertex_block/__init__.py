@@ -1,0 +1,1 @@
+"""Vertex block descent and its variants: method, kernels, contact."""

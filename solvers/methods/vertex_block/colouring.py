@@ -1,0 +1,55 @@
+"""Colourings for Gauss-Seidel methods: items of one colour are independent, so their order is irrelevant.
+
+Springs are adjacent if they share a vertex, vertices if they share a spring. Each item gets the first free colour
+(greedy, in order of its index). Springs need at most twice the largest degree of colours, vertices at most the largest
+number of neighbours plus one. Items of one colour can be processed in parallel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from springbench.solvers.kernels.greedy_colouring import first_fit
+from springbench.solvers.model.system_matrix_assembly import signed_incidence_matrix_sparse
+
+
+@dataclass(frozen=True, eq=False)
+class Colouring:
+    """The items by colour and index (order), and the start of each colour in that order (colours + 1,)."""
+
+    item_order: NDArray[np.int64]
+    colour_starts: NDArray[np.int64]
+
+    @property
+    def num_colours(self) -> int:
+        """Number of colours."""
+        return len(self.colour_starts) - 1
+
+
+def colour_springs(edges: NDArray[np.int64], n: int) -> Colouring:
+    """Colour springs (m, 2) over n vertices; no two of a colour share a vertex."""
+    A = signed_incidence_matrix_sparse(edges, n)
+    return _colour_rows(A, csr_array(A.T))
+
+
+def colour_vertices(edges: NDArray[np.int64], n: int) -> Colouring:
+    """Colour n vertices; no two of a colour share one of the springs (m, 2)."""
+    A = signed_incidence_matrix_sparse(edges, n)
+    return _colour_rows(csr_array(A.T), A)
+
+
+def _colour_rows(groups: csr_array, items: csr_array) -> Colouring:
+    """Colour the rows of `groups`, adjacent if they have an entry in one column; `items` is the transpose."""
+    for matrix in (groups, items):
+        matrix.sort_indices()
+    count = len(groups.indptr) - 1
+    colour, taken = np.zeros(count, np.int64), np.full(count, -1)
+    pointers, columns, back, rows = (
+        np.asarray(x, np.int64) for x in (groups.indptr, groups.indices, items.indptr, items.indices)
+    )
+    first_fit(pointers, columns, back, rows, colour, taken)
+    start = np.concatenate([[0], np.cumsum(np.bincount(colour))]) if count else np.zeros(1, np.int64)
+    return Colouring(np.argsort(colour, kind="stable"), start)

@@ -1,0 +1,298 @@
+"""Vertex block descent (Chen, Liu, Yang and Yuksel 2024): one Newton step per vertex, one vertex after another.
+
+    B_i d_i = -grad_i g(p),   p_i += d_i,   B_i = q_i I + sum over its springs of k (nn' + max(0, 1 - r/l) (I - nn'))
+
+with n the direction and l the length of a spring, and q the anchor stiffness (inertia and penalty pins). Compressed
+springs lose their negative lateral curvature, so B_i is positive definite. A quadratic form adds its diagonal entry.
+Contact adds its exact second derivatives, since it acts on single vertices. A projective energy of elements (strain
+limits, dashpots) adds those of the vertex's elements. The paper has no line search. Here a step that would raise the
+energy is replaced by that of the majorant (q_i + sum of k) I, which cannot raise it; hence no sweep raises the
+objective. Energies without such a majorant, that is, energies that are not projective, are not supported.
+`device: cuda` computes the same iterates in `springbench.solvers.cuda.device_vbd`. Vertices are processed by colour:
+no spring,
+form or element joins two of the same colour.
+
+    p_{k+1} = w_{k+1} (sweep(p_k) - p_{k-1}) + p_{k-1},    w_1 = 1,  w_2 = 2/(2 - rho^2),  w_{k+1} = 4/(4 - rho^2 w_k),
+
+with a safeguard: an extrapolation that would raise the objective above that of p_k is rejected, and the weights restart
+at w_1. With these restarts rho needs no tuning: overestimates perform as well as the exact value.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, ClassVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.solvers.contact.half_space.half_space_steps import HalfSpaces
+from springbench.solvers.contact.half_space.vertex_contact import (
+    VertexContactEnergy,
+    begin_active_contacts,
+    without_vertex_contact,
+)
+from springbench.solvers.iteration import vertex_terms
+from springbench.solvers.iteration.device_interface import PrecisionOptions
+from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
+from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, RESIDUAL_EACH, RESIDUAL_LAST, LoopLimits
+from springbench.solvers.kernels.spring_objective import ObjectiveWeights
+from springbench.solvers.linalg.memory import allocate_aligned
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.methods.vertex_block import vbd_sweeps as kernels
+from springbench.solvers.methods.vertex_block.colour_blocks import VertexBlocks
+from springbench.solvers.methods.vertex_block.vertex_elements import VertexElements
+from springbench.solvers.model.barrier_energy import is_barrier_energy, without_barriers
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System, Unsupported
+from springbench.solvers.objective.spring_form import SpringForm, decompose_energies
+from springbench.solvers.simd.spring_packets import LANES
+from springbench.solvers.simd.vbd_packets import SPRING_SCRATCH_SIZE
+
+if TYPE_CHECKING:
+    from springbench.solvers.contact.half_space.half_space_potential import ContactPlanes
+    from springbench.solvers.methods.local_global.half_space_contact import ContactFreeSolver
+    from springbench.solvers.objective.fixed_objective import FixedObjective
+
+_PADDING_COORDINATE = 1e100
+"""Coordinate at which padding springs of a packet end: far from all vertices, whatever the unit of length."""
+
+
+@dataclass(frozen=True)
+class VertexBlockDescent(PrecisionOptions):
+    """Vertex block descent for springs, quadratic forms, elements of projective energies, and contact.
+
+    Args:
+        spectral_radius: rho of the Chebyshev acceleration, in [0, 1); 0 disables it.
+    """
+
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
+        "vertex block descent",
+        Citation(
+            "Chen, Anka He and Liu, Ziheng and Yang, Yin and Yuksel, Cem",
+            2024,
+            "Vertex block descent",
+            "10.1145/3658179",
+        ),
+    )
+
+    spectral_radius: float = 0.999
+
+    def __post_init__(self) -> None:
+        """Raise ValueError if a parameter is out of range."""
+        super().__post_init__()
+        if not 0.0 <= self.spectral_radius < 1.0:
+            raise ValueError(f"spectral_radius: should be at least 0 and less than 1, not {self.spectral_radius}")
+
+    def prepare(self, system: System) -> PreparedSolver:
+        """Prepare the method for a system.
+
+        Raises:
+            Unsupported: for other energies.
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+        """
+        if self.device == "cuda":
+            from springbench.solvers.cuda.cuda_device import require_device  # for those who ask for it
+
+            require_device("vbd")
+        bare, n = without_barriers(without_vertex_contact(system)), system.num_vertices
+        parts, beside = decompose_energies(bare), VertexElements.from_system(system)
+        unknown = {*parts.unsupported_energies} - {type(energy).__name__ for energy in beside.energies}
+        if unknown:
+            raise Unsupported(
+                f"vbd: {', '.join(sorted(unknown))} states no elements of a projective energy, and so neither whose "
+                "neighbours its vertices are nor a bound of the second derivatives; a vertex's step needs both, the "
+                "neighbours for the colouring and the bound for the fallback step that cannot raise the energy"
+            )
+        made = VertexBlocks.from_system(system, parts, beside)
+        if self.device == "cuda":
+            from springbench.solvers.methods.vertex_block.device_vbd import prepare_vbd  # for those who ask for it
+
+            return prepare_vbd(system, parts, made, self.spectral_radius, self.real_dtype)
+        gauge = cast("ContactFreeSolver", CompiledLocalGlobal().prepare(system))
+        shares = ObjectiveWeights.from_packets(
+            made.spring_packets, made.anchor_stiffness, made.row_of_vertex[system.pins.vertices[system.pins.exact_mask]]
+        )
+        return PreparedVertexBlockDescent(
+            system,
+            parts,
+            beside.with_rows(made.row_of_vertex, n + 2),
+            self.spectral_radius,
+            kernels.ColourPackets(
+                made.spring_packets, shares, made.num_free, made.spring_packets.gather_lanes(made.majorant)
+            ),
+            made.row_of_vertex,
+            made.anchor_stiffness,
+            made.majorant[made.row_of_vertex],
+            gauge,
+            f"vertices in {made.num_colours} colours; for the residual alone {gauge.description}",
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedVertexBlockDescent(IterativeSolver):
+    """Vertex block descent, prepared for a system.
+
+    Attributes:
+        spring_form: the springs and quadratic forms.
+        vertex_elements: the elements of the other energies.
+        colour_packets: packets of the free vertices by colour.
+        row_of_vertex: (n,), row of each vertex in the packets.
+        anchor_stiffness: inertia and penalty pins of each row [N/m].
+        majorant: (n,) [N/m], of all energies except contact.
+        residual_solver: computes the residual at p by one local-global iteration; it has no other use.
+    """
+
+    system: System
+    spring_form: SpringForm
+    vertex_elements: VertexElements
+    spectral_radius: float
+    colour_packets: kernels.ColourPackets
+    row_of_vertex: NDArray[np.int64]
+    anchor_stiffness: NDArray[np.float64]
+    hessian_majorant: NDArray[np.float64]
+    residual_solver: ContactFreeSolver
+    description: str
+
+    @property
+    def stats(self) -> dict[str, float]:
+        """Exact counts of the prepared data."""
+        return self.residual_solver.stats
+
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
+        """Start a solve from an initial guess (n, 3) [m]."""
+        sweeps = SweepState(self, problem, initial_guess)
+        if not any(map(is_barrier_energy, self.system.energies)):
+            return sweeps
+        from springbench.solvers.methods.vertex_block.vbd_barrier_contact import (
+            BarrierVbdState,  # for those who need it
+        )
+        from springbench.solvers.objective.step_objective import StepObjective
+
+        step, gauge = StepObjective(self._fixed_objective, problem), self.residual_solver.build_residual(problem)
+        return BarrierVbdState(sweeps, step, initial_guess, self.hessian_majorant, self.spectral_radius, gauge)
+
+    @cached_property
+    def _fixed_objective(self) -> FixedObjective:
+        from springbench.solvers.objective.fixed_objective import FixedObjective
+
+        return FixedObjective(self.system)
+
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """Return the residual at p, by a local-global iteration if no contact is active."""
+        return self.residual_solver.build_residual(problem)(p)
+
+    def residual_scale(self, problem: StepProblem) -> float:
+        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
+        return compute_max_coordinate(problem) * float(self.hessian_majorant[self.system.unpinned_mask].sum()) ** 0.5
+
+    def pack_rows(self, x: Positions) -> NDArray[np.float64]:
+        """Pack x (n, 3) into rows of four numbers.
+
+        Two padding rows for the packets follow.
+        """
+        out = allocate_aligned(4 * (len(x) + 2))
+        out.reshape(-1, 4)[self.row_of_vertex, :3] = x
+        return out
+
+    def build_half_spaces(self, contacts: list[VertexContactEnergy]) -> HalfSpaces:
+        """Build the half-spaces of the contacts."""
+        from springbench.solvers.contact.half_space.packed_half_spaces import pack_half_spaces  # for those who need it
+
+        return pack_half_spaces(
+            contacts, self.row_of_vertex, self.colour_packets.spring_packets, self.colour_packets.num_free
+        )
+
+
+class SweepState(SolverState):
+    """State of a solve: sweeps over all vertices in one step problem."""
+
+    def __init__(self, prepared: PreparedVertexBlockDescent, problem: StepProblem, guess: Positions) -> None:
+        contacts, blocks = begin_active_contacts(problem), prepared.colour_packets
+        self._element_data = prepared.vertex_elements.update_elements(problem)
+        self._prepared, self._colour_packets, self._compute_residual = (
+            prepared,
+            blocks,
+            prepared.residual_solver.build_residual(problem),
+        )
+        pull = vertex_terms.compute_anchor_force(
+            replace(problem, external_force=prepared.spring_form.compute_force(problem))
+        )
+        p, y = (prepared.pack_rows(x) for x in (vertex_terms.apply_exact_pins(guess, problem), pull))
+        self._right_hand_side = blocks.spring_packets.build_right_hand_side(prepared.anchor_stiffness, y)
+        self._half_spaces = prepared.build_half_spaces(contacts) if contacts else None
+        p[-4] = _PADDING_COORDINATE
+        entries = int(np.diff(blocks.spring_packets.packet_start).max(initial=0))
+        scratch = allocate_aligned(SPRING_SCRATCH_SIZE * LANES * entries), allocate_aligned(9 * LANES)
+        self._sweep_scratch = kernels.SweepScratch(
+            p.copy(), p.copy(), np.zeros_like(p), *scratch, np.zeros(1), np.full(1, np.nan)
+        )
+        self._rows, self.positions = p, guess
+
+    def step_state(self) -> bool:
+        """Do one iteration; return False if round-off prevents any further change."""
+        self.run_sweeps(1)
+        return True
+
+    def residual(self) -> float:
+        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
+        return self._compute_residual(self.positions)
+
+    def sweep_without_contact(self, p: Positions) -> Positions:
+        """Return the positions (n, 3) after a sweep from p without contact planes."""
+        if p is not self.positions:
+            self._restart_at(p)
+        self.run_sweeps(1)
+        return self.positions
+
+    def sweep_with_planes(self, p: Positions, planes: ContactPlanes) -> Positions:
+        """Return the positions (n, 3) after a sweep from p with the given contact planes."""
+        from springbench.solvers.contact.half_space.packed_half_spaces import pack_contact_planes
+
+        made = self._prepared
+        self._restart_at(p)
+        touched = self._half_spaces
+        self._half_spaces = pack_contact_planes(
+            planes,
+            np.ones(len(planes.vertices)),
+            made.row_of_vertex,
+            made.colour_packets.spring_packets,
+            made.colour_packets.num_free,
+            is_two_sided=True,
+        )
+        self.run_sweeps(1)
+        self._half_spaces = touched
+        return self.positions
+
+    def _restart_at(self, p: Positions) -> None:
+        """Restart the sweeps at p."""
+        self._rows.reshape(-1, 4)[self._prepared.row_of_vertex, :3] = p
+        self._sweep_scratch.omega[0], self._sweep_scratch.objective_value[0] = 0.0, np.nan
+
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
+        """Run iterations within the limits, in one call if no residual can end them."""
+        if limits.residual_mode == RESIDUAL_EACH:
+            return super().run_iterations(limits)
+        self.run_sweeps(limits.max_iterations)
+        return (
+            limits.max_iterations,
+            self.residual() if limits.residual_mode == RESIDUAL_LAST else float("nan"),
+            REASON_ITERATIONS,
+        )
+
+    def run_sweeps(self, num_iterations: int) -> None:
+        """Run sweeps over all vertices."""
+        made = self._prepared
+        made.vertex_elements.iteration_kernel(
+            self._colour_packets,
+            self._half_spaces,
+            self._element_data,
+            self._right_hand_side,
+            made.spectral_radius,
+            self._sweep_scratch,
+            self._rows,
+            num_iterations,
+        )
+        self.positions = self._rows.reshape(-1, 4)[made.row_of_vertex, :3].copy()

@@ -1,0 +1,158 @@
+"""Compiled vertex block descent: colour by colour, in packets of eight vertices, all others at rest."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.solvers.contact.half_space.half_space_steps import build_vertex_move, half_space_energy
+from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.kernels.spring_local_step import SpringPackets, add_degenerate_packet
+from springbench.solvers.kernels.spring_objective import ObjectiveWeights
+from springbench.solvers.kernels.spring_objective import value_and_descent as objective
+from springbench.solvers.simd.spring_packets import LANES
+from springbench.solvers.simd.vbd_packets import vbd_newton_step
+
+
+class ColourPackets(NamedTuple):
+    """The packets of the free vertices and their majorants.
+
+    Vectors have rows of four numbers, the unknowns first.
+
+    Attributes:
+        spring_packets: packets of the free vertices, by colour.
+        objective_weights: weights of the objective.
+        num_free: number of free vertices.
+        majorant: of each lane, stiffness of inertia, pins and springs [N/m]; 1 for padding.
+    """
+
+    spring_packets: SpringPackets
+    objective_weights: ObjectiveWeights
+    num_free: int
+    majorant: NDArray[np.float64]
+
+
+class SweepScratch(NamedTuple):
+    """The arrays that the iterations of a step overwrite, except the positions.
+
+    Attributes:
+        previous_positions, older_positions: previous positions.
+        descent_scratch: scratch.
+        spring_scratch: scratch for the springs of one packet.
+        packet_sums: scratch of nine numbers per vertex of a packet.
+        omega: Chebyshev factor (1,), 0 at the start of a step.
+        objective_value: the objective (1,), nan if it is unknown.
+    """
+
+    previous_positions: NDArray[np.float64]
+    older_positions: NDArray[np.float64]
+    descent_scratch: NDArray[np.float64]
+    spring_scratch: NDArray[np.float64]
+    packet_sums: NDArray[np.float64]
+    omega: NDArray[np.float64]
+    objective_value: NDArray[np.float64]
+
+
+@jit_inner
+def _no_contribution(beside, i, p, gradient, block):
+    return gradient, block
+
+
+@jit_inner
+def _no_energy_change(beside, i, p, d):
+    return 0.0
+
+
+_move_vertices = build_vertex_move(_no_contribution, _no_energy_change)
+
+
+@jit_inner
+def _sweep_vertices(blocks, spaces, beside, right, p, work):
+    """Move every vertex once to a lower energy."""
+    own = blocks.spring_packets.row_offset
+    for b in range(len(blocks.spring_packets.packet_start) - 1):
+        if spaces is not None:  # noqa: SIM102 Numba leaves a branch out for None alone
+            if spaces.has_half_space[b]:
+                _move_vertices(blocks.spring_packets, spaces, beside, b, blocks.num_free, p, right, blocks.majorant)
+                continue
+        short = vbd_newton_step(blocks.spring_packets, b, p, right, blocks.majorant, work.spring_scratch)
+        if short:
+            # Step with the majorant's block, because a spring of zero length has no Hessian.
+            write_degenerate_descent(blocks.spring_packets, b, p, right, work.descent_scratch)
+            for lane in range(LANES):
+                i = own[LANES * b + lane]
+                for k in range(i, i + 3):
+                    p[k] += work.descent_scratch[k] / blocks.majorant[LANES * b + lane]
+
+
+@jit_inner
+def write_degenerate_descent(bundles, b, p, right, out):
+    """Write minus the gradient of a packet with a spring of zero length to the rows of `out`."""
+    for lane in range(LANES):
+        for k in range(4):
+            out[bundles.row_offset[LANES * b + lane] + k] = 0.0
+    add_degenerate_packet(bundles, b, p, right, out, True)
+
+
+@jit_inner
+def _copy_positions(p, out):
+    for k in range(len(p)):
+        out[k] = p[k]
+
+
+@jit_inner
+def _evaluate_objective(blocks, spaces, beside, p, right, out):
+    return objective(blocks.spring_packets, blocks.objective_weights, p, right, out) + half_space_energy(spaces, p)
+
+
+def build_iteration(sweep: Any, level: Any) -> Any:
+    """Build the iteration from a sweep and the objective."""
+
+    @jit_kernel
+    def iterate(blocks, spaces, beside, right, radius, work, p, iterations):
+        """Run n sweeps over all vertices from p, which is overwritten with the result.
+
+        An extrapolation that increases the objective above that before the sweep is rejected and restarts.
+
+        Args:
+            blocks: packets of the vertices.
+            spaces: half-spaces of the vertices, or None.
+            beside: other element energies, or None.
+            right: see `SpringPackets.build_right_hand_side`.
+            radius: spectral radius of Chebyshev's extrapolation, 0 for none.
+            work: scratch memory.
+            p: positions in rows of four [m].
+            iterations: number of sweeps.
+        """
+        omega, known, older = work.omega, work.objective_value, work.older_positions
+        for _ in range(iterations):
+            w = (
+                4.0 / (4.0 - radius**2 * omega[0])
+                if omega[0] > 1.0
+                else 2.0 / (2.0 - radius**2)
+                if omega[0] == 1.0
+                else 1.0
+            )
+            if w > 1.0 and np.isnan(known[0]):
+                known[0] = level(blocks, spaces, beside, p, right, work.descent_scratch)
+            _copy_positions(p, work.previous_positions)
+            sweep(blocks, spaces, beside, right, p, work)
+            if radius == 0.0:
+                continue
+            omega[0] = w
+            if w > 1.0:
+                for k in range(4 * blocks.num_free):
+                    older[k] += w * (p[k] - older[k])
+                new = level(blocks, spaces, beside, older, right, work.descent_scratch)
+                if new <= known[0]:
+                    _copy_positions(older, p)
+                    known[0] = new
+                else:
+                    omega[0], known[0] = 0.0, np.nan
+            _copy_positions(work.previous_positions, older)
+
+    return iterate
+
+
+run_iterations = build_iteration(_sweep_vertices, _evaluate_objective)

@@ -1,0 +1,1 @@
+"""The step problem: system, constraints, assembly, energies, integrators."""

@@ -1,0 +1,105 @@
+"""Shared parts of energies along vertex pairs: v = A p, forces A'f, the matrix A'KA, and 3 x 3 blocks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+from springbench.solvers.model.step_problem import Positions
+from springbench.solvers.model.system_matrix_assembly import diagonal_matrix, drop_zeros, signed_incidence_matrix_sparse
+
+ZERO_LENGTH = 1e-140
+"""Lengths [m] up to this value count as zero, because their squares underflow."""
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeEnergy:
+    """An energy along pairs of vertices.
+
+    Attributes:
+        edges: (m, 2).
+        stiffness: k (m,) [N/m], not negative.
+    """
+
+    edges: NDArray[np.int64]
+    stiffness: NDArray[np.float64]
+
+    def edge_lengths(self, p: Positions) -> NDArray[np.float64]:
+        """Return the length of each edge [m] at p (n, 3), shape (m,)."""
+        return row_norms(self._edge_vectors(p))
+
+    def stiffness_matrix(self, n: int) -> scipy.sparse.csr_array:
+        """Return A'KA [N/m], shape (n, n), the contribution to Q."""
+        A = signed_incidence_matrix_sparse(self.edges, n)
+        return drop_zeros(A.T @ diagonal_matrix(self.stiffness) @ A)
+
+    @property
+    def _num_vertices(self) -> int:
+        return int(self.edges.max(initial=-1)) + 1
+
+    @cached_property
+    def _incidence(self) -> tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]:
+        """A over the vertices up to the last one with an edge, and A'K."""
+        A = signed_incidence_matrix_sparse(self.edges, self._num_vertices)
+        return A, scipy.sparse.csr_array(A.T @ diagonal_matrix(self.stiffness))
+
+    def _edge_vectors(self, p: Positions) -> Positions:
+        """Return v = A p, (m, 3)."""
+        return self._incidence[0] @ p[: self._num_vertices]
+
+    def _scatter_forces(self, x: Positions, out: Positions) -> None:
+        """Add A'K x to `out`, x: (m, 3)."""
+        out[: self._num_vertices] += self._incidence[1] @ x
+
+    def _scatter_absolute_terms(self, terms: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+        """Add k times the terms (m,) [m] of each edge to `out` (n,) at both ends, except for self-loops."""
+        (i, j), terms = self.edges.T, self.stiffness * terms
+        terms = np.where(i != j, terms, 0.0)
+        for end in (i, j):
+            out += np.bincount(end, terms, minlength=len(out))
+
+    def _endpoint_norms(self, p: Positions) -> NDArray[np.float64]:
+        """Return |p_i| + |p_j| of each edge (m,) [m], which scales the rounding error of its ends."""
+        size = row_norms(p)
+        return size[self.edges[:, 0]] + size[self.edges[:, 1]]
+
+    def _block_hessian(
+        self, lateral: NDArray[np.float64], unit: Positions, n: int, along: float | NDArray = 1.0
+    ) -> scipy.sparse.csr_array:
+        """Return the Hessian (3n, 3n) of edges with blocks k (along nn' + lateral (I - nn')), n unit directions."""
+        nn = unit[:, :, None] * unit[:, None, :]
+        full = np.reshape(along, (-1, 1, 1)) * nn + lateral[:, None, None] * (np.eye(3) - nn)
+        H, (i, j) = self.stiffness[:, None, None] * full, self.edges.T
+        rows, columns = np.concatenate([i, j, i, j]), np.concatenate([i, j, j, i])
+        blocks = np.concatenate([H, H, -H, -H])
+        order = np.lexsort((columns, rows))
+        indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))])
+        whole = scipy.sparse.bsr_array((blocks[order], columns[order], indptr), shape=(3 * n, 3 * n))
+        return drop_zeros(scipy.sparse.csr_array(scipy.sparse.coo_array(whole)))
+
+
+def row_norms(v: Positions) -> NDArray[np.float64]:
+    """Return |v| of each row, (m,)."""
+    return np.sqrt(np.einsum("ij,ij->i", v, v))
+
+
+def unit_directions(v: Positions, fallback: Positions) -> tuple[NDArray[np.float64], Positions]:
+    """Return |v| (m,) and v/|v| (m, 3) of each row, with the fallback for a row of zero length."""
+    length = row_norms(v)
+    unit = v / np.maximum(length, ZERO_LENGTH)[:, None]
+    zero = length <= ZERO_LENGTH
+    unit[zero] = fallback[zero]
+    return length, unit
+
+
+def rest_directions(rest: Positions, edges: NDArray[np.int64]) -> tuple[NDArray[np.float64], Positions]:
+    """Return the rest lengths (m,) [m] and directions (m, 3).
+
+    Edges of zero length get the first axis.
+    """
+    i, j = edges.T
+    v = rest[i] - rest[j]
+    return unit_directions(v, np.tile([1.0, 0.0, 0.0], (len(v), 1)))

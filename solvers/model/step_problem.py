@@ -1,0 +1,363 @@
+"""The interfaces between a scene and a solver: Energy, System, StepProblem, Solver.
+
+A step of implicit Euler minimises the incremental potential (Liu et al. 2013, eq. 6)
+
+    g(p) = sum of energies(p) + c/(2 dt^2) |p - target|_M^2 - tr(p' f) + sum_pins w/2 |p_i - pin_i|^2
+
+over the positions p that satisfy all length constraints, with c = 1 and target = 2 p^t - p^(t-dt). Other integrators
+have other values of c and target (see `springbench.solvers.model.integrators`). `StepProblem` evaluates g in plain
+NumPy; every
+accuracy figure is computed from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import ClassVar, Literal, Protocol, TypeGuard, runtime_checkable
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+from springbench.solvers.model.constraints import DirichletPins, LengthConstraints
+
+Positions = NDArray[np.float64]
+"""Positions [m], shape (n, 3), float64, C-contiguous."""
+ResidualIterate = Literal["returned", "previous", "none"]
+"""The iterate that a residual belongs to: the returned one, or its predecessor; "none" if there is no residual."""
+
+
+class PluginContractError(Exception):
+    """An error in a user-supplied solver component; the message begins with the source line."""
+
+
+class Unsupported(Exception):
+    """An error for a system that a solver cannot minimise; the message states the part and the reason."""
+
+
+class NotPositiveDefinite(Exception):
+    """An error for a system matrix without a Cholesky factor.
+
+    Causes are a vertex without mass, spring or pin, rounding errors, and invalid input.
+
+    Attributes:
+        vertices: the vertices that the message names.
+    """
+
+    def __init__(self, message: str = "", vertices: Sequence[int] = ()) -> None:
+        super().__init__(message)
+        self.vertices = tuple(vertices)
+
+
+class Energy(Protocol):
+    """A potential energy [J] as a function of the positions [m]."""
+
+    def value(self, p: Positions) -> float:
+        """Return the energy [J] at p, shape (n, 3)."""
+        ...
+
+    def add_gradient(self, p: Positions, out: Positions) -> None:
+        """Add the gradient [N], shape (n, 3), to `out`."""
+        ...
+
+    def hessian(self, p: Positions) -> scipy.sparse.csr_array:
+        """Return the Hessian [N/m], shape (3n, 3n), with the coordinates of a vertex contiguous."""
+        ...
+
+
+@runtime_checkable
+class ProjectiveEnergy(Energy, Protocol):
+    """A projective energy min over d of sum_e w_e/2 |(A p)_e - d_e|^2, each d_e on a manifold (Bouaziz et al. 2014)."""
+
+    def stiffness_matrix(self, n: int) -> scipy.sparse.csr_array:
+        """Return the contribution A'KA [N/m] of the energy to the system matrix, shape (n, n)."""
+        ...
+
+    def add_projection(self, p: Positions, out: Positions) -> None:
+        """Add A'K d(p) [N], shape (n, 3), the contribution to the right-hand side, to `out`."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """The data that stay constant in a run, so that they are factorised once.
+
+    Attributes:
+        mass: (n,) [kg]; zero is allowed at vertices with a spring or a pin.
+        time_step: dt [s].
+        energies: potentials of the positions.
+        pins: the pinned vertices and their weights.
+        inertia_factor: the integrator's c.
+        velocity_factor: the integrator's ratio of the velocity to the change of the stage, in units of 1/dt; None for
+            sqrt(c).
+        length_constraints: length constraints that hold exactly.
+    """
+
+    mass: NDArray[np.float64]
+    time_step: float
+    energies: tuple[Energy, ...] = ()
+    pins: DirichletPins = field(default_factory=DirichletPins)
+    inertia_factor: float = 1.0
+    velocity_factor: float | None = None
+    length_constraints: tuple[LengthConstraints, ...] = ()
+
+    @property
+    def velocity_rate(self) -> float:
+        """Velocity per displacement of the stage, sqrt(c)/dt or velocity_factor/dt [1/s]."""
+        return (self.inertia_factor**0.5 if self.velocity_factor is None else self.velocity_factor) / self.time_step
+
+    @cached_property
+    def inertia_diagonal(self) -> NDArray[np.float64]:
+        """Diagonal c m/dt^2 (n,) [N/m] of the inertia term in the system matrix Q."""
+        return self.inertia_factor * self.mass / self.time_step**2
+
+    @property
+    def num_vertices(self) -> int:
+        """Number of vertices n."""
+        return len(self.mass)
+
+    @cached_property
+    def free_vertices(self) -> NDArray[np.int64]:
+        """Vertices that are degrees of freedom, i.e. all except the exactly pinned ones, shape (f,)."""
+        return np.setdiff1d(np.arange(self.num_vertices), self.pins.vertices[self.pins.exact_mask])
+
+    @cached_property
+    def unpinned_mask(self) -> NDArray[np.bool_]:
+        """Mask of the vertices without any pin, exact or by penalty, shape (n,)."""
+        mask = np.ones(self.num_vertices, bool)
+        mask[self.pins.vertices] = False
+        return mask
+
+    @cached_property
+    def penalty_pins(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.float64]]:
+        """Penalty pins: their mask within `pins` (q,), their vertices and their weights [N/m]."""
+        soft = ~self.pins.exact_mask
+        return soft, self.pins.vertices[soft], self.pins.weight[soft]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepStart:
+    """The state at the start of a step, for lagged energies and for methods that do not minimise.
+
+    Attributes:
+        positions: p^t (n, 3) [m].
+        velocity: v^t (n, 3) [m/s], after the velocity filters.
+        time: t [s].
+        velocity_origin: (n, 3) [m]; the stage x has the velocity velocity_rate * (x - velocity_origin).
+        velocity_rate: velocity per displacement [1/s].
+        stage_time: time of the stage x [s]; the default nan propagates into all results that depend on it.
+        lag_extrapolation: time [s] by which lagged positions are extrapolated.
+        lag_override: positions (n, 3) [m] that replace p^t as the lagged ones.
+        predicted_acceleration: acceleration (n, 3) [m/s^2] predicted from the previous motion.
+        warm_start: warm start from the previous solve.
+        normal_force_positions: an iterate of x (n, 3) [m] at which friction evaluates normal forces; None for the start
+            of the step.
+    """
+
+    positions: Positions
+    velocity: Positions
+    time: float
+    velocity_origin: Positions
+    velocity_rate: float
+    stage_time: float = float("nan")
+    lag_extrapolation: float = 0.0
+    lag_override: Positions | None = None
+    predicted_acceleration: Positions | None = None
+    warm_start: NDArray[np.float64] | None = None
+    normal_force_positions: Positions | None = None
+
+    @property
+    def lagged_positions(self) -> Positions:
+        """Positions (n, 3) [m] of lagged energies: p^t or `lag_override`, extrapolated by `lag_extrapolation`."""
+        p = self.positions if self.lag_override is None else self.lag_override
+        return p + self.lag_extrapolation * self.velocity if self.lag_extrapolation else p
+
+    def velocity_at(self, x: Positions) -> Positions:
+        """Return the velocity [m/s] of the stage x, both (n, 3)."""
+        return self.velocity_rate * (x - self.velocity_origin)
+
+
+class LaggedEnergy(Energy, Protocol):
+    """An energy that depends on the start of the step, such as damping, friction or moving obstacles.
+
+    The stiffness of a projective energy may depend on nothing of that start but its rate, because Q is built once.
+    """
+
+    def begin_step(self, start: StepStart) -> Energy:
+        """Return the energy of this step."""
+        ...
+
+
+def is_lagged(energy: Energy) -> TypeGuard[LaggedEnergy]:
+    """Return whether an energy is lagged; isinstance on the protocol would cost a hundredth of a small step."""
+    return hasattr(energy, "begin_step")
+
+
+@dataclass(frozen=True, eq=False)
+class StepProblem:
+    """The objective of one step. All arrays are float64 and never modified.
+
+    Attributes:
+        system: the data that stay constant in a run.
+        inertial_target: positions of the stage under inertia alone (n, 3) [m], velocity filters included.
+        external_force: external force (n, 3) [N].
+        pin_targets: target positions of the pins (q, 3) [m], in the order of `system.pins`.
+        current_positions: p^t with pinned vertices on their targets (n, 3) [m]; the stop rule takes the initial
+            residual here.
+        initial_guess: initial guess of the iteration (n, 3) [m].
+        step_start: state at the start of the step.
+    """
+
+    system: System
+    inertial_target: Positions
+    external_force: Positions
+    pin_targets: Positions
+    current_positions: Positions
+    initial_guess: Positions
+    step_start: StepStart
+
+    @cached_property
+    def energies(self) -> tuple[Energy, ...]:
+        """Energies of the system in their order, with the lagged ones evaluated for this step."""
+        return tuple(e.begin_step(self.step_start) if is_lagged(e) else e for e in self.system.energies)
+
+    def evaluate_terms(self, p: Positions) -> dict[str, float]:
+        """Return the terms [J] of the objective at p by name: inertia, force, pins, and energies by their class."""
+        s, values, away = self.system, dict[str, float](), p - self.inertial_target
+        for energy in self.energies:
+            name = type(energy).__name__.lower()  # which may be that of one of the three
+            name = f"energy {name}" if name in ("inertia", "force", "pins") else name
+            values[name] = values.get(name, 0.0) + energy.value(p)
+        values["inertia"] = 0.5 * float(s.inertia_diagonal @ np.einsum("ij,ij->i", away, away))
+        values["force"] = -float(np.einsum("ij,ij->", p, self.external_force))
+        soft, vertices, weight = s.penalty_pins
+        sag = p[vertices] - self.pin_targets[soft]
+        values["pins"] = 0.5 * float(weight @ np.einsum("ij,ij->i", sag, sag))
+        return values
+
+    def value(self, p: Positions) -> float:
+        """Return the objective g(p) [J]; exactly pinned vertices must be on their targets."""
+        return sum(self.evaluate_terms(p).values())
+
+    def value_scale(self, p: Positions) -> float:
+        """Return the sum of the absolute terms [J], which is the scale of rounding errors in `value`."""
+        return sum(abs(term) for term in self.evaluate_terms(p).values())
+
+    def gradient(self, p: Positions) -> Positions:
+        """Return the gradient of g at p [N], shape (n, 3), with zero rows at exactly pinned vertices."""
+        s = self.system
+        out = s.inertia_diagonal[:, None] * (p - self.inertial_target) - self.external_force
+        for energy in self.energies:
+            energy.add_gradient(p, out)
+        soft, vertices, weight = s.penalty_pins
+        out[vertices] += weight[:, None] * (p[vertices] - self.pin_targets[soft])
+        out[s.pins.vertices[s.pins.exact_mask]] = 0.0
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class StopRule:
+    """The criteria that terminate a solve.
+
+    A solve ends after `max_iterations`, or if the residual is at most max(atol, rtol * initial residual), or if the
+    gradient is no larger than rounding errors, so that a scene at rest stops immediately. The residual is
+    |Q^-1 grad g(p)|_Q = |p - LG(p)|_Q over the unpinned vertices. The initial residual is the one at the current
+    positions.
+
+    Attributes:
+        max_iterations: maximum number of iterations.
+        rtol: relative tolerance; None for none.
+        roundoff_floor: a gradient is round-off if at each unpinned vertex it is at most this factor times the bound of
+            `springbench.solvers.model.rounding_bound`; 0 disables the criterion.
+        atol: absolute tolerance [J^(1/2)].
+    """
+
+    max_iterations: int = 50
+    rtol: float | None = None
+    roundoff_floor: float = 8.0
+    atol: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """The result of a solve.
+
+    Attributes:
+        positions: (n, 3) [m].
+        num_iterations: number of iterations.
+        residual: |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices that the stop rule tested, at the iterate that
+            `residual_iterate` names; nan for a method that does not minimise.
+        initial_residual: residual at the current positions; nan without a tolerance.
+        termination_reason: "iterations", "tolerance", "floor" (round-off), or "stalled" if no step decreases the
+            objective.
+        velocity: (n, 3) [m/s], for a method that computes its own.
+        residual_iterate: the iterate of the residual.
+        warm_start: warm start of the next solve, of any shape.
+    """
+
+    positions: Positions
+    num_iterations: int
+    residual: float
+    initial_residual: float
+    termination_reason: str
+    velocity: Positions | None = None
+    residual_iterate: ResidualIterate = "returned"
+    warm_start: NDArray[np.float64] | None = None
+
+
+class PreparedSolver(Protocol):
+    """A solver after the setup for one system: factorisation, colouring and compilation."""
+
+    @property
+    def description(self) -> str:
+        """Automatic decisions of the solver and their reasons in words; empty if there were none."""
+        ...
+
+    @property
+    def stats(self) -> dict[str, float]:
+        """Exact counts of the setup by name, for example `nnz_system` and `nnz_factor`."""
+        ...
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        """Yield one iterate after another; a yielded array may be overwritten, so copy it to store it."""
+        ...
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """Compute the iterates on the fast path until `stop` terminates them."""
+        ...
+
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """Return |Q^-1 grad g|_Q [J^(1/2)] at p (n, 3) [m], or nan if it is not defined.
+
+        The evaluation may cost an iteration.
+        """
+        ...
+
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """Return the phases of an iteration by name, if any, as callables that return what they compute."""
+        ...
+
+
+class Solver(Protocol):
+    """The parameters of a method, as a frozen dataclass.
+
+    A method that supports exact length constraints also has `keeps_lengths = True`.
+
+    Attributes:
+        is_minimiser: whether the iterates converge to a minimum of the step's objective; other methods are scored by
+            their trajectories.
+        is_monotone: whether the objective increases in no iteration, except by round-off.
+    """
+
+    is_minimiser: ClassVar[bool]
+    is_monotone: ClassVar[bool]
+
+    def prepare(self, system: System) -> PreparedSolver:
+        """Return the solver set up for a system.
+
+        Raises:
+            Unsupported: the method does not support part of the system; raised before any work.
+            NotPositiveDefinite: the system matrix has no Cholesky factor.
+        """
+        ...

@@ -1,0 +1,1 @@
+"""The objective of a step: value, gradient, Hessian, positive semidefinite projection."""

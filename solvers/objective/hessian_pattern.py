@@ -1,0 +1,137 @@
+"""The matrix of a Hessian: 3 x 3 blocks between free vertices, their positions per energy, and the factorisation.
+
+The pattern covers springs, projective energies and elements, which are known before the first step. If another energy
+needs more blocks, a step extends the pattern (`springbench.solvers.objective.step_matrix`). The last extended one is
+cached for
+steps that need exactly that pattern, so that a result depends on its problem only, not on earlier ones.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+from springbench.solvers.kernels import quadratic_form_kernels, spring_hessian
+from springbench.solvers.kernels.objective_kernels import ObjectiveTerms
+from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
+from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
+from springbench.solvers.model import system_matrix_assembly
+from springbench.solvers.model.step_problem import System
+
+IndexArray = NDArray[np.int64]
+
+
+class BlockMatrix:
+    """A matrix of 3 x 3 blocks between free vertices."""
+
+    def __init__(
+        self,
+        system: System,
+        terms: ObjectiveTerms,
+        quadratic_form: QuadraticForm | None,
+        free_index: IndexArray,
+        graph: csr_array,
+    ) -> None:
+        """Analyse a block pattern.
+
+        Args:
+            system: the system.
+            terms: objective terms.
+            quadratic_form: quadratic form of the system, or None.
+            free_index: index of each vertex among the free ones (n,), or -1.
+            graph: pattern of the blocks (f, f), sorted, with a diagonal.
+        """
+        self.graph, self._free_index, self._num_free = graph, free_index, len(system.free_vertices)
+        self._objective_terms, self._quadratic_form = terms, quadratic_form
+        self.values = np.empty((graph.nnz, 3, 3))
+        self.factor = BlockCholesky(graph)
+        self.block_indices = spring_hessian.BlockIndices.from_graph(system, terms.edges, graph)
+        rows = np.repeat(np.arange(len(graph.indptr) - 1), np.diff(graph.indptr))
+        self._block_keys = rows * self._num_free + graph.indices
+        self.diagonal_entries = self.entry_indices(*np.tile(np.arange(3 * len(system.free_vertices)), (2, 1)))
+        self._element_indices: dict[int, tuple[IndexArray, IndexArray]] = {}
+
+    @classmethod
+    def from_graph(
+        cls,
+        system: System,
+        terms: ObjectiveTerms,
+        quadratic_form: QuadraticForm | None,
+        free_index: IndexArray,
+        graph: csr_array,
+        i: IndexArray,
+        j: IndexArray,
+    ) -> BlockMatrix:
+        """Return a matrix with the blocks of a graph and additional ones.
+
+        The latter are between vertices i and j, in both directions, where both are free.
+        """
+        i, j = i[(i >= 0) & (j >= 0)], j[(i >= 0) & (j >= 0)]
+        ones = np.ones(2 * len(i))
+        more = csr_array(coo_array((ones, (np.append(i, j), np.append(j, i))), shape=graph.shape))
+        return cls(system, terms, quadratic_form, free_index, system_matrix_assembly.drop_zeros(abs(graph) + more))
+
+    @property
+    def block_coordinates(self) -> tuple[IndexArray, IndexArray]:
+        """Rows and columns of all blocks."""
+        return self._block_keys // self._num_free, self._block_keys % self._num_free
+
+    def has_blocks(self, i: IndexArray, j: IndexArray) -> bool:
+        """Return whether the matrix has the blocks (i, j)."""
+        keys = i * self._num_free + j
+        at = np.minimum(np.searchsorted(self._block_keys, keys), len(self._block_keys) - 1)
+        return bool((self._block_keys[at] == keys).all())
+
+    def is_exact_extension(self, i: IndexArray, j: IndexArray, base: BlockMatrix) -> bool:
+        """Return whether the matrix has exactly the blocks of another one, (i, j) and (j, i)."""
+        size = self._num_free
+        return len(np.unique(np.concatenate([base._block_keys, i * size + j, j * size + i]))) == len(self._block_keys)
+
+    def entry_indices(self, rows: IndexArray, columns: IndexArray) -> IndexArray:
+        """Return the indices of the entries (rows, columns) within the flat values."""
+        block = np.searchsorted(self._block_keys, rows // 3 * self._num_free + columns // 3)
+        return 9 * block + 3 * (rows % 3) + columns % 3
+
+    def element_block_indices(self, energy: int, vertices: IndexArray) -> IndexArray:
+        """Return the block index of each vertex pair of an energy's elements (m, k), as (m, k^2); -1 if not free.
+
+        They are cached for the same array of vertices. Raises LookupError if a block is missing.
+        """
+        if not self.has_element_blocks(energy, vertices):
+            raise LookupError("the matrix has no place for some blocks of these elements")
+        return self._element_indices[energy][1]
+
+    def has_element_blocks(self, energy: int, vertices: IndexArray) -> bool:
+        """Return whether the matrix has all blocks of an energy's elements."""
+        known = self._element_indices.get(energy)
+        if known is not None and known[0] is vertices:
+            return True
+        (m, k), graph = vertices.shape, self.graph
+        if k == 1:
+            self._element_indices[energy] = vertices, self.block_indices.diagonal_block[vertices]
+            return True
+        out = np.empty((m, k * k), np.int64)
+        if not spring_hessian.locate_blocks(
+            self._free_index, graph.indptr, graph.indices, np.ascontiguousarray(vertices), out
+        ):
+            return False
+        self._element_indices[energy] = vertices, out
+        return True
+
+    def _pair_block_indices(self, i: IndexArray, j: IndexArray) -> IndexArray:
+        """Return the blocks between vertices i and j, of one shape; -1 if one is not free."""
+        i, j = self._free_index[i], self._free_index[j]
+        return np.where((i >= 0) & (j >= 0), np.searchsorted(self._block_keys, i * self._num_free + j), -1)
+
+    @cached_property
+    def constant_blocks(self) -> NDArray[np.float64]:
+        """Blocks of inertia, penalty pins and the form, (b, 3, 3) [N/m]."""
+        out = np.empty_like(self.values)
+        spring_hessian.write_constant_blocks(self._objective_terms, self.block_indices, out)
+        if self._quadratic_form is not None:
+            i, j = self._quadratic_form.pairs.T
+            across = np.column_stack([self._pair_block_indices(i, j), self._pair_block_indices(j, i)])
+            quadratic_form_kernels.add_blocks(self._quadratic_form, self.block_indices.diagonal_block, across, out)
+        return out

@@ -1,0 +1,79 @@
+"""The matrix of a step with barrier energies, whose blocks change with the positions."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.solvers.model.barrier_energy import BarrierEnergy, PairBlocks
+from springbench.solvers.model.step_problem import Positions
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.hessian_pattern import BlockMatrix, IndexArray
+
+
+class StepMatrix:
+    """The matrix of a step's Hessians.
+
+    Blocks outside the common pattern, and those that may be needed near the positions where this first occurs, are
+    analysed once. The result is valid as long as it suffices, usually to the end of the step.
+    """
+
+    def __init__(self, fixed_objective: FixedObjective, barrier_energies: list[BarrierEnergy]) -> None:
+        self._fixed_objective, self._barrier_energies = fixed_objective, barrier_energies
+        self._cached_matrix: BlockMatrix | None = None
+
+    def matrix_at(self, p: Positions, i: IndexArray, j: IndexArray, block_vertices: list[IndexArray]) -> BlockMatrix:
+        """Return the matrix at p with blocks (i, j) of free vertices and the blocks of each barrier energy.
+
+        The latter are between the vertices `block_vertices` (a, k).
+        """
+        known = self._cached_matrix or self._fixed_objective.hessian_matrix
+        if not (
+            known.has_blocks(i, j)
+            and all(known.has_element_blocks(-1 - k, vertices) for k, vertices in enumerate(block_vertices))
+        ):
+            near = (
+                self._fixed_objective.free_vertex_pairs(energy.candidate_vertices(p))
+                for energy in self._barrier_energies
+            )
+            i, j = (np.concatenate(side) for side in zip(known.block_coordinates, (i, j), *near, strict=True))
+            known = self._cached_matrix = self._fixed_objective.matrix_with_blocks(i, j)
+        return known
+
+
+class BarrierHessian:
+    """The Hessian blocks of barrier energies at a point."""
+
+    def __init__(self, energies: list[BarrierEnergy], p: Positions) -> None:
+        self._barrier_energies, self._positions = energies, p
+        self._endpoint_values: dict[float, NDArray[np.float64]] = {}
+
+    @cached_property
+    def pair_blocks(self) -> list[PairBlocks]:
+        """Exact blocks of each energy."""
+        return [energy.hessian_blocks(self._positions) for energy in self._barrier_energies]
+
+    @cached_property
+    def block_vertices(self) -> list[IndexArray]:
+        """Vertices (a, k) of the blocks of each energy."""
+        return [energy.block_vertices(self._positions) for energy in self._barrier_energies]
+
+    def add_to_matrix(self, negative_fraction: float, matrix: BlockMatrix) -> None:
+        """Add the blocks to the matrix.
+
+        They are linear in the fraction of their negative part.
+        """
+        if any(map(len, self.block_vertices)):
+            for end, share in ((1.0, negative_fraction), (0.0, 1.0 - negative_fraction)):
+                if share:
+                    matrix.values += share * self._values_at_endpoint(end, matrix)
+
+    def _values_at_endpoint(self, endpoint: float, matrix: BlockMatrix) -> NDArray[np.float64]:
+        if endpoint not in self._endpoint_values:
+            out = self._endpoint_values[endpoint] = np.zeros_like(matrix.values)
+            for k, (energy, vertices) in enumerate(zip(self._barrier_energies, self.block_vertices, strict=True)):
+                energy.add_hessian_blocks(
+                    self._positions, endpoint, matrix.element_block_indices(-1 - k, vertices), out
+                )
+        return self._endpoint_values[endpoint]

@@ -1,0 +1,375 @@
+"""The objective of a step, its gradient and its Hessian, evaluated fast; `StepProblem` is the reference evaluator.
+
+One compiled pass evaluates all springs, another all constant quadratic forms, and one each energy with an element-wise
+form (`springbench.solvers.model.energies.element_energies`). Other energies supply their own value, gradient and
+Hessian. The
+degrees of freedom are the free vertices: exactly pinned ones stay on their targets. The matrix of the Hessian is
+analysed once, or once per step (`hessian_pattern`, `step_matrix`). Terms that are constant in a run or a step are
+summed once.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property, reduce
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from springbench.solvers.kernels import objective_kernels, quadratic_form_kernels, spring_hessian
+from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
+from springbench.solvers.model.barrier_energy import BarrierEnergy, is_barrier_energy, max_step_size
+from springbench.solvers.model.energies.element_energies import JoinedElements, add_blocks
+from springbench.solvers.model.step_problem import Energy, Positions, StepProblem
+from springbench.solvers.objective import woodbury
+from springbench.solvers.objective.fixed_objective import ElementEnergy, FixedObjective
+from springbench.solvers.objective.hessian_pattern import BlockMatrix, IndexArray
+from springbench.solvers.objective.psd_projection import ProjectedHessian, PsdProjection
+from springbench.solvers.objective.step_matrix import BarrierHessian, StepMatrix
+
+FloatArray = NDArray[np.float64]
+
+VALUE_ROUNDOFF = 4.0 * np.finfo(np.float64).eps
+"""Relative rounding error of an energy's value."""
+
+SLOPE_FALLBACK_RATIO = 1e-10
+"""Relative change of an energy below which the mean slope is more accurate than the difference of values."""
+
+
+class StepObjective:
+    """The objective g of one step. All positions are (n, 3) [m], with exactly pinned vertices on their targets.
+
+    Attributes:
+        element_energies: energies with an element-wise form, except those without elements in this step.
+        other_energies: energies without an element-wise form.
+        barrier_energies: barrier energies among these, which limit the step size.
+        step_matrix: the matrix of the Hessians.
+    """
+
+    def __init__(self, fixed_objective: FixedObjective, problem: StepProblem) -> None:
+        """Build the objective of a problem; raise ValueError if its system has another number of energies."""
+        if len(problem.system.energies) != len(fixed_objective.system.energies):
+            raise ValueError("the objective was made for a system of other energies than the step's")
+        self.fixed_objective, self.problem = fixed_objective, problem
+        self.step_data = objective_kernels.StepData.from_problem(problem)
+        self.element_energies: list[ElementEnergy] = []
+        self.other_energies: list[Energy] = []
+        self.barrier_energies: list[BarrierEnergy] = []
+        if (
+            fixed_objective.quadratic_form is not None
+            or fixed_objective.element_energy_indices
+            or fixed_objective.other_energy_indices
+        ):
+            begun: Any = problem.energies
+            for k in fixed_objective.forms_with_force:
+                begun[k].add_projection(problem.inertial_target, self.step_data.external_force)
+            found = (
+                ElementEnergy(k, k in fixed_objective.projective_indices, begun[k].law, begun[k].elements)
+                for k in fixed_objective.element_energy_indices
+            )
+            self.element_energies = [one for one in found if len(one.elements.vertices)]
+            self.other_energies = [begun[k] for k in fixed_objective.other_energy_indices]
+            self.barrier_energies = [energy for energy in self.other_energies if is_barrier_energy(energy)]
+        self._constant_cache: tuple[BlockMatrix, FloatArray] | None = None
+        self.step_matrix = StepMatrix(fixed_objective, self.barrier_energies)
+        pins = problem.system.pins
+        self._exact_pins, self._exact_targets = pins.vertices[pins.exact_mask], problem.pin_targets[pins.exact_mask]
+
+    @property
+    def has_contact_elements(self) -> bool:
+        """Whether elements act that are not part of Q, i.e. those of contact that may become active in this step."""
+        return any(not one.is_projective for one in self.element_energies)
+
+    def max_step_size(self, p: Positions, search_direction: Positions, initial_step: float = 1.0) -> float:
+        """Return the largest collision-free step size up to `initial_step`.
+
+        It is that from p along the search direction, both (n, 3); see `barrier_energy`.
+        """
+        return (
+            initial_step
+            * max_step_size(
+                self.barrier_energies, p, search_direction if initial_step == 1.0 else initial_step * search_direction
+            )
+            if self.barrier_energies
+            else initial_step
+        )
+
+    def apply_exact_pins(self, p: Positions) -> Positions:
+        """Return a copy of p with the exactly pinned vertices on their targets."""
+        out = np.array(p, np.float64, order="C")
+        out[self._exact_pins] = self._exact_targets
+        return out
+
+    def inertial_prediction(self) -> Positions:
+        """Return the positions (n, 3) under inertia and external force alone, pinned vertices on their targets."""
+        problem, h = self.problem, self.problem.system.inertia_diagonal[:, None]
+        p = problem.inertial_target + np.divide(
+            problem.external_force, h, out=np.zeros_like(problem.external_force), where=h > 0.0
+        )
+        p[problem.system.pins.vertices] = problem.pin_targets
+        return p
+
+    def gradient(self, p: Positions) -> Positions:
+        """Return the gradient [N], (n, 3), zero at exactly pinned vertices."""
+        out = np.empty_like(p)
+        objective_kernels.gradient(self.fixed_objective.objective_terms, self.step_data, p, out)
+        if self.fixed_objective.quadratic_form is not None:
+            quadratic_form_kernels.add_gradient(self.fixed_objective.quadratic_form, p, out)
+        for one in self.element_energies:
+            one.element_law.add_gradient(one.elements, p, out)
+        for energy in self.other_energies:
+            energy.add_gradient(p, out)
+        out[self._exact_pins] = 0.0
+        return out
+
+    def objective_change(self, p: Positions, q: Positions) -> tuple[float, float]:
+        """Return g(q) - g(p) [J], and the part that may be round-off of energies without an element-wise form.
+
+        Such an energy contributes the difference of its values, or the mean slope if that difference is cancelled.
+        """
+        change, noise = (
+            objective_kernels.objective_change(self.fixed_objective.objective_terms, self.step_data, p, q),
+            0.0,
+        )
+        if self.fixed_objective.quadratic_form is not None:
+            change += quadratic_form_kernels.energy_change(self.fixed_objective.quadratic_form, p, q)
+        for one in self.element_energies:
+            change += one.element_law.energy_change(one.elements, p, q)
+        for energy in self.other_energies:
+            before, after = energy.value(p), energy.value(q)
+            if before == after == 0.0 and is_barrier_energy(energy):
+                continue  # nothing is in range, at either
+            slope = np.zeros_like(q)
+            energy.add_gradient(q, slope)
+            scale = abs(before) + abs(after) + float(np.abs(slope * q).sum())
+            if abs(after - before) <= SLOPE_FALLBACK_RATIO * scale < np.inf:
+                energy.add_gradient(p, slope)
+                change += 0.5 * float((slope * (q - p)).sum())
+            else:
+                change += after - before
+                noise += VALUE_ROUNDOFF * scale
+        return change, noise
+
+    def linearise_tensions(self, p: Positions, d: Positions) -> FloatArray:
+        """Return the springs' tensions [N], (m,), at p, linearised for a displacement d."""
+        out = np.empty(len(self.fixed_objective.objective_terms.stiffness))
+        spring_hessian.linearise_tensions(self.fixed_objective.objective_terms, p, d, out)
+        return out
+
+    def hessian(self, p: Positions) -> Hessian:
+        """Build the Hessian at p for a factorisation."""
+        return Hessian(self, p)
+
+    def element_hessians(self, p: Positions) -> list[FloatArray]:
+        """Return the second derivatives of the elements at p, (m, 6) [N/m] for each energy."""
+        return [self._evaluate_hessian(one, p) for one in self.element_energies]
+
+    @staticmethod
+    def _evaluate_hessian(one: ElementEnergy, p: Positions) -> FloatArray:
+        out = np.empty((len(one.elements.vertices), 6))
+        one.element_law.evaluate_hessians(one.elements, p, out)
+        return out
+
+    def constant_blocks(self, matrix: BlockMatrix, p: Positions) -> FloatArray | None:
+        """Return the matrix blocks that do not depend on the point p of this step; None for springs alone."""
+        steady = [one for one in self.element_energies if one.element_law.has_constant_hessian]
+        if not steady:
+            return matrix.constant_blocks if self.fixed_objective.quadratic_form is not None else None
+        if self._constant_cache is None or self._constant_cache[0] is not matrix:
+            blocks = matrix.constant_blocks.copy()
+            for one in steady:
+                places = matrix.element_block_indices(one.energy_index, one.elements.vertices)
+                add_blocks(one.elements, places, self._evaluate_hessian(one, p), blocks)
+            self._constant_cache = matrix, blocks
+        return self._constant_cache[1]
+
+    @cached_property
+    def joined_elements(self) -> JoinedElements | None:
+        """The elements of all energies in one set; None if there are none."""
+        return (
+            JoinedElements.from_elements([one.elements for one in self.element_energies])
+            if self.element_energies
+            else None
+        )
+
+
+class Hessian:
+    """The Hessian [N/m] at a point, over the free vertices (f,), with the blocks of elements and of collisions."""
+
+    def __init__(self, step: StepObjective, p: Positions) -> None:
+        self._step_objective, self._positions = step, p
+        self._objective_terms, self.free_vertices = (
+            step.fixed_objective.objective_terms,
+            step.fixed_objective.system.free_vertices,
+        )
+        parts = [
+            woodbury.sparse_part(energy, p) for energy in step.other_energies if energy not in step.barrier_energies
+        ]
+        self._low_rank_columns = woodbury.low_rank_columns(step.other_energies, p) if step.other_energies else None
+        self._sparse_part = reduce(lambda a, b: csr_array(a + b), parts) if parts else None
+        self.element_hessians = step.element_hessians(p)
+        self.barrier_hessian = BarrierHessian(step.barrier_energies, p)
+
+    @cached_property
+    def _matrix_and_entries(self) -> tuple[BlockMatrix, IndexArray, FloatArray]:
+        """The matrix, and the places and values in it of energies without an element-wise form."""
+        step, whole = self._step_objective, self._step_objective.fixed_objective
+        rows, columns, entries = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
+        if self._sparse_part is not None:
+            total = self._sparse_part.tocoo()
+            rows, columns = (3 * whole.free_index[x // 3] + x % 3 for x in total.coords)
+            inside = (rows >= 0) & (columns >= 0)
+            rows, columns, entries = rows[inside], columns[inside], np.asarray(total.data[inside], np.float64)
+        matrix = step.step_matrix.matrix_at(
+            self._positions, rows // 3, columns // 3, self.barrier_hessian.block_vertices
+        )
+        return matrix, matrix.entry_indices(rows, columns), entries
+
+    def factorise(
+        self, negative_fraction: float = 1.0, shift: FloatArray | float = 0.0, tension: FloatArray | None = None
+    ) -> bool:
+        """Factorise the Hessian and return whether it is positive definite; the defaults give the exact Hessian.
+
+        Args:
+            negative_fraction: fraction of the negative transverse part of springs to include.
+            shift: value added to the diagonal [N/m].
+            tension: tensions of the springs (m,) [N]; None for those at the point.
+
+        Returns:
+            True if it is positive definite, so that `solve` can be called.
+        """
+        return self._factor.factorise(self._assemble(negative_fraction, shift, tension).values)
+
+    def project_to_psd(self, psd_projection: PsdProjection) -> ProjectedHessian:
+        """Return the Hessian with projected elements; constant forms have no negative eigenvalue."""
+        keep, tension = psd_projection.project_springs(self._objective_terms.edges, self._current_tensions)
+        stated = zip(self._step_objective.element_energies, self.element_hessians, strict=True)
+        curvature = [
+            c if one.element_law.has_constant_hessian else psd_projection.project_packed(one.elements.vertices, c)
+            for one, c in stated
+        ]
+        pairs = [psd_projection.project_pairs(blocks) for blocks in self.barrier_hessian.pair_blocks]
+        return ProjectedHessian(
+            keep, tension, curvature, pairs, psd_projection.num_examined, psd_projection.num_projected
+        )
+
+    def assemble_clamped(self) -> BlockMatrix:
+        """Assemble the Hessian with negative eigenvalues of elements clamped; valid until the next assembly."""
+        clamped = self.project_to_psd(PsdProjection())
+        return self._assemble(clamped.negative_fraction, 0.0, clamped.spring_tensions, clamped)
+
+    def factorise_projected(self, projected: ProjectedHessian, shift: FloatArray | float = 0.0) -> bool:
+        """Factorise a projected Hessian plus `shift` [N/m] on its diagonal.
+
+        Returns whether it is positive definite.
+        """
+        return self._factor.factorise(
+            self._assemble(projected.negative_fraction, shift, projected.spring_tensions, projected).values
+        )
+
+    def factorise_and_solve(
+        self,
+        b: Positions,
+        negative_fraction: float = 1.0,
+        shift: FloatArray | float = 0.0,
+        tension: FloatArray | None = None,
+    ) -> Positions | None:
+        """Factorise and solve in one pass, faster than both calls.
+
+        Returns None if it is not positive definite.
+        """
+        out = np.zeros_like(b)
+        x = self._factor.factorise_and_solve(
+            self._assemble(negative_fraction, shift, tension).values, b[self.free_vertices]
+        )
+        if x is None:
+            return None
+        out[self.free_vertices] = x
+        return out
+
+    def _assemble(
+        self,
+        negative_fraction: float,
+        shift: FloatArray | float,
+        tension: FloatArray | None,
+        projected: ProjectedHessian | None = None,
+    ) -> BlockMatrix:
+        matrix, places, entries = self._matrix_and_entries
+        step, tension = self._step_objective, self._current_tensions if tension is None else tension
+        constant = step.constant_blocks(matrix, self._positions)
+        spring_hessian.assemble_hessian(
+            self._objective_terms,
+            matrix.block_indices,
+            constant,
+            self._positions,
+            tension,
+            negative_fraction,
+            matrix.values,
+        )
+        elements = projected.element_hessians if projected else self.element_hessians
+        for one, curvature in zip(step.element_energies, elements, strict=True):
+            if not one.element_law.has_constant_hessian:
+                at = matrix.element_block_indices(one.energy_index, one.elements.vertices)
+                add_blocks(one.elements, at, curvature, matrix.values)
+        for k, blocks in enumerate(projected.pair_blocks if projected else []):
+            blocks.add_blocks(matrix.element_block_indices(-1 - k, blocks.vertices), matrix.values)
+        if not projected:
+            self.barrier_hessian.add_to_matrix(negative_fraction, matrix)
+        values = matrix.values.reshape(-1)
+        values[places] += entries
+        values[matrix.diagonal_entries] += shift
+        return matrix
+
+    def solve(self, b: Positions) -> Positions:
+        """Solve with the last factor for b (n, 3).
+
+        The result is zero at vertices that are not free.
+        """
+        out = np.zeros_like(b)
+        out[self.free_vertices] = self._factor.solve(b[self.free_vertices])
+        return out
+
+    @cached_property
+    def _factor(self) -> BlockCholesky | woodbury.Woodbury:
+        matrix = self._matrix_and_entries[0]
+        return (
+            matrix.factor
+            if self._low_rank_columns is None
+            else woodbury.Woodbury(matrix, self._low_rank_columns[self.free_vertices])
+        )
+
+    @cached_property
+    def _current_tensions(self) -> FloatArray:
+        return self._step_objective.linearise_tensions(self._positions, np.zeros_like(self._positions))
+
+    @cached_property
+    def _linear_terms(self) -> FloatArray:
+        linear = np.empty((len(self._objective_terms.stiffness), 4))
+        spring_hessian.linearise_springs(self._objective_terms, self._positions, linear)
+        return linear
+
+    @cached_property
+    def kernel_arguments(self) -> tuple[Any, ...]:
+        """Arguments of `springbench.solvers.kernels.spring_hessian.multiply_hessian`: all terms with an element-wise form."""
+        step = self._step_objective
+        curvature = np.concatenate(self.element_hessians) if self.element_hessians else None
+        return (
+            self._objective_terms,
+            self._linear_terms,
+            step.fixed_objective.quadratic_form,
+            step.joined_elements,
+            curvature,
+        )
+
+    def matvec(self, x: Positions) -> Positions:
+        """Return the exact Hessian times x (n, 3); x and the product are zero at vertices that are not free."""
+        product, out = np.empty_like(x), np.zeros_like(x)
+        spring_hessian.multiply_hessian(*self.kernel_arguments, x, product)
+        if self._sparse_part is not None:
+            product += (self._sparse_part @ x.ravel()).reshape(-1, 3)
+        if self._low_rank_columns is not None:
+            product += self._low_rank_columns @ np.einsum("nik,ni->k", self._low_rank_columns, x)
+        for pairs in self.barrier_hessian.pair_blocks:
+            pairs.add_product(x, product)
+        out[self.free_vertices] = product[self.free_vertices]
+        return out

@@ -1,0 +1,1 @@
+"""Discovery and import of solvers and effects of others."""

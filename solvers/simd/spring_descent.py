@@ -1,0 +1,71 @@
+"""Objective of eight vertices and their springs, and its negative gradient, in explicit LLVM vectors.
+
+See `springbench.solvers.kernels.spring_objective` for the formula, and `springbench.solvers.simd.spring_packets` for
+the lanes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from springbench.solvers.simd.llvm_vectors import F64, I64, unpack_arguments
+from springbench.solvers.simd.spring_packets import (
+    LANES,
+    MAX_SQUARED_LENGTH,
+    PACKET_TYPE,
+    PacketBuilder,
+    SpringPacket,
+    constant_packet,
+)
+
+
+def _spring_gradient_code(typingctx: Any, bundles: Any, shares: Any, number: Any, x: Any, right: Any, out: Any) -> Any:
+    """Write a packet's rows of `out` and return its energy; return -1 without writing if a spring is too short."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        bundles, shares, number, x, right, out = unpack_arguments(context, builder, signature, args)
+        v, springs = PacketBuilder(context, builder), SpringPacket.from_bundles(builder, bundles, number)
+        centre = v.gather_rows(x, v.load_row_offsets(springs.row_offset, number))
+        sums, shortest = v.allocate_sums(4), cgutils.alloca_once_value(builder, constant_packet(MAX_SQUARED_LENGTH))
+
+        def read(entry: Any) -> list[Any]:
+            """Load the data of an entry's springs: k r, k, 1/(4 k), and the vector from their other ends."""
+            numbers = [
+                *v.load_packets(springs.weights, springs.weight_offset, entry),
+                *v.load_packets(shares.energy_weights, shares.weight_offset, entry, 1),
+            ]
+            return [*numbers, *v.compute_spring_vectors(x, centre, springs.neighbour_offset, entry)]
+
+        def add(values: list[Any]) -> None:
+            """Add an entry's springs to the sums."""
+            pull, k, share, *arrow = values
+            squared = v.squared_norm(arrow)
+            v.update_minimum(squared, shortest)
+            scale = builder.fsub(builder.fmul(pull, v.inverse_sqrt(squared)), k)
+            energy = builder.fmul(builder.fmul(share, scale), scale)
+            v.add_products([scale] * 3 + [energy], [*arrow, squared], sums)
+
+        v.pipeline_entries(springs.first_entry, springs.end_entry, read, add)
+        *total, energy = [builder.load(accumulator) for accumulator in sums]
+        short = v.has_short_spring(shortest)
+        with builder.if_then(builder.not_(short), likely=True):
+            *constants, held = v.load_right_hand_side(right, number)
+            away = [v.subtract_product(a, held, b) for a, b in zip(constants, centre, strict=True)]
+            half = v.load(builder.gep(shares.inverse_anchor, [builder.mul(number, I64(LANES))]), PACKET_TYPE)
+            builder.store(v.multiply_add(half, v.squared_norm(away), energy), sums[3])
+            total = [builder.fadd(a, b) for a, b in zip(total, away, strict=True)]
+            for place, row in zip(
+                v.load_row_offsets(springs.row_offset, number), v.transpose_to_rows(total), strict=True
+            ):
+                v.store(row, builder.gep(out, [place]))
+        return builder.select(short, F64(-1.0), v.sum_lanes(builder.load(sums[3])))
+
+    return types.float64(bundles, shares, number, x, right, out), generate
+
+
+spring_energy_and_descent: Any = intrinsic(
+    _spring_gradient_code
+)  # Numba passes the first argument itself, which type checkers do not know
