@@ -66,7 +66,7 @@ SOLVER_TABLE = PluginTable("springbench.solvers", SOLVERS, OPTIONAL_SOLVERS)
 
 def is_minimiser(solver: Any) -> bool:
     """Return whether the iterates converge to a minimum; a solver without `is_minimiser` is scored as if they do."""
-    return getattr(solver, "minimises", True)
+    return getattr(solver, "is_minimiser", True)
 
 
 def find_solver_name(solver: Any) -> str:
@@ -81,4 +81,4 @@ def find_solver_info(solver: Any, name: str) -> SolverInfo:
 
     Without any, the solver is a family of its own.
     """
-    return getattr(solver, "about", SolverInfo(name))
+    return getattr(solver, "solver_info", SolverInfo(name))

@@ -124,7 +124,7 @@ def _select_parameters(solver: type, parameters: ConfigModel) -> dict[str, Any]:
 
     Those that the solver omits at their default are excluded.
     """
-    unstated: frozenset[str] = getattr(solver, "unstated", frozenset())
+    unstated: frozenset[str] = getattr(solver, "omitted_defaults", frozenset())
     usual = {name for name in unstated if getattr(parameters, name, None) == getattr(solver, name, None)}
     return parameters.model_dump(mode="json", exclude=usual)
 

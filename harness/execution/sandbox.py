@@ -87,7 +87,7 @@ class _SandboxProcess:
         settings["ARROW_DEFAULT_MEMORY_POOL"] = "system"  # others reserve a GiB at once, which counts as taken
         self._owner = os.getpid()
         self._process = subprocess.Popen(
-            [sys.executable, "-c", f"from {__name__} import serve; serve()"],
+            [sys.executable, "-c", f"from {__name__} import serve_calls; serve_calls()"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={**os.environ, **settings, "PYTHONPATH": os.pathsep.join(paths)},

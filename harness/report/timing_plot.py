@@ -112,7 +112,7 @@ def _collect_facts(table: pa.Table) -> list[str]:
     facts = ["median and quartiles of all steps"]
     if threads:
         facts.append(f"{', '.join(map(str, threads))} thread{'s' if threads != [1] else ''}")
-    return [*facts, *describe_machine_and_commit(table.build_query(["cpu", "commit"]).to_pylist())]
+    return [*facts, *describe_machine_and_commit(table.select(["cpu", "commit"]).to_pylist())]
 
 
 def _draw_scene(

@@ -96,7 +96,7 @@ class EnergyBalance:
         system = scene.system
         self._scene, self._now = scene, build_initial_state(scene).motion
         self._first = self._now.positions
-        self._when = float(getattr(scene.integrator, "when", 1.0))
+        self._when = float(getattr(scene.integrator, "stage_fraction", 1.0))
         self._free, self._exact = system.free_vertices, system.pins.vertices[system.pins.exact_mask]
         self._mass, self._load = (
             np.where(system.unpinned_mask, system.mass, 0.0)[self._free],

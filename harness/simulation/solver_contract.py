@@ -101,7 +101,7 @@ class ContractCheckedSolver(DelegatingSolver):
 def _locate_method(owner: type, method: str) -> str:
     function: Callable[..., Any] | None = getattr(owner, method, None)
     if getattr(function, "__module__", "") == IterativeSolver.__module__:  # the loop is not the solver's own
-        function = getattr(owner, "begin", None)
+        function = getattr(owner, "init_state", None)
     code = getattr(function, "__code__", None)
     return (
         f"{Path(code.co_filename).name}:{code.co_firstlineno}"

@@ -168,4 +168,4 @@ def require_masses(scene: Scene) -> None:
 
 def _is_lagged(energy: object) -> bool:
     """Return whether an energy depends on the expected solution of a stage."""
-    return getattr(energy, "lagged", False)
+    return getattr(energy, "is_lag_extrapolated", False)

@@ -163,7 +163,7 @@ def prepare(scene: Scene, solver: Solver) -> PreparedSolver:
         zero, or the solver does not support exact lengths; also as `solver.prepare` raises.
     """
     require_masses(scene)
-    if scene.system.length_constraints and not getattr(solver, "keeps_lengths", False):
+    if scene.system.length_constraints and not getattr(solver, "supports_length_constraints", False):
         raise Unsupported(f"{find_solver_name(solver)}: {EXACT_LENGTHS_UNSUPPORTED}")
     history, alternate = (
         isinstance(scene.integrator, SingleStageIntegrator) and scene.integrator.needs_history,

@@ -243,7 +243,7 @@ def _second_derivative(energy: Any, x: Array, d: Array) -> float:
     The Hessian may be split into a sparse part and columns.
     """
     flat = d.ravel()
-    if not hasattr(energy, "columns"):
+    if not hasattr(energy, "low_rank_columns"):
         return float(flat @ (energy.hessian(x) @ flat))
     dense = np.einsum("nik,ni->k", energy.low_rank_columns(x), d)
     return float(flat @ (energy.sparse_hessian(x) @ flat) + dense @ dense)

@@ -106,7 +106,7 @@ def solve_with_friction(prepared: PreparedSolver, problem: StepProblem, stop: St
 
 def has_friction(energy: Energy) -> TypeGuard[FrictionEnergy]:
     """Return whether an energy has friction with lagged normal forces."""
-    return getattr(energy, "friction", 0.0) > 0.0 and hasattr(energy, "friction_rounds")
+    return getattr(energy, "friction", 0.0) > 0.0 and hasattr(energy, "friction_iterations")
 
 
 def _max_friction_iterations(system: System) -> int:

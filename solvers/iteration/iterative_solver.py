@@ -53,7 +53,7 @@ EXACT_LENGTHS_UNSUPPORTED = (
 """Reason, after the method's name, why a method without length constraints does not support the scene."""
 
 
-_interpreted_loop = iteration_loop.build_loop(methodcaller("advance"), methodcaller("residual"))
+_interpreted_loop = iteration_loop.build_loop(methodcaller("step_state"), methodcaller("residual"))
 
 
 class SolverState(ABC):

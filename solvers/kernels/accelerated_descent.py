@@ -34,23 +34,23 @@ _MAX_HALVINGS = 40
 
 WINDOW_STATE_DTYPE = np.dtype(
     [
-        ("method", np.int64),  # see `accelerate_coefficients`
-        ("retries", np.int64),  # shorter steps along d before the plain correction
-        ("count", np.int64),  # pairs in the window
-        ("newest", np.int64),  # the latest of them
-        ("tries", np.int64),  # trials rejected in this iteration
-        ("plain", np.int64),  # whether the trial is along c
-        ("rise", np.float64),  # g(trial) - g(p) [J]
-        ("noise", np.float64),  # what of it may be round-off
-        ("fallen", np.float64),  # by how much g fell since the start, where round-off does not hide it [J]
-        ("length", np.float64),  # t
+        ("coefficient_rule", np.int64),  # see `accelerate_coefficients`
+        ("max_retries", np.int64),  # shorter steps along d before the plain correction
+        ("num_pairs", np.int64),  # pairs in the window
+        ("newest_pair", np.int64),  # the latest of them
+        ("num_rejected_trials", np.int64),  # trials rejected in this iteration
+        ("is_plain", np.int64),  # whether the trial is along c
+        ("objective_change", np.float64),  # g(trial) - g(p) [J]
+        ("roundoff", np.float64),  # what of it may be round-off
+        ("objective_decrease", np.float64),  # by how much g fell since the start, where round-off does not hide it [J]
+        ("step_size", np.float64),  # t
         ("slope", np.float64),  # grad g(p) d [J]
-        ("squared", np.float64),  # |c|_Q^2 [J]
-        ("scale", np.float64),
-        ("radius", np.float64),  # Chebyshev's: of convergence of the plain iteration
-        ("weight", np.float64),  # omega
-        ("degree", np.int64),  # of the polynomial
-        ("reference", np.float64),  # |c|_Q^2 where it began [J]
+        ("correction_squarednorm", np.float64),  # |c|_Q^2 [J]
+        ("correction_scale", np.float64),
+        ("spectral_radius", np.float64),  # Chebyshev's: of convergence of the plain iteration
+        ("chebyshev_weight", np.float64),  # omega
+        ("polynomial_degree", np.int64),  # of the polynomial
+        ("reference_squarednorm", np.float64),  # |c|_Q^2 where it began [J]
     ]
 )
 """The state of an iteration."""

@@ -85,8 +85,8 @@ class ConjugateGradientIteration(ABC):
 
 
 _run_cg_loop = make_cg_loop(
-    lambda state, product, before: state.turn(product, before),
-    lambda state, product, curvature: state.go(product, curvature),
-    lambda state, curvature: state.convex(curvature),
-    lambda state, product: state.near(product),
+    lambda state, product, before: state.update_direction(product, before),
+    lambda state, product, curvature: state.update_iterate(product, curvature),
+    lambda state, curvature: state.is_convex(curvature),
+    lambda state, product: state.is_converged(product),
 )

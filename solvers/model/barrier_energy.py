@@ -106,7 +106,7 @@ class BarrierEnergy(Energy, Protocol):
 
 def is_barrier_energy(energy: Energy) -> TypeGuard[BarrierEnergy]:
     """Return whether an energy is a barrier that limits the step size."""
-    return hasattr(energy, "largest_step")
+    return hasattr(energy, "collision_free_step_size")
 
 
 def max_step_size(energies: Iterable[Energy], p: Positions, direction: Positions) -> float:

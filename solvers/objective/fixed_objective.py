@@ -67,7 +67,7 @@ class FixedObjective:
             )
         self.forms_with_force = [k for k, e in quadratic.items() if is_lagged(e) or e.d.any()]
         rest = {k: e for k, e in energies.items() if k not in quadratic}
-        self.element_energy_indices = [k for k, e in rest.items() if hasattr(e, "law")]
+        self.element_energy_indices = [k for k, e in rest.items() if hasattr(e, "element_law")]
         self.other_energy_indices = [k for k in rest if k not in self.element_energy_indices]
         self.projective_indices = {k for k, e in energies.items() if isinstance(e, ProjectiveEnergy)}
 

@@ -88,7 +88,7 @@ class SpringForm:
         both = (*self.strain_limits, *self.dashpots)
         ends, k = np.concatenate([e.edges for e in both]), np.concatenate([e.stiffness for e in both])
         none = np.empty(0)
-        low, high = (np.concatenate([none, *(getattr(e, at) for e in self.strain_limits)]) for at in ("low", "high"))
+        low, high = (np.concatenate([none, *(getattr(e, at) for e in self.strain_limits)]) for at in ("min_length", "max_length"))
         edges = EdgeElements.from_edges(ends, k, low, high, row, rows)
         edges.edge_axis[: len(low)] = np.concatenate(
             [none.reshape(0, 3), *(e.rest_direction for e in self.strain_limits)]
@@ -101,7 +101,7 @@ class SpringForm:
             from springbench.solvers.model.energies.strain_limit_energy import StrainLimits
 
             limits = [e for e in problem.energies if isinstance(e, StrainLimits)]
-            low, high = (np.concatenate([getattr(e, at) for e in limits]) for at in ("low", "high"))
+            low, high = (np.concatenate([getattr(e, at) for e in limits]) for at in ("min_length", "max_length"))
             edges = edges._replace(min_length=low, max_length=high)
         if edges is None or not self.dashpots:
             return edges
@@ -133,7 +133,7 @@ def decompose_energies(system: System) -> SpringForm:
     forms = [energy for energy in others if isinstance(energy, Quadratic)]
     limits = tuple(energy for energy in others if isinstance(energy, StrainLimits))
     dashpots = tuple(
-        replace(energy, entry_stiffness=system.velocity_rate * energy.stiffness)
+        replace(energy, stiffness=system.velocity_rate * energy.stiffness)
         for energy in others
         if isinstance(energy, Dashpots)
     )

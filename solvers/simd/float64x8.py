@@ -83,7 +83,7 @@ def _where_code(typingctx: Any, flag: Any, x: Any, y: Any) -> Any:
     kind = FLOAT64X8 if flag is MASK8 else types.float64
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.build_query(*args)
+        return builder.select(*args)
 
     return kind(flag, kind, kind), generate
 

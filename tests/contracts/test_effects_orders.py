@@ -100,7 +100,7 @@ def end(case: Case, integrator: str, steps: int, seconds: float = END) -> np.nda
 
 
 def test_every_effect_states_it() -> None:
-    stated = {name: load_target(target).exact_to for name, target in EFFECT_CLASSES.items()}
+    stated = {name: load_target(target).max_convergence_order for name, target in EFFECT_CLASSES.items()}
     assert {name for name, order in stated.items() if isinf(order)} == set(SMOOTH)
     assert {name for name, order in stated.items() if order == 1.0} == set(ROUGH)
 
@@ -113,7 +113,7 @@ def test_every_effect_states_it() -> None:
 def test_integrators_keep_their_order_up_to_it(effect, integrator):
     order, case = INTEGRATORS[integrator].order, SMOOTH[effect]
     errors = [truth(effect).measure_error(0, end(case, integrator, n)) for n in (case.steps, 2 * case.steps)]
-    stated = min(order, load_target(EFFECT_CLASSES[effect]).exact_to)
+    stated = min(order, load_target(EFFECT_CLASSES[effect]).max_convergence_order)
     # The next term of the error is smaller by a time step times the fastest frequency; signs may make it larger.
     assert np.log2(errors[0] / errors[1]) > stated - 0.35
 
@@ -129,4 +129,4 @@ def test_what_begins_within_steps_has_order_1(effect):
     # Where in a step contact begins scatters single errors; over a factor of 8 that counts for little. Those of other
     # integrators scatter more.
     assert 0.6 < np.log2(errors[0] / errors[1]) / 3.0 < 1.7
-    assert load_target(EFFECT_CLASSES[effect]).exact_to == 1.0
+    assert load_target(EFFECT_CLASSES[effect]).max_convergence_order == 1.0

@@ -212,7 +212,7 @@ def test_the_energy_stays_near_over_a_hundred_thousand_steps(name):
     assert abs(found[-100:].mean() - found[:100].mean()) < 0.02 * found[0]
 
 
-MINIMISERS = [name for name, target in SOLVERS.items() if load_target(target).minimises]
+MINIMISERS = [name for name, target in SOLVERS.items() if load_target(target).is_minimiser]
 
 
 @pytest.mark.parametrize("name", ["implicit-euler", "bdf2", "midpoint", "generalised-alpha", "sdirk-3"])

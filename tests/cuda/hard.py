@@ -78,7 +78,7 @@ def outcome(made: Scene, method: str, precision: Precision) -> Outcome:
         changes = rounded * np.random.default_rng(seed).uniform(-1.0, 1.0, (2, *begun.shape))
         may = max(may, TIMES * np.abs(ran(made, solver(), changes) - wanted).max())
     why = f"{away:.1e} m from the processor"
-    if away > may and precision == "float32" and solver().minimises:
+    if away > may and precision == "float32" and solver().is_minimiser:
         part = _fall(made, found[0]) / _fall(made, wanted[0])
         away, why = may * (1.0 - part) / LESS, f"{why}, its first step falling by {part:.4f} of what that one's does"
     return Outcome("right" if away <= may else "wrong", why, float(away / may))

@@ -46,7 +46,7 @@ REFUSED = {
     (case, method): "mass"
     for case in ("numbers-massless-vertices", "numbers-mostly-massless")
     for method in SOLVERS
-    if method in ("xpbd", "mgpbd") or load_target(SOLVERS[method]).about.own_steps
+    if method in ("xpbd", "mgpbd") or load_target(SOLVERS[method]).solver_info.is_substepping
 }
 REFUSED |= {(case, "velocity-verlet"): "substeps" for case in ("effects-air-drag-1e9", "effects-bending-1e12")}
 """Methods that move each vertex by its own mass cannot move one that has none; explicit ones would take all day."""

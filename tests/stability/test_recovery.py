@@ -34,7 +34,7 @@ from tests.scene_builders import build_test_scene
 STEPS, STOP = 100, StopRule(200, 1e-6)
 """Steps of at most so many iterations, converged or not: a step cut short damps more."""
 
-MINIMISERS = [name for name, target in SOLVERS.items() if load_target(target).minimises]
+MINIMISERS = [name for name, target in SOLVERS.items() if load_target(target).is_minimiser]
 
 
 def held_block() -> Scene:

@@ -92,7 +92,7 @@ def test_vertices_of_one_element_have_different_colours():
     system = problem.system
     beside = VertexElements.from_system(system)
     far = [
-        replace(energy, edges=np.array([[0, 35], [5, 30]]), entry_stiffness=energy.entry_stiffness[:2], offset=energy.offset[:2],
+        replace(energy, edges=np.array([[0, 35], [5, 30]]), stiffness=energy.stiffness[:2], offset=energy.offset[:2],
                 direction=energy.direction[:2])
         for energy in beside.energies
     ]  # fmt: skip

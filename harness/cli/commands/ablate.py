@@ -93,7 +93,7 @@ def _measure_overheads(
 
     if solver is not None or pairs:
         raise InputError("--all-solvers: takes neither --solver nor --pairs; leave them out, or do without it")
-    minimising = [name for name, target in SOLVERS.items() if load_target(target).minimises]
+    minimising = [name for name, target in SOLVERS.items() if load_target(target).is_minimiser]
     usual = {"rounds": DEFAULT_NUM_ROUNDS, "threads": 1, "tolerance": DEFAULT_OVERHEAD_TOLERANCE}
     sweep = load_config(scene, solvers=minimising, sizes=[size] if size else [], **usual | context.obj)
     folder = claim_folder(results / sweep.name, scene)

@@ -45,7 +45,7 @@ def build_evidence(
         time_step=scene.system.time_step,
         has_pins=bool(len(scene.system.pins.vertices)),
         is_driven=bool(scene.varying_forces or scene.pin_motions),
-        is_damped=any(getattr(_load_effect_class(kind), "damps", False) for kind in effect_kinds),
+        is_damped=any(getattr(_load_effect_class(kind), "is_dissipative", False) for kind in effect_kinds),
         positions=positions,
         velocities=velocities,
     )
@@ -59,9 +59,9 @@ def suggest_effects(evidence: ObservedMotion, effect_kinds: Collection[str]) -> 
         effect_kinds: kinds of the effects that the scene lists.
     """
     absent = [
-        kind for kind in EFFECT_CLASSES if kind not in effect_kinds and hasattr(_load_effect_class(kind), "called_for")
+        kind for kind in EFFECT_CLASSES if kind not in effect_kinds and hasattr(_load_effect_class(kind), "find_evidence")
     ]
-    told = (EffectSuggestion(kind, _load_effect_class(kind).called_for(evidence)) for kind in absent)
+    told = (EffectSuggestion(kind, _load_effect_class(kind).find_evidence(evidence)) for kind in absent)
     return [suggestion for suggestion in told if suggestion.evidence]
 
 

@@ -124,7 +124,7 @@ def select_effects(scene: SceneSpec, *kinds: str) -> SceneSpec:
 
 def _is_baseline_effect(effect: SceneEffect) -> bool:
     """Return whether an effect is declared part of the baseline."""
-    return bool(getattr(effect, "plain", False))
+    return bool(getattr(effect, "is_baseline_effect", False))
 
 
 def measure_overheads(

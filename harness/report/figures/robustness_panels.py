@@ -35,7 +35,7 @@ def robustness_panels(folder: Path, find_stale: StaleFinder) -> list[PanelEntry]
     """
     table = read_sweep_rows(folder)
     cells, other = read_verified_runs(folder), find_stale(table)
-    told = describe_provenance(table.build_query(PROVENANCE_COLUMNS).to_pylist())
+    told = describe_provenance(table.select(PROVENANCE_COLUMNS).to_pylist())
     panels: list[FigurePanel] = [_build_share_plot(cells, other, told)]
     for family in dict.fromkeys(cell.case.partition("-")[0] for cell in cells):
         mine = [cell for cell in cells if cell.case.partition("-")[0] == family]

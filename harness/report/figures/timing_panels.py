@@ -50,7 +50,7 @@ def timing_panels(folder: Path, find_stale: StaleFinder) -> list[PanelEntry]:
     found, other = read_run_times(table), find_stale(table)
     names = label_runs(found)
     marked = assign_label_styles((names[run.run_id], run.solver) for run in found)
-    told = describe_provenance(table.build_query(PROVENANCE_COLUMNS).to_pylist())
+    told = describe_provenance(table.select(PROVENANCE_COLUMNS).to_pylist())
     plots: list[CurvePlot] = []
     for scene in dict.fromkeys(run.scene for run in found):
         here = [run for run in found if run.scene == scene]
@@ -121,7 +121,7 @@ def speed_panels(folder: Path) -> list[PanelEntry]:
     if table is None or speed_figures.MACHINE_SOLVER not in table["solver"].unique().to_pylist():
         raise InputError(InputMistake("holds no speed report; wanted the rows of `springbench speed CONFIG`", folder))
     found = [one for one in speed_figures.compute_speed_figures(table) if one.status == "ok"]
-    told = describe_provenance(table.build_query(PROVENANCE_COLUMNS).to_pylist())
+    told = describe_provenance(table.select(PROVENANCE_COLUMNS).to_pylist())
     marked = assign_label_styles((one.label, one.solver) for one in found)
     plots: list[CurvePlot] = []
     for scene in dict.fromkeys(one.scene for one in found):

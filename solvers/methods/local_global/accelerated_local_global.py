@@ -68,7 +68,7 @@ def allocate_window(
     """Allocate vectors of `vector_size`, of which `num_entries` are unknown; `precision` is that of the factor."""
     m = scheme.history_size
     now = np.zeros(1, accelerated_descent.WINDOW_STATE_DTYPE)
-    now["method"], now["retries"] = scheme.coefficient_rule, scheme.max_retries
+    now["coefficient_rule"], now["max_retries"] = scheme.coefficient_rule, scheme.max_retries
     steps, images, correction, direction = (allocate_aligned(k * num_entries, precision) for k in (m, m, 1, 1))
     position, trial, descent, there = (allocate_aligned(vector_size) for _ in range(4))
     sy, wy = np.zeros((2, m, m))
@@ -104,7 +104,7 @@ class InterpretedState(AcceleratedState):
             if not self._shorten_trial():
                 return False
             self._evaluate_trial()
-            now["rise"], now["noise"] = self._objective.objective_change(self.positions, self._trial_positions)
+            now["objective_change"], now["roundoff"] = self._objective.objective_change(self.positions, self._trial_positions)
             verdict = accelerated_descent.judge_trial(window)
         if verdict == accelerated_descent.TRIAL_STALLED:
             return False

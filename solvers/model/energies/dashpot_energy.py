@@ -91,7 +91,7 @@ class Dashpots(EdgeEnergy):
         """Return the energy of a step."""
         _, n = unit_directions(self._edge_vectors(start.lagged_positions), self.direction)
         offset = _row_dots(n, self._edge_vectors(start.velocity_origin))
-        return replace(self, entry_stiffness=start.velocity_rate * self.stiffness, direction=n, offset=offset)
+        return replace(self, stiffness=start.velocity_rate * self.stiffness, direction=n, offset=offset)
 
     def _closing_length(self, p: Positions) -> NDArray[np.float64]:
         """Return n'(A p - A velocity_origin), (m,) [m]."""
