@@ -64,7 +64,7 @@ class StepObjective:
             for k in fixed_objective.forms_with_force:
                 begun[k].add_projection(problem.inertial_target, self.step_data.external_force)
             found = (
-                ElementEnergy(k, k in fixed_objective.projective_indices, begun[k].law, begun[k].elements)
+                ElementEnergy(k, k in fixed_objective.projective_indices, begun[k].element_law, begun[k].elements)
                 for k in fixed_objective.element_energy_indices
             )
             self.element_energies = [one for one in found if len(one.elements.vertices)]

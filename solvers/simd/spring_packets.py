@@ -120,13 +120,13 @@ class PacketBuilder(VectorBuilder):
         b, depth = self.builder, len(stages)
         waiting: list[list[Any]] = []  # for each stage, the last one first
         for k in range(depth):
-            values = read(b.add_vectors(begin, I64(k)))
+            values = read(b.add(begin, I64(k)))
             for stage in stages[: depth - 1 - k]:
                 values = stage(values)
             waiting.append([cgutils.alloca_once(b, value.type) for value in values])
             for value, place in zip(values, waiting[-1], strict=True):
                 b.store(value, place)
-        with cgutils.for_range_slice(b, b.add_vectors(begin, I64(depth)), end, I64(1), I64) as (entry, _):
+        with cgutils.for_range_slice(b, b.add(begin, I64(depth)), end, I64(1), I64) as (entry, _):
             fresh = read(entry)
             for stage, places in zip(stages, reversed(waiting), strict=True):
                 values = [b.load(place) for place in places]

@@ -226,7 +226,7 @@ SOLVING = {
     ),
     "processes": Hostile("solving", STRAY, "solver", FINE, ""),
     "much output": Hostile("solving", PRINT, "solver", FINE, "of output the first 8192 are shown"),
-    "a written problem": Hostile("solving", "problem.target[:] = 0", "solver", FAILED, "wrote to problem.target"),
+    "a written problem": Hostile("solving", "problem.inertial_target[:] = 0", "solver", FAILED, "wrote to problem.inertial_target"),
     "closed files": Hostile("solving", "os.closerange(0, 4096)", "solver", FAILED, ""),
     "another folder": Hostile("solving", "os.chdir('/')", "solver", FINE, ""),
     "a fault in its residual": Hostile("measuring", "return 'small'", "solver", FAILED, ""),
@@ -234,9 +234,9 @@ SOLVING = {
 BINDING = {
     "binds nothing": Hostile("binding", "return None", "effect", MISTAKE, "`bind` returned None; wanted"),
     "binds a text": Hostile("binding", "return 'x'", "effect", MISTAKE, "`bind` returned a str"),
-    "writes to the mesh": Hostile("binding", "mesh.rest[0] = 1", "effect", MISTAKE, "read-only"),
+    "writes to the mesh": Hostile("binding", "mesh.rest_positions[0] = 1", "effect", MISTAKE, "read-only"),
     "writes to the mesh by force": Hostile(
-        "binding", "mesh.rest.flags.writeable = True; mesh.rest[0] = 1", "effect", MISTAKE, "wrote to the mesh"
+        "binding", "mesh.rest_positions.flags.writeable = True; mesh.rest_positions[0] = 1", "effect", MISTAKE, "wrote to the mesh"
     ),
     "writes to the masses": Hostile("binding", "mass *= 2", "effect", MISTAKE, "wrote to the mesh or the masses"),
     "raises": Hostile("binding", "raise KeyError(3)", "effect", MISTAKE, "`bind` raised KeyError: 3 (mine.py:"),
@@ -248,7 +248,7 @@ BINDING = {
     "binds no energy": Hostile("binding", "return Contribution(energies=(7,))", "effect", MISTAKE, "has no method"),
     "binds no force": Hostile("binding", "return Contribution(forces=(7,))", "effect", MISTAKE, "should be functions"),
     "binds a force that is NaN": Hostile(
-        "binding", "return Contribution(forces=steady(mesh.rest * np.nan))", "effect", MISTAKE, "not finite"
+        "binding", "return Contribution(forces=steady(mesh.rest_positions * np.nan))", "effect", MISTAKE, "not finite"
     ),
     "binds a short force": Hostile(
         "binding", "return Contribution(forces=steady(np.ones((2, 3))))", "effect", MISTAKE, "shape (2, 3)"
@@ -290,12 +290,12 @@ MESHES = {
         "generating", "return None", "mesh", MISTAKE, "returned None; wanted a springbench.harness.scenes.mesh"
     ),
     "has NaN": Hostile(
-        "generating", "return replace(made, rest=made.rest * np.nan)", "mesh", MISTAKE, "`rest` has values"
+        "generating", "return replace(made, rest=made.rest_positions * np.nan)", "mesh", MISTAKE, "`rest` has values"
     ),
     "is flat": Hostile(
-        "generating", "return replace(made, rest=made.rest[:, :2].copy())", "mesh", MISTAKE, "shape (4, 2)"
+        "generating", "return replace(made, rest=made.rest_positions[:, :2].copy())", "mesh", MISTAKE, "shape (4, 2)"
     ),
-    "is single": Hostile("generating", "return replace(made, rest=made.rest.astype('f4'))", "mesh", MISTAKE, "float32"),
+    "is single": Hostile("generating", "return replace(made, rest=made.rest_positions.astype('f4'))", "mesh", MISTAKE, "float32"),
     "is empty": Hostile("generating", "return replace(made, rest=np.empty((0, 3)))", "mesh", MISTAKE, "no vertices"),
     "is a list": Hostile("generating", "return replace(made, rest=[[0.0, 0.0, 0.0]])", "mesh", MISTAKE, "mine.py"),
     "springs away": Hostile(

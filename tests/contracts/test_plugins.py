@@ -49,7 +49,7 @@ class Hum(Model):
     force: float
 
     def bind(self, mesh, mass, time_step):
-        return Contribution(forces=steady(np.full_like(mesh.rest, self.force)))
+        return Contribution(forces=steady(np.full_like(mesh.rest_positions, self.force)))
 
 
 class Cord(Chain):

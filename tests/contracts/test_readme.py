@@ -38,7 +38,7 @@ def test_the_effect_of_the_readme_is_an_effect():
     exec(compile(example("harness/README.md", "Adding an effect", "python"), "<README.md>", "exec"), names)
     assert len(example("harness/README.md", "Adding an effect", "python").splitlines()) <= 40
     mesh = ChainMesh().build_mesh(3)
-    (drag,) = names["LinearDrag"](coefficient=2.0).bind(mesh, np.ones(3), 0.1).forces
+    (drag,) = names["LinearDrag"](coefficient=2.0).build_contribution(mesh, np.ones(3), 0.1).forces
     v = np.arange(9.0).reshape(3, 3)
     assert drag(mesh.rest_positions, v, 0.0) == pytest.approx(-2.0 * v)
 

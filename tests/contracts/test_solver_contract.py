@@ -114,7 +114,7 @@ def test_a_solution_belongs_to_its_caller(solver, problem):
     prepared = solver.prepare(problem.system)
     positions = prepared.solve(problem, StopRule(3)).positions
     kept = positions.copy()
-    prepared.solve(replace(problem, first_guess=problem.initial_guess + 1.0), StopRule(4))
+    prepared.solve(replace(problem, initial_guess=problem.initial_guess + 1.0), StopRule(4))
     np.testing.assert_array_equal(positions, kept)
     assert positions.flags.c_contiguous
     assert positions.dtype == np.float64
@@ -158,7 +158,7 @@ def test_each_phase_does_what_it_returns(solver, problem):
             first.fill(np.nan)
             again = np.asarray(call())
             written = ~np.isnan(again)
-            assert written.sum() >= 3 * len(problem.system.free)
+            assert written.sum() >= 3 * len(problem.system.free_vertices)
             np.testing.assert_array_equal(again[written], kept[written])
 
 
@@ -167,7 +167,7 @@ def test_each_phase_does_what_it_returns(solver, problem):
 def test_a_global_phase_solves_for_what_its_right_hand_side_says(solver, problem):
     """Q times what the global phase gives is the right-hand side that each backend states."""
     prepared = solver.prepare(problem.system)
-    system, free = problem.system, problem.system.free
+    system, free = problem.system, problem.system.free_vertices
     phases = prepared.iteration_phases(problem)
     phases["local"]()
     given = np.asarray(phases["global"]())

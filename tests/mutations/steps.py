@@ -49,8 +49,8 @@ _TABLE = (
     (
         "inertial-guess",
         "harness/simulation/time_loop.py",
-        "first_guess=_pinned(stated.system, stated.target, stated.pin_targets)",
-        "first_guess=stated.target",
+        "first_guess=_pinned(stated.system, stated.inertial_target, stated.pin_targets)",
+        "first_guess=stated.inertial_target",
         _STEPS,
     ),
     (
@@ -77,8 +77,8 @@ _TABLE = (
     (
         "force-in-right",
         "solvers/methods/local_global/prefactored.py",
-        "y = s.inertia[:, None] * problem.target + problem.force",
-        "y = s.inertia[:, None] * problem.target - problem.force",
+        "y = s.inertia[:, None] * problem.inertial_target + problem.force",
+        "y = s.inertia[:, None] * problem.inertial_target - problem.force",
         f"{_U}/test_local_global.py",
     ),
     (

@@ -98,12 +98,12 @@ def test_a_chain_points_where_it_is_told():
 @pytest.mark.parametrize("model", [GridMesh, NetMesh])
 def test_a_vertical_sheet_hangs_below_its_top(model):
     mesh = model(width=2.0, height=1.0, plane="vertical").build(5)
-    assert np.all(mesh.rest[mesh.parts["top"], 1] == 0)
-    assert np.all(mesh.rest[mesh.parts["bottom"], 1] == -1)
-    assert np.all(mesh.rest[mesh.parts["left"], 0] == -1)
-    assert np.all(mesh.rest[mesh.parts["right"], 0] == 1)
+    assert np.all(mesh.rest_positions[mesh.parts["top"], 1] == 0)
+    assert np.all(mesh.rest_positions[mesh.parts["bottom"], 1] == -1)
+    assert np.all(mesh.rest_positions[mesh.parts["left"], 0] == -1)
+    assert np.all(mesh.rest_positions[mesh.parts["right"], 0] == 1)
     assert mesh.parts["top_corners"].tolist() == [0, 4]
-    assert not mesh.rest[:, 2].any()
+    assert not mesh.rest_positions[:, 2].any()
 
 
 @pytest.mark.parametrize("model", [GridMesh, NetMesh])

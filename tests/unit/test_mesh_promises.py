@@ -96,7 +96,7 @@ def test_parts_are_sorted_vertices(generator, size):
         assert len(part)
         assert np.all(np.diff(part) > 0)
         assert part[0] >= 0
-        assert part[-1] < len(mesh.rest)
+        assert part[-1] < len(mesh.rest_positions)
 
 
 @pytest.mark.parametrize(("generator", "size"), MESH_CASES)
@@ -157,7 +157,7 @@ def test_closed_surfaces_enclose_their_volume(generator, size, volume, tolerance
     mesh = generator.build_mesh(size)
     edges = set(directed_edges(mesh))
     assert all((j, i) in edges for i, j in edges)
-    a, b, c = (mesh.rest[mesh.triangles[:, k]] for k in range(3))
+    a, b, c = (mesh.rest_positions[mesh.triangles[:, k]] for k in range(3))
     assert np.einsum("ij,ij->", np.cross(a, b), c) / 6 == pytest.approx(volume, rel=tolerance)
 
 
@@ -169,14 +169,14 @@ def test_senseless_sizes_are_refused_with_what_is_allowed(generator, size):
     (mistake,) = caught.value.mistakes
     assert mistake.key == "size"
     assert mistake.problem.startswith(f"{size} ")
-    assert f"{generator.SMALLEST} to " in mistake.problem
+    assert f"{generator.MIN_SIZE} to " in mistake.problem
 
 
 @pytest.mark.parametrize("generator", GENERATORS, ids=lambda g: type(g).__name__)
 def test_the_largest_size_named_is_the_largest_that_fits(generator, monkeypatch):
     monkeypatch.setattr(memory, "of_machine", lambda: 2.0**40)  # so that memory is not what limits
     with pytest.raises(InputError) as caught:
-        generator.build_mesh(generator.SMALLEST - 1)
+        generator.build_mesh(generator.MIN_SIZE - 1)
     largest = int(str(caught.value).split(" to ")[1].split()[0])
     assert generator.count(largest) <= MAX_VERTICES < generator.count(largest + 1)
 

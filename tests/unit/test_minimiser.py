@@ -92,7 +92,7 @@ def lower(p: Positions) -> Positions:
 
 @problems
 def test_the_hessian_is_the_derivative_of_the_gradient(problem):
-    p, free, h = problem.initial_guess, problem.system.free, 1e-6
+    p, free, h = problem.initial_guess, problem.system.free_vertices, 1e-6
     H = build_free_hessian(problem, p).toarray()
     for column, (vertex, axis) in enumerate((v, a) for v in free for a in range(3)):
         e = np.zeros_like(p)
@@ -126,7 +126,7 @@ def test_no_point_beside_a_minimum_is_lower(problem):
     for size in (1e-3, 1e-2):
         for _ in range(20):
             e = np.zeros_like(best.positions)
-            e[problem.system.free] = size * rng.normal(size=(len(problem.system.free), 3))
+            e[problem.system.free_vertices] = size * rng.normal(size=(len(problem.system.free_vertices), 3))
             assert problem.value(best.positions + e) > best.objective
 
 

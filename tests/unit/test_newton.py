@@ -35,7 +35,7 @@ ENOUGH = StopRule(300)
 
 def stated(case) -> StepProblem:
     made = case.scene()
-    return build_problem(made, resting(case.start(made.mesh.rest)), "assignment")
+    return build_problem(made, resting(case.start(made.mesh.rest_positions)), "assignment")
 
 
 def is_certified(found: StepProblem, p: Positions) -> bool:

@@ -134,7 +134,7 @@ def test_the_rise_keeps_its_digits_where_values_have_none_left():
 @problems
 def test_a_product_with_the_hessian_is_that_of_the_energies(problem):
     step, p, _ = stepped(problem)
-    free = problem.system.free
+    free = problem.system.free_vertices
     x = np.zeros_like(p)
     x[free] = np.random.default_rng(1).normal(size=(len(free), 3))
     H = exact_hessian(problem, p)
@@ -147,7 +147,7 @@ def test_a_product_with_the_hessian_is_that_of_the_energies(problem):
 @problems
 def test_a_solve_undoes_a_product(problem):
     step, p, _ = stepped(problem)
-    free = problem.system.free
+    free = problem.system.free_vertices
     hessian = step.hessian(p)
     shift = 1.1 * float(abs(exact_hessian(problem, p)).sum(axis=1).max()) if len(free) else 0.0
     assert hessian.factorise(shift=shift)

@@ -90,8 +90,8 @@ def moved(rest: Positions, seed: int) -> Positions:
 def test_nothing_is_near_where_patches_say_so_however_fast_it_moves(made, share):
     said, limits, near = 0, CollisionQuery(REACH, 0.3 * REACH, share), made.near_at_rest
     for seed in range(24):
-        p = moved(made.rest, seed)
-        q = moved(made.rest, 100 + seed) if seed % 2 else p + 0.4 * (moved(p - p.mean(axis=0), 200 + seed) - p)
+        p = moved(made.rest_positions, seed)
+        q = moved(made.rest_positions, 100 + seed) if seed % 2 else p + 0.4 * (moved(p - p.mean(axis=0), 200 + seed) - p)
         gaps = made.patches.clear(p, q, limits)
         if gaps:
             assert not made.met(p, q, limits).any()
@@ -107,11 +107,11 @@ def test_what_patches_remember_of_ways_before_says_nothing_that_is_not_so(made):
     said, skipped, limits, near = 0, 0, CollisionQuery(REACH, 0.3 * REACH, MIN_GAP_FRACTION), made.near_at_rest
     for seed in range(2):
         rng = np.random.default_rng(seed)
-        p = made.rest @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        p = made.rest_positions @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
         made.patches.seen.clear()
         for _ in range(8):
             size = 10.0 ** rng.uniform(-2.5, 0.0)
-            q = p + size * np.sin(made.rest @ rng.normal(size=3) * 2.0)[:, None] * rng.normal(size=3)
+            q = p + size * np.sin(made.rest_positions @ rng.normal(size=3) * 2.0)[:, None] * rng.normal(size=3)
             looked = list(made.patches.apart)
             gaps = made.patches.clear(p, q, limits)
             if gaps:
@@ -123,12 +123,12 @@ def test_what_patches_remember_of_ways_before_says_nothing_that_is_not_so(made):
                 skipped += any(one is other for one in looked for other in made.patches.apart)
                 p = q if rng.uniform() < 0.7 else p
     assert said > 0
-    assert skipped > 0 or made.rest[:, 1].any()  # a balloon of few patches has nothing that is far
+    assert skipped > 0 or made.rest_positions[:, 1].any()  # a balloon of few patches has nothing that is far
 
 
 def test_a_way_that_begins_where_one_before_began_is_looked_at_from_there(made):
     limits, patches = CollisionQuery(REACH, 0.0, MIN_GAP_FRACTION), made.patches
-    p = 2.0 * made.rest
+    p = 2.0 * made.rest_positions
     q, r = 1.02 * p, 1.04 * p @ np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
     patches.recent_poses.clear()
     patches.remote_clearances.clear()
@@ -147,7 +147,7 @@ def test_a_way_that_begins_where_one_before_began_is_looked_at_from_there(made):
 def test_patches_that_are_not_doubted_have_nothing_near_in_them(made):
     told, patches, owner, limits = 0, made.patches, made.owners(), CollisionQuery(REACH, 0.3 * REACH, MIN_GAP_FRACTION)
     for seed in range(8):
-        p = moved(made.rest, 300 + seed)
+        p = moved(made.rest_positions, 300 + seed)
         q = p + 1e-3 * moved(p, 400 + seed)
         lies = [patches._fit_clusters(x, limits).lie for x in (p, q)]
         memory = patches.scratch
@@ -162,13 +162,13 @@ def test_patches_that_are_not_doubted_have_nothing_near_in_them(made):
         for k in np.flatnonzero(bad):
             x, cut = made.pairs.vertices[k].tolist(), 1 if k < made.pairs.points else 2
             assert tuple(sorted((owner[tuple(x[:cut])], owner[tuple(x[cut:])]))) not in clear
-    assert told > 0 or made.rest[:, 1].any()  # a coarse balloon has no flat patch
+    assert told > 0 or made.rest_positions[:, 1].any()  # a coarse balloon has no flat patch
 
 
 def test_what_is_near_at_rest_moves_beside_itself_by_no_more_than_the_unevenness(made):
     near = made.pairs.vertices[made.near_at_rest]
     for seed in range(3):
-        p, q = moved(made.rest, seed), moved(made.rest, 50 + seed)
+        p, q = moved(made.rest_positions, seed), moved(made.rest_positions, 50 + seed)
         way = q - p
         beside = np.linalg.norm(way[near[:, :, None]] - way[near[:, None, :]], axis=-1).max()
         found = made.patches.unevenness(p, q)
@@ -187,7 +187,7 @@ def ways(p: Positions) -> list[Positions]:
 @pytest.mark.parametrize("share", [MIN_GAP_FRACTION, 0.9])
 def test_boxes_leave_out_no_pair_that_comes_to_its_limits(made, share):
     points, edges, triangles = made.trees
-    p, bound = 0.3 * moved(made.rest, 504), 0
+    p, bound = 0.3 * moved(made.rest_positions, 504), 0
     for way in ways(p):
         limits = CollisionQuery(0.5 * REACH, 0.2 * REACH, share, max_relative_displacement(p, p + way))
         x, y = pad_positions(p), pad_positions(p + way)

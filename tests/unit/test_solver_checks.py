@@ -73,7 +73,7 @@ WRONG = {
     "no answer": Wrong(
         "return None", "def solve", "gave a NoneType; wanted a springbench.solvers.model.step_problem.Solution"
     ),
-    "writes to the target": Wrong("problem.target[:] += 0.1", "problem.target", "wrote to problem.target"),
+    "writes to the target": Wrong("problem.inertial_target[:] += 0.1", "problem.inertial_target", "wrote to problem.inertial_target"),
     "writes to the velocity": Wrong(
         "problem.start.velocity[0] = 3.0", "problem.start", "wrote to problem.start.velocity"
     ),

@@ -44,7 +44,7 @@ def test_it_ends_at_the_minimiser_of_local_global(method, problem, factor):
     problem = replace(problem, system=replace(problem.system, factor=factor))
     # Near the minimiser, where the objective is convex: from far away they may choose other valleys.
     wanted = CompiledLocalGlobal().prepare(problem.system).solve(problem, StopRule(30_000, 1e-13)).positions
-    near = replace(problem, first_guess=wanted + 1e-3 * np.random.default_rng(0).normal(size=wanted.shape))
+    near = replace(problem, initial_guess=wanted + 1e-3 * np.random.default_rng(0).normal(size=wanted.shape))
     found = method.prepare(problem.system).solve(near, StopRule(4000)).positions
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)  # what local-global's rate leaves at its tolerance
 
@@ -63,7 +63,7 @@ STARTS = {
 @problems
 @pytest.mark.parametrize("start", STARTS)
 def test_no_iteration_raises_the_objective(method, problem, start):
-    problem = replace(problem, first_guess=STARTS[start](problem.initial_guess, np.random.default_rng(0)))
+    problem = replace(problem, initial_guess=STARTS[start](problem.initial_guess, np.random.default_rng(0)))
     path = iterates(method, problem, 60)
     for before, after in pairwise(path):
         assert problem.value(after) <= problem.value(before) + 1e-13 * problem.value_scale(before)  # a hundred terms

@@ -118,7 +118,7 @@ class InterpretedState(AcceleratedState):
     @property
     def objective_decrease(self) -> float:
         """Decrease of the objective so far [J]."""
-        return float(self._window.window_state["fallen"][0])
+        return float(self._window.window_state["objective_decrease"][0])
 
     def gradient(self) -> Positions:
         """Return the gradient of the objective [N], (n, 3)."""

@@ -213,7 +213,7 @@ class _CompiledAccelerationState(AcceleratedState):
     @property
     def objective_decrease(self) -> float:
         """Decrease of the objective so far [J], unless round-off hides it."""
-        return float(self._state[-1].window_state["fallen"][0])
+        return float(self._state[-1].window_state["objective_decrease"][0])
 
     def gradient(self) -> Positions:
         """Return the gradient of the objective (n, 3) [N] at the current point."""

@@ -96,7 +96,7 @@ class VertexElements:
     @cached_property
     def _unique_laws(self) -> list[ElementLaw]:
         """The distinct laws."""
-        return list({id(energy.law): energy.law for energy in self.energies}.values())
+        return list({id(energy.element_law): energy.element_law for energy in self.energies}.values())
 
     def _elements_by_law(self, energies: list[Any]) -> list[Elements]:
         """Concatenate the elements of the energies by law."""
