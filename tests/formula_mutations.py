@@ -140,8 +140,8 @@ def mutate_contribution(
 
     def tell(patch: pytest.MonkeyPatch) -> None:
         kind = load_target(EFFECT_CLASSES[target])
-        true = kind.bind
-        patch.setattr(kind, "bind", lambda *given: change(true(*given)))
+        true = kind.build_contribution
+        patch.setattr(kind, "build_contribution", lambda *given: change(true(*given)))
 
     return tell
 

@@ -21,7 +21,7 @@ class LinearDrag(ConfigModel):
     coefficient: NonNegativeFloat
     """The drag coefficient c [N s/m]."""
 
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
+    def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """The drag as a force, of positions p [m], velocities v [m/s] and time t [s]."""
         return EffectContribution(forces=(lambda p, v, t: -self.coefficient * v,))
 

@@ -98,9 +98,9 @@ PLUGIN_KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
         lambda made: isinstance(made, type) and is_dataclass(made) and callable(getattr(made, "prepare", None)),
     ),
     "effect": (
-        "a subclass of springbench.harness.schema.base_model.ConfigModel with a method `bind` and a `kind`",
+        "a subclass of springbench.harness.schema.base_model.ConfigModel with a method `build_contribution` and a `kind`",
         lambda made: (
-            _make_model_check(ConfigModel, "bind")(made)
+            _make_model_check(ConfigModel, "build_contribution")(made)
             and hasattr(made, "model_fields")
             and "kind" in made.model_fields
         ),
@@ -206,14 +206,14 @@ def build_checked_contribution(
         InputError: if the plug-in fails, or its contribution is invalid.
     """
     before = [array.tobytes() for array in _list_arrays(mesh, mass)]
-    with attribute_errors(plugin, "bind"):
+    with attribute_errors(plugin, "build_contribution"):
         made: Any = effect.build_contribution(mesh, mass, time_step)
     if [array.tobytes() for array in _list_arrays(mesh, mass)] != before:
-        raise InputError(f"{plugin}: `bind` wrote to the mesh or the masses, which it was given; change copies")
+        raise InputError(f"{plugin}: `build_contribution` wrote to the mesh or the masses, which it was given; change copies")
     if not isinstance(made, EffectContribution):
         wanted = "wanted a springbench.harness.scenes.effects.effect_interface.EffectContribution"
-        raise InputError(f"{plugin}: `bind` returned {_describe_value(made)}; {wanted}")
-    with attribute_errors(plugin, "bind"):
+        raise InputError(f"{plugin}: `build_contribution` returned {_describe_value(made)}; {wanted}")
+    with attribute_errors(plugin, "build_contribution"):
         for field in fields(made):
             _require_true(isinstance(getattr(made, field.name), tuple), f"`{field.name}` should be a tuple")
         for energy in made.energies:

@@ -58,7 +58,7 @@ class Prepared:
 class Hum(Model):
     kind: Literal["hum"] = "hum"
 
-    def bind(self, mesh, mass, time_step):
+    def build_contribution(self, mesh, mass, time_step):
         def force(p, v, t):
             {forcing}
             return np.zeros_like(p)
@@ -232,14 +232,14 @@ SOLVING = {
     "a fault in its residual": Hostile("measuring", "return 'small'", "solver", FAILED, ""),
 }
 BINDING = {
-    "binds nothing": Hostile("binding", "return None", "effect", MISTAKE, "`bind` returned None; wanted"),
-    "binds a text": Hostile("binding", "return 'x'", "effect", MISTAKE, "`bind` returned a str"),
+    "binds nothing": Hostile("binding", "return None", "effect", MISTAKE, "`build_contribution` returned None; wanted"),
+    "binds a text": Hostile("binding", "return 'x'", "effect", MISTAKE, "`build_contribution` returned a str"),
     "writes to the mesh": Hostile("binding", "mesh.rest_positions[0] = 1", "effect", MISTAKE, "read-only"),
     "writes to the mesh by force": Hostile(
         "binding", "mesh.rest_positions.flags.writeable = True; mesh.rest_positions[0] = 1", "effect", MISTAKE, "wrote to the mesh"
     ),
     "writes to the masses": Hostile("binding", "mass *= 2", "effect", MISTAKE, "wrote to the mesh or the masses"),
-    "raises": Hostile("binding", "raise KeyError(3)", "effect", MISTAKE, "`bind` raised KeyError: 3 (mine.py:"),
+    "raises": Hostile("binding", "raise KeyError(3)", "effect", MISTAKE, "`build_contribution` raised KeyError: 3 (mine.py:"),
     "exits": Hostile("binding", "sys.exit(0)", "effect", MISTAKE, "raised SystemExit: 0"),
     "hangs": Hostile("binding", HANG, "effect", MISTAKE, LIMIT),
     "crashes": Hostile("binding", CRASH, "effect", MISTAKE, "crashed by SIGSEGV"),

@@ -20,7 +20,7 @@ from tests.effect_scenes import EFFECT_SCENES, build_moving_problem, with_integr
 SOLVED: dict[str, Solver] = {
     name: solver
     for name, solver in ((name, load_target(target)()) for name, target in SOLVERS.items())
-    if solver.minimises
+    if solver.is_minimiser
 }
 INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
 TAKE_ALL = {"newton", "newton-cg", "hybrid", "lbfgs"}

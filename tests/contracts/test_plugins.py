@@ -48,7 +48,7 @@ class Hum(Model):
     kind: Literal["hum"] = "hum"
     force: float
 
-    def bind(self, mesh, mass, time_step):
+    def build_contribution(self, mesh, mass, time_step):
         return Contribution(forces=steady(np.full_like(mesh.rest_positions, self.force)))
 
 

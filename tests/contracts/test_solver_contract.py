@@ -42,7 +42,7 @@ LOCAL_GLOBAL = {
     if isinstance(solver, DenseLocalGlobal | SparseLocalGlobal | CompiledLocalGlobal)
 }
 FLOAT64 = {name: s for name, s in LOCAL_GLOBAL.items() if getattr(s, "precision", "float64") == "float64"}
-MINIMISERS = {name: solver for name, solver in CHOICES.items() if solver.minimises}
+MINIMISERS = {name: solver for name, solver in CHOICES.items() if solver.is_minimiser}
 
 
 def over(choices):
@@ -84,8 +84,8 @@ def test_a_solve_ends_at_exactly_the_iterate_of_its_number(solver, problem, coun
 def test_a_solve_that_a_tolerance_ends_does_so_at_exactly_an_iterate(solver, problem):
     prepared = solver.prepare(problem.system)
     solution = prepared.solve(problem, StopRule(200, 1e-2))
-    assert 0 < solution.iterations <= 200
-    np.testing.assert_array_equal(solution.positions, iterates(prepared, problem, solution.iterations)[-1])
+    assert 0 < solution.num_iterations <= 200
+    np.testing.assert_array_equal(solution.positions, iterates(prepared, problem, solution.num_iterations)[-1])
 
 
 @solvers
@@ -246,6 +246,6 @@ def test_the_reported_residual_is_the_length_of_the_last_step_in_the_norm_of_the
 
 @solvers
 def test_the_facts_are_whole_numbers_by_name(solver):
-    facts = solver.prepare(build_random_problem(0).system).facts
+    facts = solver.prepare(build_random_problem(0).system).stats
     assert not solver.is_minimiser or facts["nnz_system"] > 0
     assert all(float(value).is_integer() for value in facts.values())

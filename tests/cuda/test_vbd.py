@@ -117,7 +117,7 @@ def test_the_objective_is_summed_over_all_vertices(iterations: int) -> None:
     run: Any = on_device(problem).init_state(problem, problem.initial_guess)
     run.run_unchecked(iterations)
     run._sum_objective(run._displacement, OBJECTIVE, run._sums[0])
-    found, step = run.stream.download(run._sums[0]).sum(), StepObjective(FixedObjective(problem.system), problem)
+    found, step = run.stream.download_array(run._sums[0]).sum(), StepObjective(FixedObjective(problem.system), problem)
     assert len(run._sums[0]) > 1
     assert found == pytest.approx(step.objective_change(problem.initial_guess, run.positions)[0], rel=1e-5)
 

@@ -17,7 +17,7 @@ from springbench.solvers.model.step_problem import DirichletPins, Positions, Ste
 from springbench.solvers.registry import SOLVERS, load_target
 
 ALL = {name: load_target(target)() for name, target in SOLVERS.items()}
-MINIMISERS = {name: solver for name, solver in ALL.items() if solver.minimises}
+MINIMISERS = {name: solver for name, solver in ALL.items() if solver.is_minimiser}
 
 EPS = float(np.finfo(float).eps)
 DT = 1 / 30

@@ -90,7 +90,7 @@ def test_a_step_compiled_as_a_whole_is_the_step_with_calls_in_between(method, na
 def test_a_run_tells_its_gradient_and_by_how_much_the_objective_fell(method, name, linear):
     problem = PROBLEMS[name]()
     prepared = method(linear=linear).prepare(problem.system)
-    run = prepared.begin(problem, problem.initial_guess)
+    run = prepared.init_state(problem, problem.initial_guess)
     run.run_iterations(iteration_limit(0))
     # Of a gradient some units in the last place of stiffness times position: at a pin of its weight times that.
     pins, exact = problem.system.pins, problem.system.pins.exact_mask
@@ -162,7 +162,7 @@ def test_no_iteration_is_the_first_guess(method):
     solution = method().prepare(problem.system).solve(problem, StopRule(0))
     free = problem.system.free_vertices
     np.testing.assert_array_equal(solution.positions[free], problem.initial_guess[free])
-    assert solution.iterations == 0
+    assert solution.num_iterations == 0
 
 
 @methods

@@ -210,7 +210,7 @@ def test_the_bits_do_not_depend_on_the_number_of_threads(solver, stop):
     finally:
         numba.set_num_threads(before)
     np.testing.assert_array_equal(found[0].positions, found[1].positions)
-    assert (found[0].residual, found[0].iterations) == (found[1].residual, found[1].iterations)
+    assert (found[0].residual, found[0].num_iterations) == (found[1].residual, found[1].num_iterations)
 
 
 def test_a_small_system_keeps_to_one_thread_and_says_so(monkeypatch):

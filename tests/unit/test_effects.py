@@ -51,7 +51,7 @@ def force_of(effect) -> np.ndarray:
 
 
 def bound(effect) -> EffectContribution:
-    return effect.bind(MESH, MASS, DT)
+    return effect.build_contribution(MESH, MASS, DT)
 
 
 def chosen(**selectors) -> list[int]:

@@ -47,7 +47,7 @@ def hessian(energy, p) -> np.ndarray:
     """(3n, 3n), from the second derivatives of the elements."""
     elements, n = energy.elements, len(p)
     curvature = np.empty((len(elements.vertices), 6))
-    energy.element_law.curve(elements, p, curvature)
+    energy.element_law.evaluate_hessians(elements, p, curvature)
     k = elements.vertices.shape[1]
     places = np.repeat(elements.vertices, k, axis=1) * n + np.tile(elements.vertices, k)
     blocks = np.zeros((n * n, 3, 3))
@@ -77,7 +77,7 @@ def test_the_hessian_is_the_energys(begun):
 def test_the_rise_is_the_difference_of_the_values(begun):
     energy, p, q = begun
     wanted, size = energy.value(q) - energy.value(p), energy.value(q) + energy.value(p)
-    assert energy.element_law.rise(energy.elements, p, q) == pytest.approx(wanted, rel=0, abs=SUMS * size)
+    assert energy.element_law.energy_change(energy.elements, p, q) == pytest.approx(wanted, rel=0, abs=SUMS * size)
 
 
 def test_the_rise_keeps_its_digits_where_values_have_none_left(begun):
@@ -87,12 +87,12 @@ def test_the_rise_keeps_its_digits_where_values_have_none_left(begun):
     q = p + 1e-13 * (q - p)
     wanted = float((slope * (q - p)).sum())  # to first order; what follows is less by the length of the step
     # A difference of values is off by 1e-16 of an energy of 1e13 times the rise.
-    assert energy.element_law.rise(energy.elements, p, q) == pytest.approx(wanted, rel=1e-5)
+    assert energy.element_law.energy_change(energy.elements, p, q) == pytest.approx(wanted, rel=1e-5)
 
 
 def test_one_that_says_that_its_second_derivatives_are_constant_is_right(begun):
     energy, p, q = begun
-    assert np.array_equal(hessian(energy, p), hessian(energy, q)) == energy.law.constant
+    assert np.array_equal(hessian(energy, p), hessian(energy, q)) == energy.element_law.has_constant_hessian
 
 
 def test_a_product_is_that_of_all_energies_together():

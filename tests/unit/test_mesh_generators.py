@@ -97,7 +97,7 @@ def test_a_chain_points_where_it_is_told():
 
 @pytest.mark.parametrize("model", [GridMesh, NetMesh])
 def test_a_vertical_sheet_hangs_below_its_top(model):
-    mesh = model(width=2.0, height=1.0, plane="vertical").build(5)
+    mesh = model(width=2.0, height=1.0, plane="vertical").build_mesh(5)
     assert np.all(mesh.rest_positions[mesh.parts["top"], 1] == 0)
     assert np.all(mesh.rest_positions[mesh.parts["bottom"], 1] == -1)
     assert np.all(mesh.rest_positions[mesh.parts["left"], 0] == -1)
@@ -108,7 +108,7 @@ def test_a_vertical_sheet_hangs_below_its_top(model):
 
 @pytest.mark.parametrize("model", [GridMesh, NetMesh])
 def test_a_horizontal_sheet_lies_level_around_the_origin(model):
-    mesh = model(width=2.0, height=1.0).build(5)
+    mesh = model(width=2.0, height=1.0).build_mesh(5)
     assert not mesh.rest_positions[:, 1].any()
     assert mesh.mass_fractions @ mesh.rest_positions == pytest.approx([0, 0, 0], abs=ROUND_OFF)
     assert len(mesh.parts["corners"]) == 4

@@ -149,7 +149,7 @@ def test_patches_that_are_not_doubted_have_nothing_near_in_them(made):
     for seed in range(8):
         p = moved(made.rest_positions, 300 + seed)
         q = p + 1e-3 * moved(p, 400 + seed)
-        lies = [patches._fit_clusters(x, limits).lie for x in (p, q)]
+        lies = [patches._fit_clusters(x, limits).pose for x in (p, q)]
         memory = patches.scratch
         doubted = np.empty((patches.num_rest_pairs, 2), np.int64)
         count, near = cluster_bounds.unresolved_cluster_pairs(
@@ -165,15 +165,15 @@ def test_patches_that_are_not_doubted_have_nothing_near_in_them(made):
     assert told > 0 or made.rest_positions[:, 1].any()  # a coarse balloon has no flat patch
 
 
-def test_what_is_near_at_rest_moves_beside_itself_by_no_more_than_the_unevenness(made):
+def test_what_is_near_at_rest_moves_beside_itself_by_no_more_than_the_max_relative_displacement(made):
     near = made.pairs.vertices[made.near_at_rest]
     for seed in range(3):
         p, q = moved(made.rest_positions, seed), moved(made.rest_positions, 50 + seed)
         way = q - p
         beside = np.linalg.norm(way[near[:, :, None]] - way[near[:, None, :]], axis=-1).max()
-        found = made.patches.unevenness(p, q)
+        found = made.patches.max_relative_displacement(p, q)
         assert beside <= found <= max_relative_displacement(p, q) * (1.0 + 1e-12)
-        assert made.patches.unevenness(p, p + 3.0) <= 1e-14
+        assert made.patches.max_relative_displacement(p, p + 3.0) <= 1e-14
 
 
 def ways(p: Positions) -> list[Positions]:

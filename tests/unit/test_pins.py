@@ -64,7 +64,7 @@ def test_all_vertices_may_be_pinned_exactly(backend):
     prepared = backend.prepare(problem.system)
     solution = prepared.solve(problem, StopRule(5, 1e-6))
     np.testing.assert_array_equal(solution.positions, problem.pin_targets)
-    assert (solution.iterations, solution.residual) == (1, 0.0)
+    assert (solution.num_iterations, solution.residual) == (1, 0.0)
     assert not problem.gradient(solution.positions).any()
 
 

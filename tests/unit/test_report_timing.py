@@ -351,7 +351,7 @@ def test_the_modulus_follows_the_spacing_by_rule_and_dimension() -> None:
         for rule in SCALING_RULES:
             by_size: dict[int, float] = {}
             for size in (3, 5):
-                made = load_target(MESH_CLASSES[mesh]).model_validate({"kind": mesh}).build(size)
+                made = load_target(MESH_CLASSES[mesh]).model_validate({"kind": mesh}).build_mesh(size)
                 assert made.dimension == dimension
                 reference = 3 if rule == "liu2013" else None
                 k = compute_spring_stiffness(

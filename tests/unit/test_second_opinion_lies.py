@@ -287,7 +287,7 @@ LIES: dict[str, FormulaMutation] = {
         [SPRINGS_SPEC, PINS_SPEC],
         "objective (gradient)",
         patch_attribute(
-            StepProblem, "gradient", lambda true: lambda self, p: true(self, p) * self.system.unpinned[:, None]
+            StepProblem, "gradient", lambda true: lambda self, p: true(self, p) * self.system.unpinned_mask[:, None]
         ),
     ),
 }

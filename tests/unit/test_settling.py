@@ -43,7 +43,7 @@ def test_it_finds_the_minima_of_newtons_method_alone_in_less_than_half_of_the_it
         wanted = alone.solve(problem, STOP)
         np.testing.assert_allclose(solution.positions, wanted.positions, rtol=0, atol=1e-6)
         iterations += wanted.num_iterations
-    assert 2 * sum(solution.iterations for _, solution in solved[20:]) < iterations
+    assert 2 * sum(solution.num_iterations for _, solution in solved[20:]) < iterations
 
 
 def test_settling_lowers_the_objective_and_leaves_a_minimum_where_it_is(scene, solved):

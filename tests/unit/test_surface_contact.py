@@ -228,7 +228,7 @@ def test_surfaces_of_round_obstacles_lie_inside_by_no_more_than_is_said():
         points, triangles = build_obstacle_surface(one, 1e-3, np.zeros((1, 3)))
         weights = rng.dirichlet(np.ones(3), size=(20, len(triangles)))
         inside = np.einsum("kfc,fcx->kfx", weights, points[triangles]).reshape(-1, 3)
-        depth = -one.obstacle().distance(inside, 0.0)
+        depth = -one.build_obstacle().signed_distance(inside, 0.0)
         assert depth.min() > -1e-12
         assert 1e-4 < depth.max() <= 1e-3
 

@@ -23,7 +23,7 @@ begin = jit_kernel(lambda team: reset_team(team))
 @jit_kernel
 def work(team, first, phases, log, by):
     """A thread that adds the phase to each task's entry of `log`, and one to its own count `by` of tasks."""
-    tasks = len(team.sums)
+    tasks = len(team.task_sums)
     phase = 0
     while phase >= 0:
         for i in range(tasks):

@@ -236,7 +236,7 @@ def test_a_trajectory_of_equations_that_have_changed_is_integrated_anew(tmp_path
     kept, asked = ReferenceStore(tmp_path), spec(ChainMesh(), *SWING)
     before = kept.load_trajectory(asked, 3, TIMES, error=1e-3)
     stiffer = build_exact_scene(spec(ChainMesh(), SpringsEffect(rule="fixed", stretch=K + 1.0), *SWING[1:]), 3)
-    monkeypatch.setattr(equations_of_motion, "bind", lambda *question: stiffer)
+    monkeypatch.setattr(equations_of_motion, "build_exact_scene", lambda *question: stiffer)
     after = kept.load_trajectory(asked, 3, TIMES, error=1e-3)
     assert np.abs(after.positions - before.positions).max() > 1e-4
     np.testing.assert_array_equal(after.positions, integrate_motion(stiffer, TIMES).positions)

@@ -63,7 +63,7 @@ def test_the_cheapest_by_processor_time_within_the_error_wins(found):
         "implicit, order 2",
         NO_WINNER,
     ]
-    assert found[0.1].prices["implicit, order 2"].cpu == 0.8, "seconds a simulated second, the cheaper of the two"
+    assert found[0.1].cheapest_by_family["implicit, order 2"].cpu == 0.8, "seconds a simulated second, the cheaper of the two"
 
 
 def test_the_page_has_a_point_for_each_error_that_somebody_reaches(tmp_path: Path):
@@ -81,9 +81,9 @@ def test_the_page_has_a_point_for_each_error_that_somebody_reaches(tmp_path: Pat
 
 
 def test_a_cell_tells_how_far_ahead_its_winner_is(found):
-    assert found[0.1].ahead == pytest.approx(3.0)
-    assert found[1e-4].ahead == inf
-    assert not found[1e-8].prices, "what no reference certifies wins nothing"
+    assert found[0.1].lead_ratio == pytest.approx(3.0)
+    assert found[1e-4].lead_ratio == inf
+    assert not found[1e-8].cheapest_by_family, "what no reference certifies wins nothing"
 
 
 def test_the_stiffness_number_is_that_of_a_frame_whatever_the_step(found):

@@ -136,7 +136,7 @@ def predict_step(
     """
     i = cuda.grid(1)
     while i < x.shape[0]:
-        q, w = vertex_data.pin[i], vertex_data.pin_weight[i]
+        q, w = vertex_data.pin_indices[i], vertex_data.pin_weight[i]
         for c in range(3):
             here = x[i, c]
             before[i, c], u[i, c] = here, 0.0

@@ -243,7 +243,7 @@ class AugmentedSweepState(SweepState):
             np.empty_like(base),
         )
         *others, hard = cast(tuple[Any, ...], self._element_data)
-        self._constraint_elements = hard._replace(numbers=hard.numbers.copy())
+        self._constraint_elements = hard._replace(parameters=hard.parameters.copy())
         self._element_data = (*others, self._constraint_elements)
         self._colour_packets = self._colour_packets._replace(majorant=self._colour_packets.majorant.copy())
         self._kernel = kernels.build_augmented_iteration(made.vertex_elements.iteration_kernel)
