@@ -12,7 +12,7 @@ import sys
 from copy import copy
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from springbench.harness.cli.commands.ablate import ablate
@@ -89,18 +89,18 @@ def run(
     ] = None,
     size: Annotated[list[int] | None, typer.Option(help="For a scene: mesh sizes; repeatable.")] = None,
     error_target: ErrorOption = None,
-    horizon: EndTimeOption = None,
-    check: VerifyOption = False,
-    peers: CompareOption = False,
+    t_end: EndTimeOption = None,
+    verify: VerifyOption = False,
+    compare: CompareOption = False,
     positions: Annotated[
         Path | None, typer.Option(help="Store the positions after every step (float64, .npz) of one run.")
     ] = None,
-    again: RerunOption = False,
-    changed: RerunStaleOption = False,
+    rerun: RerunOption = False,
+    rerun_stale: RerunStaleOption = False,
     workers: Annotated[
         int | None, typer.Option(min=1, max=1024, help="How many processes do runs; one is timed at a time.")
     ] = None,
-    on: Annotated[
+    scheduler: Annotated[
         str | None, typer.Option(help="Do runs by Dask: a scheduler's address, local:N, or a batch system's file.")
     ] = None,
     in_process: InProcessOption = False,
@@ -112,20 +112,43 @@ def run(
     from springbench.harness.results.folder_ownership import claim_folder
 
     _check_positions_path(positions)
-    of_error = {"horizon": horizon, "check": check, "peers": peers}
+    with_error = {"t_end": t_end, "verify": verify, "compare": compare}
     if error_target is not None:
         from springbench.harness.cli.commands.error_control import run_error_control
 
-        others = {"solver": solver, "on": on, "workers": workers, **context.obj}
-        wanted: dict[str, Any] = {"sizes": size or (), "positions": positions, "again": again, "others": others}
-        raise typer.Exit(0 if run_error_control(config, error_target, results, _say, **of_error, **wanted) else 1)
-    if unfit := next((key for key, value in of_error.items() if value), None):
-        raise InputError(InputMistake("is of a run with --error; leave it out", key=f"--{unfit}"))
+        is_accurate = run_error_control(
+            config,
+            error_target,
+            results,
+            _say,
+            t_end=t_end,
+            sizes=size or (),
+            verify=verify,
+            compare_third_party=compare,
+            positions=positions,
+            rerun=rerun,
+            rejected_options={"solver": solver, "scheduler": scheduler, "workers": workers, **context.obj},
+        )
+        raise typer.Exit(0 if is_accurate else 1)
+    if name := next((name for name, value in with_error.items() if value), None):
+        key = f"--{name.replace('_', '-')}"
+        raise InputError(InputMistake("is of a run with --error; leave it out", key=key))
     sweep = load_config(config, solvers=solver or (), sizes=size or (), **context.obj)
     folder = claim_folder(results / sweep.name, config)
-    how: dict[str, Any] = {"again": again, "changed": changed, "positions": positions, "isolated": not in_process}
-    how |= {"at_once": workers, "on": on, "meanwhile": _preload_reports}
-    table = run_sweep(sweep.name, sweep.list_runs(), folder, create_display(get_error_console()), _say, **how)
+    table = run_sweep(
+        sweep.name,
+        sweep.list_runs(),
+        folder,
+        create_display(get_error_console()),
+        _say,
+        rerun=rerun,
+        rerun_stale=rerun_stale,
+        positions=positions,
+        isolated=not in_process,
+        num_workers=workers,
+        scheduler_address=scheduler,
+        background_call=_preload_reports,
+    )
     raise typer.Exit(1 if _report_sweep(sweep, table, config, results, folder) else 0)
 
 
@@ -165,8 +188,8 @@ def _report_sweep(sweep: SweepPlan, table: pa.Table, config: Path, results: Path
 def accuracy(
     config: Annotated[Path, typer.Argument(help="An accuracy config (YAML).")],
     results: ResultsOption = Path("results"),
-    again: RerunOption = False,
-    changed: RerunStaleOption = False,
+    rerun: RerunOption = False,
+    rerun_stale: RerunStaleOption = False,
     in_process: InProcessOption = False,
 ) -> None:
     """Measure work and precision: convergence on single steps, and errors of whole simulations."""
@@ -184,8 +207,8 @@ def accuracy(
         folder,
         create_display(get_error_console()),
         _say,
-        rerun=again,
-        rerun_stale=changed,
+        rerun=rerun,
+        rerun_stale=rerun_stale,
         isolated=not in_process,
     )
     drawn = draw_accuracy_report(folder, files)
@@ -241,7 +264,7 @@ app.command()(gallery)
 app.command()(preview)
 app.command()(regress)
 app.command()(regress_history)
-app.add_typer(regress_study, name="gate-study")
+app.add_typer(regress_study, name="regress-study")
 
 
 @app.command()
@@ -305,6 +328,10 @@ def main() -> None:
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it would look for some in every installed package
     # Typer builds the parsers of all registered commands, which takes a tenth of the time of `list`.
     one = copy(app)
-    asked = [c for c in app.registered_commands if c.callback and (c.name or c.callback.__name__) in sys.argv[1:2]]
-    one.registered_commands = asked or app.registered_commands
+    named = [
+        command
+        for command in app.registered_commands
+        if command.callback and (command.name or command.callback.__name__.replace("_", "-")) in sys.argv[1:2]
+    ]
+    one.registered_commands = named or app.registered_commands
     one(prog_name="springbench")

@@ -21,19 +21,21 @@ _RESULTS_SETTINGS: Any = {
 }
 ResultsOption = Annotated[Path, typer.Option(callback=remote_storage.sync_results, **_RESULTS_SETTINGS)]
 RowsOption = Annotated[Path, typer.Option(callback=remote_storage.fetch_rows, **_RESULTS_SETTINGS)]
-RerunOption = Annotated[bool, typer.Option("--again", help="Do all, also what is there.")]
-RerunStaleOption = Annotated[bool, typer.Option("--changed", help="Do also what is there by other code than today's.")]
+RerunOption = Annotated[bool, typer.Option("--rerun", help="Do all, also what is there.")]
+RerunStaleOption = Annotated[
+    bool, typer.Option("--rerun-stale", help="Do also what is there by other code than today's.")
+]
 InProcessOption = Annotated[
-    bool, typer.Option("--here", help="Do all in this process, without limits, as a debugger wants it.")
+    bool, typer.Option("--in-process", help="Do all in this process, without limits, as a debugger wants it.")
 ]
 ErrorOption = Annotated[
     float | None,
     typer.Option(help="For a scene: the error wanted at its end, relative to the displacement; how, is chosen."),
 ]
 EndTimeOption = Annotated[float | None, typer.Option(help="With --error: simulated seconds; all frames if left out.")]
-VerifyOption = Annotated[bool, typer.Option("--check", help="With --error: let the reference grade it.")]
+VerifyOption = Annotated[bool, typer.Option("--verify", help="With --error: let the reference grade it.")]
 CompareOption = Annotated[
-    bool, typer.Option("--peers", help="With --error: time other libraries' integrators beside it.")
+    bool, typer.Option("--compare", help="With --error: time other libraries' integrators beside it.")
 ]
 
 

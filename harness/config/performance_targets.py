@@ -1,4 +1,4 @@
-"""Performance targets of `springbench goals`: errors, baselines and target ratios of cost."""
+"""Performance targets of `springbench targets`: errors, baselines and target ratios of cost."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class PerformanceTarget(ConfigModel):
     error: OneOrMany[Annotated[float, Field(gt=0, lt=1)]]
     """Error relative to the displacement at the end; each of several values is a target of its own."""
     peer: str | None = None
-    """Baseline: a third-party integrator, by name (`springbench run SCENE --error E --peers` lists them)."""
+    """Baseline: a third-party integrator, by name (`springbench run SCENE --error E --compare` lists them)."""
     integrator: OneOrMany[IntegratorName] | None = None
     """Baseline instead of `peer`: fixed step sizes by these integrators ..."""
     solver: OneOrMany[str] = ()

@@ -49,13 +49,13 @@ def open_scheduler(scheduler_address: str) -> Generator[Any]:
     if kind == "local":
         if not many.isdecimal() or not 1 <= int(many) <= 1024:
             raise InputError(
-                InputMistake(f"came {scheduler_address}; wanted local:N with a number of workers", key="--on")
+                InputMistake(f"came {scheduler_address}; wanted local:N with a number of workers", key="--scheduler")
             )
         try:
             secure = Security.temporary()
         except ImportError:
             raise InputError(
-                InputMistake("needs cryptography: pip install 'springbench[cluster]'", key="--on")
+                InputMistake("needs cryptography: pip install 'springbench[cluster]'", key="--scheduler")
             ) from None
         quiet: Any = {"dashboard_address": None, "silence_logs": DASK_LOG_LEVEL}
         with config.set({"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}):

@@ -111,7 +111,7 @@ def select_missing_units(
     if older := [p.title for p in planned if p.completion_status.is_stale and not to_do(p)]:
         more = f" and {len(older) - _MAX_LISTED_UNITS} more" if len(older) > _MAX_LISTED_UNITS else ""
         print_message(f"{len(older)} of them by other code than today's: {', '.join(older[:_MAX_LISTED_UNITS])}{more}")
-        print_message("--changed does these again, --again does all")
+        print_message("--rerun-stale does these again, --rerun does all")
     for p in todo:
         if p.completion_status.damage_reason:
             print_message(f"{p.completion_status.damage_reason}; {p.title} is done again")

@@ -141,7 +141,7 @@ def connect_cluster(
         except (OSError, ValueError) as error:
             why = f"no scheduler answers within {CONNECT_TIMEOUT:g} s ({' '.join(str(error).split())[:200]})"
             raise InputError(
-                InputMistake(f"{scheduler_address}: {why}; start one with `dask scheduler`", key="--on")
+                InputMistake(f"{scheduler_address}: {why}; start one with `dask scheduler`", key="--scheduler")
             ) from None
         # Dask's log would print tracebacks in addition to the message about a lost scheduler.
         with silence_logging_cmgr(DASK_LOG_LEVEL), client, client.as_current():
@@ -152,7 +152,7 @@ def connect_cluster(
                 except TimeoutError:
                     if not waits:
                         why = f"the scheduler has no worker; start some with `dask worker {scheduler_address} --nthreads 1`"
-                        raise InputError(InputMistake(f"{scheduler_address}: {why}", key="--on")) from None
+                        raise InputError(InputMistake(f"{scheduler_address}: {why}", key="--scheduler")) from None
                     print_message(f"{scheduler_address}: no worker has come yet")
             yield DaskCluster(client, check_workers(client, runs, print_message))
 
@@ -193,10 +193,10 @@ def check_workers(client: Client, runs: Sequence[RunSpec], print_message: Callab
                 f"the clock of {worker} is {abs(off):.0f} s {'ahead' if off > 0 else 'behind'}; its rows tell by it"
             )
     if problems:
-        raise InputError([InputMistake(problem, key="--on") for problem in problems])
+        raise InputError([InputMistake(problem, key="--scheduler") for problem in problems])
     answers = [said for said in found.values() if not isinstance(said, OSError)]
     if not answers:
-        raise InputError(InputMistake("all workers were lost; start others", key="--on"))
+        raise InputError(InputMistake("all workers were lost; start others", key="--scheduler"))
     return sorted({about.machine_id for about, _ in answers})
 
 

@@ -43,7 +43,9 @@ def _connect_cluster(
     try:
         from springbench.harness.experiments.dask_cluster import connect_cluster
     except ModuleNotFoundError as error:
-        raise InputError(InputMistake(f"needs {error.name}: pip install 'springbench[cluster]'", key="--on")) from None
+        raise InputError(
+            InputMistake(f"needs {error.name}: pip install 'springbench[cluster]'", key="--scheduler")
+        ) from None
     return connect_cluster(scheduler_address, runs, print_message)
 
 
@@ -83,7 +85,7 @@ def run_sweep(
         RunFailed: the drawing process was lost.
     """
     if scheduler_address and (positions or not isolated):
-        raise InputError("--positions and --here are of this machine; leave --on out")
+        raise InputError("--positions and --in-process are of this machine; leave --scheduler out")
     if positions and len(runs) != 1:
         raise InputError(f"--positions stores the positions of one run; this is {len(runs)} runs")
     if not scheduler_address:

@@ -216,7 +216,7 @@ def read_network(source: RecordingSource) -> dict[str, NDArray[Any]]:
         # Rerun writes no column for an empty array: a mesh without springs, or without pins.
         none = dict.fromkeys(("springs", "rest_lengths", "pinned"), np.empty(0))
         if "layout" not in names or int(read_cell(batch, "layout")[0]) != LAYOUT_VERSION:
-            problem = "is laid out as another version of springbench did it; do its run again, with --again"
+            problem = "is laid out as another version of springbench did it; do its run again, with --rerun"
             raise InputError(InputMistake(problem, file=source.path))
         return none | {name: read_cell(batch, name) for name in names}
     names = f"application {source.application!r}"

@@ -104,7 +104,7 @@ class PerturbationGrowth:
     def _suggest_alternative(self, error: float, least: float) -> str:
         longest = self.compute_longest_horizon(error)
         possible = [f"an --error of {_round_digits(ceil, least, 2):g} or more"] if least < 1.0 else []
-        possible += [f"a --horizon of {longest:g} s or less"] if longest else []
+        possible += [f"a --t-end of {longest:g} s or less"] if longest else []
         return f"ask for {', or '.join(possible) or 'another scene'}"
 
 

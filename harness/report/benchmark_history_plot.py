@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Plot of `springbench history`: one panel per benchmark with results by commit, levels and changes."""
+"""Plot of `springbench regress-history`: one panel per benchmark with results by commit, levels and changes."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 It finds regressions in time, and other changes. Runs are paired by their inputs, and compared step by step
 (`springbench.harness.results.bootstrap_statistics.estimate_slowdown`). The load of the machine may have differed
 between the two
-results, and statistics cannot detect that: hence a margin beyond the interval, and `springbench gate --against` for
+results, and statistics cannot detect that: hence a margin beyond the interval, and `springbench regress --against` for
 smaller changes. Times of two machines are not comparable; with a baseline solver that both ran, the ratios to it are.
 """
 

@@ -291,7 +291,7 @@ class _AdaptiveIntegration:
         return StepSizeUnderflow(
             f"frame {len(self._seen)}, after {time:.6g} s: even a step of {MIN_RELATIVE_STEP:g} s {cause}; up to there "
             f"{self._accepted} steps kept to {self._tolerance:.2g} m: forces are too sudden there, or round-off is "
-            "larger; ask for a larger --error or a shorter --horizon"
+            "larger; ask for a larger --error or a shorter --t-end"
         )
 
 

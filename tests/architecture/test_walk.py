@@ -103,7 +103,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> list[Call]:
     (folder / "sweep.yaml").write_text(SWEEP)
 
     def run() -> None:
-        asked = ["run", str(folder / "sweep.yaml"), "--here", "--again", "--results", str(folder / "results")]
+        asked = ["run", str(folder / "sweep.yaml"), "--in-process", "--rerun", "--results", str(folder / "results")]
         told = CliRunner().invoke(app, asked)
         assert told.exit_code == 0, told.output
 

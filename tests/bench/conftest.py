@@ -5,7 +5,6 @@ import os
 from typing import Any
 
 import pytest
-from springbench.harness.execution import machine_info
 from threadpoolctl import threadpool_info
 
 from tests.bench.gates import THREADS

@@ -132,7 +132,7 @@ def test_the_results_of_another_scene_of_this_name_are_left_alone(scene: Path) -
 def test_an_error_that_nothing_keeps_to_is_told_with_the_nearest(scene: Path) -> None:
     with pytest.raises(RunFailed, match=r"nothing that was measured keeps to an error of 1e-08 .* midpoint") as told:
         asked(scene, 1e-8)
-    assert "ask for a larger --error or a shorter --horizon" in str(told.value)
+    assert "ask for a larger --error or a shorter --t-end" in str(told.value)
 
 
 def test_a_budget_that_is_used_up_is_stated_and_the_search_goes_on_from_there(scene: Path) -> None:
@@ -162,7 +162,7 @@ def test_the_command_shows_what_it_predicts_and_what_it_measured(
     scene: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     results = str(scene.parent / "results")
-    options = ["--error", "0.1", "--horizon", "0.2", "--results", results]
+    options = ["--error", "0.1", "--t-end", "0.2", "--results", results]
     monkeypatch.setattr("sys.argv", ["springbench", "recommend", str(scene), *options])
     with pytest.raises(SystemExit) as ended:
         main()

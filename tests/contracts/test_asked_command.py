@@ -36,11 +36,11 @@ SCENES = Path(__file__).parents[2] / "configs" / "scenes"
     [
         (("--error", "2"), "--error: came 2; wanted a number between 0 and 1"),
         (("--error", "nan"), "--error: came nan"),
-        (("--error", "1e-3", "--horizon", "-1"), "--horizon: came -1; wanted seconds above 0"),
+        (("--error", "1e-3", "--t-end", "-1"), "--t-end: came -1; wanted seconds above 0"),
         (("--error", "1e-3", "--solver", "newton"), "--solver: with --error, solver and steps are chosen"),
         (("--error", "1e-3", "--integrator", "bdf2"), "--integrator: with --error"),
-        (("--horizon", "1"), "--horizon: is of a run with --error"),
-        (("--check",), "--check: is of a run with --error"),
+        (("--t-end", "1"), "--t-end: is of a run with --error"),
+        (("--verify",), "--verify: is of a run with --error"),
     ],
 )
 def test_what_cannot_be_asked_is_the_users_mistake(options, told, tmp_path, capsys):
@@ -52,14 +52,14 @@ def test_what_cannot_be_asked_is_the_users_mistake(options, told, tmp_path, caps
 
 def rows_of(folder: Path, *options: str) -> list[dict[str, Any]]:
     """The rows that a run of a small chain to an error leaves."""
-    given = ["run", str(SCENES / "chain.yaml"), "--size", "5", "--error", "1e-3", "--horizon", "0.2", *options]
+    given = ["run", str(SCENES / "chain.yaml"), "--size", "5", "--error", "1e-3", "--t-end", "0.2", *options]
     found = CliRunner().invoke(app, [*given, "--results", str(folder)])
     assert found.exit_code == 0, found.output
     return parquet_rows.read_rows((folder / "chain" / "accuracy").glob("*.parquet"), ACCURACY_SCHEMA).to_pylist()
 
 
 def test_a_run_to_an_error_leaves_its_row_its_recording_and_its_positions(tmp_path):
-    row, *tried = rows_of(tmp_path, "--check", "--positions", str(tmp_path / "p.npz"))
+    row, *tried = rows_of(tmp_path, "--verify", "--positions", str(tmp_path / "p.npz"))
     assert row["kind"] == "asked"
     assert {"way"} == {one["kind"] for one in tried}
     assert all(one["promised"] > 0.0 for one in tried)
@@ -71,7 +71,9 @@ def test_a_run_to_an_error_leaves_its_row_its_recording_and_its_positions(tmp_pa
 
 def test_what_rows_measured_before_tell_to_be_dear_is_not_tried_again(tmp_path, monkeypatch):
     few = [("own", SolverSpec(name, {})) for name in ("velocity-verlet", "blanes-moan-4", "rodas")]  # the last is dear
-    monkeypatch.setattr("springbench.harness.experiments.error_control.candidate_methods.list_candidate_methods", lambda: few)
+    monkeypatch.setattr(
+        "springbench.harness.experiments.error_control.candidate_methods.list_candidate_methods", lambda: few
+    )
     monkeypatch.setattr("springbench.harness.experiments.error_control.stored_trials.tried", lambda: few)
     asked = ErrorTarget.from_scene(load_scene(SCENES / "single-spring.yaml"), 2, 0.2)
     seen = compute_predictability_horizon(asked, 1e-3, lambda line: None)
@@ -98,7 +100,7 @@ def test_what_rows_measured_before_tell_to_be_dear_is_not_tried_again(tmp_path, 
 
 @pytest.mark.long
 def test_peers_have_rows_beside_it(tmp_path):
-    beside = [row for row in rows_of(tmp_path, "--peers") if row["kind"] == "peer"]
+    beside = [row for row in rows_of(tmp_path, "--compare") if row["kind"] == "peer"]
     assert [peer["solver"] for peer in beside] == list(THIRD_PARTY_INTEGRATORS)
     assert all(peer["reason"] or peer["estimated"] <= 1e-3 for peer in beside)
     assert [peer["status"] for peer in beside][:2] == ["ok", "ok"]

@@ -227,14 +227,14 @@ def test_growth_does_not_depend_on_the_time_step_and_ends_where_nothing_is_known
 
 def test_a_refusal_names_the_longest_horizon_that_works(tmp_path):
     asked, error = ErrorTarget.from_scene(CRUMPLING, 7, 1.6), 1e-7
-    with pytest.raises(UnpredictableMotion, match=r"after 1.6 s .* a --horizon of [\d.]+ s or less") as refused:
+    with pytest.raises(UnpredictableMotion, match=r"after 1.6 s .* a --t-end of [\d.]+ s or less") as refused:
         compute_predictability_horizon(asked, error, lambda line: None)
-    horizon = float(str(refused.value).rpartition("--horizon of ")[2].split()[0])
+    horizon = float(str(refused.value).rpartition("--t-end of ")[2].split()[0])
     assert 0.3 < horizon < 1.6
     compute_predictability_horizon(ErrorTarget.from_scene(CRUMPLING, 7, horizon), error, lambda line: None)
     kept = ReferenceStore(tmp_path)
     assert kept.load_trajectory(CRUMPLING, 7, [horizon], error=error).growth[0] <= 0.1 * error
-    with pytest.raises(UnpredictableMotion, match=f"a --horizon of {horizon:g} s or less"):
+    with pytest.raises(UnpredictableMotion, match=f"a --t-end of {horizon:g} s or less"):
         kept.load_trajectory(CRUMPLING, 7, [1.6], error=error)
 
 

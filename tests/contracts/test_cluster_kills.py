@@ -94,7 +94,7 @@ class Sweep(NamedTuple):
         return cls(folder / "sweep.yaml", folder / "r" / "sweep" / "rows")
 
     def begin(self, address: str) -> subprocess.Popen[str]:
-        command = ["run", str(self.config), "--results", str(self.rows.parents[1]), "--on", address]
+        command = ["run", str(self.config), "--results", str(self.rows.parents[1]), "--scheduler", address]
         return subprocess.Popen([sys.executable, "-m", "harness", *command], cwd=ROOT, stdout=-1, stderr=-2, text=True)
 
     def done(self) -> dict[str, tuple[int, int]]:

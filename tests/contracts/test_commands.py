@@ -84,7 +84,7 @@ schema
 show configs/scenes/curtain.yaml
 run configs/scenes/hanging-cloth.yaml --size 8
 recommend configs/scenes/chain.yaml --error 1e-2
-run configs/scenes/chain.yaml --error 1e-4 --horizon 2 --check
+run configs/scenes/chain.yaml --error 1e-4 --t-end 2 --verify
 repeat configs/engines.yaml
 ablate configs/scenes/pulled-curtain.yaml
 report results

@@ -26,7 +26,7 @@ options: {frames: 3, rounds: 2, iterations: 20}
 
 
 def did(*words: str) -> str:
-    told = CliRunner().invoke(app, [*words, "--here"])
+    told = CliRunner().invoke(app, [*words, "--in-process"])
     assert told.exit_code == 0, told.output
     return told.output
 

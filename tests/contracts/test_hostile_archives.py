@@ -35,13 +35,13 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Content:
 @pytest.mark.parametrize("name", each(CHANGES))
 def test_a_hostile_archive_is_not_confirmed(name: str, good: Content, tmp_path: Path):
     archive(name, good, tmp_path / "x.zip")
-    require_answer(attempt(tmp_path, ["verify", "x.zip", "--seed", "1"]), 1, 2, 3)
+    require_answer(attempt(tmp_path, ["verify-archive", "x.zip", "--seed", "1"]), 1, 2, 3)
 
 
 @pytest.mark.parametrize("name", each(RAW))
 def test_what_is_no_archive_of_ours_is_refused(name: str, tmp_path: Path):
     (tmp_path / "x.zip").write_bytes(RAW[name]())
-    require_answer(attempt(tmp_path, ["verify", "x.zip"]), 1, 2)
+    require_answer(attempt(tmp_path, ["verify-archive", "x.zip"]), 1, 2)
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,7 @@ def test_what_is_no_file_is_refused(what: str, tmp_path: Path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
     (tmp_path / "loop").symlink_to("loop")
-    require_answer(attempt(tmp_path, ["verify", what]), 2)
+    require_answer(attempt(tmp_path, ["verify-archive", what]), 2)
 
 
 @pytest.mark.parametrize("name", each(FOLDERS))
@@ -71,7 +71,7 @@ def test_hostile_results_are_answered_by_all_commands(name: str, tmp_path: Path)
             ["compact", "results"],
             ["merge", "clean", "results", "-o", "results/../results-merged"],
             ["publish", "results", "-o", "results-published.zip"],
-            ["gate", "clean", "results"],
+            ["regress", "clean", "results"],
             ["query", "SELECT count(*) FROM rows", "--results", "results"],
         )
     ):

@@ -48,7 +48,7 @@ def require_answer(outcome: Outcome, *codes: int) -> None:
 @pytest.mark.parametrize("name", each(TABLES))
 def test_a_hostile_table_is_refused_by_name(name: str, folder: Path):
     put(folder / "hostile.yaml", TABLES[name])
-    outcome = attempt(folder, ["gate", "hostile.yaml", "--budget", "0.1"])
+    outcome = attempt(folder, ["regress", "hostile.yaml", "--budget", "0.1"])
     require_answer(outcome, 2)
     assert "hostile.yaml" in outcome.said
 
@@ -56,8 +56,8 @@ def test_a_hostile_table_is_refused_by_name(name: str, folder: Path):
 @pytest.mark.parametrize("name", each(RECORDS))
 def test_a_hostile_record_is_answered(name: str, folder: Path):
     put(folder / "hostile.json", RECORDS[name])
-    require_answer(attempt(folder, ["gate", "hostile.json", "hostile.json"]), 0, 2, 3)
-    require_answer(attempt(folder, ["history", "hostile.json", "-o", "results/history.png"]), 2, 3)
+    require_answer(attempt(folder, ["regress", "hostile.json", "hostile.json"]), 0, 2, 3)
+    require_answer(attempt(folder, ["regress-history", "hostile.json", "-o", "results/history.png"]), 2, 3)
 
 
 @pytest.mark.long

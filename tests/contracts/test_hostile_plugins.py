@@ -54,7 +54,7 @@ def test_a_command_survives_its_plugins(name: str, tmp_path: Path, monkeypatch: 
 
 LOOKS = [
     *(("list", name) for name in HOSTILE),
-    *(("show", name) for name, case in HOSTILE.items() if case.part in ("effect", "mesh")),
+    *(("preview", name) for name, case in HOSTILE.items() if case.part in ("effect", "mesh")),
 ]
 
 
@@ -66,7 +66,7 @@ def test_listing_and_showing_survive_plugins(command: str, name: str, tmp_path: 
     write(tmp_path, case)
     monkeypatch.chdir(tmp_path)
     before, began = state(), monotonic()
-    arguments = ["list", "sweep.yaml"] if command == "list" else ["show", "odd.yaml", "-o", "picture.png"]
+    arguments = ["list", "sweep.yaml"] if command == "list" else ["preview", "odd.yaml", "-o", "picture.png"]
     told = CliRunner().invoke(app, arguments)
     assert told.exit_code in ((0, 2) if command == "list" else (0, 1, 2)), told.output[-3000:]
     assert told.exception is None or isinstance(told.exception, SystemExit)

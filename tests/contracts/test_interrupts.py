@@ -53,7 +53,7 @@ def test_ctrl_c_while_modules_are_imported(seconds: float):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("where", [(), ("--on", "local:2")], ids=["here", "dask"])
+@pytest.mark.parametrize("where", [(), ("--scheduler", "local:2")], ids=["here", "dask"])
 @pytest.mark.parametrize("seed", range(20))
 def test_ctrl_c_at_a_random_moment(seed: int, where: tuple[str, ...], tmp_path: Path):
     sweep = tmp_path / "sweep.yaml"

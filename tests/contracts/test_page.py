@@ -192,7 +192,7 @@ def test_a_run_says_what_it_was_and_how_to_repeat_it_by_keys_alone(tab: Tab, pag
     panel = shown.get_by_role("complementary")
     panel.get_by_role("heading", level=2).wait_for()
     said = panel.inner_text()
-    for words in ("1" * 10, "A processor of 3 GHz", "--again", "Liu, Bargteil", "frames, rounds"):
+    for words in ("1" * 10, "A processor of 3 GHz", "--rerun", "Liu, Bargteil", "frames, rounds"):
         assert words in said
     shown.wait_for_function("document.activeElement.matches('aside')")
     shown.keyboard.press("Escape")

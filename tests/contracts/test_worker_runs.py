@@ -118,7 +118,7 @@ def test_a_debugger_can_have_the_runs_in_its_own_process(tmp_path: Path, monkeyp
     assert (told := ran(made)).exit_code == 0, told.output
     module = made.solver_path.stem
     assert not hasattr(sys.modules.get(module), "seen")
-    assert ran(made, "--again", "--here").exit_code == 0
+    assert ran(made, "--rerun", "--in-process").exit_code == 0
     assert sys.modules[module].seen == os.getpid()
 
 

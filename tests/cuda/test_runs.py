@@ -31,7 +31,7 @@ def ran(folder: Path) -> tuple[Result, list[list[dict[str, Any]]]]:
     (folder / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     sweep = folder / "sweep.yaml"
     sweep.write_text(SWEEP)
-    told = CliRunner().invoke(app, ["run", str(sweep), "--results", str(folder / "r"), "--here"])
+    told = CliRunner().invoke(app, ["run", str(sweep), "--results", str(folder / "r"), "--in-process"])
     found = [
         parquet_rows.read_rows([RunFiles.for_run(run, folder / "r" / "sweep").rows_path]).to_pylist()
         for run in load_config(sweep).list_runs()

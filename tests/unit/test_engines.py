@@ -275,10 +275,10 @@ def test_the_script_that_is_printed_ends_where_the_run_did(
     (tmp_path / "net.yaml").write_text(NET)
     config = tmp_path / "config.yaml"
     config.write_text(CONFIG.format(engine=name))
-    listed = CliRunner().invoke(app, ["repeat", str(config)])
+    listed = CliRunner().invoke(app, ["export-script", str(config)])
     (line,) = [line for line in listed.stdout.splitlines() if f"net-3-work-{name}" in line]
     point = line.split()[0]
-    told = CliRunner().invoke(app, ["repeat", str(config), point[-6:], "-o", str(tmp_path)])
+    told = CliRunner().invoke(app, ["export-script", str(config), point[-6:], "-o", str(tmp_path)])
     assert told.exit_code == 0, told.output
     assert (tmp_path / f"{point}.py").read_text() in told.stdout
     monkeypatch.chdir(tmp_path)
@@ -292,5 +292,5 @@ def test_the_script_that_is_printed_ends_where_the_run_did(
 def test_a_point_of_none_or_of_several_is_a_mistake(tmp_path: Path):
     (tmp_path / "net.yaml").write_text(NET)
     (tmp_path / "config.yaml").write_text(CONFIG.format(engine="mujoco"))
-    told = CliRunner().invoke(app, ["repeat", str(tmp_path / "config.yaml"), "nothing"])
+    told = CliRunner().invoke(app, ["export-script", str(tmp_path / "config.yaml"), "nothing"])
     assert told.exit_code == 2

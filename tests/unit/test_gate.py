@@ -1,4 +1,4 @@
-"""`springbench gate`: what counts as a regression between two stored benchmark files."""
+"""`springbench regress`: what counts as a regression between two stored benchmark files."""
 
 import io
 import json
@@ -130,7 +130,7 @@ def test_files_without_a_common_benchmark_tell_nothing(tmp_path: Path):
 def test_the_command_line_answers_with_the_exit_code(new: float | None, code: int, tmp_path: Path):
     base = stored(tmp_path / "base.json", benchmark(ratio=ratio(1.0)))
     other = stored(tmp_path / "new.json", benchmark(ratio=ratio(new))) if new else tmp_path / "missing.json"
-    assert CliRunner().invoke(app, ["gate", str(base), str(other)]).exit_code == code
+    assert CliRunner().invoke(app, ["regress", str(base), str(other)]).exit_code == code
 
 
 BENCHMARK = """

@@ -1,4 +1,4 @@
-"""`springbench gate --against REVISION`, in small repositories whose gates do arithmetic instead of physics."""
+"""`springbench regress --against REVISION`, in small repositories whose gates do arithmetic instead of physics."""
 
 import re
 import subprocess
@@ -73,7 +73,7 @@ def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def gate(*arguments: str) -> tuple[int, str]:
-    done = CliRunner().invoke(app, ["gate", *arguments])
+    done = CliRunner().invoke(app, ["regress", *arguments])
     return done.exit_code, " ".join(done.output.split())
 
 
@@ -147,8 +147,8 @@ def test_a_revision_whose_libraries_cannot_be_had_does_not_build(repository: Pat
         (("--against", "HEAD", "--limit", "-1"), "--limit: came -1.0; wanted a ratio of times"),
         (("-k", "old"), "-k: chooses gates to compare with another revision; wanted --against REVISION"),
         (("a.json", "b.json", "--budget", "3"), "--budget: nothing is timed between stored results"),
-        (("a.json",), "gate: came 1 file; wanted --against REVISION, a table of gates, or two stored"),
-        ((), "gate: came 0 files; wanted --against REVISION, a table of gates, or two stored"),
+        (("a.json",), "regress: came 1 file; wanted --against REVISION, a table of gates, or two stored"),
+        ((), "regress: came 0 files; wanted --against REVISION, a table of gates, or two stored"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )

@@ -115,7 +115,7 @@ def test_other_answers(race): race.solvers("cloth.yaml", "xpbd", "sparse", limit
 
 
 def gate(path: Path, *options: str) -> tuple[int, str]:
-    done = CliRunner().invoke(app, ["gate", str(path), *options])
+    done = CliRunner().invoke(app, ["regress", str(path), *options])
     return done.exit_code, " ".join(done.output.split())
 
 

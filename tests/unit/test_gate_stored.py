@@ -1,4 +1,4 @@
-"""`springbench gate OLD NEW` for results of sweeps: folders and archives, paired by run."""
+"""`springbench regress OLD NEW` for results of sweeps: folders and archives, paired by run."""
 
 import shutil
 import tarfile
@@ -32,7 +32,7 @@ def results(folder: Path, *runs: dict[str, Any]) -> Path:
 
 
 def gate(*arguments: str | Path) -> tuple[int, str]:
-    done = CliRunner().invoke(app, ["gate", *map(str, arguments)], catch_exceptions=False)
+    done = CliRunner().invoke(app, ["regress", *map(str, arguments)], catch_exceptions=False)
     return done.exit_code, " ".join(done.output.split())
 
 

@@ -89,7 +89,7 @@ def test_turns_are_recorded_and_replayed_by_the_command(tmp_path: Path, monkeypa
     samples = tmp_path / "samples.parquet"
     given = ["record", str(samples), "cloth.yaml", "--solver", "sparse", "--seconds", "1", "--planted", "0.1"]
     for starts in ("2", "1"):  # what is stored already is kept
-        done = CliRunner().invoke(app, ["gate-study", *given, "--starts", starts])
+        done = CliRunner().invoke(app, ["regress-study", *given, "--starts", starts])
         assert done.exit_code == 0, done.output
     recorded = parquet_rows.read_rows([samples], RECORD_SCHEMA).to_pylist()
     assert {row["start"] for row in recorded} == {0, 1, 2}
@@ -97,7 +97,7 @@ def test_turns_are_recorded_and_replayed_by_the_command(tmp_path: Path, monkeypa
     ((key, found),) = read_recorded_blocks([samples]).items()
     assert key == ("cloth, size 4, sparse, 50 iterations, implicit-euler, dt 0.03333", "nothing")
     assert sum(len(start.log_ratios) for start in found) == len(recorded)
-    done = CliRunner().invoke(app, ["gate-study", "replay", str(samples), "--replays", "20"])
+    done = CliRunner().invoke(app, ["regress-study", "replay", str(samples), "--replays", "20"])
     assert done.exit_code == 0, done.output
     assert "asv continuous" in done.output
 
@@ -107,7 +107,18 @@ def test_real_gates_are_held_and_counted_and_kept(tmp_path: Path, monkeypatch: p
     (tmp_path / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("springbench.harness.experiments.regression.git_worktrees.find_checkout", lambda folder: folder)
-    given = ["gate-study", "live", "held.parquet", "cloth.yaml", "--solver", "sparse", "--budget", "20", "--limit", "2"]
+    given = [
+        "regress-study",
+        "live",
+        "held.parquet",
+        "cloth.yaml",
+        "--solver",
+        "sparse",
+        "--budget",
+        "20",
+        "--limit",
+        "2",
+    ]
     assert CliRunner().invoke(app, [*given, "--gates", "2"]).exit_code == 0
     done = CliRunner().invoke(app, [*given, "--gates", "1", "--planted", "4"])
     assert done.exit_code == 0, done.output
@@ -126,7 +137,7 @@ def test_real_gates_are_held_and_counted_and_kept(tmp_path: Path, monkeypatch: p
             ("record", "new.parquet", "cloth.yaml", "--condition", "windy"),
             "--condition: came windy; wanted one of nothing",
         ),
-        (("replay", "nowhere.parquet"), "nowhere.parquet: no such file; `springbench gate-study record` makes one"),
+        (("replay", "nowhere.parquet"), "nowhere.parquet: no such file; `springbench regress-study record` makes one"),
     ],
 )
 def test_a_mistake_is_one_message(
@@ -135,6 +146,6 @@ def test_a_mistake_is_one_message(
     (tmp_path / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("springbench.harness.experiments.regression.git_worktrees.find_checkout", lambda folder: folder)
-    done = CliRunner().invoke(app, ["gate-study", *arguments])
+    done = CliRunner().invoke(app, ["regress-study", *arguments])
     assert done.exit_code == 2, done.output
     assert said in " ".join(done.output.split())

@@ -77,7 +77,7 @@ def test_what_cannot_be_a_goal_is_refused(tmp_path: Path, goal: str, said: str) 
 
 def test_other_commands_name_the_one_for_goals(tmp_path: Path) -> None:
     path = config(tmp_path, "[{scene: spring, horizon: 0.2, error: 1e-3, peer: scipy-rk45, wanted: 1}]")
-    with pytest.raises(InputError, match="springbench goals"):
+    with pytest.raises(InputError, match="springbench targets"):
         load_config(path)
 
 
@@ -89,7 +89,7 @@ def test_goals_are_timed_beside_a_peer_and_steps_of_one_length(tmp_path: Path) -
     path = config(
         tmp_path, "[" + ", ".join(f"{{scene: spring, horizon: 0.2, error: 1e-3, {a}}}" for a in against) + "]"
     )
-    done = CliRunner().invoke(app, ["goals", str(path), "--results", str(tmp_path / "results")])
+    done = CliRunner().invoke(app, ["targets", str(path), "--results", str(tmp_path / "results")])
     assert done.exit_code == 1, done.output
     assert "does not hold" in done.output
     found = parquet_rows.read_rows(
@@ -110,7 +110,7 @@ def test_what_takes_too_long_is_a_bound_of_the_goal(tmp_path: Path, monkeypatch:
     path = config(
         tmp_path, "[{scene: spring, horizon: 0.2, error: 1e-3, integrator: midpoint, solver: newton, wanted: 1e-9}]"
     )
-    done = CliRunner().invoke(app, ["goals", str(path), "--results", str(tmp_path / "results")])
+    done = CliRunner().invoke(app, ["targets", str(path), "--results", str(tmp_path / "results")])
     assert done.exit_code == 1, done.output
     assert "an error of" in done.output
     assert "at most" in done.output

@@ -1,4 +1,4 @@
-"""`springbench history`: changes are found where they are, noise is none, and too little is said to be so."""
+"""`springbench regress-history`: changes are found where they are, noise is none, and too little is said to be so."""
 
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,7 @@ def test_the_command_tells_them_and_draws_a_picture(tmp_path: Path, ratio: bool)
         {"test_slower": build_ratio_series(2, 12, (6, 1.2)), "test_same": build_ratio_series(3, 12)},
         is_ratio=ratio,
     )
-    told = CliRunner().invoke(app, ["history", str(folder), "-o", str(tmp_path / "history.png")])
+    told = CliRunner().invoke(app, ["regress-history", str(folder), "-o", str(tmp_path / "history.png")])
     assert told.exit_code == 0, told.output
     assert "% at 0000006" in told.output
     assert imread(tmp_path / "history.png").std() > 0
@@ -62,7 +62,7 @@ def test_the_command_tells_them_and_draws_a_picture(tmp_path: Path, ratio: bool)
 
 def test_too_little_is_said_to_be_so_and_is_no_answer(tmp_path: Path):
     folder = write_benchmark_files(tmp_path / "bench", {"test_slower": build_ratio_series(2, 5, (3, 2.0))})
-    told = CliRunner().invoke(app, ["history", str(folder), "-o", str(tmp_path / "history.png")])
+    told = CliRunner().invoke(app, ["regress-history", str(folder), "-o", str(tmp_path / "history.png")])
     assert told.exit_code == 3
     assert "at most 5 results of a gate, wanted 6; `pytest tests/bench" in " ".join(told.output.split())
     assert not (tmp_path / "history.png").exists()
@@ -76,5 +76,5 @@ def test_what_is_no_stored_result_is_named(tmp_path: Path):
         (tmp_path / "empty", "no stored results"),
         (tmp_path / "no", "not there"),
     ):
-        told = CliRunner().invoke(app, ["history", str(place)])
+        told = CliRunner().invoke(app, ["regress-history", str(place)])
         assert (told.exit_code, said in told.output) == (2, True), told.output

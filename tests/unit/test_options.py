@@ -27,7 +27,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_the_command_line_gives_numbers_as_numbers(folder: Path) -> None:
     given = ["run", str(folder / "cloth.yaml"), "--frames", "1", "--tolerance", "1e-2", "--threads", "auto"]
-    done = CliRunner().invoke(app, [*given, "--size", "4", "--here", "--results", str(folder / "results")])
+    done = CliRunner().invoke(app, [*given, "--size", "4", "--in-process", "--results", str(folder / "results")])
     assert done.exit_code == 0, done.output
 
 
@@ -100,7 +100,9 @@ def test_an_error_asked_beside_stated_steps_is_one_run_and_has_no_part_in_the_ot
 def test_a_sweep_keeps_to_an_error_and_its_rows_say_what_it_took(folder: Path) -> None:
     (folder / "cloth.yaml").write_text(f"{CLOTH}  - {{kind: gravity}}\n  - {{kind: pins, at: [top_corners]}}\n")
     (folder / "sweep.yaml").write_text(SWEEP.format("dormand-prince-8, xpbd", "accuracy: 1e-3, pictures: false"))
-    done = CliRunner().invoke(app, ["run", str(folder / "sweep.yaml"), "--here", "--results", str(folder / "results")])
+    done = CliRunner().invoke(
+        app, ["run", str(folder / "sweep.yaml"), "--in-process", "--results", str(folder / "results")]
+    )
     assert done.exit_code == 1, done.output
     assert "xpbd: tells no error of its steps" in done.output
     (file,) = (folder / "results" / "sweep" / "rows").glob("*-dormand-prince-8-*.parquet")
@@ -114,5 +116,5 @@ def test_a_sweep_keeps_to_an_error_and_its_rows_say_what_it_took(folder: Path) -
 def test_speed_compares_steps_as_they_are_stated(folder: Path) -> None:
     for options in ("accuracy: 1e-2", "tolerance: auto"):
         (folder / "sweep.yaml").write_text(SWEEP.format("newton", options))
-        done = CliRunner().invoke(app, ["speed", str(folder / "sweep.yaml"), "--results", str(folder / "results")])
+        done = CliRunner().invoke(app, ["roofline", str(folder / "sweep.yaml"), "--results", str(folder / "results")])
         assert done.exit_code == 2, done.output

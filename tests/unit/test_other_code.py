@@ -41,7 +41,7 @@ def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PluginSweep:
 def ran(made: PluginSweep, *options: str) -> str:
     """What the command says, in lines without breaks."""
     told = CliRunner().invoke(
-        app, ["run", str(made.sweep_path), "--here", "--results", str(made.sweep_path.parent / "r"), *options]
+        app, ["run", str(made.sweep_path), "--in-process", "--results", str(made.sweep_path.parent / "r"), *options]
     )
     assert told.exit_code == 0, told.output
     return re.sub(r"\s+", " ", told.output)
@@ -60,14 +60,14 @@ def test_run_says_which_rows_are_of_other_code_and_the_table_marks_them(done: Pl
     before = started(done)
     told = ran(done)
     assert "2 of 2 runs are there already" in told
-    assert "1 of them by other code than today's: scene 4 mine --changed does these again" in told
+    assert "1 of them by other code than today's: scene 4 mine --rerun-stale does these again" in told
     assert re.search(r" 4 mine [^a-z]+ iterations† ", told)
     assert "† by other code than today's" in told
     assert re.search(r" 4 sparse [^a-z]+ iterations [^†]", told)
     assert started(done) == before
 
 
-@pytest.mark.parametrize(("option", "redone"), [("--changed", {"mine"}), ("--again", {"mine", "sparse"})])
+@pytest.mark.parametrize(("option", "redone"), [("--rerun-stale", {"mine"}), ("--rerun", {"mine", "sparse"})])
 def test_other_code_s_rows_are_done_again_on_request(done: PluginSweep, option: str, redone: set[str]):
     before = started(done)
     assert "other code" not in ran(done, option)

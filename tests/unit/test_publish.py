@@ -109,7 +109,7 @@ def test_an_archive_that_was_changed_is_named_and_none_of_it_is_run(home: Path, 
         content["mine.py"] = b"raise SystemExit"
         del content["CITATION.cff"]
 
-    told = command("verify", changed(home / "x.zip", tmp_path / "y.zip", change, sums=False))
+    told = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=False))
     assert told.exit_code == 1
     for line in ("sweep.yaml: does not hold (was changed)", "mine.py: does not hold (was not", "(missing)"):
         assert line in told.output
@@ -224,7 +224,7 @@ def test_runs_that_no_config_asks_for_cannot_be_told(home: Path, tmp_path: Path)
         made_up = [row | {"run_id": "f" * 12, "solver": "magic"} for row in build_dummy_rows(1)]
         content["results/sweep/rows/cloth-4-magic.parquet"] = parquet_rows.encode_rows(made_up)
 
-    told = command("verify", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True), "--seed", "1")
+    told = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True), "--seed", "1")
     assert "1 of 3 runs of sweep: cannot tell (the config asks for none such)" in told.output
     assert told.exit_code == (1 if "does not hold" in told.output else 3), told.output
     assert "no repeat confirms these columns: " in told.output
@@ -240,7 +240,7 @@ def test_rows_that_lie_under_true_checksums_do_not_hold(home: Path, tmp_path: Pa
             )
             content[name] = (tmp_path / "x.parquet").read_bytes()
 
-    told = command("verify", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True))
+    told = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True))
     assert told.exit_code == 1, told.output
     assert "positions: does not hold (they differ from step 1 of 2 on)" in told.output
 
@@ -249,7 +249,7 @@ def test_an_archive_whose_results_lead_to_another_config_is_refused(home: Path, 
     def change(content: dict[str, bytes]) -> None:
         content["results/sweep/.config"] = str(home / "sweep.yaml").encode()
 
-    told = command("verify", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True))
+    told = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True))
     assert (told.exit_code, "leads out of the archive" in told.output) == (2, True)
 
 
@@ -263,7 +263,7 @@ BAD: dict[str, Callable[[Path], object]] = {
 @pytest.mark.parametrize("kind", BAD)
 def test_what_is_no_such_archive_is_the_users_mistake(tmp_path: Path, kind: str):
     BAD[kind](tmp_path / "x.zip")
-    told = command("verify", tmp_path / "x.zip")
+    told = command("verify-archive", tmp_path / "x.zip")
     assert (told.exit_code, "springbench: " in told.output) == (2, True)
 
 

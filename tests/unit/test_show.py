@@ -30,7 +30,7 @@ effects:
 def test_what_is_chosen_is_said_and_drawn(tmp_path: Path):
     (tmp_path / "cloth.yaml").write_text(SCENE)
     picture = tmp_path / "cloth.png"
-    told = CliRunner().invoke(app, ["show", str(tmp_path / "cloth.yaml"), "-o", str(picture)])
+    told = CliRunner().invoke(app, ["preview", str(tmp_path / "cloth.yaml"), "-o", str(picture)])
     assert told.exit_code == 0, told.output
     lines = " ".join(told.output.split())
     assert "effects[1] pins: 2 vertices (at (top_corners)): 0, 4" in lines
@@ -48,5 +48,5 @@ def test_what_is_chosen_is_said_and_drawn(tmp_path: Path):
 
 def test_a_picture_that_is_none_is_refused(tmp_path: Path):
     (tmp_path / "cloth.yaml").write_text(SCENE)
-    told = CliRunner().invoke(app, ["show", str(tmp_path / "cloth.yaml"), "-o", str(tmp_path / "cloth.jpg")])
+    told = CliRunner().invoke(app, ["preview", str(tmp_path / "cloth.yaml"), "-o", str(tmp_path / "cloth.jpg")])
     assert told.exit_code != 0

@@ -162,7 +162,7 @@ CHAOS = spec(
 def test_a_horizon_beyond_which_round_off_decides_is_refused(tmp_path):
     kept = ReferenceStore(tmp_path)
     assert kept.load_trajectory(CHAOS, 4, [0.5], error=1e-3).growth[0] < 1e-8
-    with pytest.raises(UnpredictableMotion, match=r"after 8 s a perturbation of 1e-12 .* a --horizon of"):
+    with pytest.raises(UnpredictableMotion, match=r"after 8 s a perturbation of 1e-12 .* a --t-end of"):
         kept.load_trajectory(CHAOS, 4, [0.5, 8.0], error=1e-3)
 
 

@@ -34,8 +34,8 @@ def ablate(
     all_solvers: Annotated[
         bool, typer.Option("--all-solvers", help="What each effect alone adds to an iteration, by every solver.")
     ] = False,
-    again: RerunOption = False,
-    changed: RerunStaleOption = False,
+    rerun: RerunOption = False,
+    rerun_stale: RerunStaleOption = False,
     in_process: InProcessOption = False,
 ) -> None:
     """Measure the cost and the influence of each effect, and suggest missing ones."""
@@ -48,15 +48,23 @@ def ablate(
     from springbench.harness.results.folder_ownership import claim_folder
 
     if all_solvers:
-        _measure_overheads(context, scene, results, solver, size, pairs, again, changed, in_process)
+        _measure_overheads(context, scene, results, solver, size, pairs, rerun, rerun_stale, in_process)
         return
     usual = {"rounds": DEFAULT_NUM_ROUNDS, "threads": 1} | ({} if solver else {"tolerance": DEFAULT_ABLATION_TOLERANCE})
     sweep = load_config(
         scene, solvers=[solver or DEFAULT_ABLATION_SOLVER], sizes=[size] if size else [], **usual | context.obj
     )
     folder = claim_folder(results / sweep.name, scene)
-    how = {"pairs": pairs, "again": again, "changed": changed, "isolated": not in_process}
-    path = run_ablation(sweep, folder, create_display(get_error_console()), print_message, **how)
+    path = run_ablation(
+        sweep,
+        folder,
+        create_display(get_error_console()),
+        print_message,
+        with_pairs=pairs,
+        rerun=rerun,
+        rerun_stale=rerun_stale,
+        isolated=not in_process,
+    )
     rows, picture = read_ablation(path), folder / "pictures" / f"ablation-{path.stem}.png"
     if rows[0]["status"] != "ok":  # of the whole scene, with which all others are compared
         print_message(f"{sweep.name}: {rows[0]['status']}: {rows[0]['reason']}")
@@ -77,8 +85,8 @@ def _measure_overheads(
     solver: str | None,
     size: int | None,
     pairs: bool,
-    again: bool,
-    changed: bool,
+    rerun: bool,
+    rerun_stale: bool,
     in_process: bool,
 ) -> None:
     """Run `--all-solvers`."""
@@ -102,8 +110,8 @@ def _measure_overheads(
         folder,
         create_display(get_error_console()),
         print_message,
-        rerun=again,
-        rerun_stale=changed,
+        rerun=rerun,
+        rerun_stale=rerun_stale,
         isolated=not in_process,
     )
     get_output_console().print(

@@ -66,7 +66,7 @@ def publish(
     from springbench.harness.experiments.archive.publication import publish_results as put_together
 
     count = put_together(results, output, print_message, license_text=license)
-    print_message(f"{output} holds {count} files; `springbench verify {output}` does a tenth of its runs again")
+    print_message(f"{output} holds {count} files; `springbench verify-archive {output}` does a tenth of its runs again")
 
 
 def verify_archive(

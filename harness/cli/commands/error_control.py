@@ -57,8 +57,8 @@ def run_error_control(
     *,
     t_end: float | None = None,
     sizes: Sequence[int] = (),
-    check: bool = False,
-    peers: bool = False,
+    verify: bool = False,
+    compare_third_party: bool = False,
     positions: Path | None = None,
     rerun: bool = False,
     rejected_options: Mapping[str, Any] | None = None,
@@ -86,7 +86,18 @@ def run_error_control(
     """
     _check_options(error, t_end, {**(rejected_options or {}), "second --size": sizes[1:]})
     scene = load_scene(config)
-    given = config, scene, error, results, t_end, sizes[0] if sizes else None, check, peers, positions, rerun
+    given = (
+        config,
+        scene,
+        error,
+        results,
+        t_end,
+        sizes[0] if sizes else None,
+        verify,
+        compare_third_party,
+        positions,
+        rerun,
+    )
     return run_isolated(
         partial(_execute_error_control, *given), [plugin for plugin, _ in scene.own.values()], print_message
     )
@@ -99,8 +110,8 @@ def _execute_error_control(
     results: Path,
     t_end: float | None,
     size: int | None,
-    check: bool,
-    peers: bool,
+    verify: bool,
+    compare_third_party: bool,
     positions: Path | None,
     rerun: bool,
     print_message: PrintMessage,
@@ -119,7 +130,7 @@ def _execute_error_control(
         + (f"; more exact than asked, for {answer.note}" if answer.note else "")
     )
     print_message(f"choosing, and a closer motion for the estimate, took {answer.search_seconds:.3g} s besides")
-    measured = _verify_error(asked, error, path.positions[-1], results, print_message) if check else None
+    measured = _verify_error(asked, error, path.positions[-1], results, print_message) if verify else None
     label = f"{config.stem}-{asked.size}-asked-{error:g}-{asked.t_end:g}"
     recording = _record_motion(folder / "recordings" / f"{label}.rrd", config.stem, asked, answer)
     row = _build_row(config.stem, asked, error, answer) | {
@@ -127,7 +138,7 @@ def _execute_error_control(
         "recording": f"recordings/{recording.name}",
     }
     (folder / "accuracy").mkdir(exist_ok=True)
-    found = [row, *(_build_third_party_rows(row, asked, error, answer, print_message) if peers else ())]
+    found = [row, *(_build_third_party_rows(row, asked, error, answer, print_message) if compare_third_party else ())]
     shared = {name: row[name] for name in (*_SHARED_COLUMNS, "problem")} | build_provenance_columns()
     found += [shared | way for way in build_trial_rows(answer, before, error)]
     parquet_rows.write_rows(
@@ -136,7 +147,7 @@ def _execute_error_control(
     if positions:
         save_positions(positions, path.positions[1:])
     print_message(f"the row is in {folder / 'accuracy'}, the recording is {recording}")
-    return not check or (measured is not None and measured <= error)
+    return not verify or (measured is not None and measured <= error)
 
 
 def _search_method(
@@ -154,7 +165,7 @@ def _search_method(
     if not pairs:
         return search_cheapest_method(error_target, error, growth, print_message)
     names = ", ".join(format_method_name(integrator, solver.name) for integrator, solver in pairs)
-    print_message(f"worth trying by rows measured before, for an error of {nearest:g}: {names}; --again tries all ways")
+    print_message(f"worth trying by rows measured before, for an error of {nearest:g}: {names}; --rerun tries all ways")
     try:
         return search_cheapest_method(error_target, error, growth, print_message, pairs)
     except RunFailed as failed:
@@ -191,7 +202,7 @@ def _check_options(error: float, t_end: float | None, rejected_options: Mapping[
     if not 0.0 < error < 1.0:
         mistakes.append(InputMistake(f"came {error:g}; wanted a number between 0 and 1", key="--error"))
     if t_end is not None and not (isfinite(t_end) and 0.0 < t_end <= 1e4):
-        mistakes.append(InputMistake(f"came {t_end:g}; wanted seconds above 0, at most 10,000", key="--horizon"))
+        mistakes.append(InputMistake(f"came {t_end:g}; wanted seconds above 0, at most 10,000", key="--t-end"))
     if mistakes:
         raise InputError(mistakes)
 

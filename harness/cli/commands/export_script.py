@@ -1,4 +1,4 @@
-"""Command `springbench repeat`: export a simulation as a script for an external engine.
+"""Command `springbench export-script`: export a simulation as a script for an external engine.
 
 The simulation is a point of an accuracy config.
 """
@@ -38,9 +38,7 @@ def export_script(
         return
     found = [label for label in engines if label.endswith(point)]
     if len(found) != 1:
-        problem = (
-            f"came {point!r}, which {len(found)} points of outside engines end with; `springbench repeat {config}` "
-        )
+        problem = f"came {point!r}, which {len(found)} points of outside engines end with; `springbench export-script {config}` "
         raise InputError(InputMistake(f"{problem}lists them", key="POINT"))
     if output.exists() and not output.is_dir():
         raise InputError(

@@ -1,4 +1,4 @@
-"""Command `springbench show`: preview a scene with the vertices that its effects select."""
+"""Command `springbench preview`: preview a scene with the vertices that its effects select."""
 
 from __future__ import annotations
 

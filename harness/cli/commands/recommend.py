@@ -14,7 +14,7 @@ def recommend(
     scene: Annotated[Path, typer.Argument(help="A scene (YAML), or an assignment's scene (JSON).")],
     error: Annotated[float, typer.Option(help="The error wanted, relative to the displacement from the start.")],
     size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default if left out.")] = None,
-    horizon: Annotated[
+    t_end: Annotated[
         float | None,
         typer.Option(
             help="After how many simulated seconds the error counts; if left out 1, or less where the motion cannot be "
@@ -35,7 +35,7 @@ def recommend(
         scene,
         error,
         size=size,
-        t_end=horizon,
+        t_end=t_end,
         time_limit=time_limit,
         budget=budget,
         results=results,
@@ -58,9 +58,9 @@ def recommend(
         f"Ways to an error of {100 * error:g} %: {scene.stem} {found.best_method.work_spec.case.size or ''}".rstrip()
     )
     folder = results / f"recommend-{scene.stem}" / "pictures"
-    horizon = found.best_method.work_spec.horizon
-    name = f"ways-{scene.stem}-{found.best_method.work_spec.case.size}-{error:g}-{horizon:g}".replace(".", "_")
-    facts = [f"{horizon:g} s simulated", "time stepping and solver together"]
+    t_end = found.best_method.work_spec.horizon
+    name = f"ways-{scene.stem}-{found.best_method.work_spec.case.size}-{error:g}-{t_end:g}".replace(".", "_")
+    facts = [f"{t_end:g} s simulated", "time stepping and solver together"]
     facts += [] if integrated else [f"by a {found.checked_method.reference_kind} reference"]
     picture, *_ = draw_recommendation(folder / name, title, facts, points, error)
     print_message(f"the runners-up are in {picture}")

@@ -1,4 +1,4 @@
-"""The command `springbench gate`: performance regressions against a revision, from a table, or between stored
+"""The command `springbench regress`: performance regressions against a revision, from a table, or between stored
 results."""
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def regress(
             raise InputError(f"{option}: nothing is timed between stored results; leave it out")
     if len(files) != 2:
         wanted = "wanted --against REVISION, a table of gates, or two stored results, the old one first"
-        raise InputError(f"gate: came {len(files)} file{'s' * (len(files) != 1)}; {wanted}")
+        raise InputError(f"regress: came {len(files)} file{'s' * (len(files) != 1)}; {wanted}")
     raise typer.Exit(_compare_stored(files[0], files[1], yardstick))
 
 
@@ -110,7 +110,7 @@ def _compare_with_revision(
     )
 
     if len(files) > 1 or (files and pattern):
-        raise InputError("gate --against: wanted one scene, one sweep, or -k NAME; came several of them")
+        raise InputError("regress --against: wanted one scene, one sweep, or -k NAME; came several of them")
     both = git_worktrees.open_revisions(git_worktrees.find_checkout(Path.cwd()), revision)
     requests = build_config_requests(both, files[0], run_options) if files else build_test_requests(both, pattern)
     found = compare_revisions(both, requests, options, print_message)

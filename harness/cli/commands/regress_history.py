@@ -1,4 +1,4 @@
-"""The command `springbench history`: performance changes over the stored results of commits."""
+"""The command `springbench regress-history`: performance changes over the stored results of commits."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def regress_history(
     hint = "`pytest tests/bench --benchmark-only` stores one, at each commit that you run it at"
     if not files:
         where = ", ".join(map(str, folders or DEFAULT_FOLDERS))
-        raise InputError(f"history: no stored results in {where}; {hint}")
+        raise InputError(f"regress-history: no stored results in {where}; {hint}")
     found = tell(files)
     get_output_console().print(split_wide_table(build_history_table(found)))
     if not any(len(series.points) >= MIN_RESULTS for series in found):

@@ -1,4 +1,4 @@
-"""The command `springbench gate-study`: record blocks, replay the tests over them, and run real tests."""
+"""The command `springbench regress-study`: record blocks, replay the tests over them, and run real tests."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def replay(
     from springbench.harness.experiments.regression.confidence_sequence import SequentialTest
 
     if missing := [str(path) for path in samples if not path.is_file()]:
-        raise InputError(f"{', '.join(missing)}: no such file; `springbench gate-study record` makes one")
+        raise InputError(f"{', '.join(missing)}: no such file; `springbench regress-study record` makes one")
     told = "slower", "limit", "fails", "holds", "cannot tell", "median s", *of.OTHER_COMPARISONS
     for (gate, condition), starts in of.read_recorded_blocks(samples).items():
         load = f"{median(start.load_average for start in starts):.1f}"

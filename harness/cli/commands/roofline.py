@@ -1,4 +1,4 @@
-"""Command `springbench speed`."""
+"""Command `springbench roofline`."""
 
 from __future__ import annotations
 
@@ -38,9 +38,17 @@ def roofline(
     if any(run.tolerance == AUTO for run in sweep.list_runs()):
         raise InputError(InputMistake("needs the steps before; give a number, or null", config, key="tolerance"))
     folder = claim_folder(results / sweep.name, config)
-    how = {"again": rerun, "changed": rerun_stale, "isolated": not in_process}
     found = compute_speed_figures(
-        run_roofline(sweep, folder, create_display(get_error_console()), print_message, budget=budget, **how)
+        run_roofline(
+            sweep,
+            folder,
+            create_display(get_error_console()),
+            print_message,
+            rerun=rerun,
+            rerun_stale=rerun_stale,
+            budget=budget,
+            isolated=not in_process,
+        )
     )
     get_output_console().print(split_wide_table(build_speed_table(found), key_columns=2))
     for line in describe_speed(found):

@@ -1,4 +1,4 @@
-"""Command `springbench goals`: compare the time to an error with a baseline."""
+"""Command `springbench targets`: compare the time to an error with a baseline."""
 
 from __future__ import annotations
 

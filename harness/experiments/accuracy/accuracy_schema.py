@@ -9,8 +9,8 @@ One table contains all kinds of rows; the column `kind` distinguishes them:
     work      a simulation up to the horizon: its error, its wall time, and the CPU time of its best round
     asked     a simulation to a requested error (`springbench run SCENE --error`)
     way       a method that was tried for it, at its first setting
-    peer      a simulation to the same error by a third-party integrator (`--peers`), whose name is `solver`
-    goal      the CPU time of the cheapest method for an error, compared with a baseline (`springbench goals`)
+    peer      a simulation to the same error by a third-party integrator (`--compare`), whose name is `solver`
+    goal      the CPU time of the cheapest method for an error, compared with a baseline (`springbench targets`)
 
 Rows contain energies and errors of positions, never gaps. Gaps are computed on reading from `g`, `g0` and the lowest
 `g` of the minima, so that a better minimum needs no new measurement.

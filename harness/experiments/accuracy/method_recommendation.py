@@ -186,7 +186,7 @@ def recommend_method(
         InputError: an option is invalid.
         RunFailed: no method meets the error.
     """
-    asked_for = {"--error": max_error, "--horizon": t_end, "--time-limit": time_limit, "--budget": budget}
+    asked_for = {"--error": max_error, "--t-end": t_end, "--time-limit": time_limit, "--budget": budget}
     for key, value in asked_for.items():
         if value is not None and not 0 < value < math.inf:
             raise InputError(InputMistake(f"came {value:g}; wanted a number above 0", key=key))
@@ -388,7 +388,7 @@ def _explain_no_method(
         nearest = min(methods, key=lambda way: way.error)
         return (
             f"nothing that was measured keeps to an error of {max_error:g} over {t_end:g} s; the nearest is {nearest}, "
-            f"which errs by {nearest.error:.2g}: ask for a larger --error or a shorter --horizon"
+            f"which errs by {nearest.error:.2g}: ask for a larger --error or a shorter --t-end"
         )
     reasons = {row["reason"] for row in failed_rows}
     return f"no error over {t_end:g} s could be measured: {'; '.join(sorted(reasons)) or 'nothing was simulated'}"

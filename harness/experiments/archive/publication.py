@@ -1,6 +1,6 @@
 """Publish results as one archive that others can cite, read and check.
 
-`springbench verify` repeats some of its runs.
+`springbench verify-archive` repeats some of its runs.
 
     results/<sweep>/       rows, recordings, pictures, pages
     configs/<sweep>/       the config, and the scenes, meshes and code that it names

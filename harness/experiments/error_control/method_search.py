@@ -419,7 +419,7 @@ class _MethodSearch:
         return RunFailed(
             f"no steps keep to an error of {self._max_error:g}: {nearest.method} came nearest and reached "
             f"{nearest.error_estimated:.1g}{at}, and shorter ones come no nearer; ask for a larger --error or a shorter "
-            "--horizon"
+            "--t-end"
         )
 
 

@@ -1,4 +1,4 @@
-"""Table of performance tests in a YAML file: `springbench gate gates.yaml`.
+"""Table of performance tests in a YAML file: `springbench regress gates.yaml`.
 
 gates:
   - {scene: cloth.yaml, size: 32, solver: numba, against: sparse, limit: 0.6, agree: 1e-6}

@@ -1,6 +1,6 @@
 """Comparison of this checkout with a git revision.
 
-`springbench gate --against REVISION` runs it, in one run on one machine. Both must give the same answer before anything
+`springbench regress --against REVISION` runs it, in one run on one machine. Both must give the same answer before anything
 is timed. Deterministic counts (iterations, entries, bytes) are compared exactly. Then two processes are benchmarked by
 interleaved blocks.
 """
@@ -87,14 +87,19 @@ def build_config_requests(revisions: Sequence[GitRevision], config: Path, option
     config = config.resolve()
     with start_workers(*revisions) as alive:
         listed = [
-            worker.send_request("runs", config=str(worker.revision.resolve_file(config)), asked=options)["runs"]
+            worker.send_request("list_runs", config=str(worker.revision.resolve_file(config)), run_options=options)[
+                "runs"
+            ]
             for worker in alive
         ]
     if listed[0] != listed[1]:
         raise InputError(
             f"{config}: {revisions[0].name} and {revisions[1].name} read different runs out of it: {_find_first_difference(listed)}"
         )
-    return [WorkRequest(title, "run", {"asked": options, "index": i}, config) for i, title in enumerate(listed[0])]
+    return [
+        WorkRequest(title, "prepare_run", {"run_options": options, "index": i}, config)
+        for i, title in enumerate(listed[0])
+    ]
 
 
 def build_test_requests(revisions: Sequence[GitRevision], name: str) -> list[WorkRequest]:
@@ -107,14 +112,14 @@ def build_test_requests(revisions: Sequence[GitRevision], name: str) -> list[Wor
         InputError: if no test matches, or if one revision lacks it.
     """
     with start_workers(*revisions) as alive:
-        listed = [worker.send_request("gates")["gates"] for worker in alive]
-    found = [[gate for gate in gates if name in gate] for gates in listed]
+        listed = [worker.send_request("list_tests")["tests"] for worker in alive]
+    found = [[test for test in tests if name in test] for tests in listed]
     if not any(found):
         raise InputError(f"-k {name}: neither has such a gate; they have {', '.join(listed[0])}")
     for one, other, side in ((*found, revisions[1]), (*found[::-1], revisions[0])):
         if missing := sorted(set(one) - set(other)):
             raise InputError(f"-k {name}: {side.name} has no gate {', '.join(missing)}; name others")
-    return [WorkRequest(gate, "gate", {"name": gate}) for gate in found[0]]
+    return [WorkRequest(test, "prepare_test", {"name": test}) for test in found[0]]
 
 
 def compare_revisions(
@@ -196,8 +201,8 @@ def _prepare_work(processes: Sequence[RevisionProcess], request: WorkRequest, nu
         if request.config:
             more = {
                 "config": str(worker.revision.resolve_file(request.config)),
-                "frames": num_frames,
-                "extra": worker.revision.injected_slowdown,
+                "num_frames": num_frames,
+                "injected_slowdown": worker.revision.injected_slowdown,
             }
         held.append(worker.prepare_work(request.command, **request.arguments, **more))
     return held

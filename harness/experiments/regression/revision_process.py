@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.errors import InputError
 
-WORKER_SCRIPT = Path(__file__).with_name("worker.py")
+WORKER_SCRIPT = Path(__file__).with_name("revision_worker.py")
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ class RevisionProcess:
         assert process.stdin is not None
         assert process.stdout is not None
         with suppress(BrokenPipeError):
-            process.stdin.write(json.dumps({"do": command, **arguments}) + "\n")
+            process.stdin.write(json.dumps({"command": command, **arguments}) + "\n")
             process.stdin.flush()
         line = process.stdout.readline()
         if not line:
@@ -110,12 +110,12 @@ class RevisionProcess:
 
     def prepare_work(self, command: str, **arguments: Any) -> PreparedWork:
         """Request the preparation of work; `revision_worker.py` lists the commands."""
-        told = self.send_request(command, positions=str(self._answer_path), **arguments)
-        return PreparedWork(np.load(self._answer_path), told["facts"], told["clock"], told.get("frames", 0))
+        reply = self.send_request(command, positions=str(self._answer_path), **arguments)
+        return PreparedWork(np.load(self._answer_path), reply["stats"], reply["clock"], reply.get("num_frames", 0))
 
     def count_instructions(self) -> int | None:
         """Count the instructions of one call of the work; None if the machine hides them."""
-        return self.send_request("instructions")["instructions"]
+        return self.send_request("count_instructions")["instructions"]
 
     def time_calls(self, num_calls: int, clock: str) -> float:
         """Time calls of the work together.
@@ -125,11 +125,11 @@ class RevisionProcess:
             clock: cpu or wall.
         Returns: seconds.
         """
-        return self.send_request("time", calls=num_calls, clock=clock)["seconds"]
+        return self.send_request("time_calls", num_calls=num_calls, clock=clock)["seconds"]
 
     def rebuild_work(self) -> None:
         """Rebuild the prepared work at other addresses."""
-        self.send_request("renew")
+        self.send_request("rebuild_work")
 
     def close(self) -> None:
         """Stop the process."""

@@ -4,13 +4,14 @@ It runs with the revision's worktree on the path. It exchanges JSON by standard 
 and per answer. The work prints to standard error. All imports come from the worktree, so that only the revision's own
 code is timed.
 
-    {"do": "runs", "config": "...", "asked": {...}}           -> {"runs": ["cloth 32 numba", ...]}
-    {"do": "run", "config": "...", "asked": {...}, "index": i, "frames": n, "extra": 0.0, "positions": "..."}
-    {"do": "gates"}                                           -> {"gates": ["numba-against-sparse-64", ...]}
-    {"do": "gate", "name": "...", "positions": "..."}         -> {"facts": {...}, "clock": "cpu"}
-    {"do": "time", "calls": n, "clock": "cpu"}                -> {"seconds": s}, all calls together
-    {"do": "renew"}                                           -> {}, the same work, rebuilt at other addresses
-    {"do": "instructions"}                                    -> {"instructions": n}, null if they are hidden
+    {"command": "list_runs", "config": "...", "run_options": {...}}     -> {"runs": ["cloth 32 numba", ...]}
+    {"command": "prepare_run", "config": "...", "run_options": {...}, "index": i, "num_frames": n,
+     "injected_slowdown": 0.0, "positions": "..."}            -> {"stats": {...}, "clock": "cpu", "num_frames": n}
+    {"command": "list_tests"}                                 -> {"tests": ["numba-against-sparse-64", ...]}
+    {"command": "prepare_test", "name": "...", "positions": "..."}      -> {"stats": {...}, "clock": "cpu"}
+    {"command": "time_calls", "num_calls": n, "clock": "cpu"} -> {"seconds": s}, all calls together
+    {"command": "rebuild_work"}                               -> {}, the same work, rebuilt at other addresses
+    {"command": "count_instructions"}                         -> {"instructions": n}, null if they are hidden
 """
 
 from __future__ import annotations
@@ -71,11 +72,11 @@ class RevisionWorker:
         self._pin_threads(threads)
         num_frames = min(num_frames, run.frames)
         steps = self._prepare_work(lambda: _RevisionSteps(run, num_frames, injected_slowdown), positions)
-        return {"facts": steps.facts(), "clock": "cpu" if threads == 1 else "wall", "frames": num_frames}
+        return {"stats": steps.collect_stats(), "clock": "cpu" if threads == 1 else "wall", "num_frames": num_frames}
 
     def list_tests(self) -> dict[str, Any]:
         """List the names of the worktree's own performance tests."""
-        return {"gates": sorted(_load_tests())}
+        return {"tests": sorted(_load_tests())}
 
     def prepare_test(self, name: str, positions: str) -> dict[str, Any]:
         """Prepare the candidate of one of the worktree's own performance tests.
@@ -85,9 +86,9 @@ class RevisionWorker:
             positions: path of the file that receives the answer.
         """
         self._pin_threads(1)
-        gate = _load_tests()[name]
-        self._prepare_work(gate.candidate, positions)
-        return {"facts": {}, "clock": gate.clock}
+        test = _load_tests()[name]
+        self._prepare_work(test.candidate, positions)
+        return {"stats": {}, "clock": test.clock}
 
     def rebuild_work(self) -> dict[str, Any]:
         """Rebuild the work behind a random offset, while the old work still occupies its memory."""
@@ -116,12 +117,14 @@ class RevisionWorker:
         The counter is the module next to this script, not the worktree's.
         """
         assert self._work is not None
-        place = spec_from_file_location("springbench_instructions", Path(__file__).with_name("instructions.py"))
-        assert place is not None
-        assert place.loader is not None
-        counter = module_from_spec(place)
-        place.loader.exec_module(counter)
-        return {"instructions": counter.count(self._work)}
+        spec = spec_from_file_location(
+            "springbench_hardware_counters", Path(__file__).with_name("hardware_counters.py")
+        )
+        assert spec is not None
+        assert spec.loader is not None
+        counters = module_from_spec(spec)
+        spec.loader.exec_module(counters)
+        return {"instructions": counters.count_events(self._work)}
 
     def _prepare_work(self, build_work: Callable[[], Any], positions: str) -> Any:
         """Build the work, run it once, and write its answer to a file."""
@@ -190,7 +193,7 @@ def _load_runs(config: str, run_options: dict[str, Any]) -> list[Any]:
 
 def _count_iterations(step: Any) -> int:
     """Count the iterations of a step; older revisions report them only in the solution."""
-    return step.num_iterations if hasattr(step, "iterations") else step.solution.iterations
+    return step.num_iterations if hasattr(step, "num_iterations") else step.solution.num_iterations
 
 
 def _format_title(run: Any) -> str:
@@ -202,10 +205,10 @@ def _format_title(run: Any) -> str:
 
 
 def _load_tests() -> dict[str, Any]:
-    import tests.bench.test_gates as listed
+    from tests.bench import test_gates
 
-    groups: list[tuple[Any, ...]] = [value for value in vars(listed).values() if isinstance(value, tuple)]
-    return {gate.name: gate for group in groups for gate in group if hasattr(gate, "candidate")}
+    groups: list[tuple[Any, ...]] = [value for value in vars(test_gates).values() if isinstance(value, tuple)]
+    return {test.name: test for group in groups for test in group if hasattr(test, "candidate")}
 
 
 def main() -> None:
@@ -214,10 +217,10 @@ def main() -> None:
     os.dup2(2, 1)  # what the work prints must not look like an answer
     worker = RevisionWorker()
     for line in sys.stdin:
-        asked = json.loads(line)
+        request = json.loads(line)
         try:
-            answer = getattr(worker, asked.pop("do"))(**asked)
-        except Exception as error:  # it is told, whatever it is: the other side says it in one message
+            answer = getattr(worker, request.pop("command"))(**request)
+        except Exception as error:  # of any class: the other process reports it in one message
             traceback.print_exc()
             ours = any(base.__name__ == "SpringbenchError" for base in type(error).__mro__)
             answer = {"error": str(error) if ours else f"{type(error).__name__}: {error}"}

@@ -124,7 +124,7 @@ FIGURE_KINDS: dict[str, FigureKind] = {
     ),
     "speed": FigureKind(
         "Speed",
-        "rows of `springbench speed CONFIG`",
+        "rows of `springbench roofline CONFIG`",
         _without_stale(timing_panels.speed_panels),
         (("step",), ("global",)),
     ),

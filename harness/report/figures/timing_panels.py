@@ -35,7 +35,7 @@ def read_sweep_rows(folder: Path) -> pa.Table:
         raise InputError(InputMistake("holds no rows of runs; wanted those of `springbench run CONFIG`", folder))
     table = parquet_rows.read_rows(units, required_columns=_REQUIRED_COLUMNS)
     if speed_figures.MACHINE_SOLVER in table["solver"].unique().to_pylist():
-        raise InputError(InputMistake("holds rows of `springbench speed`; ask for the kind speed", folder))
+        raise InputError(InputMistake("holds rows of `springbench roofline`; ask for the kind speed", folder))
     return table
 
 
@@ -119,7 +119,9 @@ def speed_panels(folder: Path) -> list[PanelEntry]:
     units = row_store.list_units(folder / "rows")
     table = parquet_rows.read_rows(units, required_columns=_REQUIRED_COLUMNS) if units else None
     if table is None or speed_figures.MACHINE_SOLVER not in table["solver"].unique().to_pylist():
-        raise InputError(InputMistake("holds no speed report; wanted the rows of `springbench speed CONFIG`", folder))
+        raise InputError(
+            InputMistake("holds no speed report; wanted the rows of `springbench roofline CONFIG`", folder)
+        )
     found = [one for one in speed_figures.compute_speed_figures(table) if one.status == "ok"]
     told = describe_provenance(table.select(PROVENANCE_COLUMNS).to_pylist())
     marked = assign_label_styles((one.label, one.solver) for one in found)

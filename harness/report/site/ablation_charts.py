@@ -13,8 +13,8 @@ from springbench.harness.report.site.run_table import format_references
 
 _PERCENT_AXIS = {"ticksuffix": " %", "zeroline": True}
 _CHART_COMMANDS = {
-    "ablation": "springbench ablate CONFIG --again",
-    "prices": "springbench ablate CONFIG --all-solvers --again",
+    "ablation": "springbench ablate CONFIG --rerun",
+    "prices": "springbench ablate CONFIG --all-solvers --rerun",
 }
 _NAME_AXIS = {"type": "category", "autorange": "reversed"}
 

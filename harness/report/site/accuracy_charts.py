@@ -46,7 +46,7 @@ from springbench.harness.report.site.run_table import format_references
 
 ChartItem = dict[str, Any]
 
-_ACCURACY_COMMAND = "springbench accuracy CONFIG --again"
+_ACCURACY_COMMAND = "springbench accuracy CONFIG --rerun"
 _SHARE_AXIS = {"range": [-0.02, 1.05], "tickformat": ".0%"}
 
 

@@ -56,7 +56,7 @@ def build_speed_chart(table: pa.Table) -> tuple[dict[str, Any], list[str]]:
         "items": [_build_item(scene, label, some, newest) for (scene, label), some in lines.items()],
         "marks": {label: plotly_style(mark) for label, mark in marks.items()},
         "references": format_references((f.label, reference.get(f.solver)) for f in timed),
-        "command": "springbench speed CONFIG --again",
+        "command": "springbench roofline CONFIG --rerun",
     }, describe_speed(found)
 
 

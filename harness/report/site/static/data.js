@@ -50,7 +50,7 @@ Object.assign(springbench, (() => {
   function command(row) {
     const sweep = sweepOf(row.slug), scene = own(sweep.scenes, row.scene);
     const whole = `springbench run ${quoted(sweep.config || `${sweep.name}.yaml`)}`;
-    if (!scene || !row.plain || row.own) return `${whole} --again`;
+    if (!scene || !row.plain || row.own) return `${whole} --rerun`;
     const chosen = row.asked !== null && row.asked !== undefined;
     const stated = {
       iterations: row.max_iterations, tolerance: row.tolerance === 0 ? "auto" : row.tolerance, integrator: row.integrator, "first-guess": row.first_guess,
