@@ -21,21 +21,22 @@ def marks(gate: Gate) -> list[pytest.MarkDecorator]:
 
 
 @pytest.mark.parametrize("gate", [pytest.param(gate, id=gate.name, marks=marks(gate)) for gate in ALL])
-def test_the_gate_holds(gate: Gate, benchmark: BenchmarkFixture, race: PairedBenchmark):
+def test_the_gate_holds(gate: Gate, benchmark: BenchmarkFixture, paired_benchmark: PairedBenchmark):
     with limit_threads(THREADS):
         candidate = gate.candidate()
         if gate.tolerance is None and benchmark.disabled:
             benchmark.pedantic(candidate)
             return  # nothing to compare
-        told = {key: getattr(gate, key) for key in ("goal", "why", "guards")}
-        race(
-            *(candidate, gate.yardstick()),
-            limit=gate.limit,
+        extra_info = {key: getattr(gate, key) for key in ("goal", "why", "guards")}
+        paired_benchmark(
+            candidate,
+            gate.yardstick(),
+            max_ratio=gate.limit,
             clock=gate.clock,
-            agree=gate.tolerance,
+            agreement_rtol=gate.tolerance,
             budget=gate.budget,
-            error=gate.error,
-            **told,
+            alpha=gate.error,
+            **extra_info,
         )
 
 

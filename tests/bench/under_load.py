@@ -31,7 +31,7 @@ ASKED = ("harness-against-bare-solver-64", "numba-against-sparse-64", "idle-cont
 
 
 def held(gate: Gate, budget: float) -> BenchmarkResult:
-    """One race of a gate, as `race` of the plugin for pytest has it."""
+    """One race of a gate, as `paired_benchmark` of the plugin for pytest has it."""
     candidate, yardstick = gate.candidate(), gate.yardstick()
     assert gate.tolerance is not None, f"{gate.name}: has no answers to compare"
     if said := describe_difference(candidate(), yardstick(), gate.tolerance):

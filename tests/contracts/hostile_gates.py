@@ -82,14 +82,14 @@ WRONG = [
     {"limit": 1.0, "error": 2.0}, {"limit": 1.0, "error": -1.0},
 ]
 @pytest.mark.parametrize("given", WRONG)
-def test_race(race, given):
-    race(lambda: 1.0, lambda: 1.0, **given)
+def test_race(paired_benchmark, given):
+    paired_benchmark(lambda: 1.0, lambda: 1.0, **given)
 @pytest.mark.parametrize("scene", ["none.yaml", "/dev/zero", "pipe", "sweep.yaml", ""])
-def test_solvers(race, scene):
-    race.solvers(scene, "sparse", "dense", limit=1.0)
-def test_wrong_answer(race):
-    race(lambda: 1.0, lambda: 2.0, limit=1.0)
-def test_no_answer(race):
-    race(lambda: None, lambda: None, limit=1.0)
+def test_solvers(paired_benchmark, scene):
+    paired_benchmark.compare_solvers(scene, "sparse", "dense", max_ratio=1.0)
+def test_wrong_answer(paired_benchmark):
+    paired_benchmark(lambda: 1.0, lambda: 2.0, max_ratio=1.0)
+def test_no_answer(paired_benchmark):
+    paired_benchmark(lambda: None, lambda: None, max_ratio=1.0)
 """
 """Tests that use the plug-in wrongly: each of them fails, and none breaks pytest."""

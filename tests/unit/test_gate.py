@@ -137,8 +137,8 @@ BENCHMARK = """
 def count():
     return sum(range(1000))
 
-def test_counts(race):
-    race(count, count, limit=9, budget=500)
+def test_counts(paired_benchmark):
+    paired_benchmark(count, count, max_ratio=9, budget=500)
 """
 
 

@@ -172,26 +172,26 @@ def test_a_run_of_a_scene_is_held_with_its_exact_facts_and_each_revision_has_its
     other.mkdir()
     (other / "cloth.yaml").write_text(CLOTH_SCENE_YAML.replace("300", "600"))
     sides = GitRevision("this", repository), GitRevision("that", other, checkout=repository, injected_slowdown=0.1)
-    asked = {"solvers": ["sparse"], "sizes": [], "iterations": 20}
+    run_options = {"solvers": ["sparse"], "sizes": [], "iterations": 20}
     with start_workers(*sides) as alive:
         held = []
         for worker in alive:
             config = str(worker.revision.resolve_file(repository / "cloth.yaml"))
-            (title,) = worker.send_request("runs", config=config, asked=asked)["runs"]
+            (title,) = worker.send_request("list_runs", config=config, run_options=run_options)["runs"]
             assert title == "cloth, size 4, sparse, 20 iterations, implicit-euler, dt 0.03333"
             given = {
                 "config": config,
-                "asked": asked,
+                "run_options": run_options,
                 "index": 0,
-                "frames": 9,
-                "extra": worker.revision.injected_slowdown,
+                "num_frames": 9,
+                "injected_slowdown": worker.revision.injected_slowdown,
             }
-            held.append(worker.prepare_work("run", **given))
+            held.append(worker.prepare_work("prepare_run", **given))
             assert worker.time_calls(2, "cpu") > 0
     assert [(h.num_frames, h.clock, h.answer.shape) for h in held] == [(2, "cpu", (16, 3))] * 2
-    assert held[0].facts == held[1].facts  # what is planted is beside the run's own work
-    assert held[0].facts["iterations"] == 40
-    assert held[0].facts["nnz_factor"] > 16
+    assert held[0].stats == held[1].stats  # what is planted is beside the run's own work
+    assert held[0].stats["iterations"] == 40
+    assert held[0].stats["nnz_factor"] > 16
     assert abs(held[0].answer - held[1].answer).max() > 1e-6
 
 
@@ -202,9 +202,11 @@ def test_work_that_is_renewed_is_made_again_before_it_is_timed(tmp_path: Path, m
         made.append(number := len(made))
         return lambda: done.append(number) or 0.0
 
-    monkeypatch.setattr(revision_worker, "_gates", lambda: {"mine": SimpleNamespace(candidate=candidate, clock="cpu")})
+    monkeypatch.setattr(
+        revision_worker, "_load_tests", lambda: {"mine": SimpleNamespace(candidate=candidate, clock="cpu")}
+    )
     held = revision_worker.RevisionWorker()
-    monkeypatch.setattr(held, "_pin", lambda threads: None)
+    monkeypatch.setattr(held, "_pin_threads", lambda threads: None)
     held.prepare_test("mine", str(tmp_path / "answer.npy"))
     held.rebuild_work()
     held.time_calls(2, "cpu")
@@ -213,7 +215,7 @@ def test_work_that_is_renewed_is_made_again_before_it_is_timed(tmp_path: Path, m
 
 def test_a_worker_that_dies_is_told_with_its_last_words(tmp_path: Path):
     (tmp_path / "json.py").write_text("raise SystemExit('there is no more json')")
-    request = WorkRequest("a gate", "gate", {"name": "a gate"})
+    request = WorkRequest("a gate", "prepare_test", {"name": "a gate"})
     from springbench.harness.errors import InputError
     from springbench.harness.experiments.regression.revision_comparison import ComparisonOptions
 

@@ -1,4 +1,4 @@
-"""The fixture `race` and tables of gates, as somebody uses them in a folder of their own."""
+"""The fixture `paired_benchmark` and tables of gates, as somebody uses them in a folder of their own."""
 
 import json
 import os
@@ -56,16 +56,16 @@ def session(folder: Path, test: str, *options: str) -> tuple[int, str, list[dict
 def test_a_race_has_three_answers_and_stores_what_it_found(tmp_path: Path):
     # Nothing depends on the machine's speed: limits lie far from the true ratios of 1 and 3, and there is time enough.
     test = """
-def test_holds(race): race(spin(50_000), spin(50_000), limit=20)
-def test_fails(race): race(spin(300_000), spin(100_000), limit=1.2)
-def test_undecided(race): race(spin(100_000), spin(100_000), limit=1, budget=1e-3)
+def test_holds(paired_benchmark): paired_benchmark(spin(50_000), spin(50_000), max_ratio=20)
+def test_fails(paired_benchmark): paired_benchmark(spin(300_000), spin(100_000), max_ratio=1.2)
+def test_inconclusive(paired_benchmark): paired_benchmark(spin(100_000), spin(100_000), max_ratio=1, budget=1e-3)
 """
-    code, said, stored = session(tmp_path, test, "--race-budget=500")
+    code, said, stored = session(tmp_path, test, "--paired-benchmark-budget=500")
     assert code == 1
-    assert "1 failed, 1 passed, 1 undecided" in said
+    assert "1 failed, 1 passed, 1 inconclusive" in said
     assert "FAILED test_mine.py::test_fails - Failed: ratio" in said
-    assert "UNDECIDED test_mine.py::test_undecided: cannot tell within" in said
-    assert [b["extra_info"]["answer"] for b in stored] == ["holds", "fails", "undecided"]
+    assert "INCONCLUSIVE test_mine.py::test_inconclusive: cannot tell within" in said
+    assert [b["extra_info"]["answer"] for b in stored] == ["pass", "fail", "inconclusive"]
     for benchmark in stored:
         extra = benchmark["extra_info"]
         assert extra["ratio"]["low"] <= extra["ratio"]["median"] <= extra["ratio"]["high"]
@@ -73,14 +73,14 @@ def test_undecided(race): race(spin(100_000), spin(100_000), limit=1, budget=1e-
 
 
 def test_a_session_without_failures_that_cannot_tell_has_an_exit_code_of_its_own(tmp_path: Path):
-    test = "def test_it(race): race(spin(100_000), spin(100_000), limit=1, budget=1e-3)\ndef test_other(): pass"
+    test = "def test_it(paired_benchmark): paired_benchmark(spin(100_000), spin(100_000), max_ratio=1, budget=1e-3)\ndef test_other(): pass"
     code, said, _ = session(tmp_path, test)
     assert code == 13, said
-    assert "1 passed, 1 undecided" in said
+    assert "1 passed, 1 inconclusive" in said
 
 
 def test_answers_that_differ_fail_and_nothing_is_timed(tmp_path: Path):
-    test = "def test_it(race): race(spin(10, [0.0, 2.0]), spin(10, [0.0, 4.0]), limit=9)"
+    test = "def test_it(paired_benchmark): paired_benchmark(spin(10, [0.0, 2.0]), spin(10, [0.0, 4.0]), max_ratio=9)"
     code, said, stored = session(tmp_path, test)
     assert code == 1
     assert "the answers differ, so nothing was timed: they lie 5.0e-01 of the answer's size apart, wanted 0" in said
@@ -89,8 +89,8 @@ def test_answers_that_differ_fail_and_nothing_is_timed(tmp_path: Path):
 
 def test_where_benchmarks_are_disabled_only_the_answers_are_compared(tmp_path: Path):
     test = """
-def test_same(race): assert race(spin(10), spin(10), limit=1e-6) is None
-def test_other(race): race(spin(10, 1.0), spin(10, 2.0), limit=9)
+def test_same(paired_benchmark): assert paired_benchmark(spin(10), spin(10), max_ratio=1e-6) is None
+def test_other(paired_benchmark): paired_benchmark(spin(10, 1.0), spin(10, 2.0), max_ratio=9)
 """
     code, said, stored = session(tmp_path, test, "--benchmark-disable")
     assert code == 1
@@ -103,15 +103,15 @@ def test_solvers_race_on_a_scene_and_one_of_them_may_be_ones_own(tmp_path: Path)
     (tmp_path / "cloth.yaml").write_text(SCENE)
     test = """
 from springbench.solvers.methods.local_global import SparseLocalGlobal
-def test_named(race): race.solvers("cloth.yaml", "sparse", {"name": "dense"}, limit=1e6, iterations=20)
-def test_own(race): race.solvers("cloth.yaml", SparseLocalGlobal(), "sparse", limit=1e6, agree=0.0)
-def test_other_answers(race): race.solvers("cloth.yaml", "xpbd", "sparse", limit=1e6)
+def test_named(paired_benchmark): paired_benchmark.compare_solvers("cloth.yaml", "sparse", {"name": "dense"}, max_ratio=1e6, iterations=20)
+def test_own(paired_benchmark): paired_benchmark.compare_solvers("cloth.yaml", SparseLocalGlobal(), "sparse", max_ratio=1e6, agreement_rtol=0.0)
+def test_other_answers(paired_benchmark): paired_benchmark.compare_solvers("cloth.yaml", "xpbd", "sparse", max_ratio=1e6)
 """
-    code, said, stored = session(tmp_path, test, "--race-budget=500")
+    code, said, stored = session(tmp_path, test, "--paired-benchmark-budget=500")
     assert code == 1
     assert "2 passed" in said
     assert "FAILED test_mine.py::test_other_answers - Failed: the answers differ" in said
-    assert [b["extra_info"]["answer"] for b in stored] == ["holds", "holds"]
+    assert [b["extra_info"]["answer"] for b in stored] == ["pass", "pass"]
 
 
 def gate(path: Path, *options: str) -> tuple[int, str]:

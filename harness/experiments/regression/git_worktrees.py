@@ -18,7 +18,7 @@ from typing import Any
 
 from springbench.harness.atomic_files import open_lock_file, user_cache_dir
 from springbench.harness.errors import InputError
-from springbench.harness.experiments.regression.revision_process import GitRevision
+from springbench.harness.experiments.regression.revision_process import PACKAGE_FOLDER, GitRevision
 
 MAX_WORKTREES = 6
 """Maximum number of worktrees in the cache."""
@@ -57,6 +57,8 @@ def open_revisions(checkout: Path, revision: str) -> tuple[GitRevision, GitRevis
     commit = resolve_commit(checkout, revision)
     tree = prepare_worktree(checkout, commit)
     name = f"revision {revision}" if commit.startswith(revision) else f"revision {revision} ({commit[:10]})"
+    if (checkout / PACKAGE_FOLDER).is_dir() and not (tree / PACKAGE_FOLDER).is_dir():
+        raise InputError(f"--against: {name} has no folder {PACKAGE_FOLDER}: it is older than the package springbench")
     return GitRevision("this checkout", checkout), GitRevision(
         name, tree, _prepare_python(checkout, tree, name), checkout
     )

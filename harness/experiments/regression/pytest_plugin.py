@@ -1,14 +1,14 @@
 """Plugin for pytest with performance tests, based on pytest-benchmark.
 
-    def test_mine_is_no_slower(race):
-        race(mine, theirs, limit=1.03)                                  # two functions of no arguments
+    def test_new_code_is_no_slower(paired_benchmark):
+        paired_benchmark(new, old, max_ratio=1.03)  # two functions without arguments
 
-    def test_my_solver_is_no_slower(race):
-        race.solvers("cloth.yaml", Mine(), "numba", limit=1.0, agree=1e-6)      # on a scene
+    def test_new_solver_is_no_slower(paired_benchmark):
+        paired_benchmark.compare_solvers("cloth.yaml", New(), "numba", max_ratio=1.0, agreement_rtol=1e-6)
 
 Both must give the same answer, in every test run. With pytest-benchmark enabled they are then timed in interleaved
 blocks, and pytest-benchmark's JSON has the result. An inconclusive test is neither passed nor failed: it is counted as
-`undecided`. A session without failures then ends with the exit code 13, because 3 is pytest's code of internal errors.
+`inconclusive`. A session without failures then ends with the exit code 13, because 3 is pytest's code of internal errors.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class PairedBenchmark:
 
     def __init__(self, benchmark: BenchmarkFixture, item: pytest.Item) -> None:
         self._benchmark, self._item = benchmark, item
-        self._budget: float = item.config.option.race_budget
+        self._budget: float = item.config.option.paired_benchmark_budget
 
     def __call__(
         self,
@@ -65,7 +65,7 @@ class PairedBenchmark:
             max_ratio: limit of the ratio of times.
             clock: "cpu" for the CPU time of the process, "wall" for elapsed time.
             agreement_rtol: tolerance of the difference of the answers, relative to their size; None if there are none.
-            budget: seconds; --race-budget by default.
+            budget: seconds; --paired-benchmark-budget by default.
             alpha: probability of a wrong verdict; 0.1 % by default.
             extra_info: stored in the benchmark's JSON.
         Returns: the result, or None if nothing is timed.
@@ -135,7 +135,7 @@ class PairedBenchmark:
             max_ratio: limit of the ratio of times.
             agreement_rtol: tolerance of the difference of the positions, relative to the scene's size.
             clock: "cpu" or "wall".
-            budget: seconds; --race-budget by default.
+            budget: seconds; --paired-benchmark-budget by default.
             size: mesh size; the scene's default if omitted.
             options: options of a run: iterations, tolerance, frames, integrator, time_step, first_guess.
         Returns: the result, or None if nothing is timed.
@@ -175,7 +175,9 @@ def paired_benchmark(benchmark: BenchmarkFixture, request: pytest.FixtureRequest
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the plugin's command-line options."""
     group = parser.getgroup("springbench")
-    group.addoption("--race-budget", type=float, default=60.0, help="Seconds that a race may take; 60.")
+    group.addoption(
+        "--paired-benchmark-budget", type=float, default=60.0, help="Seconds that a paired benchmark may take; 60."
+    )
 
 
 class _InconclusiveCounter:
@@ -185,7 +187,7 @@ class _InconclusiveCounter:
         self.num_inconclusive = 0
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        self.num_inconclusive += getattr(report, "undecided", False)
+        self.num_inconclusive += getattr(report, "inconclusive", False)
 
     @pytest.hookimpl(trylast=True)
     def pytest_sessionfinish(self, session: pytest.Session, exitstatus: int) -> None:
@@ -195,7 +197,7 @@ class _InconclusiveCounter:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Register the counter of inconclusive tests."""
-    config.pluginmanager.register(_InconclusiveCounter(), "springbench-undecided")
+    config.pluginmanager.register(_InconclusiveCounter(), "springbench-inconclusive")
 
 
 @pytest.hookimpl(wrapper=True)
@@ -203,19 +205,19 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
     """Mark the report of an inconclusive test."""
     report = yield
     if report.when == "call" and report.skipped and item.stash.get(INCONCLUSIVE_KEY, False):
-        report.undecided = True  # type: ignore[attr-defined]
+        report.inconclusive = True  # type: ignore[attr-defined]
     return report
 
 
 def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, tuple[str, dict[str, bool]]] | None:
     """Report an inconclusive test as `?`."""
-    if getattr(report, "undecided", False):
-        return "undecided", "?", ("UNDECIDED", {"yellow": True})
+    if getattr(report, "inconclusive", False):
+        return "inconclusive", "?", ("INCONCLUSIVE", {"yellow": True})
     return None
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
     """Print the inconclusive tests with their reasons."""
-    for report in terminalreporter.stats.get("undecided", []):
+    for report in terminalreporter.stats.get("inconclusive", []):
         said = report.longrepr[2].removeprefix("Skipped: ")
-        terminalreporter.write_line(f"UNDECIDED {report.nodeid}: {said}")
+        terminalreporter.write_line(f"INCONCLUSIVE {report.nodeid}: {said}")

@@ -21,6 +21,9 @@ from springbench.harness.errors import InputError
 
 WORKER_SCRIPT = Path(__file__).with_name("revision_worker.py")
 
+PACKAGE_FOLDER = ".src"
+"""Folder of a checkout from which `springbench` is imported."""
+
 
 @dataclass(frozen=True, slots=True)
 class GitRevision:
@@ -155,7 +158,8 @@ class RevisionProcess:
 def _build_python_path(revision: GitRevision) -> str:
     """Build the Python path of a revision.
 
-    The worktree comes first, then existing entries, mapped from the checkout to the worktree.
+    The worktree's package and the worktree come first, so that the package installed with this interpreter is not
+    timed instead. Existing entries follow, mapped from the checkout to the worktree.
     """
     given = [Path(entry).resolve() for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep) if entry]
     mapped = [
@@ -164,7 +168,8 @@ def _build_python_path(revision: GitRevision) -> str:
         else entry
         for entry in given
     ]
-    return os.pathsep.join(map(str, dict.fromkeys([revision.worktree, *mapped])))
+    package = [folder for folder in [revision.worktree / PACKAGE_FOLDER] if folder.is_dir()]
+    return os.pathsep.join(map(str, dict.fromkeys([*package, revision.worktree, *mapped])))
 
 
 @contextmanager
