@@ -87,7 +87,7 @@ def towards(share: Callable[[int], float]) -> Callable[[int], Positions]:
 
 
 def curve(prepared: Any, **more: Any) -> ScoredCurve:
-    limits: dict[str, Any] = {"iterations": 200, "time_limit": 60.0, "rounds": 2} | more
+    limits: dict[str, Any] = {"max_iterations": 200, "time_limit": 60.0, "num_rounds": 2} | more
     return measure_convergence(
         prepared, PROBLEM, ReferenceEvaluator(PROBLEM.system), PROBLEM.value(minimum()), **limits
     )
@@ -120,7 +120,7 @@ def test_a_curve_says_how_it_ended(iterate: Callable[[int], Positions], status: 
 
 
 def test_a_curve_ends_at_its_time_limit_without_the_iterates_that_compile() -> None:
-    found = curve(Scripted(towards(lambda n: 1 / (1 + n)), pause=0.02), time_limit=0.05, rounds=1)
+    found = curve(Scripted(towards(lambda n: 1 / (1 + n)), pause=0.02), time_limit=0.05, num_rounds=1)
     assert found.status == "time-limit"
     # Sleeping takes at least as long as asked: three iterates after the warm-up are over the limit, perhaps fewer.
     assert (
@@ -131,7 +131,7 @@ def test_a_curve_ends_at_its_time_limit_without_the_iterates_that_compile() -> N
 
 def test_grades_are_the_oracles_and_stamps_ascend_in_each_round() -> None:
     prepared = SparseLocalGlobal().prepare(PROBLEM.system)
-    found = curve(prepared, iterations=120, rounds=3)
+    found = curve(prepared, max_iterations=120, num_rounds=3)
     assert found.iterate_indices == [number for number in range(121) if is_scored_iteration(number)]
     for number, p, g in zip(found.iterate_indices[1:], found.positions[1:], found.g[1:], strict=True):
         expected = next(islice(prepared.iterates(PROBLEM), number - 1, None))
@@ -149,7 +149,7 @@ def test_stamps_that_another_clock_does_not_bear_out_are_a_failure(
     monkeypatch.setattr(convergence_curves, "perf_counter", lambda: scale * perf_counter())
     prepared = SparseLocalGlobal().prepare(PROBLEM.system)
     with pytest.raises(RunFailed, match="the times of iterates add up to"):
-        retry_if_preempted(lambda: ([{"interrupted": curve(prepared, iterations=120).preempted}], None))
+        retry_if_preempted(lambda: ([{"interrupted": curve(prepared, max_iterations=120).preempted}], None))
 
 
 def test_passes_that_differ_in_the_last_bit_are_a_failure() -> None:
@@ -166,7 +166,7 @@ def test_passes_that_differ_in_the_last_bit_are_a_failure() -> None:
 
 def at_a_saddle(iterate: Callable[[int], Positions]) -> ScoredCurve:
     above = refine_minimum(FLAT, FLAT.current_positions, NewtonSolver())
-    limits: dict[str, Any] = {"iterations": 40, "time_limit": 60.0, "rounds": 1}
+    limits: dict[str, Any] = {"max_iterations": 40, "time_limit": 60.0, "num_rounds": 1}
     return measure_convergence(
         cast("Any", Scripted(iterate)), STARTED, ReferenceEvaluator(FLAT.system), above.objective, **limits
     )
@@ -191,5 +191,5 @@ def test_a_solver_that_leaves_a_saddle_goes_on_to_its_minimum() -> None:
 
 def test_a_stationarity_that_is_no_number_is_a_divergence(monkeypatch: pytest.MonkeyPatch) -> None:
     reading = StationarityReading(np.inf, 0.0, np.inf)
-    monkeypatch.setattr(ReferenceEvaluator, "stationarity", lambda self, problem, p: reading)
+    monkeypatch.setattr(ReferenceEvaluator, "measure_stationarity", lambda self, problem, p: reading)
     assert curve(Scripted(towards(lambda n: 0.5**n))).status == "diverged"
