@@ -113,7 +113,7 @@ def factorisations(monkeypatch: pytest.MonkeyPatch) -> Factorisations:
         return once(self, *given)
 
     monkeypatch.setattr(BlockCholesky, "factorise", factorise)
-    monkeypatch.setattr(BlockCholesky, "solve_anew", solve_anew)
+    monkeypatch.setattr(BlockCholesky, "factorise_and_solve", solve_anew)
     return found
 
 

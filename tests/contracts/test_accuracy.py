@@ -194,7 +194,9 @@ def test_a_minimum_that_is_not_certified_is_told_and_nothing_is_graded_by_it(
 ) -> None:
     monkeypatch.setattr(reference_store, "find_minima", lambda problem, solver: KnownMinima((), "it ended on a saddle"))
     monkeypatch.setattr(
-        reference_store, "polish", lambda problem, p, solver: replace(certify_minimum(problem, p), kind=INACCURATE)
+        reference_store,
+        "refine_minimum",
+        lambda problem, p, solver: replace(certify_minimum(problem, p), kind=INACCURATE),
     )
     made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, violent]", "early"))
     made.run()

@@ -46,8 +46,8 @@ COUNT = len(REFINEMENTS) * 3
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """A grid of six simulations."""
-    monkeypatch.setattr(module, "candidates", lambda: WAYS)
-    monkeypatch.setattr(module, "REFINEMENTS", REFINEMENTS)
+    monkeypatch.setattr(module, "build_candidate_grid", lambda: WAYS)
+    monkeypatch.setattr(module, "TIME_STEP_REFINEMENTS", REFINEMENTS)
 
 
 @pytest.fixture
@@ -203,7 +203,7 @@ def test_compiling_counts_against_no_time_limit(scene: Path, monkeypatch: pytest
                 sleep(0.3)
             yield step
 
-    monkeypatch.setattr(work_precision, "simulate", simulate)
+    monkeypatch.setattr(work_precision, "simulate_scene", simulate)
     limited = replace(spec, measurement=replace(spec.measurement, time_limit=0.25))
     row = work_precision.build_work_rows(
         limited, load_reference_trajectory(limited, open_reference_store(scene.parent / "results")), lambda: None

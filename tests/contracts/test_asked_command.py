@@ -74,7 +74,9 @@ def test_what_rows_measured_before_tell_to_be_dear_is_not_tried_again(tmp_path, 
     monkeypatch.setattr(
         "springbench.harness.experiments.error_control.candidate_methods.list_candidate_methods", lambda: few
     )
-    monkeypatch.setattr("springbench.harness.experiments.error_control.stored_trials.tried", lambda: few)
+    monkeypatch.setattr(
+        "springbench.harness.experiments.error_control.stored_trials.list_candidate_methods", lambda: few
+    )
     asked = ErrorTarget.from_scene(load_scene(SCENES / "single-spring.yaml"), 2, 0.2)
     seen = compute_predictability_horizon(asked, 1e-3, lambda line: None)
     answer = search_cheapest_method(asked, 1e-3, seen, lambda line: None)

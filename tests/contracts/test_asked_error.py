@@ -161,7 +161,8 @@ def test_the_error_is_never_above_the_one_that_was_asked_for_whichever_way_wins(
     )
     for way in prepare_candidate_methods(asked, told.append):
         monkeypatch.setattr(
-            "springbench.harness.experiments.error_control.method_search.ways", lambda *_, way=way: [way]
+            "springbench.harness.experiments.error_control.method_search.prepare_candidate_methods",
+            lambda *_, way=way: [way],
         )
         found = search_cheapest_method(asked, error, seen, told.append).best_trial
         true = truth.measure_error(0, found.trajectory.positions[-1])
@@ -363,7 +364,7 @@ def test_contact_is_refused_with_what_can_be_had(monkeypatch):
     """Which is the difference that halving the steps makes: half as much each time, for the order is 1."""
     floor = ContactEffect.model_validate({"obstacles": [{"kind": "plane", "point": [0.0, -9.0, 0.0]}]})
     spec = chain(SpringsEffect(stretch=40.0), GravityEffect(), HELD, floor)
-    monkeypatch.setattr(module, "_SPENT", 0.5)
+    monkeypatch.setattr(module, "_STEP_DOUBLING_SECONDS", 0.5)
     with pytest.raises(RunFailed, match=r"contact begins and ends within steps.*steps of .* s end within .* of where"):
         ErrorTarget.from_scene(spec, 5, END)
     asked = ErrorTarget(chain(SpringsEffect(stretch=40.0), GravityEffect(), HELD), 5, END, FRAMES)

@@ -67,7 +67,7 @@ def test_others_refuse_contact_by_name(solver):
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("solver", [*PREFACTORED, "vbd"])
 def test_no_iteration_raises_the_objective(solver, scene, few, monkeypatch):
-    monkeypatch.setattr(method, "_FEW", few)
+    monkeypatch.setattr(method, "_MAX_WOODBURY_ROWS", few)
     problem, wanted = landed(scene)
     problem = replace(problem, initial_guess=problem.inertial_target)  # deep inside
     values = [problem.value(problem.initial_guess)]
@@ -89,9 +89,9 @@ def test_conjugate_gradients_correct_as_woodburys_formula_does(scene, monkeypatc
     gradient[problem.system.pins.vertices[problem.system.pins.exact_mask]] = 0.0
     plain = corrections.solve_without_contact(gradient)
     exact, rows = corrections.solve_with_contact([energy], p, gradient, plain, majorise=True)
-    monkeypatch.setattr(method, "_FEW", 0)
-    monkeypatch.setattr(method, "_ITERATIONS", 2000)
-    monkeypatch.setattr(method, "_TOLERANCE", 1e-12)
+    monkeypatch.setattr(method, "_MAX_WOODBURY_ROWS", 0)
+    monkeypatch.setattr(method, "_MAX_CG_ITERATIONS", 2000)
+    monkeypatch.setattr(method, "_CG_RTOL", 1e-12)
     found = corrections.solve_with_rows(rows, gradient, plain)
     # Weights lie six orders above Q: so many digits of sixteen are lost, on both ways.
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-6 * np.abs(exact).max())

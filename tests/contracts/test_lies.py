@@ -147,7 +147,7 @@ def late(monkeypatch: pytest.MonkeyPatch) -> None:
         held.append(frame.positions)
         record(self, replace(frame, positions=held[-2] if len(held) > 1 else held[0]))
 
-    monkeypatch.setattr(RerunRecorder, "frame", frame)
+    monkeypatch.setattr(RerunRecorder, "record_frame", frame)
 
 
 def recoloured(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -158,7 +158,7 @@ def recoloured(monkeypatch: pytest.MonkeyPatch) -> None:
         first.append(strains(self, p))
         return first[0]
 
-    monkeypatch.setattr(StrainShading, "strains", of)
+    monkeypatch.setattr(StrainShading, "compute_strains", of)
 
 
 RECORDINGS = {
@@ -184,7 +184,7 @@ def test_a_run_whose_second_pass_goes_another_way_than_the_timed_one_fails(ran, 
         moved = advance(self, start, solution)
         return moved._replace(positions=moved.positions + 1e-9 * (next(steps) >= 2 * FRAMES))
 
-    monkeypatch.setattr(SingleStageIntegrator, "advance", drifting)
+    monkeypatch.setattr(SingleStageIntegrator, "complete_step", drifting)
     (row,), _ = ran()
     assert row["status"] == "failed"
     assert row["reason"] == "the recorded pass ended at other positions than the timed pass"

@@ -57,7 +57,9 @@ def found(monkeypatch: pytest.MonkeyPatch, error: float, told: list[str], **foll
     """The answer among ways of these names, the last of which tells the errors of all."""
     exact = Tolerant(lambda steps: 5.0 * steps**-4.0, 0.5, 4)
     named = [Method("own", name, one) for name, one in {**followers, "exact": exact}.items()]
-    monkeypatch.setattr("springbench.harness.experiments.error_control.method_search.ways", lambda *_: named)
+    monkeypatch.setattr(
+        "springbench.harness.experiments.error_control.method_search.prepare_candidate_methods", lambda *_: named
+    )
     asked = ErrorTarget.from_scene(SPRING, 2, 0.2)
     return search_cheapest_method(asked, error, estimate_growth(SPRING, 2, 0.2), told.append)
 
@@ -109,9 +111,12 @@ def test_a_way_that_takes_longer_than_the_next_promises_is_tried_after_it(monkey
 def test_an_error_that_no_way_comes_near_is_refused_with_the_nearest(monkeypatch):
     lows = {"a": 0.3, "b": 0.2}
     named = [Method("own", k, Formula(lambda steps, low=low: low + 1.0 / steps**2, 1e-3)) for k, low in lows.items()]
-    monkeypatch.setattr("springbench.harness.experiments.error_control.method_search.ways", lambda *_: named)
     monkeypatch.setattr(
-        "springbench.harness.experiments.error_control.method_search._Search._closer", lambda *_: _truth()
+        "springbench.harness.experiments.error_control.method_search.prepare_candidate_methods", lambda *_: named
+    )
+    monkeypatch.setattr(
+        "springbench.harness.experiments.error_control.method_search._MethodSearch._find_reference_trial",
+        lambda *_: _truth(),
     )
     with pytest.raises(RunFailed, match=r"no steps keep to an error of 0.01: b came nearest and reached 0\.3"):
         search_cheapest_method(

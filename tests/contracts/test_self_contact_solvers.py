@@ -220,7 +220,7 @@ def test_the_second_opinion_agrees_with_the_barrier_and_with_no_other(stiff, tol
     spec = SceneSpec.model_validate(
         given | {"effects": (SpringsEffect(stretch=100.0), SelfContactEffect(thickness=0.4, friction=friction))}
     )
-    monkeypatch.setattr(collision_primitives, "_STIFF", stiff)
+    monkeypatch.setattr(collision_primitives, "_STIFFNESS_FRACTION", stiff)
     assert verify_terms(spec, build_scene(spec, 3), "implicit-euler").startswith(told)
 
 

@@ -111,7 +111,7 @@ def test_what_somebody_else_has_done_since_is_left_to_that(tmp_path: Path):
 
 
 def test_whoever_packs_a_folder_has_it_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(folder_locks, "_PATIENCE", 0.0)
+    monkeypatch.setattr(folder_locks, "_LOCK_TIMEOUT", 0.0)
     with (
         folder_locks.lock_folder_shared(tmp_path),
         pytest.raises(InputError, match="another springbench is running"),

@@ -174,8 +174,10 @@ def test_a_drawing_process_that_is_lost_fails_the_command_and_keeps_what_was_mea
 ):
     from springbench.harness.report import sweep_pictures
 
-    monkeypatch.setattr(sweep_pictures, "get_ready", int)
-    monkeypatch.setattr(sweep_pictures, "draw_sweep", leave)  # where it draws: that process is a fork of this one
+    monkeypatch.setattr(sweep_pictures, "preload_drawing", int)
+    monkeypatch.setattr(
+        sweep_pictures, "draw_sweep_pictures", leave
+    )  # where it draws: that process is a fork of this one
     made = write_plugin_solver(tmp_path, monkeypatch, options="frames: 1, rounds: 1, iterations: 5")
     told = ran(made)
     assert told.exit_code == 1

@@ -107,8 +107,8 @@ def launch_all() -> None:
 @pytest.mark.skipif(bool(missing()), reason=f"{missing()} is not installed; {cuda_device.INSTALL_HINT}")
 def test_every_kernel_compiles_as_it_is_launched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(additive_schwarz, "PATCH", 3)  # small scenes have levels, and the reference changes soon
-        patch.setattr(device_vbd, "REBASE", 3)
+        patch.setattr(additive_schwarz, "SUBDOMAIN_SIZE", 3)  # small scenes have levels, and the reference changes soon
+        patch.setattr(device_vbd, "REBASE_INTERVAL", 3)
         launches = recorded(patch)
         launch_all()
         assert set(launches) == set(ahead.kernels())

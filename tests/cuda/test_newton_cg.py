@@ -51,7 +51,7 @@ def test_iterates_on_several_levels_are_those_of_the_processor(
     name: str, make: Callable[[], StepProblem], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In patches of three, so that small scenes have three levels, and a last patch that is not full."""
-    monkeypatch.setattr(additive_schwarz, "PATCH", 3)
+    monkeypatch.setattr(additive_schwarz, "SUBDOMAIN_SIZE", 3)
     same_iterates(schwarz_cg, make(), 2)
 
 
@@ -88,7 +88,7 @@ def test_what_it_does_not_know_it_refuses_by_name(
 
 def test_sums_of_blocks_are_added_by_a_tree(monkeypatch: pytest.MonkeyPatch) -> None:
     if is_simulated():
-        monkeypatch.setattr(device_sums, "THREADS", 8)
+        monkeypatch.setattr(device_sums, "THREADS_PER_BLOCK", 8)
     count = 3 * device_sums.THREADS_PER_BLOCK + 1
     terms = np.random.default_rng(0).normal(size=(2, count))
     given, out = cuda.to_device(terms), cuda.to_device(np.zeros(2))

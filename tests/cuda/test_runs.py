@@ -56,7 +56,7 @@ def test_rows_tell_of_the_device_and_timed_steps_ask_for_no_residual(
         return found
 
     monkeypatch.setattr(device_solver.DeviceSolverState, "residual", counted)
-    monkeypatch.setattr(device_solver.DeviceSolver, "replay", seen)
+    monkeypatch.setattr(device_solver.DeviceSolver, "replay_iterations", seen)
     told, (here, there) = ran(tmp_path)
     assert told.exit_code == 0, told.output
     assert {row["device"] for row in here} == {cuda_device.describe_device()["device"]}
@@ -95,12 +95,12 @@ for kind in (OutOfMemory, Lost):
 def test_a_device_that_fails_is_a_row_and_the_sweep_goes_on(
     error: Exception, said: str, lost: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(where, "_BROKEN", [])
+    monkeypatch.setattr(where, "_DEVICE_FAILURES", [])
 
     def fails(self: Any, array: Any) -> Any:
         raise error
 
-    monkeypatch.setattr(cuda_target.DeviceStream, "download", fails)
+    monkeypatch.setattr(cuda_target.DeviceStream, "download_array", fails)
     told, (here, there) = ran(tmp_path)
     assert told.exit_code == 1
     assert [row["status"] for row in here] == ["failed"]

@@ -44,7 +44,7 @@ STARTS: dict[str, Callable[[Positions, np.random.Generator], Positions]] = {
 @pytest.fixture(autouse=True)
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """The reference changes within few iterations."""
-    monkeypatch.setattr(device_vbd, "REBASE", 3)
+    monkeypatch.setattr(device_vbd, "REBASE_INTERVAL", 3)
 
 
 PRECISIONS: tuple[Literal["float64", "float32"], ...] = ("float64", "float32")

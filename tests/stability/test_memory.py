@@ -82,11 +82,11 @@ def test_a_size_within_the_limit_is_refused_by_a_machine_that_is_too_small_for_i
     """4,999,696 vertices, just below the largest number of all."""
     config = tmp_path / "large.yaml"
     config.write_text(SCENE.format(kind="grid", size=2_236))
-    monkeypatch.setattr(memory, "of_machine", lambda: 4.0 * GIB)
+    monkeypatch.setattr(memory, "compute_memory_limit", lambda: 4.0 * GIB)
     said = refusal(config, "list")
     for needle in ("4,999,696 vertices of at most 3,869,339", "5.17 GiB", "4 GiB may be taken"):
         assert needle in said
-    monkeypatch.setattr(memory, "of_machine", lambda: 6.0 * GIB)
+    monkeypatch.setattr(memory, "compute_memory_limit", lambda: 6.0 * GIB)
     GridMesh().check_size(2_236)
     with pytest.raises(InputError, match="allowed for grid: 2 to 2236 "):
         GridMesh().check_size(2_237)
@@ -127,7 +127,7 @@ def test_a_mesh_takes_what_was_estimated(mesh: MeshGenerator, size: int):
 @pytest.mark.parametrize("solver", [DenseLocalGlobal()], ids=repr)
 def test_dense_matrices_are_refused_at_200_vertices_a_side(solver: Solver, monkeypatch: pytest.MonkeyPatch):
     system = build_test_scene(GridMesh(), SpringsEffect(stretch=10.0, shear=2.0), size=200).system
-    monkeypatch.setattr(memory, "of_machine", lambda: 64.0 * GIB)
+    monkeypatch.setattr(memory, "compute_memory_limit", lambda: 64.0 * GIB)
     with pytest.raises(Unsupported, match=r"40,000 vertices and 158,802 springs take 178 GiB .* 64 GiB may be taken"):
         solver.prepare(system)
 
@@ -136,7 +136,7 @@ def test_dense_matrices_are_refused_at_200_vertices_a_side(solver: Solver, monke
 def test_a_hessians_factor_that_does_not_fit_is_refused(solver: Solver, monkeypatch: pytest.MonkeyPatch):
     """Nine times the entries of Q's, which fits."""
     system = build_test_scene(GridMesh(), SpringsEffect(stretch=10.0, shear=2.0), size=40).system
-    monkeypatch.setattr(memory, "of_machine", lambda: 4.0 * 2**20)
+    monkeypatch.setattr(memory, "compute_memory_limit", lambda: 4.0 * 2**20)
     with pytest.raises(Unsupported, match=r"factor of the Hessian has [\d,]+ entries and takes [\d.]+ MiB .* 4 MiB"):
         solver.prepare(system)
 

@@ -60,7 +60,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], dict[st
         page_layout.save_page(sheet, path)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plot_sheet, "save", save)
+        patch.setattr(plot_sheet, "save_page", save)
         return draw_accuracy_report(folder), pages
 
 
@@ -130,7 +130,7 @@ def test_what_other_code_measured_is_hollow_in_every_picture_and_told(
             rows += made.build_curve_rows("net", size, "early", solver, code="before" if solver == "newton" else None)
     rows += [row | {"code": "before" if row["solver"] == "hybrid" else None} for row in made.build_work_rows("net", 6)]
     pages: dict[str, Figure] = {}
-    monkeypatch.setattr(plot_sheet, "save", lambda drawn, path: pages.setdefault(path.parent.name, drawn))
+    monkeypatch.setattr(plot_sheet, "save_page", lambda drawn, path: pages.setdefault(path.parent.name, drawn))
     table = read_accuracy(made.write_accuracy_rows(tmp_path, rows))
     for draw_all, name in (
         (draw_convergence, "convergence"),

@@ -96,7 +96,7 @@ def test_clocks_that_differ_are_said(off: float, words: str):
     ],
 )
 def test_where_there_is_no_cluster_that_is_said(on: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    monkeypatch.setattr(dask_cluster, "PATIENCE", 0.3)
+    monkeypatch.setattr(dask_cluster, "CONNECT_TIMEOUT", 0.3)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=said), dask_cluster.connect_cluster(on, [], print):
         pass

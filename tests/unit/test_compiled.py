@@ -179,7 +179,7 @@ def test_blocks_change_nothing_but_the_order_of_work(solver, size, monkeypatch):
     """A sheet large enough for groups, in one block each and in many, with one thread and two."""
     problem = build_first_problem(build_cloth(60))
     whole = solver.prepare(problem.system)
-    monkeypatch.setattr(elimination_schedule, "BLOCK_BYTES", size)
+    monkeypatch.setattr(elimination_schedule, "MAX_BLOCK_BYTES", size)
     cut = solver.prepare(problem.system)
     assert isinstance(cut, PreparedCompiledLocalGlobal)
     assert isinstance(whole, PreparedCompiledLocalGlobal)

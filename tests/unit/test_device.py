@@ -132,7 +132,7 @@ def nvml(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         nvmlDeviceGetTemperature=lambda handle, of: 41,
     )
     there = {"pynvml": made, "numba.cuda": SimpleNamespace(get_current_device=lambda: SimpleNamespace(uuid="GPU-0"))}
-    monkeypatch.setattr(cuda_device, "simulated", lambda: False)
+    monkeypatch.setattr(cuda_device, "is_simulated", lambda: False)
     monkeypatch.setattr(cuda_device, "import_module", there.__getitem__)
     return made
 

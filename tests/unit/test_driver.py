@@ -203,7 +203,9 @@ class PreparedNear(PreparedStepping):
 def test_a_small_residual_is_the_floor_where_the_gradient_is_round_off(monkeypatch, rests, most, wanted, looks):
     run, looked = Stepping(0, 1000), []
     monkeypatch.setattr(PreparedNear, "begin", lambda *_: run)
-    monkeypatch.setattr(iterative_solver, "at_rest", lambda *_: looked.append(run.count) or run.count >= rests)
+    monkeypatch.setattr(
+        iterative_solver, "is_gradient_roundoff", lambda *_: looked.append(run.count) or run.count >= rests
+    )
     monkeypatch.setattr(PreparedNear, "residual_at", lambda *_: 1.0)
     solution = PreparedNear(0).solve(build_first_problem(build_cloth(3)), StopRule(most, 1e-300))
     assert ((solution.num_iterations, solution.termination_reason), looked) == (wanted, looks)

@@ -80,7 +80,7 @@ def test_and_in_those_of_speed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert {row["series"] for row in panel.rows() if row["other_code"]} == {"numba supernodal"}
     found = speed_figures(base_rows.read_rows(row_store.list_units(told / "rows")))
     pages: list[Figure] = []
-    monkeypatch.setattr(size_plot, "save", lambda page, path: pages.append(page))
+    monkeypatch.setattr(size_plot, "save_page", lambda page, path: pages.append(page))
     draw_speed_plots(found, tmp_path)
     drawn = [page for page in pages if page.axes[0].lines]
     assert len(drawn) == 4, "the part of the limit is not known"

@@ -75,7 +75,7 @@ def test_the_sheet_has_a_tile_for_each_scene_and_says_what_drew_it(tmp_path: Pat
         said.append([text.get_text() for text in page.texts])
         page.savefig(path)
 
-    monkeypatch.setattr(gallery_sheet, "save", save)
+    monkeypatch.setattr(gallery_sheet, "save_page", save)
     paths = [tmp_path / f"scene-{k}.yaml" for k in range(7)]
     for path in paths:
         path.write_text(SCENE)

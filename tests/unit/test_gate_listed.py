@@ -27,6 +27,6 @@ def test_the_gates_of_a_table_share_its_error_and_each_may_have_a_budget_of_its_
         asked.append((rule, budget))
         return "holds"
 
-    monkeypatch.setattr(regression_table, "confirmed", confirmed)
+    monkeypatch.setattr(regression_table, "run_confirmed_benchmark", confirmed)
     regression_table.run_regression_table(tmp_path / "gates.yaml", 60.0, lambda line: None, alpha=0.01)
     assert asked == [(SequentialTest(1.5, 0.005), 60.0), (SequentialTest(2.0, 0.005), 7.0)]

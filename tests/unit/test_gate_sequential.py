@@ -132,11 +132,11 @@ def test_a_smaller_error_takes_more_turns():
 @pytest.mark.parametrize(
     ("given", "named"),
     [
-        ({"limit": 0.0}, "limit: came 0.0"),
-        ({"limit": -1.0}, "limit: came -1.0"),
-        ({"limit": float("nan")}, "limit: came nan"),
-        ({"limit": 1.03, "alpha": 0.0}, "alpha: came 0.0"),
-        ({"limit": 1.03, "alpha": 1.0}, "alpha: came 1.0"),
+        ({"max_ratio": 0.0}, "limit: came 0.0"),
+        ({"max_ratio": -1.0}, "limit: came -1.0"),
+        ({"max_ratio": float("nan")}, "limit: came nan"),
+        ({"max_ratio": 1.03, "alpha": 0.0}, "alpha: came 0.0"),
+        ({"max_ratio": 1.03, "alpha": 1.0}, "alpha: came 1.0"),
     ],
 )
 def test_a_rule_that_cannot_be_is_refused(given: dict[str, float], named: str):

@@ -67,7 +67,7 @@ def test_pairs_that_differ_all_their_lives_are_drawn_again_in_a_long_race(monkey
     # A third of the pairs is .8 % apart: alone it does not show that the code is 2 % slower and not 1 %.
     recorded = starts((1.0, 1.0, 0.992), noise=0.04)
     several = replay_tests(recorded, 1.02, SequentialTest(1.01), budget=300.0, num_replays=300)
-    monkeypatch.setattr("springbench.harness.experiments.regression.replay_study.PAIR", 300.0)
+    monkeypatch.setattr("springbench.harness.experiments.regression.replay_study.RESTART_SECONDS", 300.0)
     alone = replay_tests(recorded, 1.02, SequentialTest(1.01), budget=300.0, num_replays=300)
     assert several.pass_rate == 0.0
     assert several.fail_rate > alone.fail_rate + 0.2  # .90 and .54

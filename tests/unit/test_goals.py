@@ -106,7 +106,7 @@ def test_goals_are_timed_beside_a_peer_and_steps_of_one_length(tmp_path: Path) -
 
 
 def test_what_takes_too_long_is_a_bound_of_the_goal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(target_baseline, "LONGEST", 0.0)
+    monkeypatch.setattr(target_baseline, "MAX_SIMULATION_SECONDS", 0.0)
     path = config(
         tmp_path, "[{scene: spring, horizon: 0.2, error: 1e-3, integrator: midpoint, solver: newton, wanted: 1e-9}]"
     )

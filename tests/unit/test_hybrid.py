@@ -66,7 +66,7 @@ def test_a_graph_is_ordered_once(monkeypatch):
         ordered[0] += 1
         return whole(*graph)
 
-    monkeypatch.setattr(symbolic_factorisation, "nested_dissection", ordering)
+    monkeypatch.setattr(symbolic_factorisation, "nested_dissection_order", ordering)
     HybridNewton().prepare(stiff(1.0).system)
     assert ordered == [1]
     HybridNewton().prepare(stiff(1.0).system)

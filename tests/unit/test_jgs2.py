@@ -108,7 +108,7 @@ def test_what_the_rest_shape_does_not_tell_is_refused_by_name(scene, name):
 
 
 def test_responses_that_do_not_fit_in_memory_are_refused_beforehand(monkeypatch):
-    monkeypatch.setattr(memory, "of_machine", lambda: 5e4)
+    monkeypatch.setattr(memory, "compute_memory_limit", lambda: 5e4)
     with pytest.raises(Unsupported, match=r"within 4 rings .* KiB of memory.*take fewer rings"):
         compute_responses(csr_array(np.eye(300)), chain(100), 4)
 

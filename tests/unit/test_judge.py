@@ -239,7 +239,7 @@ def test_a_run_that_fails_keeps_and_marks_its_recording_up_to_there(tmp_path: Pa
                 step.positions[1] = np.inf
             yield step
 
-    monkeypatch.setattr("springbench.harness.simulation.timing_pass.simulate", burst)
+    monkeypatch.setattr("springbench.harness.simulation.timing_pass.simulate_scene", burst)
     (row,) = execute_run(spec, files, lambda phase: None)
     assert (row["status"], row["frame"]) == ("diverged", 3)
     assert "not finite" in row["reason"]

@@ -213,7 +213,7 @@ def test_what_cannot_be_read_is_compiled_and_kept_anew(home: Path, damage: Damag
 @pytest.fixture
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder in which kernels are kept."""
-    monkeypatch.setattr(kernel_cache, "_home", lambda source: tmp_path)
+    monkeypatch.setattr(kernel_cache, "_writable_root", lambda source: tmp_path)
     return tmp_path
 
 
@@ -221,7 +221,7 @@ def test_a_disk_without_room_costs_the_kept_code_alone(home: Path, monkeypatch: 
     def full(path: Path, content: bytes) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(kernel_cache, "_write", full)
+    monkeypatch.setattr(kernel_cache, "_write_atomically", full)
     assert cached_njit()(twice)(1.0) == 2.0
     assert not [*home.glob("*/*")]
 

@@ -270,6 +270,6 @@ def test_stiffness_beyond_the_digits_of_inertia_leaves_numbers(backend):
 def test_the_product_with_a_large_dense_matrix_is_the_same(monkeypatch):
     problem = build_first_problem(build_cloth(12))
     usual = iterates(DenseLocalGlobal(), problem, 10)
-    monkeypatch.setattr(reference_local_global, "_LARGE", 0)
+    monkeypatch.setattr(reference_local_global, "_LARGE_MATRIX_ENTRIES", 0)
     for one, other in zip(usual, iterates(DenseLocalGlobal(), problem, 10), strict=True):
         np.testing.assert_allclose(other, one, rtol=0.0, atol=1e-12)  # metres, beside an extent of one

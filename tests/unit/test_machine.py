@@ -170,7 +170,7 @@ def looked(monkeypatch: pytest.MonkeyPatch):
     """Says how busy four cores are [%]; what was found of them is forgotten before and after."""
 
     def pretend(*busy: float) -> None:
-        monkeypatch.setattr(machine_info, "_usable", lambda: 4)
+        monkeypatch.setattr(machine_info, "_count_usable_cores", lambda: 4)
         monkeypatch.setattr(machine_info.os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
         monkeypatch.setattr(psutil, "cpu_percent", lambda _, percpu: list(busy))
 

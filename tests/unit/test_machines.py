@@ -116,8 +116,8 @@ def test_a_report_says_that_its_counts_may_be_compared():
 
 def test_what_a_machine_can_do_is_found_once_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(machine_calibration, "_KNOWN", {})
-    monkeypatch.setattr(machine_calibration, "_OWN", 0.0)  # whatever else runs here
+    monkeypatch.setattr(machine_calibration, "_CALIBRATION_CACHE", {})
+    monkeypatch.setattr(machine_calibration, "_MIN_CPU_SHARE", 0.0)  # whatever else runs here
     found = machine_calibration.calibrate_machine(lambda said: None)
     assert set(found) == set(machine_calibration.CALIBRATION_COLUMNS)
     assert 1e7 < found["machine_bandwidth"] < 1e13
@@ -127,14 +127,14 @@ def test_what_a_machine_can_do_is_found_once_and_kept(tmp_path: Path, monkeypatc
     assert kept.stem == compute_node_id()
     for name in ("bandwidth", "flops", "step"):
         monkeypatch.delattr(machine_calibration, name)  # what is kept is not found again
-    monkeypatch.setattr(machine_calibration, "_KNOWN", {})
+    monkeypatch.setattr(machine_calibration, "_CALIBRATION_CACHE", {})
     assert machine_calibration.calibrate_machine(lambda said: None) == found
 
 
 def test_what_a_busy_machine_can_do_is_told_and_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(machine_calibration, "_KNOWN", {})
-    monkeypatch.setattr(machine_calibration, "_OWN", 2.0)  # more than any thread can have
+    monkeypatch.setattr(machine_calibration, "_CALIBRATION_CACHE", {})
+    monkeypatch.setattr(machine_calibration, "_MIN_CPU_SHARE", 2.0)  # more than any thread can have
     assert set(machine_calibration.calibrate_machine(lambda said: None)) == set(machine_calibration.CALIBRATION_COLUMNS)
     assert not user_cache_dir("machine").exists()
 
@@ -144,6 +144,6 @@ def test_a_run_without_the_memory_for_it_is_done_all_the_same(tmp_path: Path, mo
         raise MemoryError
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(machine_calibration, "_KNOWN", {})
-    monkeypatch.setattr(machine_calibration, "bandwidth", full)
+    monkeypatch.setattr(machine_calibration, "_CALIBRATION_CACHE", {})
+    monkeypatch.setattr(machine_calibration, "measure_copy_bandwidth", full)
     assert machine_calibration.calibrate_machine(lambda said: None) == {}

@@ -174,7 +174,7 @@ def test_senseless_sizes_are_refused_with_what_is_allowed(generator, size):
 
 @pytest.mark.parametrize("generator", GENERATORS, ids=lambda g: type(g).__name__)
 def test_the_largest_size_named_is_the_largest_that_fits(generator, monkeypatch):
-    monkeypatch.setattr(memory, "of_machine", lambda: 2.0**40)  # so that memory is not what limits
+    monkeypatch.setattr(memory, "compute_memory_limit", lambda: 2.0**40)  # so that memory is not what limits
     with pytest.raises(InputError) as caught:
         generator.build_mesh(generator.MIN_SIZE - 1)
     largest = int(str(caught.value).split(" to ")[1].split()[0])

@@ -67,7 +67,7 @@ def test_a_matrix_without_a_factor_is_refused(name: str):
 
 @pytest.mark.parametrize("name", NATIVE)
 def test_other_energies_are_refused_before_anything_is_compiled(name: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(cpp_backend, "library", lambda *_: pytest.fail("compiled"))
+    monkeypatch.setattr(cpp_backend, "load_library", lambda *_: pytest.fail("compiled"))
     system = build_cloth(3).system
     with pytest.raises(Unsupported, match=f"{name}: knows springs only"):
         load_target(OPTIONAL_SOLVERS[name])().prepare(

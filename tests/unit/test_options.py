@@ -49,7 +49,7 @@ def test_a_value_on_the_command_line_means_what_it_means_in_a_file(
         asked["runs"] = load_config(path, sizes=[4], **options).list_runs()
         raise InputError("enough")
 
-    monkeypatch.setattr(config_loader, "load_any", loaded)
+    monkeypatch.setattr(config_loader, "load_config", loaded)
     values = {"iterations": "7", "tolerance": "1e-3", "integrator": "bdf2", "time_step": "1/60", "frames": "0x3"}
     values |= {"first_guess": "inertial", "threads": "auto", "rounds": "1"}
     assert set(values) == set(RUN_OPTIONS) - {"accuracy"}, "which would choose most of them"

@@ -146,13 +146,13 @@ def test_parameters_by_other_sources_are_kept_beside_each_other_for_a_while(
     (tmp_path / "sweep.yaml").write_text("scenes: [scene.yaml]\nsolvers: [sparse]\n")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     for checkout in "ab":
-        monkeypatch.setattr(solver_parameters, "_of_sources", lambda checkout=checkout: 16 * checkout)
+        monkeypatch.setattr(solver_parameters, "_hash_solver_sources", lambda checkout=checkout: 16 * checkout)
         load_config(tmp_path / "sweep.yaml", imports_code=False)
     kept = {path.stem: path for path in (tmp_path / "springbench" / "parameters").iterdir()}
     assert set(kept) == {f"sparse-{16 * checkout}" for checkout in "ab"}
 
     os.utime(kept.pop(f"sparse-{16 * 'a'}"), (0, 0))
-    monkeypatch.setattr(solver_parameters, "_of_sources", lambda: 16 * "c")
+    monkeypatch.setattr(solver_parameters, "_hash_solver_sources", lambda: 16 * "c")
     load_config(tmp_path / "sweep.yaml", imports_code=False)
     assert {path.stem[-1] for path in (tmp_path / "springbench" / "parameters").iterdir()} == {"b", "c"}
 
@@ -167,6 +167,6 @@ def test_the_file_of_a_class_is_known_however_its_module_was_loaded(tmp_path: Pa
     by_hand.loader.exec_module(module)
     assert source_digest.find_class_sources(module.Mine) == {path}
     monkeypatch.setitem(sys.modules, "by_hand", module)
-    monkeypatch.setattr(source_digest, "_INSTALLED", {str(tmp_path)})  # as a package that brings a solver is
+    monkeypatch.setattr(source_digest, "_LIBRARY_FOLDERS", {str(tmp_path)})  # as a package that brings a solver is
     source_digest.find_class_sources.cache_clear()
     assert source_digest.find_class_sources(module.Mine) == {path}

@@ -56,7 +56,7 @@ def test_distances_are_taken_from_the_lowest_residual_that_ends_finite() -> None
 
 def test_without_opengl_the_message_names_the_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(
-        opengl_probe, "_TRY", "import os; os.kill(os.getpid(), 11)"
+        opengl_probe, "_PROBE_SCRIPT", "import os; os.kill(os.getpid(), 11)"
     )  # as VTK ends without the libraries
     opengl_probe.find_opengl_problem.cache_clear()
     try:

@@ -177,7 +177,7 @@ def products(prepared: PreparedDescent, stated: StepProblem, monkeypatch: pytest
         return multiply(self, x)
 
     with monkeypatch.context() as patched:
-        patched.setattr(Hessian, "multiply", counting)
+        patched.setattr(Hessian, "matvec", counting)
         assert prepared.solve(stated, StopRule(500, 1e-6)).termination_reason == "tolerance"
     return count[0]
 

@@ -71,7 +71,7 @@ def test_notes_that_cannot_be_kept_are_no_failure(recording: Path, monkeypatch: 
 
 
 def test_notes_begin_anew_before_they_are_many(recording: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(recording_integrity, "_NOTED", 64)
+    monkeypatch.setattr(recording_integrity, "_MAX_NOTES_BYTES", 64)
     for _ in range(20):
         mark_verified(recording)
     assert recording_integrity._notes_path().stat().st_size <= 64 + 16

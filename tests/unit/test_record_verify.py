@@ -161,7 +161,7 @@ def test_positions_far_from_zero_are_stored_relative_to_an_origin(tmp_path: Path
 def test_positions_rounded_far_from_zero_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Single precision resolves 2 m at 32,000 km; an origin of zero is consistent with that, and no excuse for it."""
     of = far_info()
-    monkeypatch.setattr(rerun_recorder, "local_origin", lambda rest: np.zeros(3))
+    monkeypatch.setattr(rerun_recorder, "compute_local_origin", lambda rest: np.zeros(3))
     with pytest.raises(RunFailed, match=r"positions rounded by 1\.\d* m|positions rounded by 0\.\d+ m"):
         require_last(write_recording(tmp_path / "a.rrd", of, COUNT), of, COUNT - 1, TIME, whole(of)[COUNT - 1])
 

@@ -116,7 +116,7 @@ def boxes(monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[PixelBox, list[
         found.append(layout_frames(*given))
         return found[-1]
 
-    monkeypatch.setattr(run_picture, "layout", kept)
+    monkeypatch.setattr(run_picture, "layout_frames", kept)
     return lambda: found[-1]
 
 

@@ -121,7 +121,7 @@ def sheets(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
         drawn.append(sheet)
         page_layout.save_page(sheet, path, **more)
 
-    monkeypatch.setattr(timing_plot, "save", save)
+    monkeypatch.setattr(timing_plot, "save_page", save)
     return drawn
 
 

@@ -30,7 +30,7 @@ def test_a_run_that_fails_now_keeps_nothing_of_when_it_did_not(tmp_path: Path, m
     def broken(*_):
         raise ZeroDivisionError("nothing to divide by")
 
-    monkeypatch.setattr(run_pipeline, "measure", broken)
+    monkeypatch.setattr(run_pipeline, "measure_run", broken)
     (row,) = execute_run(spec, files, lambda phase: None)
     assert row["status"] == "failed"
     assert "ZeroDivisionError: nothing to divide by (test_run.py:" in row["reason"]

@@ -247,7 +247,7 @@ def test_a_run_that_is_disputed_is_not_right(tmp_path: Path, monkeypatch: pytest
         times.append(verify_terms(*given))
         return times[-1]
 
-    monkeypatch.setattr(verification_status, "second_opinion", counted)
+    monkeypatch.setattr(verification_status, "verify_terms", counted)
 
     def rows_of(run: Any) -> list[dict[str, Any]]:
         files = runs.RunFiles.for_run(run, tmp_path)
@@ -274,7 +274,7 @@ def test_a_run_that_is_disputed_is_not_right(tmp_path: Path, monkeypatch: pytest
 
 def test_a_run_that_is_not_judged_asks_for_no_second_opinion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "scene.yaml").write_text(SCENE)
-    monkeypatch.setattr(verification_status, "second_opinion", lambda *given: pytest.fail("was asked"))
+    monkeypatch.setattr(verification_status, "verify_terms", lambda *given: pytest.fail("was asked"))
     (run,) = load_config(tmp_path / "scene.yaml", solvers=["sparse"], rounds=1, record=False).list_runs()
     files = runs.RunFiles.for_run(run, tmp_path)
     files.rows_path.parent.mkdir()

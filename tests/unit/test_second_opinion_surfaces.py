@@ -64,7 +64,7 @@ WRONG = r"disagrees: (objective \(gradient\), by \S+ of its size; )?effects\[1\]
 
 @pytest.mark.parametrize("name", OBSTACLES)
 def test_it_knows_another_stiffness(name: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(collision_primitives, "_STIFF", 0.1001)
+    monkeypatch.setattr(collision_primitives, "_STIFFNESS_FRACTION", 0.1001)
     given = spec(*OBSTACLES[name])
     assert re.match(WRONG, verify_terms(given, build_scene(given, 3), "implicit-euler"))
 

@@ -42,7 +42,7 @@ def test_where_nothing_touches_it_is_the_motion_that_is_integrated_and_is_found_
     assert (found.reference_kind, truth.reference_kind) == ("self-converged", "integrated")
     # Both integrators err by about what halving their steps moved them, and that is the most that either did.
     assert truth.measure_error(0, found.positions[0]) <= 1.5 * found.disagreement[0] <= 1.5 * REFERENCE_MARGIN * 0.1
-    monkeypatch.setattr(self_converged_trajectory, "converge", None)
+    monkeypatch.setattr(self_converged_trajectory, "compute_self_converged", None)
     again = ReferenceStore(tmp_path).load_trajectory(beside, 3, [END], error=0.2)
     assert (again.positions == found.positions).all()
     with pytest.raises(NotConverged, match=r"halving the steps further takes more than .* ask for an error of"):
@@ -54,7 +54,7 @@ def test_where_nothing_touches_it_is_the_motion_that_is_integrated_and_is_found_
 
 def test_an_impact_that_the_steps_do_not_resolve_has_no_truth(monkeypatch):
     """The end is as far off as the chain has moved: what it gave back is the integrator's."""
-    monkeypatch.setattr(self_converged_trajectory, "SPENT", 0.3)
+    monkeypatch.setattr(self_converged_trajectory, "MAX_SECONDS", 0.3)
     bouncing = thrown(SpringsEffect(stretch=400.0), floor(-0.05), velocity=(0.0, -2.0, 0.0))
     found = self_converged_trajectory.compute_self_converged(
         lambda h, name: build_exact_scene(bouncing.with_time_step(h), 3, name), bouncing.time_step, [END], 0.1

@@ -124,8 +124,8 @@ def test_nothing_is_removed_where_the_packed_rows_differ_from_the_originals(
         table, number = right(*arguments, **named)
         return table.set_column(table.schema.get_field_index("size"), "size", pa.array([64] * len(table))), number
 
-    monkeypatch.setattr(row_union, "table", wrong)
-    monkeypatch.setattr(parquet_rows, "_FEW", 0)
+    monkeypatch.setattr(row_union, "read_table", wrong)
+    monkeypatch.setattr(parquet_rows, "_MAX_SINGLE_READS", 0)
     with pytest.raises(InputError, match="nothing was removed"):
         compact_results(sweep, lambda line: None)
     assert {path: path.read_bytes() for path in sweep.rglob("*.parquet")} == before

@@ -207,7 +207,7 @@ def test_only_what_is_new_is_written_again(tmp_path: Path, monkeypatch: pytest.M
     seen: list[str] = []
     told = page_build.build_overview
     monkeypatch.setattr(
-        page_build, "overview", lambda folder, *a, **k: (seen.append(folder.name), told(folder, *a, **k))[1]
+        page_build, "build_overview", lambda folder, *a, **k: (seen.append(folder.name), told(folder, *a, **k))[1]
     )
     update_page(tmp_path)
     assert not seen
@@ -292,7 +292,9 @@ def test_a_run_alone_is_on_the_page(tmp_path: Path):
 
 def test_figures_of_what_blew_up_are_shown_as_large_as_a_page_can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     normal = synthetic_site_rows.build_run_rows
-    monkeypatch.setattr(synthetic_site_rows, "rows", lambda k: [row | {"largest_strain": 5.2e39} for row in normal(k)])
+    monkeypatch.setattr(
+        synthetic_site_rows, "build_run_rows", lambda k: [row | {"largest_strain": 5.2e39} for row in normal(k)]
+    )
     synthetic_site_rows.write_site_results(tmp_path, 1)
     update_page(tmp_path)
     found = read(tmp_path, f"made/runs/{build_run_columns(0)['run_id']}")

@@ -73,7 +73,9 @@ WRONG = {
     "no answer": Wrong(
         "return None", "def solve", "gave a NoneType; wanted a springbench.solvers.model.step_problem.Solution"
     ),
-    "writes to the target": Wrong("problem.inertial_target[:] += 0.1", "problem.inertial_target", "wrote to problem.inertial_target"),
+    "writes to the target": Wrong(
+        "problem.inertial_target[:] += 0.1", "problem.inertial_target", "wrote to problem.inertial_target"
+    ),
     "writes to the velocity": Wrong(
         "problem.start.velocity[0] = 3.0", "problem.start", "wrote to problem.start.velocity"
     ),
@@ -132,7 +134,7 @@ def test_checks_take_no_timed_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         return measured
 
     sound = runs.measure_run
-    monkeypatch.setattr(runs, "measure", spied)
+    monkeypatch.setattr(runs, "measure_run", spied)
     made = write_plugin_solver(tmp_path, monkeypatch)
     rows_of(made, tmp_path)
     assert seen == [made.solver_path.stem]

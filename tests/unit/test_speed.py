@@ -116,7 +116,7 @@ def test_one_that_would_take_too_long_is_left_out_with_a_row_that_says_so():
 def test_a_long_preparation_is_not_repeated(monkeypatch: pytest.MonkeyPatch):
     calls: list[str] = []
     slow, quick = Scripted("a", calls), Scripted("b", calls)
-    monkeypatch.setattr(round_robin, "LONG", 0.7)
+    monkeypatch.setattr(round_robin, "MAX_REPEATED_SECONDS", 0.7)
     monkeypatch.setattr(slow, "prepare", lambda: calls.append("prepare a") or 1.0)
     found, _ = measure_round_robin([slow, quick], COUNTS, {}, budget=10.0)
     assert [calls.count(f"prepare {name}") for name in "ab"] == [1, NUM_PREPARATIONS]
@@ -237,7 +237,7 @@ def test_a_report_is_complete_and_done_once(sweep, tmp_path: Path, monkeypatch: 
     assert done().equals(table)
     assert (display.titles, said) == (titles, ["2 of 2 sizes are there already"])
     # What other code measured is shown, and said to be so.
-    monkeypatch.setattr(machine_info, "code_hash", lambda: "another")
+    monkeypatch.setattr(machine_info, "hash_sources", lambda: "another")
     done()
     assert said[2] == f"2 of them by other code than today's: {', '.join(titles)}"
     assert all((tmp_path / "out" / "rows").glob("*.parquet"))

@@ -210,7 +210,7 @@ def threads():
 
 @pytest.mark.parametrize("precision", ["float64", "float32", "float16"])
 def test_gives_the_same_bits_whatever_the_number_of_threads(precision, threads, monkeypatch):
-    monkeypatch.setattr(supernodal_cholesky, "_WORTH_THREADS", 0)
+    monkeypatch.setattr(supernodal_cholesky, "_MIN_THREADED_BYTES", 0)
     Q, b = sheet(64), right_hand_sides(4096)
     factor = SupernodalCholesky(Q, precision=precision)
     results = []

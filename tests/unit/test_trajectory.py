@@ -207,7 +207,7 @@ SWING = (SPRING, HELD, GravityEffect(), EtherDragEffect(rate=C))
 def test_a_trajectory_is_integrated_once_for_all_time_steps(tmp_path, monkeypatch):
     kept = ReferenceStore(tmp_path)
     found = kept.load_trajectory(spec(ChainMesh(), *SWING), 3, TIMES, error=1e-3)
-    monkeypatch.setattr(reference_store, "integrate", None)
+    monkeypatch.setattr(reference_store, "integrate_motion", None)
     for time_step in (1 / 30, 1 / 240):
         again = kept.load_trajectory(spec(ChainMesh(), *SWING, time_step=time_step), 3, TIMES, error=1e-3)
         for f in fields(ReferenceTrajectory):
