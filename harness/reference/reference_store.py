@@ -7,7 +7,7 @@
     growth-SCENE-SIZE-HORIZON.npz             growth of a perturbation of the start up to an end time
     converged-SCENE-SIZE-TIMES.npz            positions and velocities of a scene with contact, self-converged
 
-Files have a temporary name until they are complete, and contain arrays only.
+Files have a temporary name until they are complete, and contain arrays only, named as the fields that they store.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from springbench.harness.reference.self_converged_trajectory import (
     has_contact,
 )
 from springbench.harness.reference.step_snapshot import (
+    SNAPSHOT_ARRAYS,
     Arrays,
     StepSnapshot,
     build_exact_scene,
@@ -50,10 +51,12 @@ from springbench.harness.simulation.time_loop import SimulationStep
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.model.step_problem import Positions, Solver
 
-_CERTIFICATE_FIELDS = ("positions", "g", "error", "smallest_eigenvalue", "doubt", "near")
+_CERTIFICATE_FIELDS = tuple(f.name for f in fields(MinimumCertificate) if f.name != "kind")
 """Stored fields of a minimum: the complete certificate of the stored point."""
 _TRAJECTORY_FIELDS = tuple(f.name for f in fields(ReferenceTrajectory) if f.name != "growth")
 """Stored fields of a trajectory; the growth of perturbations has its own file."""
+_SELF_CONVERGED_FIELDS = tuple(f.name for f in fields(SelfConvergedTrajectory))
+_GROWTH_FIELDS = tuple(f.name for f in fields(PerturbationGrowth))
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +87,7 @@ class ReferenceStore:
         """
         asked = _ReferenceRequest(spec, size, integrator)
         path = self.folder / f"run-{asked.name}.npz"
-        violence = _read_arrays(path)["violence"] if path.exists() else np.empty(0)
+        violence = _read_arrays(path, ["violence"]).get("violence", np.empty(0))
         moments = select_snapshot_frames(violence, spec.frames)
         known = self._load_known_snapshots(asked, moments.values()) if len(violence) == spec.frames else {}
         if not set(moments.values()) <= set(known):
@@ -126,9 +129,7 @@ class ReferenceStore:
         `lowest` of the result raises UncertifiedError if there is none.
         """
         path = self.folder / f"minima-{frozen.digest}.npz"
-        if path.exists() and (stored := _read_arrays(path)).keys() >= set(
-            _CERTIFICATE_FIELDS
-        ):  # else by code that certified less
+        if stored := _read_arrays(path, _CERTIFICATE_FIELDS):
             return _build_minima(stored)
         found = find_minima(frozen.problem, self.solver)
         if found.minima:
@@ -180,11 +181,9 @@ class ReferenceStore:
         seen.require_predictable(error, times)
         scene = build_ode_scene(spec, size)
         witness, path = OdeField(scene).evaluate_fingerprint(), self.folder / f"trajectory-{name}.npz"
-        stored: dict[str, Any] = dict(_read_arrays(path)) if path.exists() else {}
+        stored = _read_arrays(path, [*_TRAJECTORY_FIELDS, "witness"])
         if stored and is_equal_to_roundoff(stored.pop("witness"), witness):
-            found = ReferenceTrajectory(
-                **{key: stored[key] for key in _TRAJECTORY_FIELDS}, growth=seen.interpolate_growth(times)
-            )
+            found = ReferenceTrajectory(**stored, growth=seen.interpolate_growth(times))
         else:
             found = replace(integrate_motion(scene, times, report_progress), growth=seen.interpolate_growth(times))
             _write_arrays(path, {key: getattr(found, key) for key in _TRAJECTORY_FIELDS} | {"witness": witness})
@@ -205,11 +204,11 @@ class ReferenceStore:
         """
         witness = OdeField(build_ode_scene(spec, size)).evaluate_fingerprint()
         path = self.folder / f"growth-{_build_motion_name(spec, size, [t_end])}.npz"
-        stored: dict[str, Any] = dict(_read_arrays(path)) if path.exists() else {}
+        stored = _read_arrays(path, [*_GROWTH_FIELDS, "witness"])
         if stored and is_equal_to_roundoff(stored.pop("witness"), witness):
             return PerturbationGrowth(scale=float(stored.pop("scale")), **stored)
         found = estimate_growth(spec, size, t_end)
-        arrays = {f.name: np.asarray(getattr(found, f.name)) for f in fields(PerturbationGrowth)}
+        arrays = {name: np.asarray(getattr(found, name)) for name in _GROWTH_FIELDS}
         _write_arrays(path, arrays | {"witness": witness})
         return found
 
@@ -221,25 +220,25 @@ class ReferenceStore:
         Its fingerprint is its first step.
         """
         witness = next(iter(run_reference(build_exact_scene(spec, size), self.solver, 1, [1])[0].values())).positions
-        stored: dict[str, Any] = dict(_read_arrays(path)) if path.exists() else {}
+        stored = _read_arrays(path, [*_SELF_CONVERGED_FIELDS, "witness", "error"])
         known = bool(stored) and is_equal_to_roundoff(stored.pop("witness"), witness)
         if known and float(stored.pop("error")) <= error:
-            plain = {key: stored.pop(key).item() for key in ("step", "moved_last")}
-            found = SelfConvergedTrajectory(**stored, **plain)
+            scalars = {key: stored.pop(key).item() for key in ("step", "last_change")}
+            found = SelfConvergedTrajectory(**stored, **scalars)
         else:
             found = compute_self_converged(
                 lambda h, name: build_exact_scene(spec.with_time_step(h), size, name), spec.time_step, times, error
             )
-            arrays = {f.name: np.asarray(getattr(found, f.name)) for f in fields(SelfConvergedTrajectory)}
+            arrays = {name: np.asarray(getattr(found, name)) for name in _SELF_CONVERGED_FIELDS}
             _write_arrays(path, arrays | {"witness": witness, "error": np.asarray(error)})
         found.require_accuracy(error)
         return found
 
     def _load_known_snapshots(self, asked: _ReferenceRequest, frames: Iterable[int]) -> dict[int, StepSnapshot]:
         """Load those of the snapshots that are on disk and match the present scene."""
-        paths = [path for path in (self._snapshot_path(asked, frame) for frame in frames) if path.exists()]
-        thawed = [restore_snapshot(_read_arrays(path), asked.scene) for path in paths]
-        return {one.frame: one for one in thawed if one}
+        stored = [_read_arrays(self._snapshot_path(asked, frame), SNAPSHOT_ARRAYS) for frame in frames]
+        snapshots = [restore_snapshot(arrays, asked.scene) for arrays in stored if arrays]
+        return {snapshot.frame: snapshot for snapshot in snapshots if snapshot}
 
     def _snapshot_path(self, asked: _ReferenceRequest, frame: int) -> Path:
         return self.folder / f"problem-{asked.name}-{frame}.npz"
@@ -273,17 +272,22 @@ def _build_motion_name(spec: SceneSpec, size: int, times: Sequence[float]) -> st
 
 
 def _build_minima(arrays: Arrays) -> KnownMinima:
-    numbers = (arrays[name].tolist() for name in ("g", "error", "smallest_eigenvalue", "doubt"))
-    columns = zip(arrays["positions"], *numbers, arrays["near"], strict=True)
-    return KnownMinima(tuple(MinimumCertificate(*values, kind=MINIMUM) for values in columns))
+    columns = [arrays[name] if arrays[name].ndim > 1 else arrays[name].tolist() for name in _CERTIFICATE_FIELDS]
+    return KnownMinima(tuple(MinimumCertificate(*values, kind=MINIMUM) for values in zip(*columns, strict=True)))
 
 
-def _read_arrays(path: Path) -> Arrays:
+def _read_arrays(path: Path, names: Collection[str]) -> dict[str, Any]:
+    """Read the arrays of a file; none if there is no file, or one of the names is missing in it.
+
+    Names are missing in files that were written by other code.
+    """
+    if not path.exists():
+        return {}
     with np.load(path, allow_pickle=False) as stored:
         arrays = dict(stored)
     for array in arrays.values():
         array.flags.writeable = False
-    return arrays
+    return arrays if arrays.keys() >= set(names) else {}
 
 
 def _write_arrays(path: Path, arrays: Arrays) -> None:

@@ -142,9 +142,11 @@ def select_snapshot_frames(violence: NDArray[np.float64], num_steps: int) -> dic
     }
 
 
-_ARRAYS = ("target", "force", "pin_targets", "current")
-_OPTIONAL_FIELDS = ("lagged", "acceleration", "kept", "pressed")
+_PROBLEM_FIELDS = ("inertial_target", "external_force", "pin_targets", "current_positions")
+_OPTIONAL_FIELDS = ("lag_override", "predicted_acceleration", "warm_start", "normal_force_positions")
 _START_FIELDS = tuple(field.name for field in fields(StepStart) if field.name not in _OPTIONAL_FIELDS)
+SNAPSHOT_ARRAYS = (*_PROBLEM_FIELDS, *(f"start_{name}" for name in _START_FIELDS))
+"""Names of the arrays of a stored snapshot that depend on names of fields."""
 
 
 def save_snapshot(step: SimulationStep, origin: str) -> tuple[StepSnapshot, Arrays]:
@@ -156,7 +158,7 @@ def save_snapshot(step: SimulationStep, origin: str) -> tuple[StepSnapshot, Arra
     """
     problem, now = step.problem, step.state.motion
     system, start = problem.system, problem.step_start
-    arrays: dict[str, Any] = {name: getattr(problem, name) for name in _ARRAYS}
+    arrays: dict[str, Any] = {name: getattr(problem, name) for name in _PROBLEM_FIELDS}
     arrays |= {f"start_{name}": getattr(start, name) for name in _START_FIELDS}
     arrays |= {f"start_{name}": known for name in _OPTIONAL_FIELDS if (known := getattr(start, name)) is not None}
     arrays |= {
@@ -185,8 +187,8 @@ def restore_snapshot(arrays: Arrays, scene: Scene) -> StepSnapshot | None:
         name: arrays[f"start_{name}"] for name in (*_START_FIELDS, *_OPTIONAL_FIELDS) if f"start_{name}" in arrays
     }
     begun |= {name: float(value) for name, value in begun.items() if not value.ndim}
-    given = {name: arrays[name] for name in _ARRAYS}
-    problem = StepProblem(system, **given, initial_guess=given["current"], step_start=StepStart(**begun))
+    given = {name: arrays[name] for name in _PROBLEM_FIELDS}
+    problem = StepProblem(system, **given, initial_guess=given["current_positions"], step_start=StepStart(**begun))
     same = (
         system.time_step == arrays["time_step"]
         and np.array_equal(system.mass, arrays["mass"])

@@ -23,7 +23,10 @@ from springbench.solvers.model.step_problem import PreparedSolver, Solution, Sol
 Arrays = dict[str, NDArray[Any]]
 
 
-_REQUIRED_METHODS, _REQUIRED_PROPERTIES = ("iterates", "solve", "residual_at", "phases"), ("choice", "facts")
+_REQUIRED_METHODS, _REQUIRED_PROPERTIES = (
+    ("iterates", "solve", "residual_at", "iteration_phases"),
+    ("description", "stats"),
+)
 """Methods and properties of a prepared solver (`springbench.solvers.model.step_problem.PreparedSolver`)."""
 
 
@@ -112,7 +115,7 @@ def _locate_method(owner: type, method: str) -> str:
 
 def _collect_problem_arrays(problem: StepProblem) -> Arrays:
     named = {f"problem.{f.name}": getattr(problem, f.name) for f in fields(problem)}
-    named |= {f"problem.start.{f.name}": getattr(problem.step_start, f.name) for f in fields(problem.step_start)}
+    named |= {f"problem.step_start.{f.name}": getattr(problem.step_start, f.name) for f in fields(problem.step_start)}
     return {name: value for name, value in named.items() if _is_array(value)}
 
 
@@ -120,10 +123,10 @@ def _restore_problem(problem: StepProblem, arrays: Arrays) -> StepProblem:
     """Return the problem with copies of the given arrays."""
     copies = {name: array.copy() for name, array in arrays.items()}
     begun = {
-        f.name: copies.get(f"problem.start.{f.name}", getattr(problem.step_start, f.name))
+        f.name: copies.get(f"problem.step_start.{f.name}", getattr(problem.step_start, f.name))
         for f in fields(problem.step_start)
     }
-    own = {name.removeprefix("problem."): array for name, array in copies.items() if "start." not in name}
+    own = {name.removeprefix("problem."): array for name, array in copies.items() if "step_start." not in name}
     return replace(problem, step_start=replace(problem.step_start, **begun), **own)
 
 

@@ -20,29 +20,29 @@ from tests.synthetic_recordings import build_recording_info, generate_waves, wri
 RECORD = """
 import os, resource, signal, sys
 from pathlib import Path
-from springbench.harness.record.rerun import RerunRecorder
-from tests.recordings import info, waving
-recorder = RerunRecorder(Path(sys.argv[1]), info())
+from springbench.harness.recording.rerun_recorder import RerunRecorder
+from tests.synthetic_recordings import build_recording_info, generate_waves
+recorder = RerunRecorder(Path(sys.argv[1]), build_recording_info())
 {before}
 try:
-    for frame in waving(info(), 33):
-        recorder.frame(frame)
+    for frame in generate_waves(build_recording_info(), 33):
+        recorder.record_frame(frame)
     {after}
 finally:
-    recorder.abandon()
+    recorder.abandon_recording()
 """
 KILLED = RECORD.format(before="", after="os.kill(os.getpid(), signal.SIGKILL)")
 FULL = RECORD.format(
     before="signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16))",
-    after="recorder.close({})",
+    after="recorder.finish_recording({})",
 )
 
 THREADS = """
 import os, sys
 from pathlib import Path
-from tests.recordings import record
+from tests.synthetic_recordings import write_recording
 for _ in range(4):
-    record(Path(sys.argv[1]), count=2)
+    write_recording(Path(sys.argv[1]), count=2)
     print(len(os.listdir("/proc/self/task")))
 """
 

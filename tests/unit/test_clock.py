@@ -117,11 +117,11 @@ def test_a_watch_adds_up_what_is_done_within_it_and_nothing_in_between() -> None
 
 STOPPED = """
 import os, signal
-from springbench.harness.simulation.clock import Watch
-watch = Watch()
+from springbench.harness.simulation.stopwatch import PhaseWatch
+watch = PhaseWatch()
 with watch:
     os.kill(os.getpid(), signal.SIGSTOP)
-print(watch.columns("step", [watch.wall])["interrupted"], watch.lost)
+print(watch.build_columns("step", [watch.wall_seconds])["interrupted"], watch.preempted_seconds)
 """
 
 
@@ -158,7 +158,7 @@ DOES_NOT = {"it returns nothing": lambda: None, "it returns its array as it is":
 
 
 def prepared(call: Any) -> Any:
-    return SimpleNamespace(phases=lambda problem: {"local": filled, "global": call})
+    return SimpleNamespace(iteration_phases=lambda problem: {"local": filled, "global": call})
 
 
 @pytest.mark.parametrize("call", DOES.values(), ids=DOES)

@@ -192,25 +192,25 @@ effects:
 OPTIONS = "options: {frames: 50, tolerance: 1e-8, record: %s, pictures: false, timing: %s, integrator: %s}\n"
 WRONG = '''from dataclasses import dataclass
 
-from springbench.solvers.problem import Solution
+from springbench.solvers.model.step_problem import Solution
 
 
 @dataclass(frozen=True)
 class Wrong:
     """Steepest descent with the wrong sign."""
 
-    minimises = True
-    descends = False
+    is_minimiser = True
+    is_monotone = False
 
     def prepare(self, system):
         return Prepared()
 
 
 class Prepared:
-    choice, facts = "", {}
+    description, stats = "", {}
 
     def iterates(self, problem):
-        p = problem.first_guess
+        p = problem.initial_guess
         while True:
             p = p + 1e-2 * problem.gradient(p)
             yield p
@@ -218,7 +218,7 @@ class Prepared:
     def residual_at(self, problem, p):
         return float(abs(problem.gradient(p)).max())
 
-    def phases(self, problem):
+    def iteration_phases(self, problem):
         return {}
 
     def solve(self, problem, stop):

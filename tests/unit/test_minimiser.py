@@ -202,7 +202,7 @@ def test_minima_are_found_once(tmp_path):
     found = ReferenceStore(tmp_path).find_minima(one).lowest
     again = ReferenceStore(tmp_path, Stays()).find_minima(one).lowest
     np.testing.assert_array_equal(found.positions, again.positions)
-    fields = ("g", "error", "smallest_eigenvalue", "doubt", "kind", "name")
+    fields = ("g", "error", "smallest_eigenvalue", "eigenvalue_uncertainty", "kind", "name")
     assert [getattr(found, f) for f in fields] == [getattr(again, f) for f in fields]
     assert not again.positions.flags.writeable
 
@@ -288,10 +288,10 @@ def test_minima_that_were_stored_with_less_than_a_certificate_are_found_again(tm
     found = ReferenceStore(tmp_path).find_minima(one).lowest
     path = tmp_path / f"minima-{one.digest}.npz"
     arrays = dict(np.load(path))
-    del arrays["doubt"]
+    del arrays["eigenvalue_uncertainty"]
     np.savez(path, allow_pickle=False, **arrays)
     assert ReferenceStore(tmp_path).find_minima(one).lowest.eigenvalue_uncertainty == found.eigenvalue_uncertainty
-    assert "doubt" in np.load(path)
+    assert "eigenvalue_uncertainty" in np.load(path)
 
 
 def test_a_minimum_that_is_not_known_well_says_by_how_much():

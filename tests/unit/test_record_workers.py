@@ -15,18 +15,18 @@ SCRIPT = """
 import sys
 from functools import partial
 from pathlib import Path
-from springbench.harness.base.workers import Limits, Workers
-from tests.recordings import record
-from tests.workers import threads_after
+from springbench.harness.execution.isolated_worker import IsolatedWorker, TaskLimits
+from tests.synthetic_recordings import write_recording
+from tests.worker_tasks import count_threads_after_recording
 
 if __name__ == "__main__":
     folder, before = Path(sys.argv[1]), sys.argv[2] == "True"
     if before:
-        record(folder / "parent.rrd", count=2)
-    workers = Workers()
+        write_recording(folder / "parent.rrd", count=2)
+    worker = IsolatedWorker()
     for k in range(4):
-        print(workers.do(partial(threads_after, folder / f"{k}.rrd"), print, Limits()))
-    workers.end()
+        print(worker.run_task(partial(count_threads_after_recording, folder / f"{k}.rrd"), print, TaskLimits()))
+    worker.stop_worker()
 """
 
 
