@@ -63,7 +63,7 @@ def counted() -> Iterator[list[int]]:
         looked.append(found.num_examined)
         return found
 
-    with patch.object(Hessian, "filtered", counting):
+    with patch.object(Hessian, "project_to_psd", counting):
         yield looked
 
 

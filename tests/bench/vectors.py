@@ -122,7 +122,7 @@ def solving(solver: str) -> Callable[[], object]:
 
 def of_springs() -> Iterator[Case]:
     """Over bundles of eight vertices with their springs."""
-    state, _, window, _, _ = given(accelerated_step, "run", solving("lbfgs"))
+    state, _, window, _, _ = given(accelerated_step, "run_solve", solving("lbfgs"))
     parts, p, out = state.spring_packets, window.trial_position, window.trial_descent.copy()
     whole = 0, len(parts.start) - 1
     short = {"project": plain.refuse, "correct": plain.refuse}
@@ -144,7 +144,7 @@ def of_springs() -> Iterator[Case]:
 
 def of_descent() -> Iterator[Case]:
     """Over the same bundles, with the objective."""
-    state, _, window, _, _ = given(accelerated_step, "run", solving("lbfgs"))
+    state, _, window, _, _ = given(accelerated_step, "run_solve", solving("lbfgs"))
     descent = (
         state.spring_packets,
         state.objective_weights,
@@ -158,14 +158,14 @@ def of_descent() -> Iterator[Case]:
 
 def of_dots() -> Iterator[Case]:
     """Over the vectors of L-BFGS."""
-    _, _, window, _, _ = given(accelerated_step, "run", solving("lbfgs"))
+    _, _, window, _, _ = given(accelerated_step, "run_solve", solving("lbfgs"))
     both = {"dot": plain.dot, "dots": plain.dots}
     yield Case("a step of L-BFGS", accelerated_descent.accept_trial, (window, window.correction.copy()), both, ())
 
 
 def of_vbd() -> Iterator[Case]:
     """Over colours."""
-    blocks, spaces, beside, right, _, work, p, _ = given(vbd_sweeps, "iterate", solving("vbd"))
+    blocks, spaces, beside, right, _, work, p, _ = given(vbd_sweeps, "run_iterations", solving("vbd"))
     yield Case(
         "sweep", vbd_sweeps._sweep_vertices, (blocks, spaces, beside, right, p, work), {"descend": plain.newton}, (4,)
     )
@@ -177,7 +177,7 @@ def of_supernodal() -> Iterator[Case]:
     panel = {"add_forward": plain.add_forward, "set_backward": plain.set_backward}
     for precision in ("float64", "float32"):
         factor = SupernodalCholesky(Q, precision=precision)
-        solve = given(supernodal_cholesky, "solve_by", lambda factor=factor: factor.solve(b, np.empty_like(b)))
+        solve = given(supernodal_cholesky, "solve_from_arrays", lambda factor=factor: factor.solve(b, np.empty_like(b)))
         yield Case(f"solve, {precision}", triangular_solve.solve_from_arrays, solve, panel, (10,))
 
 
@@ -187,9 +187,13 @@ def of_block() -> Iterator[Case]:
     tiles = {name: getattr(plain, name) for name in names}
     newton = solving("newton")
     yield Case(
-        "factorisation", block_multifrontal.factorise_blocks, given(block_cholesky, "factorise", newton), tiles, (2,)
+        "factorisation",
+        block_multifrontal.factorise_blocks,
+        given(block_cholesky, "factorise_blocks", newton),
+        tiles,
+        (2,),
     )
-    yield Case("solve", block_multifrontal.solve_blocks, given(block_cholesky, "solve", newton), tiles, (2,))
+    yield Case("solve", block_multifrontal.solve_blocks, given(block_cholesky, "solve_blocks", newton), tiles, (2,))
 
 
 def of_rows() -> Iterator[Case]:

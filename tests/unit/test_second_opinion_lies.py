@@ -75,7 +75,9 @@ LIES: dict[str, FormulaMutation] = {
         [SPRINGS_SPEC], "springs (Hessian)", scale_method(Springs, "hessian", 1.01)
     ),
     "skip-one springs that stiffen the cloth": FormulaMutation(
-        [BEND_SPRINGS_SPEC], "springs", patch_attribute(spring_stiffness, "_relieved", lambda true: lambda mesh, k: k)
+        [BEND_SPRINGS_SPEC],
+        "springs",
+        patch_attribute(spring_stiffness, "_subtract_bend_stiffness", lambda true: lambda mesh, k: k),
     ),
     "limits that are wider": FormulaMutation(
         [SPRINGS_SPEC, STRAIN_LIMITS_SPEC], "strain-limits", mutate_energy(StrainLimits, scale_fields(high=1.01))
@@ -229,12 +231,16 @@ LIES: dict[str, FormulaMutation] = {
     "pins of the step's start": FormulaMutation(
         [SPRINGS_SPEC, PINS_SPEC],
         "targets of pins",
-        patch_attribute(Scene, "pins_at", lambda true: lambda self, time: true(self, time - self.system.time_step)),
+        patch_attribute(
+            Scene, "pin_targets_at", lambda true: lambda self, time: true(self, time - self.system.time_step)
+        ),
     ),
     "key frames that turn the other way": FormulaMutation(
         [SPRINGS_SPEC, PINS_SPEC],
         "targets of pins",
-        patch_attribute(KeyFrameMotion, "_at", lambda true: lambda self, time: true(self, time) * [1, 1, 1, -1]),
+        patch_attribute(
+            KeyFrameMotion, "_interpolate_pose", lambda true: lambda self, time: true(self, time) * [1, 1, 1, -1]
+        ),
     ),
     "implicit Euler that goes too far": FormulaMutation(
         [SPRINGS_SPEC], "inertial target", scale_prediction("implicit-euler", target=1.0 + 1e-6)
@@ -265,7 +271,7 @@ LIES: dict[str, FormulaMutation] = {
         "velocities after the step",
         patch_attribute(
             SingleStageIntegrator,
-            "advance",
+            "complete_step",
             lambda true: lambda *given: (after := true(*given))._replace(velocity=1.001 * after.velocity),
         ),
     ),
@@ -275,13 +281,17 @@ LIES: dict[str, FormulaMutation] = {
         patch_attribute(System, "__init__", lambda true: lambda self, mass, *more: true(self, 1.01 * mass, *more)),
     ),
     "an objective without its inertia": FormulaMutation(
-        [SPRINGS_SPEC], "objective (value)", patch_attribute(StepProblem, "terms", drop_term("inertia"))
+        [SPRINGS_SPEC], "objective (value)", patch_attribute(StepProblem, "evaluate_terms", drop_term("inertia"))
     ),
     "an objective without an energy": FormulaMutation(
-        [SPRINGS_SPEC, BENDING_SPEC], "objective (value)", patch_attribute(StepProblem, "terms", drop_term("bending"))
+        [SPRINGS_SPEC, BENDING_SPEC],
+        "objective (value)",
+        patch_attribute(StepProblem, "evaluate_terms", drop_term("bending")),
     ),
     "an objective without its forces": FormulaMutation(
-        [SPRINGS_SPEC, GRAVITY_SPEC], "objective (value)", patch_attribute(StepProblem, "terms", drop_term("force"))
+        [SPRINGS_SPEC, GRAVITY_SPEC],
+        "objective (value)",
+        patch_attribute(StepProblem, "evaluate_terms", drop_term("force")),
     ),
     "a gradient without the penalties": FormulaMutation(
         [SPRINGS_SPEC, PINS_SPEC],
