@@ -179,7 +179,10 @@ class WorkSpec:
 
         It is the same for other measurement settings, so that a new measurement replaces the file.
         """
-        return f"{self.case.scene_name}-{self.case.size}-work-{sanitise_name(self.solver.name)}-{_compute_hash(self.describe_point())}"
+        return (
+            f"{self.case.scene_name}-{self.case.size}-work-{sanitise_name(self.solver.name)}-"
+            f"{_compute_hash(self.describe_point())}"
+        )
 
 
 def _compute_hash(content: Any) -> str:

@@ -89,7 +89,8 @@ def _try_plugin(document: ConfigDocument, name: PluginName, asked: dict[str, Any
         document.add_mistake(str(error), at)
     except Exception as error:
         document.add_mistake(
-            f"{name} cannot be made of these parameters: {format_error(error)} ({locate_error(error, {name.source_path})})",
+            f"{name} cannot be made of these parameters: {format_error(error)} "
+            f"({locate_error(error, {name.source_path})})",
             at,
         )
 

@@ -151,7 +151,10 @@ def connect_cluster(
                     break
                 except TimeoutError:
                     if not waits:
-                        why = f"the scheduler has no worker; start some with `dask worker {scheduler_address} --nthreads 1`"
+                        why = (
+                            "the scheduler has no worker; start some with `dask worker "
+                            f"{scheduler_address} --nthreads 1`"
+                        )
                         raise InputError(InputMistake(f"{scheduler_address}: {why}", key="--scheduler")) from None
                     print_message(f"{scheduler_address}: no worker has come yet")
             yield DaskCluster(client, check_workers(client, runs, print_message))

@@ -85,7 +85,10 @@ class MinimumCertificate:
     @property
     def describe_flaw(self) -> str:
         """The reason why the minimum is not certified."""
-        curvature = f"the smallest eigenvalue is {self.min_eigenvalue:.1e} N/m, give or take {self.eigenvalue_uncertainty:.1e} N/m"
+        curvature = (
+            f"the smallest eigenvalue is {self.min_eigenvalue:.1e} N/m, give or "
+            f"take {self.eigenvalue_uncertainty:.1e} N/m"
+        )
         return {
             VALLEY: f"the minima are a valley, all as low, to whose points no distance means anything: {curvature}",
             FLAT: f"the curvature along some direction is round-off: {curvature}",

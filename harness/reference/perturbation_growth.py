@@ -98,7 +98,8 @@ class PerturbationGrowth:
             if _min_error(grown) > error:
                 raise UnpredictableMotion(
                     f"after {t:g} s a perturbation of 1e-12 of the size has grown to {grown:.1e} of the displacement: "
-                    f"an error of {error:g} cannot be reached or measured there; {self._suggest_alternative(error, _min_error(grown))}"
+                    f"an error of {error:g} cannot be reached or measured there; "
+                    f"{self._suggest_alternative(error, _min_error(grown))}"
                 )
 
     def _suggest_alternative(self, error: float, least: float) -> str:

@@ -70,7 +70,10 @@ def describe_effect(row: ResultRow, rows: Sequence[ResultRow]) -> str:
     if not whose:
         return f"{moves}; by how much the scene is wrong anyway is not known"
     if moved <= error:
-        return f"{moves}, less than {whose} of {_format_two_digits(error)}: this scene does not call for it at this accuracy"
+        return (
+            f"{moves}, less than {whose} of {_format_two_digits(error)}: this "
+            "scene does not call for it at this accuracy"
+        )
     return f"{moves}, more than {whose} of {_format_two_digits(error)}: this scene calls for it"
 
 

@@ -169,7 +169,8 @@ def summarise_runs(all_runs: Sequence[DeviceRun], config: str) -> list[str]:
         return []
     if not any(run.status == "ok" for run in asked):
         return [
-            f"No run on a device ended well, so nothing is said of what one saves ({_most_common_reason(asked)}). Where there is a "
+            "No run on a device ended well, so nothing is said of what one saves "
+            f"({_most_common_reason(asked)}). Where there is a "
             f"device, `.venv/bin/springbench run {config or 'CONFIG'}` fills this in."
         ]
     said = [_describe_panel(panel, compared) for panel, compared in pair_fastest_runs(all_runs).items()]
@@ -194,7 +195,10 @@ def _describe_panel(panel: ScenePanel, device_pairs: Sequence[DevicePair]) -> st
         told += f", and {_describe_speedup(last)} at {format_count(last.vertices)}" if last is not first else ""
         told += "" if first is not both[0] else ", the smallest that was measured"
     else:
-        told = f"a device does not pay up to {format_count(last.vertices)} vertices, where both got there: {_describe_speedup(last)}"
+        told = (
+            f"a device does not pay up to {format_count(last.vertices)} vertices, where "
+            f"both got there: {_describe_speedup(last)}"
+        )
     alone = [
         f"{format_count(p.vertices)} ({'device' if p.device_run else 'processor'})"
         for p in device_pairs

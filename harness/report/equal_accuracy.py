@@ -84,12 +84,14 @@ def describe_comparison(comparison: AccuracyComparison, names: Mapping[str, str]
         slower = [f"{names[run.run_id]} {format_quantity(_compute_time_ratio(run, first))} times" for run in others]
         words = f"fastest at equal accuracy is {names[first.run_id]}, {format_quantity(first.step or 0.0)} ms a step"
         yield (
-            f"{comparison.group_label}: {words}; {_join_words(slower)} as long ({error} to {EQUAL_ERROR_FACTOR:g} times that, or round-off).",
+            f"{comparison.group_label}: {words}; {_join_words(slower)} as long ({error} to "
+            f"{EQUAL_ERROR_FACTOR:g} times that, or round-off).",
             ids[:_MAX_LISTED],
         )
     else:
         yield (
-            f"{comparison.group_label}: most accurate is {names[first.run_id]}, {error}; no other run is known to be as "
+            f"{comparison.group_label}: most accurate is {names[first.run_id]}, "
+            f"{error}; no other run is known to be as "
             "accurate, so times are not compared.",
             [first.run_id],
         )

@@ -85,7 +85,10 @@ def find_recordings(paths: Sequence[Path]) -> list[Path]:
         if not below:
             raise InputError(InputMistake("this folder has no Rerun recording (.rrd) below it", file=path))
         if len(below) > _MAX_VIEWED:
-            problem = f"{len(below):,} recordings are below this folder; at most {_MAX_VIEWED} can be opened, such as {below[0]}"
+            problem = (
+                f"{len(below):,} recordings are below this folder; at most {_MAX_VIEWED} "
+                f"can be opened, such as {below[0]}"
+            )
             raise InputError(InputMistake(problem, file=path))
         found += below
     return found

@@ -63,7 +63,10 @@ def map_headline(cells: Sequence[VerifiedRun], name: str) -> str:
     """Return the headline of the map: counts of the main outcomes."""
     of = {outcome: sum(cell.outcome == outcome for cell in cells) for outcome in RUN_OUTCOMES}
     broken = of[DIVERGED] + of[FAILED]
-    return f"{name}: {of[CORRECT]} of {len(cells)} runs right, {of[SILENTLY_WRONG]} silently wrong, {broken} diverged or failed"
+    return (
+        f"{name}: {of[CORRECT]} of {len(cells)} runs right, {of[SILENTLY_WRONG]} "
+        f"silently wrong, {broken} diverged or failed"
+    )
 
 
 def draw_robustness_map(cells: Sequence[VerifiedRun], path: Path, title: str, stale_ids: Collection[str] = ()) -> None:

@@ -101,7 +101,8 @@ def _describe_unsolved(ok_runs: Sequence[RunTimes], names: Mapping[str, str]) ->
         if run.max_stationarity_audit is not None and run.max_stationarity_audit > SOLVED_RESIDUAL:
             yield (
                 f"{names[run.run_id]} on {run.scene} {run.size or ''}".rstrip()
-                + f" does not converge to the minimum of a step's objective: up to {run.max_stationarity_audit:.1e} of the residual at a "
+                + " does not converge to the minimum of a step's objective: up to "
+                f"{run.max_stationarity_audit:.1e} of the residual at a "
                 "step's start is left (column `graded`); more iterations need not lower it."
             )
 

@@ -165,7 +165,8 @@ class RemoteStorage:
             there = self._list_remote()
         except Exception as error:  # of whatever library speaks to it
             raise RunFailed(
-                f"{self.url}: cannot be written: {_format_error(error)}; all is kept in {self.folder}, and the next command "
+                f"{self.url}: cannot be written: {_format_error(error)}; all is kept "
+                f"in {self.folder}, and the next command "
                 "with this URL sends it"
             ) from error
         for name in new:

@@ -229,7 +229,10 @@ def query_first_rows(
         for part, stated, source in zip(whole.groups, whole.columns, whole.sources, strict=True):
             at = "file_index" if part.packed_numbers is None else FILE_COLUMN
             rows = f"SELECT {stated}, {at} AS {_UNIT_COLUMN}, file_row_number AS {_ROW_COLUMN} FROM {source}"
-            sql = f"SELECT {_UNIT_COLUMN}, arg_min({{{named}}}, {_ROW_COLUMN}) FROM ({rows}) GROUP BY {_UNIT_COLUMN} HAVING {full}"
+            sql = (
+                f"SELECT {_UNIT_COLUMN}, arg_min({{{named}}}, {_ROW_COLUMN}) FROM "
+                f"({rows}) GROUP BY {_UNIT_COLUMN} HAVING {full}"
+            )
             for which, head in connection.execute(sql).fetchall():
                 found[part.unit_numbers[which] if part.packed_numbers is None else part.packed_numbers[which]] = head
     return found

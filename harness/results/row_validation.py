@@ -129,7 +129,10 @@ class InvalidValue(NamedTuple):
 
     def __str__(self) -> str:
         came = repr(self.value[:_MAX_QUOTED_LENGTH] if isinstance(self.value, str) else self.value)
-        return f"came {came if len(came) <= _MAX_QUOTED_LENGTH else came[:_MAX_QUOTED_LENGTH] + '…'}; wanted {self.expected}"
+        return (
+            f"came {came if len(came) <= _MAX_QUOTED_LENGTH else came[:_MAX_QUOTED_LENGTH] + '…'}; "
+            f"wanted {self.expected}"
+        )
 
 
 def find_invalid_values(table: pa.Table) -> Iterator[InvalidValue]:

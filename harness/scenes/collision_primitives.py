@@ -93,7 +93,8 @@ def require_fixed_exact_pins(effect_name: str, start: Positions, pins: Sequence[
         moves = pin.motion is not None or not np.array_equal(pin.targets, start[pin.vertices])
         if np.isinf(pin.weight) and moves:
             raise InputError(
-                f"{effect_name}: exact pins that move, or do not start where they hold, would carry the mesh through what it "
+                f"{effect_name}: exact pins that move, or do not start where they "
+                "hold, would carry the mesh through what it "
                 "meets; give these pins a weight"
             )
 
@@ -108,7 +109,8 @@ def require_intersection_free(
             for x, two, apart in closed[:_MAX_NAMED_PAIRS]
         )
         raise InputError(
-            f"{effect_name}: {len(closed)} pairs start nearer than the thickness of {min_distance:g} m: {near}; move them apart, "
+            f"{effect_name}: {len(closed)} pairs start nearer than the thickness of "
+            f"{min_distance:g} m: {near}; move them apart, "
             "or take a smaller thickness"
         )
 
@@ -126,7 +128,10 @@ def _describe_primitive(x: Sequence[int], mesh: Mesh) -> str:
     n = len(mesh.rest_positions)
     own = all(i < n for i in x)
     kind = ("vertex", "edge", "triangle")[len(x) - 1]
-    return f"{kind} {'-'.join(str(i if own else i - n) for i in x)}{mesh.format_file_numbers(*x) if own else ' of the obstacles'}"
+    return (
+        f"{kind} {'-'.join(str(i if own else i - n) for i in x)}"
+        f"{mesh.format_file_numbers(*x) if own else ' of the obstacles'}"
+    )
 
 
 def describe_intersections(intersections: list[Intersection], mesh: Mesh) -> str:

@@ -241,7 +241,9 @@ def _require_unique(spec: SceneSpec, parts: list[EffectContribution]) -> None:
 
 def _require_end_of_step_stages(parts: list[EffectContribution], method: integrators.AnyIntegrator, name: str) -> None:
     """Raise InputError if an effect requires stages at the end of the step and the integrator has others."""
-    there = [n for n, known in integrators.INTEGRATORS.items() if getattr(known, "stage_fraction", 0.0) == 1.0 and n != "own"]
+    there = [
+        n for n, known in integrators.INTEGRATORS.items() if getattr(known, "stage_fraction", 0.0) == 1.0 and n != "own"
+    ]
     for i, part in enumerate(parts):
         if part.end_of_step_reasons and getattr(method, "stage_fraction", 0.0) != 1.0:
             problem = f"{part.end_of_step_reasons[0]}, and {name} has other unknowns; take {' or '.join(there)}"

@@ -49,7 +49,10 @@ def load_plugin(document: ConfigDocument, plugin: PluginName, part_kind: str, ke
             problem = problem or f"has no method `{'`, `'.join(lacks)}`, which its base wants; write it"
     except AttributeError as error:
         missing = error.name == plugin.import_target.rpartition(":")[2] and error.obj is not None
-        problem = f"cannot be loaded: {f'{plugin.module_name} has no {error.name}' if missing else _describe_error(error, plugin)}"
+        problem = (
+            "cannot be loaded: "
+            f"{f'{plugin.module_name} has no {error.name}' if missing else _describe_error(error, plugin)}"
+        )
     except Exception as error:  # it is somebody's code, and may fail in any way
         problem = f"cannot be loaded: {_describe_error(error, plugin)}"
     else:
@@ -98,7 +101,8 @@ PLUGIN_KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
         lambda made: isinstance(made, type) and is_dataclass(made) and callable(getattr(made, "prepare", None)),
     ),
     "effect": (
-        "a subclass of springbench.harness.schema.base_model.ConfigModel with a method `build_contribution` and a `kind`",
+        "a subclass of springbench.harness.schema.base_model.ConfigModel with "
+        "a method `build_contribution` and a `kind`",
         lambda made: (
             _make_model_check(ConfigModel, "build_contribution")(made)
             and hasattr(made, "model_fields")
@@ -209,7 +213,9 @@ def build_checked_contribution(
     with attribute_errors(plugin, "build_contribution"):
         made: Any = effect.build_contribution(mesh, mass, time_step)
     if [array.tobytes() for array in _list_arrays(mesh, mass)] != before:
-        raise InputError(f"{plugin}: `build_contribution` wrote to the mesh or the masses, which it was given; change copies")
+        raise InputError(
+            f"{plugin}: `build_contribution` wrote to the mesh or the masses, which it was given; change copies"
+        )
     if not isinstance(made, EffectContribution):
         wanted = "wanted a springbench.harness.scenes.effects.effect_interface.EffectContribution"
         raise InputError(f"{plugin}: `build_contribution` returned {_describe_value(made)}; {wanted}")

@@ -104,7 +104,8 @@ class PhaseWatch:
         ):  # so that NaN fails too
             raise ClockMismatch(
                 f"the times of {what} add up to {told:.6g} s, where another clock saw {self.wall_seconds:.6g} s go by, "
-                f"{self.preempted_seconds:.3g} s of them without computing: one of the two does not measure what it says"
+                f"{self.preempted_seconds:.3g} s of them without computing: one "
+                "of the two does not measure what it says"
             )
         return {
             "pass_seconds": self.wall_seconds,

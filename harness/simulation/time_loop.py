@@ -357,7 +357,8 @@ def _guess_coarse_to_fine(scene: Scene, state: MotionState, step_problem: StepPr
         if scene.build_coarser is None:
             raise Unsupported(
                 "first_guess: coarse needs the scene on a mesh of half the size, and there is none: the mesh is from a "
-                f"file, or smaller than {2 * MIN_COARSENING_SIZE - 1}, or effects name vertices by `indices` or `every`; take "
+                f"file, or smaller than {2 * MIN_COARSENING_SIZE - 1}, or effects name "
+                "vertices by `indices` or `every`; take "
                 "current, inertial or motion"
             )
         try:

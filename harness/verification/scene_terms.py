@@ -77,7 +77,9 @@ def build_scene_terms(spec: SceneSpec, scene: Scene) -> SceneTerms:
     """Build the reference terms of a scene built from the specification."""
     mesh, dt = scene.mesh, spec.time_step
     mass = _compute_masses(spec, mesh)
-    declared = SceneDeclaration(mesh, mass, dt, tuple(spec.effects), not getattr(scene.integrator, "has_split_filters", False))
+    declared = SceneDeclaration(
+        mesh, mass, dt, tuple(spec.effects), not getattr(scene.integrator, "has_split_filters", False)
+    )
     bound = [effect.build_contribution(mesh, mass, dt).by(scene.integrator) for effect in declared.effects]
     # The order is that of the scene's energies: those of each effect first, then those derived from all of them.
     first = [energy for part in bound for energy in part.energies]

@@ -222,7 +222,10 @@ def _estimate_inverse_cost(n: int) -> CostEstimate:
 
 def _estimate_cg_cost(Q: csr_array) -> CostEstimate:
     entries = Q.nnz + 4 * (len(Q.indptr) - 1)
-    words = f"{format_bytes(_BYTES_STORED_PER_ENTRY * entries)} for multigrid on {Q.nnz:,} entries, about {_EXPECTED_CG_ITERATIONS} iterations a solve"
+    words = (
+        f"{format_bytes(_BYTES_STORED_PER_ENTRY * entries)} for multigrid on {Q.nnz:,} entries, "
+        f"about {_EXPECTED_CG_ITERATIONS} iterations a solve"
+    )
     return CostEstimate(
         _BYTES_STORED_PER_ENTRY * entries, _EXPECTED_CG_ITERATIONS * _BYTES_READ_PER_ENTRY * entries, words
     )

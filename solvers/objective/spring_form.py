@@ -88,7 +88,9 @@ class SpringForm:
         both = (*self.strain_limits, *self.dashpots)
         ends, k = np.concatenate([e.edges for e in both]), np.concatenate([e.stiffness for e in both])
         none = np.empty(0)
-        low, high = (np.concatenate([none, *(getattr(e, at) for e in self.strain_limits)]) for at in ("min_length", "max_length"))
+        low, high = (
+            np.concatenate([none, *(getattr(e, at) for e in self.strain_limits)]) for at in ("min_length", "max_length")
+        )
         edges = EdgeElements.from_edges(ends, k, low, high, row, rows)
         edges.edge_axis[: len(low)] = np.concatenate(
             [none.reshape(0, 3), *(e.rest_direction for e in self.strain_limits)]

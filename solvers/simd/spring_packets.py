@@ -57,7 +57,9 @@ class SpringPacket(NamedTuple):
     def from_bundles(cls, builder: Any, bundles: Any, number: Any) -> SpringPacket:
         """Load the packet with a given index."""
         begin, end = (builder.load(builder.gep(bundles.packet_start, [builder.add(number, I64(k))])) for k in (0, 1))
-        return cls(bundles.row_offset, bundles.neighbour_offset, bundles.weight_offset, bundles.weights, number, begin, end)
+        return cls(
+            bundles.row_offset, bundles.neighbour_offset, bundles.weight_offset, bundles.weights, number, begin, end
+        )
 
 
 class PacketBuilder(VectorBuilder):

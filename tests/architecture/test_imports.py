@@ -13,7 +13,10 @@ ROOT = Path(__file__).resolve().parents[2]
 DRAWING = {"PIL", "matplotlib", "mpl_toolkits", "plotly", "pyvista", "vtkmodules", "rerun"}
 COMPUTING = {"duckdb", "llvmlite", "numba", "numpy", "pyarrow", "pydantic", "scipy"}
 STEPPING = {"duckdb", "llvmlite", "numba", "pyarrow", "scipy.linalg"}
-PROGRAM = "import atexit, sys; atexit.register(lambda: print('loaded', *sys.modules)); from springbench.harness.cli.main import main; main()"
+PROGRAM = (
+    "import atexit, sys; atexit.register(lambda: print('loaded', *sys.modules)); from "
+    "springbench.harness.cli.main import main; main()"
+)
 
 
 def loads(arguments: list[str], cache: Path) -> list[str]:

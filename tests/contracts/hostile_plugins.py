@@ -226,7 +226,9 @@ SOLVING = {
     ),
     "processes": Hostile("solving", STRAY, "solver", FINE, ""),
     "much output": Hostile("solving", PRINT, "solver", FINE, "of output the first 8192 are shown"),
-    "a written problem": Hostile("solving", "problem.inertial_target[:] = 0", "solver", FAILED, "wrote to problem.inertial_target"),
+    "a written problem": Hostile(
+        "solving", "problem.inertial_target[:] = 0", "solver", FAILED, "wrote to problem.inertial_target"
+    ),
     "closed files": Hostile("solving", "os.closerange(0, 4096)", "solver", FAILED, ""),
     "another folder": Hostile("solving", "os.chdir('/')", "solver", FINE, ""),
     "a fault in its residual": Hostile("measuring", "return 'small'", "solver", FAILED, ""),
@@ -236,10 +238,16 @@ BINDING = {
     "binds a text": Hostile("binding", "return 'x'", "effect", MISTAKE, "`build_contribution` returned a str"),
     "writes to the mesh": Hostile("binding", "mesh.rest_positions[0] = 1", "effect", MISTAKE, "read-only"),
     "writes to the mesh by force": Hostile(
-        "binding", "mesh.rest_positions.flags.writeable = True; mesh.rest_positions[0] = 1", "effect", MISTAKE, "wrote to the mesh"
+        "binding",
+        "mesh.rest_positions.flags.writeable = True; mesh.rest_positions[0] = 1",
+        "effect",
+        MISTAKE,
+        "wrote to the mesh",
     ),
     "writes to the masses": Hostile("binding", "mass *= 2", "effect", MISTAKE, "wrote to the mesh or the masses"),
-    "raises": Hostile("binding", "raise KeyError(3)", "effect", MISTAKE, "`build_contribution` raised KeyError: 3 (mine.py:"),
+    "raises": Hostile(
+        "binding", "raise KeyError(3)", "effect", MISTAKE, "`build_contribution` raised KeyError: 3 (mine.py:"
+    ),
     "exits": Hostile("binding", "sys.exit(0)", "effect", MISTAKE, "raised SystemExit: 0"),
     "hangs": Hostile("binding", HANG, "effect", MISTAKE, LIMIT),
     "crashes": Hostile("binding", CRASH, "effect", MISTAKE, "crashed by SIGSEGV"),
@@ -295,7 +303,9 @@ MESHES = {
     "is flat": Hostile(
         "generating", "return replace(made, rest=made.rest_positions[:, :2].copy())", "mesh", MISTAKE, "shape (4, 2)"
     ),
-    "is single": Hostile("generating", "return replace(made, rest=made.rest_positions.astype('f4'))", "mesh", MISTAKE, "float32"),
+    "is single": Hostile(
+        "generating", "return replace(made, rest=made.rest_positions.astype('f4'))", "mesh", MISTAKE, "float32"
+    ),
     "is empty": Hostile("generating", "return replace(made, rest=np.empty((0, 3)))", "mesh", MISTAKE, "no vertices"),
     "is a list": Hostile("generating", "return replace(made, rest=[[0.0, 0.0, 0.0]])", "mesh", MISTAKE, "mine.py"),
     "springs away": Hostile(

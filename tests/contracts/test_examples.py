@@ -40,7 +40,10 @@ def test_an_example_runs(name: str, tmp_path: Path):
 
 
 def test_what_scripts_use_is_all_that_harness_shows(tmp_path: Path):
-    program = "import sys, harness; print(dir(harness)); print('springbench.harness.api' in sys.modules, 'numpy' in sys.modules)"
+    program = (
+        "import sys, harness; print(dir(harness)); print('springbench.harness.api' "
+        "in sys.modules, 'numpy' in sys.modules)"
+    )
     names, loaded = python("-c", program, folder=tmp_path).splitlines()
     types = ["IntegratorName", "OptionKeys", "OwnName", "SceneKeys", "SolverName", "SweepKeys"]
     does = ["Picture", "Simulation", "draw", "load_scene", "make_scene", "open_recording", "rows", "run"]

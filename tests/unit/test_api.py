@@ -34,9 +34,7 @@ def test_rows_of_a_folder_are_a_table_in_the_order_of_their_files(tmp_path: Path
         parquet_rows.write_rows(tmp_path / "rows" / f"{name}.parquet", [{"solver": name, "frame": k} for k in (1, 2)])
     monkeypatch.setattr(api, "find_spec", lambda name: None)  # neither polars nor pandas
     found = springbench.load_rows(tmp_path)
-    assert found.select(["solver", "frame"]).to_pylist() == [
-        {"solver": s, "frame": k} for s in "ab" for k in (1, 2)
-    ]
+    assert found.select(["solver", "frame"]).to_pylist() == [{"solver": s, "frame": k} for s in "ab" for k in (1, 2)]
 
 
 def test_an_opened_recording_has_every_frame(tmp_path: Path):

@@ -130,7 +130,9 @@ def test_the_budget_is_that_of_both_races(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_programs_are_started_anew_as_long_as_a_race_lasts(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("springbench.harness.experiments.regression.abba_benchmark.RESTART_SECONDS", 0.0)  # a start for each turn
+    monkeypatch.setattr(
+        "springbench.harness.experiments.regression.abba_benchmark.RESTART_SECONDS", 0.0
+    )  # a start for each turn
     start, started = pairs(*[1.0] * 16)
     found = run_confirmed_benchmark(start, RULE, time_budget=60.0)  # type: ignore[arg-type]
     assert (found.verdict, found.num_process_pairs, len(found.blocks), len(started)) == (

@@ -63,7 +63,9 @@ def test_the_cheapest_by_processor_time_within_the_error_wins(found):
         "implicit, order 2",
         NO_WINNER,
     ]
-    assert found[0.1].cheapest_by_family["implicit, order 2"].cpu == 0.8, "seconds a simulated second, the cheaper of the two"
+    assert found[0.1].cheapest_by_family["implicit, order 2"].cpu == 0.8, (
+        "seconds a simulated second, the cheaper of the two"
+    )
 
 
 def test_the_page_has_a_point_for_each_error_that_somebody_reaches(tmp_path: Path):

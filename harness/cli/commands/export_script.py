@@ -38,7 +38,10 @@ def export_script(
         return
     found = [label for label in engines if label.endswith(point)]
     if len(found) != 1:
-        problem = f"came {point!r}, which {len(found)} points of outside engines end with; `springbench export-script {config}` "
+        problem = (
+            f"came {point!r}, which {len(found)} points of outside engines end "
+            f"with; `springbench export-script {config}` "
+        )
         raise InputError(InputMistake(f"{problem}lists them", key="POINT"))
     if output.exists() and not output.is_dir():
         raise InputError(

@@ -82,7 +82,8 @@ def _draw_preview(run: RunSpec, path: Path, tick: ProgressCallback) -> list[str]
         origin=origin,
     )
     facts = [
-        f"{len(mesh.rest_positions):,} vertices, {len(mesh.triangles):,} triangles, {len(made.all_springs.edges):,} springs",
+        f"{len(mesh.rest_positions):,} vertices, {len(mesh.triangles):,} triangles, "
+        f"{len(made.all_springs.edges):,} springs",
         f"{made.system.mass.sum():.4g} kg",
         "at the start",
     ]

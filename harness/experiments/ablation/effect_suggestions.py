@@ -59,7 +59,9 @@ def suggest_effects(evidence: ObservedMotion, effect_kinds: Collection[str]) -> 
         effect_kinds: kinds of the effects that the scene lists.
     """
     absent = [
-        kind for kind in EFFECT_CLASSES if kind not in effect_kinds and hasattr(_load_effect_class(kind), "find_evidence")
+        kind
+        for kind in EFFECT_CLASSES
+        if kind not in effect_kinds and hasattr(_load_effect_class(kind), "find_evidence")
     ]
     told = (EffectSuggestion(kind, _load_effect_class(kind).find_evidence(evidence)) for kind in absent)
     return [suggestion for suggestion in told if suggestion.evidence]

@@ -237,7 +237,8 @@ def _find_longest_t_end(
     if not longest:
         seen.require_predictable(max_error)
     print_message(
-        f"{path.stem} {size or ''}: an error of {max_error:g} can be measured up to {longest:g} s, for a perturbation of "
+        f"{path.stem} {size or ''}: an error of {max_error:g} can be measured "
+        f"up to {longest:g} s, for a perturbation of "
         f"1e-12 of the size grows to {seen.growth_factor[-1]:.1e} of the displacement after {DEFAULT_T_END:g} s"
     )
     return longest

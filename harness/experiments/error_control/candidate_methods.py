@@ -77,10 +77,12 @@ class ErrorTarget:
         if without_vertex_contact(system) is not system:
             if print_message:
                 print_message(
-                    f"no error can be promised with contact; halving steps for {_STEP_DOUBLING_SECONDS:g} s to tell what can be had"
+                    "no error can be promised with contact; halving steps for "
+                    f"{_STEP_DOUBLING_SECONDS:g} s to tell what can be had"
                 )
             raise RunFailed(
-                f"{_CONTACT_MESSAGE}; {estimate_by_step_doubling(asked.build_scene, t_end, frames, time_budget=_STEP_DOUBLING_SECONDS)}"
+                f"{_CONTACT_MESSAGE}; "
+                f"{estimate_by_step_doubling(asked.build_scene, t_end, frames, time_budget=_STEP_DOUBLING_SECONDS)}"
             )
         return asked
 

@@ -150,7 +150,8 @@ def compute_predictability_horizon(
     seen.require_predictable(max_error)
     print_message(
         f"a perturbation of 1e-12 of the size grows to {seen.growth_factor[-1]:.1e} of the displacement after "
-        f"{error_target.t_end:g} s: an error of {max_error:g} can be reached there, of {seen.min_error:.0e} at the least"
+        f"{error_target.t_end:g} s: an error of {max_error:g} can be reached "
+        f"there, of {seen.min_error:.0e} at the least"
     )
     return seen
 
@@ -199,7 +200,8 @@ class _MethodSearch:
         graded = sorted((self._estimate_error_and_order(one, closer) for one in raced), key=self._predict_cost)
         for one in graded:
             self._print_message(
-                f"  {one.method}: {self._predict_cost(one):.3g} s predicted; {one.trajectory.cpu_seconds:.3g} s for an error of "
+                f"  {one.method}: {self._predict_cost(one):.3g} s predicted; "
+                f"{one.trajectory.cpu_seconds:.3g} s for an error of "
                 f"{one.error_estimated:.1e}, of order {one.order:.2g}"
             )
         best, note = self._find_first_reaching(graded, closer)
@@ -418,7 +420,8 @@ class _MethodSearch:
         )
         return RunFailed(
             f"no steps keep to an error of {self._max_error:g}: {nearest.method} came nearest and reached "
-            f"{nearest.error_estimated:.1g}{at}, and shorter ones come no nearer; ask for a larger --error or a shorter "
+            f"{nearest.error_estimated:.1g}{at}, and shorter ones come no nearer; "
+            "ask for a larger --error or a shorter "
             "--t-end"
         )
 

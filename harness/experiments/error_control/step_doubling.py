@@ -37,7 +37,10 @@ class StepDoublingEstimate:
     def __str__(self) -> str:
         if self.relative_change is None:
             return f"steps of {self.time_step:.3g} s alone take longer than is spent on saying what can be had"
-        return f"what can be had: steps of {self.time_step:.3g} s end within {self.relative_change:.1g} of where steps half as long do"
+        return (
+            f"what can be had: steps of {self.time_step:.3g} s end within "
+            f"{self.relative_change:.1g} of where steps half as long do"
+        )
 
 
 def estimate_by_step_doubling(

@@ -30,7 +30,10 @@ that.
 
 def format_problem_id(error_target: ErrorTarget) -> str:
     """Return an identifier of the simulated problem, including its frames."""
-    return f"{error_target.scene.with_time_step(1.0).scene_digest[:12]}-{error_target.size}-{error_target.t_end:.9g}-{error_target.num_frames}"
+    return (
+        f"{error_target.scene.with_time_step(1.0).scene_digest[:12]}-{error_target.size}-"
+        f"{error_target.t_end:.9g}-{error_target.num_frames}"
+    )
 
 
 def read_stored_trials(folder: Path, error_target: ErrorTarget) -> list[ResultRow]:

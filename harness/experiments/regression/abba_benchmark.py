@@ -140,7 +140,10 @@ class BenchmarkResult:
         )
         if self.verdict is SequentialVerdict.INCONCLUSIVE:
             held = f"{low:.3g} to {high:.3g}" if low > 0 else f"{len(self.blocks)} turns are too few"
-            return f"cannot tell within {self.elapsed_seconds:.0f} s: {held} (limit {limit:.3g}), on a machine with {self._load_text}"
+            return (
+                f"cannot tell within {self.elapsed_seconds:.0f} s: {held} (limit "
+                f"{limit:.3g}), on a machine with {self._load_text}"
+            )
         near = 0.9 <= limit <= 1.5 and ratio < 2
         if self.verdict is SequentialVerdict.FAIL:
             if near:

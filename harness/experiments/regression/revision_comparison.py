@@ -94,7 +94,8 @@ def build_config_requests(revisions: Sequence[GitRevision], config: Path, option
         ]
     if listed[0] != listed[1]:
         raise InputError(
-            f"{config}: {revisions[0].name} and {revisions[1].name} read different runs out of it: {_find_first_difference(listed)}"
+            f"{config}: {revisions[0].name} and {revisions[1].name} read different runs "
+            f"out of it: {_find_first_difference(listed)}"
         )
     return [
         WorkRequest(title, "prepare_run", {"run_options": options, "index": i}, config)

@@ -126,11 +126,13 @@ def describe_failures(curves: Sequence[ConvergenceCurve]) -> list[str]:
         if curve.status != "ok":
             why = f": {curve.reason}" if curve.reason else ""
             words.append(
-                f"× {curve.label}, {INITIAL_GUESS_LABELS.get(curve.initial_guess, curve.initial_guess)}, {curve.status}{why}"
+                f"× {curve.label}, {INITIAL_GUESS_LABELS.get(curve.initial_guess, curve.initial_guess)}, "
+                f"{curve.status}{why}"
             )
         if curve.minimum_index:
             words.append(
-                f"{curve.label}, {INITIAL_GUESS_LABELS.get(curve.initial_guess, curve.initial_guess)}, ended in minimum {curve.minimum_index}, "
+                f"{curve.label}, {INITIAL_GUESS_LABELS.get(curve.initial_guess, curve.initial_guess)}, "
+                f"ended in minimum {curve.minimum_index}, "
                 "higher than the lowest known (minimum 0); its vertex errors refer to the minimum that it reached"
             )
     return words

@@ -104,4 +104,7 @@ def _describe_candidate(point: CandidatePoint, best: CandidatePoint | None = Non
         if best
         else ""
     )
-    return f"{point.description}: an error of {100 * point.error:.2g} % for {format_duration(point.seconds_per_simulated_second)} a simulated second{times}"
+    return (
+        f"{point.description}: an error of {100 * point.error:.2g} % for "
+        f"{format_duration(point.seconds_per_simulated_second)} a simulated second{times}"
+    )

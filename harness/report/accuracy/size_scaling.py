@@ -111,7 +111,8 @@ def draw_scalings(table: AccuracyData, stem: Path) -> list[Path]:
         "Median over the steps of a mesh, set-up apart. Powers are fitted to three sizes or more.",
         *describe_excluded_steps(problem for problem in table.problems if problem.scene in scenes),
         *(
-            f"× {g.label} on {g.scene}, {INITIAL_GUESS_LABELS[g.initial_guess]}, did not get there at {_join_numbers(g.unsolved_sizes)} vertices"
+            f"× {g.label} on {g.scene}, {INITIAL_GUESS_LABELS[g.initial_guess]}, did not get "
+            f"there at {_join_numbers(g.unsolved_sizes)} vertices"
             for g in found
             if g.unsolved_sizes
         ),

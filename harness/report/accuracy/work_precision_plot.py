@@ -100,12 +100,14 @@ def describe_cheapest_settings(works: Sequence[WorkPoint]) -> list[str]:
                 default=None,
             )
             against = (
-                f", 1/{format_quantity(euler.seconds_per_simulated_second / best.seconds_per_simulated_second)} of what the default's method needs"
+                f", 1/{format_quantity(euler.seconds_per_simulated_second / best.seconds_per_simulated_second)} "
+                "of what the default's method needs"
                 if euler
                 else ""
             )
             words.append(
-                f"{100 * error:g} %: {best.setting_label}: {format_duration(best.seconds_per_simulated_second)} a simulated second{against}"
+                f"{100 * error:g} %: {best.setting_label}: {format_duration(best.seconds_per_simulated_second)} "
+                f"a simulated second{against}"
             )
     return words
 

@@ -189,7 +189,8 @@ def work_precision_panels(folder: Path) -> list[PanelEntry]:
             said = ["Joined points differ in the time step alone."]
             if len(tolerances) > 1:
                 said.append(
-                    f"Larger marks: tighter tolerances, {', '.join(format_power(t) if t else 'auto' for t in tolerances)}."
+                    "Larger marks: tighter tolerances, "
+                    f"{', '.join(format_power(t) if t else 'auto' for t in tolerances)}."
                 )
             plots.append(
                 CurvePlot(

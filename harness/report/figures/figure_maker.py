@@ -65,7 +65,10 @@ def make_figure(
     wrong = find_layout_faults(figure)
     if wrong:
         more = f" and {len(wrong) - _MAX_LISTED} more" if len(wrong) > _MAX_LISTED else ""
-        why = f"came {options.width_mm:g} mm for type of {options.font_size:g} points, in which {'; '.join(wrong[:_MAX_LISTED])}{more}"
+        why = (
+            f"came {options.width_mm:g} mm for type of {options.font_size:g} points, in "
+            f"which {'; '.join(wrong[:_MAX_LISTED])}{more}"
+        )
         raise InputError(InputMistake(f"{why}; wanted a wider figure, smaller type or fewer panels", key="--width"))
     parts = [part for selector in options.selectors for part in selector]
     stem = folder / "-".join(dict.fromkeys([name, *parts]))

@@ -19,7 +19,8 @@ from springbench.harness.report.site.plotly_styles import axis_choice, plotly_st
 
 _CHART_NOTE = (
     "Each line is the Pareto front of a program's settings in time and error; "
-    f"{OWN_PROGRAM}: of all of its methods that were tried. Errors are those of the positions at the end, relative to the way "
+    f"{OWN_PROGRAM}: of all of its methods that were tried. Errors are those of "
+    "the positions at the end, relative to the way "
     "from the start. springbench export-script CONFIG prints a script that repeats an engine's point without us."
 )
 

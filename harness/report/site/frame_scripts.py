@@ -46,7 +46,8 @@ def write_frame_scripts(folder: SweepFolder, table: pa.Table, data: Path, run_id
     # Single precision, whose shortest decimals to_json writes, is more accurate than the display. Values outside its
     # range are so large that only their order of magnitude matters.
     outer = ", ".join(
-        f"'{name}': list(case when isfinite({name}) then least(greatest({name}, -{_FLOAT32_MAX}), {_FLOAT32_MAX})::float end "
+        f"'{name}': list(case when isfinite({name}) then least(greatest({name}, "
+        f"-{_FLOAT32_MAX}), {_FLOAT32_MAX})::float end "
         "order by frame)"
         for name in _FRAME_COLUMNS
     )

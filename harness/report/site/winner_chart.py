@@ -21,7 +21,8 @@ from springbench.harness.report.site.plotly_styles import axis_choice, plotly_st
 _CHART_NOTE = (
     "Each point is the family of methods that reaches an error in the least processor time, whatever its steps and "
     "tolerances; without a point no method reached it. Stiffness number: k dt²/m at dt = 1/30 s. Errors are those of "
-    f"the positions at the end, relative to the way from the start. Prices within a factor of {SIMILAR_COST_RATIO} are alike."
+    "the positions at the end, relative to the way from the start. Prices within "
+    f"a factor of {SIMILAR_COST_RATIO} are alike."
 )
 
 

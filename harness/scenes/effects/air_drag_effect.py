@@ -64,7 +64,8 @@ class AirDragEffect(ConfigModel):
         if not most or late <= MIN_ENERGY_FRACTION * most:
             return ""
         return (
-            f"nothing drives the motion or damps it; in the last quarter of {observed.compute_frame_time(len(v) - 1):.2f} s it still "
+            "nothing drives the motion or damps it; in the last quarter of "
+            f"{observed.compute_frame_time(len(v) - 1):.2f} s it still "
             f"has {100 * late / most:.0f} % of its largest kinetic energy, and only the time integrator's own "
             "damping, which depends on the time step, would ever bring it to rest"
         )

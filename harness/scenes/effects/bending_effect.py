@@ -48,7 +48,8 @@ class BendingEffect(ConfigModel):
         if (count > 2).any():
             ends = shared[count > 2][0].tolist()
             raise InputError(
-                f"bending: more than two triangles meet at the edge {ends}{mesh.format_file_numbers(*ends)}; repair the mesh"
+                "bending: more than two triangles meet at the edge "
+                f"{ends}{mesh.format_file_numbers(*ends)}; repair the mesh"
             )
         return EffectContribution(
             energies=(bending_energy.Bending.from_rest_shape(mesh.rest_positions, triangles, self.stiffness),)
@@ -71,7 +72,8 @@ class BendingEffect(ConfigModel):
             return ""
         return (
             f"over the last quarter of the motion {100 * share:.1f} % of the edges between triangles are bent by more "
-            f"than {np.rad2deg(SHARP_ANGLE):.0f} degrees, the sharpest by {np.rad2deg(turned.max()):.0f}: folds as sharp as "
+            f"than {np.rad2deg(SHARP_ANGLE):.0f} degrees, the sharpest by "
+            f"{np.rad2deg(turned.max()):.0f}: folds as sharp as "
             "the mesh"
         )
 

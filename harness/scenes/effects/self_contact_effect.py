@@ -72,7 +72,8 @@ class SelfContactEffect(ConfigModel):
         reach = self.thickness if self.range is None else self.range
         if crossed := find_edge_triangle_intersections(rest, edges, mesh.triangles):
             raise InputError(
-                f"self-contact: the mesh passes through itself at rest, {describe_intersections(crossed, mesh)}; repair it"
+                "self-contact: the mesh passes through itself at rest, "
+                f"{describe_intersections(crossed, mesh)}; repair it"
             )
 
         def energy(stiffness: NDArray[np.float64]) -> Energy:
@@ -89,7 +90,8 @@ class SelfContactEffect(ConfigModel):
             require_fixed_exact_pins("self-contact", start, pins)
             if crossed := find_edge_triangle_intersections(start, edges, mesh.triangles):
                 raise InputError(
-                    f"self-contact: the start passes through itself, {describe_intersections(crossed, mesh)}; move them apart"
+                    "self-contact: the start passes through itself, "
+                    f"{describe_intersections(crossed, mesh)}; move them apart"
                 )
             require_intersection_free("self-contact", energy(np.ones(len(mass))), start, self.thickness, mesh)
 
@@ -122,8 +124,10 @@ class SelfContactEffect(ConfigModel):
         if not most:
             return ""
         return (
-            f"{most} pairs of vertices without a spring between them are closer than {MIN_DISTANCE_FRACTION:g} mean rest lengths at "
-            f"{observed.compute_frame_time(at):.2f} s, two come as close as {closest / observed.mean_spring_length:.2g}; contact with obstacles "
+            f"{most} pairs of vertices without a spring between them are closer than "
+            f"{MIN_DISTANCE_FRACTION:g} mean rest lengths at "
+            f"{observed.compute_frame_time(at):.2f} s, two come as close as "
+            f"{closest / observed.mean_spring_length:.2g}; contact with obstacles "
             "does not keep them apart"
         )
 

@@ -52,7 +52,8 @@ class SewingEffect(ConfigModel):
         )
         if len(both := np.intersect1d(*rows)):
             raise InputError(
-                f"{self.kind}: vertex {both[0]}{mesh.format_file_numbers(both[0])} is in both rows; each should be in one of them"
+                f"{self.kind}: vertex {both[0]}{mesh.format_file_numbers(both[0])} is "
+                "in both rows; each should be in one of them"
             )
         if not self.stiffness:
             return EffectContribution()

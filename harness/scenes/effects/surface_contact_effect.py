@@ -136,7 +136,8 @@ class SurfaceContactEffect(ConfigModel):
             require_fixed_exact_pins(self.kind, start, pins)
             if crossed := apart.find_intersections(start, 0.0):
                 raise InputError(
-                    f"{self.kind}: the start passes through obstacles, {describe_intersections(crossed, mesh)}; move them apart"
+                    f"{self.kind}: the start passes through obstacles, "
+                    f"{describe_intersections(crossed, mesh)}; move them apart"
                 )
             require_intersection_free(self.kind, energy(np.ones(n)), start, self.thickness, mesh)
 

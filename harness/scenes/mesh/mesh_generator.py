@@ -56,7 +56,8 @@ class MeshGenerator(ConfigModel):
             memory.format_bytes(memory.compute_memory_limit()),
         )
         return (
-            f"would give {vertices:,} vertices of at most {self._max_vertices:,}; with their springs and Q they would take "
+            f"would give {vertices:,} vertices of at most {self._max_vertices:,}; "
+            "with their springs and Q they would take "
             f"about {needs} of memory, where {has} may be taken"
         )
 

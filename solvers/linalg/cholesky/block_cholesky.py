@@ -58,7 +58,8 @@ class BlockCholesky:
         needs, free = 8.0 * (f.panel_start[-1] + 2 * room), memory.compute_memory_limit()
         if needs > free:
             raise Unsupported(
-                f"a factor of the Hessian has {self.nonzeros:,} entries and takes {memory.format_bytes(needs)} of memory, "
+                f"a factor of the Hessian has {self.nonzeros:,} entries and takes "
+                f"{memory.format_bytes(needs)} of memory, "
                 f"where {memory.format_bytes(free)} may be taken; take numba or newton-cg, or a coarser mesh"
             )
         self._panels = np.zeros(f.panel_start[-1] + TILE_ROWS)

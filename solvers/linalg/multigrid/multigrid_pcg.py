@@ -75,12 +75,14 @@ class ConjugateGradients:
         self.correction_ratios = columns.correction_ratios
         if ended == NEGATIVE_CURVATURE:
             raise NotPositiveDefinite(
-                f"Q = A'KA + M/dt^2 + w C'C is not positive definite about vertex {columns.failing_vertex}: stiffnesses, "
+                "Q = A'KA + M/dt^2 + w C'C is not positive definite about vertex "
+                f"{columns.failing_vertex}: stiffnesses, "
                 "masses and pin weights lie too far apart or are negative"
             )
         if not columns.is_within_tolerance():
             raise Unsupported(
-                f"cg: after {self.num_iterations} iterations entries still change by {self.correction_ratios[-1].max():.1e} of "
+                f"cg: after {self.num_iterations} iterations entries still change by "
+                f"{self.correction_ratios[-1].max():.1e} of "
                 "the largest: the stiffnesses lie too far apart for multigrid; use supernodal"
             )
         out[:] = columns.x[:, :3]

@@ -87,7 +87,8 @@ class Multigrid:
         except NotPositiveDefinite as error:
             raise NotPositiveDefinite(
                 f"Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point: level {len(self._levels)} of "
-                f"multigrid, of {self.level_sizes[-1]} vertices, is not; stiffnesses, masses and pin weights lie too far "
+                f"multigrid, of {self.level_sizes[-1]} vertices, is not; stiffnesses, "
+                "masses and pin weights lie too far "
                 "apart or are negative"
             ) from error
         self.nonzeros += self._factor.nonzeros or 0

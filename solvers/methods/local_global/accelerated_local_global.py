@@ -104,7 +104,9 @@ class InterpretedState(AcceleratedState):
             if not self._shorten_trial():
                 return False
             self._evaluate_trial()
-            now["objective_change"], now["roundoff"] = self._objective.objective_change(self.positions, self._trial_positions)
+            now["objective_change"], now["roundoff"] = self._objective.objective_change(
+                self.positions, self._trial_positions
+            )
             verdict = accelerated_descent.judge_trial(window)
         if verdict == accelerated_descent.TRIAL_STALLED:
             return False

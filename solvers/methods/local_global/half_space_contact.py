@@ -249,7 +249,10 @@ class PreparedHalfSpaceLocalGlobal(IterativeSolver):
     @property
     def description(self) -> str:
         """Description of the linear solver."""
-        return f"{self.contact_free.description}; contact by Woodbury's formula, beyond {_MAX_WOODBURY_ROWS} rows by conjugate gradients"
+        return (
+            f"{self.contact_free.description}; contact by Woodbury's formula, beyond "
+            f"{_MAX_WOODBURY_ROWS} rows by conjugate gradients"
+        )
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Return the initial state of a step; that of the contact-free method without active contact."""

@@ -84,8 +84,10 @@ class ExplicitSolver:
         needed = substeps * max(1.0, ceil(system.time_step * rate / (_STABILITY_SAFETY * method.stability_limit)))
         if needed * method.num_evaluations * max(1, len(parts.springs.edges)) > _MAX_SPRING_EVALUATIONS:
             raise Unsupported(
-                f"{self.solver_name}: is stable with {needed:.3g} substeps a step of {method.num_evaluations} evaluations, which "
-                f"for {len(parts.springs.edges)} springs are beyond the {_MAX_SPRING_EVALUATIONS:.0e} allowed; take a shorter time step"
+                f"{self.solver_name}: is stable with {needed:.3g} substeps a step of "
+                f"{method.num_evaluations} evaluations, which "
+                f"for {len(parts.springs.edges)} springs are beyond the {_MAX_SPRING_EVALUATIONS:.0e} "
+                "allowed; take a shorter time step"
             )
         soft = int((~system.pins.exact_mask).sum())
         exact = f"; {soft} pins by penalty taken as exact" if soft else ""

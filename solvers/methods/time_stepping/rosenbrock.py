@@ -77,7 +77,8 @@ class _RosenbrockSolver:
         """
         if self.refine < 1 or not 0.0 <= self.error <= 1.0:
             raise Unsupported(
-                f"{self.solver_name}: refine came as {self.refine} and error as {self.error}; wanted 1 or more, and a number "
+                f"{self.solver_name}: refine came as {self.refine} and error as "
+                f"{self.error}; wanted 1 or more, and a number "
                 "from 0 to 1"
             )
         vertex_terms.require_implicit_euler(system, self.solver_name)
@@ -88,7 +89,8 @@ class _RosenbrockSolver:
                 drag += c
             elif is_lagged(energy) or is_barrier_energy(energy):
                 raise Unsupported(
-                    f"{self.solver_name}: needs the exact derivatives of all forces, and knows energies of the positions "
+                    f"{self.solver_name}: needs the exact derivatives of all forces, "
+                    "and knows energies of the positions "
                     f"alone and drag on vertices; the scene has {type(energy).__name__} as well"
                 )
             else:
@@ -253,7 +255,8 @@ class PreparedRosenbrock(IterativeSolver):
                 h = length * (max(_MIN_STEP_FACTOR, _STEP_SAFETY * ratio ** (-1.0 / power)) if ratio < np.inf else 0.5)
             if h < _MIN_STEP_FRACTION * frame or accepted + rejected >= _MAX_STEPS:
                 raise RuntimeError(
-                    f"the error of {self.error_tolerance:.3g} m was not kept within {accepted + rejected} steps, the last of "
+                    f"the error of {self.error_tolerance:.3g} m was not kept within "
+                    f"{accepted + rejected} steps, the last of "
                     f"{h:.3g} s: after {t:.6g} of {frame:.6g} s of the frame the forces are too sudden, or round-off "
                     "is larger; ask for a larger error"
                 )

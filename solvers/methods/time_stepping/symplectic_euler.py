@@ -80,7 +80,8 @@ class SymplecticEuler:
         if needed * max(1, len(springs.edges)) > _MAX_SPRING_EVALUATIONS:
             raise Unsupported(
                 f"symplectic-euler: is stable with {needed:.3g} substeps a step, which for {len(springs.edges)} "
-                f"springs are more than the {_MAX_SPRING_EVALUATIONS:.0e} evaluations that are allowed; take a shorter time step"
+                f"springs are more than the {_MAX_SPRING_EVALUATIONS:.0e} evaluations "
+                "that are allowed; take a shorter time step"
             )
         soft = int((~system.pins.exact_mask).sum())
         taken = f"; {soft} pins by penalty taken as exact" if soft else ""

@@ -119,7 +119,8 @@ class PreparedDeviceVertexBlockDescent(MinimisingSolver):
     def description(self) -> str:
         """Description of the prepared solver."""
         return (
-            f"vertices in {self.vertex_blocks.num_colours} colours; kernels in {np.dtype(self.real_dtype)}, the gradient in float64; for "
+            f"vertices in {self.vertex_blocks.num_colours} colours; kernels in "
+            f"{np.dtype(self.real_dtype)}, the gradient in float64; for "
             f"the residual alone {self.metric.description}"
         )
 

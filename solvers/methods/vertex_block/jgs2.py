@@ -106,7 +106,8 @@ class Jgs2:
         )
         mean = len(patches.patch_vertices) / max(1, len(patches.patch_starts) - 1)
         choice = (
-            f"on average {mean:.1f} vertices answer to one, in {memory.format_bytes(patches.response.nbytes)}; residuals "
+            f"on average {mean:.1f} vertices answer to one, in "
+            f"{memory.format_bytes(patches.response.nbytes)}; residuals "
             f"by {metric.description}{objective.interpreted_energies}"
         )
         return PreparedDescent(

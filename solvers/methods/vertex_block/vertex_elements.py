@@ -37,7 +37,9 @@ class VertexElements:
     @classmethod
     def from_system(cls, system: System) -> VertexElements:
         """Select those of a system."""
-        known = (k for k, e in enumerate(system.energies) if hasattr(e, "element_law") and isinstance(e, ProjectiveEnergy))
+        known = (
+            k for k, e in enumerate(system.energies) if hasattr(e, "element_law") and isinstance(e, ProjectiveEnergy)
+        )
         return cls(system, tuple(known))
 
     @property
