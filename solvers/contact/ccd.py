@@ -95,11 +95,19 @@ def collision_free_step_size(candidates, p, displacement, max_step, local_indice
 def _needs_ccd(candidates, p, displacement, max_step, first, last, edges):
     """Return as bits which of eight pairs can reach each other, by distances and displacement lengths alone."""
     x = candidates.vertices
-    a, b, c, d = (gather_rows(p, x, first, last, 0), gather_rows(p, x, first, last, 1), gather_rows(p, x, first, last, 2),
-                  gather_rows(p, x, first, last, 3))  # fmt: skip
+    a, b, c, d = (
+        gather_rows(p, x, first, last, 0),
+        gather_rows(p, x, first, last, 1),
+        gather_rows(p, x, first, last, 2),
+        gather_rows(p, x, first, last, 3),
+    )
     z = edge_edge_distance_vector(a, b, c, d)[4] if edges else point_triangle_distance_vector(a, b, c, d)[4]
-    a, b, c, d = (gather_rows(displacement, x, first, last, 0), gather_rows(displacement, x, first, last, 1),
-                  gather_rows(displacement, x, first, last, 2), gather_rows(displacement, x, first, last, 3))  # fmt: skip
+    a, b, c, d = (
+        gather_rows(displacement, x, first, last, 0),
+        gather_rows(displacement, x, first, last, 1),
+        gather_rows(displacement, x, first, last, 2),
+        gather_rows(displacement, x, first, last, 3),
+    )
     mean = _mean_coordinate(a, b, c, d, 0), _mean_coordinate(a, b, c, d, 1), _mean_coordinate(a, b, c, d, 2)
     l0, l1, l2, l3 = (
         _relative_length(a, mean),

@@ -350,7 +350,7 @@ class Hessian:
 
     @cached_property
     def kernel_arguments(self) -> tuple[Any, ...]:
-        """Arguments of `springbench.solvers.kernels.spring_hessian.multiply_hessian`: all terms with an element-wise form."""
+        """Arguments of `spring_hessian.multiply_hessian`: all terms with an element-wise form."""
         step = self._step_objective
         curvature = np.concatenate(self.element_hessians) if self.element_hessians else None
         return (

@@ -53,8 +53,10 @@ class _StripBuilder(VectorBuilder):
         return builder.call(store, [value, place, I32(8), mask])
 
 
-def _subtract_tile_product_code(typingctx: Any, L: Any, at: Any, top: Any, stride: Any, depth: Any, C: Any, to: Any, step: Any,
-                      strips: Any, columns: Any) -> Any:  # fmt: skip
+def _subtract_tile_product_code(
+    typingctx: Any, L: Any, at: Any, top: Any, stride: Any, depth: Any,
+    C: Any, to: Any, step: Any, strips: Any, columns: Any,
+) -> Any:  # fmt: skip
     """Compute C[to + r + step j] -= sum over k < depth of L[at + r + stride k] L[top + j + stride k].
 
     j < columns, and r covers `strips` strips of eight rows.

@@ -5,6 +5,7 @@ import os
 from typing import Any
 
 import pytest
+from springbench.harness.execution.machine_info import collect_versions
 from threadpoolctl import threadpool_info
 
 from tests.bench.gates import THREADS
@@ -40,7 +41,7 @@ def pytest_benchmark_update_machine_info(machine_info: dict[str, Any]) -> None:
     del machine_info["node"]
     machine_info["cpu"] = {key: machine_info["cpu"].get(key) for key in ("brand_raw", "arch", "count")}
     machine_info["affinity"] = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    machine_info["versions"] = machine_info.collect_versions()
+    machine_info["versions"] = collect_versions()
     machine_info["threads"] = THREADS
     machine_info["blas"] = [
         {key: library[key] for key in ("internal_api", "version")}

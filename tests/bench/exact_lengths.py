@@ -95,8 +95,10 @@ def swinging() -> Table:
 
 def ratios() -> Table:
     """The second table."""
-    chain = build_test_scene(ChainMesh(), SpringsEffect(stretch=1e4, rule="fixed"), GravityEffect(), ENDS, EtherDragEffect(rate=2.0), size=12,
-                  mass=11.0, time_step=FRAME)  # fmt: skip
+    chain = build_test_scene(
+        ChainMesh(), SpringsEffect(stretch=1e4, rule="fixed"), GravityEffect(), ENDS, EtherDragEffect(rate=2.0),
+        size=12, mass=11.0, time_step=FRAME,
+    )  # fmt: skip
     (found,) = chain.system.energies
     assert isinstance(found, spring_energy.Springs)
     k = np.where(np.arange(11) % 2, 1e4, 1.0) * found.stiffness

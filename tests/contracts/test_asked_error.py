@@ -193,7 +193,11 @@ def perturbed(spec: SceneSpec, size: int, times: list[float]) -> np.ndarray:
 
 CRUMPLING = SceneSpec(
     mesh=GridMesh(),
-    effects=(SpringsEffect(stretch=300.0, shear=60.0), GravityEffect(), PinsEffect(at=("top_corners",), weight="exact")),
+    effects=(
+        SpringsEffect(stretch=300.0, shear=60.0),
+        GravityEffect(),
+        PinsEffect(at=("top_corners",), weight="exact"),
+    ),
     mass=0.3, time_step=1 / 30, frames=60, path=Path("cloth.yaml"), default_size=9,
 )  # fmt: skip
 

@@ -83,7 +83,9 @@ PROBLEMS: dict[str, tuple[tuple[SceneEffect, ...], tuple, tuple[float, float, fl
     "slowed by quadratic drag": ((SOFT, AirDragEffect(law="quadratic", coefficient=3.0), HELD), (), (1.0, 0.0, 2.0)),
     "slowed by air": ((SOFT, GravityEffect(), AirDragEffect(coefficient=2.0), HELD), (), (1.0, 0.0, 2.0)),
     "slowed by dashpots": ((SOFT, GravityEffect(), DashpotsEffect(stretch=0.4), HELD), (), (1.0, 0.0, 2.0)),
-    "slowed by Rayleigh's damping": ((SOFT, GravityEffect(), RayleighEffect(mass=0.5, stiffness=0.02), HELD), (), (1.0, 0.0, 2.0)),
+    "slowed by Rayleigh's damping": (
+        (SOFT, GravityEffect(), RayleighEffect(mass=0.5, stiffness=0.02), HELD), (), (1.0, 0.0, 2.0)
+    ),
     "swung by its pin": ((SOFT, GravityEffect(), SWUNG), (), (0.5, 1.0, 0.0)),
 }  # fmt: skip
 

@@ -96,8 +96,9 @@ def test_pins_that_move_evenly_keep_the_order(name):
 
 def test_the_linearised_step_is_that_of_baraff_and_witkin():
     """(M - dt^2 df/dx) dv = dt (f + dt df/dx v), by a dense matrix."""
-    scene = made(SpringsEffect(stretch=300.0), GravityEffect(), PinsEffect(at=("top_corners",), weight="exact"), mesh=GridMesh(),
-                 integrator="implicit-euler", time_step=1 / 30)  # fmt: skip
+    pins = PinsEffect(at=("top_corners",), weight="exact")
+    effects = SpringsEffect(stretch=300.0), GravityEffect(), pins
+    scene = made(*effects, mesh=GridMesh(), integrator="implicit-euler", time_step=1 / 30)
     (p, v), dt, free = build_initial_state(scene).motion, 1 / 30, scene.system.free_vertices
     K = np.asarray(scene.all_springs.hessian(p).toarray())
     f = scene.constant_force.copy()

@@ -1,8 +1,8 @@
 """Comparison of this checkout with a git revision.
 
-`springbench regress --against REVISION` runs it, in one run on one machine. Both must give the same answer before anything
-is timed. Deterministic counts (iterations, entries, bytes) are compared exactly. Then two processes are benchmarked by
-interleaved blocks.
+`springbench regress --against REVISION` runs it, in one run on one machine. Both must give the same answer before
+anything is timed. Deterministic counts (iterations, entries, bytes) are compared exactly. Then two processes are
+benchmarked by interleaved blocks.
 """
 
 from __future__ import annotations

@@ -62,8 +62,14 @@ def draw_recommendation(
     ]
     looks = assign_solver_styles(point.solver for point in points)
     with page_of(stem, title, facts) as page:
-        ax = add_panel(page, PANEL_LEFT + 62, PANEL_TOP + 30, PANEL_RIGHT - PANEL_LEFT - 82, notes_top(words) - PANEL_TOP - 96,
-                   "error of the positions, relative to the way from the start")  # fmt: skip
+        ax = add_panel(
+            page,
+            PANEL_LEFT + 62,
+            PANEL_TOP + 30,
+            PANEL_RIGHT - PANEL_LEFT - 82,
+            notes_top(words) - PANEL_TOP - 96,
+            "error of the positions, relative to the way from the start",
+        )
         down = log_limits([*(point.error for point in points), error_requested], margin=1.8)
         ax.axhspan(down[0], error_requested, color=RULE_COLOUR, alpha=0.45, zorder=0, lw=0)
         for point in points:
@@ -79,7 +85,8 @@ def draw_recommendation(
             )
             ax.plot(point.seconds_per_simulated_second, point.error, "o", mfc="none", zorder=4, **ring)
             ax.annotate(
-                "recommended" if not k else str(k), (point.seconds_per_simulated_second, point.error), (0, 10 if k else -22),
+                "recommended" if not k else str(k),
+                (point.seconds_per_simulated_second, point.error), (0, 10 if k else -22),
                 textcoords="offset points", ha="center", fontsize=9, color=TEXT_COLOUR if not k else MUTED_COLOUR,
             )  # fmt: skip
         format_log_axis(
@@ -88,8 +95,8 @@ def draw_recommendation(
         format_log_axis(ax.yaxis, *down, unit="percent")
         ax.set_xlabel("wall time a simulated second", fontsize=9, loc="left")
         ax.annotate(
-            f"asked: {100 * error_requested:.3g} %", (1.0, error_requested), (-6, 4), xycoords=("axes fraction", "data"),
-            textcoords="offset points", ha="right", fontsize=9, color=MUTED_COLOUR,
+            f"asked: {100 * error_requested:.3g} %", (1.0, error_requested), (-6, 4),
+            xycoords=("axes fraction", "data"), textcoords="offset points", ha="right", fontsize=9, color=MUTED_COLOUR,
         )  # fmt: skip
         draw_legend(
             page, {solver: looks[solver]._replace(dash="") for solver in dict.fromkeys(p.solver for p in points)}

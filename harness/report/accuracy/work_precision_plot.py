@@ -225,7 +225,8 @@ def _draw_panel(
         )
         ax.annotate(
             "the default", (base.seconds_per_simulated_second, base.error), (11, 4), textcoords="offset points",
-            fontsize=9, ha="left", color=TEXT_COLOUR, bbox={"facecolor": BACKGROUND_COLOUR, "alpha": 0.8, "edgecolor": "none", "pad": 0.8},
+            fontsize=9, ha="left", color=TEXT_COLOUR,
+            bbox={"facecolor": BACKGROUND_COLOUR, "alpha": 0.8, "edgecolor": "none", "pad": 0.8},
         )  # fmt: skip
 
 

@@ -71,8 +71,9 @@ class _EndLabels:
         for series, (x, y) in zip(known, self._ends, strict=True):
             line = {"arrowstyle": "-", "color": series.style.color, "alpha": 0.5, "linewidth": 0.5, "shrinkA": 0}
             name = ax.annotate(
-                series.label, (x, y), (1.0, 0.5), textcoords="axes fraction", va="center", fontsize=options.small_font_size,
-                color=_darken_colour(series.style.color), arrowprops=line | {"shrinkB": 2.5, "relpos": (0.0, 0.5)},
+                series.label, (x, y), (1.0, 0.5), textcoords="axes fraction", va="center",
+                fontsize=options.small_font_size, color=_darken_colour(series.style.color),
+                arrowprops=line | {"shrinkB": 2.5, "relpos": (0.0, 0.5)},
                 annotation_clip=False,
             )  # fmt: skip
             name.set_position((self._label_position(), 0.5))

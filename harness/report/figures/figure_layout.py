@@ -192,10 +192,10 @@ def _draw_strain_scale(
     low, high = (float(end([0.0, *(end(panel.strain) for panel in pictures)])) for end in (np.nanmin, np.nanmax))
     cut = {"min": low < -limit, "max": high > limit}
     extend = "both" if all(cut.values()) else next((end for end, beyond in cut.items() if beyond), "neither")
+    num_ticks = 5 if options.width_mm * 8.0 / options.font_size > _FIVE_TICK_WIDTH else 3
     bar = figure.colorbar(
         ScalarMappable(Normalize(-limit, limit), STRAIN_MAP), ax=list(axes), location="bottom", shrink=0.8, aspect=45,
-        extend=extend, pad=0.02,
-        ticks=np.linspace(-limit, limit, 5 if options.width_mm * 8.0 / options.font_size > _FIVE_TICK_WIDTH else 3).tolist(),
+        extend=extend, pad=0.02, ticks=np.linspace(-limit, limit, num_ticks).tolist(),
     )  # fmt: skip
     bar.outline.set_visible(False)
     bar.ax.xaxis.set_major_formatter(

@@ -12,8 +12,8 @@ from springbench.harness.results.folder_ownership import OWNER_FILE as CLAIM
 _MACHINE_COLUMNS = ("machine", "cpu", "cores", "memory_gib", "system", "commit")
 
 _PROVENANCE_QUERY = f"""
-select {", ".join(f'"{name}"' for name in _MACHINE_COLUMNS)}, list(distinct code order by code), min(started), max(started),
-    count(distinct {{unit}})
+select {", ".join(f'"{name}"' for name in _MACHINE_COLUMNS)}, list(distinct code order by code),
+    min(started), max(started), count(distinct {{unit}})
 from rows_of where machine is not null group by all order by max(started) desc
 """
 

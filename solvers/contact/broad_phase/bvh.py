@@ -211,8 +211,8 @@ def traverse_trees(one, other, begin, end, query, is_same_tree, stack, out):
             above, slot, own = max(0, node - 1) // 8, (node - 1) % 8, 255
             if node > 0:  # which of the eight come near the box around this node
                 own = overlap_mask(
-                    mine, yours, leaf + first_of_eight // 8, *extract_aabb(boxes[above], slot), *extract_aabb(there[above], slot),
-                    query,
+                    mine, yours, leaf + first_of_eight // 8,
+                    *extract_aabb(boxes[above], slot), *extract_aabb(there[above], slot), query,
                 )  # fmt: skip
             while own != 0:
                 k = lowest_set_bit(own)

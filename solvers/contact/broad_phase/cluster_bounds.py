@@ -199,10 +199,20 @@ def _deviation_bounds(poses, pairs, first, last, e1, e2):
     c = _subtract_combination(
         c, load_packet(pairs.relative_pose, first), f1, load_packet(pairs.relative_pose, room + first), f2
     )
-    g1 = _subtract_combination(gather_rows(poses.f1, x, first, last, 1), load_packet(pairs.relative_pose, 2 * room + first), f1,
-               load_packet(pairs.relative_pose, 3 * room + first), f2)  # fmt: skip
-    g2 = _subtract_combination(gather_rows(poses.f2, x, first, last, 1), load_packet(pairs.relative_pose, 4 * room + first), f1,
-               load_packet(pairs.relative_pose, 5 * room + first), f2)  # fmt: skip
+    g1 = _subtract_combination(
+        gather_rows(poses.f1, x, first, last, 1),
+        load_packet(pairs.relative_pose, 2 * room + first),
+        f1,
+        load_packet(pairs.relative_pose, 3 * room + first),
+        f2,
+    )
+    g2 = _subtract_combination(
+        gather_rows(poses.f2, x, first, last, 1),
+        load_packet(pairs.relative_pose, 4 * room + first),
+        f1,
+        load_packet(pairs.relative_pose, 5 * room + first),
+        f2,
+    )
     wide, left = load_packet(pairs.relative_pose, 6 * room + first), gather_rows(poses.fit_residual, x, first, last, 1)
     a, b, c1, d = dot3(e1, g1), dot3(e2, g1), dot3(e1, g2), dot3(e2, g2)
     z = _projected_length(e1, e2, c) + sqrt_packet(a * a + b * b + c1 * c1 + d * d) * wide

@@ -146,8 +146,14 @@ def overlap_mask(boxes, end_boxes, node, low, high, lower, upper, query):
     x0, x1, x2 = load_packet(boxes, at), load_packet(boxes, at + 8), load_packet(boxes, at + 16)
     y0, y1, y2 = load_packet(boxes, at + 24), load_packet(boxes, at + 32), load_packet(boxes, at + 40)
     if end_boxes is boxes:  # half the tests say the other half
-        return mask_to_bits((x0 <= high[0] + most) & (y0 >= low[0] - most) & (x1 <= high[1] + most) & (y1 >= low[1] - most)
-                    & (x2 <= high[2] + most) & (y2 >= low[2] - most))  # fmt: skip
+        return mask_to_bits(
+            (x0 <= high[0] + most)
+            & (y0 >= low[0] - most)
+            & (x1 <= high[1] + most)
+            & (y1 >= low[1] - most)
+            & (x2 <= high[2] + most)
+            & (y2 >= low[2] - most)
+        )
     s0, s1, s2 = load_packet(end_boxes, at), load_packet(end_boxes, at + 8), load_packet(end_boxes, at + 16)
     t0, t1, t2 = load_packet(end_boxes, at + 24), load_packet(end_boxes, at + 32), load_packet(end_boxes, at + 40)
     w0, w1, w2 = (
@@ -158,10 +164,14 @@ def overlap_mask(boxes, end_boxes, node, low, high, lower, upper, query):
     wide = query.min_distance + query.relative_min_distance * sqrt_packet(w0 * w0 + w1 * w1 + w2 * w2)
     wide = where(wide > query.inflation_radius, wide, query.inflation_radius + 0.0 * wide)
     wide = where(wide < most, wide, most + 0.0 * wide)
-    return mask_to_bits(((x0 <= high[0] + wide) | (s0 <= upper[0] + wide)) & ((y0 >= low[0] - wide) | (t0 >= lower[0] - wide))
-        & ((x1 <= high[1] + wide) | (s1 <= upper[1] + wide)) & ((y1 >= low[1] - wide) | (t1 >= lower[1] - wide))
-        & ((x2 <= high[2] + wide) | (s2 <= upper[2] + wide)) & ((y2 >= low[2] - wide) | (t2 >= lower[2] - wide))
-    )  # fmt: skip
+    return mask_to_bits(
+        ((x0 <= high[0] + wide) | (s0 <= upper[0] + wide))
+        & ((y0 >= low[0] - wide) | (t0 >= lower[0] - wide))
+        & ((x1 <= high[1] + wide) | (s1 <= upper[1] + wide))
+        & ((y1 >= low[1] - wide) | (t1 >= lower[1] - wide))
+        & ((x2 <= high[2] + wide) | (s2 <= upper[2] + wide))
+        & ((y2 >= low[2] - wide) | (t2 >= lower[2] - wide))
+    )
 
 
 @jit_inner

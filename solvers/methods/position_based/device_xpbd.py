@@ -303,7 +303,8 @@ class DeviceXpbdSmallStepsState(_DeviceXpbdState):
         for left in range(self._num_substeps - 1, -1, -1):
             part = left / self._num_substeps
             self.launch_kernel(
-                predict_step, n, h, part, places, step.copy_positions, step.pin_targets, self._float64_compliance, step.external_force, self._v, self._substep_start,
+                predict_step, n, h, part, places, step.copy_positions, step.pin_targets,
+                self._float64_compliance, step.external_force, self._v, self._substep_start,
                 self.reference, self.displacement,
             )  # fmt: skip
             self.linearise_constraints()

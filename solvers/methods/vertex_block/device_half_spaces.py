@@ -99,9 +99,11 @@ class DeviceHalfSpaces:
         self._stream.overwrite_array(np.zeros(1), self._max_squared_speed)
         measure_max_speed[self.launch_shape](step.velocity, self._max_squared_speed)
         build_half_spaces[self.launch_shape](
-            self._vertex, step.copy_positions, step.velocity, self._dt, (end - begin) / self._dt, self._max_squared_speed, self._frames,
+            self._vertex, step.copy_positions, step.velocity, self._dt, (end - begin) / self._dt,
+            self._max_squared_speed, self._frames,
             self._obstacle_bodies, self._found, step.normal_force_positions is not None,
-            step.copy_positions if step.normal_force_positions is None else step.normal_force_positions, self.half_spaces,
+            step.copy_positions if step.normal_force_positions is None else step.normal_force_positions,
+            self.half_spaces,
         )  # fmt: skip
 
     def _obstacle_frames(self, time: float) -> NDArray[np.float64]:

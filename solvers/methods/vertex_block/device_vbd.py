@@ -230,8 +230,8 @@ class DeviceSweepState(DeviceSolverState):
                 self._control,
             )
         self._launch_kernel(
-            self._springs.linearise_springs, len(lanes.lane_row), *lanes.float64_arguments, lanes.padding_row, lanes.padding_end_row, self.loaded_step.step_data,
-            self._reference, self._force,
+            self._springs.linearise_springs, len(lanes.lane_row), *lanes.float64_arguments, lanes.padding_row,
+            lanes.padding_end_row, self.loaded_step.step_data, self._reference, self._force,
         )  # fmt: skip
 
     def _launch_iteration(self) -> None:
@@ -262,8 +262,8 @@ class DeviceSweepState(DeviceSolverState):
         lanes, first = made.device_lanes, made.vertex_blocks.first_packet
         for begin, end in zip(LANES * first[:-1], LANES * first[1:], strict=True):
             colour = (
-                begin, end, *lanes.single_type_arguments, lanes.padding_row, lanes.padding_end_row, made.anchor_stiffness, made.hessian_majorant, self._force, self._displacement,
-                self._sweep_start,
+                begin, end, *lanes.single_type_arguments, lanes.padding_row, lanes.padding_end_row,
+                made.anchor_stiffness, made.hessian_majorant, self._force, self._displacement, self._sweep_start,
             )  # fmt: skip
             self._launch_kernel(self._kernels.sweep_colour, end - begin, *colour)
             if self._half_spaces:
@@ -279,7 +279,8 @@ class DeviceSweepState(DeviceSolverState):
         made = self._prepared
         lanes = made.device_lanes
         self._launch_kernel(
-            self._kernels.sum_objective, len(lanes.lane_row), *lanes.single_type_arguments, lanes.padding_row, lanes.padding_end_row, made.vertex_blocks.num_free, made.anchor_stiffness,
+            self._kernels.sum_objective, len(lanes.lane_row), *lanes.single_type_arguments, lanes.padding_row,
+            lanes.padding_end_row, made.vertex_blocks.num_free, made.anchor_stiffness,
             self._force, u, asked, self._control, sums,
         )  # fmt: skip
         if self._half_spaces:
