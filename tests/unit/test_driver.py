@@ -202,7 +202,7 @@ class PreparedNear(PreparedStepping):
 )
 def test_a_small_residual_is_the_floor_where_the_gradient_is_round_off(monkeypatch, rests, most, wanted, looks):
     run, looked = Stepping(0, 1000), []
-    monkeypatch.setattr(PreparedNear, "begin", lambda *_: run)
+    monkeypatch.setattr(PreparedNear, "init_state", lambda *_: run)
     monkeypatch.setattr(
         iterative_solver, "is_gradient_roundoff", lambda *_: looked.append(run.count) or run.count >= rests
     )
