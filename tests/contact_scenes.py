@@ -69,6 +69,6 @@ def collect_steps(
 
 def penetration_depth(scene: Scene, p: Positions, time: float) -> float:
     """How much nearer than the thickness the nearest vertex is [m], negative where there is room."""
-    (energy,) = (e for e in scene.system.energies if type(e).__name__ == "Contact")
+    (energy,) = (e for e in scene.system.energies if type(e).__name__ == "HalfSpaceContact")
     obstacles = energy.obstacles  # pyright: ignore[reportAttributeAccessIssue]
     return max(CONTACT_THICKNESS - float(one.signed_distance(p, time).min()) for one in obstacles)

@@ -347,7 +347,7 @@ class ObstacleContact(BarrierContact):
             pressed = (
                 first if start.normal_force_positions is None else np.concatenate([start.normal_force_positions, end])
             )
-            step = replace(step, grip=step._build_tangential_collisions(pressed, first, start))
+            step = replace(step, tangential_collisions=step._build_tangential_collisions(pressed, first, start))
         return step
 
     def append_obstacle_positions(self, p: Positions) -> Positions:

@@ -44,7 +44,10 @@ def landed(scene: str) -> tuple[StepProblem, Positions]:
     """The step at which most presses and something grips, and its minimum by Newton's method."""
     step = collect_steps(SCENES[scene](), 4, stop=StopRule(100, 1e-12))[-1]
     energy = step.problem.energies[-1]
-    assert len(energy.rows(step.problem.current_positions, step.solution.positions, cautious=False).vertices) > 3  # pyright: ignore[reportAttributeAccessIssue]
+    assert (
+        len(energy.build_penalty_rows(step.problem.current_positions, step.solution.positions, majorise=False).vertices)
+        > 3
+    )  # pyright: ignore[reportAttributeAccessIssue]
     return step.problem, step.solution.positions
 
 

@@ -72,7 +72,7 @@ def test_more_sweeps_take_fewer_iterations():
     assert one > two > four
 
 
-@pytest.mark.parametrize(("scene", "name"), [("contact", "Contact"), ("gas", "Gas")], ids=lambda x: x)
+@pytest.mark.parametrize(("scene", "name"), [("contact", "HalfSpaceContact"), ("gas", "Gas")], ids=lambda x: x)
 def test_what_has_no_rows_in_q_is_refused_by_name(scene, name):
     with pytest.raises(Unsupported, match=f"a-jacobi: .*{name}"):
         AggregatedJacobi().prepare(build_moving_problem(EFFECT_SCENES[scene]()).system)

@@ -73,7 +73,7 @@ def test_a_spring_shorter_than_the_weight_allows_has_no_fixed_point(weight, stay
 
 
 @pytest.mark.parametrize(
-    ("scene", "name"), [("dashpots", "Dashpots"), ("contact", "Contact"), ("gas", "Gas")], ids=lambda x: x
+    ("scene", "name"), [("dashpots", "Dashpots"), ("contact", "HalfSpaceContact"), ("gas", "Gas")], ids=lambda x: x
 )
 def test_what_has_no_projection_along_edges_is_refused_by_name(scene, name):
     with pytest.raises(Unsupported, match=f"admm: .*the scene has .*{name}"):

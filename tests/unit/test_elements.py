@@ -23,7 +23,7 @@ ENERGIES = {
     "strain limits": (STRAIN_LIMIT_EFFECT, "StrainLimits"),
     "dashpots": (DASHPOT_EFFECT, "Dashpots"),
     "rayleigh": (RAYLEIGH_EFFECT, "RayleighDashpots"),
-    "contact": (FLOOR_CONTACT, "Contact"),
+    "contact": (FLOOR_CONTACT, "HalfSpaceContact"),
 }
 SUMS = 1e-13
 """Sums of some dozen terms in another order, relative to the largest."""

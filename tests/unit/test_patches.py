@@ -32,9 +32,11 @@ class Made:
 
     def __init__(self, mesh: Mesh) -> None:
         n, edges = len(mesh.rest_positions), unique_edges(mesh.triangles)
-        self.rest, corners = mesh.rest_positions, mesh.triangles
-        self.trees = [BVH.from_primitives(self.rest, x) for x in (np.arange(n)[:, None], edges, corners)]
-        self.patches = ClusterCulling.from_rest_shape(self.rest, self.trees[0], self.trees[1], self.trees[2], 4 * REACH)
+        self.rest_positions, corners = mesh.rest_positions, mesh.triangles
+        self.trees = [BVH.from_primitives(self.rest_positions, x) for x in (np.arange(n)[:, None], edges, corners)]
+        self.patches = ClusterCulling.from_rest_shape(
+            self.rest_positions, self.trees[0], self.trees[1], self.trees[2], 4 * REACH
+        )
         one = [(i, *t) for i in range(n) for t in corners.tolist() if i not in t]
         two = [(*e, *f) for e, f in combinations(edges.tolist(), 2) if not set(e) & set(f)]
         none = np.empty(0)

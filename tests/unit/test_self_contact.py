@@ -184,7 +184,10 @@ def test_each_contact_stands_for_all_pairs_that_have_its_closest_points():
     contact, p, _ = build_touching_sheets(noise=5e-4)
     pairs, total, gradient = contact.find_candidates(p), 0.0, np.zeros_like(p)
     for e in range(len(pairs.vertices)):
-        cut = {name: getattr(pairs, name)[e : e + 1] for name in ("vertices", "scale", "stiffness", "parallel")}
+        cut = {
+            name: getattr(pairs, name)[e : e + 1]
+            for name in ("vertices", "distance_scale", "stiffness", "mollifier_threshold")
+        }
         single = pairs._replace(num_point_triangle=int(e < pairs.num_point_triangle), **cut)
         total += energy_and_gradient(
             build_collisions(single, pad_positions(p), allocate_collisions(1, CONTACT_THICKNESS, CONTACT_DHAT)),
