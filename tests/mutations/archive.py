@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from tests.mutations.base import Mutation
 
-_COMPACT, _MERGE, _PUBLISH, _VERIFY = (
-    f"harness/experiments/archive/{name}.py" for name in ("compact", "merge", "publish", "verify")
-)
 _SHELF, _MERGED, _PUBLISHED, _REFUSED, _LOCKS = (
     f"tests/unit/test_{name}.py" for name in ("shelf", "merge", "publish", "publish_refused", "machine_lock")
 )
@@ -21,51 +18,52 @@ ARCHIVE = (
     ),
     Mutation(
         "packed-without-comparing",
-        _COMPACT,
-        "if not rows.same(file.read_row_group(group), rows.read_each(batch, schema, named=True)):",
+        "harness/experiments/archive/compaction.py",
+        "if not parquet_rows.is_bitwise_equal(\n                file.read_row_group(group), "
+        "parquet_rows.read_rows_by_file(batch, schema, with_unit_names=True)\n            ):",
         "if not file.num_row_groups:",
         (f"{_SHELF}::test_nothing_is_removed_where_the_packed_rows_differ_from_the_originals",),
     ),
     Mutation(
         "merged-without-comparing",
-        _MERGE,
-        "if not rows.same(rows.read_each([partial], _ANY), table):",
+        "harness/experiments/archive/result_merge.py",
+        "if not parquet_rows.is_bitwise_equal(parquet_rows.read_rows_by_file([partial], _EMPTY_SCHEMA), table):",
         "if not partial.exists():",
         (f"{_MERGED}::test_rows_that_are_not_written_as_they_were_replace_nothing",),
     ),
     Mutation(
         "older-rows-keep-the-name",
-        _MERGE,
-        "_started(heads[pair[0]]), reverse=True)",
-        "_started(heads[pair[0]]), reverse=False)",
+        "harness/experiments/archive/result_merge.py",
+        "_read_start_time(heads[pair[0]]), reverse=True\n        )",
+        "_read_start_time(heads[pair[0]]), reverse=False)",
         (f"{_MERGED}::test_a_run_that_was_done_twice_keeps_both_rows_and_the_newer_its_name",),
     ),
     Mutation(
         "published-from-anywhere",
-        _PUBLISH,
+        "harness/experiments/archive/publication.py",
         "if not place.is_relative_to(folder.resolve()):",
         "if not place.is_absolute():",
         (_REFUSED,),
     ),
     Mutation(
         "positions-alone-are-verified",
-        _VERIFY,
-        "wrong = _differing([(row, of_place[_place(row)]) for row in old.rows], names)",
-        "wrong = _differing([], names)",
+        "harness/experiments/archive/archive_verification.py",
+        "wrong = _find_differences([(row, of_place[_row_key(row)]) for row in original.rows], names)",
+        "wrong = _find_differences([], names)",
         (f"{_PUBLISHED}::test_a_forged_column_does_not_hold",),
     ),
     Mutation(
         "any-times-are-verified",
-        _VERIFY,
-        "RATIO, ELSEWHERE, SECONDS = 1.25, 2.0, 3.0",
-        "RATIO, ELSEWHERE, SECONDS = 1.25, 2.0, 3e6",
+        "harness/experiments/archive/archive_verification.py",
+        "MAX_RATIO_SAME_MACHINE, MAX_RATIO_OTHER_MACHINE, MAX_SECONDS_RATIO = 1.25, 2.0, 3.0",
+        "MAX_RATIO_SAME_MACHINE, MAX_RATIO_OTHER_MACHINE, MAX_SECONDS_RATIO = 1.25, 2.0, 3e6",
         (f"{_PUBLISHED}::test_a_forged_column_does_not_hold",),
     ),
     Mutation(
         "names-are-not-verified",
-        _VERIFY,
-        "wrong = _differing([(row, asked_for) for row in one.rows], asked_for)",
-        "wrong = _differing([(row, row) for row in one.rows], asked_for)",
+        "harness/experiments/archive/archive_verification.py",
+        "wrong = _find_differences([(row, asked_for) for row in published_run.rows], asked_for)",
+        "wrong = _find_differences([(row, row) for row in published_run.rows], asked_for)",
         (f"{_PUBLISHED}::test_a_forged_column_does_not_hold",),
     ),
     Mutation(

@@ -15,8 +15,8 @@ DEVICE = (
     Mutation(
         "device-tension-forgotten",
         "solvers/methods/position_based/device_xpbd_kernels.py",
-        "springs.tension[e] += change",
-        "springs.tension[e] = change",
+        "springs.spring_tensions[e] += change",
+        "springs.spring_tensions[e] = change",
         ("tests/cuda/test_xpbd.py",),
     ),
 )

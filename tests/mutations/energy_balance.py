@@ -13,21 +13,21 @@ ENERGY_BALANCE = (
     Mutation(
         "velocity-as-claimed",
         _BALANCE,
-        "speed = step.state.now.velocity, moved / stated.system.time_step",
-        "speed = step.state.now.velocity, 0.0 * moved",
+        "speed = step.state.motion.velocity, moved / stated.system.time_step",
+        "speed = step.state.motion.velocity, 0.0 * moved",
         _TESTS,
     ),
     Mutation(
         "drag-as-source",
         _BALANCE,
-        "work.append(min(float(np.mean(taken)), self._work_of_forces(step, moved)))",
+        "work.append(min(float(np.mean(taken)), self._force_work(step, moved)))",
         "work.append(float(np.mean(taken)))",
         _TESTS,
     ),
     Mutation(
         "pins-give-nothing",
         _BALANCE,
-        "work.append(_dot(self._pull(stated, x)[self._exact], moved[self._exact]))",
+        "work.append(_dot(self._conservative_gradient(stated, x)[self._exact], moved[self._exact]))",
         "work.append(0.0)",
         _TESTS,
     ),
@@ -38,7 +38,7 @@ ENERGY_BALANCE = (
         "0.0,",
         _TESTS,
     ),
-    Mutation("growth-of-a-thousand", _BALANCE, "GROWTH = 1.0", "GROWTH = 1e4", _TESTS),
+    Mutation("growth-of-a-thousand", _BALANCE, "GROWTH_LIMIT = 1.0", "GROWTH_LIMIT = 1e4", _TESTS),
     Mutation(
         "growth-is-ok",
         "harness/experiments/failure_columns.py",
@@ -47,6 +47,10 @@ ENERGY_BALANCE = (
         _TESTS,
     ),
     Mutation(
-        "no-blow-up", "harness/simulation/instrumentation_pass.py", "if balance.exceeds(BLOW_UP):", "if False:", _TESTS
+        "no-blow-up",
+        "harness/simulation/instrumentation_pass.py",
+        "if balance.is_above(BLOW_UP_FACTOR):",
+        "if False:",
+        _TESTS,
     ),
 )

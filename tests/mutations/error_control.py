@@ -20,16 +20,22 @@ _TABLE = (
     (
         "control-measured",
         _SEARCH,
-        "log(before.estimated / after.estimated) / shorter",
-        "log(before.estimated / after.estimated) / (2.0 * shorter)",
+        "log(before.error_estimated / after.error_estimated) / shorter",
+        "log(before.error_estimated / after.error_estimated) / (2.0 * shorter)",
         _FORMULAS,
     ),
-    ("control-promise", _SEARCH, "stepping * part ** (-1.0 / one.order)", "stepping * part ** -1.0", _FORMULAS),
+    (
+        "control-promise",
+        _SEARCH,
+        "stepping * error_fraction ** (-1.0 / trial.order)",
+        "stepping * error_fraction ** -1.0",
+        _FORMULAS,
+    ),
     (
         "control-fallback",
         _SEARCH,
-        "if found.estimated <= self._error:",
-        "if found.estimated < 10.0 * self._error:",
+        "if found.error_estimated <= self._max_error:",
+        "if found.error_estimated < 10.0 * self._max_error:",
         _FORMULAS,
     ),
     (
@@ -39,12 +45,12 @@ _TABLE = (
         "one + (two - one) * (first / apart), factor",
         _GROWS,
     ),
-    ("growth-not-rescaled", _GROWTH, "if apart > _LINEAR * first:", "if apart > 1e30 * first:", _GROWS),
+    ("growth-not-rescaled", _GROWTH, "if apart > _LINEAR_LIMIT * first:", "if apart > 1e30 * first:", _GROWS),
     (
         "growth-longest",
         _GROWTH,
-        "self.times[self.grown <= _SURE * MARGIN * error]",
-        "self.times[self.grown <= error]",
+        "self.times[self.growth_factor <= _HORIZON_SAFETY * REFERENCE_MARGIN * error]",
+        "self.times[self.growth_factor <= error]",
         f"{_ASKED}::test_a_refusal_names_the_longest_horizon_that_works",
     ),
     (
@@ -57,8 +63,8 @@ _TABLE = (
     (
         "error-doubt",
         _SEARCH,
-        "DOUBT * self._apart(p[-1], q[-1]) / moved",
-        "0.5 * self._apart(p[-1], q[-1]) / moved",
+        "ESTIMATE_SAFETY * self._compute_distance(p[-1], q[-1]) / moved",
+        "0.5 * self._compute_distance(p[-1], q[-1]) / moved",
         _FORMULAS,
     ),
 )

@@ -15,7 +15,8 @@ EXACT_LENGTHS = (
     Mutation(
         "multipliers-of-one-limit",
         _MULTIPLIERS,
-        "return np.where((trial > x.high) | (x.low == x.high), 1, np.where(trial < x.low, -1, 0))",
+        "return np.where(\n            (trial > x.max_length) | (x.min_length == x.max_length), 1, "
+        "np.where(trial < x.min_length, -1, 0)\n        )",
         "return np.ones(len(trial), np.int64)",
         (_TESTS,),
     ),
@@ -30,7 +31,7 @@ EXACT_LENGTHS = (
     Mutation(
         "ended-by-own-multipliers",
         _AVBD,
-        "while ended == loop.TOLERANCE and not residual <= limits.limit:",
+        "while ended == iteration_loop.REASON_TOLERANCE and not residual <= limits.residual_limit:",
         "while False:",
         (_TESTS,),
     ),
@@ -51,8 +52,8 @@ EXACT_LENGTHS = (
     Mutation(
         "doubt-a-hundredth",
         "harness/reference/hessian_curvature.py",
-        "here = Curvature(smallest, 4.0 * (sums + moved), direction, solve)",
-        "here = Curvature(smallest, 0.04 * (sums + moved), direction, solve)",
+        "here = HessianCurvature(smallest, 4.0 * (sums + moved), direction, solve)",
+        "here = HessianCurvature(smallest, 0.04 * (sums + moved), direction, solve)",
         ("tests/unit/test_judge.py",),
     ),
 )

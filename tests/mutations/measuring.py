@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from tests.mutations.base import Mutation
 
-_MEASURE, _CLOCK = (f"harness/simulation/{name}.py" for name in ("measure", "clock"))
 _RERUN, _RENDER = "harness/recording/rerun_recorder.py", "harness/report/mesh_rendering.py"
 _LIES, _RECORDINGS = "tests/contracts/test_lies.py", "tests/contracts/test_recordings.py"
 _UNIT_STEP, _UNIT_MEASURE, _UNIT_CLOCK = (f"tests/unit/test_{name}.py" for name in ("simulate", "measure", "clock"))
@@ -18,7 +17,7 @@ _TWO_CLOCKS = "add up to"
 MEASURING = (
     Mutation(
         "steps-without-solve",
-        _CLOCK,
+        "harness/simulation/stopwatch.py",
         "        self.seconds = perf_counter() - self._began\n",
         "        self._began = perf_counter()\n        self.seconds = perf_counter() - self._began\n",
         (_UNIT_STEP,),
@@ -26,20 +25,25 @@ MEASURING = (
     ),
     Mutation(
         "steps-scaled",
-        _CLOCK,
+        "harness/simulation/stopwatch.py",
         "self.seconds = perf_counter() - self._began",
         "self.seconds = (perf_counter() - self._began) / 1000",
         (_UNIT_STEP,),
         ("sparse", _TWO_CLOCKS),
     ),
     Mutation(
-        "phases-scaled", _MEASURE, "round, b - a)", "round, (b - a) / 1000)", (_UNIT_MEASURE,), ("sparse", _TWO_CLOCKS)
+        "phases-scaled",
+        "harness/simulation/timing_pass.py",
+        "round, b - a)",
+        "round, (b - a) / 1000)",
+        (_UNIT_MEASURE,),
+        ("sparse", _TWO_CLOCKS),
     ),
     Mutation(
         "prepare-scaled",
-        _MEASURE,
-        'Timing("prepare", None, round, seconds)',
-        'Timing("prepare", None, round, seconds / 1000)',
+        "harness/simulation/timing_pass.py",
+        'TimingSample("prepare", None, round, seconds)',
+        'TimingSample("prepare", None, round, seconds / 1000)',
         (_UNIT_MEASURE,),
         ("sparse", _TWO_CLOCKS),
     ),
@@ -62,21 +66,39 @@ MEASURING = (
     Mutation(
         "global-leaves-what-is-there",
         "solvers/methods/local_global/fused_local_global.py",
-        '"global": lambda: self.base.correction(y, out)}',
+        '"global": lambda: self.base.solve_correction(y, out)}',
         '"global": lambda: out}',
         (_PHASES,),
         ("numba", "does nothing"),
     ),
     Mutation(
         "a-round-too-few",
-        _MEASURE,
+        "harness/simulation/timing_pass.py",
         "    for round in range(settings.rounds):",
         "    for round in range(settings.rounds - 1):",
         (_UNIT_MEASURE,),
     ),
-    Mutation("tolerance-of-all", _CLOCK, "SHARE, LEAST, CALL = 0.03", "SHARE, LEAST, CALL = 3.0", (_UNIT_CLOCK,)),
-    Mutation("never-interrupted", _CLOCK, '"interrupted": self.lost >', '"interrupted": 0.0 >', (_UNIT_CLOCK,)),
-    Mutation("phases-of-any-time", _CLOCK, "ITERATION_SHARE = 0.15", "ITERATION_SHARE = 15.0", (_UNIT_MEASURE,)),
+    Mutation(
+        "tolerance-of-all",
+        "harness/simulation/stopwatch.py",
+        "CLOCK_RTOL, CLOCK_ATOL_SECONDS, CALL_OVERHEAD_SECONDS = 0.03",
+        "CLOCK_RTOL, CLOCK_ATOL_SECONDS, CALL_OVERHEAD_SECONDS = 3.0",
+        (_UNIT_CLOCK,),
+    ),
+    Mutation(
+        "never-interrupted",
+        "harness/simulation/stopwatch.py",
+        '"interrupted": self.preempted_seconds >',
+        '"interrupted": 0.0 >',
+        (_UNIT_CLOCK,),
+    ),
+    Mutation(
+        "phases-of-any-time",
+        "harness/simulation/stopwatch.py",
+        "PHASE_SUM_RTOL = 0.15",
+        "PHASE_SUM_RTOL = 15.0",
+        (_UNIT_MEASURE,),
+    ),
     Mutation(
         "curves-scaled",
         "harness/experiments/accuracy/convergence_curves.py",
@@ -109,16 +131,16 @@ MEASURING = (
     Mutation(
         "frame-of-the-start",
         "harness/simulation/instrumentation_pass.py",
-        "scene.time(step.index), step.positions, *drawn",
-        "scene.time(step.index), step.problem.start.positions, *drawn",
+        "scene.compute_time(step.index), step.positions, *drawn",
+        "scene.compute_time(step.index), step.problem.step_start.positions, *drawn",
         (_LIES,),
         ("sparse", "other positions"),
     ),
     Mutation(
         "colours-late",
         _RERUN,
-        "p, self._shading.colours(of_vertex)))",
-        "p, self._held[-1][2] if self._held else self._shading.colours(of_vertex)))",
+        "p, self._shading.compute_colours(of_vertex)))",
+        "p, self._held[-1][2] if self._held else self._shading.compute_colours(of_vertex)))",
         (_RECORDINGS,),
         ("sparse", "other colours"),
     ),
@@ -143,22 +165,23 @@ MEASURING = (
     Mutation(
         "passes-not-compared",
         "harness/experiments/run_pipeline.py",
-        'if measured.final is not None and found[run.frames]["digest"] != digest(measured.final):',
+        'if measured.final_positions is not None and found[run.frames]["digest"] != '
+        "hash_positions(\n            measured.final_positions\n        ):",
         "if False:",
         (_LIES,),
     ),
     Mutation(
         "picture-of-other-colours",
         _RENDER,
-        'mesh.point_data["strain"] = vertex_strain(replay, frame)',
-        'mesh.point_data["strain"] = vertex_strain(replay, 0)',
+        'mesh.point_data["strain"] = compute_vertex_strain(replay, frame)',
+        'mesh.point_data["strain"] = compute_vertex_strain(replay, 0)',
         (_PICTURES,),
     ),
     Mutation(
         "net-of-other-colours",
         _RENDER,
-        'lines.cell_data["strain"] = spring_strain(replay, frame)',
-        'lines.cell_data["strain"] = spring_strain(replay, 0)',
+        'lines.cell_data["strain"] = compute_spring_strain(replay, frame)',
+        'lines.cell_data["strain"] = compute_spring_strain(replay, 0)',
         (_PICTURES,),
     ),
     Mutation(

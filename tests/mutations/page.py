@@ -33,7 +33,13 @@ PAGE = (
     ),
     Mutation("step-mean-of-rows", _QUANTITIES, "1e3 * median(seconds)", "1e3 * avg(seconds)", (_STATED,)),
     Mutation("step-mean-of-recording", _QUANTITIES, "float(np.median(seconds))", "float(np.mean(seconds))", (_STATED,)),
-    Mutation("map-same-5-percent", "harness/report/robustness.py", "\nSAME = 1e-2\n", "\nSAME = 5e-2\n", (_STATED,)),
+    Mutation(
+        "map-same-5-percent",
+        "harness/report/robustness.py",
+        "\nSAME_MOTION_DISTANCE = 1e-2\n",
+        "\nSAME_MOTION_DISTANCE = 5e-2\n",
+        (_STATED,),
+    ),
     Mutation("strain-of-last-frame", _QUANTITIES, "float(after.max())", "float(after[-1])", (_STATED,)),
     Mutation("strain-of-start", _QUANTITIES, "strains[frames > 0]", "strains[frames >= 0]", (_STATED,)),
     Mutation(

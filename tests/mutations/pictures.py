@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from tests.mutations.base import Mutation
 
-_RERUN, _VERIFY, _BASE = (f"harness/record/{name}.py" for name in ("rerun", "verify", "base"))
 _RECORDINGS, _READ_BACK, _DRAWN, _LAYOUT = (
     "tests/contracts/test_recordings.py",
     "tests/unit/test_record_verify.py",
@@ -15,7 +14,7 @@ _RECORDINGS, _READ_BACK, _DRAWN, _LAYOUT = (
 PICTURES = (
     Mutation(
         "odd-frames-late",
-        _RERUN,
+        "harness/recording/rerun_recorder.py",
         "self._held.append((frame.index, p,",
         "self._held.append((frame.index, self._held[-1][1] if self._held and frame.index % 2 else p,",
         (_RECORDINGS,),
@@ -31,27 +30,37 @@ PICTURES = (
     Mutation(
         "external-forces-reversed",
         "harness/simulation/instrumentation_pass.py",
-        '{"external": step.problem.force}',
-        '{"external": -step.problem.force}',
+        '{"external": step.problem.external_force}',
+        '{"external": -step.problem.external_force}',
         ("tests/unit/test_observe.py",),
     ),
     Mutation(
         "origin-not-stated",
-        _RERUN,
-        "**declared(info.obstacles), **origin_property(self._origin)}",
-        "**declared(info.obstacles)}",
+        "harness/recording/rerun_recorder.py",
+        "**build_obstacles_property(info.obstacles), **build_origin_property(self._origin)}",
+        "**build_obstacles_property(info.obstacles)}",
         (_READ_BACK,),
     ),
     Mutation(
         "origin-subtracted-twice",
-        _BASE,
+        "harness/recording/recorder_interface.py",
         "self.positions[frame] + self.origin",
         "self.positions[frame] - self.origin",
         (_READ_BACK,),
     ),
-    Mutation("coarse-positions-pass", _VERIFY, "        if coarse:\n", "        if False:\n", (_READ_BACK,)),
     Mutation(
-        "samples-of-one-array", _BASE, "self.positions[frame] = p.copy()", "self.positions[frame] = p", (_READ_BACK,)
+        "coarse-positions-pass",
+        "harness/recording/recording_check.py",
+        "        if coarse:\n",
+        "        if False:\n",
+        (_READ_BACK,),
+    ),
+    Mutation(
+        "samples-of-one-array",
+        "harness/recording/recorder_interface.py",
+        "self.positions[frame] = p.copy()",
+        "self.positions[frame] = p",
+        (_READ_BACK,),
     ),
     Mutation(
         "runaway-framed",

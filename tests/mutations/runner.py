@@ -20,7 +20,7 @@ from time import monotonic
 
 from tests.mutations.base import ROOT, Mutation
 
-FOLDERS = ("harness", "solvers", "configs", "tests", "results", ".github")
+FOLDERS = (".src", "harness", "solvers", "configs", "tests", "results", ".github")
 SOURCES = (*FOLDERS, "pyproject.toml", "README.md", "CITATION.cff")
 OUTCOMES = Path(__file__).with_name("outcomes.json")
 LONGEST = 600.0
@@ -92,7 +92,7 @@ class Copy:
         for name in SOURCES:
             source = ROOT / name
             if source.is_dir():
-                shutil.copytree(source, self._root / name, ignore=ignored)
+                shutil.copytree(source, self._root / name, symlinks=True, ignore=ignored)
             else:
                 shutil.copy2(source, self._root / name)
 
@@ -113,11 +113,11 @@ class Copy:
         """The exit code of a Python command in the copy, and what it printed; -1 where it takes too long."""
         cache = self._own if lie.compiled else self._compiled
         environment = os.environ | {
-            "PYTHONPATH": str(self._root),
+            "PYTHONPATH": os.pathsep.join((str(self._root / ".src"), str(self._root))),
             "NUMBA_CACHE_DIR": str(cache),
             "PYTHONDONTWRITEBYTECODE": "1",  # a lie and the truth may have one length, and one second
         }
-        if lie.file.startswith("solvers/cuda/"):
+        if any(test.startswith("tests/cuda/") for test in lie.tests):
             environment["NUMBA_ENABLE_CUDASIM"] = "1"
         try:
             done = subprocess.run(
