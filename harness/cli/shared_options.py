@@ -30,7 +30,7 @@ InProcessOption = Annotated[
 ]
 ErrorOption = Annotated[
     float | None,
-    typer.Option(help="For a scene: the error wanted at its end, relative to the displacement; how, is chosen."),
+    typer.Option("--error", help="For a scene: its relative error at the end; solver and steps are chosen."),
 ]
 EndTimeOption = Annotated[float | None, typer.Option(help="With --error: simulated seconds; all frames if left out.")]
 VerifyOption = Annotated[bool, typer.Option("--verify", help="With --error: let the reference grade it.")]
