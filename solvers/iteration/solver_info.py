@@ -40,7 +40,7 @@ class SolverInfo:
         supports_error_control: whether runs with an error target try the method. A substepping method then chooses its
             steps by their error (`with_tolerance`); other methods minimise the objective of an integrator with an error
             estimate.
-        has_fixed_step: whether the substeps have a fixed size, which can be reduced (`with_refinement`).
+        has_fixed_step: whether the substeps have a fixed size, which can be reduced (`with_refined_substeps`).
         package_name: the distribution that the method is an interface to, whose version is part of its rows.
     """
 

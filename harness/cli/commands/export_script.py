@@ -28,7 +28,9 @@ def export_script(
 
     engines = {spec.build_file_stem(): spec for spec in load_accuracy(config).work}
     engines = {
-        label: spec for label, spec in engines.items() if hasattr(load_target(SOLVER_TABLE[spec.solver.name]), "script")
+        label: spec
+        for label, spec in engines.items()
+        if hasattr(load_target(SOLVER_TABLE[spec.solver.name]), "write_script")
     }
     if not point:
         for line in format_plain_table(

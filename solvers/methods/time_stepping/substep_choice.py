@@ -56,7 +56,7 @@ class PreparedSubstepping:
             raise Unsupported("the method chooses no steps by an error")
         return replace(self, substep_choice=replace(self.substep_choice, tolerance=tolerance))
 
-    def with_refinement(self, refinement_factor: float) -> Self:
+    def with_refined_substeps(self, refinement_factor: float) -> Self:
         """Return the solver with a multiple of the substeps, rounded up."""
         count = ceil(refinement_factor * self.substep_choice.num_substeps)
         return replace(self, substep_choice=replace(self.substep_choice, num_substeps=count))
