@@ -59,8 +59,8 @@ def scene(tmp_path: Path) -> Path:
 def asked(scene: Path, error: float, **more: Any) -> tuple[MethodRecommendation, int]:
     """The answer, and how many simulations were measured for it."""
     display, results = SilentDisplay(), scene.parent / "results"
-    options: dict[str, Any] = {"size": None, "horizon": 0.2, "time_limit": 60.0} | more
-    options = {"say": lambda line: None} | options
+    options: dict[str, Any] = {"size": None, "t_end": 0.2, "time_limit": 60.0} | more
+    options = {"print_message": lambda line: None} | options
     found = recommend_method(scene, error, results=results, display=display, **options)
     return found, display.finished_units
 
@@ -71,7 +71,7 @@ def measured(scene: Path) -> list[Path]:
 
 def test_the_cheapest_that_keeps_to_the_error_is_recommended_and_checked(scene: Path) -> None:
     said = list[str]()
-    found, count = asked(scene, 0.1, say=said.append)
+    found, count = asked(scene, 0.1, print_message=said.append)
     assert count == len(measured(scene)) <= COUNT
     assert any(line.startswith(f"chain 4: {count} of {COUNT} settings measured") for line in said)
     table = parquet_rows.read_rows(measured(scene), ACCURACY_SCHEMA).to_pylist()
@@ -116,7 +116,7 @@ def test_what_was_measured_of_another_scene_or_on_another_machine_is_no_answer(s
             table = table.set_column(k, column, pa.array([value] * len(table)))
         pq.write_table(table, path)
     assert asked(scene, 0.1)[1] > 0
-    assert asked(scene, 0.1, horizon=0.4)[1] > 0
+    assert asked(scene, 0.1, t_end=0.4)[1] > 0
 
 
 def test_the_results_of_another_scene_of_this_name_are_left_alone(scene: Path) -> None:
@@ -143,7 +143,7 @@ def test_a_budget_that_is_used_up_is_stated_and_the_search_goes_on_from_there(sc
     assert found.best_method.error <= 0.1
 
 
-@pytest.mark.parametrize("option", ["error", "horizon", "time_limit", "budget"])
+@pytest.mark.parametrize("option", ["error", "t_end", "time_limit", "budget"])
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
 def test_what_is_no_number_above_zero_is_a_mistake(scene: Path, option: str, value: float) -> None:
     with pytest.raises(InputError, match="wanted a number above 0"):
@@ -187,7 +187,7 @@ def test_a_scene_without_a_reference_is_refused_before_anything_is_measured(scen
     scene.write_text(SCENE.replace("{kind: gravity}", "{kind: contact, obstacles: [{kind: plane, point: [0, -9, 0]}]}"))
     said = list[str]()
     with pytest.raises(RunFailed, match="nothing moves"):
-        asked(scene, 0.1, say=said.append)
+        asked(scene, 0.1, print_message=said.append)
     assert said[0].startswith("chain: contact has")
     assert sum("no certified reference" in line for line in said) == 1
     assert not measured(scene)

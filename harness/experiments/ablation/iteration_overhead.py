@@ -228,7 +228,7 @@ def _limit_iterations(baseline: PreparedScene, stop_rule: StopCriterion) -> Stop
     for k in range(NUM_WARMUP_STEPS):  # what the first compiles does not count
         run.run_step(is_counted=k == NUM_WARMUP_STEPS - 1)
     return (
-        replace(stop_rule, iterations=max(1, int(MAX_ROUND_SECONDS / 4.0 / run.seconds_per_iteration)))
+        replace(stop_rule, max_iterations=max(1, int(MAX_ROUND_SECONDS / 4.0 / run.seconds_per_iteration)))
         if run.seconds > MAX_ROUND_SECONDS
         else stop_rule
     )
