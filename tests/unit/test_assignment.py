@@ -87,7 +87,7 @@ def test_pins_count_from_one(tmp_path):
 def test_a_repeated_face_weighs_once(tmp_path, caplog):
     mass = read_assignment_scene(scene(tmp_path, SQUARE + "f 2 3 4 1\n", m=None)).mesh.mass
     assert mass == pytest.approx([0.25] * 4)
-    assert "6 repeats 5" in caplog.message_counts[0]
+    assert "6 repeats 5" in caplog.messages[0]
 
 
 def test_the_mass_of_a_right_triangulated_square_is_its_voronoi_area(tmp_path):
@@ -123,7 +123,7 @@ def test_vertices_that_no_face_uses_stay_without_mass(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "key", "words"),
     [
-        ({"obj": None}, "obj", "is missing: The OBJ file"),
+        ({"obj": None}, "obj", "is missing: Path of the OBJ file"),
         ({"k": None}, "k", "is missing: Stiffness"),
         ({"b": None}, "b", "is missing: Pinned"),
         ({"bc": [[0, 0, 0]]}, "bc", "unknown key; wanted one of b, k, m, obj, png"),

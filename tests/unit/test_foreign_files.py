@@ -169,7 +169,7 @@ def test_gmshs_entities_without_a_group_are_read_and_stray_points_left_out(tmp_p
     assert (len(mesh.rest_positions), len(mesh.springs), len(mesh.triangles)) == (4, 5, 2)
     sides = ("left", "right", "bottom", "top", "back", "front")
     assert {name: part.tolist() for name, part in mesh.parts.items() if name not in sides} == groups
-    assert "1 points belong to no cell and are left out: at (9, 9, 9) m" in caplog.message_counts[0]
+    assert "1 points belong to no cell and are left out: at (9, 9, 9) m" in caplog.messages[0]
 
 
 def test_gmshs_parametric_nodes_are_refused_by_name(tmp_path):

@@ -81,7 +81,7 @@ def membrane(size: int, **material) -> float:
     """Pulls a cloth of 1 m x 0.5 m along its length."""
     mesh = GridMesh(width=1.0, height=0.5, diagonals="both", skip_one=material.get("bend", 0) > 0).build_mesh(size)
     k = compute_spring_stiffness(
-        mesh, **({"rule": "continuum", "stretch": 100.0, "shear": 50.0, "bend": 0.0} | material)
+        mesh, **({"scaling_rule": "continuum", "stretch": 100.0, "shear": 50.0, "bend": 0.0} | material)
     )
     return pull(mesh, k, fixed=mesh.parts["left"], moved=mesh.parts["right"], axis=0)
 
@@ -220,17 +220,17 @@ def test_the_rule_of_liu_2013_gives_the_stiffness_of_their_figure(size, k):
 @pytest.mark.parametrize(
     ("changes", "key"),
     [
-        ({"rule": "continum"}, "rule"),
-        ({"rule": "liu2013"}, "reference"),
-        ({"rule": "liu2013", "reference": 1}, "reference"),
-        ({"rule": "fixed", "reference": 10}, "reference"),
+        ({"scaling_rule": "continum"}, "rule"),
+        ({"scaling_rule": "liu2013"}, "reference"),
+        ({"scaling_rule": "liu2013", "reference_size": 1}, "reference"),
+        ({"scaling_rule": "fixed", "reference_size": 10}, "reference"),
         ({"stretch": -1.0}, "stretch"),
         ({"shear": float("nan")}, "shear"),
         ({"bend": float("inf")}, "bend"),
     ],
 )
 def test_senseless_materials_are_refused(changes, key):
-    arguments = {"rule": "fixed", "stretch": 1.0, "shear": 1.0, "bend": 1.0} | changes
+    arguments = {"scaling_rule": "fixed", "stretch": 1.0, "shear": 1.0, "bend": 1.0} | changes
     with pytest.raises(InputError) as caught:
         compute_spring_stiffness(GridMesh().build_mesh(3), **arguments)
     assert caught.value.mistakes[0].key == key

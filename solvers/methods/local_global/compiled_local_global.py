@@ -72,7 +72,7 @@ class CompiledLocalGlobal:
         found = compile_iterations(base)
         if isinstance(found, PreparedCompiledLocalGlobal):
             return found
-        local = {"project": _compile_local_step(alone[0], system.num_vertices)} if alone else {}
+        local = {"local_step": _compile_local_step(alone[0], system.num_vertices)} if alone else {}
         return replace(base, description=f"{base.description}; {found}", **local)
 
 
