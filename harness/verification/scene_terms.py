@@ -80,7 +80,9 @@ def build_scene_terms(spec: SceneSpec, scene: Scene) -> SceneTerms:
     declared = SceneDeclaration(
         mesh, mass, dt, tuple(spec.effects), not getattr(scene.integrator, "has_split_filters", False)
     )
-    bound = [effect.build_contribution(mesh, mass, dt).adapt_to_integrator(scene.integrator) for effect in declared.effects]
+    bound = [
+        effect.build_contribution(mesh, mass, dt).adapt_to_integrator(scene.integrator) for effect in declared.effects
+    ]
     # The order is that of the scene's energies: those of each effect first, then those derived from all of them.
     first = [energy for part in bound for energy in part.energies]
     owners = [k for k, part in enumerate(bound) for _ in part.energies]

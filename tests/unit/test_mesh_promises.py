@@ -134,7 +134,9 @@ def test_building_again_gives_the_same_mesh(generator, size):
 def test_the_extent_does_not_depend_on_the_size(generator):
     coarse, fine = generator.build_mesh(12), generator.build_mesh(24)
     # rings and spheres of 12 vertices miss the extreme points of a circle by at most 1 - cos(pi/12) = 3.4 %
-    assert np.ptp(fine.rest_positions, axis=0) == pytest.approx(np.ptp(coarse.rest_positions, axis=0), rel=0.035, abs=ROUND_OFF)
+    assert np.ptp(fine.rest_positions, axis=0) == pytest.approx(
+        np.ptp(coarse.rest_positions, axis=0), rel=0.035, abs=ROUND_OFF
+    )
 
 
 @pytest.mark.parametrize("generator", GENERATORS, ids=lambda g: type(g).__name__)
@@ -178,7 +180,7 @@ def test_the_largest_size_named_is_the_largest_that_fits(generator, monkeypatch)
     with pytest.raises(InputError) as caught:
         generator.build_mesh(generator.MIN_SIZE - 1)
     largest = int(str(caught.value).split(" to ")[1].split()[0])
-    assert generator.count_vertices(largest) <= MAX_VERTICES < generator.count(largest + 1)
+    assert generator.count_vertices(largest) <= MAX_VERTICES < generator.count_vertices(largest + 1)
 
 
 def directed_edges(mesh: Mesh) -> list[tuple[int, int]]:
