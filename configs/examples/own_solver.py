@@ -14,7 +14,7 @@ class HeavyBall(FixedPointSolver):
 
     momentum: float = 0.3
 
-    def formula(self, p: Positions, before: Positions, correction: Positions) -> Positions:
+    def next_iterate(self, p: Positions, before: Positions, correction: Positions) -> Positions:
         """The next iterate; correction: Q^-1 grad g(p)."""
         return p - correction + self.momentum * (p - before)
 

@@ -88,7 +88,7 @@ def test_where_it_is_not_installed_the_reason_is_the_command_that_does_so(name: 
 
     monkeypatch.setattr(external_engine, "import_module", none)
     engine = load_target(OPTIONAL_SOLVERS[name])()
-    wanted = rf"^{name}: .*pip install -e '\.\[{engine.engine_package.extra}\]'` in the checkout"
+    wanted = rf"^{name}: .*pip install -e '\.\[{engine.engine_package.extra_name}\]'` in the checkout"
     with pytest.raises(Unsupported, match=wanted):
         engine.prepare(made(*HANGING).system)
 

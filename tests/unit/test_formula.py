@@ -36,12 +36,12 @@ def test_a_formula_that_answers_wrongly_is_named_with_its_line(name: str):
     wrong, words = WRONG[name]
     line = inspect.getsourcelines(wrong)[1]
     stated = build_first_problem(build_cloth(4))
-    with pytest.raises(PluginContractError, match=rf"test_formula\.py:{line}: `formula` {words}"):
-        solver_with(formula=wrong)().prepare(stated.system).solve(stated, StopRule(3))
+    with pytest.raises(PluginContractError, match=rf"test_formula\.py:{line}: `next_iterate` {words}"):
+        solver_with(next_iterate=wrong)().prepare(stated.system).solve(stated, StopRule(3))
 
 
 def test_a_class_without_a_formula_says_so():
-    with pytest.raises(TypeError, match="formula"):
+    with pytest.raises(TypeError, match="next_iterate"):
         solver_with()()
 
 

@@ -176,9 +176,9 @@ def test_generalised_alpha_damps_the_highest_frequencies_by_its_spectral_radius(
         one = [np.full((1, 3), x) for x in (d, v, a)]
         step = method.iterate_stages(Motion(one[0], one[1]), one[2], 1.0)
         unknown = next(step)
-        x = unknown.target * method.inertia_factor / (method.inertia_factor + size)  # c (x - target) = -z^2 x
+        x = unknown.inertial_target * method.inertia_factor / (method.inertia_factor + size)  # c (x - target) = -z^2 x
         with pytest.raises(StopIteration) as ended:
-            step.send(StageSolution(x, x, method.inertia_factor * (x - unknown.target)))
+            step.send(StageSolution(x, x, method.inertia_factor * (x - unknown.inertial_target)))
         (p, w), b, _ = ended.value.value
         columns.append([p[0, 0], w[0, 0], b[0, 0]])
     powers = np.abs(np.linalg.eigvals(np.transpose(columns)))

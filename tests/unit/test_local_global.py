@@ -234,9 +234,9 @@ INDEFINITE = {
     "a negative stiffness": lambda system: replace(system, energies=(_stiffness(system, -1e6),)),
     "a stiffness that is not a number": lambda system: replace(system, energies=(_stiffness(system, np.nan),)),
     "an infinite stiffness": lambda system: replace(system, energies=(_stiffness(system, np.inf),)),
-    "a mass that is not a number": lambda system: replace(system, mass=np.full(system.vertices, np.nan)),
+    "a mass that is not a number": lambda system: replace(system, mass=np.full(system.num_vertices, np.nan)),
     "a negative pin weight": lambda system: replace(system, pins=DirichletPins(np.array([0]), np.array([-1e9]))),
-    "no mass and no pin": lambda system: replace(system, mass=np.zeros(system.vertices), pins=DirichletPins()),
+    "no mass and no pin": lambda system: replace(system, mass=np.zeros(system.num_vertices), pins=DirichletPins()),
 }
 
 

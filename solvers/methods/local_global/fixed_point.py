@@ -49,7 +49,7 @@ class FixedPointSolver(ABC):
             inspect.signature(self.next_iterate).bind(None, None, None)
         except TypeError:
             raise PluginContractError(
-                f"{source_line_of(self.next_iterate)}: `formula` should take p, before and correction"
+                f"{source_line_of(self.next_iterate)}: `next_iterate` should take p, before and correction"
             ) from None
         return PreparedFixedPoint(
             prepare_local_global(system, require_projective(system, name), lambda Q: (SparseLU(Q), "SuperLU")),
@@ -97,7 +97,7 @@ class _FixedPointState(SolverState):
             return found
         came = f"{found.dtype} of shape {found.shape}" if isinstance(found, np.ndarray) else f"a {type(found).__name__}"
         raise PluginContractError(
-            f"{source_line_of(self._ready.next_iterate)}: `formula` gave {came}; wanted float64 of shape {wanted}"
+            f"{source_line_of(self._ready.next_iterate)}: `next_iterate` gave {came}; wanted float64 of shape {wanted}"
         )
 
     def residual(self) -> float:
