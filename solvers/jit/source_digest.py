@@ -2,8 +2,8 @@
 
 A source depends on itself and on the sources that its imports lead to, wherever in the file the imports stand. Imports
 are followed within this project, and within its own folder or package if the source lies elsewhere. A source also
-depends on compiled-language files of the same name next to it, as `eigen.py` does on `eigen.cpp` and `eigen.hpp`.
-Installed libraries are identified by their versions.
+depends on compiled-language files of the same name next to it, as `eigen_local_global.py` does on
+`eigen_local_global.cpp` and `eigen_local_global.hpp`. Installed libraries are identified by their versions.
 
 A process continues to run the code that it has imported, even if the files change. So each source is identified by its
 state when this module was imported, or when its digest was first needed. A source that has changed since then gets a
@@ -21,11 +21,17 @@ from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 
-PROJECT_ROOT = Path(__file__).resolve().parents[1]
+PROJECT_ROOT = Path(__file__).resolve().parents[2]
 """The folder of the project's packages."""
 
 PACKAGE_NAMES = ("solvers", "harness")
-_PACKAGE_PREFIXES = tuple(f"{PROJECT_ROOT / package}{os.sep}" for package in PACKAGE_NAMES)
+_TOP_PACKAGE = "springbench"
+_PACKAGE_PREFIXES = tuple(
+    f"{root / package}{os.sep}"
+    # An editable installation imports the packages through links.
+    for root in dict.fromkeys((PROJECT_ROOT, Path(os.path.abspath(__file__)).parents[2]))
+    for package in PACKAGE_NAMES
+)
 
 COMPILED_SUFFIXES = (".c", ".cc", ".cpp", ".cu", ".cuh", ".f90", ".h", ".hpp")
 """Suffixes of sources that a Python source of the same name compiles."""
@@ -185,8 +191,8 @@ def _resolve_import(source: str, base: str, name: str) -> Iterator[str]:
     else:
         parts = [*base.split("."), *name.split(".")]
     parts = [part for part in parts if part]
-    if parts[0] in PACKAGE_NAMES:
-        folder = str(PROJECT_ROOT)
+    if parts[0] == _TOP_PACKAGE and parts[1:2] and parts[1] in PACKAGE_NAMES:
+        folder, parts = str(PROJECT_ROOT), parts[1:]
     elif parts[0] not in own[:1] and (_is_project_file(source) or folder in _LIBRARY_FOLDERS):
         return
     place = folder

@@ -71,7 +71,9 @@ def fixed(name: str, scene: Scene, substeps: int) -> PreparedExplicit:
     one: Any = prepared(name, scene)
     taken = replace(one.substep_choice, num_substeps=substeps, tolerance=0.0)
     method = (
-        replace(one.method, error_exponent=0.0) if hasattr(one.method, "error_exponent") and one.substep_choice.tolerance else one.method
+        replace(one.method, error_exponent=0.0)
+        if hasattr(one.method, "error_exponent") and one.substep_choice.tolerance
+        else one.method
     )
     return replace(one, substep_choice=taken, method=method)
 

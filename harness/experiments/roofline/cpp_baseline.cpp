@@ -1,11 +1,11 @@
-// C++ baseline: one step of the local-global iterations of `eigen.hpp`, timed repeatedly.
+// C++ baseline: one step of the local-global iterations of `eigen_local_global.hpp`, timed repeatedly.
 //
 // Input: the scene, from the file named first (see `harness.experiments.roofline.cpp_baseline`); then, on the standard
 // input, a number of iterations per line. Output: the seconds of the preparation; then, for each line, the wall seconds
 // of a step from the initial guess, of its local steps and of its global steps. At the end of the input the last
 // positions are written, row by row, to the file named second.
 
-#include "eigen.hpp"
+#include "eigen_local_global.hpp"
 
 #include <chrono>
 #include <cstdio>

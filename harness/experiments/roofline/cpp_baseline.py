@@ -19,7 +19,7 @@ from springbench.solvers.methods.local_global.eigen_local_global import EIGEN_RE
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.step_problem import Positions, StepProblem, Unsupported
 
-CPP_SOURCE = Path(__file__).with_name("yardstick.cpp")
+CPP_SOURCE = Path(__file__).with_name("cpp_baseline.cpp")
 
 MALLOC_TUNABLES = ":".join(
     f"glibc.malloc.{setting}"

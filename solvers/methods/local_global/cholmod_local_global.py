@@ -1,4 +1,4 @@
-"""Optimised C++ baseline: local-global iterations (`cholmod.cpp`) with CHOLMOD's ordering and factor.
+"""Optimised C++ baseline: local-global iterations (`cholmod_local_global.cpp`) with CHOLMOD's ordering and factor.
 
 The second C++ baseline of the compiled solvers; the first is the plain program of `eigen_local_global`.
 """
@@ -39,7 +39,7 @@ class CholmodLocalGlobal:
         """
         springs = require_only_springs(system, "cholmod")
         library = cpp_backend.load_library(
-            cpp_backend.HEADER_FOLDER / "cholmod.cpp", CHOLMOD_REQUIREMENTS, ["-lcholmod"]
+            cpp_backend.HEADER_FOLDER / "cholmod_local_global.cpp", CHOLMOD_REQUIREMENTS, ["-lcholmod"]
         )
         compiled = cpp_backend.CppBackend(library, system, springs)
         return cpp_backend.prepare_cpp_backend(

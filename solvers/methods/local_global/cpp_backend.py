@@ -1,6 +1,6 @@
 """Local-global steps in C++: compiled on demand, cached in the user's cache folder, called by ctypes.
 
-A source has `prepare`, `local`, `global_` and `release`, see `solvers/methods/local_global/eigen.cpp`. If it does not
+A source has `prepare`, `local`, `global_` and `release`, see `solvers/methods/local_global/eigen_local_global.cpp`. If it does not
 compile, its solver raises an error with the reason. Springs of length zero, for which the formula defines no direction,
 get none.
 """
@@ -25,7 +25,7 @@ from springbench.solvers.model import system_matrix_assembly
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.step_problem import NotPositiveDefinite, Positions, System, Unsupported
 
-HEADER_FOLDER = Path(__file__).parent.parent / "methods"
+HEADER_FOLDER = Path(__file__).parent
 COMPILER_FLAGS = ("-O3", "-march=native", "-DNDEBUG", "-std=c++17")
 SYSTEM_INCLUDE_FOLDERS = ("/usr/include/eigen3", "/usr/include/suitesparse")
 """Header folders of Debian's libraries; those in the compiler's own search path (CPATH) are used as well."""

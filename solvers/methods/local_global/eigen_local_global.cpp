@@ -1,6 +1,6 @@
 // C interface for `solvers.methods.local_global.eigen_local_global`. Points are stored as x, y, z per vertex.
 
-#include "eigen.hpp"
+#include "eigen_local_global.hpp"
 
 using Rows = Eigen::Matrix<double, Eigen::Dynamic, 3, Eigen::RowMajor>;
 using In = Eigen::Map<const Rows>;
