@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from springbench.solvers.methods.local_global import SparseLocalGlobal
-from springbench.solvers.problem import Solution
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.model.step_problem import Solution
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Mine:
 
 
 class Prepared:
-    choice, facts = "", {}
+    description, stats = "", {}
 
     def __init__(self, sound):
         self.sound = sound
@@ -41,7 +41,7 @@ class Prepared:
     def residual_at(self, problem, p):
         return self.sound.residual_at(problem, p)
 
-    def phases(self, problem):
+    def iteration_phases(self, problem):
         return {}
 
     def solve(self, problem, stop):

@@ -111,7 +111,7 @@ PLUGIN_KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     ),
     "mesh": (
         "a subclass of springbench.harness.scenes.mesh.mesh_generator.MeshGenerator",
-        _make_model_check(mesh_generator.MeshGenerator, "generate"),
+        _make_model_check(mesh_generator.MeshGenerator, "generate_mesh"),
     ),
     "report": ("a function of rows and a folder", callable),
     "integrator": (
@@ -306,7 +306,7 @@ def _require_pin(pin: Any, count: int) -> None:
 
 def check_plugin_mesh(plugin: PluginName, mesh: Any) -> Mesh:
     """Check a mesh from a plug-in; raise InputError if it is invalid."""
-    with attribute_errors(plugin, "generate"):
+    with attribute_errors(plugin, "generate_mesh"):
         _require_true(
             isinstance(mesh, Mesh),
             f"returned {_describe_value(mesh)}; wanted a springbench.harness.scenes.mesh.mesh.Mesh",

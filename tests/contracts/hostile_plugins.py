@@ -12,13 +12,13 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from springbench.harness.base.model import Model
-from springbench.harness.scenes.effects.base import Contribution, Pin, steady
-from springbench.harness.scenes.mesh.base import Mesh
-from springbench.harness.scenes.mesh.chain import Chain
-from springbench.solvers.integrators import IMPLICIT_EULER
-from springbench.solvers.methods.local_global import SparseLocalGlobal
-from springbench.solvers.problem import Solution
+from springbench.harness.schema.base_model import ConfigModel
+from springbench.harness.scenes.effects.effect_interface import EffectContribution, PinGroup, build_constant_force
+from springbench.harness.scenes.mesh.mesh import Mesh
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.solvers.model.integrators.single_stage import IMPLICIT_EULER
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.model.step_problem import Solution
 
 {importing}
 
@@ -33,7 +33,7 @@ class Mine:
 
 
 class Prepared:
-    choice, facts = "", {{}}
+    description, stats = "", {{}}
 
     def __init__(self, sound):
         self.sound = sound
@@ -46,7 +46,7 @@ class Prepared:
         {measuring}
         return self.sound.residual_at(problem, p)
 
-    def phases(self, problem):
+    def iteration_phases(self, problem):
         return {{}}
 
     def solve(self, problem, stop):
@@ -55,7 +55,7 @@ class Prepared:
         return found
 
 
-class Hum(Model):
+class Hum(ConfigModel):
     kind: Literal["hum"] = "hum"
 
     def build_contribution(self, mesh, mass, time_step):
@@ -67,17 +67,17 @@ class Hum(Model):
             {filtering}
             return v
 
-        made = Contribution(forces=(force,), filters=(filtered,))
+        made = EffectContribution(forces=(force,), velocity_filters=(filtered,))
         {binding}
         return made
 
 
-class Cord(Chain):
+class Cord(ChainMesh):
     kind: Literal["cord"] = "cord"
     {counting}
 
-    def generate(self, size):
-        made = super().generate(size)
+    def generate_mesh(self, size):
+        made = super().generate_mesh(size)
         {generating}
         return made
 
@@ -87,7 +87,7 @@ def predict(now, before, dt):
     return now.positions + dt * now.velocity, now.positions
 
 
-EULER = replace(IMPLICIT_EULER, predict=predict)
+EULER = replace(IMPLICIT_EULER, predict_target=predict)
 {integrator}
 
 
@@ -182,7 +182,7 @@ IMPORTING = {
     "changes the folder": Hostile("importing", "os.chdir('/')", "effect", FINE, ""),
     "patches NumPy": Hostile("importing", "np.zeros_like = None", "effect", MISTAKE, "mine.py"),
     "changes the environment": Hostile("importing", "os.environ.clear()", "effect", FINE, ""),
-    "answers every name": Hostile("importing", "__getattr__ = print\ndel Model", "effect", MISTAKE, "NameError"),
+    "answers every name": Hostile("importing", "__getattr__ = print\ndel ConfigModel", "effect", MISTAKE, "NameError"),
 }
 PREPARED = {
     "a field without a type": Hostile("fields", "x = 1", "solver", FINE, ""),
@@ -252,32 +252,46 @@ BINDING = {
     "hangs": Hostile("binding", HANG, "effect", MISTAKE, LIMIT),
     "crashes": Hostile("binding", CRASH, "effect", MISTAKE, "crashed by SIGSEGV"),
     "swells": Hostile("binding", SWELL, "effect", MISTAKE, "MemoryError"),
-    "binds no tuple": Hostile("binding", "return Contribution(forces=[force])", "effect", MISTAKE, "should be a tuple"),
-    "binds no energy": Hostile("binding", "return Contribution(energies=(7,))", "effect", MISTAKE, "has no method"),
-    "binds no force": Hostile("binding", "return Contribution(forces=(7,))", "effect", MISTAKE, "should be functions"),
+    "binds no tuple": Hostile(
+        "binding", "return EffectContribution(forces=[force])", "effect", MISTAKE, "should be a tuple"
+    ),
+    "binds no energy": Hostile(
+        "binding", "return EffectContribution(energies=(7,))", "effect", MISTAKE, "has no method"
+    ),
+    "binds no force": Hostile(
+        "binding", "return EffectContribution(forces=(7,))", "effect", MISTAKE, "should be functions"
+    ),
     "binds a force that is NaN": Hostile(
-        "binding", "return Contribution(forces=steady(mesh.rest_positions * np.nan))", "effect", MISTAKE, "not finite"
+        "binding",
+        "return EffectContribution(forces=build_constant_force(mesh.rest_positions * np.nan))",
+        "effect",
+        MISTAKE,
+        "not finite",
     ),
     "binds a short force": Hostile(
-        "binding", "return Contribution(forces=steady(np.ones((2, 3))))", "effect", MISTAKE, "shape (2, 3)"
+        "binding",
+        "return EffectContribution(forces=build_constant_force(np.ones((2, 3))))",
+        "effect",
+        MISTAKE,
+        "shape (2, 3)",
     ),
     "pins what is not there": Hostile(
         "binding",
-        "return Contribution(pins=(Pin(np.array([99]), np.ones((1, 3)), 1.0),))",
+        "return EffectContribution(pins=(PinGroup(np.array([99]), np.ones((1, 3)), 1.0),))",
         "effect",
         MISTAKE,
         "names 99",
     ),
     "pins to nowhere": Hostile(
         "binding",
-        "return Contribution(pins=(Pin(np.array([0]), np.full((1, 3), np.nan), 1.0),))",
+        "return EffectContribution(pins=(PinGroup(np.array([0]), np.full((1, 3), np.nan), 1.0),))",
         "effect",
         MISTAKE,
         "not finite",
     ),
     "pins with less than nothing": Hostile(
         "binding",
-        "return Contribution(pins=(Pin(np.array([0]), np.ones((1, 3)), -1.0),))",
+        "return EffectContribution(pins=(PinGroup(np.array([0]), np.ones((1, 3)), -1.0),))",
         "effect",
         MISTAKE,
         "above 0",
@@ -298,16 +312,32 @@ MESHES = {
         "generating", "return None", "mesh", MISTAKE, "returned None; wanted a springbench.harness.scenes.mesh"
     ),
     "has NaN": Hostile(
-        "generating", "return replace(made, rest=made.rest_positions * np.nan)", "mesh", MISTAKE, "`rest` has values"
+        "generating",
+        "return replace(made, rest_positions=made.rest_positions * np.nan)",
+        "mesh",
+        MISTAKE,
+        "`rest_positions` has values",
     ),
     "is flat": Hostile(
-        "generating", "return replace(made, rest=made.rest_positions[:, :2].copy())", "mesh", MISTAKE, "shape (4, 2)"
+        "generating",
+        "return replace(made, rest_positions=made.rest_positions[:, :2].copy())",
+        "mesh",
+        MISTAKE,
+        "shape (4, 2)",
     ),
     "is single": Hostile(
-        "generating", "return replace(made, rest=made.rest_positions.astype('f4'))", "mesh", MISTAKE, "float32"
+        "generating",
+        "return replace(made, rest_positions=made.rest_positions.astype('f4'))",
+        "mesh",
+        MISTAKE,
+        "float32",
     ),
-    "is empty": Hostile("generating", "return replace(made, rest=np.empty((0, 3)))", "mesh", MISTAKE, "no vertices"),
-    "is a list": Hostile("generating", "return replace(made, rest=[[0.0, 0.0, 0.0]])", "mesh", MISTAKE, "mine.py"),
+    "is empty": Hostile(
+        "generating", "return replace(made, rest_positions=np.empty((0, 3)))", "mesh", MISTAKE, "no vertices"
+    ),
+    "is a list": Hostile(
+        "generating", "return replace(made, rest_positions=[[0.0, 0.0, 0.0]])", "mesh", MISTAKE, "mine.py"
+    ),
     "springs away": Hostile(
         "generating", "return replace(made, springs=made.springs + 9)", "mesh", MISTAKE, "there are 4"
     ),

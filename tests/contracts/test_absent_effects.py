@@ -71,8 +71,8 @@ if {load}:
 from springbench.harness.config.load import load_scene
 from springbench.harness.scenes.bind import build
 from springbench.harness.simulation.step import prepare, simulate
-from springbench.solvers.methods.local_global import SparseLocalGlobal
-from springbench.solvers.problem import StopRule
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+from springbench.solvers.model.step_problem import StopRule
 made = build(load_scene(Path({scene!r})), 10)
 steps = simulate(made, prepare(made, SparseLocalGlobal()), StopRule(10), first_guess="current", frames=5)
 digests = [hashlib.sha256(step.positions.tobytes()).hexdigest() for step in steps]

@@ -30,11 +30,11 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from springbench.harness.base.model import Model
-from springbench.harness.scenes.effects.base import Contribution, steady
-from springbench.harness.scenes.mesh.chain import Chain
-from springbench.solvers.integrators import IMPLICIT_EULER
-from springbench.solvers.methods.local_global import SparseLocalGlobal
+from springbench.harness.schema.base_model import ConfigModel
+from springbench.harness.scenes.effects.effect_interface import EffectContribution, build_constant_force
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.solvers.model.integrators.single_stage import IMPLICIT_EULER
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
 
 open(__file__ + ".was-run", "w").close()
 
@@ -44,15 +44,15 @@ class Mine(SparseLocalGlobal):
     patience: int = 3
 
 
-class Hum(Model):
+class Hum(ConfigModel):
     kind: Literal["hum"] = "hum"
     force: float
 
     def build_contribution(self, mesh, mass, time_step):
-        return Contribution(forces=steady(np.full_like(mesh.rest_positions, self.force)))
+        return EffectContribution(forces=build_constant_force(np.full_like(mesh.rest_positions, self.force)))
 
 
-class Cord(Chain):
+class Cord(ChainMesh):
     kind: Literal["cord"] = "cord"
 
 

@@ -9,21 +9,21 @@ import pytest
 from springbench.solvers.jit import kernel_cache
 
 CLOSURES = """
-from springbench.solvers.compiling import inner, inner_closure, kernel
-@inner
+from springbench.solvers.jit.kernel_compilation import jit_closure, jit_inner, jit_kernel
+@jit_inner
 def double(x):
     return 2.0 * x
-@inner
+@jit_inner
 def triple(x):
     return 3.0 * x
 def made(part):
-    @inner_closure
+    @jit_closure
     def middle(x):
         return part(x)
-    @inner_closure
+    @jit_closure
     def outer(x):
         return middle(x)
-    @kernel
+    @jit_kernel
     def closed(x):
         return outer(x)
     return closed

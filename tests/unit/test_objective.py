@@ -62,8 +62,8 @@ def with_links(problem: StepProblem, reach: float) -> StepProblem:
 @pytest.mark.parametrize("solver", ["newton", "newton-cg", "hybrid", "lbfgs"])
 def test_a_solver_says_which_energies_take_the_slow_path(solver):
     problem, made = build_random_problem(2), load_target(SOLVERS[solver])()
-    assert "Python" not in made.prepare(problem.system).choice
-    choice = made.prepare(with_links(problem, 0.5).system).choice
+    assert "Python" not in made.prepare(problem.system).description
+    choice = made.prepare(with_links(problem, 0.5).system).description
     assert "Python" in choice
     assert "Links" in choice
 
