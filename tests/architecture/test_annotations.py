@@ -1,4 +1,4 @@
-"""Every parameter says its type, but for what Numba compiles: kernels, and the functions that generate their code."""
+"""Every parameter has a type, except those of functions that Numba compiles and of functions that generate code."""
 
 from __future__ import annotations
 
@@ -11,24 +11,25 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 
 KERNELS = {
-    "kept",
-    "kernel",
-    "inner",
-    "inner_closure",
-    "inlined_closure",
-    "inner_in_parallel",
-    "part",
+    "cached_njit",
+    "jit_kernel",
+    "jit_inner",
+    "jit_inner_allocating",
+    "jit_inner_numpy",
+    "jit_inner_parallel",
+    "jit_closure",
+    "jit_inlined_closure",
     "register_jitable",
     "cuda.jit",
 }
-"""What a compiled function is decorated with: ours, Numba's for what is compiled within its caller, and its own for a
-device."""
+"""Decorators of compiled functions: this project's, and Numba's for functions that are compiled into their callers and
+for those of a device."""
 GENERATES = {"typingctx", "context"}
-"""The first parameter of an intrinsic, and of the function that generates its code; Numba gives both."""
+"""First parameters of an intrinsic and of the function that generates its code."""
 
 
 def unannotated(tree: ast.AST) -> Iterator[str]:
-    """The parameters without a type, as `function: parameter`; what is defined within a kernel is part of it."""
+    """Parameters without a type, as `function: parameter`; functions inside a kernel are part of it."""
     for node in ast.iter_child_nodes(tree):
         if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             yield from unannotated(node)
@@ -47,7 +48,7 @@ def compiled(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
 
 
 @pytest.mark.parametrize("folder", ["harness", "solvers"])
-def test_every_parameter_outside_kernels_says_its_type(folder: str):
+def test_every_parameter_outside_kernels_has_a_type(folder: str):
     found = {
         f"{path.relative_to(ROOT)}: {words}"
         for path in (ROOT / folder).rglob("*.py")
@@ -56,11 +57,11 @@ def test_every_parameter_outside_kernels_says_its_type(folder: str):
     assert not found
 
 
-def test_a_missing_type_is_found_and_a_kernel_is_left_alone():
+def test_a_missing_type_is_found_and_kernels_are_exempt():
     code = """
 class A:
     def method(self, a, *rest: int, **more): ...
-@kept(parallel=True)
+@cached_njit(parallel=True)
 def kernel(p, q): ...
 def intrinsic(typingctx, x):
     def generate(context, builder, signature, args):

@@ -1,4 +1,4 @@
-"""The way of a run, as `harness/README.md` tells it: traced, call by call, for two frames."""
+"""The call sequence of a run as `harness/README.md` describes it: traced, call by call, for two frames."""
 
 from __future__ import annotations
 
@@ -10,8 +10,22 @@ import pytest
 from springbench.harness.cli.main import app
 from typer.testing import CliRunner
 
-ROWS = ("cli", "experiments", "report", "config", "reference", "simulation", "record", "scenes", "base", "solvers")
-"""The rows of the page, the uppermost first."""
+ROWS = (
+    "cli",
+    "experiments",
+    "report",
+    "config",
+    "reference verification",
+    "simulation",
+    "recording",
+    "scenes",
+    "results",
+    "execution schema",
+    "console atomic_files",
+    "errors",
+    "solvers",
+)
+"""Rows of the page, the uppermost first."""
 
 GIVEN = {
     (
@@ -84,13 +98,16 @@ class Call(NamedTuple):
 
 
 def row(module: str) -> int:
-    first, _, rest = module.partition(".")
-    return ROWS.index("solvers" if first == "solvers" else rest.partition(".")[0])
+    _, package, name, *_ = [*module.split("."), ""]
+    wanted = package if package == "solvers" else name
+    return next(index for index, names in enumerate(ROWS) if wanted in names.split())
 
 
 def ours(frame: FrameType | None) -> FrameType | None:
     """The nearest frame of the project's, from this one on upwards."""
-    while frame and not frame.f_globals.get("__name__", "").startswith(("harness.", "solvers.")):
+    while frame and not frame.f_globals.get("__name__", "").startswith(
+        ("springbench.harness.", "springbench.solvers.")
+    ):
         frame = frame.f_back
     return frame
 
@@ -128,7 +145,11 @@ def test_calls_lead_down_the_rows_and_up_to_what_was_given_on_the_way(walk: list
 
 
 def test_a_solve_takes_nothing_of_the_harness_along(walk: list[Call]):
-    up = {(call.by, call.of) for call in walk if call.by.startswith("solvers.") and call.of.startswith("harness.")}
+    up = {
+        (call.by, call.of)
+        for call in walk
+        if call.by.startswith("springbench.solvers.") and call.of.startswith("springbench.harness.")
+    }
     assert up <= set(GIVEN)
 
 

@@ -46,8 +46,8 @@ class Gate:
     `test_exact.py`, that see on any machine what would make the candidate slow; clock: what time is, cpu or wall;
     goal: what the ratio is to become where it is not yet: the limit then keeps what has been reached; tolerance: the
     largest difference of the two answers, in their size, None where each maker makes sure of its own; budget: seconds
-    until the gate cannot tell, --paired-benchmark-budget where it has none; error: the probability of a wrong answer; short:
-    whether every run of the CI takes it.
+    until the gate cannot tell, --paired-benchmark-budget where it has none; error: the probability of a wrong answer;
+    short: whether every run of the CI takes it.
     """
 
     name: str

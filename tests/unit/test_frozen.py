@@ -58,7 +58,9 @@ class Refuses(NewtonSolver):
 
 def arrays(frozen: StepSnapshot) -> dict[str, np.ndarray]:
     """All that a problem is made of, its system's energies apart."""
-    named = {f.name: getattr(frozen.problem, f.name) for f in fields(StepProblem) if f.name not in ("system", "step_start")}
+    named = {
+        f.name: getattr(frozen.problem, f.name) for f in fields(StepProblem) if f.name not in ("system", "step_start")
+    }
     named |= {f"start {f.name}": np.asarray(getattr(frozen.problem.step_start, f.name)) for f in fields(StepStart)}
     return named | {"after p": frozen.end_motion.positions, "after v": frozen.end_motion.velocity}
 

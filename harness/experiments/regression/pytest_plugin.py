@@ -8,7 +8,8 @@
 
 Both must give the same answer, in every test run. With pytest-benchmark enabled they are then timed in interleaved
 blocks, and pytest-benchmark's JSON has the result. An inconclusive test is neither passed nor failed: it is counted as
-`inconclusive`. A session without failures then ends with the exit code 13, because 3 is pytest's code of internal errors.
+`inconclusive`. A session without failures then ends with the exit code 13, because 3 is pytest's code of internal
+errors.
 """
 
 from __future__ import annotations
