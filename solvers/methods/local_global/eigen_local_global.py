@@ -30,6 +30,8 @@ class EigenLocalGlobal:
         """
         springs = require_only_springs(system, "eigen")
         compiled = cpp_backend.CppBackend(
-            cpp_backend.load_library(cpp_backend.HEADER_FOLDER / "eigen_local_global.cpp", EIGEN_REQUIREMENTS), system, springs
+            cpp_backend.load_library(cpp_backend.HEADER_FOLDER / "eigen_local_global.cpp", EIGEN_REQUIREMENTS),
+            system,
+            springs,
         )
         return cpp_backend.prepare_cpp_backend(PreparedLocalGlobal, system, springs, compiled, "Eigen's SimplicialLLT")
