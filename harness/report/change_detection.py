@@ -157,7 +157,7 @@ def detect_changes(points: Sequence[BenchmarkPoint]) -> tuple[int, ...]:
     y: FloatArray = np.log([p.value for p in points])
     sigma = max(estimate_noise(y), float(np.median([math.log(p.high / p.low) for p in points])) / _INTERVAL_SIGMAS)
     fitted: Any = Pelt(model="l2", min_size=MIN_SEGMENT_RESULTS, jump=1).fit(y / sigma)
-    found: list[int] = fitted.predict_target(pen=CHANGE_PENALTY * math.log(len(y)))
+    found: list[int] = fitted.predict(pen=CHANGE_PENALTY * math.log(len(y)))
     return (0, *found[:-1])
 
 

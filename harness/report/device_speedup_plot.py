@@ -108,7 +108,7 @@ def _draw_panel(ax: Axes, panel_pairs: Sequence[DevicePair]) -> None:
     looks = assign_solver_styles(run.solver for pair in panel_pairs for run in (pair.device_run, pair.cpu_run) if run)
     ax.set_xscale("log")
     ax.set_yscale("log")
-    for (side, color, dash), of in zip(_SIDE_STYLES, ("there", "here"), strict=True):
+    for (side, color, dash), of in zip(_SIDE_STYLES, ("device_run", "cpu_run"), strict=True):
         ended = [(pair.vertices, run) for pair in panel_pairs if (run := getattr(pair, of))]
         ax.plot([n for n, _ in ended], [run.seconds for _, run in ended], color=color, ls=dash, lw=1.6, label=side)
         for n, run in ended:

@@ -263,7 +263,7 @@ def _classify_change(old: StoredRun, new: StoredRun, units: Sequence[float | Non
 def _compare_other_quantities(old: StoredRun, new: StoredRun) -> tuple[str, str, str, str]:
     """Compare iterations, residual, stationarity error and last positions."""
     told: list[str] = []
-    for name in ("iterations", "residual", "error"):
+    for name in ("num_iterations", "last_residual", "last_stationarity"):
         was, now = getattr(old, name), getattr(new, name)
         same = was == now or was is None or now is None
         told.append(("" if now is None else f"{now:.4g}") if same else f"{was:.4g} -> {now:.4g}")

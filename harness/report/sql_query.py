@@ -51,7 +51,7 @@ _MAX_CHARACTERS = 50_000_000
 class QueryResult:
     """Column names and rows of a query result; `is_truncated` states whether further rows were omitted."""
 
-    run_schema: list[str]
+    columns: list[str]
     values: list[tuple[Any, ...]]
     is_truncated: bool = False
 

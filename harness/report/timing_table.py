@@ -107,10 +107,10 @@ select run_id, any_value(scene), any_value("size"), any_value(solver), any_value
     {SQL_EXPRESSIONS["step"]}, {SQL_EXPRESSIONS["lower"]}, {SQL_EXPRESSIONS["upper"]}, {SQL_EXPRESSIONS["least"]},
     1e3 * median(seconds) filter (phase = 'local'),
     1e3 * median(seconds) filter (phase = 'global'),
-    {SQL_EXPRESSIONS["iterations"]},
+    {SQL_EXPRESSIONS["num_iterations"]},
     arg_min(stopped, list_position(['iterations', 'stalled', 'tolerance', 'floor'], stopped)) filter (
         stopped <> 'iterations' or not coalesce(own_steps, false) and coalesce(iterations >= max_iterations, true)),
-    {SQL_EXPRESSIONS["residual"]}, {SQL_EXPRESSIONS["largest_strain"]}, {SQL_EXPRESSIONS["strain_99"]},
+    {SQL_EXPRESSIONS["residual"]}, {SQL_EXPRESSIONS["max_strain"]}, {SQL_EXPRESSIONS["strain_p99"]},
     bool_or(interrupted) filter (phase = 'step'), bool_and(adds_up),
     max(frame), any_value(integrator), any_value(time_step), any_value(asked), {SQL_EXPRESSIONS["worst_residual"]},
     {ROUNDOFF_RATIO} * max(greatest({_ENERGY_COLUMNS})),

@@ -124,4 +124,4 @@ def test_the_report_draws_it_and_the_page_says_it(there: bool, tmp_path: Path) -
     assert wanted in (tmp_path / "r" / "site" / "data" / "index.js").read_text()
     if there:
         with Image.open(picture) as image:
-            assert np.asarray(image.convert_node("L")).min() < 100, "something is drawn"
+            assert np.asarray(image.convert("L")).min() < 100, "something is drawn"

@@ -217,7 +217,7 @@ def test_a_report_from_outside_is_a_kind_if_it_has_panels(
         return [CurvePlot(("mine",), ("rows",), "all", "", *scales, series)]
 
     monkeypatch.setattr(report, "panels", panels, raising=False)
-    monkeypatch.setattr(type(figure_kinds.REPORT_TABLE), "_installed", lambda _: {"mine": None})
+    monkeypatch.setattr(type(figure_kinds.REPORT_TABLE), "_installed_entry_points", lambda _: {"mine": None})
     monkeypatch.setattr(type(figure_kinds.REPORT_TABLE), "__getitem__", lambda self, name: "tests:mine")
     monkeypatch.setattr(figure_kinds, "load_target", lambda _: report)
     found = figure_kinds.find_figure_kind("mine")

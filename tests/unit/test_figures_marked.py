@@ -35,7 +35,7 @@ def test_what_other_code_measured_is_hollow_and_told(tmp_path: Path) -> None:
     }
     assert "white" in faces
     assert STALE_NOTE in "\n".join(text.get_text() for text in visible_texts(figure))
-    assert {row["series"] for row in panel.rows() if row["other_code"]} == {"newton"}
+    assert {row["series"] for row in panel.csv_rows() if row["is_stale"]} == {"newton"}
     _, (grid,) = compose_kind("hard", swept, FigureOptions(), older)
     assert {cell.column for cell in grid.cells if cell.is_stale} == {"newton"}
     assert "other code" in grid.notes[0]
@@ -70,14 +70,14 @@ def test_in_figures_of_accuracy_too(tmp_path: Path, kind: str) -> None:
         assert f"Measured by other code than today's, in whole or in part: {before}." in said
     else:
         assert STALE_NOTE in said
-        older = {row["series"].split()[0] for panel in panels for row in panel.rows() if row["other_code"]}
+        older = {row["series"].split()[0] for panel in panels for row in panel.csv_rows() if row["is_stale"]}
         assert older == {"newton"}
 
 
 def test_and_in_those_of_speed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told = made.write_speed_results(tmp_path / "told")
     _, (panel,) = compose_kind("speed", told, FigureOptions())
-    assert {row["series"] for row in panel.rows() if row["other_code"]} == {"numba supernodal"}
+    assert {row["series"] for row in panel.csv_rows() if row["is_stale"]} == {"numba supernodal"}
     found = speed_figures(base_rows.read_rows(row_store.list_units(told / "rows")))
     pages: list[Figure] = []
     monkeypatch.setattr(size_plot, "save_page", lambda page, path: pages.append(page))

@@ -31,12 +31,12 @@ def test_meshes_side_by_side_have_one_camera_one_scale_and_the_distance_from_the
     folder = made.write_recorded_runs(tmp_path)
     figure, pictures = compose_mesh_kind("comparison", folder)
     assert find_layout_faults(figure) == []
-    assert len({picture.limit for picture in pictures}) == len({picture.aspect for picture in pictures}) == 1
+    assert len({picture.strain_limit for picture in pictures}) == len({picture.aspect for picture in pictures}) == 1
     assert len({picture.render.view for picture in pictures}) == 1
-    shown = [np.asarray(ax.image_history[0].get_array()) for ax in figure.axes[:2]]
+    shown = [np.asarray(ax.images[0].get_array()) for ax in figure.axes[:2]]
     assert all((picture.min(axis=-1) < 200).mean() > 0.1 for picture in shown), "the mesh fills its place"
     alone, (one,) = compose_mesh_kind("run", folder)
-    assert len(one.rows()) == 36
+    assert len(one.csv_rows()) == 36
     assert find_layout_faults(alone) == []
 
 

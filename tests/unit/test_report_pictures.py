@@ -84,7 +84,7 @@ def broken(replay: RecordingReplay, frame: int, value: float = np.nan) -> Record
 
 def pixels(path: Path) -> NDArray[np.float64]:
     with Image.open(path) as image:
-        return np.asarray(image.convert_node("RGB")).astype(float)
+        return np.asarray(image.convert("RGB")).astype(float)
 
 
 def drawn(image: NDArray[np.float64], left: int, top: int, width: int, height: int) -> float:
@@ -103,7 +103,7 @@ def words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         page_layout.save_page(sheet, path, **more)
 
     for module in (run_picture, comparison_picture):
-        monkeypatch.setattr(module, "save", save)
+        monkeypatch.setattr(module, "save_page", save)
     return written
 
 

@@ -136,10 +136,10 @@ def test_a_run_is_summed_up_in_milliseconds() -> None:
     expected |= {
         "local": 0.01,
         "global_": 0.02,
-        "iterations": 10,
+        "num_iterations": 10,
         "residual": 1e-4,
-        "largest_strain": 0.4,
-        "strain_99": 0.04,
+        "max_strain": 0.4,
+        "strain_p99": 0.04,
     }
     assert {name: getattr(run, name) for name in expected} == pytest.approx(expected, rel=1e-9)
     assert (run.scene, run.size, run.vertices, run.springs, run.status) == ("cloth", 10, 100, 400, "ok")

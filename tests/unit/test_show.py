@@ -37,7 +37,7 @@ def test_what_is_chosen_is_said_and_drawn(tmp_path: Path):
     assert "effects[2] sewing: second: 3 vertices (at (right), every 2): 4, 14, 24" in lines
     assert "boundary loops (loops): 0: 4 m" in lines
     with Image.open(picture) as drawn:
-        pixels = np.asarray(drawn.convert_node("RGB"), np.float64) / 255
+        pixels = np.asarray(drawn.convert("RGB"), np.float64) / 255
     hue = pixels - pixels.mean(axis=2, keepdims=True)
     for k in range(3):  # lit from one side, so lighter and darker: by its hue
         colour = np.array(to_rgb(indexed_style(k).color))

@@ -74,7 +74,7 @@ def test_every_run_is_a_line_of_the_table(results: Path):
     assert cells(table, "residual")[first] == pytest.approx(1e-3 / synthetic_site_rows.FRAME_COUNT, rel=1e-4), (
         "of the last frame"
     )
-    assert cells(table, "largest_strain")[first] == pytest.approx(0.3)
+    assert cells(table, "max_strain")[first] == pytest.approx(0.3)
     assert cells(table, "picture")[first] == 1
     assert sum(cells(table, "picture")) == 1
     assert sum(cells(table, "recording")) == 0
@@ -146,7 +146,7 @@ def test_a_run_s_frames_are_a_script_of_their_own(results: Path):
 def test_the_table_comes_as_parquet_too(results: Path):
     table = pq.read_table(results / "site" / "data" / "made" / "runs.parquet")
     assert len(table) == COUNT
-    assert {"run_id", "step", "residual", "stopped"} <= set(table.column_names)
+    assert {"run_id", "step", "residual", "termination_reason"} <= set(table.column_names)
 
 
 def test_accuracy_s_charts_are_there_with_the_solvers_marks(results: Path):

@@ -63,7 +63,7 @@ def test_the_cheapest_by_processor_time_within_the_error_wins(found):
         "implicit, order 2",
         NO_WINNER,
     ]
-    assert found[0.1].cheapest_by_family["implicit, order 2"].cpu == 0.8, (
+    assert found[0.1].cheapest_by_family["implicit, order 2"].cpu_seconds_per_simulated_second == 0.8, (
         "seconds a simulated second, the cheaper of the two"
     )
 
@@ -89,7 +89,7 @@ def test_a_cell_tells_how_far_ahead_its_winner_is(found):
 
 
 def test_the_stiffness_number_is_that_of_a_frame_whatever_the_step(found):
-    assert found[0.1].number == pytest.approx(1.0)
+    assert found[0.1].stiffness_number == pytest.approx(1.0)
 
 
 def test_an_integrator_from_outside_is_a_family_by_its_name(tmp_path):

@@ -174,9 +174,12 @@ def _build_curve(
 
 
 def _build_work_point(row: _ResultRow, label: _RowLabeller) -> WorkPoint:
-    names = ("scene", "size", "solver", "parameters", "integrator", "time_step", "tolerance", "iterations")
+    same_names = ("scene", "size", "solver", "parameters", "integrator", "time_step", "status")
     return WorkPoint(
-        **{name: row[name] for name in (*names, "first_guess", "status")},
+        **{name: row[name] for name in same_names},
+        residual_rtol=row["tolerance"],
+        max_iterations=row["iterations"],
+        initial_guess=row["first_guess"],
         family=row["family"] or "",
         citation=row["reference"] or "",
         is_minimiser=row["minimises"] is not False,

@@ -89,7 +89,7 @@ def _build_convergence_plot(
     for curve in curves:
         y = np.maximum(values(curve), _MIN_ERROR)
         early, x, late = np.quantile(curve.seconds, (0.25, 0.5, 0.75), axis=0)
-        how: Any = {"older": np.full(len(y), is_stale(curve))}
+        how: Any = {"stale": np.full(len(y), is_stale(curve))}
         if against == "iterations":
             series.append(CurveSeries(curve.label, styles[curve.label], curve.iterations, y, **how))
         else:
@@ -321,7 +321,7 @@ def liu2013_panels(folder: Path) -> list[PanelEntry]:
     for curve in dict.fromkeys(one.curve for one in found):
         mine = [one for one in found if one.curve == curve]
         x = np.array([one.iterations for one in mine], float)
-        ours, theirs = (np.array([getattr(one, side) for one in mine]) for side in ("ours", "theirs"))
+        ours, theirs = (np.array([getattr(one, side) for one in mine]) for side in ("own_error", "published_error"))
         series = [CurveSeries("ours", SeriesStyle("#0072b2", "o"), x, ours)]
         series.append(CurveSeries("Liu et al. 2013", SeriesStyle(MUTED_COLOUR, "D", (0, (3, 1.5))), x, theirs))
         of = curve.replace("figure ", "figure-").replace(" × ", "x").replace(" = ", "").replace(", ", ":").split(":")

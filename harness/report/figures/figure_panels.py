@@ -211,9 +211,9 @@ def _series_rows(panel: str, series: CurveSeries) -> list[CsvRow]:
             "setting": series.setting,
             "x": float(x),
             "y": float(y),
-            "low": float(a),
-            "high": float(b),
-            "other_code": bool(old),
+            "lower": float(a),
+            "upper": float(b),
+            "is_stale": bool(old),
         }
         for x, y, a, b, old in table
     ]

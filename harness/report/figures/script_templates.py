@@ -36,10 +36,10 @@ for ax in axes.flat[len(PANELS) :]:
 for ax, (panel, how) in zip(axes.flat, PANELS.items()):
     for label, (color, marker, dash) in LOOKS.items():
         mine = [row for row in data if (row["panel"], row["series"]) == (panel, label)]
-        x, y, low, high = ([float(row[key]) for row in mine] for key in ("x", "y", "low", "high"))
+        x, y, low, high = ([float(row[key]) for row in mine] for key in ("x", "y", "lower", "upper"))
         style = {{"drawstyle": "steps-post"}} if how["steps"] else {{}}
         ax.plot(x, y, color=color, linestyle=dash if how["joined"] else "none", linewidth=1.1, **style)
-        face = ["white" if row["other_code"] == "True" else color for row in mine]
+        face = ["white" if row["is_stale"] == "True" else color for row in mine]
         if len(mine) <= 12 and not how["steps"]:  # more marks than that hide the curve, and a step is no measurement
             ax.scatter(x, y, 13, marker=marker, facecolors=face, edgecolors=color, linewidths=0.8, zorder=3)
         if how["across"]:
@@ -73,7 +73,7 @@ for ax, panel in zip(axes.flat, panels):
     for row in mine:
         at = across.index(row["column"]), down.index(row["row"])
         ax.add_patch(plt.Rectangle((at[0] + 0.04, at[1] + 0.06), 0.92, 0.88, color=row["color"]))
-        if row["older"] == "True":
+        if row["is_stale"] == "True":
             ax.plot(at[0] + 0.12, at[1] + 0.24, "o", color="black", markerfacecolor="white", markersize=2.6)
     ax.set(xlim=(0, len(across)), ylim=(len(down), 0))
     ax.set_xticks([k + 0.5 for k in range(len(across))], across, rotation=90)

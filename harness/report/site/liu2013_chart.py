@@ -35,7 +35,7 @@ def build_liu2013_chart(table: AccuracyData) -> dict[str, Any]:
         }
         for curve in dict.fromkeys(one.curve for one in found)
         for mine in [[one for one in found if one.curve == curve]]
-        for label, side in zip(_SERIES_STYLES, ("ours", "theirs"), strict=True)
+        for label, side in zip(_SERIES_STYLES, ("own_error", "published_error"), strict=True)
     ]
     return {
         "title": "The paper reproduced",

@@ -60,4 +60,4 @@ def build_robustness_chart(folder: SweepFolder) -> dict[str, Any]:
 
 def outcomes_by_run(map_of: dict[str, Any]) -> dict[str, Any]:
     """Return the outcome and its reason by run id."""
-    return {cell[5]: {"words": map_of["outcomes"][cell[2]]["words"], "reason": cell[4]} for cell in map_of["cells"]}
+    return {cell[5]: {"label": map_of["outcomes"][cell[2]]["label"], "reason": cell[4]} for cell in map_of["cells"]}

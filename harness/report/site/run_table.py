@@ -101,9 +101,9 @@ def build_run_script(
     columns = {
         name: [run[name] for run in run_records] for name in _PAGE_COLUMNS if run_records and name in run_records[0]
     }
-    columns["parameters"] = [run["parameters"] or "{}" for run in run_records]
+    columns["parameters"] = [run["parameters_json"] or "{}" for run in run_records]
     if outcomes:
-        columns["outcome"] = [outcomes.get(run["run_id"], {}).get("words") for run in run_records]
+        columns["outcome"] = [outcomes.get(run["run_id"], {}).get("label") for run in run_records]
     marks = assign_label_styles((run["label"], run["solver"]) for run in run_records)
     exact = {name: [run[name] for run in run_records] for name in _EXACT_COLUMNS}
     return {
@@ -141,8 +141,30 @@ _PAGE_COLUMNS = (
         "frames",
         "rounds",
     ),
-    *("status", "reason", "stopped", "iterations", "residual", "cold", "warm", "step", "lower", "upper", "least"),
-    *("local", "global", "largest_strain", "strain_99", "penetration", "interrupted", "adds_up", "timing", "digest"),
+    *(
+        "status",
+        "reason",
+        "termination_reason",
+        "num_iterations",
+        "residual",
+        "cold",
+        "warm",
+        "step",
+        "lower",
+        "upper",
+        "least",
+    ),
+    *(
+        "local",
+        "global",
+        "max_strain",
+        "strain_p99",
+        "penetration",
+        "preempted",
+        "phases_consistent",
+        "timing",
+        "digest",
+    ),
     *(
         "picture",
         "recording",

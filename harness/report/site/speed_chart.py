@@ -22,9 +22,9 @@ _AXIS_CHOICES = {
     "global_": axis_choice("global_", "ms, a global step"),
     "local": axis_choice("local", "ms, a local step"),
     "warm": axis_choice("warm", "ms, to prepare, warm"),
-    "touched": axis_choice("touched", "bytes a second that an iteration touches", LOG_AXIS),
-    "reached": axis_choice("reached", "of the limit that binds", _SHARE_AXIS),
-    "faster": axis_choice("faster", "times faster than the yardstick in C++", _LINEAR_AXIS),
+    "achieved_bandwidth": axis_choice("achieved_bandwidth", "bytes a second that an iteration touches", LOG_AXIS),
+    "roofline_fraction": axis_choice("roofline_fraction", "of the limit that binds", _SHARE_AXIS),
+    "speedup": axis_choice("speedup", "times faster than the yardstick in C++", _LINEAR_AXIS),
 }
 
 
@@ -52,7 +52,7 @@ def build_speed_chart(table: pa.Table) -> tuple[dict[str, Any], list[str]]:
         "filters": ["scene"],
         "x": [axis_choice("vertices", "vertices")],
         "y": list(_AXIS_CHOICES.values()),
-        "hover": [*hover, ["binds", "limit that binds"], ["reached", "share of that limit reached"]],
+        "hover": [*hover, ["binding_limit", "limit that binds"], ["roofline_fraction", "share of that limit reached"]],
         "items": [_build_item(scene, label, some, newest) for (scene, label), some in lines.items()],
         "marks": {label: plotly_style(mark) for label, mark in marks.items()},
         "references": format_references((f.label, reference.get(f.solver)) for f in timed),
@@ -61,10 +61,10 @@ def build_speed_chart(table: pa.Table) -> tuple[dict[str, Any], list[str]]:
 
 
 def _build_item(scene: str, label: str, some: list[SpeedFigures], newest_fingerprint: str) -> dict[str, Any]:
-    names = ("vertices", *(name for name in _AXIS_CHOICES if name != "faster"))
+    names = ("vertices", *(name for name in _AXIS_CHOICES if name != "speedup"))
     columns = {name: [round_number(getattr(f, name)) for f in some] for name in names}
-    columns["faster"] = [round_number(f.speedup and f.speedup.estimate) for f in some]
-    ends = {f"faster_{end}": [round_number(getattr(f.speedup, end, None)) for f in some] for end in ("low", "high")}
+    columns["speedup"] = [round_number(f.speedup and f.speedup.estimate) for f in some]
+    ends = {f"speedup_{end}": [round_number(getattr(f.speedup, end, None)) for f in some] for end in ("low", "high")}
     threads = f"{some[0].threads} thread{'s' if some[0].threads > 1 else ''}"
     told = {"label": label, "what": f"{scene}, {threads}", "scene": scene, "panel": scene, "parameters": "{}"}
     return (
@@ -72,7 +72,7 @@ def _build_item(scene: str, label: str, some: list[SpeedFigures], newest_fingerp
         | columns
         | ends
         | {
-            "binds": [f.binding_limit for f in some],
+            "binding_limit": [f.binding_limit for f in some],
             "older": [f.source_fingerprint != newest_fingerprint for f in some],
         }
     )

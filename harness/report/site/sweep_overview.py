@@ -81,7 +81,7 @@ def build_overview(
     there = [kind for kind in kinds if kind != "gates" and row_store.list_units(folder.path / kind)]
     there += ["gates"] if find_benchmark_files(folder.path) else []
     told = [_build_section(kind, kinds[kind], folder, data_folder, with_recordings, print_message) for kind in there]
-    made = [one for each in told for one in each.provenance]
+    made = [one for each in told for one in each.row_provenance]
     summary: dict[str, Any] = {
         "slug": folder.slug,
         "name": folder.name,

@@ -118,7 +118,7 @@ def describe_speed(candidates: Sequence[SpeedFigures]) -> list[str]:
         elif f.solver_description and "auto" in f.label.split():
             told[f"{f.label} chose {f.solver_description}"].append(where(f))
     said = [f"{words} (at {', '.join(sizes)})" for words, sizes in told.items()]
-    entries = fit_exponents(candidates, "entries")
+    entries = fit_exponents(candidates, "factor_entries")
     for (scene, label), exponent in fit_exponents(candidates).items():
         factor = f", its factor has n^{entries[scene, label]:.2f} entries" if (scene, label) in entries else ""
         said.append(f"{label}: from 10,000 vertices of {scene} on a solve costs n^{exponent:.2f}{factor}")

@@ -35,7 +35,7 @@
       ...differing.map(([key, words]) => line(words, rows.map(row => (key === "commit" ? springbench.commit(row[key]) : key === "parameters" ? Object.entries(JSON.parse(row[key])).map(pair => pair.join(" ")).join(", ") || "–" : String(row[key] ?? "–"))))),
       line("status", rows.map(row => state(row.status))), line("ms a step, quartiles", rows.map(row => (row.step === null ? "–" : `${number(row.step)} (${number(row.lower)} to ${number(row.upper)})`))),
       rows.length > 1 && line("times as long as the first, 95 % by frames", against), line("least ms", rows.map(row => number(row.least))), line("prepare ms, cold, warm", rows.map(row => `${number(row.cold)}, ${number(row.warm)}`)),
-      line("iterations, stopped by", rows.map(row => `${number(row.iterations)}, ${row.stopped || "–"}`)), line("last residual", rows.map(row => fixed(row.residual))), line("largest strain", rows.map(row => percent(row.largest_strain))),
+      line("iterations, stopped by", rows.map(row => `${number(row.num_iterations)}, ${row.termination_reason || "–"}`)), line("last residual", rows.map(row => fixed(row.residual))), line("largest strain", rows.map(row => percent(row.largest_strain))),
       rows.length > 1 && line("last positions", rows.map((row, k) => (k ? (row.digest && row.digest === rows[0].digest ? "equal to the bit" : "differ") : ""))),
     ];
     const head = rows.map(row => element("th", { scope: "col" }, glyph(row.mark), " ", element("a", { href: address("runs", { sweep: row.slug, run: row.key }) }, title(row))));

@@ -47,9 +47,9 @@ Object.assign(springbench, (() => {
     return list([
       ["ms a step", `${number(row.step)}   (quartiles ${number(row.lower)} to ${number(row.upper)}, least ${number(row.least)})`],
       ["prepare, ms", `cold ${number(row.cold)}, warm ${number(row.warm)}`], ["local, global, ms", row.local !== null ? `${number(row.local)}, ${number(row.global)}` : null],
-      ["iterations", `${number(row.iterations)}, stopped by ${row.stopped || "their number"}`],
+      ["iterations", `${number(row.num_iterations)}, stopped by ${row.termination_reason || "their number"}`],
       ["last residual", row.residual === null ? "none: it minimises nothing" : `${fixed(row.residual)} J^½`],
-      ["largest strain", percent(row.largest_strain)], ["99 % of springs below", row.strain_99 === undefined || row.strain_99 === null ? null : percent(row.strain_99)],
+      ["largest strain", percent(row.max_strain)], ["99 % of springs below", row.strain_p99 === undefined || row.strain_p99 === null ? null : percent(row.strain_p99)],
       ["deepest inside an obstacle", row.penetration ? `${number(row.penetration)} m` : null],
     ]);
   }

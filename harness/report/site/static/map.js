@@ -7,7 +7,7 @@ springbench.map = (chart, sweep) => {
   const tell = element("p", { role: "status" }, "Point at a cell, or go there by arrow keys, for its reason; it leads to the run.");
 
   function cell(found) {
-    const outcome = chart.outcomes[found[2]], words = `${found[0]}, ${found[1]}: ${outcome.words}. ${found[4]}`;
+    const outcome = chart.outcomes[found[2]], words = `${found[0]}, ${found[1]}: ${outcome.label}. ${found[4]}`;
     const read = () => { tell.textContent = words; };
     return element("td", {}, element("button", {
       type: "button", tabIndex: -1, title: words, "aria-label": words, onmouseenter: read, onfocus: read,
@@ -50,6 +50,6 @@ springbench.map = (chart, sweep) => {
     next.tabIndex = 0;
     next.focus();
   });
-  const key = element("ul.key", {}, ...chart.outcomes.filter(o => o.count).map(o => element("li", { title: o.meaning }, element("span", { style: `background:${o.color}` }), `${o.words} (${o.count})`)));
+  const key = element("ul.key", {}, ...chart.outcomes.filter(o => o.count).map(o => element("li", { title: o.description }, element("span", { style: `background:${o.color}` }), `${o.label} (${o.count})`)));
   return [element("p", {}, element("b", {}, chart.headline)), key, tell, element("div.mapbox", {}, table)];
 };

@@ -30,7 +30,7 @@
       return {
         label: some[0].label, what: some[0].scene, scene: some[0].scene, panel: some[0].scene, runs: column("key"), vertices: column("vertices"), size: column("size"), step: column("step"),
         step_low: column("lower"), step_high: column("upper"), least: column("least"), warm: column("warm"), local: column("local"), global: column("global"),
-        iterations: column("iterations"), residual: column("residual"), strain: some.map(row => row.largest_strain === null ? null : 100 * row.largest_strain),
+        iterations: column("num_iterations"), residual: column("residual"), strain: some.map(row => row.max_strain === null ? null : 100 * row.max_strain),
         older: some.map(row => row.by === "other code"),
       };
     });

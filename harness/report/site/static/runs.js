@@ -9,7 +9,7 @@
   };
   const marked = row => (row.by ? element("span.code", { title: row.by === "other code" ? "made by other code than the newest run of its scene and solver" : "made by an earlier commit than the newest run" }, row.by) : "");
   const DOUBT = "the process was interrupted while steps were timed: its least time is nearest to the truth";
-  const doubt = row => (row.interrupted ? element("span.doubt", { title: DOUBT }, " !") : "");
+  const doubt = row => (row.preempted ? element("span.doubt", { title: DOUBT }, " !") : "");
 
   // meaning: tooltip; show: cell of a row; numeric: right-aligned; spare: priority for removal if space is short.
   const COLUMNS = [
@@ -21,17 +21,17 @@
     { id: "solver", width: "minmax(150px, 2fr)", title: "Solver", meaning: "and the options in which its runs differ", show: row => element("span.who", { title: row.cited }, glyph(row.mark), row.solver, row.options && element("span.options", {}, row.options)) },
     { id: "status", width: "minmax(118px, 1fr)", title: "Status", show: row => element("span", {}, state(row.status), row.by && " ", marked(row)) },
     { id: "outcome", width: "minmax(116px, 1fr)", title: "Judged", show: row => (row.outcome ? state(row.outcome) : "–") },
-    { id: "stopped", width: "92px", spare: 3, title: "Stopped by", meaning: "what ended the last step's iterations", show: row => words(row, "stopped") || "–" },
-    { id: "iterations", width: "64px", spare: 6, title: "Iter.", meaning: "median iterations a step", numeric: true, show: row => number(row.iterations) },
+    { id: "termination_reason", width: "92px", spare: 3, title: "Stopped by", meaning: "what ended the last step's iterations", show: row => words(row, "termination_reason") || "–" },
+    { id: "num_iterations", width: "64px", spare: 6, title: "Iter.", meaning: "median iterations a step", numeric: true, show: row => number(row.num_iterations) },
     { id: "residual", width: "84px", title: "Residual", meaning: "of the last step, J^(1/2)", numeric: true, show: row => fixed(row.residual) },
     { id: "step", width: "86px", title: "ms a step", meaning: "the median over frames and rounds", numeric: true, show: row => element("span", {}, number(row.step), doubt(row)) },
     { id: "least", width: "82px", spare: 7, title: "Least ms", numeric: true, show: row => number(row.least) },
     { id: "warm", width: "92px", spare: 8, title: "Prepare ms", meaning: "warm", numeric: true, show: row => number(row.warm) },
-    { id: "largest_strain", width: "78px", spare: 1, title: "Strain", meaning: "the largest of all springs and frames", numeric: true, show: row => percent(row.largest_strain) },
-    { id: "strain_99", width: "78px", spare: 2, title: "99 %", meaning: "strain that 99 % of the springs stay below", numeric: true, show: row => percent(row.strain_99) },
+    { id: "max_strain", width: "78px", spare: 1, title: "Strain", meaning: "the largest of all springs and frames", numeric: true, show: row => percent(row.max_strain) },
+    { id: "strain_p99", width: "78px", spare: 2, title: "99 %", meaning: "strain that 99 % of the springs stay below", numeric: true, show: row => percent(row.strain_p99) },
   ];
-  const FACETS = [["sweep", "Results"], ["scene", "Scene"], ["size", "Size"], ["solver", "Solver"], ["status", "Status"], ["outcome", "Judged"], ["stopped", "Stopped by"], ["by", "Code"]];
-  const LIMITS = [["residual", "Residual at most"], ["step", "ms a step at most"], ["largest_strain", "Strain at most (%)"]];
+  const FACETS = [["sweep", "Results"], ["scene", "Scene"], ["size", "Size"], ["solver", "Solver"], ["status", "Status"], ["outcome", "Judged"], ["termination_reason", "Stopped by"], ["by", "Code"]];
+  const LIMITS = [["residual", "Residual at most"], ["step", "ms a step at most"], ["max_strain", "Strain at most (%)"]];
 
   const value = (row, key) => (key === "sweep" ? row.slug : String(row[key] ?? ""));
 
@@ -39,7 +39,7 @@
     for (const [key] of FACETS) if (key !== except && query.get(key) && value(row, key) !== query.get(key)) return false;
     for (const [key] of LIMITS) {
       const most = query.get(`max-${key}`);
-      if (most && !(row[key] !== null && row[key] <= Number(most) / (key === "largest_strain" ? 100 : 1))) return false;
+      if (most && !(row[key] !== null && row[key] <= Number(most) / (key === "max_strain" ? 100 : 1))) return false;
     }
     const wanted = (query.get("q") || "").toLowerCase();
     if (!wanted) return true;
@@ -71,7 +71,7 @@
     const all = await springbench.rows();
     const known = key => all.some(row => row[key] !== null && row[key] !== undefined && row[key] !== "");
     const several = key => new Set(all.map(row => row[key])).size > 1;
-    const hidden = new Set([...["outcome", "strain_99", "picture"].filter(key => !known(key)), ...(several("sweep") ? [] : ["sweep"])]);
+    const hidden = new Set([...["outcome", "strain_p99", "picture"].filter(key => !known(key)), ...(several("sweep") ? [] : ["sweep"])]);
     if (hidden.has("picture")) hidden.add("shot");
     const columns = COLUMNS.filter(column => !hidden.has(column.id));
     let shown = all, selected = new Set(), now = query;
@@ -123,7 +123,7 @@
         changes.sort = [sort.replace("-", ""), sort.startsWith("-")];
         total.textContent = shown.length === all.length ? many(all.length, "run") : `${count(shown.length)} of ${many(all.length, "run")}`;
         by.textContent = shown.length ? madeBy([...shown].sort((a, b) => (b.started || "").localeCompare(a.started || ""))) : "";
-        note.textContent = shown.some(row => row.interrupted) ? `! ${DOUBT}` : "";
+        note.textContent = shown.some(row => row.preempted) ? `! ${DOUBT}` : "";
         for (const { key, select } of facets) {
           const sizes = new Map();
           for (const row of all) if (fits(row, next, key)) sizes.set(value(row, key), (sizes.get(value(row, key)) || 0) + 1);
