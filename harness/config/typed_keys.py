@@ -48,20 +48,20 @@ class SceneKeys(TypedDict, total=False):
 class OptionKeys(TypedDict, total=False):
     """Options of a sweep, as in `springbench.harness.config.sweep_config.SweepOptions`."""
 
-    max_iterations: OneOrSequence[int]
-    rtol: OneOrSequence[float | Literal["auto"] | None]
+    iterations: OneOrSequence[int]
+    tolerance: OneOrSequence[float | Literal["auto"] | None]
     integrator: OneOrSequence[IntegratorName | UserCodeName]
     time_step: OneOrSequence[NumberOrText | None]
-    initial_guess: OneOrSequence[InitialGuess | None]
+    first_guess: OneOrSequence[InitialGuess | None]
     threads: OneOrSequence[int | Literal["auto"]]
     frames: OneOrSequence[int | None]
     rounds: OneOrSequence[int]
-    error_target: OneOrSequence[float | None]
+    accuracy: OneOrSequence[float | None]
     convergence_frames: Sequence[int] | None
     strain_range: float | None
     record: bool
     pictures: bool
-    verify: bool
+    judge: bool
     timing: Literal["exclusive", "shared", "rough"]
     time_limit: float | None
     memory_limit: float | None

@@ -16,7 +16,7 @@ SourcePart = Path | type | PluginName
 ERROR_CONTROL_TARGET = "springbench.harness.experiments.error_control.error_controlled_run:run_error_controlled"
 """Import target that executes error-controlled runs; other runs do not depend on it."""
 
-_RUN_MODULE = Path(__file__).with_name("run.py")
+_RUN_MODULE = Path(__file__).with_name("run_pipeline.py")
 """Module that executes every run."""
 
 

@@ -30,15 +30,15 @@ MISTAKEN = """
 import springbench
 
 scene = springbench.make_scene(mesh={"kind": "grid"}, time_step=0.01, frames=3, mass=1.0)
-fine = springbench.Simulation(scene, "newton", integrator="bdf2", tolerance=None)
+fine = springbench.Simulation(scene, "newton", integrator="bdf2", rtol=None)
 springbench.Simulation(scene, "hybird")  # 6
 springbench.Simulation(scene, integrator="implicit-eular")  # 7
 springbench.make_scene(mesh={"kind": "grid"}, time_step=0.01, frames=3, mass_per_aera=1.0)  # 8
 sweep: springbench.SweepKeys = {"scenes": ["a.yaml"], "solvers": ["sparse"]}
-harness.run({"scenes": ["a.yaml"], "solvers": ["sparse"], "options": {"iteration": 3}}, name="a")  # 10
+springbench.run_config({"scenes": ["a.yaml"], "solvers": ["sparse"], "options": {"iteration": 3}}, name="a")  # 10
 springbench.make_scene(mesh={"kind": "grid"}, time_step=0.01, frames="many")  # 11
-harness.run({"scenes": ["a.yaml"], "solvers": ["sprase"]}, name="a")  # 12
-harness.run({"scenes": ["a.yaml"], "solvers": ["sparse"], "reports": ["timings"]}, name="a")  # 13
+springbench.run_config({"scenes": ["a.yaml"], "solvers": ["sprase"]}, name="a")  # 12
+springbench.run_config({"scenes": ["a.yaml"], "solvers": ["sparse"], "reports": ["timings"]}, name="a")  # 13
 """
 
 

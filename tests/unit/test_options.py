@@ -64,8 +64,8 @@ def test_a_value_on_the_command_line_means_what_it_means_in_a_file(
 @pytest.mark.parametrize(("key", "value"), [("tolerance", None), ("threads", 2), ("size", [4, 8])])
 def test_an_entry_states_what_it_lists_and_nothing_else(key: str, value: object) -> None:
     entry = IncludeEntry.model_validate({key: value})
-    assert entry.stated(key) == (tuple(value) if isinstance(value, list) else (value,))
-    assert not any(entry.stated(other) for other in IncludeEntry.model_fields if other != key)
+    assert entry.get_values(key) == (tuple(value) if isinstance(value, list) else (value,))
+    assert not any(entry.get_values(other) for other in IncludeEntry.model_fields if other != key)
 
 
 SWEEP = "scenes: [cloth.yaml]\nsizes: [4]\nsolvers: [{}]\noptions: {{frames: 4, threads: 1, rounds: 1, {}}}\n"

@@ -130,7 +130,7 @@ def test_one_scene_is_solved_to_a_tolerance_by_the_recommended_solver_as_in_pyth
     assert stop(run) == (DEFAULT_SOLVER, *DEFAULT_STOP_RULE.values()) == ("hybrid", 500, 1e-4)
     assert stop(other) == ("sparse", 500, 1e-4)
     usual = signature(Simulation).parameters
-    assert stop(run) == tuple(usual[name].default for name in ("solver", "iterations", "tolerance"))
+    assert stop(run) == tuple(usual[name].default for name in ("solver", "max_iterations", "rtol"))
 
 
 @pytest.mark.parametrize("options", [{"iterations": 7}, {"tolerance": None}, {"tolerance": 1e-3}, {"accuracy": 1e-2}])
@@ -230,12 +230,12 @@ def test_every_shipped_config_asks_for_runs_and_names_its_schema(path: Path) -> 
 
 def test_the_committed_schema_is_the_models() -> None:
     committed = json.loads((ROOT / "configs" / "schema.json").read_text())
-    assert committed == build_json_schema(), "write it anew: springbench schema > configs/schema.json"
+    assert committed == build_json_schema(), "regenerate it: springbench schema > configs/schema.json"
 
 
 def test_the_schema_describes_every_key_of_a_scene_and_a_sweep() -> None:
     definitions = build_json_schema()["$defs"]
-    for name in ("Scene", "Sweep", "Options", "Include", "Exclude", "Accuracy", "CurveStudy", "WorkStudy"):
+    for name in ("Scene", "Sweep", "SweepOptions", "IncludeEntry", "ExcludeEntry", "Accuracy", "CurveStudyConfig", "WorkStudyConfig"):
         assert all(key.get("description") for key in definitions[name]["properties"].values()), name
 
 
