@@ -17,14 +17,14 @@ class Wheel(MeshGenerator):
 
     kind: Literal["wheel"] = "wheel"
     radius: LengthMetres = 1.0
-    SMALLEST: ClassVar[int] = 3
-    COUNTS: ClassVar[str] = "vertices of the rim"
-    SPRINGS: ClassVar[int] = 2
+    MIN_SIZE: ClassVar[int] = 3
+    SIZE_MEANING: ClassVar[str] = "vertices of the rim"
+    SPRINGS_PER_VERTEX: ClassVar[int] = 2
 
-    def count(self, size: int) -> int:
+    def count_vertices(self, size: int) -> int:
         return size + 1
 
-    def generate(self, size: int) -> Mesh:
+    def generate_mesh(self, size: int) -> Mesh:
         angle, i = 2.0 * np.pi * np.arange(size) / size, np.arange(1, size + 1)
         rest = np.zeros((size + 1, 3))
         rest[1:, :2] = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)

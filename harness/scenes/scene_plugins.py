@@ -46,7 +46,7 @@ def load_plugin(document: ConfigDocument, plugin: PluginName, part_kind: str, ke
             made = load_target(plugin.import_target)
         problem = "" if fits(made) else f"is no {part_kind}; wanted {wanted}"
         if lacks := sorted(getattr(made, "__abstractmethods__", ())):
-            problem = problem or f"has no method `{'`, `'.join(lacks)}`, which its base wants; write it"
+            problem = problem or f"has no method `{'`, `'.join(lacks)}`, which its base class requires"
     except AttributeError as error:
         missing = error.name == plugin.import_target.rpartition(":")[2] and error.obj is not None
         problem = (
@@ -115,7 +115,7 @@ PLUGIN_KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     ),
     "report": ("a function of rows and a folder", callable),
     "integrator": (
-        "an object of solvers.integrators.Integrator, of finite numbers, its `factor` above 0",
+        "an integrator of springbench.solvers.model.integrators, of finite numbers, with `inertia_factor` above 0",
         lambda made: isinstance(made, integrators.AnyIntegrator) and _is_valid_integrator(made),
     ),
 }
@@ -227,11 +227,11 @@ def build_checked_contribution(
             _require_true(not methods, f"the energy {type(energy).__name__} has no method `{', '.join(methods)}`")
         for pin in made.pins:
             _require_pin(pin, len(mesh.rest_positions))
-        _require_true(all(map(callable, made.velocity_filters)), "`filters` should be functions of velocities")
+        _require_true(all(map(callable, made.velocity_filters)), "`velocity_filters` should be functions of velocities")
         _require_true(all(map(callable, made.forces)), "`forces` should be functions of positions, velocities and time")
         for force in made.forces:
             if isinstance(force, ConstantForceField):
-                _require_array(force.force, mesh.rest_positions.shape, "a steady force")
+                _require_array(force.force, mesh.rest_positions.shape, "a constant force")
     n = len(mesh.rest_positions)
     forces = tuple(
         f if isinstance(f, ConstantForceField) else _CheckedFunction(f, plugin, "force [N]", n) for f in made.forces
@@ -311,20 +311,24 @@ def check_plugin_mesh(plugin: PluginName, mesh: Any) -> Mesh:
             isinstance(mesh, Mesh),
             f"returned {_describe_value(mesh)}; wanted a springbench.harness.scenes.mesh.mesh.Mesh",
         )
-        _require_array(mesh.rest_positions, (None, 3), "`rest`")
+        _require_array(mesh.rest_positions, (None, 3), "`rest_positions`")
         n, m = len(mesh.rest_positions), len(mesh.springs)
-        _require_true(n > 0, "`rest` has no vertices")
+        _require_true(n > 0, "`rest_positions` has no vertices")
         _require_indices(mesh.springs, (None, 2), "`springs`", n)
         _require_indices(mesh.triangles, (None, 3), "`triangles`", n)
-        _require_array(mesh.mass_fractions, (n,), "`shares`")
-        _require_true(bool((mesh.mass_fractions >= 0.0).all()), "`shares` has values below 0")
-        _require_true(math.isclose(float(mesh.mass_fractions.sum()), 1.0, rel_tol=1e-6), "`shares` should sum to 1")
+        _require_array(mesh.mass_fractions, (n,), "`mass_fractions`")
+        _require_true(bool((mesh.mass_fractions >= 0.0).all()), "`mass_fractions` has values below 0")
+        _require_true(
+            math.isclose(float(mesh.mass_fractions.sum()), 1.0, rel_tol=1e-6), "`mass_fractions` should sum to 1"
+        )
         if unknown := mesh.spring_families.keys() - {STRETCH, SHEAR, BEND}:
-            raise ValueError(f"`families` has {sorted(map(str, unknown))[0]!r}; wanted {STRETCH}, {SHEAR} and {BEND}")
+            raise ValueError(
+                f"`spring_families` has {sorted(map(str, unknown))[0]!r}; wanted {STRETCH}, {SHEAR} and {BEND}"
+            )
         for name, members in mesh.spring_families.items():
-            _require_indices(members, (None,), f"`families[{name!r}]`", m)
+            _require_indices(members, (None,), f"`spring_families[{name!r}]`", m)
         listed = np.concatenate([*mesh.spring_families.values(), np.empty(0, np.int64)])
-        _require_true(np.array_equal(np.sort(listed), np.arange(m)), "`families` should have each spring once")
+        _require_true(np.array_equal(np.sort(listed), np.arange(m)), "`spring_families` should have each spring once")
         for name, members in mesh.parts.items():
             _require_indices(members, (None,), f"`parts[{name!r}]`", n)
         if mesh.mass is not None:

@@ -16,7 +16,7 @@ from springbench.harness.schema.base_model import ConfigModel
 from springbench.harness.scenes.effects.effect_interface import EffectContribution, PinGroup, build_constant_force
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
-from springbench.solvers.model.integrators.single_stage import IMPLICIT_EULER
+from springbench.solvers.model.integrators import IMPLICIT_EULER
 from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
 from springbench.solvers.model.step_problem import Solution
 
@@ -82,12 +82,12 @@ class Cord(ChainMesh):
         return made
 
 
-def predict(now, before, dt):
+def predict_target(now, before, dt):
     {predicting}
     return now.positions + dt * now.velocity, now.positions
 
 
-EULER = replace(IMPLICIT_EULER, predict_target=predict)
+EULER = replace(IMPLICIT_EULER, predict_target=predict_target)
 {integrator}
 
 
@@ -195,7 +195,7 @@ PREPARED = {
         "fields", "def __post_init__(self): raise KeyError('no')", "solver", MISTAKE, "KeyError: 'no' (mine.py:"
     ),
     "statements that are none": Hostile(
-        "fields", "about: ClassVar = 7; minimises: ClassVar = 'yes'", "solver", MISTAKE, ""
+        "fields", "solver_info: ClassVar = 7; is_minimiser: ClassVar = 'yes'", "solver", MISTAKE, ""
     ),
     "nothing prepared": Hostile("preparing", "return None", "solver", FAILED, "mine.py"),
     "a wrong thing prepared": Hostile("preparing", "return 7", "solver", FAILED, "mine.py"),
@@ -351,26 +351,38 @@ MESHES = {
         "generating", "return replace(made, springs=made.springs * 0.5)", "mesh", MISTAKE, "integers"
     ),
     "has families of others": Hostile(
-        "generating", "return replace(made, families={'kin': np.arange(3)})", "mesh", MISTAKE, "`families` has 'kin'"
+        "generating",
+        "return replace(made, spring_families={'kin': np.arange(3)})",
+        "mesh",
+        MISTAKE,
+        "`spring_families` has 'kin'",
     ),
-    "forgets springs": Hostile("generating", "return replace(made, families={})", "mesh", MISTAKE, "each spring once"),
+    "forgets springs": Hostile(
+        "generating", "return replace(made, spring_families={})", "mesh", MISTAKE, "each spring once"
+    ),
     "shares too much": Hostile(
-        "generating", "return replace(made, shares=made.shares * 2)", "mesh", MISTAKE, "sum to 1"
+        "generating", "return replace(made, mass_fractions=made.mass_fractions * 2)", "mesh", MISTAKE, "sum to 1"
     ),
-    "shares negatively": Hostile("generating", "return replace(made, shares=-made.shares)", "mesh", MISTAKE, "below 0"),
+    "shares negatively": Hostile(
+        "generating", "return replace(made, mass_fractions=-made.mass_fractions)", "mesh", MISTAKE, "below 0"
+    ),
     "has a face away": Hostile(
         "generating", "return replace(made, triangles=np.array([[0, 1, 99]]))", "mesh", MISTAKE, "`triangles` names 99"
     ),
     "has seven dimensions": Hostile(
         "generating", "return replace(made, dimension=7)", "mesh", MISTAKE, "wanted 1, 2 or 3"
     ),
-    "raises": Hostile("generating", "raise KeyError(3)", "mesh", MISTAKE, "`generate` raised KeyError: 3 (mine.py:"),
+    "raises": Hostile(
+        "generating", "raise KeyError(3)", "mesh", MISTAKE, "`generate_mesh` raised KeyError: 3 (mine.py:"
+    ),
     "hangs": Hostile("generating", HANG, "mesh", MISTAKE, LIMIT),
     "exits": Hostile("generating", "os._exit(0)", "mesh", MISTAKE, "exit code 0"),
     "swells": Hostile("generating", SWELL, "mesh", MISTAKE, "MemoryError"),
-    "cannot count": Hostile("counting", "def count(self, size): raise KeyError(3)", "mesh", MISTAKE, "KeyError: 3"),
-    "counts in words": Hostile("counting", "def count(self, size): return 'many'", "mesh", MISTAKE, "mine.py"),
-    "begins in words": Hostile("counting", "SMALLEST: ClassVar = 'two'", "mesh", MISTAKE, "mine.py"),
+    "cannot count": Hostile(
+        "counting", "def count_vertices(self, size): raise KeyError(3)", "mesh", MISTAKE, "KeyError: 3"
+    ),
+    "counts in words": Hostile("counting", "def count_vertices(self, size): return 'many'", "mesh", MISTAKE, "mine.py"),
+    "begins in words": Hostile("counting", "MIN_SIZE: ClassVar = 'two'", "mesh", MISTAKE, "mine.py"),
 }
 OTHERS = {
     "an integrator that is a number": Hostile(
@@ -383,9 +395,11 @@ OTHERS = {
     "an integrator that hangs": Hostile("predicting", HANG, "integrator", FAILED, LIMIT),
     "an integrator that exits": Hostile("predicting", "os._exit(0)", "integrator", FAILED, "exit code 0"),
     "an integrator of NaN": Hostile(
-        "integrator", "EULER = replace(EULER, factor=float('nan'))", "integrator", MISTAKE, ""
+        "integrator", "EULER = replace(EULER, inertia_factor=float('nan'))", "integrator", MISTAKE, ""
     ),
-    "an integrator of words": Hostile("integrator", "EULER = replace(EULER, factor='one')", "integrator", MISTAKE, ""),
+    "an integrator of words": Hostile(
+        "integrator", "EULER = replace(EULER, inertia_factor='one')", "integrator", MISTAKE, ""
+    ),
     "a report of nothing": Hostile(
         "reporting", "return None", "report", FAILED, "it returned a NoneType; wanted a list"
     ),

@@ -64,17 +64,17 @@ class Hidden:
 sys.meta_path.insert(0, Hidden())
 import springbench
 if {load}:
-    from springbench.harness.scenes.effects.effect_names import EFFECTS
-    from springbench.solvers.registry import load
-    for target in EFFECTS.values():
-        load(target)
-from springbench.harness.config.load import load_scene
-from springbench.harness.scenes.bind import build
-from springbench.harness.simulation.step import prepare, simulate
+    from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES
+    from springbench.solvers.registry import load_target
+    for target in EFFECT_CLASSES.values():
+        load_target(target)
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
 from springbench.solvers.model.step_problem import StopRule
-made = build(load_scene(Path({scene!r})), 10)
-steps = simulate(made, prepare(made, SparseLocalGlobal()), StopRule(10), first_guess="current", frames=5)
+made = build_scene(load_scene(Path({scene!r})), 10)
+steps = simulate_scene(made, prepare(made, SparseLocalGlobal()), StopRule(10), initial_guess="current", frames=5)
 digests = [hashlib.sha256(step.positions.tobytes()).hexdigest() for step in steps]
 print(json.dumps({{"modules": sorted(sys.modules), "digests": digests}}))
 """

@@ -95,7 +95,9 @@ class Sweep(NamedTuple):
 
     def begin(self, address: str) -> subprocess.Popen[str]:
         command = ["run", str(self.config), "--results", str(self.rows.parents[1]), "--scheduler", address]
-        return subprocess.Popen([sys.executable, "-m", "harness", *command], cwd=ROOT, stdout=-1, stderr=-2, text=True)
+        return subprocess.Popen(
+            [sys.executable, "-m", "springbench", *command], cwd=ROOT, stdout=-1, stderr=-2, text=True
+        )
 
     def done(self) -> dict[str, tuple[int, int]]:
         """The runs that have rows: which file, and when it was written."""

@@ -20,7 +20,7 @@ SCENE = ROOT / "configs" / "scenes" / "hanging-cloth.yaml"
 def start(*arguments: str, **environment: str) -> subprocess.Popen[str]:
     """A command in a session of its own, as a terminal starts it."""
     return subprocess.Popen(
-        [sys.executable, "-m", "harness", *arguments],
+        [sys.executable, "-m", "springbench", *arguments],
         cwd=ROOT,
         env=os.environ | environment,
         stdout=subprocess.PIPE,
@@ -68,7 +68,8 @@ def test_ctrl_c_at_a_random_moment(seed: int, where: tuple[str, ...], tmp_path: 
 def test_an_interrupt_that_a_destructor_swallows_is_raised_again():
     code = """
         import os, signal, time
-        from springbench.harness.base import interrupts, rows
+        from springbench.harness.execution import interrupts
+        from springbench.harness.results import parquet_rows
 
         class Swallows:
             def __del__(self):

@@ -206,7 +206,7 @@ def test_a_killed_sweep_goes_on_where_it_was(undisturbed: Undisturbed, tmp_path:
 def test_ctrl_c_says_how_to_go_on(tmp_path: Path):
     sweep = Sweep.write(tmp_path / "home", "sparse, numba", pictures=False)
     process = subprocess.Popen(
-        [sys.executable, "-m", "harness", *sweep.arguments],
+        [sys.executable, "-m", "springbench", *sweep.arguments],
         cwd=ROOT,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,

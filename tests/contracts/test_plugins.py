@@ -33,7 +33,7 @@ import numpy as np
 from springbench.harness.schema.base_model import ConfigModel
 from springbench.harness.scenes.effects.effect_interface import EffectContribution, build_constant_force
 from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
-from springbench.solvers.model.integrators.single_stage import IMPLICIT_EULER
+from springbench.solvers.model.integrators import IMPLICIT_EULER
 from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
 
 open(__file__ + ".was-run", "w").close()
@@ -110,8 +110,8 @@ def configs(folder: Path, names: dict[str, str]) -> Path:
 
 def springbench(folder: Path, *arguments: str, code: int = 0) -> str:
     """What a command says in a process of its own, to which the folder's `installed` are packages."""
-    command = [sys.executable, "-m", "harness", *arguments]
-    path = os.pathsep.join([str(ROOT), str(folder / "installed")])
+    command = [sys.executable, "-m", "springbench", *arguments]
+    path = os.pathsep.join([str(ROOT / ".src"), str(folder / "installed")])
     told = subprocess.run(command, cwd=folder, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True)
     assert told.returncode == code, told.stdout + told.stderr
     return told.stdout + told.stderr
@@ -231,8 +231,8 @@ def test_a_file_beside_the_config_travels_between_processes(beside: Path):
     run = load_config(configs(beside, WAYS["beside"])).list_runs()[0]
     (beside / "run.pickle").write_bytes(pickle.dumps(run))
     program = "import pickle; run = pickle.load(open('run.pickle', 'rb')); "
-    program += "print(run.scene.opened().effects[1], run.identity())"
-    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    program += "print(run.scene.load_plugins().effects[1], run.build_identity())"
+    env = {**os.environ, "PYTHONPATH": str(ROOT / ".src")}
     told = subprocess.run([sys.executable, "-c", program], cwd=beside, env=env, capture_output=True, text=True)
     assert told.stdout.split(" ", 2)[:2] == ["kind='hum'", "force=0.5"], told.stderr
     assert told.stdout.rstrip().endswith(run.build_identity())
@@ -249,7 +249,7 @@ REFUSED = {
     "./nothing.py:Mine": "there is no file",
     "./mine.py:": "wanted",
     "nobodys:Mine": "which Python does not find",
-    "solvers.nothing:Mine": "which Python does not find",
+    "springbench.solvers.nothing:Mine": "which Python does not find",
 }
 
 

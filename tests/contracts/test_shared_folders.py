@@ -32,7 +32,7 @@ def sweep(folder: Path) -> Path:
 
 def begun(config: Path, workers: int = 1) -> subprocess.Popen[str]:
     command = ["run", str(config), "--results", str(config.parent / "r"), "--workers", str(workers)]
-    return subprocess.Popen([sys.executable, "-m", "harness", *command], cwd=ROOT, stdout=-1, stderr=-2, text=True)
+    return subprocess.Popen([sys.executable, "-m", "springbench", *command], cwd=ROOT, stdout=-1, stderr=-2, text=True)
 
 
 def done(said: str) -> Counter[str]:

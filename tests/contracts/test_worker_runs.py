@@ -130,7 +130,7 @@ def test_no_worker_stays_behind(how: signal.Signals, tmp_path: Path, monkeypatch
     made = write_plugin_solver(tmp_path, monkeypatch)
     made.sweep_path.write_text(LONG)
     process = subprocess.Popen(
-        [sys.executable, "-m", "harness", "run", str(made.sweep_path), "--results", str(tmp_path / "r")],
+        [sys.executable, "-m", "springbench", "run", str(made.sweep_path), "--results", str(tmp_path / "r")],
         cwd=ROOT,
         stderr=subprocess.DEVNULL,
         # A shell that started these tests in the background has made its children deaf to Ctrl-C.

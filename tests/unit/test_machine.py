@@ -122,9 +122,9 @@ def test_the_code_hash_follows_names_and_contents_of_the_sources(tmp_path: Path)
 
 
 PINNED = """
-from springbench.harness.base.machine import pinned_threads
+from springbench.harness.execution.machine_info import limit_threads
 from threadpoolctl import threadpool_info
-with pinned_threads({threads}):
+with limit_threads({threads}):
     import numba, numpy, scipy.linalg
     print(numba.get_num_threads(), *[p["num_threads"] for p in threadpool_info() if p["user_api"] == "blas"])
 """

@@ -63,7 +63,7 @@ SIZES = {"pulled-curtain": 9}
 def test_both_opinions_agree_on_a_scene(name: str):
     spec = load_scene(SCENES[name])
     # A third of the size has the same formulas and takes a tenth of the time; the integrators take turns.
-    size = SIZES.get(name) or max(getattr(spec.mesh, "SMALLEST", 2), (spec.default_size or 0) // 3)
+    size = SIZES.get(name) or max(getattr(spec.mesh, "MIN_SIZE", 2), (spec.default_size or 0) // 3)
     assert run_reference_check(spec, size, INTEGRATOR_NAMES[list(SCENES).index(name) % 3]) == "agrees"
 
 
