@@ -98,7 +98,7 @@ def test_a_frozen_problem_is_the_step_of_a_converged_run_with_exact_pins(tmp_pat
     for frame, one in frozen.items():
         assert one.problem.system.pins.exact_mask.all()
         assert one.problem.system.inertia_factor == steps[frame].system.inertia_factor
-        for name in ("target", "force", "pin_targets", "current"):
+        for name in ("inertial_target", "external_force", "pin_targets", "current_positions"):
             np.testing.assert_array_equal(getattr(one.problem, name), getattr(steps[frame], name))
 
 

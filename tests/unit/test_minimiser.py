@@ -115,7 +115,7 @@ def test_a_minimum_is_certified_by_the_oracle(problem):
         assert gradient <= 10 * values[-1] * np.finfo(float).eps * np.abs(found.positions).max()
         assert found.newton_step_length <= 1e-12
         assert not found.positions.flags.writeable
-        exact = problem.system.pins.exact
+        exact = problem.system.pins.exact_mask
         held = problem.system.pins.vertices[exact]
         np.testing.assert_array_equal(found.positions[held], problem.pin_targets[exact])
 
@@ -202,7 +202,7 @@ def test_minima_are_found_once(tmp_path):
     found = ReferenceStore(tmp_path).find_minima(one).lowest
     again = ReferenceStore(tmp_path, Stays()).find_minima(one).lowest
     np.testing.assert_array_equal(found.positions, again.positions)
-    fields = ("g", "error", "smallest_eigenvalue", "eigenvalue_uncertainty", "kind", "name")
+    fields = ("objective", "newton_step_length", "min_eigenvalue", "eigenvalue_uncertainty", "kind", "minimum_id")
     assert [getattr(found, f) for f in fields] == [getattr(again, f) for f in fields]
     assert not again.positions.flags.writeable
 
@@ -268,16 +268,16 @@ def test_a_classification_lets_no_valley_in(tmp_path):
     assert not list(tmp_path.glob("minima-*"))
 
 
-@pytest.mark.parametrize("name", ["error", "smallest_eigenvalue", "g"])
+@pytest.mark.parametrize("name", ["newton_step_length", "min_eigenvalue", "objective"])
 def test_a_certificate_is_of_the_very_point_that_is_stored(name: str):
     problem = PROBLEMS["random, pinned by penalty too"]()
     found = refine_minimum(problem, problem.initial_guess, NewtonSolver())
     H = build_free_hessian(problem, found.positions).toarray()
     step = np.linalg.solve(H, problem.gradient(found.positions)[problem.system.free_vertices].ravel()).reshape(-1, 3)
     there = {
-        "error": np.linalg.norm(step, axis=1).max(),
-        "smallest_eigenvalue": np.linalg.eigvalsh(H)[0],
-        "g": problem.value(found.positions),
+        "newton_step_length": np.linalg.norm(step, axis=1).max(),
+        "min_eigenvalue": np.linalg.eigvalsh(H)[0],
+        "objective": problem.value(found.positions),
     }
     # The step is round-off, by two factors; the eigenvalue what Lanczos is told.
     assert getattr(found, name) == pytest.approx(there[name], rel=1e-6, abs=1e-14)
