@@ -189,14 +189,14 @@ def join_problems(problem: StepProblem, other: StepProblem) -> StepProblem:
         (*problem.system.energies, *moved),
         DirichletPins(np.append(pins[0].vertices, pins[1].vertices + n), np.append(pins[0].weight, pins[1].weight)),
     )
-    names = ("target", "force", "pin_targets", "current", "first_guess")
+    names = ("inertial_target", "external_force", "pin_targets", "current_positions", "initial_guess")
     arrays = {name: np.concatenate([getattr(problem, name), getattr(other, name)]) for name in names}
     return StepProblem(system, **arrays, step_start=build_step_start(system, arrays["current"], arrays["current"]))
 
 
 def shift_problem(problem: StepProblem, offset: float, stiffness_factor: float = 1.0) -> StepProblem:
     """The problem elsewhere, and of stiffer springs."""
-    names = ("target", "pin_targets", "current", "first_guess")
+    names = ("inertial_target", "pin_targets", "current_positions", "initial_guess")
     energies = tuple(
         replace(e, stiffness=stiffness_factor * e.stiffness) for e in problem.system.energies if isinstance(e, Springs)
     )

@@ -126,7 +126,10 @@ def changed(problem: StepProblem, places: Map, vectors: Map) -> StepProblem:
         velocity=vectors(start.velocity),
         velocity_origin=places(start.velocity_origin),
     )
-    moved = {key: places(getattr(problem, key)) for key in ("target", "pin_targets", "current", "first_guess")}
+    moved = {
+        key: places(getattr(problem, key))
+        for key in ("inertial_target", "pin_targets", "current_positions", "initial_guess")
+    }
     return replace(problem, external_force=vectors(problem.external_force), step_start=begun, **moved)
 
 

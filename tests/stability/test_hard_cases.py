@@ -161,7 +161,10 @@ def test_the_scale_of_time_and_length_is_free(backend, time_step):
             made.system.pins,
         ),
         external_force=stated.external_force * length,
-        **{name: getattr(stated, name) * length for name in ("target", "pin_targets", "current", "first_guess")},
+        **{
+            name: getattr(stated, name) * length
+            for name in ("inertial_target", "pin_targets", "current_positions", "initial_guess")
+        },
     )
     found, other = (list(islice(backend.prepare(one.system).iterates(one), 5))[-1] for one in (stated, scaled))
     np.testing.assert_array_equal(other, found * length)

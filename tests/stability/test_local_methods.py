@@ -95,7 +95,7 @@ def test_the_scale_of_time_and_length_is_free(method, time_step):
         velocity_origin=stated.step_start.velocity_origin * length,
         velocity_rate=stated.step_start.velocity_rate / time,
     )
-    names = ("target", "force", "pin_targets", "current", "first_guess")
+    names = ("inertial_target", "external_force", "pin_targets", "current_positions", "initial_guess")
     scaled = replace(
         stated, system=system, step_start=begun, **{name: getattr(stated, name) * length for name in names}
     )
