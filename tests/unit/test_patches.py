@@ -98,12 +98,12 @@ def test_nothing_is_near_where_patches_say_so_however_fast_it_moves(made, share)
             if seed % 2
             else p + 0.4 * (moved(p - p.mean(axis=0), 200 + seed) - p)
         )
-        gaps = made.patches.clear(p, q, limits)
+        gaps = made.patches.compute_clearance_bounds(p, q, limits)
         if gaps:
             assert not made.met(p, q, limits).any()
             apart = compute_distances(made.pairs, q)
-            assert REACH <= gaps.near <= apart[near].min()
-            assert gaps.far <= apart[~near].min(initial=np.inf)
+            assert REACH <= gaps.near_clearance <= apart[near].min()
+            assert gaps.far_clearance <= apart[~near].min(initial=np.inf)
             said += 1
     assert 0 < said < 24
 
@@ -114,19 +114,19 @@ def test_what_patches_remember_of_ways_before_says_nothing_that_is_not_so(made):
     for seed in range(2):
         rng = np.random.default_rng(seed)
         p = made.rest_positions @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        made.patches.seen.clear()
+        made.patches.recent_poses.clear()
         for _ in range(8):
             size = 10.0 ** rng.uniform(-2.5, 0.0)
             q = p + size * np.sin(made.rest_positions @ rng.normal(size=3) * 2.0)[:, None] * rng.normal(size=3)
-            looked = list(made.patches.apart)
-            gaps = made.patches.clear(p, q, limits)
+            looked = list(made.patches.remote_clearances)
+            gaps = made.patches.compute_clearance_bounds(p, q, limits)
             if gaps:
                 assert not made.met(p, q, limits).any()
                 apart = compute_distances(made.pairs, q)
-                assert gaps.near <= apart[near].min()
-                assert gaps.far <= apart[~near].min(initial=np.inf)
+                assert gaps.near_clearance <= apart[near].min()
+                assert gaps.far_clearance <= apart[~near].min(initial=np.inf)
                 said += 1
-                skipped += any(one is other for one in looked for other in made.patches.apart)
+                skipped += any(one is other for one in looked for other in made.patches.remote_clearances)
                 p = q if rng.uniform() < 0.7 else p
     assert said > 0
     assert skipped > 0 or made.rest_positions[:, 1].any()  # a balloon of few patches has nothing that is far
@@ -143,11 +143,11 @@ def test_a_way_that_begins_where_one_before_began_is_looked_at_from_there(made):
     patches.remote_clearances.clear()
     patches.compute_clearance_bounds(p, q, limits)
     begin, end = patches._fit_clusters(p, limits), patches._fit_clusters(r, limits)
-    np.testing.assert_array_equal(begin.x[:, :3], p)
-    np.testing.assert_array_equal(end.x[:, :3], r)
+    np.testing.assert_array_equal(begin.positions[:, :3], p)
+    np.testing.assert_array_equal(end.positions[:, :3], r)
     found = patches.compute_clearance_bounds(p, r, limits)
     assert (found is None) == (wanted is None)
-    assert found is None or wanted is None or found.near == wanted.near
+    assert found is None or wanted is None or found.near_clearance == wanted.near_clearance
 
 
 def test_patches_that_are_not_doubted_have_nothing_near_in_them(made):
@@ -161,12 +161,12 @@ def test_patches_that_are_not_doubted_have_nothing_near_in_them(made):
         count, near = cluster_bounds.unresolved_cluster_pairs(
             *lies, patches.cluster_pairs, patches.num_rest_pairs, limits, REACH, memory.projection, memory.tile, doubted
         )
-        known = {tuple(x) for x in patches.cluster_pairs.patches[: patches.num_rest_pairs].tolist()}
+        known = {tuple(x) for x in patches.cluster_pairs.clusters[: patches.num_rest_pairs].tolist()}
         clear, apart = known - {tuple(x) for x in doubted[:count].tolist()}, compute_distances(made.pairs, q)
         told += len(clear)
         bad = made.met(p, q, limits) | (apart < near)
         for k in np.flatnonzero(bad):
-            x, cut = made.pairs.vertices[k].tolist(), 1 if k < made.pairs.points else 2
+            x, cut = made.pairs.vertices[k].tolist(), 1 if k < made.pairs.num_point_triangle else 2
             assert tuple(sorted((owner[tuple(x[:cut])], owner[tuple(x[cut:])]))) not in clear
     assert told > 0 or made.rest_positions[:, 1].any()  # a coarse balloon has no flat patch
 
@@ -201,10 +201,10 @@ def test_boxes_leave_out_no_pair_that_comes_to_its_limits(made, share):
             find_candidate_pairs(points, triangles, x, y, limits),
             find_candidate_pairs(edges, edges, x, y, limits),
         )
-        names = {(*points.corners[i], *triangles.corners[j]) for i, j in one}
-        names |= {frozenset((tuple(edges.corners[i]), tuple(edges.corners[j]))) for i, j in two}
+        names = {(*points.primitives[i], *triangles.primitives[j]) for i, j in one}
+        names |= {frozenset((tuple(edges.primitives[i]), tuple(edges.primitives[j]))) for i, j in two}
         met = made.met(p, p + way, limits)
-        wanted, many = made.pairs.vertices[met].tolist(), int(met[: made.pairs.points].sum())
+        wanted, many = made.pairs.vertices[met].tolist(), int(met[: made.pairs.num_point_triangle].sum())
         assert {tuple(x) for x in wanted[:many]} <= names
         assert {frozenset((tuple(x[:2]), tuple(x[2:]))) for x in wanted[many:]} <= names
         bound += len(wanted)
@@ -215,7 +215,7 @@ def test_a_sheet_that_swings_as_one_piece_is_clear_however_far():
     sheet = Made(GridMesh().build_mesh(9))
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     turn *= np.sign(np.linalg.det(turn))
-    p = sheet.rest @ turn
+    p = sheet.rest_positions @ turn
     angle = 0.7
     about = np.array([[1, 0, 0], [0, np.cos(angle), np.sin(angle)], [0, -np.sin(angle), np.cos(angle)]])
     limits = CollisionQuery(REACH, 0.0, MIN_GAP_FRACTION)
