@@ -51,11 +51,11 @@ class Wrong(NamedTuple):
     said: str
 
 
-NOTHING = "return Solution(problem.first_guess.copy(), 1, 0.0, 0.0, 'tolerance')"
+NOTHING = "return Solution(problem.initial_guess.copy(), 1, 0.0, 0.0, 'tolerance')"
 WRONG = {
     "does nothing and says that nothing is left": Wrong(NOTHING, "", "Mine: reports a residual of 0 J^(1/2), where"),
     "says that it reached the tolerance": Wrong(
-        "return replace(found, stopped='tolerance')", "", "says that it reached the tolerance, where"
+        "return replace(found, termination_reason='tolerance')", "", "says that it reached the tolerance, where"
     ),
     "says a residual that is too small": Wrong("return replace(found, residual=found.residual / 100)", "", "reports a"),
     "says no residual": Wrong("return replace(found, residual=float('nan'))", "", "reports a residual of nan"),
@@ -77,7 +77,7 @@ WRONG = {
         "problem.inertial_target[:] += 0.1", "problem.inertial_target", "wrote to problem.inertial_target"
     ),
     "writes to the velocity": Wrong(
-        "problem.start.velocity[0] = 3.0", "problem.start", "wrote to problem.start.velocity"
+        "problem.step_start.velocity[0] = 3.0", "problem.step_start", "wrote to problem.step_start.velocity"
     ),
     "writes to the springs": Wrong(
         "e = self.sound.system.energies[0]; e.stiffness.flags.writeable = True; e.stiffness[:] *= 2",
