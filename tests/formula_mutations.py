@@ -192,7 +192,7 @@ def scale_prediction(name: str, target: float = 1.0, origin: float = 1.0) -> Cal
             p, (aim, began) = now.positions, true(now, before, dt)
             return p + target * (aim - p), p + origin * (began - p)
 
-        mutate_integrator(name, predict=lying)(patch)
+        mutate_integrator(name, predict_target=lying)(patch)
 
     return tell
 
@@ -210,5 +210,5 @@ def mutate_half_spaces(**changes: Callable[[Any], Any]) -> Callable[[HalfSpaceCo
 
 
 def drop_term(word: str) -> Callable[[Any], Any]:
-    """`StepProblem.terms` without a term."""
+    """`StepProblem.evaluate_terms` without a term."""
     return lambda true: lambda self, p: {name: value for name, value in true(self, p).items() if name != word}

@@ -80,7 +80,7 @@ LIES: dict[str, FormulaMutation] = {
         patch_attribute(spring_stiffness, "_subtract_bend_stiffness", lambda true: lambda mesh, k: k),
     ),
     "limits that are wider": FormulaMutation(
-        [SPRINGS_SPEC, STRAIN_LIMITS_SPEC], "strain-limits", mutate_energy(StrainLimits, scale_fields(high=1.01))
+        [SPRINGS_SPEC, STRAIN_LIMITS_SPEC], "strain-limits", mutate_energy(StrainLimits, scale_fields(max_length=1.01))
     ),
     "limits half as stiff": FormulaMutation(
         [SPRINGS_SPEC, STRAIN_LIMITS_SPEC], "strain-limits", mutate_energy(StrainLimits, scale_fields(stiffness=0.5))
@@ -103,7 +103,7 @@ LIES: dict[str, FormulaMutation] = {
     "damping by stiffness at another rate": FormulaMutation(
         [SPRINGS_SPEC, RAYLEIGH_SPEC],
         "rayleigh",
-        mutate_step_start(RayleighDashpots, lambda start: replace(start, rate=1.1 * start.rate)),
+        mutate_step_start(RayleighDashpots, lambda start: replace(start, velocity_rate=1.1 * start.velocity_rate)),
     ),
     "damping by mass": FormulaMutation(
         [SPRINGS_SPEC, RAYLEIGH_SPEC], "rayleigh", mutate_energy(RayleighDamping, scale_fields(weight=1.01))
@@ -120,7 +120,7 @@ LIES: dict[str, FormulaMutation] = {
         mutate_energy(Bending, lambda one: replace(one, A=csr_array(abs(one.A)))),
     ),
     "gas of twice the volume": FormulaMutation(
-        [SPRINGS_SPEC, GAS_SPEC], "gas", mutate_energy(Gas, scale_fields(volume=2.0)), mesh=BALLOON_SPEC, size=2
+        [SPRINGS_SPEC, GAS_SPEC], "gas", mutate_energy(Gas, scale_fields(rest_volume=2.0)), mesh=BALLOON_SPEC, size=2
     ),
     "gas that pulls": FormulaMutation(
         [SPRINGS_SPEC, GAS_SPEC], "gas (gradient)", scale_method(Gas, "add_gradient", -1.0), mesh=BALLOON_SPEC, size=2
@@ -134,7 +134,7 @@ LIES: dict[str, FormulaMutation] = {
     "attachments where the points were": FormulaMutation(
         [SPRINGS_SPEC, ATTACHMENTS_SPEC],
         "attachments",
-        mutate_step_start(Attachments, lambda start: replace(start, until=start.time)),
+        mutate_step_start(Attachments, lambda start: replace(start, stage_time=start.time)),
     ),
     "drag without its rate": FormulaMutation(
         [SPRINGS_SPEC, AIR_DRAG_SPEC], "air-drag", mutate_step_energy(AirDrag, scale_fields(weight=1 / 30))
@@ -142,7 +142,7 @@ LIES: dict[str, FormulaMutation] = {
     "drag towards where the step starts, not its origin": FormulaMutation(
         [SPRINGS_SPEC, AIR_DRAG_SPEC],
         "air-drag",
-        mutate_step_start(AirDrag, lambda start: replace(start, origin=start.positions)),
+        mutate_step_start(AirDrag, lambda start: replace(start, velocity_origin=start.positions)),
         integrator="bdf2",
     ),
     "friction at .9": FormulaMutation(
@@ -151,36 +151,40 @@ LIES: dict[str, FormulaMutation] = {
     "friction of the step's start": FormulaMutation(
         [SPRINGS_SPEC, FLOOR_SPEC],
         "friction's pressure",
-        mutate_energy(HalfSpaceContact, lambda one: replace(one, friction_rounds=1)),
+        mutate_energy(HalfSpaceContact, lambda one: replace(one, friction_iterations=1)),
     ),
     "friction that sticks half as long": FormulaMutation(
-        [SPRINGS_SPEC, FLOOR_SPEC], "contact", mutate_energy(HalfSpaceContact, scale_fields(creep=0.5))
+        [SPRINGS_SPEC, FLOOR_SPEC], "contact", mutate_energy(HalfSpaceContact, scale_fields(eps_v=0.5))
     ),
     "contact half as stiff": FormulaMutation(
         [SPRINGS_SPEC, FLOOR_SPEC], "contact", mutate_energy(HalfSpaceContact, scale_fields(stiffness=0.5))
     ),
     "contact a little thicker": FormulaMutation(
-        [SPRINGS_SPEC, FLOOR_SPEC], "contact", mutate_energy(HalfSpaceContact, scale_fields(thickness=1.01))
+        [SPRINGS_SPEC, FLOOR_SPEC], "contact", mutate_energy(HalfSpaceContact, scale_fields(min_distance=1.01))
     ),
     "half-spaces a micrometre too high": FormulaMutation(
         [SPRINGS_SPEC, FLOOR_SPEC],
         "contact",
-        mutate_step_energy(HalfSpaceContact, mutate_half_spaces(offset=lambda found: found.offset + 1e-6)),
+        mutate_step_energy(HalfSpaceContact, mutate_half_spaces(offset=lambda planes: planes.offset + 1e-6)),
     ),
     "friction against a floor that moves": FormulaMutation(
         [SPRINGS_SPEC, FLOOR_SPEC],
         "contact",
-        mutate_step_energy(HalfSpaceContact, mutate_half_spaces(anchor=lambda found: found.anchor + 1e-5)),
+        mutate_step_energy(
+            HalfSpaceContact, mutate_half_spaces(friction_anchor=lambda planes: planes.friction_anchor + 1e-5)
+        ),
     ),
     "contact's normals tilted": FormulaMutation(
         [SPRINGS_SPEC, FLOOR_SPEC],
         "contact",
-        mutate_step_energy(HalfSpaceContact, mutate_half_spaces(normal=lambda found: np.roll(found.normal, 1, axis=1))),
+        mutate_step_energy(
+            HalfSpaceContact, mutate_half_spaces(normal=lambda planes: np.roll(planes.normal, 1, axis=1))
+        ),
     ),
     "contact at the step's end for midpoint": FormulaMutation(
         [SPRINGS_SPEC, FLOOR_SPEC],
         "contact",
-        mutate_step_start(HalfSpaceContact, lambda start: replace(start, until=2 * start.until - start.time)),
+        mutate_step_start(HalfSpaceContact, lambda start: replace(start, stage_time=2 * start.stage_time - start.time)),
         integrator="midpoint",
     ),
     "gravity of the moon": FormulaMutation(
@@ -202,7 +206,7 @@ LIES: dict[str, FormulaMutation] = {
         [SPRINGS_SPEC, GUSTS_SPEC], "forces", mutate_contribution("wind", scale_forces(1.0 - 1e-6))
     ),
     "forces of the step's start for BDF2": FormulaMutation(
-        [SPRINGS_SPEC, *FORCE_SPECS], "forces", mutate_integrator("bdf2", ahead=0.0), "bdf2"
+        [SPRINGS_SPEC, *FORCE_SPECS], "forces", mutate_integrator("bdf2", extrapolation_fraction=0.0), "bdf2"
     ),
     "ether drag twice": FormulaMutation(
         [SPRINGS_SPEC, *DRAG_SPECS], "inertial target", mutate_contribution("ether-drag", scale_filters(0.9))
@@ -246,7 +250,7 @@ LIES: dict[str, FormulaMutation] = {
         [SPRINGS_SPEC], "inertial target", scale_prediction("implicit-euler", target=1.0 + 1e-6)
     ),
     "BDF2 with another coefficient": FormulaMutation(
-        [SPRINGS_SPEC], "inertia", mutate_integrator("bdf2", factor=2.2), "bdf2"
+        [SPRINGS_SPEC], "inertia", mutate_integrator("bdf2", inertia_factor=2.2), "bdf2"
     ),
     "BDF2 with another target": FormulaMutation(
         [SPRINGS_SPEC], "inertial target", scale_prediction("bdf2", target=1.001), "bdf2"
@@ -255,13 +259,13 @@ LIES: dict[str, FormulaMutation] = {
         [SPRINGS_SPEC], "origin of velocities", scale_prediction("bdf2", origin=0.75), "bdf2"
     ),
     "BDF2 without its history": FormulaMutation(
-        [SPRINGS_SPEC], "inertial target", mutate_integrator("bdf2", history=False), "bdf2"
+        [SPRINGS_SPEC], "inertial target", mutate_integrator("bdf2", needs_history=False), "bdf2"
     ),
     "midpoint with another coefficient": FormulaMutation(
-        [SPRINGS_SPEC], "inertia", mutate_integrator("midpoint", factor=2.0), "midpoint"
+        [SPRINGS_SPEC], "inertia", mutate_integrator("midpoint", inertia_factor=2.0), "midpoint"
     ),
     "midpoint that ends in the middle": FormulaMutation(
-        [SPRINGS_SPEC], "positions after the step", mutate_integrator("midpoint", when=1.0), "midpoint"
+        [SPRINGS_SPEC], "positions after the step", mutate_integrator("midpoint", stage_fraction=1.0), "midpoint"
     ),
     "midpoint with another target": FormulaMutation(
         [SPRINGS_SPEC], "inertial target", scale_prediction("midpoint", target=2.0), "midpoint"
