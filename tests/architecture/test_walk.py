@@ -29,14 +29,9 @@ ROWS = (
 
 GIVEN = {
     (
-        "springbench.harness.cli.shared_options",
         "springbench.harness.config.cli_options",
-    ): "Typer asks for a command's options",
-    (
-        "springbench.harness.cli.shared_options",
         "springbench.harness.cli.main",
-    ): "and calls what stands before every command, `--version`",
-    ("springbench.harness.config.cli_options", "springbench.harness.cli.main"): "and calls the command",
+    ): "the options' wrapper calls the command",
     (
         "springbench.harness.schema.config_document",
         "springbench.harness.scenes.vertex_selectors",
@@ -157,7 +152,7 @@ def test_a_run_comes_by_its_stations_in_the_order_of_the_page(walk: list[Call]):
     assert [module for module in dict.fromkeys(call.of for call in walk) if module in STATIONS] == list(STATIONS)
     # A config is bound once to be checked, and a run once.
     assert [
-        call.by for call in walk if (call.of, call.name) == ("springbench.harness.scenes.scene_builder", "build")
+        call.by for call in walk if (call.of, call.name) == ("springbench.harness.scenes.scene_builder", "build_scene")
     ] == [
         "springbench.harness.config.config_loader",
         "springbench.harness.experiments.run_pipeline",

@@ -103,9 +103,12 @@ def test_solvers_race_on_a_scene_and_one_of_them_may_be_ones_own(tmp_path: Path)
     (tmp_path / "cloth.yaml").write_text(SCENE)
     test = """
 from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
-def test_named(paired_benchmark): paired_benchmark.compare_solvers("cloth.yaml", "sparse", {"name": "dense"}, max_ratio=1e6, iterations=20)
-def test_own(paired_benchmark): paired_benchmark.compare_solvers("cloth.yaml", SparseLocalGlobal(), "sparse", max_ratio=1e6, agreement_rtol=0.0)
-def test_other_answers(paired_benchmark): paired_benchmark.compare_solvers("cloth.yaml", "xpbd", "sparse", max_ratio=1e6)
+def test_named(paired_benchmark):
+    paired_benchmark.compare_solvers("cloth.yaml", "sparse", {"name": "dense"}, max_ratio=1e6, iterations=20)
+def test_own(paired_benchmark):
+    paired_benchmark.compare_solvers("cloth.yaml", SparseLocalGlobal(), "sparse", max_ratio=1e6, agreement_rtol=0.0)
+def test_other_answers(paired_benchmark):
+    paired_benchmark.compare_solvers("cloth.yaml", "xpbd", "sparse", max_ratio=1e6)
 """
     code, said, stored = session(tmp_path, test, "--paired-benchmark-budget=500")
     assert code == 1

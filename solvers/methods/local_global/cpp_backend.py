@@ -1,6 +1,6 @@
 """Local-global steps in C++: compiled on demand, cached in the user's cache folder, called by ctypes.
 
-A source has `prepare`, `local`, `global_` and `release`, see `solvers/methods/local_global/eigen_local_global.cpp`. If it does not
+A source has `prepare`, `local`, `global_` and `release`, see `eigen_local_global.cpp` in this folder. If it does not
 compile, its solver raises an error with the reason. Springs of length zero, for which the formula defines no direction,
 get none.
 """

@@ -1,0 +1,127 @@
+"""Names and docstrings use the terms of the field: `harness/VOCABULARY.md` lists each and where it is implemented."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+FILES = [path for package in ("harness", "solvers") for path in sorted((ROOT / package).rglob("*.py"))]
+PAGE = (ROOT / "harness" / "VOCABULARY.md").read_text(encoding="utf-8")
+GLOSSARY = re.findall(r"^\| ([\w -]+) \| ([\w/]+\.py) \| .+ \|$", PAGE, re.MULTILINE)
+
+
+def _split_words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+DIALECT = _split_words(
+    "told tell tells kept held holding asks beside anew whoever nobody somebody yardstick racer racers crew "
+    "shelf blame foresee oracle opinion grip peers goals"
+)
+"""Words that stand for terms of the field; none is part of a public name or opens a docstring."""
+
+SYMBOLS = _split_words(
+    "solve step prepare residual iterates value gradient hessian stats description title order close main run "
+    "positions velocity time elements energies factorise multiply matvec toarray dhat gamma beta state kind index "
+    "name weight vertices values targets blocks kernels"
+)
+"""Operations and quantities that papers and SciPy, optimistix and ipctk call by this one word."""
+PROPER = _split_words("Admm Xpbd Anderson Chebyshev Lbfgs Tsitouras5 Ros2 Rodas Jgs2 Multigrid Woodbury BVH Colouring")
+"""Methods and data structures with a name of their own."""
+NOUNS = _split_words(
+    "Mesh Scene System Solver Solution Energy Hessian Stage Motion Unsupported Simulation Trajectory Trial Method "
+    "Stepper Stopwatch Citation Elements Kernels Candidates Collisions Springs Dashpots Bending Gas Sewing Quadratic "
+    "Attachments Triangulation"
+)
+"""The classes that everything else is described by."""
+COMMANDS = _split_words(
+    "ablate compact merge publish figure gallery preview recommend regress record live replay roofline accuracy report "
+    "query schema inspect view targets"
+)
+"""Commands of the command line."""
+REQUIRED = _split_words(
+    "invoke emit filter finalize codegen enable disable flush load store shuffle transform save begin again search "
+    "dot3 cross3 subtract3"
+)
+"""Methods whose names a base class of a library prescribes, and operations of vector registers and of LLVM."""
+NOUN_PROPERTIES = _split_words(
+    "packages complete left drop measuring Omitted verdict scene rows columns kill info lowest winner speedup expected "
+    "motion rest"
+)
+"""Attributes of small classes, whose class name says the rest."""
+ONE_WORD = SYMBOLS | PROPER | NOUNS | COMMANDS | REQUIRED | NOUN_PROPERTIES
+
+
+class Definition(NamedTuple):
+    """A module, class or function with its docstring."""
+
+    file: str
+    name: str
+    docstring: str
+    is_module: bool = False
+
+    @property
+    def words(self) -> list[str]:
+        """Words of the name, in lower case."""
+        return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z0-9]+", self.name)]
+
+
+def find_definitions(tree: ast.Module, file: str) -> Iterator[Definition]:
+    """Yield the module, and its classes, functions and methods."""
+    yield Definition(file, Path(file).stem.strip("_"), ast.get_docstring(tree) or "", is_module=True)
+    pending: list[ast.AST] = [tree]
+    while pending:
+        for node in ast.iter_child_nodes(pending.pop()):
+            if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+                yield Definition(file, node.name, ast.get_docstring(node) or "")
+            if isinstance(node, ast.ClassDef):
+                pending.append(node)
+
+
+DEFINITIONS = [
+    definition
+    for path in FILES
+    for definition in find_definitions(ast.parse(path.read_text()), path.relative_to(ROOT).as_posix())
+]
+PUBLIC = [definition for definition in DEFINITIONS if not definition.name.startswith("_")]
+
+
+def test_no_public_name_uses_a_word_of_the_dialect() -> None:
+    assert not {f"{one.file}: {one.name}" for one in PUBLIC if DIALECT & set(one.words)}
+
+
+def test_no_docstring_begins_with_a_word_of_the_dialect() -> None:
+    first_lines = ((one, one.docstring.partition("\n")[0].lower()) for one in PUBLIC)
+    assert not {f"{one.file}: {line}" for one, line in first_lines if DIALECT & set(re.findall(r"\w+", line))}
+
+
+def test_public_names_have_two_words_or_a_reason() -> None:
+    one_word = {one.name for one in PUBLIC if not one.is_module and len(one.words) == 1}
+    assert one_word - ONE_WORD == set(), "give it a second word, or a reason in this file"
+    assert ONE_WORD - one_word == set(), "these are no longer defined"
+
+
+def test_the_glossary_has_forty_terms() -> None:
+    assert len({term for term, _ in GLOSSARY}) >= 40
+
+
+@pytest.mark.parametrize(("term", "file"), GLOSSARY, ids=[term for term, _ in GLOSSARY])
+def test_a_search_for_a_term_ends_at_the_file_that_implements_it(term: str, file: str) -> None:
+    pattern = re.compile(r"[\s_-]+".join(map(re.escape, re.split(r"[ _-]", term))), re.IGNORECASE)
+    tree = ast.parse((ROOT / file).read_text())
+    names = [node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)]
+    names += [node.id for node in ast.walk(tree) if isinstance(node, ast.Name)]
+    texts = [text for one in find_definitions(tree, file) for text in (one.name, one.docstring)]
+    assert any(map(pattern.search, [*names, *texts]))
+
+
+def test_a_word_of_the_dialect_is_found_within_a_name() -> None:
+    (_, one) = find_definitions(ast.parse("class KeptPairs: ..."), "a.py")
+    assert one.words == ["kept", "pairs"]
+    assert DIALECT & set(one.words)
