@@ -81,11 +81,11 @@ SHORT = """
 list
 list configs/quickstart.yaml
 schema
-show configs/scenes/curtain.yaml
+preview configs/scenes/curtain.yaml
 run configs/scenes/hanging-cloth.yaml --size 8
 recommend configs/scenes/chain.yaml --error 1e-2
 run configs/scenes/chain.yaml --error 1e-4 --t-end 2 --verify
-repeat configs/engines.yaml
+export-script configs/engines.yaml
 ablate configs/scenes/pulled-curtain.yaml
 report results
 query "SELECT size, solver, 1e3 * min(seconds) AS ms FROM rows WHERE phase = 'step' GROUP BY ALL ORDER BY ALL"

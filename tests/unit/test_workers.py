@@ -48,29 +48,29 @@ class Case(NamedTuple):
 
 CASES = {
     "a crash": Case(
-        does.crash_process, "failed", ("crashed by SIGSEGV at workers.py", "in crash", "after 2 steps of the crashing")
+        does.crash_process, "failed", ("crashed by SIGSEGV at worker_tasks.py", "in crash", "after 2 steps of the crashing")
     ),
     "an abort": Case(
-        does.abort_process, "failed", ("crashed by SIGABRT at workers.py", "in abort", "it said: I cannot go on")
+        does.abort_process, "failed", ("crashed by SIGABRT at worker_tasks.py", "in abort", "it said: I cannot go on")
     ),
     "an exit by the system": Case(
         does.exit_with_error, "failed", ("ended its process with exit code 7, before its first step",)
     ),
     "an exit that says that all is well": Case(does.exit_cleanly, "failed", ("exit code 0",)),
-    "an exit by Python": Case(does.raise_system_exit, "failed", ("raised SystemExit: I am off (workers.py",)),
-    "the end of a generator": Case(does.raise_generator_exit, "failed", ("raised GeneratorExit (workers.py",)),
+    "an exit by Python": Case(does.raise_system_exit, "failed", ("raised SystemExit: I am off (worker_tasks.py",)),
+    "the end of a generator": Case(does.raise_generator_exit, "failed", ("raised GeneratorExit (worker_tasks.py",)),
     "an interrupt that nobody made": Case(
-        does.raise_keyboard_interrupt, "failed", ("raised KeyboardInterrupt (workers.py",)
+        does.raise_keyboard_interrupt, "failed", ("raised KeyboardInterrupt (worker_tasks.py",)
     ),
     "a kill": Case(does.kill_process, "killed", ("SIGKILL",)),
     "a loop": Case(
         does.loop_forever,
         "time-limit",
-        ("did not end within 1 s; it was at workers.py", "in loop"),
+        ("did not end within 1 s; it was at worker_tasks.py", "in loop"),
         TaskLimits(wall_seconds=1.0),
     ),
     "too much memory": Case(
-        does.exhaust_memory, "failed", ("raised MemoryError (workers.py",), TaskLimits(memory_gib=0.5)
+        does.exhaust_memory, "failed", ("raised MemoryError (worker_tasks.py",), TaskLimits(memory_gib=0.5)
     ),
 }
 
