@@ -342,7 +342,7 @@ class PreparedSolver(Protocol):
 class Solver(Protocol):
     """The parameters of a method, as a frozen dataclass.
 
-    A method that supports exact length constraints also has `keeps_lengths = True`.
+    A method that supports exact length constraints also has `supports_length_constraints = True`.
 
     Attributes:
         is_minimiser: whether the iterates converge to a minimum of the step's objective; other methods are scored by

@@ -51,7 +51,7 @@ def test_stiff_springs_take_less_than_half_of_newtons_factorisations(ratio, monk
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """A list that grows with every factorisation of a Hessian from now on."""
     done = list[str]()
-    for name in ("factorise", "solve_anew"):
+    for name in ("factorise", "factorise_and_solve"):
         whole = getattr(BlockCholesky, name)
         counting = lambda self, *given, whole=whole, name=name: (done.append(name), whole(self, *given))[1]  # noqa: E731
         monkeypatch.setattr(BlockCholesky, name, counting)
