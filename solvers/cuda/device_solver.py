@@ -88,7 +88,7 @@ class DeviceSolverState(SolverState):
         return out
 
     @property
-    def copy_positions(self) -> Positions:  # pyright: ignore[reportIncompatibleVariableOverride] a copy, when asked for
+    def positions(self) -> Positions:  # pyright: ignore[reportIncompatibleVariableOverride] a copy, when asked for
         """A copy of the current positions (n, 3) [m], with the velocity; reused until the next iteration."""
         if self._positions_copy is None:
             with cuda_device.guard_device_errors():
@@ -118,7 +118,7 @@ class DeviceSolverState(SolverState):
 
     def residual(self) -> float:
         """Return the residual; computed on the host from a copy of the positions."""
-        return self.residual_of_positions(self.copy_positions)
+        return self.residual_of_positions(self.positions)
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Run iterations within the limits; evaluate the residual at intervals if it can end the solve."""
@@ -191,14 +191,14 @@ class DeviceSolver(IterativeSolver):
             while True:
                 run.run_unchecked(1)
                 run.stream.synchronise_stream()
-                yield lambda: run.copy_positions
+                yield lambda: run.positions
 
     def replay_iterations(self, problem: StepProblem, iterations: int) -> tuple[Solution, SolveEvents | None]:
         """Repeat iterations without residuals; return the solution, and the events or None without a clock."""
         with cuda_device.guard_device_errors():
             run = self.init_state(problem, problem.initial_guess)
             run.run_unchecked(iterations)
-            p, nan = run.copy_positions, float("nan")
+            p, nan = run.positions, float("nan")
             found = Solution(p, iterations, nan, nan, "iterations", run.velocity, self.residual_iterate)
             return found, run.solve_events()
 
@@ -207,7 +207,7 @@ class MinimisingSolver(DeviceSolver):
     """A device method that minimises the objective of a network.
 
     Attributes:
-        uploaded: the network on the device.
+        uploaded_network: the network on the device.
         metric, objective: for residuals, on the host.
         touches: whether the method supports contact and requires the start of a step.
     """
@@ -221,9 +221,9 @@ class MinimisingSolver(DeviceSolver):
         """Upload a step to the device, with an initial guess (n, 3) [m]."""
         return self.uploaded_network.upload_step(problem, initial_guess, supports_contact=self.supports_contact)
 
-    def begin(self, problem: StepProblem, guess: Positions) -> DeviceSolverState:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> DeviceSolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        run = super().init_state(problem, guess)
+        run = super().init_state(problem, initial_guess)
         run.residual_of_positions = self.residual_of_positions(problem)
         return run
 

@@ -42,7 +42,7 @@ class DeviceStep(NamedTuple):
     pin_targets: Any
     velocity_origin: Any
     lagged_positions: Any
-    copy_positions: Any
+    positions: Any
     velocity: Any
     start_and_stage_time: tuple[float, float]
     normal_force_positions: Any = None
@@ -150,7 +150,7 @@ class LoadedStep:
                 stream.upload_array(network.edge_direction),
                 stream.allocate_zeros(len(network.rest_length), np.float64),
             )
-            edges = edges._replace(axis=own[0], offset=own[1])
+            edges = edges._replace(edge_direction=own[0], dashpot_offset=own[1])
         self.device_edges = edges
         self.step_data = DeviceStepData(
             uploaded.anchor_stiffness, stream.allocate_zeros(rows, np.float64), stream.allocate_zeros(rows, np.float64)
@@ -230,9 +230,9 @@ def write_lagged_positions(first_dashpot, row_vertices, velocity_origin, lagged_
         n0, n1, n2 = default_directions[e, 0], default_directions[e, 1], default_directions[e, 2]
         if length > ZERO_LENGTH:
             n0, n1, n2 = v0 / length, v1 / length, v2 / length
-        edges.axis[e, 0], edges.axis[e, 1], edges.axis[e, 2] = n0, n1, n2
+        edges.edge_direction[e, 0], edges.edge_direction[e, 1], edges.edge_direction[e, 2] = n0, n1, n2
         moved = n0 * (velocity_origin[i, 0] - velocity_origin[j, 0]) + n1 * (
             velocity_origin[i, 1] - velocity_origin[j, 1]
         )
-        edges.offset[e] = moved + n2 * (velocity_origin[i, 2] - velocity_origin[j, 2])
+        edges.dashpot_offset[e] = moved + n2 * (velocity_origin[i, 2] - velocity_origin[j, 2])
         e += cuda.gridsize(1)

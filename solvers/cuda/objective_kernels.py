@@ -26,7 +26,7 @@ def edge_direction_and_tension(edges, e, v0, v1, v2):
     The direction points away from the entry's own end; v is the vector from the other end.
     """
     length = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-    k, rest = edges.stiffness[e], edges.entry_rest_length[e]
+    k, rest = edges.entry_stiffness[e], edges.entry_rest_length[e]
     if rest == rest and length > ZERO_LENGTH:
         return v0 / length, v1 / length, v2 / length, k * (length - rest), length
     named, sign = edges.edge_indices[e], 1.0
@@ -39,7 +39,7 @@ def edge_direction_and_tension(edges, e, v0, v1, v2):
     )
     if rest == rest:
         return n0, n1, n2, -k * rest, 0.0
-    return n0, n1, n2, k * (n0 * v0 + n1 * v1 + n2 * v2 - edges.offset[named]), length
+    return n0, n1, n2, k * (n0 * v0 + n1 * v1 + n2 * v2 - edges.dashpot_offset[named]), length
 
 
 @cuda.jit
@@ -51,9 +51,9 @@ def gradient_bytes(edges, step_data, p, out):
         g0 = h * (x - step_data.anchor_positions[i, 0]) - step_data.external_force[i, 0]
         g1 = h * (y - step_data.anchor_positions[i, 1]) - step_data.external_force[i, 1]
         g2 = h * (z - step_data.anchor_positions[i, 2]) - step_data.external_force[i, 2]
-        e, end = edges.first[i >> 5] + (i & 31), edges.first[(i >> 5) + 1]
+        e, end = edges.warp_starts[i >> 5] + (i & 31), edges.warp_starts[(i >> 5) + 1]
         while e < end:
-            j = edges.other[e]
+            j = edges.neighbour_rows[e]
             if j == i:
                 break
             n0, n1, n2, tension, _ = edge_direction_and_tension(edges, e, x - p[j, 0], y - p[j, 1], z - p[j, 2])
@@ -94,7 +94,7 @@ def sum_objective_change(edges, step_data, p, q, sum_slot, partials):
             if both > ZERO_LENGTH:
                 total += k * (change / both) * (0.5 * both - rest)
         else:
-            closing, closer = -edges.offset[e], 0.0
+            closing, closer = -edges.dashpot_offset[e], 0.0
             for c in range(3):
                 closing += edges.edge_direction[e, c] * (p[i, c] - p[j, c])
                 closer += edges.edge_direction[e, c] * ((q[i, c] - p[i, c]) - (q[j, c] - p[j, c]))
@@ -128,7 +128,7 @@ def build_hessian_kernels(real: type[np.float32] | type[np.float64]) -> HessianK
                 n0, n1, n2, tension, length = edge_direction_and_tension(
                     edges, e, x - p[j, 0], y - p[j, 1], z - p[j, 2]
                 )
-                k, rest = edges.stiffness[e], edges.entry_rest_length[e]
+                k, rest = edges.entry_stiffness[e], edges.entry_rest_length[e]
                 lateral = 0.0
                 if rest == 0.0:
                     lateral = k

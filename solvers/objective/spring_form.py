@@ -113,7 +113,7 @@ class SpringForm:
         axis, offset = edges.edge_axis.copy(), edges.offset.copy()
         axis[first:] = np.concatenate([e.direction for e in steps])
         offset[first:] = np.concatenate([e.offset for e in steps])
-        return edges._replace(axis=axis, offset=offset)
+        return edges._replace(edge_axis=axis, offset=offset)
 
     def edge_energy_scale(self, p: Positions) -> float:
         """Return the sum of k |v|^2 [J] over strain limits and dashpots at p (n, 3), the scale of cancellation."""

@@ -18,7 +18,7 @@ from tests.scene_builders import build_test_scene
 
 
 def ratios(made, p) -> np.ndarray:
-    return made.all_springs.compute_lengths(p) / made.all_springs.rest_length
+    return made.all_springs.edge_lengths(p) / made.all_springs.rest_length
 
 
 def test_no_spring_is_beyond_the_limit_when_converged():

@@ -113,7 +113,7 @@ class PreparedNewtonCG(MinimisingSolver):
     `forcing` and `most` are the arguments of the preparation, `columns` the device columns of rows.
     """
 
-    uploaded: UploadedNetwork
+    uploaded_network: UploadedNetwork
     metric: ResidualMetric
     objective: FixedObjective
     levels: list[SchwarzLevel]
@@ -151,7 +151,7 @@ class _NewtonCGState(DeviceSolverState):
     """
 
     def __init__(self, made: PreparedNewtonCG) -> None:
-        of, network = made.uploaded, made.uploaded.host_network
+        of, network = made.uploaded_network, made.uploaded_network.host_network
         super().__init__(of.stream, network.row_vertices)
         self._made, stream, real, rows = made, self.stream, made.real_dtype, network.num_free
         self._begun = LoadedStep(of)
@@ -224,7 +224,7 @@ class _NewtonCGState(DeviceSolverState):
 
     def _search(self, direction: Any) -> bool:
         """Line search by step halving along a direction (f, 3); return success."""
-        t, network = 1.0, self._made.uploaded.host_network
+        t, network = 1.0, self._made.uploaded_network.host_network
         for _ in range(MAX_HALVINGS):
             write_trial[self._over_all](self._p, direction, t, self._q, self._g, 0, self._partials)
             objective_kernels.sum_objective_change[self._over_all](

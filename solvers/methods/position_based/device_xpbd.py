@@ -276,7 +276,7 @@ class DeviceXpbdSmallStepsState(_DeviceXpbdState):
 
     def position_rows(self) -> Any:
         """Return the current positions in rows (n, 3) [m], on the device."""
-        return super().position_rows() if self._num_substeps else self._step.copy_positions
+        return super().position_rows() if self._num_substeps else self._step.positions
 
     def velocity_rows(self) -> Any:
         """Return the final velocity in rows (n, 3) [m/s], on the device."""
@@ -289,7 +289,7 @@ class DeviceXpbdSmallStepsState(_DeviceXpbdState):
         if not self._num_substeps:
             return num_iterations
         h = self.prepared.system.time_step / self._num_substeps
-        self.stream.copy_array(step.copy_positions, self.reference)
+        self.stream.copy_array(step.positions, self.reference)
         self.stream.copy_array(step.velocity, self._v)
         self.launch_kernel(
             self.xpbd_kernels.write_compliance,
@@ -303,7 +303,7 @@ class DeviceXpbdSmallStepsState(_DeviceXpbdState):
         for left in range(self._num_substeps - 1, -1, -1):
             part = left / self._num_substeps
             self.launch_kernel(
-                predict_step, n, h, part, places, step.copy_positions, step.pin_targets,
+                predict_step, n, h, part, places, step.positions, step.pin_targets,
                 self._float64_compliance, step.external_force, self._v, self._substep_start,
                 self.reference, self.displacement,
             )  # fmt: skip

@@ -99,10 +99,10 @@ class DeviceHalfSpaces:
         self._stream.overwrite_array(np.zeros(1), self._max_squared_speed)
         measure_max_speed[self.launch_shape](step.velocity, self._max_squared_speed)
         build_half_spaces[self.launch_shape](
-            self._vertex, step.copy_positions, step.velocity, self._dt, (end - begin) / self._dt,
+            self._vertex, step.positions, step.velocity, self._dt, (end - begin) / self._dt,
             self._max_squared_speed, self._frames,
             self._obstacle_bodies, self._found, step.normal_force_positions is not None,
-            step.copy_positions if step.normal_force_positions is None else step.normal_force_positions,
+            step.positions if step.normal_force_positions is None else step.normal_force_positions,
             self.half_spaces,
         )  # fmt: skip
 
@@ -198,7 +198,7 @@ def kernels(real: Any) -> Kernels:
         documents the other arguments.
         """
         t = begin + cuda.grid(1)
-        if t >= end or own[t] == nobody or not spaces.near[own[t]]:
+        if t >= end or own[t] == nobody or not spaces.has_half_space[own[t]]:
             return
         i, b = own[t], t // device_vbd_kernels.LANES
         first, last = start[b], start[b + 1]
@@ -228,8 +228,8 @@ def kernels(real: Any) -> Kernels:
         if asked == EXTRAPOLATION and not control[EXTRAPOLATION] > 1.0:
             return
         total, i = 0.0, cuda.grid(1)
-        while i < spaces.near.shape[0]:
-            if spaces.near[i]:
+        while i < spaces.has_half_space.shape[0]:
+            if spaces.has_half_space[i]:
                 d = float64(u[i, 0]), float64(u[i, 1]), float64(u[i, 2])
                 total = _deeper(spaces, i, (x[i, 0], x[i, 1], x[i, 2]), d, total)
             i += cuda.gridsize(1)
