@@ -42,7 +42,7 @@ import os, sys
 from pathlib import Path
 from tests.synthetic_recordings import write_recording
 for _ in range(4):
-    write_recording(Path(sys.argv[1]), count=2)
+    write_recording(Path(sys.argv[1]), frame_count=2)
     print(len(os.listdir("/proc/self/task")))
 """
 

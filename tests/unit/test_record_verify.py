@@ -141,7 +141,7 @@ FAR = np.array([32_000_000.0, -5e6, 1e6])
 
 
 def far_info() -> RecordingInfo:
-    mesh = replace(MESHES_BY_KIND["cloth"], rest=MESHES_BY_KIND["cloth"].rest_positions + FAR)
+    mesh = replace(MESHES_BY_KIND["cloth"], rest_positions=MESHES_BY_KIND["cloth"].rest_positions + FAR)
     return replace(build_recording_info(), mesh=mesh)
 
 

@@ -22,7 +22,7 @@ from tests.worker_tasks import count_threads_after_recording
 if __name__ == "__main__":
     folder, before = Path(sys.argv[1]), sys.argv[2] == "True"
     if before:
-        write_recording(folder / "parent.rrd", count=2)
+        write_recording(folder / "parent.rrd", frame_count=2)
     worker = IsolatedWorker()
     for k in range(4):
         print(worker.run_task(partial(count_threads_after_recording, folder / f"{k}.rrd"), print, TaskLimits()))
