@@ -191,7 +191,9 @@ def join_problems(problem: StepProblem, other: StepProblem) -> StepProblem:
     )
     names = ("inertial_target", "external_force", "pin_targets", "current_positions", "initial_guess")
     arrays = {name: np.concatenate([getattr(problem, name), getattr(other, name)]) for name in names}
-    return StepProblem(system, **arrays, step_start=build_step_start(system, arrays["current_positions"], arrays["current_positions"]))
+    return StepProblem(
+        system, **arrays, step_start=build_step_start(system, arrays["current_positions"], arrays["current_positions"])
+    )
 
 
 def shift_problem(problem: StepProblem, offset: float, stiffness_factor: float = 1.0) -> StepProblem:

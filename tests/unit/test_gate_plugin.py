@@ -73,7 +73,10 @@ def test_inconclusive(paired_benchmark): paired_benchmark(spin(100_000), spin(10
 
 
 def test_a_session_without_failures_that_cannot_tell_has_an_exit_code_of_its_own(tmp_path: Path):
-    test = "def test_it(paired_benchmark): paired_benchmark(spin(100_000), spin(100_000), max_ratio=1, budget=1e-3)\ndef test_other(): pass"
+    test = (
+        "def test_it(paired_benchmark): paired_benchmark(spin(100_000), spin(100_000), "
+        "max_ratio=1, budget=1e-3)\ndef test_other(): pass"
+    )
     code, said, _ = session(tmp_path, test)
     assert code == 13, said
     assert "1 passed, 1 inconclusive" in said

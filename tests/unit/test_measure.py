@@ -163,7 +163,8 @@ def test_no_row_is_made_of_times_that_are_scaled(seen, phase: str):
         for name, round in measured.watches
     }
     busy = {
-        key: PhaseWatch(1, walls[key], watch.num_entries, walls[key], walls[key]) for key, watch in measured.watches.items()
+        key: PhaseWatch(1, walls[key], watch.num_entries, walls[key], walls[key])
+        for key, watch in measured.watches.items()
     }
     with pytest.raises(RunFailed, match=f"the times of {phase} add up to"):
         timing_rows.build_timing_rows(RunMeasurement(measured.prepared, scaled, busy, measured.final_positions))

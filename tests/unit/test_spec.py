@@ -235,7 +235,16 @@ def test_the_committed_schema_is_the_models() -> None:
 
 def test_the_schema_describes_every_key_of_a_scene_and_a_sweep() -> None:
     definitions = build_json_schema()["$defs"]
-    for name in ("Scene", "Sweep", "SweepOptions", "IncludeEntry", "ExcludeEntry", "Accuracy", "CurveStudyConfig", "WorkStudyConfig"):
+    for name in (
+        "Scene",
+        "Sweep",
+        "SweepOptions",
+        "IncludeEntry",
+        "ExcludeEntry",
+        "Accuracy",
+        "CurveStudyConfig",
+        "WorkStudyConfig",
+    ):
         assert all(key.get("description") for key in definitions[name]["properties"].values()), name
 
 

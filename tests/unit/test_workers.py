@@ -48,7 +48,9 @@ class Case(NamedTuple):
 
 CASES = {
     "a crash": Case(
-        does.crash_process, "failed", ("crashed by SIGSEGV at worker_tasks.py", "in crash", "after 2 steps of the crashing")
+        does.crash_process,
+        "failed",
+        ("crashed by SIGSEGV at worker_tasks.py", "in crash", "after 2 steps of the crashing"),
     ),
     "an abort": Case(
         does.abort_process, "failed", ("crashed by SIGABRT at worker_tasks.py", "in abort", "it said: I cannot go on")
