@@ -61,7 +61,7 @@ class ObstaclePairs(ContactPairs):
         """Return the positions (o, 3) [m] of the obstacle's points at a time [s]."""
         points = self._declared
         if self._frames:
-            x = np.asarray(self._frames.stored, float)
+            x = np.asarray(self._frames.frame_positions, float)
             since = min(max((time - self._frames.begin) * self._frames.rate, 0.0), len(x) - 1.0)
             low, high = int(np.floor(since)), int(np.ceil(since))
             between = (1.0 - (since - low)) * x[low] + (since - low) * x[high]

@@ -27,7 +27,7 @@ from springbench.harness.scenes.effects.gravity_effect import GravityEffect
 from springbench.harness.scenes.effects.springs_effect import SpringsEffect
 from springbench.harness.scenes.scene_spec import IntegratorName, SceneSpec
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
-from springbench.solvers.methods.newton.newton_direct import is_positive_definite
+from springbench.solvers.methods.newton.negative_curvature import is_positive_definite
 from springbench.solvers.model.step_problem import Positions, StepProblem, StopRule
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
