@@ -66,6 +66,10 @@ _QUEUED_TASKS_PER_THREAD = 4
 """Tasks queued at the scheduler per worker thread; more would use its memory without benefit."""
 
 
+_VERSION_TITLES = {"source_fingerprint": "source code", "python_version": "Python", "dask_version": "distributed"}
+"""Fields of WorkerInfo that must agree with this process, with their titles in messages."""
+
+
 class WorkerInfo(NamedTuple):
     """Machine, versions and clock of a worker."""
 
@@ -185,10 +189,10 @@ def check_workers(client: Client, runs: Sequence[RunSpec], print_message: Callab
             problems.append(f"the worker {worker} cannot do runs: {type(said).__name__}: {said}")
             continue
         about, missing = said
-        for what in ("code", "python", "distributed"):
-            theirs, ours = getattr(about, what), getattr(here, what)
+        for field, title in _VERSION_TITLES.items():
+            theirs, ours = getattr(about, field), getattr(here, field)
             if theirs != ours:
-                problems.append(f"the worker {worker} has another version: {what} {theirs}, here {ours}")
+                problems.append(f"the worker {worker} has another version: {title} {theirs}, here {ours}")
         problems += [f"the worker {worker} has no {name}: {why}" for name, why in missing.items()]
         off = about.clock_seconds - min(max(about.clock_seconds, before), time())
         if abs(off) > MAX_CLOCK_OFFSET:

@@ -32,7 +32,7 @@ class Own(NamedTuple):
 
     plugins: tuple[PluginName, ...]
 
-    def own(self) -> list[PluginName]:
+    def find_plugins(self) -> list[PluginName]:
         return list(self.plugins)
 
 
@@ -46,12 +46,15 @@ def test_workers_like_this_one_can_do_runs():
     assert machines(Workers(None, None)) == [WorkerInfo.from_this_process().machine_id]
 
 
-@pytest.mark.parametrize("what", ["code", "python", "distributed"])
-def test_a_worker_of_another_version_is_refused_with_both(what: str):
-    other = WorkerInfo.from_this_process()._replace(**{what: "0.0.1"})
+@pytest.mark.parametrize(
+    ("field", "title"),
+    [("source_fingerprint", "source code"), ("python_version", "Python"), ("dask_version", "distributed")],
+)
+def test_a_worker_of_another_version_is_refused_with_both(field: str, title: str):
+    other = WorkerInfo.from_this_process()._replace(**{field: "0.0.1"})
     with pytest.raises(InputError) as refused:
         machines(Workers(None, (other, {})))
-    for part in ("tcp://worker-1:1", f"{what} 0.0.1", str(getattr(WorkerInfo.from_this_process(), what))):
+    for part in ("tcp://worker-1:1", f"{title} 0.0.1", str(getattr(WorkerInfo.from_this_process(), field))):
         assert part in str(refused.value)
     assert "worker-0" not in str(refused.value)
 
@@ -92,7 +95,7 @@ def test_clocks_that_differ_are_said(off: float, words: str):
         ("tcp://127.0.0.1:1", "no scheduler answers"),
         ("nowhere", "no scheduler answers"),
         ("local:none", "wanted local:N"),
-        ("absent.yaml", "wanted a mapping"),
+        ("absent.yaml", "expected a mapping"),
     ],
 )
 def test_where_there_is_no_cluster_that_is_said(on: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
@@ -107,7 +110,7 @@ def test_where_there_is_no_cluster_that_is_said(on: str, said: str, monkeypatch:
     [
         ("{kind: HAND, jobs: 2}", "this machine has no submit-by-hand"),
         ("{kind: OTHER, jobs: 2}", "dask-jobqueue has no OTHERCluster"),
-        ("{kind: HAND}", "wanted a mapping"),
+        ("{kind: HAND}", "expected a mapping"),
     ],
 )
 def test_a_batch_system_that_is_not_there_is_said(
