@@ -88,7 +88,11 @@ def test_what_does_not_change_comes_back(mesh: str, tmp_path: Path):
 
 
 def test_a_mesh_without_springs_or_pins_is_recorded(tmp_path: Path):
-    none = {"springs": np.empty((0, 2), np.int64), "rest_lengths": np.empty(0), "pinned": np.empty(0, np.int64)}
+    none = {
+        "springs": np.empty((0, 2), np.int64),
+        "rest_lengths": np.empty(0),
+        "pinned_vertices": np.empty(0, np.int64),
+    }
     replay = read_replay(write_recording(tmp_path / "a.rrd", build_recording_info(**none)))
     assert (replay.springs.shape, replay.rest_lengths.shape, replay.pinned_vertices.shape) == ((0, 2), (0,), (0,))
     assert len(replay.frames) == 12
