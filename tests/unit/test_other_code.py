@@ -95,16 +95,27 @@ def test_a_run_depends_on_its_own_solver_and_effects_and_on_no_others(tmp_path: 
     reached |= source_digest.find_dependencies(run_module.__file__)
     names = {"/".join(Path(path).parts[-2:]) for path in reached}
     assert str(made.solver_path) in reached
-    assert {"methods/local_global.py", "effects/springs.py", "effects/gravity.py", "mesh/grid.py"} <= names
+    assert {
+        "local_global/reference_local_global.py",
+        "effects/springs_effect.py",
+        "effects/gravity_effect.py",
+        "mesh/grid_mesh.py",
+    } <= names
     others = {
         str(file)
         for name in ("xpbd", "vbd", "newton")
         for file in source_digest.find_class_sources(load_target(SOLVERS[name]))
     }
     assert reached & others <= {device_interface.__file__}  # which all ask whether a solver is on one
-    assert not names & {"effects/wind.py", "effects/gas.py", "mesh/chain.py", "harness/cli/main.py", "asked/search.py"}
+    assert not names & {
+        "effects/wind_effect.py",
+        "effects/gas_effect.py",
+        "mesh/chain_mesh.py",
+        "cli/main.py",
+        "error_control/method_search.py",
+    }
     to_error = collect_source_parts(run.model_copy(update={"accuracy": 0.1}))
-    assert {"kept.py"} == {
+    assert {"error_controlled_run.py"} == {
         file.name for part in to_error - collect_source_parts(run) for file in list_source_files(part)
     }
 

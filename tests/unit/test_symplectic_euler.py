@@ -205,7 +205,7 @@ def test_substeps_follow_from_the_stiffness(stretch):
     ("change", "told"),
     [
         pytest.param(lambda s: replace(s, energies=(*s.energies, Other())), "Other", id="another energy"),
-        pytest.param(lambda s: replace(s, factor=4.0), "implicit-euler", id="another integrator"),
+        pytest.param(lambda s: replace(s, inertia_factor=4.0), "implicit-euler", id="another integrator"),
         pytest.param(without_mass, r"1 of 12 have none and are not pinned \(3\)", id="no mass"),
         pytest.param(lambda s: replace(s, time_step=1e9), r"stable with 6.*e\+10 substeps", id="too many substeps"),
     ],

@@ -41,7 +41,7 @@ def iterates(method, problem: StepProblem, count: int) -> list[np.ndarray]:
 @problems
 @pytest.mark.parametrize("factor", [1.0, 2.25], ids="c = {:g}".format)
 def test_it_ends_at_the_minimiser_of_local_global(method, problem, factor):
-    problem = replace(problem, system=replace(problem.system, factor=factor))
+    problem = replace(problem, system=replace(problem.system, inertia_factor=factor))
     # Near the minimiser, where the objective is convex: from far away they may choose other valleys.
     wanted = CompiledLocalGlobal().prepare(problem.system).solve(problem, StopRule(30_000, 1e-13)).positions
     near = replace(problem, initial_guess=wanted + 1e-3 * np.random.default_rng(0).normal(size=wanted.shape))
