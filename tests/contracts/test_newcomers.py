@@ -100,7 +100,7 @@ def configs(tmp_path: Path) -> Path:
 def constants(folder: str) -> set[str]:
     """All strings in the code of a folder, documentation apart where it says more than a name.
 
-    Type checkers need the shipped names as literals: `typed_keys.py` has them, and a test compares them with the tables.
+    Type checkers need the names as literals: `typed_keys.py` has them, and a test compares them to the tables.
     """
     trees = (ast.parse(path.read_text()) for path in (ROOT / folder).rglob("*.py") if path.name != "typed_keys.py")
     return {
