@@ -30,7 +30,12 @@ def test_the_scene_of_the_readme_is_a_scene(tmp_path: Path):
     (tmp_path / "scene.yaml").write_text(example("configs/README.md", "Writing a scene", "yaml"))
     (run,) = load_config(tmp_path / "scene.yaml").list_runs()
     assert (run.size, run.frames, run.solver.name) == (48, 90, "hybrid")
-    assert [type(effect).__name__ for effect in run.scene.effects] == ["SpringsEffect", "GravityEffect", "WindEffect", "PinsEffect"]
+    assert [type(effect).__name__ for effect in run.scene.effects] == [
+        "SpringsEffect",
+        "GravityEffect",
+        "WindEffect",
+        "PinsEffect",
+    ]
 
 
 def test_the_effect_of_the_readme_is_an_effect():
