@@ -112,7 +112,7 @@ def test_vertices_that_no_face_uses_stay_without_mass(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "key", "words"),
     [
-        ({"obj": None}, "obj", "is missing: The OBJ file"),
+        ({"obj": None}, "obj", "is missing: Path of the OBJ file"),
         ({"k": None}, "k", "is missing: Stiffness"),
         ({"b": None}, "b", "is missing: Pinned"),
         ({"bc": [[0, 0, 0]]}, "bc", "unknown key; wanted one of b, k, m, obj, png"),

@@ -91,7 +91,7 @@ def test_clocks_that_differ_are_said(off: float, words: str):
         ("tcp://127.0.0.1:1", "no scheduler answers"),
         ("nowhere", "no scheduler answers"),
         ("local:none", "wanted local:N"),
-        ("absent.yaml", "wanted a mapping"),
+        ("absent.yaml", "expected a mapping"),
     ],
 )
 def test_where_there_is_no_cluster_that_is_said(on: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
@@ -106,7 +106,7 @@ def test_where_there_is_no_cluster_that_is_said(on: str, said: str, monkeypatch:
     [
         ("{kind: HAND, jobs: 2}", "this machine has no submit-by-hand"),
         ("{kind: OTHER, jobs: 2}", "dask-jobqueue has no OTHERCluster"),
-        ("{kind: HAND}", "wanted a mapping"),
+        ("{kind: HAND}", "expected a mapping"),
     ],
 )
 def test_a_batch_system_that_is_not_there_is_said(
