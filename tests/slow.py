@@ -34,19 +34,30 @@ KINDS = (
 """Parts of their names."""
 
 
+LONG = (
+    *("test_nobody_without_the_certificate", "test_each_run_is_done_by_one_of_two_commands"),
+    *("goes_on_where_it_was[without pictures]", "says_whose_it_is[entry-point]"),
+    *("[100000 brackets]", "[10001 keys]", "is_said_to_be[topology-degree-1000]", "never_passes_it[0.0-pncg]"),
+    "serves_all_steps_of_a_system[cloth large enough for threads",
+)
+"""Parts of names of tests that take 10 to 40 s; `pytest -m long` runs them."""
+
+
 def named() -> frozenset[str]:
     """The lines."""
     return frozenset(LIST.read_text(encoding="utf-8").split("\n")) - {""}
 
 
 def mark(items: list[pytest.Item]) -> None:
-    """Mark the items that are named; those that are long already are in neither run."""
+    """Mark the items that are named: `long` those of LONG, `slow` the others, unless they are long already."""
     slow = named()
     for item in items:
         if item.get_closest_marker("long"):
             continue
         name = item.nodeid
-        if name in slow or name.partition("::")[0] in slow or any(kind in name for kind in KINDS):
+        if any(part in name for part in LONG):
+            item.add_marker(pytest.mark.long)
+        elif name in slow or name.partition("::")[0] in slow or any(kind in name for kind in KINDS):
             item.add_marker(pytest.mark.slow)
 
 
