@@ -99,7 +99,7 @@ class Simulation:
     time: simulated time [s].
     positions: (n, 3) [m].
     velocity: (n, 3) [m/s].
-    last_step: last step, with its problem and its solution; None at the start.
+    last: last step, with its problem and its solution; None at the start.
     """
 
     def __init__(
@@ -121,9 +121,9 @@ class Simulation:
             solver: a solver's name as in a sweep, or a solver object.
             size: mesh size; the scene's default if omitted.
             integrator: name of the time integrator.
-            max_iterations: iteration limit of a step.
-            rtol: relative tolerance of a step; None performs all iterations.
-            initial_guess: initial guess of a step; the scene's default if omitted.
+            iterations: iteration limit of a step.
+            tolerance: relative tolerance of a step; None performs all iterations.
+            first_guess: initial guess of a step; the scene's default if omitted.
             parameters: parameters of a solver that is given by name.
         Raises: InputError, and the errors of the solver's preparation.
         """
@@ -189,8 +189,8 @@ def run(
         name: name of a sweep that is a mapping.
         folder: folder of the scenes and the code that a mapping names.
         results: folder that contains a results folder for each sweep.
-        rerun: whether to repeat runs that have results.
-    Returns: the rows, in the type that `load_rows` returns.
+        again: whether to repeat runs that have results.
+    Returns: the rows, in the type that `rows` returns.
     Raises:
         InputError: for any mistake in the config.
     """
@@ -284,7 +284,7 @@ def draw(what: str | Path | Replay | Mapping[str, str | Path | Replay]) -> Pictu
     """Draw the picture of a run from its recording, or a comparison of several recordings.
 
     Args:
-        source: a recording or its path, or a mapping of names to these.
+        what: a recording or its path, or a mapping of names to these.
     Raises:
         InputError: if a recording cannot be read.
         RunFailed: if the system cannot draw.

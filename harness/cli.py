@@ -121,7 +121,7 @@ def run(
 
 
 def _load_what_tells() -> None:
-    """Import the modules of `_report_sweep`, which takes as long as drawing a picture."""
+    """Import the modules of `_told`, which takes as long as drawing a picture."""
     from harness.base.machine_lock import beside
 
     with beside(lambda said: None):

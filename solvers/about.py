@@ -33,15 +33,15 @@ class About:
     """The metadata of a method for tables and figures.
 
     Attributes:
-        family: methods of one family share a colour; those of LOCAL_GLOBAL_FAMILY perform the same iterations.
-        citation: the publication of the method.
-        is_substepping: whether the method integrates a frame in its own substeps, independent of the run's integrator.
-        is_family_default: whether the method is the default of its family.
-        supports_error_control: whether runs with an error target try the method. A substepping method then chooses its
-            steps by their error (`with_tolerance`); other methods minimise the objective of an integrator with an error
+        family: methods of one family share a colour; those of LOCAL_GLOBAL perform the same iterations.
+        reference: the publication of the method.
+        own_steps: whether the method integrates a frame in its own substeps, independent of the run's integrator.
+        first: whether the method is the default of its family.
+        to_error: whether runs with an error target try the method. A substepping method then chooses its
+            steps by their error (`within`); other methods minimise the objective of an integrator with an error
             estimate.
-        has_fixed_step: whether the substeps have a fixed size, which can be reduced (`with_refinement`).
-        package_name: the distribution that the method is an interface to, whose version is part of its rows.
+        even: whether the substeps have a fixed size, which can be reduced (`refined`).
+        package: the distribution that the method is an interface to, whose version is part of its rows.
     """
 
     family: str

@@ -3,7 +3,7 @@
 Numba's own cache considers the kernel's file only. It ignores kernels in other files that the kernel calls, constants
 from there, and the compile options. Two processes that compile for one index may also leave the code of one under the
 signature of the other. So a kernel is cached here by the digest of all sources that its module imports
-(`solvers.jit.source_digest`). The key also has the options, the signature, the processor and the versions; each
+(`solvers.sources`). The key also has the options, the signature, the processor and the versions; each
 signature has its own file. A cache entry is therefore what a compilation would produce, whichever module imports the
 kernel and in whatever order.
 

@@ -2,7 +2,7 @@
 
 Kernels neither create nor store arrays, so there is nothing to count. Counting took half of a step of a hundred
 vertices. Kernels release the GIL. Inner functions are called by kernels only: they need no Python wrapper and no
-machine code of their own (`solvers.jit.inline_linking`).
+machine code of their own (`solvers.linking`).
 """
 
 from __future__ import annotations

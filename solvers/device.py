@@ -1,6 +1,6 @@
 """Options and interfaces for methods that run on the processor or on a device.
 
-A method that supports both inherits `DeviceOptions` or `PrecisionOptions`, and delegates its `prepare` to its file in
+A method that supports both inherits `OnDevice` or `Precise`, and delegates its `prepare` to its file in
 `solvers.cuda`, which is imported only if a device is requested.
 """
 
@@ -25,7 +25,7 @@ class OnDevice:
 
     Attributes:
         device: processor or device.
-        omitted_defaults: parameters that rows and hashes omit at their default, so that they equal those from before
+        unstated: parameters that rows and hashes omit at their default, so that they equal those from before
             the parameter existed.
     """
 

@@ -18,7 +18,7 @@ from solvers.problem import Positions
 
 @dataclass(frozen=True, slots=True)
 class Decay:
-    """Exponential decay of the velocity by `decay_factor` per step."""
+    """Exponential decay of the velocity by `kept` per step."""
 
     kept: float
 
@@ -29,7 +29,7 @@ class Decay:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QuadraticDrag:
-    """Quadratic drag. mass: m (n,) [kg]; drag_coefficient: c dt (n,) [kg s/m]."""
+    """Quadratic drag. mass: m (n,) [kg]; coefficient: c dt (n,) [kg s/m]."""
 
     mass: NDArray[np.float64]
     coefficient: NDArray[np.float64]

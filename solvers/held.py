@@ -27,7 +27,7 @@ class Lengths:
 
     Attributes:
         edges: (m, 2).
-        min_length, max_length: bounds of the lengths (m,) [m], 0 <= low <= high, 0 < high; equal for an inextensible
+        low, high: bounds of the lengths (m,) [m], 0 <= low <= high, 0 < high; equal for an inextensible
             spring.
         rest_direction: (m, 3), unit directions of edges of zero length.
     """

@@ -14,7 +14,7 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult, compile_result
 
 LINKED = "linked"
-"""Mark that distinguishes the reduced form of `LinkedLibrary` from that of Numba's libraries."""
+"""Mark that distinguishes the reduced form of `Linked` from that of Numba's libraries."""
 
 _LIBRARY: Any = JITCodeLibrary
 _COMPILER: Any = Compiler
@@ -55,7 +55,7 @@ class LinkedCompiler(_COMPILER):
     """Numba's compiler for kernels that are only linked."""
 
     def compile_extra(self, function: Any) -> Any:
-        """Compile a function into a `LinkedLibrary`."""
+        """Compile a function into a `Linked`."""
         self.state.library = Linked(self.state.targetctx.codegen(), function.__qualname__)
         return super().compile_extra(function)
 

@@ -106,7 +106,7 @@ def system_matrix_sparse(
 def assemble(system: System, energies: Iterable[ProjectiveEnergy]) -> scipy.sparse.csr_array:
     """Return Q of a system, shape (n, n): stiffness of the energies, inertia and penalty pins.
 
-    Exact pins do not contribute to Q; the caller selects the rows of `system.free_vertices`.
+    Exact pins do not contribute to Q; the caller selects the rows of `system.free`.
 
     Args:
         system: the system.
@@ -126,7 +126,7 @@ def assemble(system: System, energies: Iterable[ProjectiveEnergy]) -> scipy.spar
 def shares(system: System, energies: Iterable[ProjectiveEnergy]) -> Iterator[scipy.sparse.csr_array]:
     """Yield each energy's contribution A'KA [N/m] to Q, (n, n).
 
-    That of a lagged energy depends on the velocity_rate of the steps only.
+    That of a lagged energy depends on the rate of the steps only.
     """
     nowhere = np.zeros((system.vertices, 3))
     start = Start(nowhere, nowhere, 0.0, nowhere, system.rate, 0.0)

@@ -5,7 +5,7 @@
     my_package.module:MyMethod    named: in a module that Python finds
     ./mine.py:MyMethod            named: in a file in the config's folder, or in a folder below it
 
-The last three are imported by `load_target` only. Until then such a name is a `PluginName`, which states the module
+The last three are imported by `load` only. Until then such a name is a `Plugin`, which states the module
 and its version: that of the installed distribution, and 12 hexadecimal digits of a digest of the sources.
 """
 
@@ -35,10 +35,10 @@ class Plugin(str):
     """A name in a config that refers to third-party code.
 
     Attributes:
-        import_target: "module:name", or "path.py:name" with an absolute path.
-        module_name: the module, for display.
-        code_version: version of the code.
-        source_path: source file.
+        target: "module:name", or "path.py:name" with an absolute path.
+        module: the module, for display.
+        version: version of the code.
+        source: source file.
     """
 
     target: str
@@ -57,7 +57,7 @@ class Plugin(str):
 
 
 class Table(Mapping[str, Any]):
-    """A mapping from names to import targets: built-in ones, installed ones, and every `PluginName`."""
+    """A mapping from names to import targets: built-in ones, installed ones, and every `Plugin`."""
 
     def __init__(self, group: str, *shipped: Mapping[str, Any]) -> None:
         """Create a table from an entry-point group and tables of "module:name" or of the objects themselves."""
@@ -81,7 +81,7 @@ class Table(Mapping[str, Any]):
         return sum(1 for _ in self)
 
     def named(self, name: str, folder: Path) -> str:
-        """Return the name, as a PluginName if it is not built-in; an unknown name is returned unchanged.
+        """Return the name, as a Plugin if it is not built-in; an unknown name is returned unchanged.
 
         Imports nothing.
 
@@ -90,7 +90,7 @@ class Table(Mapping[str, Any]):
             folder: the folder of the config.
 
         Raises:
-            InvalidPluginName: the name refers to no code, or to code that a config must not name.
+            Refused: the name refers to no code, or to code that a config must not name.
         """
         if any(name in table for table in self.shipped):
             return name
@@ -142,7 +142,7 @@ def _written(name: str, folder: Path) -> Plugin:
 
 
 def _of_module(name: str, target: str, distribution: str | None) -> Plugin:
-    """Build the PluginName of a module; `distribution_version` is looked up if it is None."""
+    """Build the Plugin of a module; `distribution` is looked up if it is None."""
     module = target.partition(":")[0]
     source = source_of(module)
     if source is None:

@@ -88,10 +88,10 @@ class System:
         time_step: dt [s].
         energies: potentials of the positions.
         pins: the pinned vertices and their weights.
-        inertia_factor: the integrator's c.
-        velocity_factor: the integrator's ratio of the velocity to the change of the stage, in units of 1/dt; None for
+        factor: the integrator's c.
+        speed: the integrator's ratio of the velocity to the change of the stage, in units of 1/dt; None for
             sqrt(c).
-        length_constraints: length constraints that hold exactly.
+        lengths: length constraints that hold exactly.
     """
 
     mass: NDArray[np.float64]
@@ -104,7 +104,7 @@ class System:
 
     @property
     def rate(self) -> float:
-        """Velocity per displacement of the stage, sqrt(c)/dt or velocity_factor/dt [1/s]."""
+        """Velocity per displacement of the stage, sqrt(c)/dt or speed/dt [1/s]."""
         return (self.factor**0.5 if self.speed is None else self.speed) / self.time_step
 
     @cached_property
@@ -144,14 +144,14 @@ class Start:
         positions: p^t (n, 3) [m].
         velocity: v^t (n, 3) [m/s], after the velocity filters.
         time: t [s].
-        velocity_origin: (n, 3) [m]; the stage x has the velocity velocity_rate * (x - velocity_origin).
-        velocity_rate: velocity per displacement [1/s].
-        stage_time: time of the stage x [s]; the default nan propagates into all results that depend on it.
-        lag_extrapolation: time [s] by which lagged positions are extrapolated.
-        lag_override: positions (n, 3) [m] that replace p^t as the lagged ones.
-        predicted_acceleration: acceleration (n, 3) [m/s^2] predicted from the previous motion.
-        warm_start: warm start from the previous solve.
-        normal_force_positions: an iterate of x (n, 3) [m] at which friction evaluates normal forces; None for the start
+        origin: (n, 3) [m]; the stage x has the velocity rate * (x - origin).
+        rate: velocity per displacement [1/s].
+        until: time of the stage x [s]; the default nan propagates into all results that depend on it.
+        ahead: time [s] by which lagged positions are extrapolated.
+        lagged: positions (n, 3) [m] that replace p^t as the lagged ones.
+        acceleration: acceleration (n, 3) [m/s^2] predicted from the previous motion.
+        kept: warm start from the previous solve.
+        pressed: an iterate of x (n, 3) [m] at which friction evaluates normal forces; None for the start
             of the step.
     """
 
@@ -169,7 +169,7 @@ class Start:
 
     @property
     def expected(self) -> Positions:
-        """Positions (n, 3) [m] of lagged energies: p^t or `lag_override`, extrapolated by `lag_extrapolation`."""
+        """Positions (n, 3) [m] of lagged energies: p^t or `lagged`, extrapolated by `ahead`."""
         p = self.positions if self.lagged is None else self.lagged
         return p + self.ahead * self.velocity if self.ahead else p
 
@@ -200,13 +200,13 @@ class StepProblem:
 
     Attributes:
         system: the data that stay constant in a run.
-        inertial_target: positions of the stage under inertia alone (n, 3) [m], velocity filters included.
-        external_force: external force (n, 3) [N].
+        target: positions of the stage under inertia alone (n, 3) [m], velocity filters included.
+        force: external force (n, 3) [N].
         pin_targets: target positions of the pins (q, 3) [m], in the order of `system.pins`.
-        current_positions: p^t with pinned vertices on their targets (n, 3) [m]; the stop rule takes the initial
+        current: p^t with pinned vertices on their targets (n, 3) [m]; the stop rule takes the initial
             residual here.
-        initial_guess: initial guess of the iteration (n, 3) [m].
-        step_start: state at the start of the step.
+        first_guess: initial guess of the iteration (n, 3) [m].
+        start: state at the start of the step.
     """
 
     system: System
@@ -260,17 +260,17 @@ class StepProblem:
 class StopRule:
     """The criteria that terminate a solve.
 
-    A solve ends after `max_iterations`, or if the residual is at most max(atol, rtol * initial residual), or if the
+    A solve ends after `iterations`, or if the residual is at most max(atol, rtol * initial residual), or if the
     gradient is no larger than rounding errors, so that a scene at rest stops immediately. The residual is
     |Q^-1 grad g(p)|_Q = |p - LG(p)|_Q over the unpinned vertices. The initial residual is the one at the current
     positions.
 
     Attributes:
-        max_iterations: maximum number of iterations.
-        rtol: relative tolerance; None for none.
-        roundoff_floor: a gradient is round-off if at each unpinned vertex it is at most this factor times the bound of
-            `solvers.model.rounding_bound`; 0 disables the criterion.
-        atol: absolute tolerance [J^(1/2)].
+        iterations: maximum number of iterations.
+        tolerance: relative tolerance; None for none.
+        floor: a gradient is round-off if at each unpinned vertex it is at most this factor times the bound of
+            `solvers.round_off`; 0 disables the criterion.
+        within: absolute tolerance [J^(1/2)].
     """
 
     iterations: int = 50
@@ -285,15 +285,15 @@ class Solution:
 
     Attributes:
         positions: (n, 3) [m].
-        num_iterations: number of iterations.
+        iterations: number of iterations.
         residual: |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices that the stop rule tested, at the iterate that
-            `residual_iterate` names; nan for a method that does not minimise.
-        initial_residual: residual at the current positions; nan without a tolerance.
-        termination_reason: "iterations", "tolerance", "floor" (round-off), or "stalled" if no step decreases the
+            `residual_of` names; nan for a method that does not minimise.
+        yardstick: residual at the current positions; nan without a tolerance.
+        stopped: "iterations", "tolerance", "floor" (round-off), or "stalled" if no step decreases the
             objective.
         velocity: (n, 3) [m/s], for a method that computes its own.
-        residual_iterate: the iterate of the residual.
-        warm_start: warm start of the next solve, of any shape.
+        residual_of: the iterate of the residual.
+        kept: warm start of the next solve, of any shape.
     """
 
     positions: Positions
@@ -345,9 +345,9 @@ class Solver(Protocol):
     A method that supports exact length constraints also has `keeps_lengths = True`.
 
     Attributes:
-        is_minimiser: whether the iterates converge to a minimum of the step's objective; other methods are scored by
+        minimises: whether the iterates converge to a minimum of the step's objective; other methods are scored by
             their trajectories.
-        is_monotone: whether the objective increases in no iteration, except by round-off.
+        descends: whether the objective increases in no iteration, except by round-off.
     """
 
     minimises: ClassVar[bool]

@@ -56,7 +56,7 @@ EVERY = Table("springbench.solvers", SOLVERS, OPTIONAL)
 
 
 def minimises(solver: Any) -> bool:
-    """Return whether the iterates converge to a minimum; a solver without `is_minimiser` is scored as if they do."""
+    """Return whether the iterates converge to a minimum; a solver without `minimises` is scored as if they do."""
     return getattr(solver, "minimises", True)
 
 

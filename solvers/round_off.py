@@ -7,7 +7,7 @@
 
 The term of a spring includes the rounding of the positions, which its Hessian multiplies (1 along the spring,
 |1 - r/l| across), and that of its own length. Other energies provide their absolute terms in the same form
-(`RoundingBoundEnergy`). For an energy that does not, the rounding of the positions is multiplied by its Hessian, and
+(`Rounded`). For an energy that does not, the rounding of the positions is multiplied by its Hessian, and
 the gradient itself is assumed to be rounded once (Higham 2002, Accuracy and Stability of Numerical Algorithms, section
 3.3: running error analysis).
 

@@ -90,7 +90,7 @@ def reached(source: str) -> frozenset[str]:
 
 
 def everything(package: str) -> str:
-    """Return the SHA-256 digest, in hexadecimal digits, of all sources of a package in PACKAGE_NAMES."""
+    """Return the SHA-256 digest, in hexadecimal digits, of all sources of a package in PACKAGES."""
     start, told = f"{ROOT / package}{os.sep}", hashlib.sha256()
     for path in sorted(path for path in _FIRST if path.startswith(start)):
         told.update(f"{_name(path)}\0".encode() + _content(path))

@@ -25,7 +25,7 @@ def aside(tick: Tick, what: str) -> Generator[None]:
 
     Args:
         tick: progress callback.
-        activity: description, such as COMPILING or WAITING.
+        what: description, such as COMPILING or WAITING.
     """
     tick(_BEGIN + what)
     try:

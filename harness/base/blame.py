@@ -26,12 +26,12 @@ def said(error: BaseException) -> str:
 def where(error: BaseException, own: Collection[str]) -> str:
     """Return `file:line` of an error.
 
-    The line is the last one in user_files, else the last one in any user code, else the last one. The line that raised
+    The line is the last one in own, else the last one in any user code, else the last one. The line that raised
     the error is appended if it is another one.
 
     Args:
         error: exception with a traceback.
-        user_files: paths of the user's source files.
+        own: paths of the user's source files.
     Returns: the location, such as `mine.py:12, raised in core.py:40`.
     """
     frames = [(frame.filename, frame.lineno or 0) for frame in traceback.extract_tb(error.__traceback__)]

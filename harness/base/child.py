@@ -54,7 +54,7 @@ def call(function: Callable[..., Any], *arguments: Any, limits: Allowance) -> An
     Returns: the function's return value, which must pickle.
     Raises:
         InputError: if the function raises it.
-        SandboxError: if the function raises anything else, exceeds a limit, or crashes.
+        NoAnswer: if the function raises anything else, exceeds a limit, or crashes.
     """
     child = _Child.running()
     try:
@@ -203,7 +203,7 @@ def memory_limited(bytes: int) -> Generator[None]:
     A larger allocation raises MemoryError, or the error of a library.
 
     Args:
-        memory_bytes: allowed bytes beyond those in use now.
+        bytes: allowed bytes beyond those in use now.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     wanted = data() + bytes
@@ -230,7 +230,7 @@ def limit(what: int, value: float) -> None:
     The next call can therefore use another value.
 
     Args:
-        resource_id: constant `resource.RLIMIT_*`.
+        what: constant `resource.RLIMIT_*`.
         value: limit in the unit of the resource, or RLIM_INFINITY.
     """
     hard = resource.getrlimit(what)[1]

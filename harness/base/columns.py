@@ -1,4 +1,4 @@
-"""Columns of the rows of a run: `RUN_COLUMNS` is both their schema and their documentation.
+"""Columns of the rows of a run: `COLUMNS` is both their schema and their documentation.
 
 `results/README.md` shows the same table.
 """

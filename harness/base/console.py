@@ -44,12 +44,12 @@ def err() -> Console:
 def narrow(table: Table, beside: int = 1, width: int = WIDTH) -> Group:
     """Split a table into parts of at most `width` characters.
 
-    Each part repeats the first key_columns columns and adds as many others as fit. Columns without values are omitted.
+    Each part repeats the first beside columns and adds as many others as fit. Columns without values are omitted.
     A column that is too wide by itself is folded.
 
     Args:
         table: table to split.
-        key_columns: number of leading columns that each part repeats.
+        beside: number of leading columns that each part repeats.
         width: maximum width, in characters.
     Returns: the parts, followed by the caption.
     """

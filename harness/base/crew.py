@@ -57,13 +57,13 @@ def done_by(
     """Run tasks in a pool of workers and yield each result as it is completed.
 
     Args:
-        num_workers: maximum number of concurrent workers.
-        initialiser: called first in each worker.
+        members: maximum number of concurrent workers.
+        ready: called first in each worker.
         groups: group of each task, by index.
-        create_task: called with the index of a task when a worker is available for it.
-        background_call: called once in this process after the workers have started. No worker is polled until it
+        start: called with the index of a task when a worker is available for it.
+        meanwhile: called once in this process after the workers have started. No worker is polled until it
             returns.
-    Yields: (index, value or TaskFailure) in order of completion.
+    Yields: (index, value or Lost) in order of completion.
     Raises: the SpringbenchError that a task raises.
 
     Closing the generator stops the workers.

@@ -32,10 +32,10 @@ def _nothing(said: str) -> None:
 class OwnCode:
     """Policy for user code that a config names.
 
-    imports_code: whether the code is imported here; otherwise only its files identify it.
-    on_import: called with a description before each import.
-    solver_metadata: metadata of each solver class by solver name, as far as it was read before.
-    uses_cache: whether cached parameters of shipped solvers may be used.
+    opens: whether the code is imported here; otherwise only its files identify it.
+    tell: called with a description before each import.
+    stated: metadata of each solver class by solver name, as far as it was read before.
+    kept: whether cached parameters of shipped solvers may be used.
     """
 
     opens: bool = True
@@ -54,7 +54,7 @@ UNOPENED = OwnCode(opens=False)
 class Document:
     """A config as plain data, with line numbers and the mistakes found so far.
 
-    user_code: policy for code that the config names.
+    own: policy for code that the config names.
     """
 
     path: Path

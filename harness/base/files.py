@@ -40,7 +40,7 @@ def replacing(path: Path) -> Generator[Path]:
     """Yield a temporary path that replaces the file on success and is removed on failure.
 
     Raises:
-        WriteError: for an OSError inside the block.
+        CannotWrite: for an OSError inside the block.
     """
     partial = partial_name(path)
     try:
@@ -61,7 +61,7 @@ def open_lock(path: Path, access: int = os.O_RDWR, *, otherwise: str = "") -> in
     Args:
         path: lock file.
         access: flag of `os.open`, for reading or writing.
-        hint: alternative to removing the file, appended to the error message.
+        otherwise: alternative to removing the file, appended to the error message.
     Returns: file descriptor.
     Raises:
         InputError: if something else is at this path.
@@ -140,14 +140,14 @@ def reason(error: Exception) -> str:
 
 
 HEAD = 1024
-"""Number of leading bytes that `describe_misnamed_file` examines."""
+"""Number of leading bytes that `misnamed` examines."""
 
 
 def misnamed(head: bytes, size: int) -> str:
     """Describe a file that has the name of a data file but other content.
 
     Args:
-        head: first HEAD_BYTES bytes of the file.
+        head: first HEAD bytes of the file.
         size: size of the file [bytes].
     Returns: the end of a sentence for an empty file, a Git LFS pointer or a web page; "" for any other file.
     """

@@ -120,7 +120,7 @@ class Claims:
         self._units = {path: _state(path) for path in units}
 
     def take(self, unit: Path) -> str:
-        """Claim a unit; return "" on success, else DONE_ELSEWHERE or CLAIMED_ELSEWHERE."""
+        """Claim a unit; return "" on success, else DONE or TAKEN."""
         if self._changed(unit):
             return DONE
         place = int.from_bytes(sha256(unit.name.encode()).digest()[:7])
@@ -138,7 +138,7 @@ class Claims:
 
         Args:
             units: row files of the units.
-            poll: called between two checks.
+            look: called between two checks.
         """
         while units and all(self.take(unit) == TAKEN for unit in units):
             look()

@@ -33,7 +33,7 @@ class Machine:
     cpu: name of the processor.
     cores: number of cores that this process may use.
     memory_gib: memory [GiB], to one decimal.
-    operating_system: operating system, release and architecture.
+    system: operating system, release and architecture.
     """
 
     cpu: str

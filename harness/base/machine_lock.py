@@ -1,11 +1,11 @@
 """Timing lock of the machine: one exclusive timed run, or any number of untimed computations.
 
-    lock_timing_exclusive   waits until nothing else computes, and blocks all others
-    lock_timing_shared      waits while a run is timed exclusively, or waits for that
-    reserve_cores           as lock_timing_shared, on cores reserved for this process
+    alone   waits until nothing else computes, and blocks all others
+    beside      waits while a run is timed exclusively, or waits for that
+    own_cores           as beside, on cores reserved for this process
 
 Runs that wait to be timed have priority. Processes that were timed therefore analyse their results concurrently, and
-not each before the next one is timed. A process that prepares a timed run (`TimingSession`) counts as waiting;
+not each before the next one is timed. A process that prepares a timed run (`Turn`) counts as waiting;
 otherwise two processes would alternate indefinitely, each preparing while the other one analyses. The locks are files,
 which the system releases when a process dies. All commands and workers of a machine share them, in the folder
 `SPRINGBENCH_LOCKS` or else in the folder for temporary files.
@@ -48,9 +48,9 @@ def beside(tick: Tick) -> Generator[None]:
 
 
 class Turn:
-    """Session of one timed run: preparation, timing (`lock_timing_exclusive`), and analysis of its result.
+    """Session of one timed run: preparation, timing (`alone`), and analysis of its result.
 
-    exclusive: whether the run is timed alone. Otherwise it is timed on reserved cores (`reserve_cores`) without waiting
+    exclusive: whether the run is timed alone. Otherwise it is timed on reserved cores (`own_cores`) without waiting
     for other sessions.
     """
 

@@ -75,7 +75,7 @@ class Place:
 
     url: as the user gave it.
     folder: local folder in the user's cache.
-    filesystem: file system of fsspec.
+    system: file system of fsspec.
     root: path of the results on that file system.
     index: remote and local state of each file at the last synchronisation.
     """
@@ -111,7 +111,7 @@ class Place:
         """Download changed files, and remove local files that were deleted remotely and are unchanged here.
 
         Args:
-            only_rows: whether to download only files of rows.
+            rows_alone: whether to download only files of rows.
         Raises:
             InputError: if the storage cannot be read.
         """

@@ -48,7 +48,7 @@ ANY_EFFORT = Effort()
 
 
 class Remarks:
-    """Prints progress messages of work that is not a run, at most one per _MAX_SILENT_SECONDS."""
+    """Prints progress messages of work that is not a run, at most one per _SILENT."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say, self._said = say, monotonic()
@@ -64,7 +64,7 @@ class Run(Protocol):
     """Receiver of the events of one run."""
 
     def tick(self, phase: str) -> None:
-        """Report a finished step by the name of its phase, or an event of `harness.execution.progress_events`."""
+        """Report a finished step by the name of its phase, or an event of `harness.base.asides`."""
         ...
 
     def finished(self, outcome: str) -> None:
@@ -79,8 +79,8 @@ class Display(Protocol):
         """Start the sweep.
 
         Args:
-            costs: costs of the pending runs.
-            num_concurrent: number of runs that are executed concurrently.
+            efforts: costs of the pending runs.
+            at_once: number of runs that are executed concurrently.
         """
         ...
 
@@ -90,7 +90,7 @@ class Display(Protocol):
         Args:
             title: description of the run.
             ticks: expected number of steps.
-            cost: relative cost.
+            effort: relative cost.
         Returns: receiver of the run's events.
         """
         ...
@@ -145,7 +145,7 @@ class Pace:
         """Estimate the seconds until all runs have ended.
 
         Args:
-            running: started runs; from a twentieth of its steps on, a run's own pace is used.
+            going: started runs; from a twentieth of its steps on, a run's own pace is used.
         Returns: seconds, or None while too few runs have ended for an estimate.
         """
         known = max(self._ended / max(1, self._runs), self.done / (self.amount or 1.0))
@@ -171,8 +171,8 @@ class Pace:
 class _Running:
     """State of a started run.
 
-    on_change: called after each event.
-    on_end: called with the outcome.
+    changed: called after each event.
+    ended: called with the outcome.
     """
 
     title: str

@@ -11,8 +11,8 @@ Each has one definition and one name.
     largest strain    maximum of |length / rest length - 1| over all springs and all frames after the start
     99 % below        maximum over these frames of the 99 % quantile over the springs
 
-`SQL_EXPRESSIONS` computes them from the rows of one run. A recording stores the strain of each frame, and the run's ms
-a step as a property computed by `compute_ms_per_step`.
+`SQL` computes them from the rows of one run. A recording stores the strain of each frame, and the run's ms
+a step as a property computed by `ms_per_step`.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 # pyarrow's stubs have incomplete types of columns, and of files that Parquet is read from.
 """Reader and writer of rows: one flat Parquet file per run, under `results/<sweep>/rows/`.
 
-`harness.results.row_store` defines where rows are stored after packing.
+`harness.base.shelf` defines where rows are stored after packing.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _FEW = 8
 
 
 def write(path: Path, rows: Iterable[Row], schema: pa.Schema = SCHEMA) -> None:
-    """Write the rows of one file durably; raise WriteError if that fails."""
+    """Write the rows of one file durably; raise CannotWrite if that fails."""
     store(path, encoded(rows, schema))
 
 
@@ -68,7 +68,7 @@ def store(path: Path, content: bytes) -> None:
     After a kill or an error the file is complete or absent.
 
     Raises:
-        WriteError: if the file cannot be written.
+        CannotWrite: if the file cannot be written.
     """
     with replacing(path) as partial, partial.open("wb") as file:
         file.write(content)
@@ -92,13 +92,13 @@ def read(
     Args:
         paths: row files of the units.
         schema: columns that the result has at least.
-        required_columns: columns without which a row is invalid.
+        needed: columns without which a row is invalid.
         promote: "permissive" allows columns of one name to differ in type.
-        with_unit_names: whether to append the column `row_store.FILE_COLUMN` with the names of the units.
-        on_invalid: called for each unit with an invalid value (`row_validation`), which is then omitted.
+        named: whether to append the column `row_store.FILE` with the names of the units.
+        left_out: called for each unit with an invalid value (`row_validation`), which is then omitted.
     Returns: the rows.
     Raises:
-        InputError: for all damaged, foreign or empty files; without on_invalid also for invalid values.
+        InputError: for all damaged, foreign or empty files; without left_out also for invalid values.
     """
     paths = list(paths)
     if len(paths) > _FEW:
@@ -245,7 +245,7 @@ def heads(
         paths: row files of the units.
         columns: columns to return, which the schema has.
         schema: columns that the result has at least.
-        required_columns: columns of the schema without which a row is invalid.
+        needed: columns of the schema without which a row is invalid.
     Returns: by path, the values of the first row, or a description of what is wrong with the unit.
     Raises:
         InputError: for a damaged packed file.

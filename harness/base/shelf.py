@@ -112,8 +112,8 @@ class Part:
     """A group of files with one schema.
 
     files: paths of the files.
-    unit_numbers: for each file, the index of its unit in the request.
-    packed_numbers: for a packed file, the indices of its units by name.
+    numbers: for each file, the index of its unit in the request.
+    packed: for a packed file, the indices of its units by name.
     """
 
     files: tuple[str, ...]
@@ -125,7 +125,7 @@ def parts(asked: Iterable[Path]) -> tuple[list[Part], list[int]]:
     """Group units by schema.
 
     Args:
-        paths: row files of the units.
+        asked: row files of the units.
     Returns: the groups, and the indices of units that are evidently not files of rows.
     Raises:
         InputError: for a damaged packed file.

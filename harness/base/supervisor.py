@@ -30,16 +30,16 @@ _REAP = 1.0
 def supervise(
     calls: Connection, ticks: Connection, said: Connection, dump: Connection, ready: Callable[[], object], parent: int
 ) -> None:
-    """Start a worker (`harness.execution.worker_process.serve_tasks`), and end as it ends.
+    """Start a worker (`harness.base.worker.serve`), and end as it ends.
 
     It is the main function of the supervisor, a child of the command.
 
     Args:
         calls: pipe of tasks and results.
         ticks: pipe of progress events.
-        output_pipe: pipe for the worker's output.
+        said: pipe for the worker's output.
         dump: pipe for the worker's stack dumps.
-        initialiser: called first in the worker.
+        ready: called first in the worker.
         parent: process id of the command.
     """
     tie(parent, signal.SIGTERM)

@@ -3,7 +3,7 @@
 """Queries over the rows of many units, by DuckDB on Parquet files.
 
 Files of one schema are read together. DuckDB's `union_by_name` would do the same for files of any schema, but takes 140
-kB of memory per file. Units that cannot be read together raise `SchemaMismatch`. The caller then reads unit by unit and
+kB of memory per file. Units that cannot be read together raise `Unfit`. The caller then reads unit by unit and
 can name the invalid one. A path that DuckDB would interpret as a pattern raises it too.
 """
 
@@ -37,7 +37,7 @@ MEMORY = 2**29
 class Unfit(Exception):
     """The units cannot be read together.
 
-    damaged_units: indices of units that are not files of rows.
+    damaged: indices of units that are not files of rows.
     """
 
     def __init__(self, why: str, damaged: Sequence[int] = ()) -> None:
@@ -75,7 +75,7 @@ def connected(memory: int = MEMORY) -> Generator[DuckDBPyConnection]:
     It uses one thread because other runs may be timed.
 
     Raises:
-        SchemaMismatch: for an error of DuckDB, Arrow or the system inside the block.
+        Unfit: for an error of DuckDB, Arrow or the system inside the block.
     """
     import duckdb
 
@@ -98,11 +98,11 @@ def union(
     Args:
         connection: open connection, in which variables of the given name are set.
         name: prefix of the variables.
-        paths: row files of the units.
+        asked: row files of the units.
         schema: columns that the union has at least.
         promote: mode of Arrow's schema unification.
     Raises:
-        SchemaMismatch: if the units cannot be read together.
+        Unfit: if the units cannot be read together.
         InputError: for a damaged packed file.
     """
     found, damaged = parts(asked)
@@ -143,7 +143,7 @@ def _literal(files: Sequence[str]) -> list[str]:
     """Return absolute paths, because DuckDB interprets `~` and `file:` at the start.
 
     Raises:
-        SchemaMismatch: for a pattern.
+        Unfit: for a pattern.
     """
     found = [os.path.abspath(file) for file in files]
     if bad := next((file for file in found if _PATTERN.search(file)), None):
@@ -162,14 +162,14 @@ def table(
     """Read all rows of units, in their order.
 
     Args:
-        paths: row files of the units.
+        asked: row files of the units.
         schema: columns that the table has at least.
-        required_columns: columns that no row may lack.
-        max_rows: maximum number of rows of one unit.
+        needed: columns that no row may lack.
+        most: maximum number of rows of one unit.
         promote: mode of Arrow's schema unification.
     Returns: the rows, and the index of each row's unit (n,).
     Raises:
-        SchemaMismatch: if a unit is damaged, empty or too long, or lacks a required column.
+        Unfit: if a unit is damaged, empty or too long, or lacks a required column.
     """
     with connected() as connection:
         whole = union(connection, "files", asked, schema, promote)
@@ -212,13 +212,13 @@ def heads(
     Units without rows, or without a required column, are omitted.
 
     Args:
-        paths: row files of the units.
+        asked: row files of the units.
         columns: columns to return.
         schema: columns that the union has at least.
-        required_columns: columns that no row may lack.
+        needed: columns that no row may lack.
     Returns: values by the index of the unit.
     Raises:
-        SchemaMismatch: if the units cannot be read together.
+        Unfit: if the units cannot be read together.
     """
     with connected() as connection:
         whole = union(connection, "files", asked, schema, "default")

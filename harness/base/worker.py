@@ -48,9 +48,9 @@ parent of orphaned descendants.
 class Limits(NamedTuple):
     """Limits of a task; None is unlimited.
 
-    wall_seconds: wall time [s].
-    memory_gib: memory of all its processes [GiB], beyond what a worker uses anyway.
-    log_path: file for output that is too long to be shown.
+    seconds: wall time [s].
+    gib: memory of all its processes [GiB], beyond what a worker uses anyway.
+    log: file for output that is too long to be shown.
     """
 
     seconds: float | None = None
@@ -63,7 +63,7 @@ class PieceOutcome(NamedTuple):
 
     value: return value.
     error: its error, or a description of another failure.
-    is_clean: whether no thread, process or broken device is left behind.
+    clean: whether no thread, process or broken device is left behind.
     """
 
     value: Any
@@ -81,7 +81,7 @@ def serve(
         ticks: pipe of progress events.
         output: file descriptor that receives the worker's output.
         dump: pipe for stack dumps.
-        initialiser: called first.
+        ready: called first.
         parent: process id of the parent.
     """
     tie(parent)

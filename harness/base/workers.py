@@ -1,12 +1,12 @@
 """Isolated worker: runs user code in a process of its own.
 
 The code may crash, hang or exhaust memory without affecting this process. Between both is a supervisor
-(`harness.execution.worker_supervisor`), which reads the worker's output and ends its processes. One worker runs all
+(`harness.base.supervisor`), which reads the worker's output and ends its processes. One worker runs all
 tasks one after the other, so modules stay imported and kernels compiled. It is replaced after a failure, or if a task
 left threads behind. It is a fork of this process, which repeats none of that cost, as long as nothing was started here
 that does not survive a fork, such as OpenMP's threads. Otherwise it is spawned.
 
-Files are read in a sandbox likewise (`harness.execution.sandbox`), which shares nothing with this process.
+Files are read in a sandbox likewise (`harness.base.child`), which shares nothing with this process.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _GRACE = 5.0
 _KEPT = 2**14
 """Number of the last output bytes that are stored."""
 _SHOWN = 2**13
-"""Maximum number of output bytes of a task that are shown; longer output goes to a file, up to `BUFFER_BYTES`."""
+"""Maximum number of output bytes of a task that are shown; longer output goes to a file, up to `BUFFER`."""
 
 
 class Lost(Exception):
@@ -86,14 +86,14 @@ class Workers:
         """Run a task and wait for its result.
 
         Args:
-            function: function of the task.
+            piece: function of the task.
             tick: progress callback.
             limits: wall time and memory.
-            background_call: called once in this process after the task was submitted.
+            meanwhile: called once in this process after the task was submitted.
         Returns: the task's value.
         Raises:
             SpringbenchError: if the task raises it.
-            TaskFailure: if the task returns no result.
+            Lost: if the task returns no result.
         """
         going = self.doing(piece, tick, limits)
         while True:
@@ -109,13 +109,13 @@ class Workers:
         """Start a task that runs concurrently with others.
 
         Args:
-            function: function of the task.
+            piece: function of the task.
             tick: progress callback, which also receives POLL each time the generator is resumed.
             limits: wall time and memory.
-            user_code: user code that the task runs. A worker that has run user code is replaced before a task without
+            own: user code that the task runs. A worker that has run user code is replaced before a task without
                 that code.
         Returns: generator that yields the connection to wait for, and returns the task's value.
-        Raises: as `run_task`.
+        Raises: as `do`.
         """
         if not self._own <= own:
             self.end()
@@ -170,7 +170,7 @@ class _Worker:
         return self._process.is_alive() and not self._calls.poll()
 
     def ask(self, piece: Piece, tick: Tick, limits: Limits) -> Generator[Connection, None, PieceOutcome]:
-        """Submit a task and return its result at the end; raise TaskFailure."""
+        """Submit a task and return its result at the end; raise Lost."""
         heard, began = _Heard(self._ticks, self._said, tick, limits.log), monotonic()
         memory = TreeMemory(self._process.pid or 0, limits.gib) if limits.gib else None
         try:
@@ -329,7 +329,7 @@ class _Heard:
 
 
 def _come(pipe: Connection) -> bytes:
-    """Read the bytes that are in a pipe now, at most BUFFER_BYTES."""
+    """Read the bytes that are in a pipe now, at most BUFFER."""
     found = b""
     with suppress(OSError):
         while len(found) < BUFFER and pipe.poll() and (more := os.read(pipe.fileno(), 2**16)):

@@ -102,7 +102,7 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class How:
-    """Measurement settings of a unit, as in `AccuracyStudyConfig`."""
+    """Measurement settings of a unit, as in `Study`."""
 
     threads: int
     rounds: int
@@ -146,9 +146,9 @@ class CurveSpec:
 
 @dataclass(frozen=True, slots=True)
 class WorkSpec:
-    """Specification of one simulation up to t_end [s].
+    """Specification of one simulation up to horizon [s].
 
-    Options: the values of `STEP_OPTIONS`, in their order.
+    Options: the values of `OF_STEPS`, in their order.
     """
 
     case: Case

@@ -41,7 +41,7 @@ class Accuracy:
 def load_accuracy(path: Path) -> Accuracy:
     """Load an accuracy config from a YAML file; raise InputError.
 
-    User code that it names is tried first in a worker process (`harness.config.user_code`).
+    User code that it names is tried first in a worker process (`harness.config.own`).
     """
     return tried(partial(_load, path), _own, _stated, lambda accuracy: MOST)
 

@@ -19,7 +19,7 @@ from harness.scenes.spec import IntegratorName, SceneSpec, Size
 
 
 class Goal(Model):
-    """A performance target: an error at t_end, and the baseline of its cost.
+    """A performance target: an error at horizon, and the baseline of its cost.
 
     The cheapest variant of the baseline is compared.
     """
@@ -88,7 +88,7 @@ def load_goals(path: Path, peers: Sequence[str], solvers: Sequence[str]) -> Goal
 
     Args:
         path: the file.
-        libraries: names of available third-party integrators.
+        peers: names of available third-party integrators.
         solvers: names of available solvers.
     Raises:
         InputError: for all mistakes.

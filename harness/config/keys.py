@@ -22,7 +22,7 @@ IntegratorName = Literal[
 ]  # fmt: skip
 ReportName = Literal["certificates", "medians", "timing"]
 OwnName = NewType("OwnName", str)
-"""Name of user code: `UserCodeName("./mine.py:Mine")`."""
+"""Name of user code: `OwnName("./mine.py:Mine")`."""
 
 T = TypeVar("T")
 Some = T | Sequence[T]
@@ -46,7 +46,7 @@ class SceneKeys(TypedDict, total=False):
 
 
 class OptionKeys(TypedDict, total=False):
-    """Options of a sweep, as in `harness.config.sweep_config.SweepOptions`."""
+    """Options of a sweep, as in `harness.config.sweep.Options`."""
 
     iterations: Some[int]
     tolerance: Some[float | Literal["auto"] | None]
@@ -68,7 +68,7 @@ class OptionKeys(TypedDict, total=False):
 
 
 class SweepKeys(TypedDict, total=False):
-    """Keys of a sweep, as in `harness.config.sweep_config.SweepConfig`; a solver with parameters is a mapping."""
+    """Keys of a sweep, as in `harness.config.sweep.SweepFields`; a solver with parameters is a mapping."""
 
     description: str
     scenes: Required[Sequence[str]]

@@ -35,7 +35,7 @@ from solvers.plugins import Plugin, found, load
 
 ASSIGNMENT_FRAMES = 30
 ASSIGNMENT_SOLVER = "numba"
-"""Default number of frames and solver of an assignment's scene; iteration limits are those of `RunOptions`."""
+"""Default number of frames and solver of an assignment's scene; iteration limits are those of `Chosen`."""
 
 
 class AssignmentMesh(Model):
@@ -69,14 +69,14 @@ def load_any(
     """Load a sweep from a file, or build one of a single scene.
 
     The keyword arguments apply to scenes only; a sweep defines its own. A YAML scene without a stop rule gets
-    `DEFAULT_STOP_RULE`, and an assignment's scene gets the defaults of a sweep.
+    `DEFAULT_STOP`, and an assignment's scene gets the defaults of a sweep.
 
     Args:
         path: file of a sweep or a scene.
         solvers: names of solvers; the default solver if empty.
         sizes: mesh sizes; the scene's default if empty.
-        imports_code: whether user code is tried first in a worker process. Otherwise its parameters are not checked.
-        options: options of `harness.config.sweep_config.SweepOptions`; None corresponds to null in a sweep.
+        opens: whether user code is tried first in a worker process. Otherwise its parameters are not checked.
+        options: options of `harness.config.sweep.Options`; None corresponds to null in a sweep.
     Raises:
         InputError: for all mistakes.
     """
@@ -137,7 +137,7 @@ def stated_by(solvers: Iterable[str]) -> dict[str, Any]:
 def load_scene(path: Path) -> SceneSpec:
     """Load a scene from a YAML file, or from an assignment's JSON file; raise InputError.
 
-    User code that it names is tried first in a worker process, as in `load_config`.
+    User code that it names is tried first in a worker process, as in `load_any`.
     """
     return tried(
         partial(_scene, path), lambda scene: [plugin for plugin, _ in scene.own.values()], _bound, lambda scene: MOST
@@ -235,10 +235,10 @@ def _part(document: Document, what: str, data: Any, at: Key, own: dict[str, tupl
 
     Args:
         document: config, which collects mistakes.
-        part_kind: "mesh" or "effect".
+        what: "mesh" or "effect".
         data: mapping of the part.
         at: location of the part in the document.
-        plugins: dictionary that receives user code, by location.
+        own: dictionary that receives user code, by location.
     """
     table, unopened = _PARTS[what]
     named = chosen(document, table, data, "kind", at)

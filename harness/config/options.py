@@ -1,6 +1,6 @@
 """Options of a run, defined once.
 
-`RunOptions` determines the lists of a sweep and of an accuracy study, the options of the command line, and the keys
+`Chosen` determines the lists of a sweep and of an accuracy study, the options of the command line, and the keys
 that entries of a sweep match. It also determines the short descriptions of runs, columns of their rows, and their hash.
 """
 
@@ -25,9 +25,9 @@ Rounds = Annotated[int, Field(ge=1, le=1000)]
 class Option(NamedTuple):
     """Attributes of an option in addition to its type and description.
 
-    short_format: format of its value in short descriptions.
+    short: format of its value in short descriptions.
     column: column of rows, "" for none.
-    null_meaning: meaning of null, for options that a scene defines otherwise.
+    null: meaning of null, for options that a scene defines otherwise.
     """
 
     short: str
@@ -78,7 +78,7 @@ class Chosen(Model):
 DEFAULT_SOLVER: Final = "hybrid"
 DEFAULT_STOP: dict[str, Any] = {"iterations": 500, "tolerance": 1e-4}
 """Default stop rule of a single scene, without a sweep and in Python: the recommended solver is run to a tolerance. The
-defaults of a sweep, those of `RunOptions`, are the assignment's.
+defaults of a sweep, those of `Chosen`, are the assignment's.
 """
 
 OF_ERROR: tuple[str, ...] = ("integrator", "iterations", "tolerance", "first_guess")

@@ -82,8 +82,8 @@ def tried(
 
     Args:
         load: loads the config with a given policy; it must pickle.
-        find_plugins: lists the user code of a loaded config.
-        read_metadata: reads metadata by solver, where the classes are imported.
+        own: lists the user code of a loaded config.
+        stated: reads metadata by solver, where the classes are imported.
         limits: limits of the trial for a loaded config.
     Returns: the loaded config.
     Raises:

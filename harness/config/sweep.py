@@ -128,7 +128,7 @@ class SweepFields(Model):
 class SolverSpec:
     """A solver's name and all of its parameters, including defaults.
 
-    metadata: metadata of a user's class, as in `harness.results.solver_metadata`, with its `packages`; empty for
+    stated: metadata of a user's class, as in `harness.base.stated`, with its `packages`; empty for
     shipped solvers.
     """
 

@@ -20,9 +20,9 @@ def apart(
     """Return the result of a function, isolated if user code is involved.
 
     Args:
-        function: work to do; picklable; called with a function that reports progress.
-        user_code: plug-ins that the function runs; if empty, it is called in this process.
-        print_message: called with each progress message.
+        piece: work to do; picklable; called with a function that reports progress.
+        own: plug-ins that the function runs; if empty, it is called in this process.
+        say: called with each progress message.
         limits: limits of the process; none if left out.
 
     Raises:

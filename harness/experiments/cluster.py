@@ -6,7 +6,7 @@
 Each run is a task in a separate process of a free worker.
 
 A worker executes one run at a time. Workers of one machine wait for each other while one is timed
-(`harness.execution.timing_lock`). A run that crashes ends its process and not Dask's worker, so failed runs do not use
+(`harness.base.machine_lock`). A run that crashes ends its process and not Dask's worker, so failed runs do not use
 up the workers. The files of a run return with its outcome, except where the worker shares the client's folder. If a
 worker is lost, its current run is repeated on another. A worker that cannot write or has other source code gets no more
 runs.
@@ -81,10 +81,10 @@ class Done(NamedTuple):
     """Outcome of a run on a worker.
 
     Attributes:
-        worker_address: address of the worker.
-        message: outcome as text.
-        files: content of the files that the run wrote, by name.
-        worker_error: why this worker cannot execute runs; empty if it can.
+        worker: address of the worker.
+        told: outcome as text.
+        left: content of the files that the run wrote, by name.
+        useless: why this worker cannot execute runs; empty if it can.
     """
 
     worker: str
@@ -102,7 +102,7 @@ class Cluster(NamedTuple):
     def do_all(
         self, folder: Path, display: Display, units: Sequence[RunUnit], another: Callable[[RunUnit], str]
     ) -> None:
-        """Execute units on the workers (`execute_on_cluster`)."""
+        """Execute units on the workers (`do_on`)."""
         do_on(self.client, units, folder, display, another)
 
 
@@ -111,9 +111,9 @@ def cluster(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> Gen
     """Connect to the workers of a scheduler, and yield the cluster.
 
     Args:
-        scheduler_address: an address, a number of workers on this machine (`local:4`), or a file for a batch system.
+        on: an address, a number of workers on this machine (`local:4`), or a file for a batch system.
         runs: runs to execute, whose plug-ins the workers must have.
-        print_message: prints a remark.
+        say: prints a remark.
 
     Raises:
         InputError: there is no scheduler, or no worker that can execute the runs.
@@ -146,7 +146,7 @@ def machines(client: Client, runs: Sequence[RunSpec], say: Callable[[str], None]
     Args:
         client: Dask client.
         runs: runs whose plug-ins are required.
-        print_message: prints a remark.
+        say: prints a remark.
 
     Raises:
         InputError: a worker has other versions, or lacks a plug-in.
@@ -228,7 +228,7 @@ def do_on(
         units: runs to execute.
         folder: folder of the sweep.
         display: shows progress.
-        skip_reason: returns why another command has a unit, or an empty string (`execute_unclaimed`).
+        another: returns why another command has a unit, or an empty string (`do_together`).
 
     Raises:
         InputError: the input is invalid.
@@ -305,7 +305,7 @@ def _ended(
 ) -> bool:
     """Store the files of a finished task, and return whether to repeat its run.
 
-    `outcome` is the result if it has been fetched already; `is_last_attempt` excludes another attempt.
+    `answer` is the result if it has been fetched already; `last` excludes another attempt.
     """
     if task.status in ("cancelled", "lost"):
         raise RunFailed(_GONE)

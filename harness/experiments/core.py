@@ -72,7 +72,7 @@ U = TypeVar("U", bound=Unit)
 
 @runtime_checkable
 class Sharing(Protocol):
-    """Unit that acquires the timing lock itself (`harness.execution.timing_lock`).
+    """Unit that acquires the timing lock itself (`harness.base.machine_lock`).
 
     Any other unit is timed as a whole.
     """
@@ -118,10 +118,9 @@ def do_together(
     Args:
         todo: units to execute.
         claims: ownership of the row files in the results folder.
-        execute_batch: executes units; calls its second argument for each unit, immediately before it starts. That
-            function
-            returns why another command has the unit, or an empty string.
-        print_message: prints a remark.
+        do: executes units; calls its second argument for each unit, immediately before it starts. That
+            function returns why another command has the unit, or an empty string.
+        say: prints a remark.
     """
     remarks = Remarks(say)
     while todo:
@@ -155,8 +154,8 @@ def do_all(
         todo: units to execute.
         display: shows progress.
         isolated: whether to use worker processes; otherwise units run here, one after the other and without limits.
-        num_workers: number of units that run concurrently.
-        skip_reason: returns why another command has a unit, or an empty string (`execute_unclaimed`).
+        at_once: number of units that run concurrently.
+        another: returns why another command has a unit, or an empty string (`do_together`).
 
     Raises:
         InputError: the input is invalid.

@@ -27,7 +27,7 @@ def failure(error: BaseException, own: Collection[Path] = ()) -> dict[str, Any]:
 
     Args:
         error: the error that ended the run.
-        solver_files: source files of the solver; the reported error location is in these where possible.
+        own: source files of the solver; the reported error location is in these where possible.
 
     Raises:
         CannotWrite: if this is the error.

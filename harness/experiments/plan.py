@@ -48,7 +48,7 @@ class Files:
         Args:
             run: the run.
             folder: folder of the sweep.
-            machine_id: machine that executes the run; this machine if None.
+            on: machine that executes the run; this machine if None.
         """
         label = run.label(on or machine.describe().id)
         return cls(
@@ -67,7 +67,7 @@ class Files:
 
 @dataclass(frozen=True, slots=True)
 class PlannedRun:
-    """Run of a sweep, its files and its status (`harness.experiments.completion_status.PlannedUnit`)."""
+    """Run of a sweep, its files and its status (`harness.experiments.resume.Planned`)."""
 
     run: RunSpec
     files: Files
@@ -85,7 +85,7 @@ def plan(runs: Iterable[RunSpec], folder: Path, machines: Sequence[str | None] =
     Args:
         runs: the runs of the sweep.
         folder: folder of the sweep.
-        machine_ids: machines that may have executed the runs; None is this machine.
+        machines: machines that may have executed the runs; None is this machine.
     """
     code_of = _codes()
     planned: list[PlannedRun] = []

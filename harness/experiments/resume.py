@@ -21,9 +21,9 @@ class Standing(NamedTuple):
     """Completion status of a unit.
 
     Attributes:
-        status: completed, missing, or the status of a failed unit.
-        is_stale: whether the rows come from other source code.
-        damage_reason: what is wrong with the files; a damaged unit counts as missing.
+        state: completed, missing, or the status of a failed unit.
+        older: whether the rows come from other source code.
+        damage: what is wrong with the files; a damaged unit counts as missing.
     """
 
     state: str
@@ -54,7 +54,7 @@ def standings(
     """Return the completion status of units, by the path of their rows.
 
     Args:
-        matches_request: for each path, a predicate on the columns of the unit's first row; whether they match the
+        asked: for each path, a predicate on the columns of the unit's first row; whether they match the
             request.
         columns: columns that the predicates need; `code` is added.
         schema: schema of the rows.
@@ -82,14 +82,14 @@ def wanted(
 ) -> list[P]:
     """Return the units to execute, and print a summary of the others.
 
-    Missing units are always included, and all units with `rerun`.
+    Missing units are always included, and all units with `again`.
 
     Args:
         planned: all units of the experiment.
-        unit_noun: plural noun for the units, for messages.
-        print_message: prints a remark.
-        rerun: whether to include all units.
-        rerun_stale: whether to include units whose rows come from other source code.
+        what: plural noun for the units, for messages.
+        say: prints a remark.
+        again: whether to include all units.
+        changed: whether to include units whose rows come from other source code.
     """
 
     def to_do(p: Planned) -> bool:

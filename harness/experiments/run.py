@@ -64,7 +64,7 @@ def execute(
         files: paths of its files.
         tick: called with the name of the pass after each step.
         positions: where to store the positions after every step, (frames, n, 3) [m], float64; None for not at all.
-        num_concurrent_runs: number of runs that may be timed concurrently.
+        at_once: number of runs that may be timed concurrently.
 
     Raises:
         InputError: the input is invalid, and the run has no user code.
@@ -329,7 +329,7 @@ def _reference(motion: _Motion) -> NDArray[np.float64] | None:
 def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any], *ends: Positions) -> RerunRecorder:
     """Open the recording of a run.
 
-    `outcome` is how the run ended, stored among the recording's properties. `final_positions` set the colour scale.
+    `facts` is how the run ended, stored among the recording's properties. `ends` set the colour scale.
     """
     files.recording.parent.mkdir(parents=True, exist_ok=True)
     here = machine.describe()

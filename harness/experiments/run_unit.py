@@ -20,13 +20,13 @@ from harness.experiments.provenance import common
 
 @dataclass(frozen=True, slots=True)
 class RunUnit:
-    """Run of a sweep as a unit (`harness.experiments.experiment_units.ExperimentUnit`).
+    """Run of a sweep as a unit (`harness.experiments.core.Unit`).
 
     Attributes:
         run: specification of the run.
         files: paths of its files.
-        positions_path: where to store the positions of all steps; None for not at all.
-        num_concurrent_runs: number of runs that may be timed concurrently.
+        positions: where to store the positions of all steps; None for not at all.
+        at_once: number of runs that may be timed concurrently.
     """
 
     run: RunSpec

@@ -30,7 +30,7 @@ PATIENCE = 10.0
 """Time in which a scheduler must respond and have a worker [s]."""
 
 QUEUED = 60
-"""Number of periods of CONNECT_TIMEOUT that the first job of a batch system may wait in the queue."""
+"""Number of periods of PATIENCE that the first job of a batch system may wait in the queue."""
 
 SILENCE = logging.CRITICAL
 """Log level: Dask's messages about ended workers are suppressed, for the outcome of each run is reported."""

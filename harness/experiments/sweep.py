@@ -62,14 +62,14 @@ def run_sweep(
         runs: its runs.
         folder: its folder in the results.
         display: shows progress.
-        print_message: prints a remark.
-        rerun: whether to repeat all runs; `positions` implies it.
-        rerun_stale: whether to repeat runs whose rows come from other source code.
+        say: prints a remark.
+        again: whether to repeat all runs; `positions` implies it.
+        changed: whether to repeat runs whose rows come from other source code.
         positions: where to store the positions of the sweep's only run.
         isolated: whether runs are executed in worker processes with limits, or in this process.
-        num_workers: number of worker processes; chosen by cores and memory if left out.
-        scheduler_address: where else to execute the runs (`harness.experiments.dask_cluster`).
-        background_call: called while another process draws.
+        at_once: number of worker processes; chosen by cores and memory if left out.
+        on: where else to execute the runs (`harness.experiments.cluster`).
+        meanwhile: called while another process draws.
 
     Raises:
         InputError: the options contradict each other, or the input is invalid.

@@ -2,7 +2,7 @@
 
 Entities: `/scene/forces/<name>`. An arrow's length is proportional to its force. Each force has one scale in a
 recording, set by its longest arrow in any frame. That arrow is only known at the end, so arrows are buffered until the
-recording is finished or until MAX_BUFFERED_FRAMES frames have accumulated.
+recording is finished or until HELD frames have accumulated.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Arrows:
         Args:
           frame: frame index.
           p: positions (n, 3) [m].
-          forces: forces (n, 3) [N] by name; a subset of the vertices is drawn where more than MAX_ARROWS carry a force.
+          forces: forces (n, 3) [N] by name; a subset of the vertices is drawn where more than MOST carry a force.
           times: builds the time columns from frame indices.
         """
         for name, force in forces.items():

@@ -39,9 +39,9 @@ class Frame:
       positions: vertex positions (n, 3) [m].
       energies: energies [J] by name.
       residual: residual norm [J^(1/2)].
-      num_iterations: number of solver iterations of the step.
+      iterations: number of solver iterations of the step.
       forces: forces (n, 3) [N] by name, drawn as arrows.
-      num_intersections: number of self-intersections of the mesh; None where they were not counted.
+      intersections: number of self-intersections of the mesh; None where they were not counted.
     """
 
     index: int
@@ -64,11 +64,11 @@ class RecordingInfo:
       mesh: mesh of the scene.
       springs: vertex pairs (m, 2) of the scene's springs, which may be fewer than those of the mesh.
       rest_lengths: rest lengths of the springs (m,) [m].
-      pinned_vertices: indices of the pinned vertices (q,).
+      pinned: indices of the pinned vertices (q,).
       time_step: step size [s].
       strain_range: strain at the ends of the colour scale (0.1 is 10 %).
       properties: flat metadata of the run and its machine (scene, size, solver, iterations, cpu, ...).
-      is_solve: whether the frames are the numbered iterates of one solve, instead of the steps of a run.
+      iterates: whether the frames are the numbered iterates of one solve, instead of the steps of a run.
       obstacles: obstacles drawn with the mesh.
     """
 
@@ -142,7 +142,7 @@ class Replay:
       triangles: vertex indices (f, 3).
       springs: vertex pairs (m, 2).
       rest_lengths: rest lengths of the springs (m,) [m].
-      pinned_vertices: indices of the pinned vertices (q,).
+      pinned: indices of the pinned vertices (q,).
       strain_range: strain at the ends of the colour scale.
       scalars: (frames, values) by entity name.
       properties: metadata as recorded.

@@ -57,7 +57,7 @@ def scene_view(root: str, name: str, box: Extent, *, springs_visible: bool) -> r
     Args:
       root: entity path above `/scene`.
       name: title of the view.
-      extent: extent of the positions, from which the camera is computed.
+      box: extent of the positions, from which the camera is computed.
       springs_visible: whether springs are shown at first; forces are hidden at first.
     """
     shown: dict[Any, rrb.EntityBehavior] = {f"{root}/scene/springs": rrb.EntityBehavior(visible=springs_visible)}
@@ -81,7 +81,7 @@ def plot(
       name: title of the plot.
       contents: entity queries.
       last: last frame shown.
-      value_range: smallest and largest value; if given, a legend is shown in a space of its own above the data.
+      ends: smallest and largest value; if given, a legend is shown in a space of its own above the data.
     """
     corner = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=ends is not None)
     across = rrb.TimeRange(*(rrb.TimeRangeBoundary.absolute(seq=at) for at in (0, max(last, 1))))
@@ -99,9 +99,9 @@ def blueprint(info: RecordingInfo, box: Extent, last: int = 0, ends: Ends | None
 
     Args:
       info: properties of the recording.
-      extent: extent of the positions, from which the camera is computed.
+      box: extent of the positions, from which the camera is computed.
       last: last frame.
-      value_ranges: smallest and largest value of groups of scalars, by entity.
+      ends: smallest and largest value of groups of scalars, by entity.
     """
     ends = ends or {}
     series = rrb.Vertical(

@@ -57,12 +57,12 @@ _LEAST = 1e-3
 
 
 class Extent:
-    """Positions of some frames, and the camera that frames them (see `harness.recording.camera_framing`).
+    """Positions of some frames, and the camera that frames them (see `harness.record.framing`).
 
     Args:
       rest: rest positions (n, 3) [m].
       aspect: width of the view over its height.
-      initial_positions: positions shown first (n, 3) [m]; the rest positions if omitted or not finite.
+      first: positions shown first (n, 3) [m]; the rest positions if omitted or not finite.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class Extent:
 
         Args:
           strain_range: strain at the ends of the colour scale.
-          strain_limits: smallest and largest strain of a spring. Where one is outside the scale, the strip ends in a
+          ends: smallest and largest strain of a spring. Where one is outside the scale, the strip ends in a
             tip labelled with that strain.
         """
         sight = self._best()

@@ -64,7 +64,7 @@ def side_by_side(out: Path, recordings: Mapping[str, Path], title: str, looks: M
       out: path of the new file.
       recordings: paths of the recordings by solver name.
       title: title of the new recording.
-      styles: line styles by solver name.
+      looks: line styles by solver name.
 
     Raises:
       InputError: a file is not the recording of a run.

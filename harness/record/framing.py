@@ -5,7 +5,7 @@ initial distance from the centre of the vertices that moved least, plus its disp
 first gap in the sorted radii:
 
     reach_i = |p_i(0) - centre| + max_t |p_i(t) - p_i(0)|,    framed: reach_i <= r_k for the least k of at least
-    MIN_FRAMED_SHARE n vertices with r_{k+1} > GAP_FACTOR max(r_k, half the diagonal of the initial positions)
+    SHARE n vertices with r_{k+1} > GAP max(r_k, half the diagonal of the initial positions)
 
 A connected mesh has no such gap, and neither has one that moves as a whole.
 """

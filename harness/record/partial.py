@@ -1,7 +1,7 @@
 """Rerun file with a temporary name until it is complete.
 
 A kill therefore leaves no truncated file under the final name. The stream has no batching thread of its own, which
-would slow down concurrent work and lose its last batch in a kill. Logged data is written to disk by `flush_stream`.
+would slow down concurrent work and lose its last batch in a kill. Logged data is written to disk by `flush`.
 
 The library has no public call to end the threads of a destroyed stream, to write a layout without leaving threads
 running, or to release a stream whose writer has died. `tests/contracts/test_rerun_gaps.py` fails once it has one.

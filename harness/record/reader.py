@@ -4,7 +4,7 @@
 
 A complete file is read through the index in its footer. A file without one (its run was killed) is scanned up to the
 last complete message. A file that this process has not written is first read in a separate process
-(see `harness.recording.recording_integrity`).
+(see `harness.record.sound`).
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Summary:
 
     Attributes:
       path: path of the file.
-      is_complete: whether the run closed the file.
+      complete: whether the run closed the file.
       title: title as recorded.
       run_id: identifier of the run.
       application: application name.
@@ -63,7 +63,7 @@ class Summary:
       frames: indices of the recorded frames (k,).
       timelines: (first, last) by timeline name.
       entities: entity paths.
-      scalars: table with schema SCALAR_SCHEMA.
+      scalars: table with schema SCALARS.
     """
 
     path: Path
@@ -232,7 +232,7 @@ def positions(
 
     Args:
       source: open recording.
-      frames: indices of the frames; all if omitted.
+      wanted: indices of the frames; all if omitted.
 
     Returns: tuples of frame, time [s] and positions, which are relative to the origin.
     """

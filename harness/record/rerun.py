@@ -2,11 +2,11 @@
 # pyarrow's stubs do not type the arrays that the library creates.
 """Recorder of a run as a Rerun file that opens with its own layout.
 
-Topology is written once, positions in batches of FLUSH_INTERVAL frames, scalars in bulk. The stream has no batching
+Topology is written once, positions in batches of FLUSH frames, scalars in bulk. The stream has no batching
 thread of its own, so the file of a killed run lacks only the last few frames. The file has a temporary name until it is
 complete and its end mark has been found.
 
-Positions are stored relative to an origin (`harness.recording.local_origin`).
+Positions are stored relative to an origin (`harness.record.local_origin`).
 
 Entities:
   `/scene/mesh`: positions, exact to float32; also `/scene/pins`, `/scene/springs`, `/scene/obstacles/*`.
@@ -57,7 +57,7 @@ _STRIPS: Any = rr.components.LineStrip3DBatch([]).as_arrow_array().type
 
 
 class RerunRecorder:
-    """Recorder of one run to a Rerun file; implements `harness.recording.recorder_interface.RunRecorder`.
+    """Recorder of one run to a Rerun file; implements `harness.record.base.Recorder`.
 
     All work but opening the file is deferred to the first frame, so that it runs in the thread that delivers the
     frames.
@@ -149,7 +149,7 @@ class RerunRecorder:
 
         Args:
           milliseconds: wall time [ms] of each phase by frame, from frame 1.
-          final_properties: properties that changed at the end of the run.
+          ended: properties that changed at the end of the run.
         """
         if not self._frames:
             self._begin()
@@ -168,7 +168,7 @@ class RerunRecorder:
         return self._file.finish(blueprint.blueprint(self._info, self._box, max(self._clock, default=0), self._ranges))
 
     def abandon(self) -> None:
-        """Stop and remove the partial file; has no effect after `finish_recording`."""
+        """Stop and remove the partial file; has no effect after `close`."""
         self._file.abandon()
 
     def _begin(self) -> None:

@@ -39,7 +39,7 @@ NEUTRAL = (128, 128, 128, 255)
 
 
 def palette() -> NDArray[np.uint8]:
-    """Return the colours of the levels, most compressed first, then NEUTRAL_COLOUR: (NUM_LEVELS + 1, 4)."""
+    """Return the colours of the levels, most compressed first, then NEUTRAL: (LEVELS + 1, 4)."""
     stops = np.array([[int(colour[k : k + 2], 16) for k in (1, 3, 5)] + [255] for colour in STRAIN_COLOURS])
     at = np.linspace(0, len(stops) - 1, LEVELS)
     channels: list[NDArray[np.float64]] = [np.interp(at, range(len(stops)), channel) for channel in stops.T]
@@ -57,7 +57,7 @@ def strain_range(
       springs: vertex pairs (m, 2).
       rest_lengths: rest lengths (m,) [m].
 
-    Returns: the range of `round_scale_end` over all strains; DEFAULT_STRAIN_RANGE without springs.
+    Returns: the range of `scale_end` over all strains; STRAIN_RANGE without springs.
     """
     found = [strains(p, springs, rest_lengths)[1] for p in positions if len(rest_lengths)]
     return scale_end(np.concatenate(found)) if found else STRAIN_RANGE
@@ -66,7 +66,7 @@ def strain_range(
 def scale_end(strain: NDArray[np.float64]) -> float:
     """Return the end of a scale: the round number above 99 % of the strains.
 
-    A few large strains at a pin thus do not leave all others grey. The result is DEFAULT_STRAIN_RANGE where none is
+    A few large strains at a pin thus do not leave all others grey. The result is STRAIN_RANGE where none is
     finite.
     """
     known = np.abs(strain[np.isfinite(strain)])

@@ -2,7 +2,7 @@
 
 A recording is a header of 12 bytes and a sequence of messages. Each message is a kind and a length of 8 bytes each,
 then that many bytes of payload. The library aborts the process on some damaged files. A file that this process has not
-written is therefore first read in the child process of `harness.execution.sandbox`.
+written is therefore first read in the child process of `harness.base.child`.
 
 Files that can be read are noted in the user's cache folder, for all processes, since reading a whole recording takes
 far longer than what a report needs from it. A note identifies the state of a file by its inode, size and times; the
@@ -46,7 +46,7 @@ def trust(path: Path, *, noted: bool = True) -> None:
 
     Args:
       path: path of the recording.
-      shared: whether other processes see the mark too.
+      noted: whether other processes see the mark too.
     """
     _sound.add(state := _state(path))
     if noted:
@@ -116,7 +116,7 @@ def require_sound(path: Path, read: Callable[[Path], None]) -> None:
 
     Args:
       path: path of the recording.
-      read_recording: function at module level that reads it.
+      read: function at module level that reads it.
 
     Raises:
       InputError: the recording cannot be read.

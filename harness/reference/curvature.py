@@ -50,7 +50,7 @@ class SplitHessian(NamedTuple):
 
     Attributes:
       sparse: S (3 f, 3 f).
-      columns: V (3 f, r), with r = 0 where all energies have sparse Hessians (see `solvers.model.rank_update`).
+      columns: V (3 f, r), with r = 0 where all energies have sparse Hessians (see `solvers.core.coupled`).
     """
 
     sparse: csr_array
@@ -80,8 +80,8 @@ class Curvature:
     """Smallest eigenvalue of the Hessian at a point.
 
     Attributes:
-      min_eigenvalue: smallest eigenvalue [N/m], infinite where no vertex is free.
-      eigenvalue_uncertainty: bound on its uncertainty by round-off [N/m].
+      smallest: smallest eigenvalue [N/m], infinite where no vertex is free.
+      doubt: bound on its uncertainty by round-off [N/m].
       direction: its eigenvector (n, 3), zero at exactly pinned vertices.
       solve: product with the inverse of the Hessian (3 f,), with the smallest shift that makes it positive definite.
     """
@@ -136,7 +136,7 @@ def across(problem: StepProblem, p: Positions, at: Curvature, *, most: float = S
       problem: step problem.
       p: positions (n, 3) [m].
       at: curvature at p.
-      max_fraction: maximum length of the step relative to the mesh extent; longer steps are scaled down.
+      most: maximum length of the step relative to the mesh extent; longer steps are scaled down.
 
     Returns: positions (n, 3) [m].
     """

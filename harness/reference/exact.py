@@ -3,7 +3,7 @@
     minimise grad g . d + |d|_Q^2 / 2   such that   low <= l + n . A d <= high
 
 Lengths l and directions n are those at p. Q is that of the step's projective energies and of the penalties of exact
-lengths (`solvers.model.energies.augmented_lagrangian`). The solution d is zero if and only if p is a stationary point.
+lengths (`solvers.energies.augmented`). The solution d is zero if and only if p is a stationary point.
 The tensions t are the multipliers of its constraints: of all tensions, those that minimise the remaining gradient in
 the norm of Q^-1 once the length errors are corrected. The active set is found by a semismooth Newton method
 (Hintermueller, Ito and Kunisch 2002): a limit is active where l + t/k is beyond it. Linearly dependent lengths share
@@ -11,7 +11,7 @@ their tension.
 
 With these tensions, the step of the Lagrangian has no length constraints. Its stationarity, its round-off and the
 curvature that certifies a minimum are therefore evaluated as for any other step. The penalties of a certificate are
-PENALTY_FACTOR times larger: if the curvature were negative along the constraints, no penalty would make it positive.
+FIRM times larger: if the curvature were negative along the constraints, no penalty would make it positive.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Exact:
         Args:
           problem: step problem.
           tension: tensions (m,) [N].
-          penalty_factor: factor on the penalties.
+          firm: factor on the penalties.
         """
         return replace(problem, system=self._with(tension, firm))
 

@@ -40,7 +40,7 @@ class Frozen:
     Attributes:
       frame: step number, from 1.
       problem: step problem with exact pins, whose initial guess is the current positions.
-      end_motion: motion at the step's end.
+      after: motion at the step's end.
       digest: 12 hex digits of a hash of the problem's arrays, of the gradient at the current positions, which
         represents the energies, and of the origin of the snapshot.
       acceleration: acceleration at the step's end (n, 3) [m/s^2], None where the integrator provides none.
@@ -59,7 +59,7 @@ class Frozen:
         return State(self.after, Motion(begun.positions, begun.velocity), self.frame, self.acceleration)
 
     def stated(self, first_guess: str) -> StepProblem:
-        """Return the problem with an initial guess by name (`harness.simulation.time_loop`)."""
+        """Return the problem with an initial guess by name (`harness.simulation.step`)."""
         return guessed(self.problem, first_guess)
 
 
@@ -70,7 +70,7 @@ def bind(spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, warn
       spec: specification of the scene.
       size: size of the scene.
       integrator: name of the integrator.
-      show_warnings: whether warnings of the scene are shown.
+      warns: whether warnings of the scene are shown.
 
     Raises:
       InputError: the scene cannot be built.
@@ -88,11 +88,11 @@ def reference_run(
     Args:
       scene: scene with exact pins.
       solver: solver of the steps.
-      num_steps: number of the last step.
-      frames: steps to return; the snapshot steps if empty.
-      initial_state: state from which to continue; the start of the scene if omitted.
+      length: number of the last step.
+      wanted: steps to return; the snapshot steps if empty.
+      state: state from which to continue; the start of the scene if omitted.
 
-    Returns: the steps by frame, and for all steps (num_steps,) the decrease of the objective [J] from the current
+    Returns: the steps by frame, and for all steps (length,) the decrease of the objective [J] from the current
       positions to the solution, nan before the initial state.
 
     Raises:
@@ -114,11 +114,11 @@ def reference_run(
 
 
 def moment_frames(violence: NDArray[np.float64], length: int) -> dict[str, int]:
-    """Select the frames of SNAPSHOT_NAMES in a run.
+    """Select the frames of MOMENTS in a run.
 
     Args:
       violence: decrease of the objective [J] of the first steps (frames,).
-      num_steps: number of steps of the run.
+      length: number of steps of the run.
     """
     first = min(2, length)
     return {

@@ -1,9 +1,9 @@
 """Audit of the residuals that a solver reports, on some steps of every run.
 
-    claimed >= |Q^-1 grad g(p)|_Q / RESIDUAL_SLACK,   p the solution or the iterate before it, apart from round-off
+    claimed >= |Q^-1 grad g(p)|_Q / SLACK,   p the solution or the iterate before it, apart from round-off
 
 Where lengths are exact, g is the Lagrangian with the tensions that minimise its gradient at p
-(`harness.reference.exact_lengths`). With the tensions of the method itself the gradient may vanish where lengths are
+(`harness.reference.exact`). With the tensions of the method itself the gradient may vanish where lengths are
 wrong.
 
 The audit runs in the instrumentation pass, which is not timed. It detects a method that does nothing and reports a zero

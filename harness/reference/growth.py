@@ -1,8 +1,8 @@
 """Growth of a perturbation of the start: the estimate of the predictability horizon for all commands.
 
-Every free coordinate of the start is perturbed by `START_PERTURBATION` of the mesh size, with random sign. Both motions
+Every free coordinate of the start is perturbed by `PERTURBATION` of the mesh size, with random sign. Both motions
 are integrated with the same steps: by a symplectic composition of order 6 (Blanes and Moan 2002) where it supports the
-scene, otherwise by Dormand and Prince's method of order 8. Where the difference has grown to `_LINEAR_LIMIT` times its
+scene, otherwise by Dormand and Prince's method of order 8. Where the difference has grown to `_LINEAR` times its
 initial size, it is rescaled to that size (Benettin et al. 1980), so that it grows as an infinitesimal one does. Once a
 perturbation of 1e-12 of the size would have grown to the displacement itself, the motion is no longer predictable.
 
@@ -56,8 +56,8 @@ class Growth:
 
     Attributes:
       times: sample times (k,) [s].
-      displacement: displacement from the start (k,) [m], Frobenius norm over the free vertices.
-      growth_factor: size (k,) of a perturbation that was 1e-12 of the mesh size at the start, relative to the
+      moved: displacement from the start (k,) [m], Frobenius norm over the free vertices.
+      grown: size (k,) of a perturbation that was 1e-12 of the mesh size at the start, relative to the
         displacement, at most 1.
       scale: root mean square displacement of a free coordinate at the end [m].
     """
@@ -115,7 +115,7 @@ def growth(spec: SceneSpec, size: int, horizon: float) -> Growth:
     Args:
       spec: specification of the scene.
       size: size of the scene.
-      t_end: end time [s].
+      horizon: end time [s].
 
     Raises:
       Unpredictable: nothing moves, or the motion is not finite.

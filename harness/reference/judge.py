@@ -1,10 +1,10 @@
 """Verifier of steps: stationarity, whether the solution is a minimum, and distance from a reference run.
 
-Stationarity is measured by `harness.reference.reference_evaluator` with a matrix that it assembles and factorises
+Stationarity is measured by `harness.reference.oracle` with a matrix that it assembles and factorises
 itself, independently of the solver. A stationary point is a minimum where the smallest eigenvalue of its Hessian is
-positive beyond round-off (`harness.reference.hessian_curvature`). The motion is compared with a reference run, each
+positive beyond round-off (`harness.reference.curvature`). The motion is compared with a reference run, each
 step of which was solved to round-off. The comparison is by vertex: a distance is relative to the size of the vertex's
-connected component. A step with exact lengths is evaluated by its Lagrangian (`harness.reference.exact_lengths`).
+connected component. A step with exact lengths is evaluated by its Lagrangian (`harness.reference.exact`).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Judge:
           scene: scene of the run.
           reference: positions (frames, n, 3) [m], nan from the frame on in which there is none; None without a
             reference.
-          is_minimiser: whether the solver minimises the step's objective.
+          minimises: whether the solver minimises the step's objective.
         """
         self._stationarity = Stationarity()
         self._sizes = sizes(scene.system, scene.mesh.rest)
@@ -61,7 +61,7 @@ class Judge:
         return row
 
     def stationarity(self, problem: StepProblem, p: Positions) -> Reading:
-        """Evaluate the stationarity at p (n, 3) [m] (`harness.reference.exact_lengths`)."""
+        """Evaluate the stationarity at p (n, 3) [m] (`harness.reference.exact`)."""
         return self._stationarity(problem, p)
 
     def curvature(self, problem: StepProblem, p: Positions) -> Curvature:
@@ -76,7 +76,7 @@ def reference(scene: Scene, solver: Solver, *, first_guess: str, frames: int) ->
     Args:
       scene: scene that is stepped.
       solver: solver of the steps.
-      initial_guess: name of the initial guess.
+      first_guess: name of the initial guess.
       frames: number of steps.
 
     Returns: positions (frames, n, 3) [m], nan from the first step on that does not end at a stationary point.

@@ -1,9 +1,9 @@
 """Certified minima that solvers are compared with, by Newton's method to round-off.
 
-At a minimum grad g = 0 and the Hessian H is positive definite. Both are checked with `solvers.model.step_problem`,
+At a minimum grad g = 0 and the Hessian H is positive definite. Both are checked with `solvers.problem`,
 whatever method found the positions. Newton steps |H^-1 grad g| are repeated while each is shorter than half of the one
 before. The point where they end is stored. There the smallest eigenvalue must be positive beyond round-off
-(`harness.reference.hessian_curvature`) and one more step must be short. The energy is not convex, so there may be
+(`harness.reference.curvature`) and one more step must be short. The energy is not convex, so there may be
 several minima. The basin of a minimum is defined by Newton's method with a line search, which only descends.
 
 Where the curvature along some direction is zero within round-off, and points in that direction have the same energy,
@@ -40,7 +40,7 @@ class Uncertified(RunFailed):
 
 MINIMUM, VALLEY, FLAT, SADDLE, ROUGH = "minimum", "valley", "flat", "saddle", "rough"
 """Kinds of points where Newton's method ends: a certified minimum; one of a continuum of minima; a point where no
-curvature is negative and one is zero within round-off; a saddle; a minimum less accurate than CERTIFIED_RTOL."""
+curvature is negative and one is zero within round-off; a saddle; a minimum less accurate than NEAR."""
 WALK = 1e-3
 """Distance along a continuum at which its points are compared, relative to the mesh size."""
 LEVEL = 64.0
@@ -53,12 +53,12 @@ class Minimum:
 
     Attributes:
       positions: positions (n, 3) [m], read-only; all other attributes refer to this point.
-      objective: value g [J].
-      newton_step_length: length [m] of the next Newton step at the vertex where it is largest, infinite where the
+      g: value g [J].
+      error: length [m] of the next Newton step at the vertex where it is largest, infinite where the
         Hessian has no factor.
-      min_eigenvalue: smallest eigenvalue of the Hessian without the exactly pinned vertices [N/m].
-      eigenvalue_uncertainty: bound on its uncertainty [N/m].
-      position_tolerance: CERTIFIED_RTOL times the size of each vertex's component (n,) [m].
+      smallest_eigenvalue: smallest eigenvalue of the Hessian without the exactly pinned vertices [N/m].
+      doubt: bound on its uncertainty [N/m].
+      near: NEAR times the size of each vertex's component (n,) [m].
       kind: one of the kinds above.
     """
 
@@ -72,7 +72,7 @@ class Minimum:
 
     @property
     def certified(self) -> bool:
-        """Whether this is an isolated minimum, accurate to CERTIFIED_RTOL."""
+        """Whether this is an isolated minimum, accurate to NEAR."""
         return self.kind == MINIMUM
 
     @property
@@ -101,7 +101,7 @@ class KnownMinima:
 
     @property
     def best(self) -> Minimum:
-        """The lowest known minimum; raises UncertifiedError where there is none."""
+        """The lowest known minimum; raises Uncertified where there is none."""
         if not self.minima:
             raise Uncertified(self.reason)
         return self.minima[0]

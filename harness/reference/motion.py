@@ -50,7 +50,7 @@ class Field:
           compiled: whether springs are summed by the compiled loop instead of NumPy.
 
         Raises:
-          NotIntegrable: the scene has no equations of motion.
+          Unintegrable: the scene has no equations of motion.
         """
         system = scene.system
         self._scene, self._free, self._system = scene, system.free, system
@@ -110,7 +110,7 @@ class Field:
 
 
 def moving(spec: SceneSpec, size: int) -> Scene:
-    """Build a scene with equations of motion; raises NotIntegrable.
+    """Build a scene with equations of motion; raises Unintegrable.
 
     Velocity filters without an equation of motion are converted to forces.
     """
@@ -164,7 +164,7 @@ def add_springs(
 
 
 def _drag(scene: Scene) -> float:
-    """Return the rate of the scene's ether drag [1/s]; raises NotIntegrable for any other filter."""
+    """Return the rate of the scene's ether drag [1/s]; raises Unintegrable for any other filter."""
     v = np.random.default_rng(0).uniform(1.0, 2.0, scene.mesh.rest.shape)
     kept = reduce(lambda v, filtered: filtered(v), scene.filters, v) / v
     if not kept.min() > 0.0 or np.ptp(kept) > 1e-12 * kept.max():

@@ -4,7 +4,7 @@
     stationarity(p) = residual(p) / initial,   initial = max(residual(current positions), floor(current positions))
 
 Q is the matrix of the system's projective energies. It is assembled here and factorised by SuperLU, independently of
-the solver. Round-off is bounded for each vertex (`solvers.model.rounding_bound`): a gradient of at most FACTOR delta_i
+the solver. Round-off is bounded for each vertex (`solvers.round_off`): a gradient of at most FACTOR delta_i
 at vertex i may be round-off only; a larger one is significant, however distant or stiff another part of the scene is.
 Hence
 
@@ -13,7 +13,7 @@ Hence
 
 A step is assessed by `beyond`: it is 0 where every vertex is in equilibrium to float64 accuracy.
 
-Where Q has more than MAX_DIRECT_NNZ entries, conjugate gradients from zero replace the factor. |x_k|_Q grows towards
+Where Q has more than LARGEST entries, conjugate gradients from zero replace the factor. |x_k|_Q grows towards
 |Q^-1 g|_Q (Hestenes and Stiefel 1952), so that the result is a close lower bound. The preconditioner is multigrid,
 which affects only the number of iterations, not the limit: ten iterations on meshes of any size.
 """
@@ -40,7 +40,7 @@ LARGEST = 1_500_000
 ACCURACY = 1e-9
 """Tolerance of conjugate gradients relative to the scaled gradient norm |D^-1/2 g|, D the diagonal of Q. It gives four
 digits of |Q^-1 g|_Q where a heavy pin contributes nearly all of g, and more elsewhere. The limit is
-MAX_CG_ITERATIONS."""
+MOST."""
 
 MOST = 500
 
@@ -49,9 +49,9 @@ class Reading(NamedTuple):
     """Stationarity of a point.
 
     Attributes:
-      stationarity: residual relative to the initial residual.
-      roundoff_bound: bound on the share of it that is due to round-off.
-      above_roundoff: the share that round-off does not explain.
+      reached: residual relative to the initial residual.
+      attainable: bound on the share of it that is due to round-off.
+      beyond: the share that round-off does not explain.
     """
 
     reached: float
@@ -139,7 +139,7 @@ class Oracle:
         Args:
           problem: step problem.
           p: positions (n, 3) [m].
-          initial_residual: residual [J^(1/2)] that the result is relative to; that of the problem if omitted.
+          yardstick: residual [J^(1/2)] that the result is relative to; that of the problem if omitted.
         """
         yardstick = self.yardstick(problem) if yardstick is None else yardstick
         gradient, bound = problem.gradient(p), gradient_round_off(problem, p)

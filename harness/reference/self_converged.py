@@ -1,6 +1,6 @@
 """Self-converged reference for scenes with contact: steps are halved until the motion no longer changes.
 
-    |p_h(T) - p_(h/2)(T)| and |p(T) - q(T)| <= REFERENCE_MARGIN error |q(T) - p(0)|
+    |p_h(T) - p_(h/2)(T)| and |p(T) - q(T)| <= MARGIN error |q(T) - p(0)|
 
 Here p is the motion by implicit Euler and q the one by BDF2. Norms are Frobenius norms over the free vertices; steps
 are solved by Newton's method. Contact has no equation of motion that could be integrated instead, and its limit may
@@ -54,7 +54,7 @@ class SelfConverged(Trajectory):
     Attributes:
       disagreement: difference (k,) of the two integrators, or the last change of either by step halving, if larger.
       step: last step size [s].
-      last_change: last change by step halving alone, at the end, relative to the displacement.
+      moved_last: last change by step halving alone, at the end, relative to the displacement.
     """
 
     step: float
@@ -97,7 +97,7 @@ def converge(bound: Bound, frame: float, times: Sequence[float], error: float) -
       bound: builds the scene from a step size and an integrator.
       frame: approximate first step size [s].
       times: ascending times [s], each a multiple of the step size.
-      error: smallest relative error to be measured, if that takes no longer than MAX_SECONDS.
+      error: smallest relative error to be measured, if that takes no longer than SPENT.
 
     Raises:
       NotConverged: not even two step sizes could be compared.
@@ -126,8 +126,8 @@ class _Motion:
     """A sampled motion.
 
     Attributes:
-      free_vertices: indices of the free vertices.
-      start_positions: positions at the start (n, 3) [m].
+      free: indices of the free vertices.
+      begin: positions at the start (n, 3) [m].
       positions: positions (k, n, 3) [m].
       velocities: velocities (k, n, 3) [m/s].
     """

@@ -51,7 +51,7 @@ class Store:
     solver: Solver = field(default_factory=Newton)
 
     def moments(self, spec: SceneSpec, size: int, integrator: IntegratorName = "implicit-euler") -> dict[str, Frozen]:
-        """Load or compute the snapshots SNAPSHOT_NAMES of the scene's `frames` steps.
+        """Load or compute the snapshots MOMENTS of the scene's `frames` steps.
 
         Args:
           spec: specification of the scene.
@@ -103,7 +103,7 @@ class Store:
     def reference(self, frozen: Frozen) -> KnownMinima:
         """Load the known minima of a problem, or find them.
 
-        `lowest` of the result raises UncertifiedError if there is none.
+        `lowest` of the result raises Uncertified if there is none.
         """
         path = self.folder / f"minima-{frozen.digest}.npz"
         if path.exists() and (stored := _read(path)).keys() >= set(_CERTIFICATE):  # else by code that certified less
@@ -117,7 +117,7 @@ class Store:
         """Find the minimum in whose basin p (n, 3) [m] is.
 
         A new certified minimum is added to the known ones, and becomes the reference if it is the lowest. Its index is
-        `find_minima(snapshot).find_index(minimum)` where it is certified.
+        `find_minima(moment).branch(minimum)` where it is certified.
         """
         found, known = polish(frozen.problem, p, self.solver), self.reference(frozen)
         joined = known.joined(found)
@@ -138,12 +138,12 @@ class Store:
           size: size of the scene.
           times: ascending times [s].
           error: smallest relative error to be measured.
-          report_progress: called with the progress of an integration.
+          told: called with the progress of an integration.
 
         Raises:
           InputError: the scene cannot be built.
-          NotIntegrable: the scene has no equations of motion.
-          UnpredictableMotion: the reference would not be accurate enough.
+          Unintegrable: the scene has no equations of motion.
+          Unpredictable: the reference would not be accurate enough.
         """
         name = _named(spec, size, times)
         if touches(bind(spec, size).system):
@@ -167,11 +167,11 @@ class Store:
         Args:
           spec: specification of the scene.
           size: size of the scene.
-          t_end: end time [s].
+          horizon: end time [s].
 
         Raises:
-          UnpredictableMotion: nothing moves, or the motion is not finite.
-          NotIntegrable: the scene has no equations of motion.
+          Unpredictable: nothing moves, or the motion is not finite.
+          Unintegrable: the scene has no equations of motion.
         """
         witness = Field(moving(spec, size)).witness()
         path = self.folder / f"growth-{_named(spec, size, [horizon])}.npz"

@@ -2,7 +2,7 @@
 
 Dormand and Prince's method of order 8 (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section
 II.10) at rtol 1e-12, checked by Adams methods of orders up to 12 (VODE; ibid., section III.1). Where a perturbation of
-1e-12 at the start grows past the error to be measured (`harness.reference.perturbation_growth`), there is no reference
+1e-12 at the start grows past the error to be measured (`harness.reference.growth`), there is no reference
 trajectory, and the request is rejected.
 """
 
@@ -39,10 +39,10 @@ class Trajectory:
 
     Attributes:
       times: times (k,) [s].
-      free_vertices: indices of the vertices that are not pinned.
+      free: indices of the vertices that are not pinned.
       positions: positions (k, n, 3) [m].
       velocities: velocities (k, n, 3) [m/s].
-      displacement: displacement from the start (k,) [m].
+      moved: displacement from the start (k,) [m].
       disagreement: difference of the two methods (k,), relative to the displacement.
       growth: size of a perturbation of the start (k,), relative to the displacement; 0 where none was estimated.
     """
@@ -65,7 +65,7 @@ class Trajectory:
         return float(np.linalg.norm((p - self.positions[k])[self.free])) / float(self.moved[k])
 
     def require(self, error: float) -> None:
-        """Raise UnpredictableMotion where a relative error could not be distinguished from the reference's own."""
+        """Raise Unpredictable where a relative error could not be distinguished from the reference's own."""
         for k, t in enumerate(self.times):
             for found, what in ((self.growth[k], "a perturbation of 1e-12"), (self.disagreement[k], "round-off")):
                 if not found <= MARGIN * error:
@@ -99,10 +99,10 @@ def integrate(scene: Scene, times: Sequence[float], told: Told | None = None) ->
     Args:
       scene: scene with exact pins.
       times: ascending times after the start [s].
-      report_progress: called at each evaluation of the forces.
+      told: called at each evaluation of the forces.
 
     Raises:
-      NotIntegrable: the scene has no equations of motion.
+      Unintegrable: the scene has no equations of motion.
     """
     alone = Field(scene)
     start, atol = alone.start, RTOL * (scene.mesh.size or 1.0)

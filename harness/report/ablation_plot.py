@@ -89,8 +89,8 @@ def _errors(ax: Axes, rows: Sequence[Row], points: Sequence[Row]) -> None:
 def _effects(ax: Axes, points: Sequence[Row], whole: float, *, hollow: bool) -> None:
     """Draw one point per effect with its interval and its name.
 
-    Names that would overlap are moved apart. `full_run` is the time of a step with all effects [s]; markers are hollow
-    if `is_stale`, that is, if other code than the current version measured them.
+    Names that would overlap are moved apart. `whole` is the time of a step with all effects [s]; markers are hollow
+    if `hollow`, that is, if other code than the current version measured them.
     """
     taken: list[tuple[float, float]] = []
     face: Any = {"mfc": PAGE, "mew": 1.8} if hollow else {}

@@ -3,7 +3,7 @@
 """Certificates of intersection-free runs as CSV, one line per run.
 
 Each line states in how many frames no primitives intersect, by the exact test of
-`harness.scenes.edge_triangle_intersections`, and how many steps converged.
+`harness.scenes.intersections`, and how many steps converged.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ class _Grid(NamedTuple):
 def draw_comparison(replays: Mapping[str, Replay], path: Path) -> None:
     """Draw the final frames of several runs as one PNG picture.
 
-    The picture is PAGE_WIDTH pixels wide and at most PAGE_HEIGHT high. Distances refer to the run with the lowest
+    The picture is WIDTH pixels wide and at most HEIGHT high. Distances refer to the run with the lowest
     residual of each scene and size.
 
     Args:

@@ -47,7 +47,7 @@ class Tile:
             `commit`.
         mass: vertex masses (n,) [kg].
         name: name of the scene.
-        effect_words: effects of the scene, in words.
+        effects: effects of the scene, in words.
         angles: azimuth and elevation of the camera [degrees]; None to choose them by the mesh's shape.
     """
 

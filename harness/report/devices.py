@@ -28,10 +28,10 @@ class Run(NamedTuple):
     """One run of a sweep.
 
     Attributes:
-        device_requested: whether the run requested a device.
+        asked: whether the run requested a device.
         vertices: number of vertices; None if the run failed before its scene was built.
         seconds: median wall time of a step [s]; None without timed steps.
-        has_converged: whether all steps ended at their tolerance.
+        reached: whether all steps ended at their tolerance.
     """
 
     place: str
@@ -87,7 +87,7 @@ Panel = tuple[str, float]
 
 
 def runs(table: pa.Table) -> list[Run]:
-    """Return the runs of a sweep from its rows (schema: `harness.results.run_schema.RUN_SCHEMA`).
+    """Return the runs of a sweep from its rows (schema: `harness.base.columns.SCHEMA`).
 
     The list is empty if no run requested a device.
     """
@@ -156,7 +156,7 @@ def words(found: Sequence[Run], config: str) -> list[str]:
     """Summarise runs in sentences; empty if no run of the sweep requested a device.
 
     Args:
-        all_runs: runs of the sweep.
+        found: runs of the sweep.
         config: path of the sweep's config; "" if it no longer exists.
     """
     asked = [run for run in found if run.asked]

@@ -52,10 +52,10 @@ def draw_devices(results: Path) -> Iterator[tuple[Path | None, list[str]]]:
 def draw(compared: dict[tuple[str, float], list[Pair]], path: Path, title: str, facts: Sequence[str]) -> None:
     """Draw the fastest runs of both sides as a PNG file.
 
-    The picture is PAGE_WIDTH pixels wide and at most PAGE_HEIGHT high.
+    The picture is WIDTH pixels wide and at most HEIGHT high.
 
     Args:
-        pairs_by_panel: device pairs by scene and tolerance.
+        compared: device pairs by scene and tolerance.
         path: target file.
         title: title of the picture.
         facts: phrases below the title.

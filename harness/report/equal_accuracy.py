@@ -27,12 +27,12 @@ class Comparison(NamedTuple):
     """Runs of one scene, size and machine that solve the same steps.
 
     Attributes:
-        group_label: scene and size.
-        error_label: name of the error.
-        lowest_error: smallest error of these runs.
-        equal_runs: runs within a factor EQUAL_ERROR_FACTOR of the lowest error or of round-off, the fastest first.
-        worse_runs: runs beyond that, each with its error divided by the lowest.
-        unknown_runs: runs whose error is unknown.
+        where: scene and size.
+        what: name of the error.
+        lowest: smallest error of these runs.
+        equal: runs within a factor SAME of the lowest error or of round-off, the fastest first.
+        worse: runs beyond that, each with its error divided by the lowest.
+        unknown: runs whose error is unknown.
     """
 
     where: str
@@ -64,7 +64,7 @@ def sentences(compared: Comparison, names: Mapping[str, str]) -> Iterator[tuple[
     """Describe a comparison in sentences, each with the ids of its runs.
 
     Args:
-        comparison: comparison to describe.
+        compared: comparison to describe.
         names: labels of the runs by their ids.
     """
     not_compared = [

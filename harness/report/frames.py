@@ -28,7 +28,7 @@ def drawable_frames(replay: Replay) -> NDArray[np.int64]:
 
 
 def shown_limit(replays: Sequence[Replay], frames: Sequence[int]) -> float:
-    """Return the end of a colour scale for the strains of these frames, see `round_scale_end`.
+    """Return the end of a colour scale for the strains of these frames, see `scale_end`.
 
     Args:
         replays: recordings.

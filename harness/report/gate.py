@@ -112,7 +112,7 @@ def compare(base: Path, new: Path, console: Console) -> int:
         base: pytest-benchmark file of the old version.
         new: pytest-benchmark file of the new version.
         console: console that the table is printed on.
-    Returns: 1 if a benchmark became slower or is missing; INCONCLUSIVE_EXIT_CODE if there is no common benchmark;
+    Returns: 1 if a benchmark became slower or is missing; CANNOT_TELL if there is no common benchmark;
         otherwise 0.
     Raises:
         InputError: if pytest-benchmark did not write one of the files.

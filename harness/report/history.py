@@ -69,8 +69,8 @@ class GateHistory:
     """Results of a benchmark on one kind of machine, in the order of their commits.
 
     Attributes:
-        is_ratio: whether values are ratios; otherwise they are seconds.
-        segment_starts: first index of each segment; 0 is first, the others are changes.
+        ratio: whether values are ratios; otherwise they are seconds.
+        starts: first index of each segment; 0 is first, the others are changes.
     """
 
     gate: str

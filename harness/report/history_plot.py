@@ -23,10 +23,10 @@ _ROW = 190
 
 
 def draw_history(found: Sequence[GateHistory], path: Path) -> int:
-    """Draw at most MAX_PANELS benchmarks that have enough results, and return how many were drawn.
+    """Draw at most MOST benchmarks that have enough results, and return how many were drawn.
 
     Args:
-        gate_histories: benchmark histories, the largest change first.
+        found: benchmark histories, the largest change first.
         path: target file; its suffix determines the format, PNG by default.
     """
     shown = [series for series in found if len(series.points) >= FEWEST]

@@ -45,12 +45,12 @@ def direct_labels(ax: Axes, ends: Sequence[End]) -> None:
 
 
 def spread(wanted: Sequence[float], bottom: float, top: float) -> list[float]:
-    """Return sorted heights [pixels] that are at least LABEL_SPACING apart.
+    """Return sorted heights [pixels] that are at least LINE apart.
 
     They are moved up from below, then down from the top.
 
     Args:
-        targets: preferred heights, ascending [pixels].
+        wanted: preferred heights, ascending [pixels].
         bottom: lower limit [pixels].
         top: upper limit [pixels].
     """

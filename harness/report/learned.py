@@ -25,7 +25,7 @@ GROWS = 1.5
 def closing(table: pa.Table, config: Path, results: Path, folder: Path) -> list[str]:
     """Build the last lines of a sweep: findings, commands, and the page's address.
 
-    No line is longer than TABLE_WIDTH, except for paths.
+    No line is longer than WIDTH, except for paths.
 
     Args:
         table: rows of the sweep.
@@ -53,7 +53,7 @@ def commands(found: Sequence[RunTimes], config: Path, results: Path, recordings:
     They replay a run, find the fastest solver at equal accuracy, and update the page.
 
     Args:
-        timed_runs: runs of the sweep.
+        found: runs of the sweep.
         config: config that was run.
         results: folder of the results of all sweeps.
         recordings: folder of this sweep's recordings.

@@ -13,7 +13,7 @@ from harness.report.style import MUTED, WIDTH
 
 _DIRTY = "-dirty"
 NEEDED = ("cpu", "threads", "commit", "code")
-"""The columns that `describe_provenance` reads."""
+"""The columns that `measured_on` reads."""
 
 
 def abridged(commit: str) -> str:

@@ -2,7 +2,7 @@
 # Matplotlib's stubs do not type most keywords.
 """Layout of a picture: title, strain scale, text and images at pixel positions.
 
-The page has PAGE_WIDTH x PAGE_HEIGHT pixels.
+The page has WIDTH x HEIGHT pixels.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def save(page: Figure, path: Path, *, used: float = HEIGHT) -> None:
     Args:
         page: figure to write.
         path: target file.
-        used_height: height that is drawn on [pixels from the top]; the empty part below is cropped.
+        used: height that is drawn on [pixels from the top]; the empty part below is cropped.
     Raises:
         CannotWrite: if the file cannot be written.
     """
@@ -89,7 +89,7 @@ def save(page: Figure, path: Path, *, used: float = HEIGHT) -> None:
 def header(page: Figure, headline: str, facts: Sequence[str], *, letters: int = 56) -> None:
     """Draw the title in the upper left corner and a line of facts below.
 
-    The title is shortened to `max_letters`.
+    The title is shortened to `letters`.
     """
     text(page, 40, 50, shorten(headline, letters), size=21, weight="bold")
     text(page, 41, 82, "   ·   ".join(facts), size=11.5, color=MUTED)

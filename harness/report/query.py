@@ -1,6 +1,6 @@
 """SQL over the rows of all sweeps, accuracy configs and ablations.
 
-DuckDB reads the Parquet files. A query runs in the child process of `harness.execution.sandbox`, because it may exceed
+DuckDB reads the Parquet files. A query runs in the child process of `harness.base.child`, because it may exceed
 the allowed time or memory. Read-only queries are answered from the files; for other statements (PIVOT, CREATE) all rows
 are loaded into memory first.
 """
@@ -44,7 +44,7 @@ _CHARACTERS = 50_000_000
 
 @dataclass(frozen=True, slots=True)
 class QueryResult:
-    """Column names and rows of a query result; `is_truncated` states whether further rows were omitted."""
+    """Column names and rows of a query result; `more` states whether further rows were omitted."""
 
     columns: list[str]
     values: list[tuple[Any, ...]]
@@ -79,8 +79,8 @@ def answer(sql: str, results: Path, *, most: int = SHOWN, seconds: float = 15.0)
     Args:
         sql: query.
         results: folder of results.
-        max_rows: maximum number of rows of the result.
-        cpu_seconds: limit of the processor time [s].
+        most: maximum number of rows of the result.
+        seconds: limit of the processor time [s].
     Raises:
         InputError: if there are no rows, if the query exceeds a limit, or, with DuckDB's message, if it is invalid.
     """
@@ -134,7 +134,7 @@ def _found(sql: str, units: dict[str, list[Path]], most: int, *, in_memory: bool
 def _offer(connection: duckdb.DuckDBPyConnection, units: dict[str, list[Path]], *, lazily: bool) -> None:
     """Register the tables of rows and disable all other access.
 
-    With `as_views`, rows are read from files on demand, and these files stay accessible, so that this mode is only for
+    With `lazily`, rows are read from files on demand, and these files stay accessible, so that this mode is only for
     read-only statements. Otherwise the tables are in memory.
     """
     files: list[str] = []

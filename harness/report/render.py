@@ -75,9 +75,9 @@ class View:
     Attributes:
         position: position of the camera (3,) [m].
         target: focal point (3,) [m].
-        ground_height: height of the plane that receives the shadow [m].
-        box_low: lower corner of the box of all framed points (3,) [m].
-        box_high: upper corner of that box (3,) [m].
+        ground: height of the plane that receives the shadow [m].
+        low: lower corner of the box of all framed points (3,) [m].
+        high: upper corner of that box (3,) [m].
     """
 
     position: Points
@@ -87,7 +87,7 @@ class View:
     high: Points
 
     def scaled(self, by: float) -> View:
-        """Return the view of a scene whose coordinates are multiplied by `factor`."""
+        """Return the view of a scene whose coordinates are multiplied by `by`."""
         return View(by * self.position, by * self.target, by * self.ground, by * self.low, by * self.high)
 
     def near(self, p: Points) -> Points:
@@ -262,8 +262,8 @@ class Studio:
             replay: recording.
             frame: index among the recorded frames.
             view: camera.
-            extra_solids: solids that are drawn in addition to the obstacles.
-            coloured_points: pairs of points (q, 3) and their colour.
+            more: solids that are drawn in addition to the obstacles.
+            dots: pairs of points (q, 3) and their colour.
         Returns: pixels (height, width, 3), or 4 channels without a background.
         """
         plotter = self._plotter

@@ -99,15 +99,15 @@ class Judged:
         case: scene, with the options in which its runs differ.
         solver: solver, with the parameters in which its runs differ.
         outcome: outcome of the run.
-        worst_error: largest `beyond` of a step, or, if `error_kind` is "distance", the largest distance from the
+        worst: largest `beyond` of a step, or, if `graded` is "distance", the largest distance from the
             reference; None if unknown.
-        error_kind: "stationarity" or "distance".
+        graded: "stationarity" or "distance".
         reason: why the run is not correct.
-        citation: reference of the solver as in the rows.
+        reference: reference of the solver as in the rows.
         run_id: id of the run.
         cpu: processor that executed the run.
         commit: version of the code that executed the run.
-        solver_name: name of the solver without its parameters; it may contain spaces.
+        name: name of the solver without its parameters; it may contain spaces.
     """
 
     case: str
@@ -231,10 +231,10 @@ class Score:
     """Score of one solver over all cases.
 
     Attributes:
-        outcome_counts: number of runs with each outcome, in the order of RUN_OUTCOMES.
-        correct_share: share of correct runs among supported cases; None if no case is supported.
-        finite_share: share of runs that stayed finite, likewise.
-        worst_run: run with the largest error.
+        counts: number of runs with each outcome, in the order of OUTCOMES.
+        right: share of correct runs among supported cases; None if no case is supported.
+        finite: share of runs that stayed finite, likewise.
+        worst: run with the largest error.
     """
 
     solver: str

@@ -66,7 +66,7 @@ def draw_map(cells: Sequence[Judged], path: Path, title: str, older: Collection[
         cells: verified runs.
         path: target file.
         title: title of the map.
-        stale_ids: ids of runs that were executed by other code than the current version; they get a hollow mark.
+        older: ids of runs that were executed by other code than the current version; they get a hollow mark.
     """
     solvers = list(dict.fromkeys(cell.solver for cell in cells))
     places, rows = _places(list(dict.fromkeys(cell.case for cell in cells)))
@@ -138,7 +138,7 @@ _BARS = ("#8fcbad", "#c4ccd6")
 
 
 def _legend(figure: Figure, cells: Sequence[Judged], used: Sequence[Outcome], across: int, top: float) -> None:
-    """Draw the legend of the outcomes, with `columns` entries per row, from `top` [inches] downwards."""
+    """Draw the legend of the outcomes, with `across` entries per row, from `top` [inches] downwards."""
     width, height = figure.get_size_inches()
     for k, outcome in enumerate(used):
         row, column = divmod(k, across)
@@ -172,7 +172,7 @@ def draw_maps(results: Path, older: Callable[[Path], Collection[str]]) -> Iterat
 
     Args:
         results: folder of results, or the folder of one sweep.
-        find_stale: returns the ids of those runs in a sweep's folder that other code than the current version executed.
+        older: returns the ids of those runs in a sweep's folder that other code than the current version executed.
     Yields: each picture and its runs.
     """
     for rows in shelf.folders(results, "rows"):

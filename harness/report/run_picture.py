@@ -63,7 +63,7 @@ def layout(final: float, whole: float, earlier: int) -> tuple[PixelBox, list[Pix
 
     Args:
         final: width / height of the final frame.
-        full_run: width / height of all frames together.
+        whole: width / height of all frames together.
         earlier: number of earlier frames.
     Returns: the box of the final frame, and those of the earlier ones.
     """
@@ -89,7 +89,7 @@ def layout(final: float, whole: float, earlier: int) -> tuple[PixelBox, list[Pix
 
 
 def draw_run(replay: Replay, path: Path, *, camera: tuple[float, float] | None = None) -> None:
-    """Draw the picture of a run as a PNG file of PAGE_WIDTH x PAGE_HEIGHT pixels.
+    """Draw the picture of a run as a PNG file of WIDTH x HEIGHT pixels.
 
     If positions become non-finite, the picture states it and shows the frames before.
 

@@ -49,11 +49,11 @@ def draw_scene(
     *,
     camera: tuple[float, float] | None = None,
 ) -> None:
-    """Draw the preview of a scene as a PNG file, PAGE_WIDTH pixels wide.
+    """Draw the preview of a scene as a PNG file, WIDTH pixels wide.
 
     Args:
         replay: recording of one frame.
-        selections: vertices selected by effects.
+        choices: vertices selected by effects.
         facts: phrases below the title.
         notes: further possible selections, as pairs of kind and description.
         path: target file.

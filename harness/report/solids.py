@@ -63,8 +63,8 @@ def solid(
     Args:
         obstacle: shape of the scene.
         time: time [s].
-        framed_points: points (q, 3) [m] relative to `origin`; of a plane only the part below them is built.
-        origin: point that `framed_points` and the returned points are relative to (3,) [m].
+        seen: points (q, 3) [m] relative to `origin`; of a plane only the part below them is built.
+        origin: point that `seen` and the returned points are relative to (3,) [m].
     Returns: the mesh, or None for the level ground.
     """
     made = _MADE[obstacle.kind](obstacle, seen + origin)

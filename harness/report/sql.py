@@ -18,9 +18,9 @@ def answer(question: str, table: pa.Table, known: Mapping[str, Any] | None = Non
     """Return the rows that a query selects from `rows_of`, the table.
 
     Args:
-        sql: query.
+        question: query.
         table: table that the query calls `rows_of`.
-        parameters: values of the query's parameters by name.
+        known: values of the query's parameters by name.
     """
     with _asked(table) as cursor:
         return cursor.execute(question, known).fetchall()

@@ -1,7 +1,7 @@
 """Comparison of two stored results, folders or archives of rows.
 
 It finds regressions in time, and other changes. Runs are paired by their inputs, and compared step by step
-(`harness.results.bootstrap_statistics.estimate_slowdown`). The load of the machine may have differed between the two
+(`harness.base.statistics.changed`). The load of the machine may have differed between the two
 results, and statistics cannot detect that: hence a margin beyond the interval, and `springbench gate --against` for
 smaller changes. Times of two machines are not comparable; with a baseline solver that both ran, the ratios to it are.
 """
@@ -57,11 +57,11 @@ class StoredRun:
     Attributes:
         row: first row of the run.
         status: "ok", or the first other status.
-        seconds_by_frame: time of each frame's step [s], the minimum over its rounds.
-        num_iterations: total over all frames.
-        last_residual: residual of the last frame, if known.
-        last_stationarity: stationarity of the last frame, if known.
-        positions_digest: digest of the last positions, if known.
+        seconds: time of each frame's step [s], the minimum over its rounds.
+        iterations: total over all frames.
+        residual: residual of the last frame, if known.
+        error: stationarity of the last frame, if known.
+        digest: digest of the last positions, if known.
     """
 
     row: Row
@@ -87,8 +87,8 @@ def compare(old: Path, new: Path, console: Console, yardstick: str | None = None
         old: folder or archive of the old results.
         new: folder or archive of the new results.
         console: console that the table is printed on.
-        baseline_solver: times are divided by those of this solver, so that they are comparable between machines.
-    Returns: 1 if a run became slower or fails now; INCONCLUSIVE_EXIT_CODE, after the reasons, if nothing is comparable;
+        yardstick: times are divided by those of this solver, so that they are comparable between machines.
+    Returns: 1 if a run became slower or fails now; CANNOT_TELL, after the reasons, if nothing is comparable;
         otherwise 0.
     Raises:
         InputError: if there are no results, or none of the baseline solver.

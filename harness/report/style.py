@@ -191,7 +191,7 @@ def _members(family: Sequence[str]) -> Sequence[tuple[float, Any]]:
 
 
 def shade(color: str, by: float) -> str:
-    """Mix a colour with white, or with black if `amount` is negative."""
+    """Mix a colour with white, or with black if `by` is negative."""
     end = 1.0 if by > 0.0 else 0.0
     red, green, blue = ((1.0 - abs(by)) * part + abs(by) * end for part in to_rgb(color))
     return to_hex((red, green, blue))

@@ -45,12 +45,12 @@ def draw_sweep(
 
     Args:
         name: name of the sweep.
-        jobs: runs with their recordings and pictures.
+        pictured: runs with their recordings and pictures.
         folder: folder of the sweep's results.
         table: rows of all runs.
-        print_message: prints a remark.
-        num_concurrent: number of drawing processes.
-        stale_ids: ids of runs that were executed by other code than the current version.
+        say: prints a remark.
+        at_once: number of drawing processes.
+        older: ids of runs that were executed by other code than the current version.
     """
     write_bibtex(folder / "references.bib", table["reference"].to_pylist())
     drawn = [p for p in pictured if p.run.record and p.recording.exists()]
@@ -159,7 +159,7 @@ def _stale(made: Path, sources: Iterable[Path]) -> bool:
 class Compared:
     """Runs that differ only in their solver or its settings.
 
-    `jobs_by_label` has them by these differences; the paths are those of the files that compare them.
+    `runs` has them by these differences; the paths are those of the files that compare them.
     """
 
     label: str

@@ -49,15 +49,15 @@ def timing(rows: pa.Table, folder: Path) -> list[Path]:
 def draw_timing(table: pa.Table, path: Path, title: str, older: Collection[str] = ()) -> None:
     """Draw the times of a sweep's runs as a PNG file.
 
-    The picture is PAGE_WIDTH pixels wide and at most PAGE_HEIGHT high. Failed runs are crosses at the upper edge, with
+    The picture is WIDTH pixels wide and at most HEIGHT high. Failed runs are crosses at the upper edge, with
     their reasons in words at the foot. A scene of one size has a row for each solver instead of a point in an empty
     frame.
 
     Args:
-        table: rows (schema: `harness.results.run_schema.RUN_SCHEMA`).
+        table: rows (schema: `harness.base.columns.SCHEMA`).
         path: target file.
         title: title of the picture.
-        stale_ids: ids of runs that were executed by other code than the current version; their marks are hollow.
+        older: ids of runs that were executed by other code than the current version; their marks are hollow.
     """
     found = runs(table)
     names = labels(found)

@@ -31,20 +31,20 @@ from harness.report.sql import answer
 class RunTimes(NamedTuple):
     """One run: identification, status, and its times [ms]; None where the rows lack a value.
 
-    The fields are the columns of `_SUMMARY_QUERY`, in order. The statistics step, lower, upper, least, num_iterations,
-    residual, worst_residual, max_strain and strain_p99 are defined in `harness.results.quantities`.
+    The fields are the columns of `_SUMMARY`, in order. The statistics step, lower, upper, least, iterations,
+    residual, worst_residual, largest_strain and strain_99 are defined in `harness.base.quantities`.
 
     Attributes:
         cold, warm: time of the preparation.
         local, global_: median time of one such step.
-        termination_reason: the least favourable reason that ended a step's iterations; None if the solver has no
+        stopped: the least favourable reason that ended a step's iterations; None if the solver has no
             iteration limit and nothing else ended them.
-        preempted: whether steps were interrupted, in any round.
-        phases_consistent: whether the phases add up to an iteration.
-        roundoff_residual: residuals below it are round-off (`ROUNDOFF_RATIO`) [J^(1/2)].
-        reference_distance: the largest over all frames, if every frame was verified.
+        interrupted: whether steps were interrupted, in any round.
+        adds_up: whether the phases add up to an iteration.
+        round_off: residuals below it are round-off (`ROUND_OFF`) [J^(1/2)].
+        distance: the largest over all frames, if every frame was verified.
         modulus_exponent: value of the rows.
-        max_stationarity_audit: largest stationarity that the reference evaluator measured, for a solver that does not
+        left: largest stationarity that the reference evaluator measured, for a solver that does not
             minimise.
     """
 
@@ -124,7 +124,7 @@ from rows_of group by run_id order by min(place)
 def runs(table: pa.Table) -> list[RunTimes]:
     """Return the runs in a table of rows, in the order of their first rows.
 
-    The rows have the schema `harness.results.run_schema.RUN_SCHEMA`.
+    The rows have the schema `harness.base.columns.SCHEMA`.
     """
     numbered = table.append_column("place", pa.array(np.arange(len(table))))
     return [RunTimes(*row) for row in answer(_SUMMARY, numbered)]
@@ -207,7 +207,7 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
 
     Args:
         table: rows of the sweep.
-        stale_ids: ids of runs that were executed by other code than the current version; they are marked.
+        other_code: ids of runs that were executed by other code than the current version; they are marked.
     """
     found = runs(table)
     names, scenes = labels(found), {run.scene for run in found}

@@ -41,10 +41,10 @@ class Assignment:
     """A scene of the assignment.
 
     Attributes:
-        obj_path: the mesh file.
+        obj: the mesh file.
         mesh: the mesh, with `mass` (n,) [kg].
         stiffness: of every spring [N/m].
-        pinned_vertices: (q,), zero-based, in file order.
+        pins: (q,), zero-based, in file order.
     """
 
     obj: Path
@@ -85,7 +85,7 @@ def voronoi_areas(rest: Points, triangles: Indices) -> Points:
     """Compute the mixed Voronoi area of each vertex, (n,) [m^2].
 
     Args:
-        rest_positions: (n, 3) [m].
+        rest: (n, 3) [m].
         triangles: (f, 3); triangles without area contribute nothing.
     """
     corners = rest[triangles]

@@ -45,16 +45,16 @@ class Scene:
         mesh: the mesh at rest.
         start: the deviation of the initial state from the rest state.
         system: the data that solvers factorise.
-        constant_force: sum of the constant forces, (n, 3) [N], read-only.
-        varying_forces: the other external forces.
-        velocity_filters: changes of the velocity before a step.
+        load: sum of the constant forces, (n, 3) [N], read-only.
+        forces: the other external forces.
+        filters: changes of the velocity before a step.
         pin_targets: (q, 3) [m], in the order of `system.pins`.
-        pin_motions: which of the targets move, and how.
-        initial_velocity: of every vertex [m/s], without the start's spin.
+        moving: which of the targets move, and how.
+        velocity: of every vertex [m/s], without the start's spin.
         integrator: the time integrator; its factor and velocity rule are those of the system.
-        intersection_checks: primitives that must not intersect; empty unless an effect prevents intersections.
-        alternate_scene: the same scene with the time step of every second step, if that differs.
-        build_coarser: builds the scene on a mesh of half the size, None if there is none.
+        apart: primitives that must not intersect; empty unless an effect prevents intersections.
+        alternate: the same scene with the time step of every second step, if that differs.
+        halved: builds the scene on a mesh of half the size, None if there is none.
     """
 
     mesh: Mesh
@@ -78,11 +78,11 @@ class Scene:
     halved: Callable[[], Scene] | None = None
 
     def at(self, index: int) -> Scene:
-        """Return the scene of the step that follows step `step_index`."""
+        """Return the scene of the step that follows step `index`."""
         return self.alternate if self.alternate and index % 2 else self
 
     def time(self, index: int) -> float:
-        """Return the time [s] at which step `step_index` ends and the next starts; 0 is the start."""
+        """Return the time [s] at which step `index` ends and the next starts; 0 is the start."""
         if not self.alternate:
             return index * self.system.time_step
         return (index + 1) // 2 * self.system.time_step + index // 2 * self.alternate.system.time_step
@@ -122,7 +122,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, war
         spec: the scene.
         size: mesh size, ignored by a mesh from a file.
         integrator: name of the time integrator.
-        log_warnings: whether valid but unusual values are logged; False if the program chooses the time step.
+        warns: whether valid but unusual values are logged; False if the program chooses the time step.
 
     Raises:
         InputError: if the parts of the scene do not fit together.

@@ -35,9 +35,9 @@ class Apart:
     """Primitives that must not intersect.
 
     Attributes:
-        edges_and_triangles: edges (m, 2) and triangles (f, 3) to test against each other, each pair once; vertices of
-            the mesh, followed by those of `obstacle_positions`.
-        obstacle_positions: returns the obstacle vertices (o, 3) [m] at a time [s].
+        pairs: edges (m, 2) and triangles (f, 3) to test against each other, each pair once; vertices of
+            the mesh, followed by those of `beside`.
+        beside: returns the obstacle vertices (o, 3) [m] at a time [s].
     """
 
     pairs: tuple[tuple[Indices, Indices], ...]

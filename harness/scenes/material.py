@@ -62,10 +62,10 @@ def spring_stiffness(
 
     Args:
         mesh: the mesh.
-        scaling_rule: one of `SCALING_RULES`.
+        rule: one of `RULES`.
         stretch, shear: constants of the families, or constants by direction; infinite for length constraints.
         bend: constant of the skip-one springs.
-        reference_size: mesh size of the constants, for liu2013 only.
+        reference: mesh size of the constants, for liu2013 only.
 
     Raises:
         InputError: for an unknown rule, for a constant that is negative or not finite (except as above), for a rule

@@ -88,8 +88,8 @@ class KeyedMotion(Model):
         """Return an upper bound of the speed [m/s] between two times without a key frame in between.
 
         Args:
-            start_time: [s].
-            end_time: [s].
+            begin: [s].
+            end: [s].
             points: declared positions (q, 3) [m].
             slack: the bound holds for all points within this distance [m] of `points`.
         """

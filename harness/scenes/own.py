@@ -1,7 +1,7 @@
 """Effects and meshes from plug-ins: named by a scene, and imported where they are used.
 
-A scene is passed around with `PluginEffect` and `PluginMesh`, which hold only name and parameters.
-`SceneSpec.load_plugins` replaces them, in a process that may crash. Results of the plug-in code are checked, and its
+A scene is passed around with `OwnEffect` and `OwnMesh`, which hold only name and parameters.
+`SceneSpec.opened` replaces them, in a process that may crash. Results of the plug-in code are checked, and its
 errors name it.
 """
 
@@ -34,7 +34,7 @@ ABOUT = "\0importing "
 
 
 def opened(document: Document, plugin: Plugin, what: str, at: Key) -> Any:
-    """Load a plug-in of one of PLUGIN_KINDS, which runs its code; None after a recorded mistake."""
+    """Load a plug-in of one of WANTED, which runs its code; None after a recorded mistake."""
     wanted, fits = WANTED[what]
     document.own.tell(f"{ABOUT}{plugin}")
     try:

@@ -36,10 +36,10 @@ def nearest(
 
     Args:
         obstacle: the obstacle.
-        obstacle_motion: its motion, None if it is at rest.
-        points: declared positions (q, 3) [m].
-        point_motion: their motion, None if they are at rest.
-        min_distance: [m].
+        taken: its motion, None if it is at rest.
+        targets: declared positions (q, 3) [m].
+        motion: their motion, None if they are at rest.
+        limit: [m].
 
     Returns:
         The time [s] and all distances (q,) [m] at that time, None if there is no such time.

@@ -172,7 +172,7 @@ class Solid(Model):
         return self.scale * points + np.array(self.offset), triangles
 
     def placed(self, points: Positions, time: float) -> Positions:
-        """Return the positions (o, 3) [m] at a time [s] of the points of `build_surface`."""
+        """Return the positions (o, 3) [m] at a time [s] of the points of `shape`."""
         if self.frames:
             points = self.scale * self.frames.at(time) + np.array(self.offset)
         return points if self.motion is None else self.motion.moved(points, time)
@@ -220,8 +220,8 @@ def shape(obstacle: AnySurface, sag: float, around: Positions) -> Shape:
 
     Args:
         obstacle: the obstacle.
-        max_sag: largest inward deviation [m] of the triangles of spheres and capsules.
-        scene_points: (q, 3) [m]; the two triangles of a plane extend beyond them.
+        sag: largest inward deviation [m] of the triangles of spheres and capsules.
+        around: (q, 3) [m]; the two triangles of a plane extend beyond them.
 
     Raises:
         InputError: if the obstacle is invalid.

@@ -31,7 +31,7 @@ FirstGuess = Literal["assignment", "current", "inertial", "motion", "coarse"]
 
 
 def named_in(table: Table) -> Any:
-    """Return the type of a registered name or a plug-in (see `solvers.plugins.plugin_discovery`).
+    """Return the type of a registered name or a plug-in (see `solvers.plugins`).
 
     The validation context provides the folder of the config.
     """
@@ -144,7 +144,7 @@ class SceneSpec(SceneFields):
     effects: SkipValidation[tuple[Effect, ...]] = ()
     """Effects on the mesh; only listed effects are simulated."""
     first_guess: FirstGuess = "current"
-    """Initial guess of a step unless a sweep sets it; see `choose_initial_guess`."""
+    """Initial guess of a step unless a sweep sets it; see `guess`."""
     path: Path
     """Source file of the scene, for messages."""
     own: SkipValidation[Mapping[str, tuple[Plugin, Mapping[str, Any]]]] = Field(default_factory=dict)

@@ -49,7 +49,7 @@ def resisting(
     """Compute the barrier stiffness of each vertex.
 
     Args:
-        stiffness: given value [N/m]; None for a fraction of the resistance of inertia and springs.
+        given: given value [N/m]; None for a fraction of the resistance of inertia and springs.
         mass: (n,) [kg].
         time_step: dt [s].
         energies: energies of the other effects.
@@ -65,7 +65,7 @@ def resisting(
 
 
 class PinLike(Protocol):
-    """Interface of pins (`harness.scenes.effects.effect_interface`)."""
+    """Interface of pins (`harness.scenes.effects.base`)."""
 
     @property
     def vertices(self) -> NDArray[np.int64]:
@@ -100,7 +100,7 @@ def require_still(who: str, start: Positions, pins: Sequence[PinLike]) -> None:
 
 
 def require_open(who: str, energy: PairContact, start: Positions, thickness: float, mesh: Mesh) -> None:
-    """Raise InputError if pairs start closer than `min_distance` [m], at the start (n, 3) [m]."""
+    """Raise InputError if pairs start closer than `thickness` [m], at the start (n, 3) [m]."""
     if closed := energy.closed(start):
         near = "; ".join(f"{_pair(x.tolist(), two, mesh)} {apart:.3g} m apart" for x, two, apart in closed[:_NAMED])
         raise InputError(

@@ -2,7 +2,7 @@
 
     rate |dp|_M <= |residual|_Q,    |dp|_M + T rate |dp|_M <= PART (|e_p|_M + T |e_v|_M),    T the simulated time
 
-PART is LOCAL_ERROR_SHARE. An error dp of the stage changes the motion by dp now and by T rate dp at its end, as do the
+PART is PART. An error dp of the stage changes the motion by dp now and by T rate dp at its end, as do the
 local errors e_p of the positions and e_v of the velocities. Both are estimated for the previous step by backward
 differences of the velocity at the ends of steps, for an integrator of order q. An embedded method also provides an
 estimate, though of the lower order. The smaller one is used:

@@ -42,7 +42,7 @@ class ClocksDisagree(RunFailed):
 
 
 def measured_again(measure: Callable[P, T]) -> Callable[P, T]:
-    """Repeat a measurement once if its clocks disagree; a second ClockMismatch is raised."""
+    """Repeat a measurement once if its clocks disagree; a second ClocksDisagree is raised."""
 
     @wraps(measure)
     def twice(*arguments: P.args, **named: P.kwargs) -> T:
@@ -59,13 +59,13 @@ class Watch:
     """Sum of wall and CPU time over repeated contexts.
 
     Attributes:
-      num_threads: number of threads that may compute. While all of them do, the process uses this many CPU seconds per
+      threads: number of threads that may compute. While all of them do, the process uses this many CPU seconds per
         second; while one does, it is the calling thread, which uses one.
-      wall_seconds: total wall time [s].
-      num_entries: number of contexts.
-      process_seconds: total CPU time [s] of the process.
-      thread_seconds: total CPU time [s] of the calling thread.
-      start_times: the three clocks at the start of the present context [s].
+      wall: total wall time [s].
+      entered: number of contexts.
+      process: total CPU time [s] of the process.
+      thread: total CPU time [s] of the calling thread.
+      began: the three clocks at the start of the present context [s].
     """
 
     threads: int = 1
@@ -96,7 +96,7 @@ class Watch:
         return max(SHARE * self.wall, LEAST, CALL * self.entered)
 
     def columns(self, what: str, seconds: Iterable[float]) -> dict[str, Any]:
-        """Build the check columns of the rows with given times; raises ClockMismatch."""
+        """Build the check columns of the rows with given times; raises ClocksDisagree."""
         told = sum(seconds)
         if not -self.tolerance <= self.wall - told <= self.tolerance + COLD * self.lost:  # so that NaN fails too
             raise ClocksDisagree(

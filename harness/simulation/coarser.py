@@ -29,8 +29,8 @@ class Coarser:
     Attributes:
       scene: scene on the coarser mesh.
       prepared: its prepared solver.
-      restriction: weights (coarse, fine).
-      prolongation: weights (fine, coarse).
+      restrict: weights (coarse, fine).
+      prolong: weights (fine, coarse).
     """
 
     scene: Scene

@@ -25,7 +25,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 _METHODS, _TOLD = ("iterates", "solve", "residual_at", "phases"), ("choice", "facts")
-"""Methods and properties of a prepared solver (`solvers.model.step_problem.PreparedSolver`)."""
+"""Methods and properties of a prepared solver (`solvers.problem.Prepared`)."""
 
 
 class Contract:

@@ -6,10 +6,10 @@
 The second argument of min is the predictive controller, which also uses the previous step (Gustafsson 1994; Hairer and
 Wanner, Solving Ordinary Differential Equations II, section IV.8). The step size of an implicit step is 2^-level of the
 end time, and the step starts at a multiple of its size. Few factors are therefore needed, the last ones used are cached
-(`MAX_FACTOR_BYTES`), and the end time is met exactly. The step size is doubled where h' is at least twice as large. The
+(`FACTORS`), and the end time is met exactly. The step size is doubled where h' is at least twice as large. The
 proportional-integral controller of the explicit methods would not reach that threshold.
 
-The algebraic error of a step's solve is limited to a share of the tolerance (`ALGEBRAIC_ERROR_SHARE`). Positions
+The algebraic error of a step's solve is limited to a share of the tolerance (`ALGEBRAIC`). Positions
 between steps are interpolated by cubic Hermite polynomials. Substepping solvers choose their step sizes within a frame
 themselves.
 """
@@ -63,14 +63,14 @@ class Path:
 
     Attributes:
       positions: positions (k + 1, n, 3) [m] at the start and at the end of each of k frames.
-      num_accepted_steps: number of accepted steps.
-      num_rejected_steps: number of rejected steps.
-      num_factorisations: number of factorisations.
-      num_iterations: number of iterations of the steps' solves.
-      step_size_range: smallest and largest step size [s].
-      wall_seconds: wall time [s], without the preparation of the first steps.
-      frame_seconds: wall time (k,) [s] in which each frame was computed; frames of one step share its time equally.
-      cpu_seconds: processor time [s] of this thread, including preparation.
+      accepted: number of accepted steps.
+      rejected: number of rejected steps.
+      factorisations: number of factorisations.
+      iterations: number of iterations of the steps' solves.
+      steps: smallest and largest step size [s].
+      seconds: wall time [s], without the preparation of the first steps.
+      frames: wall time (k,) [s] in which each frame was computed; frames of one step share its time equally.
+      processor: processor time [s] of this thread, including preparation.
     """
 
     positions: Positions
@@ -87,7 +87,7 @@ class Path:
 class Follower(Protocol):
     """Integrator of a motion to an error tolerance, or with a fixed step size.
 
-    `order` is the order of convergence of the error, `has_fixed_step` states whether the step size is fixed. A setting
+    `order` is the order of convergence of the error, `even` states whether the step size is fixed. A setting
     is the error tolerance [m] of each step or, with a fixed step size, the number of steps relative to that with the
     largest step size.
     """
@@ -123,17 +123,17 @@ class Follower(Protocol):
 
         Args:
           setting: error tolerance [m] or number of steps relative to the smallest number.
-          cpu_limit: limit on the processor time [s].
+          limit: limit on the processor time [s].
 
         Raises:
-          TimeBudgetExceeded: the limit is exceeded.
-          StepSizeUnderflow: the tolerance would need steps below the minimum step size.
+          TooSlow: the limit is exceeded.
+          Stuck: the tolerance would need steps below the minimum step size.
         """
         ...
 
 
 class _Ladder:
-    """Scenes and prepared solvers by step size; the oldest beyond MAX_FACTOR_BYTES are discarded."""
+    """Scenes and prepared solvers by step size; the oldest beyond FACTORS are discarded."""
 
     def __init__(self, bound: Callable[[float], Scene], solver: Solver, horizon: float) -> None:
         self._bound, self._solver, self._horizon = bound, solver, horizon
@@ -165,9 +165,9 @@ class Implicit(Follower):
     """Adaptive stepping by an integrator with an embedded error estimate.
 
     Attributes:
-      build_scene: builds the scene with a given step size [s].
+      bound: builds the scene with a given step size [s].
       solver: solver of the steps.
-      t_end: end time [s].
+      horizon: end time [s].
       frames: number of frames up to the end time.
     """
 

@@ -12,10 +12,10 @@ is
     e(x) - grad e(x) . (p' - p) - e_before(x_before)      of an energy e; not positive where it is convex and constant
 
 A gain is measured relative to the available energy: that of the start, the energy released by potentials,
-ROUNDOFF_SAFETY times the work of sources, and the energy that the load gives to bodies at rest in one step. Pinned
+UNCERTAINTY times the work of sources, and the energy that the load gives to bodies at rest in one step. Pinned
 vertices have no kinetic energy. Stored energy counts where a spring is strained by more than its length: stiff springs
 that a solve leaves slightly too long store much energy, but move nothing. Exact lengths contribute the penalties of
-their Lagrangian (`solvers.model.energies.augmented_lagrangian`). The round-off bound is subtracted from a gain.
+their Lagrangian (`solvers.energies.augmented`). The round-off bound is subtracted from a gain.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ class Growth(NamedTuple):
     """Energy growth without a source.
 
     Attributes:
-      first_frame: first frame after which energy has grown.
-      max_ratio: largest ratio of gain to available energy.
+      first: first frame after which energy has grown.
+      times: largest ratio of gain to available energy.
     """
 
     first: int

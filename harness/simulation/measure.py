@@ -2,8 +2,8 @@
 
 The timed passes record nothing. They follow an untimed pass in which the phases of each frame are timed separately,
 next to an iteration of its solve. This pass warms up all code that the steps use. The timed passes then repeat the
-whole simulation `rounds` times. All times are checked by a second clock (`PhaseWatch`). Where times do not matter
-(`prepare_untimed`), only the instrumentation pass is run.
+whole simulation `rounds` times. All times are checked by a second clock (`Watch`). Where times do not matter
+(`roughly`), only the instrumentation pass is run.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ class Timing:
       frame: frame, None where there is none.
       round: number of the round.
       seconds: wall time [s] per call.
-      num_calls: number of calls.
-      device_columns: columns of a device: times of a step by events, and its state after the round.
+      calls: number of calls.
+      device: columns of a device: times of a step by events, and its state after the round.
     """
 
     phase: str
@@ -90,7 +90,7 @@ class Measured:
       prepared: prepared solver.
       timings: all times.
       watches: watch over the times of each phase, and over those of the steps of each round.
-      final_positions: final positions (n, 3) [m], None without timed passes.
+      final: final positions (n, 3) [m], None without timed passes.
       clock: without timed passes, the stopwatch of the steps of the instrumentation pass.
     """
 
@@ -118,7 +118,7 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
     Raises:
       Unsupported: the solver does not support the scene.
       NotPositiveDefinite: a matrix is not positive definite.
-      StepError: a step failed.
+      StepFailed: a step failed.
       RunFailed: the solver violates its contract.
     """
     timings: list[Timing] = []
@@ -188,7 +188,7 @@ class _Steps(Clock):
 def roughly(scene: Scene, solver: Solver) -> Measured:
     """Prepare once, for an instrumentation pass without timed passes.
 
-    The clock of that pass is `RunMeasurement.clock`. Writes of the solver to its inputs are not checked. Raises
+    The clock of that pass is `Measured.clock`. Writes of the solver to its inputs are not checked. Raises
     Unsupported, NotPositiveDefinite.
     """
     preparing, stepping = (Watch(numba.get_num_threads()) for _ in range(2))
@@ -212,7 +212,7 @@ def steps(
       clock: context within which each step is computed.
 
     Raises:
-      StepError: a step failed, or, caused by DivergenceError, a position is not finite.
+      StepFailed: a step failed, or, caused by Diverged, a position is not finite.
     """
     run = simulate(scene, prepared, settings.stop, first_guess=settings.first_guess, frames=settings.frames)
     for frame in range(1, settings.frames + 1):

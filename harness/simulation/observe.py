@@ -51,16 +51,16 @@ def observe(
       scene: scene that is stepped.
       prepared: prepared solver.
       settings: settings of the time stepping.
-      recorder: recorder of every frame and of the convergence in the frames `convergence_frames`.
-      convergence_frames: frames whose convergence is recorded.
-      positions_out: output array for the positions after each step, (frames, n, 3) [m].
-      sample_frame: called with each frame and its positions (n, 3) [m].
-      verify_step: returns the accuracy columns of each step.
+      recorder: recorder of every frame and of the convergence in the frames `convergence`.
+      convergence: frames whose convergence is recorded.
+      stored: output array for the positions after each step, (frames, n, 3) [m].
+      sample: called with each frame and its positions (n, 3) [m].
+      judge: returns the accuracy columns of each step.
       tick: called after each step.
       clock: context within which each step is computed.
 
     Raises:
-      StepError: a step failed, or, caused by DivergenceError, the energy diverges.
+      StepFailed: a step failed, or, caused by Diverged, the energy diverges.
     """
     found: dict[int, dict[str, Any]] = {}
     energy = EnergyBalance(scene)
@@ -216,12 +216,12 @@ def require_numbers(by_frame: Mapping[int, dict[str, Any]], *, minimises: bool, 
     """Require finite columns of each frame, and set columns that do not apply to None.
 
     Args:
-      columns_by_frame: columns by frame.
-      is_minimiser: whether the solver has a residual.
-      has_rtol: whether it has a relative tolerance, which uses the initial residual.
+      by_frame: columns by frame.
+      minimises: whether the solver has a residual.
+      tolerance: whether it has a relative tolerance, which uses the initial residual.
 
     Raises:
-      StepError: caused by DivergenceError, where a column is infinite or NaN.
+      StepFailed: caused by Diverged, where a column is infinite or NaN.
     """
     known = {"residual": minimises, "last_residual": minimises, "yardstick": minimises and tolerance}
     for frame, columns in by_frame.items():

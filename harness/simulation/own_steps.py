@@ -139,7 +139,7 @@ class OwnEven(Own):
     """Stepping by a solver with a fixed substep size.
 
     Quantities that change within a frame are taken as constant within each of a number of pieces, which is of order 1.
-    `build_scene` builds the scene with a given step size [s].
+    `bound` builds the scene with a given step size [s].
     """
 
     bound: Callable[[float], Scene]

@@ -29,8 +29,8 @@ class Done(NamedTuple):
     Attributes:
       stages: problem and solution of each stage.
       end: end of the step.
-      iteration_counts: number of iterations of each solve.
-      friction_rounds: friction rounds of the worst stage.
+      counts: number of iterations of each solve.
+      friction: friction rounds of the worst stage.
     """
 
     stages: tuple[tuple[StepProblem, Solution], ...]
@@ -88,7 +88,7 @@ class Stages:
         """Build a stage's problem, with the current positions as initial guess.
 
         Args:
-          stage: stage of the integrator.
+          unknown: stage of the integrator.
           expected: expected solution (n, 3) [m]; extrapolated from the motion if omitted.
         """
         scene, system = self.scene, self.scene.system

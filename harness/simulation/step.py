@@ -28,11 +28,11 @@ class State:
     """State between two steps.
 
     Attributes:
-      motion: motion at the start of the next step.
-      previous_motion: motion one step earlier, filtered; None where there is none.
+      now: motion at the start of the next step.
+      before: motion one step earlier, filtered; None where there is none.
       index: index of the last step, 0 at the start.
-      acceleration: acceleration (n, 3) [m/s^2] at `motion`, None where it is unknown.
-      warm_start: warm-start data of the last step's solution.
+      acceleration: acceleration (n, 3) [m/s^2] at `now`, None where it is unknown.
+      kept: warm-start data of the last step's solution.
     """
 
     now: Motion
@@ -50,11 +50,11 @@ class Step:
       problem: step problem; that of the last stage in a step of several stages.
       solution: its solution.
       state: state after the step.
-      iteration_counts: number of iterations of each solve.
+      counts: number of iterations of each solve.
       stages: problem and solution of each stage, in order.
-      stop_rule: stop rule of each solve.
-      friction_rounds: friction rounds of the step.
-      local_error: error of the motion by an embedded method, None without one.
+      stop: stop rule of each solve.
+      friction: friction rounds of the step.
+      error: error of the motion by an embedded method, None without one.
     """
 
     problem: StepProblem
@@ -97,7 +97,7 @@ def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
     Args:
       scene: scene that is stepped.
       state: state at the start of the step.
-      initial_guess: a key of `INITIAL_GUESSES`, or COARSE_TO_FINE, which solves the step on a coarser mesh.
+      first_guess: a key of `FIRST_GUESSES`, or COARSE, which solves the step on a coarser mesh.
 
     Raises:
       Unsupported: there is no coarser mesh.
@@ -158,9 +158,9 @@ def simulate(
       scene: scene that is stepped.
       prepared: result of `prepare`.
       stop: stop criterion of the solves.
-      initial_guess: name of the initial guess.
+      first_guess: name of the initial guess.
       frames: number of the last step.
-      initial_state: state to start from; the scene's start if omitted.
+      state: state to start from; the scene's start if omitted.
 
     Raises:
       Unsupported: the automatic tolerance does not support the scene.
@@ -275,7 +275,7 @@ FIRST_GUESSES: dict[str, Callable[[StepProblem], StepProblem]] = {
 def guessed(stated: StepProblem, first_guess: str) -> StepProblem:
     """Set an initial guess by name, made intersection-free.
 
-    It raises what `solvers.contact.obstacle_advancement.intersection_free_guess` raises.
+    It raises what `solvers.core.clearing.begun_free` raises.
     """
     return begun_free(FIRST_GUESSES[first_guess](stated))
 

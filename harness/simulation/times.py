@@ -17,7 +17,7 @@ from harness.simulation.measure import ITERATION, Measured, Timing
 
 
 def rows(measured: Measured) -> list[dict[str, Any]]:
-    """Build the timing columns, one row for each time; raises ClockMismatch."""
+    """Build the timing columns, one row for each time; raises ClocksDisagree."""
     groups: dict[tuple[str, int | None], list[Timing]] = defaultdict(list)
     for timing in measured.timings:
         groups[timing.phase, measured.pass_of(timing)].append(timing)

@@ -31,10 +31,10 @@ class Rest(NamedTuple):
 
     Attributes:
         vertices: vertices of each cluster (m, k); the first one repeats where there are fewer.
-        plane_coordinates: along t_1 and t_2 [m], (k, 2, m).
+        plane: along t_1 and t_2 [m], (k, 2, m).
         weights: of the vertex sum in the mean, and of the moments in f_1 and f_2, (3, m).
         centre, t1, t2, normal: X_P [m] and axes (m, 4).
-        extents: radius rho, and largest distance of a vertex from the plane [m], (m, 4).
+        size: radius rho, and largest distance of a vertex from the plane [m], (m, 4).
     """
 
     vertices: Indices
@@ -53,7 +53,7 @@ class Lie(NamedTuple):
     Attributes:
         centre: x_P [m], (m, 4).
         f1, f2, normal: columns of the deformation, and their normal (m, 4).
-        fit_residual: largest y_i in the plane, and normal to it [m], (m, 4).
+        rest: largest y_i in the plane, and normal to it [m], (m, 4).
     """
 
     centre: Array
@@ -69,7 +69,7 @@ def rest(x: Array, members: Indices, many: int) -> Rest:
     Args:
         x: rest shape (n, 3) [m].
         members: pairs of a cluster and a vertex (k, 2).
-        num_clusters: number of clusters.
+        many: number of clusters.
     """
     patch, vertex = np.unique(members, axis=0).T
     count = np.bincount(patch, minlength=many)
@@ -99,7 +99,7 @@ def lie(known, x, leaf, boxes, tile, out):
     """Fit the poses of clusters, and write their boxes to the leaves of a tree.
 
     Args:
-        rest_clusters: clusters at rest.
+        known: clusters at rest.
         x: positions (n, 4) [m]; column 3 is padding.
         leaf: first leaf node.
         boxes: boxes of the tree (nodes, 6, 8), updated.
@@ -152,10 +152,10 @@ def spread(vertices, pairs, known, p, q, way, tile, low, high):
     Args:
         vertices: vertices of each cluster (m, k).
         pairs: cluster pairs (k, 2).
-        rest_clusters: number of pairs to include.
+        known: number of pairs to include.
         p: start positions (n, 3) [m].
         q: end positions (n, 3) [m].
-        displacement, low, high: scratch, (n, 4), (m, 4) and (m, 4).
+        way, low, high: scratch, (n, 4), (m, 4) and (m, 4).
         tile: scratch of at least (3, 8).
     """
     for i in range(len(p)):

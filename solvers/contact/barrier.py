@@ -5,8 +5,8 @@
 d is the distance of a point and a triangle or of two edges, t the minimum distance, r the activation distance `dhat`,
 and k a stiffness [N/m]. Sources: Li et al. 2020, "Incremental potential contact", where b is a function of d^2; the
 offset t is that of Li, Kaufman and Jiang 2021, "Codimensional incremental potential contact". m is 1 except for nearly
-parallel edges (`contact.potentials.edge_edge_mollifier`). The sum is over collisions, each of which represents all
-pairs that share its closest points (`contact.collisions`).
+parallel edges (`contact.potentials.mollifier`). The sum is over collisions, each of which represents all
+pairs that share its closest points (`contact.contacts`).
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def press(contacts, p, out):
     """Compute the barrier energy and add its gradient.
 
     Args:
-        collisions: active collisions.
+        contacts: active collisions.
         p: positions (n, 3) [m].
         out: gradient (n, 3) [N], updated; closed gaps exert the force of a millionth of the activation distance.
 

@@ -34,7 +34,7 @@ class Room:
         self._held: Callable[[], Array | None] = lambda: None
 
     def take(self, many: int) -> Array:
-        """Return an array (num_entries,). References to views of it do not prevent its reuse."""
+        """Return an array (many,). References to views of it do not prevent its reuse."""
         if len(self._memory) < many or self._held() is not None:
             self._memory = np.empty(many)
         out = self._memory[:many]
@@ -47,7 +47,7 @@ class Blocks(NamedTuple):
 
     Attributes:
         vertices: (a, 4); -1 for none and for those of obstacles.
-        block_starts: first entry of each block, and the end of the last one, (a + 1,).
+        starts: first entry of each block, and the end of the last one, (a + 1,).
         packed: rows [N/m] of consecutive blocks, up to the last vertex of each collision.
     """
 

@@ -31,8 +31,8 @@ _NUMBERS = 48
 class Limits(NamedTuple):
     """Limits that no pair may violate during a motion.
 
-    A pair violates them if it comes closer than `inflation_radius` [m], or closer than `min_distance` [m] plus
-    `relative_min_distance` times its initial distance. max_displacement [m]: upper bound of the displacement of any two
+    A pair violates them if it comes closer than `reach` [m], or closer than `closed` [m] plus
+    `share` times its initial distance. moved [m]: upper bound of the displacement of any two
     vertices relative to each other.
     """
 
@@ -43,7 +43,7 @@ class Limits(NamedTuple):
 
 
 class Gaps(NamedTuple):
-    """Lower bounds of distances [m]: `near_clearance` of pairs close at rest, `far_clearance` of all others."""
+    """Lower bounds of distances [m]: `near` of pairs close at rest, `far` of all others."""
 
     near: float
     far: float
@@ -83,7 +83,7 @@ def apart(one: tuple[int, int], other: tuple[int, int], p: Positions, q: Positio
         other: first and last vertex of the other range.
         p: start positions (n, 3) [m] of the linear motion.
         q: end positions (n, 3) [m].
-        query: limits of the distances.
+        limits: limits of the distances.
     """
     low, high = np.empty((2, 2, 3)), np.empty((2, 2, 3))
     for k, x in enumerate((p, q)):
@@ -109,7 +109,7 @@ def extent(x, first, last, low, high):
 
 @inner
 def hull(boxes, many):
-    """Return the corners of the union of the first `num_boxes` boxes of a node (6, 8)."""
+    """Return the corners of the union of the first `many` boxes of a node (6, 8)."""
     l0, l1, l2, h0, h1, h2 = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf
     for k in range(many):
         l0, l1, l2 = min(l0, boxes[0, k]), min(l1, boxes[1, k]), min(l2, boxes[2, k])
@@ -133,11 +133,11 @@ def met(boxes, there, node, low, high, lower, upper, limits):
 
     Args:
         boxes: start boxes (nodes, 6, 8) [m].
-        end_boxes: end boxes (nodes, 6, 8) [m].
+        there: end boxes (nodes, 6, 8) [m].
         node: index of the node.
         low, high: corners of the other box at the start.
         lower, upper: corners of the other box at the end.
-        query: limits of the distances.
+        limits: limits of the distances.
     """
     at, most = _NUMBERS * node, widest(limits)
     x0, x1, x2 = loaded(boxes, at), loaded(boxes, at + 8), loaded(boxes, at + 16)

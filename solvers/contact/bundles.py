@@ -20,8 +20,8 @@ def half_spaces(contacts: list[ContactEnergy], row: NDArray[np.int64], bundles: 
     Args:
         contacts: vertex contacts of the step.
         row: row of each vertex; the first rows are the unknowns.
-        spring_packets: packets of the springs.
-        num_unknowns: number of rows that are unknowns.
+        bundles: packets of the springs.
+        unknowns: number of rows that are unknowns.
     """
     known = [contact for contact in contacts if isinstance(contact, Contact)]
     fields = [np.concatenate(field) for field in zip(*(contact.planes for contact in known), strict=True)]
@@ -36,11 +36,11 @@ def of_planes(
 
     Args:
         planes: the half-spaces.
-        smoothing_length: smoothing length of friction of each half-space [m], (k,).
+        slip: smoothing length of friction of each half-space [m], (k,).
         row: row of each vertex; the first rows are the unknowns.
-        spring_packets: packets of the springs.
-        num_unknowns: number of rows that are unknowns.
-        is_two_sided: whether the planes act from both sides.
+        bundles: packets of the springs.
+        unknowns: number of rows that are unknowns.
+        both: whether the planes act from both sides.
     """
     vertices, normal, offset, anchor, stiffness, grip = planes
     rows = row[vertices]

@@ -29,12 +29,12 @@ class Pairs(NamedTuple):
 
     Attributes:
         vertices: vertices of each pair (k, 4).
-        num_point_triangle: number of point-triangle pairs.
-        distance_scale: factor on `min_distance` and `dhat`, at most 1, (k,).
+        points: number of point-triangle pairs.
+        scale: factor on `thickness` and `reach`, at most 1, (k,).
         stiffness: barrier stiffness [N/m], (k,).
-        mollifier_threshold: e of the mollifier [m^4], 0 for point-triangle pairs, (k,).
-        min_distance: minimum distance [m].
-        dhat: barrier activation distance beyond the minimum distance [m].
+        parallel: e of the mollifier [m^4], 0 for point-triangle pairs, (k,).
+        thickness: minimum distance [m].
+        reach: barrier activation distance beyond the minimum distance [m].
     """
 
     vertices: Indices
@@ -52,14 +52,14 @@ class Contacts(NamedTuple):
     Attributes:
         vertices: (a, 4); point-point collisions repeat their second vertex, point-edge ones their third.
         kind: kind of each collision (a,).
-        coefficients: c of the distance vector (a, 4).
-        distance_vector: z [m], (a, 3).
+        weights: c of the distance vector (a, 4).
+        between: z [m], (a, 3).
         stiffness: sum over all pairs that the collision represents [N/m], (a,).
-        distance_scale: as for candidates, (a,).
-        mollifier_threshold: as for candidates, 0 where no mollifier is active, (a,).
-        cross_squarednorm: |u x v|^2 of edge pairs [m^4], (a,).
-        min_distance: minimum distance [m].
-        dhat: barrier activation distance beyond the minimum distance [m].
+        scale: as for candidates, (a,).
+        parallel: as for candidates, 0 where no mollifier is active, (a,).
+        crossed: |u x v|^2 of edge pairs [m^4], (a,).
+        thickness: minimum distance [m].
+        reach: barrier activation distance beyond the minimum distance [m].
     """
 
     vertices: Indices
@@ -78,9 +78,9 @@ def room(many: int, thickness: float, reach: float) -> Contacts:
     """Allocate uninitialised collisions.
 
     Args:
-        capacity: number of collisions.
-        min_distance: minimum distance [m].
-        dhat: barrier activation distance [m].
+        many: number of collisions.
+        thickness: minimum distance [m].
+        reach: barrier activation distance [m].
     """
     return Contacts(
         vertices=np.empty((many, 4), np.int64),
@@ -100,9 +100,9 @@ def in_range(pairs: Pairs, x: Array, space: Contacts) -> Contacts:
     """Build the active collisions at a position.
 
     Args:
-        candidates: candidate pairs.
+        pairs: candidate pairs.
         x: positions (n, 4) [m]; column 3 is padding.
-        buffer: collisions of at least the number of candidates; overwritten.
+        space: collisions of at least the number of candidates; overwritten.
 
     Returns:
         Collisions that are views of the buffer.
@@ -118,7 +118,7 @@ def gather(pairs, x, tile, slots, out):
     """Write the active collisions to `out`, and return their number.
 
     Args:
-        candidates: candidate pairs.
+        pairs: candidate pairs.
         x: positions (n, 4) [m]; column 3 is padding.
         tile: scratch (9, 8).
         slots: hash table, (2^s,), of more entries than candidates; overwritten.

@@ -6,7 +6,7 @@ With z = sum_i c_i x_i, the directions w_a in which c changes with each free loc
     D'' = c c' (x) I - B G^-1 B',     B_ia = c_i z_a + w_ia z,     z_a = sum_i w_ia x_i,     G_ab = z_a z_b
 
 so that f(d)'' = f'' g g' + f'/d (c c' (x) (I - n n') - B G^-1 B'). f' is negative, so that only the first term in the
-bracket has negative curvature. `negative_fraction` is the fraction of the negative curvature that is included. With 1
+bracket has negative curvature. `keep` is the fraction of the negative curvature that is included. With 1
 the blocks are exact; with 0 they are positive semidefinite and never less than the exact ones. A collision of k
 vertices has a block of 3 k rows.
 """
@@ -39,12 +39,12 @@ def curvature(contacts: Contacts, grip: Grip, p: Array, n: int, keep: float, roo
     """Build the Hessian blocks of collisions and of friction.
 
     Args:
-        collisions: active collisions.
-        tangential_collisions: friction.
+        contacts: active collisions.
+        grip: friction.
         p: positions (N, 3) [m] of all vertices.
         n: number of vertices that move.
-        negative_fraction: fraction of the negative curvature to include.
-        buffer: memory of the blocks.
+        keep: fraction of the negative curvature to include.
+        room: memory of the blocks.
 
     Returns:
         Blocks [N/m].
@@ -80,11 +80,11 @@ def add_curvature(
     """Add the Hessian [N/m] of collisions and friction to existing 3x3 blocks.
 
     Args:
-        collisions: active collisions.
-        tangential_collisions: friction.
+        contacts: active collisions.
+        grip: friction.
         p: positions (N, 3) [m] of all vertices.
-        negative_fraction: fraction of the negative curvature to include.
-        block_indices: target block of each vertex pair, (a, 16); -1 for none.
+        keep: fraction of the negative curvature to include.
+        places: target block of each vertex pair, (a, 16); -1 for none.
         values: blocks (b, 3, 3) [N/m], updated.
     """
     many = len(contacts.vertices)
@@ -108,11 +108,11 @@ def enter(contacts, p, keep, places, work, block, values):
     """Add the Hessian block of each collision at p (n, 3) to `values`.
 
     Args:
-        collisions: active collisions.
+        contacts: active collisions.
         p: positions (n, 3) [m].
-        negative_fraction: fraction of the negative curvature to include.
-        block_indices: target block of each vertex pair, (a, 16); -1 for none.
-        scratch: (4, 16), zero initially.
+        keep: fraction of the negative curvature to include.
+        places: target block of each vertex pair, (a, 16); -1 for none.
+        work: (4, 16), zero initially.
         block: scratch (98,).
         values: blocks (b, 3, 3) [N/m], updated.
     """
@@ -127,8 +127,8 @@ class Terms(NamedTuple):
 
     With m = grad |u x v|^2 of edges and the G-orthogonal columns b1, b2 of B, the block is
 
-    normal g g' + mollifier_cross (g m' + m g') + mollifier_outer m m' - first_tangent b1 b1' - second_tangent b2 b2'
-    + isotropic c c' (x) I, and edge_rotation, that of the rotation of edges (`contact.potentials.edge_edge_mollifier`).
+    normal g g' + mixed (g m' + m g') + bent m m' - lag b1 b1' - hold b2 b2'
+    + isotropic c c' (x) I, and turn, that of the rotation of edges (`contact.potentials.mollifier`).
     """
 
     along: float

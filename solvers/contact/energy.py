@@ -2,15 +2,15 @@
 
     E(x) = sum_i k_i/2 min(0, n_i.x_i - d_i)^2 + F_i h(|u_i|),   u_i = (I - n_i n_i')(x_i - a_i)
 
-n_i, d_i: the half-space that contains the vertex during this step (`solvers.contact.half_space.separating_planes`).
+n_i, d_i: the half-space that contains the vertex during this step (`solvers.contact.planes`).
 a_i: position of the vertex if it moved with the obstacle. F_i = mu k_i depth_i, with the depth at `start.pressed`, an
 iterate of this step, or at the step's start if that is None (Li et al. 2020, "Incremental potential contact", section
-5; `solvers.contact.lagged_friction` iterates it to convergence). h is the length, smoothed where a vertex moves by less
-than s = eps_v (t_x - t), the smoothing length, with t_x the time of the stage:
+5; `solvers.contact.friction_rounds` iterates it to convergence). h is the length, smoothed where a vertex moves by less
+than s = creep (t_x - t), the smoothing length, with t_x the time of the stage:
 
     h(u) = u^2/(2 s) for u <= s,   u - s/2 beyond
 
-A sticking vertex moves at most at the speed `eps_v`. Half-spaces, depth and friction refer to the end of the step. If
+A sticking vertex moves at most at the speed `creep`. Half-spaces, depth and friction refer to the end of the step. If
 the stage is the position at another time (`solvers.integrators`), both are moved towards the start in proportion.
 """
 
@@ -74,9 +74,9 @@ class Planes(NamedTuple):
         vertices: (k,).
         normal: unit normals n (k, 3).
         offset: d [m], (k,).
-        friction_anchor: a [m], (k, 3).
+        anchor: a [m], (k, 3).
         stiffness: penalty stiffness [N/m], (k,).
-        friction_limit: F [N], (k,).
+        grip: F [N], (k,).
     """
 
     vertices: NDArray[np.int64]
@@ -97,15 +97,15 @@ class Contact:
 
     Attributes:
         obstacles: convex obstacles.
-        min_distance: minimum distance from their surfaces [m].
+        thickness: minimum distance from their surfaces [m].
         friction: friction coefficient mu.
         stiffness: penalty stiffness k [N/m], (n,).
-        eps_v: speed below which a vertex sticks [m/s].
-        safety_margin: maximum displacement by forces in one step, in addition to that by the velocity [m].
+        creep: speed below which a vertex sticks [m/s].
+        margin: maximum displacement by forces in one step, in addition to that by the velocity [m].
         time_step: dt [s].
-        friction_iterations: maximum number of solves of a step, each with the normal forces of the previous one.
-        active_planes: half-spaces of the current step.
-        smoothing_length: s of the current step [m].
+        friction_rounds: maximum number of solves of a step, each with the normal forces of the previous one.
+        planes: half-spaces of the current step.
+        slip: s of the current step [m].
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -177,7 +177,7 @@ class Contact:
     ) -> Planes:
         """Build the half-spaces of one obstacle.
 
-        stage_fraction: time of the stage within the step, 1 at its end; normal_force_positions: where friction's normal
+        when: time of the stage within the step, 1 at its end; pressed: where friction's normal
         forces are evaluated (n, 3) [m], None for the step's start.
         """
         n, body = len(p), Rounded(obstacle.low, obstacle.high, obstacle.radius + self.thickness)
@@ -270,7 +270,7 @@ class Contact:
         Args:
             p: positions (n, 3) [m].
             trial: trial positions (n, 3) [m]; penalties active at p or there are included.
-            majorise: whether friction majorises the energy; its stiffness is exact otherwise.
+            cautious: whether friction majorises the energy; its stiffness is exact otherwise.
         """
         planes, gap = self.planes, self.gap(p)
         pressed = np.flatnonzero((gap < 0.0) | (self.gap(trial) < 0.0))

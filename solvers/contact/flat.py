@@ -1,7 +1,7 @@
 """Distance bounds of clusters that are affine images of their rest shape, by projection onto a plane.
 
 Let a and b be points of primitives of two clusters P and Q, and A and B the same points at rest. x_P, F_P and y_i are
-those of `solvers.contact.broad_phase.cluster_fit`. Let e_1, e_2 span P's plane, projected on which bending is a
+those of `solvers.contact.affine`. Let e_1, e_2 span P's plane, projected on which bending is a
 second-order effect, and E = (e_1, e_2)'. Then
 
     |a - b| >= |E (a - b)| >= l |A - B| - z,     l = least eigenvalue of the symmetric part of E F_P (t_1, t_2)
@@ -34,9 +34,9 @@ class Beside(NamedTuple):
     """Pairs of clusters.
 
     Attributes:
-        clusters: (k, 2).
-        rest_distance: lower bound of the distance at rest [m], (k,).
-        relative_pose: centre [m] and axes of the second cluster along the plane of the first; its rho [m]; distance of
+        patches: (k, 2).
+        apart: lower bound of the distance at rest [m], (k,).
+        there: centre [m] and axes of the second cluster along the plane of the first; its rho [m]; distance of
             both from that plane [m]; (8, k).
     """
 
@@ -56,8 +56,8 @@ class Sight(NamedTuple):
 
     Attributes:
         e1, e2: axes of the projection (m, 4).
-        start_bounds, end_bounds: l, the largest stretch, and |E y_i| [m], (m, 4).
-        indices: cluster indices (m, 1).
+        begin, end: l, the largest stretch, and |E y_i| [m], (m, 4).
+        each: cluster indices (m, 1).
     """
 
     e1: Array
@@ -78,7 +78,7 @@ def relate(known, first, count, out):
     """Compute the relative poses of cluster pairs at rest.
 
     Args:
-        rest_clusters: clusters at rest.
+        known: clusters at rest.
         first: first pair to compute.
         count: end of the pairs to compute.
         out: cluster pairs, updated.
@@ -105,9 +105,9 @@ def doubtful(begin, end, pairs, count, limits, enough, sight, tile, out):
         begin, end: poses at the start and at the end.
         pairs: cluster pairs.
         count: number of pairs to test.
-        query: limits of the distances.
-        min_end_distance: required distance at the end [m].
-        basis, tile: scratch.
+        limits: limits of the distances.
+        enough: required distance at the end [m].
+        sight, tile: scratch.
         out: clusters of the unresolved pairs (k, 2).
 
     Returns:

@@ -5,7 +5,7 @@
 Normal forces N, contact points and directions are constant in a solve, so that friction has a potential (Li et al.
 2020, "Incremental potential contact", section 5). With f(x; N) the gradient of friction, f(x_k; N(x_k)) - f(x_k;
 N(x_{k-1})) is the residual of x_k with its own normal forces. The iteration ends once its largest component is at most
-FRICTION_RTOL times that of f, or after `friction_iterations` of the energies.
+TOLERANCE times that of f, or after `friction_rounds` of the energies.
 
 The iteration need not converge. Friction itself may press contacts together, as in a wedge. Or mu N may be so large
 that a vertex leaves the activation distance in one iteration and, without normal force there, slides back in the next.
@@ -60,8 +60,8 @@ class FrictionSolve(NamedTuple):
     Attributes:
         problem: the problem of the last iteration, with the initial guess of the first one.
         solution: its solution.
-        iteration_counts: solver iterations of each solve.
-        convergence: convergence of friction; None where the scene has none.
+        counts: solver iterations of each solve.
+        friction: convergence of friction; None where the scene has none.
     """
 
     problem: StepProblem

@@ -4,7 +4,7 @@
 
 F: the barrier's normal force at `start.pressed`, an iterate of this step, or at the step's start if that is None; c, n:
 coefficients and direction of the closest points there; x^t: positions at the step's start (Li et al. 2020, "Incremental
-potential contact", section 5; `solvers.contact.lagged_friction` iterates them to convergence). h is the length,
+potential contact", section 5; `solvers.contact.friction_rounds` iterates them to convergence). h is the length,
 smoothed where a pair slips by less than s in a step; its slope is continuous, and below 1 there:
 
     h(u) = u^2/s - u^3/(3 s^2)  for u < s,     u - s/3 beyond
@@ -31,11 +31,11 @@ class Grip(NamedTuple):
 
     Attributes:
         vertices: (g, 4); missing vertices have zero coefficients.
-        coefficients: c (g, 4).
+        weights: c (g, 4).
         normal: unit normals (g, 3).
-        friction_anchor: sum_i c_i x_i^t [m], (g, 3).
-        friction_limit: mu F [N], (g,).
-        smoothing_length: s [m].
+        anchor: sum_i c_i x_i^t [m], (g, 3).
+        force: mu F [N], (g,).
+        slip: s [m].
     """
 
     vertices: NDArray[np.int64]
@@ -50,10 +50,10 @@ class Grip(NamedTuple):
         """Build the friction of collisions.
 
         Args:
-            collisions: active collisions.
+            contacts: active collisions.
             start: positions of all vertices at the step's start [m].
             friction: friction coefficient mu.
-            smoothing_length: s [m].
+            slip: s [m].
         """
         between, force = contacts.between, np.empty(len(contacts.vertices))
         barrier.forces(contacts, force)
@@ -126,7 +126,7 @@ def bends(u0, u1, u2, length, slip):
 
 @inner
 def bent(n, second, a, b):
-    """Return entry (a, b) of the Hessian of h [1/m], tangential to n (3,); second: from `friction_f2_terms`."""
+    """Return entry (a, b) of the Hessian of h [1/m], tangential to n (3,); second: from `bends`."""
     flat, more, u = second
     same = 1.0 if a == b else 0.0
     return flat * (same - n[a] * n[b]) + more * u[a] * u[b]

@@ -2,7 +2,7 @@
 
 Candidates are found at one position and reused while the vertices stay close to it, apart from a common translation.
 The cache changes no bit of the results: pairs beyond the activation distance contribute nothing, and all others come in
-one order. Step sizes are limited by the pairs that may collide along the displacement (`solvers.contact.ccd`). Where
+one order. Step sizes are limited by the pairs that may collide along the displacement (`solvers.contact.ways`). Where
 the previous query found none, clusters of primitives are tested first (`contact.broad_phase.cluster_culling`). The
 cache then stores the clearance at the end of the displacement, separately for pairs close to each other at rest and for
 all others. A later displacement is collision-free if no two vertices move relative to each other by more than that.
@@ -55,7 +55,7 @@ class Surfaces(Protocol):
         Args:
             p: start positions (n, 3) [m].
             q: end positions (n, 3) [m].
-            query: limits that no pair may violate.
+            limits: limits that no pair may violate.
 
         Returns:
             Clearance bounds at q; None if a pair violates a limit, or if the test would take long.
@@ -75,7 +75,7 @@ class Surfaces(Protocol):
         ...
 
     def within(self, p: Positions, reach: float) -> Pairs:
-        """Return the pairs closer than `inflation_radius` [m] at p (n, 3) [m]."""
+        """Return the pairs closer than `reach` [m] at p (n, 3) [m]."""
         ...
 
     def on_way(self, x: Array, y: Array, limits: Limits, edges: bool) -> Pairs:
@@ -84,7 +84,7 @@ class Surfaces(Protocol):
         Args:
             x: start positions (n, 4) [m]; column 3 is padding.
             y: end positions (n, 4) [m]; column 3 is padding.
-            query: limits of the distances.
+            limits: limits of the distances.
             edges: True for edge-edge pairs, False for point-triangle pairs.
 
         Returns:
@@ -94,9 +94,9 @@ class Surfaces(Protocol):
 
 
 class Kept(NamedTuple):
-    """Pairs closer than `radius` [m] at `positions` (n, 3).
+    """Pairs closer than `reach` [m] at `p` (n, 3).
 
-    far_radius [m]: lower bound of the distances of pairs not close at rest, where known to exceed `radius`.
+    far [m]: lower bound of the distances of pairs not close at rest, where known to exceed `reach`.
     """
 
     p: Positions
@@ -127,10 +127,10 @@ class Kept(NamedTuple):
         """Return the entry valid at q, if the displacement from p is collision-free.
 
         Args:
-            source: the primitives.
+            surface: the primitives.
             p: start positions (n, 3) [m].
             q: end positions (n, 3) [m].
-            displacements: maximum relative displacements of p and of q with respect to `positions` [m].
+            moved: maximum relative displacements of p and of q with respect to `positions` [m].
 
         Returns:
             The entry, or None if gaps may close on the way or a pair may be active at q.
@@ -150,7 +150,7 @@ class Kept(NamedTuple):
 def _idle(surface: Surfaces, gap: float, moved: tuple[float, float]) -> bool:
     """Return whether gaps of at least `gap` [m] stay open and remain inactive at the end of a displacement.
 
-    displacements: maximum relative displacements [m] of its start and of its end with respect to the cached position.
+    moved: maximum relative displacements [m] of its start and of its end with respect to the cached position.
     """
     return moved[1] <= gap - surface.thickness - surface.reach and _open(gap - surface.thickness, moved)
 
@@ -171,8 +171,8 @@ def pairs(surface: Surfaces, kept: list[Kept], p: Positions) -> Pairs:
     """Return all pairs that are active at p (n, 3), and possibly more.
 
     Args:
-        source: the primitives.
-        caches: cached candidates, updated.
+        surface: the primitives.
+        kept: cached candidates, updated.
         p: positions (n, 3) [m].
     """
     limit = surface.thickness + surface.reach
@@ -192,10 +192,10 @@ def largest_step(surface: Surfaces, kept: list[Kept], p: Positions, way: Positio
     """Return the largest step size up to 1 that keeps all gaps open.
 
     Args:
-        source: the primitives.
-        caches: cached candidates, updated.
+        surface: the primitives.
+        kept: cached candidates, updated.
         p: positions (n, 3) [m].
-        displacement: displacements (n, 3) [m].
+        way: displacements (n, 3) [m].
 
     Returns:
         Step size in [0, 1]; 0 if a gap is closed at p, or if the displacement is not finite.

@@ -99,8 +99,8 @@ class Corrections:
             contacts: active vertex contacts.
             p: positions (n, 3) [m].
             gradient: gradient at p (n, 3) [N].
-            contact_free_correction: Q^-1 gradient (n, 3).
-            majorise: whether friction majorises the energy.
+            plain: Q^-1 gradient (n, 3).
+            cautious: whether friction majorises the energy.
         """
         x, rows = -plain, None
         for _ in range(_PASSES):
@@ -159,7 +159,7 @@ class Corrections:
 class Model(Iteration):
     """Conjugate gradients for (Q + W) x = b, preconditioned by Q^-1.
 
-    solve: product with Q^-1; contact_matrix: W (3n, 3n).
+    solve: product with Q^-1; pulls: W (3n, 3n).
     """
 
     def __init__(self, solve: Callable[[Positions], Positions], pulls: csr_array, b: Positions) -> None:
@@ -204,8 +204,8 @@ class PreparedContact(Iterative):
 
     Attributes:
         base: the prefactored Q.
-        contact_free: the method used while no contact is active.
-        fixed_objective: objective of the system.
+        idle: the method used while no contact is active.
+        objective: objective of the system.
         corrections: minimisers with contact.
     """
 

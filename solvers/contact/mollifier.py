@@ -55,13 +55,13 @@ def mollifier(c, e):
 def bending(edges, factor, energy, keep, dc):
     """Return the mollifier's Hessian weights, and write c' to dc (12,).
 
-    The rotation of its own edges is excluded; see `add_edge_rotation_hessian`.
+    The rotation of its own edges is excluded; see `add_turning`.
 
     Args:
         edges: cross product data of both edges.
         factor: m, m' and m''.
         energy: f, f' and f''.
-        negative_fraction: included fraction of the negative curvature: of f m'' and, with a = grad f, b = grad m, of
+        keep: included fraction of the negative curvature: of f m'' and, with a = grad f, b = grad m, of
             a b' + b a' <= s a a' + b b'/s
         dc: output (12,).
 
@@ -88,12 +88,12 @@ def bending(edges, factor, energy, keep, dc):
 
 @inner
 def add_turning(edges, weight, keep, H):
-    """Add the Hessian of the rotation of edges to packed rows H (`contact.potentials.hessian_blocks`).
+    """Add the Hessian of the rotation of edges to packed rows H (`contact.potentials.blocks`).
 
     Args:
         edges: cross product data of both edges.
         weight: 2 f m'.
-        negative_fraction: included fraction of the negative curvature, which is bounded by
+        keep: included fraction of the negative curvature, which is bounded by
             4 w (du x dv) <= 2 |w| (|du|^2 |v|/|u| + |dv|^2 |u|/|v|),     w = u x v.
         H: packed block, updated.
     """

@@ -25,7 +25,7 @@ class Side(NamedTuple):
 
     Attributes:
         points, edges, triangles: trees over the primitives.
-        edge_lengths: at rest [m], (m,).
+        length: at rest [m], (m,).
     """
 
     points: Tree
@@ -41,7 +41,7 @@ class Side(NamedTuple):
             rest: rest shape (n, 3) [m].
             edges: vertex indices (m, 2).
             triangles: vertex indices (f, 3).
-            first_vertex: global index of the first vertex.
+            first: global index of the first vertex.
         """
         points = np.unique(np.append(edges.ravel(), triangles.ravel())).astype(np.int64)
         trees = Tree.of(rest, points[:, None]), Tree.of(rest, edges), Tree.of(rest, triangles)
@@ -56,10 +56,10 @@ class Against:
 
     Attributes:
         mesh: primitives of the mesh.
-        obstacles: primitives of the obstacles.
+        others: primitives of the obstacles.
         stiffness: barrier stiffness of the mesh's vertices [N/m], (n,).
-        min_distance: minimum distance between both [m].
-        dhat: barrier activation distance beyond the minimum distance [m].
+        thickness: minimum distance between both [m].
+        reach: barrier activation distance beyond the minimum distance [m].
     """
 
     mesh: Side
@@ -78,7 +78,7 @@ class Against:
         return ways.unevenness(p, q)
 
     def within(self, p: Positions, reach: float) -> Pairs:
-        """Return the pairs closer than `inflation_radius` [m] at p (n, 3) [m]."""
+        """Return the pairs closer than `reach` [m] at p (n, 3) [m]."""
         x, limits = padded(p), Limits(reach, reach, 0.0, 0.0)
         one, two = (self.on_way(x, x, limits, edges) for edges in (False, True))
         pairs = one._replace(

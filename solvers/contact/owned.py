@@ -14,7 +14,7 @@ from solvers.vectors.eights import lowest
 class Owned(NamedTuple):
     """Primitives grouped by cluster.
 
-    primitives (m, k): vertices of each; cluster_starts (clusters + 1,): first primitive of each cluster.
+    primitives (m, k): vertices of each; starts (clusters + 1,): first primitive of each cluster.
     """
 
     corners: Indices
@@ -26,8 +26,8 @@ class Owned(NamedTuple):
 
         Args:
             corners: vertices of each primitive (m, k).
-            vertex_cluster: cluster of each vertex (n,).
-            num_clusters: number of clusters.
+            rank: cluster of each vertex (n,).
+            many: number of clusters.
         """
         owner = rank[corners].min(axis=1)
         starts = np.append(0, np.cumsum(np.bincount(owner, minlength=many)))
@@ -44,12 +44,12 @@ def among(owned, patches, x, y, limits, here, there, out):
     """Write the primitive pairs of cluster pairs whose boxes may violate the limits on a linear motion.
 
     Args:
-        cluster_primitives: points, edges and triangles of the clusters.
+        owned: points, edges and triangles of the clusters.
         patches: cluster pairs (k, 2).
         x: start positions (n, 4) [m]; column 3 is padding.
         y: end positions (n, 4) [m]; column 3 is padding.
-        query: limits of the distances.
-        start_aabbs, end_aabbs: scratch boxes (nodes, 6, 8).
+        limits: limits of the distances.
+        here, there: scratch boxes (nodes, 6, 8).
         out: vertices (capacity, 4) of point-triangle pairs, then of edge pairs; overwritten.
 
     Returns:

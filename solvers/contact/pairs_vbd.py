@@ -43,7 +43,7 @@ class Separable(NamedTuple):
     Attributes:
         vertices: (v,).
         gradient: gradient of contact (v, 3) [N].
-        diagonal_blocks: four times the diagonal Hessian blocks (v, 3, 3) [N/m].
+        block: four times the diagonal Hessian blocks (v, 3, 3) [N/m].
     """
 
     vertices: NDArray[np.int64]
@@ -55,7 +55,7 @@ class Separable(NamedTuple):
 
         Args:
             p: positions of the model (n, 3) [m].
-            majorant: stiffness of each vertex without contact (n,) [N/m].
+            held: stiffness of each vertex without contact (n,) [N/m].
         """
         curve, axes = np.linalg.eigh(self.block)
         k = np.maximum(curve, 0.0) + LEAST * held[self.vertices, None]
@@ -71,7 +71,7 @@ class Sweeps(Protocol):
     def alone(self, p: Positions) -> Positions:
         """Return the positions after a sweep from p without contact, (n, 3) each.
 
-        Chebyshev extrapolation uses the preceding sweeps since the last `sweep_with_planes`.
+        Chebyshev extrapolation uses the preceding sweeps since the last `pushed`.
         """
         ...
 
@@ -83,7 +83,7 @@ class Sweeps(Protocol):
 class Guarded(Iterating):
     """Iteration state of VBD with barriers.
 
-    majorant (n,) [N/m]: of all energies but contact; compute_residual: returns the residual of positions.
+    majorant (n,) [N/m]: of all energies but contact; gauge: returns the residual of positions.
     """
 
     def __init__(

@@ -2,7 +2,7 @@
 
 The surface is divided into clusters of a few vertices each. A cluster owns the points, edges and triangles whose first
 vertex along the Morton curve belongs to it. Cluster pairs that are close at rest are tested by their affine poses
-(`solvers.contact.broad_phase.cluster_bounds`), all others by bounding boxes. Primitives are tested only where both
+(`solvers.contact.flat`), all others by bounding boxes. Primitives are tested only where both
 fail. The result is a lower bound of all distances at the end of the motion. Boxes are tested again only after vertices
 have moved relative to each other by as much.
 """
@@ -51,12 +51,12 @@ class Scratch(NamedTuple):
     Attributes:
         tile: (3 k, 8).
         stack: of the tree traversal.
-        projection: of the clusters.
-        unresolved_pairs: cluster pairs that are not proved to be separated (k, 2).
-        start_aabbs, end_aabbs: boxes of a cluster's primitives (k, 6, 8).
-        primitive_pairs: (k, 4).
-        displacement: of vertices (n, 4).
-        displacement_min, displacement_max: boxes of the displacements of each cluster (m, 4).
+        sight: of the clusters.
+        doubtful: cluster pairs that are not proved to be separated (k, 2).
+        here, there: boxes of a cluster's primitives (k, 6, 8).
+        found: (k, 4).
+        way: of vertices (n, 4).
+        low, high: boxes of the displacements of each cluster (m, 4).
     """
 
     tile: Array
@@ -76,16 +76,16 @@ class Patches:
     """Clusters of a surface.
 
     Attributes:
-        rest_clusters: clusters at rest.
-        bvh: tree over the clusters.
+        rest: clusters at rest.
+        tree: tree over the clusters.
         points, edges, triangles: primitives of the clusters.
-        rest_query_distance: lower bound of the rest distance of all pairs that are not stored [m].
-        cluster_pairs: first all pairs that are close at rest, sorted, then memory for more.
+        looked: lower bound of the rest distance of all pairs that are not stored [m].
+        pairs: first all pairs that are close at rest, sorted, then memory for more.
         scratch: scratch memory.
-        pair_starts: first pair of each cluster (clusters + 1,).
-        recent_poses: poses at the last two positions.
-        remote_clearances: position of the last query, and the clearance there of clusters not close at rest [m].
-        is_dense: whether too many clusters are close at rest, as in a stack of sheets, for culling to be useful.
+        starts: first pair of each cluster (clusters + 1,).
+        seen: poses at the last two positions.
+        apart: position of the last query, and the clearance there of clusters not close at rest [m].
+        crowded: whether too many clusters are close at rest, as in a stack of sheets, for culling to be useful.
     """
 
     rest: Rest
@@ -108,7 +108,7 @@ class Patches:
         Args:
             rest: rest shape (n, 3) [m].
             points, edges, triangles: trees over the primitives.
-            rest_query_distance: distance up to which cluster pairs count as close at rest [m].
+            looked: distance up to which cluster pairs count as close at rest [m].
         """
         many = max(1, -(-len(points.corners) // _PATCH))
         rank = np.zeros(len(rest), np.int64)
@@ -143,7 +143,7 @@ class Patches:
         Args:
             p: start positions (n, 3) [m].
             q: end positions (n, 3) [m].
-            query: limits of the distances.
+            limits: limits of the distances.
 
         Returns:
             Clearance bounds; None if the test is inconclusive.
@@ -289,7 +289,7 @@ def strange(pairs, starts, many):
     Args:
         pairs: cluster pairs (k, 2), those close at rest first; updated.
         starts: first pair of each cluster (clusters + 1,).
-        num_new_pairs: number of pairs after those close at rest.
+        many: number of pairs after those close at rest.
 
     Returns:
         Number of remaining new pairs.

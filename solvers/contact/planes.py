@@ -38,7 +38,7 @@ class HalfSpaces(NamedTuple):
         vertices: (k,).
         normal: unit normals n (k, 3).
         offset: d [m], (k,).
-        comoving_position: position of the vertex if it moved with the obstacle [m], (k, 3).
+        carried: position of the vertex if it moved with the obstacle [m], (k, 3).
     """
 
     vertices: NDArray[np.int64]
@@ -115,7 +115,7 @@ def planes(p, v, dt, frames, obstacle, margin, out, work):
 
 @inner
 def plane(p, v, i, dt, frames, obstacle, margin, out, at, work):
-    """Return whether vertex i may reach an obstacle; if so, write its half-space to row `row_index` of `out`."""
+    """Return whether vertex i may reach an obstacle; if so, write its half-space to row `at` of `out`."""
     _, normal, offset, carried = out
     a, b, x, c, n = work[0], work[1], work[2], work[3], work[4]
     first, second, way = frames[0], frames[1], 0.0

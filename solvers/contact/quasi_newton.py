@@ -23,7 +23,7 @@ _ALIKE = 2.0
 
 
 class Touching:
-    """Acceleration engine with vertex contact; contact_free: the engine used while no contact is active."""
+    """Acceleration engine with vertex contact; idle: the engine used while no contact is active."""
 
     def __init__(self, scheme: Scheme, system: System, base: PreparedLocalGlobal, idle: Engine) -> None:
         self._scheme, self._base, self._idle = scheme, base, idle

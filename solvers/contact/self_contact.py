@@ -1,6 +1,6 @@
-"""Barrier contact of primitive pairs: an energy of positions (`solvers.contact.potentials.barrier`) with a step limit.
+"""Barrier contact of primitive pairs: an energy of positions (`solvers.contact.barrier`) with a step limit.
 
-`solvers.contact.broad_phase.candidate_cache` finds the candidates and the collision-free step size.
+`solvers.contact.known` finds the candidates and the collision-free step size.
 
 `SelfContact` is contact of a mesh with itself, `ObstacleContact` that of a mesh with the surfaces of obstacles. Their
 vertices follow those of the mesh in all arrays. In a step they are at their end positions; they move there linearly
@@ -51,14 +51,14 @@ class PairContact:
     """Barrier energy of primitive pairs, with lagged friction.
 
     Attributes:
-        collision_mesh: source of the candidates.
+        surface: source of the candidates.
         friction: friction coefficient mu.
-        eps_v: speed [m/s] below which a pair counts as sticking.
-        friction_iterations: maximum number of solves of a step, each with the normal forces of the previous one.
-        candidate_caches: cached candidates, the most recent one first.
-        recent_states: collisions at the last two positions; energies, gradients and Hessians are queried alternately.
-        block_buffer: memory of the Hessian blocks.
-        tangential_collisions: friction of the current step.
+        slip: speed [m/s] below which a pair counts as sticking.
+        friction_rounds: maximum number of solves of a step, each with the normal forces of the previous one.
+        kept: cached candidates, the most recent one first.
+        met: collisions at the last two positions; energies, gradients and Hessians are queried alternately.
+        room: memory of the Hessian blocks.
+        grip: friction of the current step.
     """
 
     surface: Surfaces
@@ -84,7 +84,7 @@ class PairContact:
         return self if grip is self.grip else replace(self, grip=grip)
 
     def _gripping(self, p: Positions, begun: Positions, start: Start) -> Grip:
-        """Build friction. p: all vertices where normal forces are evaluated; start_positions: at the step's start."""
+        """Build friction. p: all vertices where normal forces are evaluated; begun: at the step's start."""
         if known.idle(self.surface, self.kept, p):
             return NO_GRIP
         return Grip.of(self._at(p).contacts, begun, self.friction, self.slip * (start.until - start.time))
@@ -139,7 +139,7 @@ class PairContact:
 
         Args:
             p: positions (n, 3) [m].
-            negative_fraction: fraction of the negative curvature to include; 0 gives positive semidefinite blocks.
+            keep: fraction of the negative curvature to include; 0 gives positive semidefinite blocks.
         """
         n, p = len(p), self.whole(p)
         return curvature(self._at(p).contacts, self.grip, p, n, keep, self.room)
@@ -160,8 +160,8 @@ class PairContact:
 
         Args:
             p: positions (n, 3) [m].
-            negative_fraction: fraction of the negative curvature to include.
-            block_indices: target block of each vertex pair, (a, 16); -1 for none.
+            keep: fraction of the negative curvature to include.
+            places: target block of each vertex pair, (a, 16); -1 for none.
             values: blocks (b, 3, 3) [N/m], updated.
         """
         p = self.whole(p)
@@ -207,7 +207,7 @@ class PairContact:
         Args:
             p: positions (n, 3) [m].
             direction: displacements (n, 3) [m] over the remainder of the step.
-            start_fraction: fraction of their motion at which the obstacles start.
+            begin: fraction of their motion at which the obstacles start.
 
         Returns:
             Fraction of the remaining displacements, in [0, 1].
@@ -246,12 +246,12 @@ class ObstacleContact(PairContact):
     """Contact of a surface with obstacles.
 
     Attributes:
-        obstacle_positions_at: time [s] -> obstacle vertices (o, 3) [m]; the same array at all times if none moves.
-        comoving_map: two times and positions (n, 3) -> these positions moved with each moving obstacle.
-        start_positions: obstacle vertices (o, 3) [m] at the step's start.
-        current_positions: obstacle vertices (o, 3) [m] of the evaluation.
-        end_positions: obstacle vertices (o, 3) [m] at the step's end.
-        step_times: start and end of the step [s].
+        place: time [s] -> obstacle vertices (o, 3) [m]; the same array at all times if none moves.
+        carry: two times and positions (n, 3) -> these positions moved with each moving obstacle.
+        begun: obstacle vertices (o, 3) [m] at the step's start.
+        placed: obstacle vertices (o, 3) [m] of the evaluation.
+        end: obstacle vertices (o, 3) [m] at the step's end.
+        times: start and end of the step [s].
     """
 
     place: Place
@@ -268,12 +268,12 @@ class ObstacleContact(PairContact):
         """Build the contact at time 0, before any step.
 
         Args:
-            collision_mesh: source of the candidates.
-            obstacle_positions_at: time [s] -> obstacle vertices (o, 3) [m].
-            comoving_map: two times and positions (n, 3) -> these positions moved with each moving obstacle.
+            surface: source of the candidates.
+            place: time [s] -> obstacle vertices (o, 3) [m].
+            carry: two times and positions (n, 3) -> these positions moved with each moving obstacle.
             friction: friction coefficient mu.
-            eps_v: speed [m/s] below which a pair counts as sticking.
-            friction_iterations: maximum number of solves of a step.
+            slip: speed [m/s] below which a pair counts as sticking.
+            friction_rounds: maximum number of solves of a step.
         """
         now = place(0.0)
         return cls(surface, friction, slip, friction_rounds, place=place, carry=carry, begun=now, placed=now, end=now)

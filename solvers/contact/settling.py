@@ -42,8 +42,8 @@ class Matrix(NamedTuple):
     """Q over the free vertices.
 
     Attributes:
-        free_index: index of each vertex among the free ones, or -1, (n,).
-        row_starts, columns, entries: rows by free index, columns by vertex.
+        number: index of each vertex among the free ones, or -1, (n,).
+        starts, columns, entries: rows by free index, columns by vertex.
         diagonal: diagonal of Q.
     """
 
@@ -85,7 +85,7 @@ class Settling:
             step: objective of the step.
             at: current point.
             direction: Newton direction at the point (n, 3) [m].
-            newton_direction: returns the direction at later points.
+            newton: returns the direction at later points.
         """
         return self._ahead(step, at, direction, newton) or self._along(step, at, direction)
 
@@ -125,7 +125,7 @@ def settle(planes, slip, matrix, p, gradient, sweeps):
 
     Args:
         planes: contact planes.
-        smoothing_length: of friction [m].
+        slip: of friction [m].
         matrix: Q over the free vertices.
         p: positions (n, 3) [m], moved tangentially to the normals.
         gradient: gradient at p (n, 3) [N] including friction's own part; updated.

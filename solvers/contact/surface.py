@@ -41,13 +41,13 @@ class Surface:
     distances scaled in proportion. They exert no force at rest, and still cannot interpenetrate.
 
     Attributes:
-        rest_positions: rest shape (n, 3) [m].
+        rest: rest shape (n, 3) [m].
         points, edges, triangles: trees over the primitives.
-        edge_lengths: at rest [m], (m,).
+        length: at rest [m], (m,).
         stiffness: barrier stiffness of each vertex [N/m], (n,).
-        min_distance: minimum distance [m].
-        dhat: barrier activation distance beyond the minimum distance [m].
-        rest_close_pairs: sorted keys of the pairs with scaled distances, and their scales.
+        thickness: minimum distance [m].
+        reach: barrier activation distance beyond the minimum distance [m].
+        near: sorted keys of the pairs with scaled distances, and their scales.
     """
 
     rest: Positions
@@ -71,8 +71,8 @@ class Surface:
             edges: vertex indices (m, 2).
             triangles: vertex indices (f, 3).
             stiffness: barrier stiffness of each vertex [N/m], (n,).
-            min_distance: minimum distance [m].
-            dhat: barrier activation distance beyond the minimum distance [m].
+            thickness: minimum distance [m].
+            reach: barrier activation distance beyond the minimum distance [m].
         """
         points = np.unique(np.append(edges.ravel(), triangles.ravel())).astype(np.int64)
         rest = np.array(rest, order="C")
@@ -107,7 +107,7 @@ class Surface:
         return self._patches.unevenness(p, q)
 
     def within(self, p: Positions, reach: float) -> Pairs:
-        """Return the pairs closer than `inflation_radius` [m] at p (n, 3) [m]."""
+        """Return the pairs closer than `reach` [m] at p (n, 3) [m]."""
         x = padded(p)
         met, first = self._near(x, reach)
         many = len(met)
@@ -183,7 +183,7 @@ def name(found, first, parts, vertices):
     """Write the vertices (k, 4) of index pairs.
 
     Args:
-        pair_indices: primitive indices (k, 2).
+        found: primitive indices (k, 2).
         first: number of point-triangle pairs, which come first.
         parts: points, triangles and edges.
         vertices: output (k, 4).
@@ -194,16 +194,16 @@ def name(found, first, parts, vertices):
 
 @kernel
 def nearer(pairs, found, parts, lengths, stiffness, x, reach):
-    """Remove the pairs that are not closer than a radius, and write the others to `candidates`.
+    """Remove the pairs that are not closer than a radius, and write the others to `pairs`.
 
     Args:
-        candidates: vertices, stiffness and mollifier threshold are overwritten.
-        pair_indices: primitive indices (k, 2), compacted in place.
+        pairs: vertices, stiffness and mollifier threshold are overwritten.
+        found: primitive indices (k, 2), compacted in place.
         parts: points, triangles and edges.
         lengths: edge lengths at rest [m], (m,).
         stiffness: stiffness of each vertex [N/m], (n,).
         x: positions (n, 4) [m].
-        inflation_radius: radius [m].
+        reach: radius [m].
 
     Returns:
         Number of point-triangle pairs, and of all pairs.

@@ -2,7 +2,7 @@
 
 Contact acts on single vertices with forces that appear and vanish, and is far stiffer than anything in Q. No constant Q
 contains it, so that it is no projective energy. It provides its stiffness as rows instead, which
-`solvers.methods.local_global.half_space_contact` adds to Q in each iteration.
+`solvers.contact.local_global` adds to Q in each iteration.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class ContactRows(NamedTuple):
     Attributes:
         vertices: v (r,).
         direction: unit vectors (r, 3).
-        stiffness: w [N/m], (r,).
+        weight: w [N/m], (r,).
         gap: [m], (r,); zero where the gradient includes the contact force at p, the distance where there is none at p.
     """
 
@@ -47,7 +47,7 @@ class ContactEnergy(LaggedEnergy, Protocol):
         Args:
             p: positions (n, 3) [m].
             trial: trial positions (n, 3) [m].
-            majorise: whether the stiffness majorises the energy; it is the exact second derivative otherwise.
+            cautious: whether the stiffness majorises the energy; it is the exact second derivative otherwise.
         """
         ...
 

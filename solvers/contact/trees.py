@@ -1,6 +1,6 @@
 """Broad phase: bounding volume hierarchies (BVH) over points, edges or triangles, built once and refitted per query.
 
-A node has eight boxes, tested at once in vector registers (`solvers.simd.float64x8`). Primitives are numbered along a
+A node has eight boxes, tested at once in vector registers (`solvers.vectors.eights`). Primitives are numbered along a
 Morton curve through the rest shape, so that eight consecutive ones form a patch of the surface however it folds. The
 tree is implicit: the child of box b of node k is node 8 k + 1 + b. Eight primitives traverse the other tree together
 and are separated at its leaves. Candidates are ordered by these packets, by the leaves, and by primitives. The order
@@ -41,9 +41,9 @@ class Tree(NamedTuple):
     """Implicit tree of eight-box nodes.
 
     Attributes:
-        primitives: vertices of each primitive in Morton order, (m, k).
-        num_levels: number of levels, including the root.
-        mean_primitive_size: mean diagonal of the primitives at rest [m].
+        corners: vertices of each primitive in Morton order, (m, k).
+        levels: number of levels, including the root.
+        size: mean diagonal of the primitives at rest [m].
     """
 
     corners: Indices
@@ -100,7 +100,7 @@ def found(one: Tree, other: Tree, x: Array, y: Array, limits: Limits) -> Indices
         one, other: the trees; if both are the same, each pair is found once, the lower index first.
         x: start positions (n, 4) [m]; column 3 is padding.
         y: end positions (n, 4) [m]; column 3 is padding.
-        query: limits of the distances.
+        limits: limits of the distances.
 
     Returns:
         Primitive indices (k, 2).
@@ -177,8 +177,8 @@ def look(one, other, begin, end, limits, same, stack, out):
     Args:
         one, other: the trees.
         begin, end: boxes of both trees at the start and at the end of the motion.
-        query: limits of the distances.
-        is_same_tree: whether both trees are the same; each pair is then found once.
+        limits: limits of the distances.
+        same: whether both trees are the same; each pair is then found once.
         stack: scratch, (s, 3).
         out: primitive indices (k, 2); pairs beyond its capacity are counted only.
     """

@@ -1,6 +1,6 @@
 """Additive continuous collision detection (CCD): the largest collision-free step size along a displacement.
 
-    t <- t + .9 (d(t) - min_distance)/l,     l = upper bound of the speed at which the distance d of the pair shrinks
+    t <- t + .9 (d(t) - closed)/l,     l = upper bound of the speed at which the distance d of the pair shrinks
 
 Source: Li, Kaufman and Jiang 2021, "Codimensional incremental potential contact", section 5. The common translation of
 a pair is removed first, which gives a tighter bound l. Pairs that are farther apart than they can move are discarded in
@@ -29,7 +29,7 @@ _LOOKS = 500
 
 
 def scratch() -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Allocate the scratch arrays `local_indices`, `corners` and `relative_displacement` of the CCD."""
+    """Allocate the scratch arrays `four`, `corners` and `way` of the CCD."""
     return np.empty(4, np.int64), np.empty((4, 3)), np.empty((4, 3))
 
 
@@ -38,14 +38,14 @@ def largest(pairs, p, direction, most, four, corners, way):
     """Return the largest step size that keeps all candidate pairs separated, on linear trajectories.
 
     Args:
-        candidates: point-triangle pairs, then edge-edge pairs.
+        pairs: point-triangle pairs, then edge-edge pairs.
         p: positions (n, 4) [m]; column 3 is padding.
-        displacement: displacements (n, 4) [m]; column 3 is padding.
-        max_step: upper bound of the step size.
-        local_indices, corners, relative_displacement: scratch, (4,), (4, 3) and (4, 3).
+        direction: displacements (n, 4) [m]; column 3 is padding.
+        most: upper bound of the step size.
+        four, corners, way: scratch, (4,), (4, 3) and (4, 3).
 
     Returns:
-        Step size in [0, max_step]; 0 if a pair starts closer than its minimum distance.
+        Step size in [0, most]; 0 if a pair starts closer than its minimum distance.
     """
     for k in range(4):
         four[k] = k
@@ -98,16 +98,16 @@ def _more(a, b):
 
 @inner
 def free(pairs, e, p, direction, most, edges, four, corners, way):
-    """Return the largest step size in [0, max_step] that keeps one pair separated.
+    """Return the largest step size in [0, most] that keeps one pair separated.
 
     Args:
-        candidates: the candidate pairs.
+        pairs: the candidate pairs.
         e: index of the pair.
         p: positions (n, 4) [m].
-        displacement: displacements (n, 4) [m].
-        max_step: upper bound of the step size.
+        direction: displacements (n, 4) [m].
+        most: upper bound of the step size.
         edges: whether the pair is one of edges.
-        local_indices, corners, relative_displacement: scratch, (4,), (4, 3) and (4, 3).
+        four, corners, way: scratch, (4,), (4, 3) and (4, 3).
     """
     x = pairs.vertices[e]
     speed = _relative(p, direction, x, edges, corners, way)
@@ -207,7 +207,7 @@ def alike(x, p, most):
     Args:
         x: start positions (n, 4) [m]; column 3 is padding.
         p: end positions (n, 3) [m].
-        max_step: tolerance along each axis [m].
+        most: tolerance along each axis [m].
     """
     a, b, c = p[0, 0] - x[0, 0], p[0, 1] - x[0, 1], p[0, 2] - x[0, 2]
     for i in range(len(p)):

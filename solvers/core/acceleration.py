@@ -1,6 +1,6 @@
 """Accelerated first-order methods with any energies and any factor of Q.
 
-Kernels of `solvers.kernels.accelerated_descent` alternate with the energies' own values and gradients and with the
+Kernels of `solvers.kernels.accelerate` alternate with the energies' own values and gradients and with the
 factor's solve.
 """
 
@@ -28,10 +28,10 @@ class Scheme:
 
     Attributes:
         name: name in the registry.
-        coefficient_rule: rule of the coefficients, see `acceleration_coefficients`.
-        history_size: number of pairs in the history.
-        max_retries: shorter steps along a direction before the plain correction.
-        needs_projective: whether energies must be projective.
+        coefficients: rule of the coefficients, see `acceleration_coefficients`.
+        pairs: number of pairs in the history.
+        retries: shorter steps along a direction before the plain correction.
+        projective: whether energies must be projective.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Engine(Protocol):
 
 
 def window_for(scheme: Scheme, entries: int, whole: int, precision: Any = np.float64) -> Window:
-    """Allocate vectors of `vector_size`, of which `num_entries` are unknown; `precision` is that of the factor."""
+    """Allocate vectors of `whole`, of which `entries` are unknown; `precision` is that of the factor."""
     m = scheme.pairs
     now = np.zeros(1, accelerate.NOW)
     now["method"], now["retries"] = scheme.coefficients, scheme.retries

@@ -1,9 +1,9 @@
 """Barrier energies, which are infinite beyond a surface in the space of positions and therefore limit the step size.
 
-A method that moves from p along a search direction limits the step size to `max_step_size` at each iterate, so that it
+A method that moves from p along a search direction limits the step size to `reach` at each iterate, so that it
 stays on the side on which it started. The line search of the descent methods does this
-(`solvers.methods.base.descent_method.backtracking_line_search`); the accelerated methods shorten their trial steps
-(`solvers.methods.local_global.accelerated_local_global`). Positions from another source, such as the inertial
+(`solvers.methods.base.descent_method.search`); the accelerated methods shorten their trial steps
+(`solvers.core.acceleration`). Positions from another source, such as the inertial
 prediction or an initial guess, are accepted if the straight path to them is free of collisions.
 """
 
@@ -59,7 +59,7 @@ class Bounded(Energy, Protocol):
         Args:
             p: positions (n, 3) [m].
             direction: displacement (n, 3) [m] over the remaining part of the step.
-            start_fraction: fraction of the step, in [0, 1], at which the obstacles start.
+            begin: fraction of the step, in [0, 1], at which the obstacles start.
         """
         ...
 
@@ -87,8 +87,8 @@ class Bounded(Energy, Protocol):
 
         Args:
             p: positions (n, 3) [m].
-            negative_fraction: factor of the blocks' negative part.
-            block_indices: (a, k^2), -1 for none.
+            keep: factor of the blocks' negative part.
+            places: (a, k^2), -1 for none.
             values: matrix blocks (b, 3, 3) [N/m].
         """
         ...
@@ -96,7 +96,7 @@ class Bounded(Energy, Protocol):
     def blocks(self, p: Positions, keep: float = 1.0) -> PairBlocks:
         """Return the Hessian blocks at p (n, 3).
 
-        `negative_fraction` is the factor of their negative part; 0 makes them positive semidefinite.
+        `keep` is the factor of their negative part; 0 makes them positive semidefinite.
         """
         ...
 

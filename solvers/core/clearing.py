@@ -41,7 +41,7 @@ def begun_free(problem: StepProblem) -> StepProblem:
     energies is returned unchanged.
 
     Raises:
-        NoClearance: no intersection-free start was found.
+        Blocked: no intersection-free start was found.
     """
     energies = [energy for energy in problem.energies if is_bounded(energy)]
     if not energies:
@@ -64,7 +64,7 @@ def begun_free(problem: StepProblem) -> StepProblem:
 def _cleared(problem: StepProblem, energies: Sequence[Bounded]) -> Positions:
     """Return positions (n, 3) [m] without intersections at the end of the step, by a path without collisions.
 
-    Raises NoClearance if none is found.
+    Raises Blocked if none is found.
     """
     p, part = problem.start.positions, 0.0
     exact = problem.system.pins.vertices[problem.system.pins.exact]

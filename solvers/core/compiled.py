@@ -1,6 +1,6 @@
 """The local-global iteration as compiled steps, without Python within a step.
 
-It uses `solvers.kernels.local_global_iteration` for factors whose panels the kernels can traverse.
+It uses `solvers.kernels.step` for factors whose panels the kernels can traverse.
 
 The factors are stored as inverses of blocks, whose products have rounding errors of eps cond(Q) |p| (Higham 2002,
 section 14.1), where cond(Q) <= 2 max_i Q_ii / (Q 1)_i, scaled by Q 1. If that exceeds a small fraction of a spring's
@@ -56,7 +56,7 @@ ORDERS: dict[type, Callable[[Any], Order]] = {Supernodal: of_supernodal, Inverse
 def compiled(base: PreparedLocalGlobal, *, corrects: bool = False) -> PreparedCompiled | str:
     """Return the compiled iterations over the factor's rows, or the reason in words why they run through Python.
 
-    `use_corrections` selects corrections for any precision of the factor.
+    `corrects` selects corrections for any precision of the factor.
     """
     order = _order(base)
     if order is None:
@@ -106,19 +106,19 @@ class StepScratch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PreparedCompiled(Iterative):
-    """The iterations over a factor's own rows (see `solvers.kernels.local_global_iteration`).
+    """The iterations over a factor's own rows (see `solvers.kernels.step`).
 
     Attributes:
         base: the uncompiled iteration.
-        spring_form: decomposition of the energies.
-        iteration_plan: plan of an iteration.
-        spring_packets: packets of the springs in the local step.
+        parts: decomposition of the energies.
+        plan: plan of an iteration.
+        bundles: packets of the springs in the local step.
         edges: strain limits and dashpots, or None.
-        norm_packets: packets of |e|_Q^2.
-        vertex_rows: rows of the vertices.
-        padding_row: last row.
-        use_corrections: whether it solves for corrections.
-        max_coordinate: largest coordinate [m] up to which it may solve for positions.
+        form: packets of |e|_Q^2.
+        rows: rows of the vertices.
+        far: last row.
+        corrects: whether it solves for corrections.
+        reach: largest coordinate [m] up to which it may solve for positions.
     """
 
     residual_of: ClassVar[ResidualOf] = "previous"
@@ -136,7 +136,7 @@ class PreparedCompiled(Iterative):
 
     @classmethod
     def of(cls, base: PreparedLocalGlobal, parts: Parts, order: Order, corrects: bool) -> PreparedCompiled:
-        """Build the iterations over a factor in blocks; use_corrections selects corrections in any case."""
+        """Build the iterations over a factor in blocks; corrects selects corrections in any case."""
         s, pins = base.system, base.system.pins
         exact = pins.vertices[pins.exact]
         nobody = order.rows + len(exact)

@@ -3,7 +3,7 @@
     E = S(p) + phi(c(p)),   Hess E = sparse + V V'
 
 The sparse part may be indefinite although the whole is not. A factorisation is made of the sparse part, and the rest is
-added by Woodbury's formula (`solvers.objective.woodbury`).
+added by Woodbury's formula (`solvers.core.low_rank`).
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 graded: the exact Hessian, or else the first positive definite one in a schedule of increasingly convex ones. With
 active collisions the schedule is finer, and each iterate starts one level below that of the previous iterate. The
-other strategies project the eigenvalues of elements (`solvers.objective.psd_projection`), whether the Hessian is
+other strategies project the eigenvalues of elements (`solvers.core.eigenvalues`), whether the Hessian is
 indefinite or not:
 
     clamp          all, lambda -> max(lambda, 0)                                     Teran et al. 2005
@@ -59,8 +59,8 @@ def factorised(
         hessian: the Hessian at a point.
         diagonal: diagonal whose multiples are added (3 f,) [N/m].
         shift: added to the diagonal at all levels [N/m].
-        schedule: pairs of the negative fraction and the multiple of `diagonal`.
-        first_level: first level to try.
+        levels: pairs of the negative fraction and the multiple of `diagonal`.
+        first: first level to try.
 
     Returns:
         The level; 0 is the exact Hessian; None if no level has a factor.
@@ -75,7 +75,7 @@ class Rule(Protocol):
     def factorised(self, hessian: Hessian, at: Point, diagonal: NDArray[np.float64]) -> int | None:
         """Factorise a Hessian and return its level: 0 for the exact one, more for others, None for no factor.
 
-        The diagonal is that of `factorise_shifted`.
+        The diagonal is that of `factorised`.
         """
         ...
 
@@ -119,8 +119,8 @@ class Clamped(Graded):
     """Eigenvalues of all elements clamped, or replaced by their absolute values.
 
     Attributes:
-        use_absolute: whether absolute values are used.
-        num_examined, num_projected: numbers of elements examined and of elements projected in the solve so far.
+        absolute: whether absolute values are used.
+        looked, changed: numbers of elements examined and of elements projected in the solve so far.
     """
 
     def __init__(self, *, absolute: bool = False) -> None:

@@ -1,7 +1,7 @@
 """The base of methods with exact gradients: points, and a line search that distinguishes descent from round-off.
 
-The line search halves a step until the objective decreases enough (`solvers.kernels.line_search_conditions`). The
-change of the objective is computed from differences (see `solvers.kernels.objective_kernels`), so that the search works
+The line search halves a step until the objective decreases enough (`solvers.kernels.line_search`). The
+change of the objective is computed from differences (see `solvers.kernels.objective`), so that the search works
 until the gradient itself is round-off. The rounding error of other energies' values is taken into account; within it
 the slope must decrease instead.
 """
@@ -33,8 +33,8 @@ class Point(NamedTuple):
     """An iterate: positions and gradient, (n, 3).
 
     Attributes:
-        is_stalled: whether round-off prevents descent from here.
-        is_past_saddle: whether the previous point was a saddle point.
+        stalled: whether round-off prevents descent from here.
+        left: whether the previous point was a saddle point.
     """
 
     positions: Positions
@@ -68,17 +68,17 @@ def search(
     curvature: float = 0.0,
     settled: Callable[[Positions], Positions] | None = None,
 ) -> Point | None:
-    """Return the first point at initial_step, initial_step/2, ... with sufficient decrease, or None.
+    """Return the first point at first, first/2, ... with sufficient decrease, or None.
 
-    No point is beyond the step size limit of the barrier energies (`solvers.model.barrier_energy`).
+    No point is beyond the step size limit of the barrier energies (`solvers.core.bounds`).
 
     Args:
         step: the objective.
         at: current point.
         direction: search direction (n, 3) [m].
-        initial_step: first step size.
-        directional_curvature: second derivative along the direction [J], if a decrease is expected from it.
-        relax_locally: relaxation that lowers the objective from given positions; its result is tried first at each
+        first: first step size.
+        curvature: second derivative along the direction [J], if a decrease is expected from it.
+        settled: relaxation that lowers the objective from given positions; its result is tried first at each
             point.
     """
     slope = dot(at.gradient, direction)
@@ -121,12 +121,12 @@ class Metric:
     """Q of a system's projective energies, factorised, which defines the norm of residuals.
 
     Attributes:
-        unpinned_trace: trace of its unpinned part [N/m].
-        free_block: its free part (f, f).
-        free_diagonal: diagonal of the free part (f,) [N/m].
+        trace: trace of its unpinned part [N/m].
+        inner: its free part (f, f).
+        diagonal: diagonal of the free part (f,) [N/m].
         factor: factor of the free part.
-        description: description of the linear solver.
-        stats: exact counts.
+        choice: description of the linear solver.
+        facts: exact counts.
     """
 
     def __init__(self, system: System) -> None:

@@ -1,10 +1,10 @@
 """The iteration loop of all methods, with the stop rule, its limits and the solution.
 
-    run = init_state(problem, guess);  step_state(run), step_state(run), ...  while residual(run) > rtol * residual_0
+    run = begin(problem, guess);  advance(run), advance(run), ...  while residual(run) > rtol * residual_0
 
-A method supplies these three functions: an `IterativeSolver` has `init_state`, and a `SolverState` has `step_state` and
-`residual`. A method with a compiled loop overrides `run_iterations` and uses the kernel version in
-`solvers.kernels.iteration_loop`.
+A method supplies these three functions: an `Iterative` has `begin`, and a `Iterating` has `advance` and
+`residual`. A method with a compiled loop overrides `iterate` and uses the kernel version in
+`solvers.kernels.loop`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _STOPPED = {
 }
 
 _NEAR = 1e-12
-"""Fraction of `IterativeSolver.residual_scale` that no rounding error reaches. It is thousands of units in the last
+"""Fraction of `Iterative.scale` that no rounding error reaches. It is thousands of units in the last
 place of any sum involved."""
 
 _DISTANT = 1e5
@@ -63,7 +63,7 @@ class Iterating(ABC):
 
     @property
     def kept(self) -> NDArray[np.float64] | None:
-        """Data for the next solve, see `solvers.model.step_problem.Solution`."""
+        """Data for the next solve, see `solvers.problem.Solution`."""
         return None
 
     @abstractmethod
@@ -71,7 +71,7 @@ class Iterating(ABC):
         """Do one iteration; return False if round-off prevents descent and the positions do not change."""
 
     def residual(self) -> float:
-        """Return |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices, at the iterate of `residual_iterate`.
+        """Return |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices, at the iterate of `residual_of`.
 
         It is nan for a method that does not minimise, and before the first iteration if it belongs to the previous
         iterate.
@@ -83,17 +83,17 @@ class Iterating(ABC):
         return True
 
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """Iterate up to the limits; return count, residual and reason, see `solvers.kernels.iteration_loop`."""
+        """Iterate up to the limits; return count, residual and reason, see `solvers.kernels.loop`."""
         return _loop(self, limits)
 
 
 class Iterative(ABC):
-    """A method after the setup for a system; with `description` and `stats` it is a `PreparedSolver`.
+    """A method after the setup for a system; with `description` and `stats` it is a `Prepared`.
 
     Attributes:
-        residual_iterate: the iterate of the residuals. It is "previous" for a method that computes them in its
+        residual_of: the iterate of the residuals. It is "previous" for a method that computes them in its
             iteration as |p - LG(p)|, and "none" for a method that does not minimise, which does all iterations.
-        supports_length_constraints: whether length constraints are supported; if not, `iterates` and `solve` raise
+        keeps_lengths: whether length constraints are supported; if not, `iterates` and `solve` raise
             Unsupported for a system that has any.
     """
 
@@ -141,7 +141,7 @@ class Iterative(ABC):
 
     @staticmethod
     def _iterated(run: Iterating, problem: StepProblem, limits: Limits, floor: float) -> tuple[int, float, int]:
-        """Call `run.run_iterations`, and return FLOOR only if the gradient is round-off at each vertex.
+        """Call `run.iterate`, and return FLOOR only if the gradient is round-off at each vertex.
 
         The gradient is checked once the residual is near round-off, then after one more iteration, and then whenever
         the iterations since the first check have grown by half. Far from the origin the bound consists mostly of the
@@ -196,7 +196,7 @@ class Substeps(Iterating):
     """
 
     def __init__(self, step: Callable[[StepProblem, int], tuple[Positions, Positions]], problem: StepProblem) -> None:
-        """Create the state; `step_in_substeps(problem, n)` returns positions [m] and velocity [m/s]."""
+        """Create the state; `step(problem, n)` returns positions [m] and velocity [m/s]."""
         self._step, self._problem, self._substeps = step, problem, 0
         self.positions = problem.start.positions
 

@@ -29,12 +29,12 @@ class Filtered(NamedTuple):
     """The parts of a Hessian with projected elements.
 
     Attributes:
-        negative_fraction: fraction of the springs' negative transverse parts.
-        spring_tensions: tensions of the springs (m,) [N].
-        element_hessians: Hessians of the elements of each energy (m, 6) [N/m].
-        pair_blocks: blocks of each barrier energy.
-        num_examined: number of elements examined.
-        num_projected: number of elements with a negative eigenvalue.
+        keep: fraction of the springs' negative transverse parts.
+        tension: tensions of the springs (m,) [N].
+        curvature: Hessians of the elements of each energy (m, 6) [N/m].
+        pairs: blocks of each barrier energy.
+        looked: number of elements examined.
+        changed: number of elements with a negative eigenvalue.
     """
 
     keep: float
@@ -49,8 +49,8 @@ class Filtering:
     """A projection and the counts of its elements.
 
     Attributes:
-        use_absolute: whether eigenvalues are replaced by absolute values instead of clamped.
-        vertex_mask: mask of the vertices (n,) whose elements are projected; None for all.
+        absolute: whether eigenvalues are replaced by absolute values instead of clamped.
+        among: mask of the vertices (n,) whose elements are projected; None for all.
     """
 
     def __init__(self, *, absolute: bool = False, among: NDArray[np.bool_] | None = None) -> None:

@@ -60,8 +60,8 @@ class Tableau:
     Attributes:
         order: order of the method.
         a: rows of the tableau (s, s); the last one ends the step.
-        error_weights: weights of the error estimates (0 to 2, s).
-        error_exponent: exponent of the step size in the error.
+        errors: weights of the error estimates (0 to 2, s).
+        power: exponent of the step size in the error.
     """
 
     order: int

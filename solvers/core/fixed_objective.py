@@ -1,7 +1,7 @@
 """The terms of the objective that do not change from step to step: springs, constant forms, Hessian pattern.
 
 The degrees of freedom are the free vertices. The matrix of the Hessian is analysed once
-(`solvers.objective.hessian_pattern`), and terms that are constant in a run are summed once.
+(`solvers.core.pattern`), and terms that are constant in a run are summed once.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ class Objective:
     """The parts of a system's objective that do not change from step to step.
 
     Attributes:
-        element_energy_indices: indices of energies with an element-wise form.
-        other_energy_indices: indices of energies without one.
-        forms_with_force: indices of quadratic forms with a force, or with one that changes from step to step.
-        projective_indices: indices of projective energies other than springs.
+        stated: indices of energies with an element-wise form.
+        own: indices of energies without one.
+        moving: indices of quadratic forms with a force, or with one that changes from step to step.
+        projective: indices of projective energies other than springs.
     """
 
     def __init__(self, system: System) -> None:

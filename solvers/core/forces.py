@@ -49,7 +49,7 @@ def frequency(system: System) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ForceParts:
-    """The forces of a system: springs and their packets, a form as in `FrameForces`, drag (n,) [1/s], load (n, 3) [N].
+    """The forces of a system: springs and their packets, a form as in `Forces`, drag (n,) [1/s], load (n, 3) [N].
 
     The load is the force of the form at the origin.
     """
@@ -95,7 +95,7 @@ _FAR = 1e100
 def rows_of_four(x: Positions, *, far: bool = False) -> NDArray[np.float64]:
     """Return x (n, 3) in rows of four, with two padding rows.
 
-    `pad_far` moves the last one away from all vertices.
+    `far` moves the last one away from all vertices.
     """
     out = aligned(4 * (len(x) + 2))
     out.reshape(-1, 4)[: len(x), :3] = x

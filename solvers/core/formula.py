@@ -1,6 +1,6 @@
 """A solver defined by one formula for the next iterate.
 
-    p' = next_iterate(p, p_before, Q^-1 grad g(p))
+    p' = formula(p, p_before, Q^-1 grad g(p))
 
 Local-global is p - Q^-1 grad g(p). Q is assembled from the projective energies and factorised by SuperLU.
 """

@@ -40,7 +40,7 @@ class Multipliers:
 
         Args:
             augmented: the system without constraints, with their penalties in Q.
-            constraints: the constraints.
+            lengths: the constraints.
             stiffness: stiffnesses of the penalties (m,) [N/m].
         """
         Q = assemble(augmented, [e for e in augmented.energies if isinstance(e, ProjectiveEnergy)])

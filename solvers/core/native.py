@@ -42,7 +42,7 @@ def compile_cpp(
     Args:
         source: C++ source.
         folder: folder of the result.
-        requirements: requirements, in words, for the error message.
+        needs: requirements, in words, for the error message.
         options: further compiler options.
         libraries: linker arguments.
 

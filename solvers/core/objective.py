@@ -1,9 +1,9 @@
 """The objective of a step, its gradient and its Hessian, evaluated fast; `StepProblem` is the reference evaluator.
 
 One compiled pass evaluates all springs, another all constant quadratic forms, and one each energy with an element-wise
-form (`solvers.model.energies.element_energies`). Other energies supply their own value, gradient and Hessian. The
+form (`solvers.energies.elements`). Other energies supply their own value, gradient and Hessian. The
 degrees of freedom are the free vertices: exactly pinned ones stay on their targets. The matrix of the Hessian is
-analysed once, or once per step (`hessian_pattern`, `step_matrix`). Terms that are constant in a run or a step are
+analysed once, or once per step (`hessian_pattern`, `matrix`). Terms that are constant in a run or a step are
 summed once.
 """
 
@@ -40,10 +40,10 @@ class StepObjective:
     """The objective g of one step. All positions are (n, 3) [m], with exactly pinned vertices on their targets.
 
     Attributes:
-        element_energies: energies with an element-wise form, except those without elements in this step.
-        other_energies: energies without an element-wise form.
-        barrier_energies: barrier energies among these, which limit the step size.
-        step_matrix: the matrix of the Hessians.
+        stated: energies with an element-wise form, except those without elements in this step.
+        own: energies without an element-wise form.
+        bounded: barrier energies among these, which limit the step size.
+        matrix: the matrix of the Hessians.
     """
 
     def __init__(self, whole: Objective, problem: StepProblem) -> None:
@@ -74,7 +74,7 @@ class StepObjective:
         return any(not one.projective for one in self.stated)
 
     def reach(self, p: Positions, direction: Positions, first: float = 1.0) -> float:
-        """Return the largest collision-free step size up to `initial_step`.
+        """Return the largest collision-free step size up to `first`.
 
         It is that from p along the search direction, both (n, 3); see `barrier_energy`.
         """
@@ -201,7 +201,7 @@ class Hessian:
         """Factorise the Hessian and return whether it is positive definite; the defaults give the exact Hessian.
 
         Args:
-            negative_fraction: fraction of the negative transverse part of springs to include.
+            keep: fraction of the negative transverse part of springs to include.
             shift: value added to the diagonal [N/m].
             tension: tensions of the springs (m,) [N]; None for those at the point.
 
@@ -291,7 +291,7 @@ class Hessian:
 
     @cached_property
     def compiled(self) -> tuple[Any, ...]:
-        """Arguments of `solvers.kernels.spring_hessian.multiply`: all terms with an element-wise form."""
+        """Arguments of `solvers.kernels.hessian.multiply`: all terms with an element-wise form."""
         step = self._step
         curvature = np.concatenate(self.curvature) if self.curvature else None
         return self._terms, self._linear, step.whole.form, step.joined, curvature

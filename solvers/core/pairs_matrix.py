@@ -27,7 +27,7 @@ class StepMatrix:
     def at(self, p: Positions, i: Indices, j: Indices, met: list[Indices]) -> Matrix:
         """Return the matrix at p with blocks (i, j) of free vertices and the blocks of each barrier energy.
 
-        The latter are between the vertices `block_vertices` (a, k).
+        The latter are between the vertices `met` (a, k).
         """
         known = self._known or self._whole.matrix
         if not (known.has(i, j) and all(known.holds(-1 - k, vertices) for k, vertices in enumerate(met))):

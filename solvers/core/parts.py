@@ -1,10 +1,10 @@
 """Decomposition of a system's energies into springs and terms that the compiled methods compute like springs.
 
 A constant quadratic form (bending, attachments, linear drag) is equivalent to springs of zero rest length between the
-vertices that it couples, and a weight of each single vertex (see `solvers.kernels.quadratic_form_kernels`). So the
+vertices that it couples, and a weight of each single vertex (see `solvers.kernels.forms`). So the
 kernels of springs compute its forces and its value. Its force at the origin, A'W d, is constant in a step and is added
 to the external force. Strain limits and dashpots are edges with their own kernel (see
-`solvers.kernels.edge_elements`); in Q they too are springs of zero rest length.
+`solvers.kernels.edges`); in Q they too are springs of zero rest length.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ class Parts:
 
     Attributes:
         springs: springs of the system.
-        springs_and_forms: these and the pairs of the forms.
-        system_pairs: all pairs in Q: these and the edges.
-        vertex_weight: weight h of all forms at each vertex (n,) [N/m].
-        form_builders: builders of each form for a step.
-        strain_limits, dashpots: edge energies, with k [N/m] of both.
-        unsupported_energies: names of unsupported energies.
-        has_cancellation: whether pairs and springs of some vertices cancel, so that the pattern of Q omits their
+        whole: these and the pairs of the forms.
+        pairs: all pairs in Q: these and the edges.
+        held: weight h of all forms at each vertex (n,) [N/m].
+        forms: builders of each form for a step.
+        limits, dashpots: edge energies, with k [N/m] of both.
+        unknown: names of unsupported energies.
+        cancel: whether pairs and springs of some vertices cancel, so that the pattern of Q omits their
             coupling.
     """
 

@@ -1,7 +1,7 @@
 """The matrix of a Hessian: 3 x 3 blocks between free vertices, their positions per energy, and the factorisation.
 
 The pattern covers springs, projective energies and elements, which are known before the first step. If another energy
-needs more blocks, a step extends the pattern (`solvers.objective.step_matrix`). The last extended one is cached for
+needs more blocks, a step extends the pattern (`solvers.core.pairs_matrix`). The last extended one is cached for
 steps that need exactly that pattern, so that a result depends on its problem only, not on earlier ones.
 """
 
@@ -32,8 +32,8 @@ class Matrix:
         Args:
             system: the system.
             terms: objective terms.
-            quadratic_form: quadratic form of the system, or None.
-            free_index: index of each vertex among the free ones (n,), or -1.
+            form: quadratic form of the system, or None.
+            number: index of each vertex among the free ones (n,), or -1.
             graph: pattern of the blocks (f, f), sorted, with a diagonal.
         """
         self.graph, self._number, self._size = graph, number, len(system.free)

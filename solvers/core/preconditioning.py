@@ -1,7 +1,7 @@
 """Preconditioners of conjugate gradients, in Newton's methods and in nonlinear ones.
 
     factor          Q^-1                                               a solve with the prefactored matrix
-    schwarz         dense inverses of patches of H+, on levels         see `solvers.linalg.additive_schwarz`
+    schwarz         dense inverses of patches of H+, on levels         see `solvers.linear.schwarz`
     block-jacobi    inverses of the 3 x 3 blocks on the diagonal of H+
 
 H+ is the Hessian at each point, with the negative eigenvalues of its elements clamped; the last two are built from it.
@@ -154,7 +154,7 @@ class Scaled:
     """The preconditioner (S Q S)^-1 with S_i = (I + W_i/Q_ii)^(1/2) at some vertices, I at all others.
 
     Attributes:
-        inverse_scaling: these vertices (c,), and S_i^-1 (c, 3, 3).
+        shrunk: these vertices (c,), and S_i^-1 (c, 3, 3).
     """
 
     def __init__(self, metric: Metric, vertices: NDArray[np.int64], blocks: NDArray[np.float64]) -> None:

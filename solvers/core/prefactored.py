@@ -1,6 +1,6 @@
 """The local-global iteration over a prefactored Q, independent of the backend of its two steps.
 
-The method is described in `solvers.methods.local_global.reference_local_global`.
+The method is described in `solvers.methods.local_global`.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ class PreparedLocalGlobal(Iterative):
 
     Attributes:
         system: the system.
-        local_step: local step.
+        project: local step.
         factor: factor of Q's free rows and columns.
-        pin_coupling: Q's free rows and exactly pinned columns (f, x).
-        energy_norm: |e|_Q [J^(1/2)] of a displacement that vanishes at the pins.
-        unpinned_trace: trace of the unpinned part of Q [N/m].
-        stats: exact counts of the setup.
-        description: description of the linear solver.
-        build_lagged_step: builder of the local step of a problem, if it depends on the problem.
-        correction_matrix: Q's free rows and columns if the factor has low precision. The iteration then solves for
+        coupling: Q's free rows and exactly pinned columns (f, x).
+        norm: |e|_Q [J^(1/2)] of a displacement that vanishes at the pins.
+        trace: trace of the unpinned part of Q [N/m].
+        facts: exact counts of the setup.
+        choice: description of the linear solver.
+        lagged: builder of the local step of a problem, if it depends on the problem.
+        rounded: Q's free rows and columns if the factor has low precision. The iteration then solves for
             corrections, p + Q^-1 (b - Q p), and the fixed point stays accurate to float64.
-        diagonal_dominance_ratio: max_i Q_ii / (Q 1)_i over the free rows and columns, half of a bound on the condition
+        spread: max_i Q_ii / (Q 1)_i over the free rows and columns, half of a bound on the condition
             number.
     """
 
@@ -152,7 +152,7 @@ class PreparedLocalGlobal(Iterative):
 
 
 class Iterations(Iterating):
-    """The state of a local-global solve with two alternating position arrays; right_hand_side: y (n, 3) [N]."""
+    """The state of a local-global solve with two alternating position arrays; constant: y (n, 3) [N]."""
 
     def __init__(self, base: PreparedLocalGlobal, problem: StepProblem, guess: Positions) -> None:
         self.base, self._project = base, base.local(problem)
@@ -203,7 +203,7 @@ def prepared(
         system: the system.
         energies: its projective energies.
         factorise: function of Q's free part that returns a factor and a description.
-        is_low_precision: whether the factor is less precise than float64.
+        rounded: whether the factor is less precise than float64.
     """
     Q = matrices.assemble(system, energies)
     free = system.free

@@ -63,7 +63,7 @@ def leave(step: StepObjective, at: Point, hessian: Hessian, diagonal: NDArray[np
 def aside(step: StepObjective, at: Point, hessian: Hessian, diagonal: NDArray[np.float64]) -> Point | None:
     """Return a lower point next to one that approaches a saddle point, or None.
 
-    It is None if a few power iterations find no negative curvature. The arguments are those of `escape_saddle`; the
+    It is None if a few power iterations find no negative curvature. The arguments are those of `leave`; the
     Hessian is that of a point near `at`.
     """
     found = _curved(at, hessian, diagonal, _FEW)

@@ -15,10 +15,10 @@ class Substeps:
     """The choice of substeps.
 
     Attributes:
-        num_substeps: substeps of a step for a fixed size, else the smallest stable number.
+        count: substeps of a step for a fixed size, else the smallest stable number.
         tolerance: error tolerance of a substep [m] for an adaptive size, else 0.
-        fastest_rate: rate of the fastest motion [1/s].
-        description: description in words.
+        rate: rate of the fastest motion [1/s].
+        choice: description in words.
     """
 
     count: int

@@ -23,11 +23,11 @@ class VertexBlocks(NamedTuple):
     """The rows, packets and majorants of a system.
 
     Attributes:
-        row_of_vertex: row of each vertex (n,).
-        num_free: number of free rows.
-        spring_packets: packets of the free rows, by colour.
-        first_packet: first packet of each colour (colours + 1,).
-        anchor_stiffness: stiffness [N/m] of inertia and pins of each row (n + 2,).
+        row: row of each vertex (n,).
+        free: number of free rows.
+        bundles: packets of the free rows, by colour.
+        first: first packet of each colour (colours + 1,).
+        held: stiffness [N/m] of inertia and pins of each row (n + 2,).
         majorant: that plus the stiffness of springs and elements (n + 2,) [N/m]; 1 for padding.
     """
 

@@ -27,8 +27,8 @@ class Beside:
     """The projective energies of a system with an element-wise form.
 
     Attributes:
-        energy_indices: their indices in the system.
-        incident_elements: their elements by rows, one set for each law, once the rows are known.
+        numbers: their indices in the system.
+        around: their elements by rows, one set for each law, once the rows are known.
     """
 
     system: System
@@ -81,7 +81,7 @@ class Beside:
 
     @cached_property
     def kernel(self) -> Any:
-        """The kernel `solvers.methods.vertex_block.vbd_sweeps.run_iterations` extended by these energies."""
+        """The kernel `solvers.kernels.vbd.iterate` extended by these energies."""
         if not self.numbers:
             return plain.iterate
         from solvers.kernels.stencils import Kind  # for those who need it

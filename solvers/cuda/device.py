@@ -17,7 +17,7 @@ from solvers.device import SIMULATED, broken
 from solvers.memory import in_words
 from solvers.problem import Unsupported
 
-INSTALL = "`.venv/bin/pip install -e '.[cuda]'` in the checkout installs what it needs beside NVIDIA's driver"
+INSTALL = "`.venv/bin/pip install -e '.[cuda]'` in the checkout installs what it needs in addition to NVIDIA's driver"
 _PACKAGES = "numba-cuda", "cuda-bindings", "cuda-core", "cuda-toolkit", "nvidia-ml-py"
 _DRIVERS = ("cudadrv", "cuda.bindings", "cuda.core")
 """Parts of the names of modules that raise driver errors."""
@@ -144,7 +144,7 @@ def _handle(nvml: Any, device: Any) -> Any:
 
 @contextmanager
 def guarded() -> Generator[None]:
-    """Convert driver errors to DeviceFailure.
+    """Convert driver errors to DeviceFailed.
 
     After an error other than a lack of memory, the process cannot use its device again and does not attempt to.
     """

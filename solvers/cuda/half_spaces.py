@@ -1,8 +1,8 @@
 """Vertex contact with obstacles on a device: half-spaces, built at the start of a step and used in sweeps.
 
 The host only provides the frames of moving obstacles. The functions are shared with the CPU: the half-space of a vertex
-(`solvers.contact.half_space.separating_planes`), its terms in the gradient and block of the vertex, and the trial steps
-(`solvers.contact.half_space.half_space_steps`). They compute in float64, as few vertices are in contact. The springs'
+(`solvers.contact.planes`), its terms in the gradient and block of the vertex, and the trial steps
+(`solvers.kernels.half_spaces`). They compute in float64, as few vertices are in contact. The springs'
 terms come from the kernels of `solvers.cuda.vbd_kernels` in their type.
 """
 
@@ -118,7 +118,7 @@ def find(vertex, p, v, dt, when, square, frames, bodies, found, rounds, pressed,
 
     A half-space is empty if the vertex is not near the obstacle.
 
-    See `solvers.contact.half_space.half_space_potential`.
+    See `solvers.contact.energy`.
 
     Args:
         p: positions [m] at the start of the step, by vertices.
@@ -203,7 +203,7 @@ def kernels(real: Any) -> Kernels:
     def press(spaces, x, u, asked, control, first, out):
         """Write the change of the half-space energy from the reference to u [J], one number per block.
 
-        The numbers are stored in `out` from `first` on; see `sum_objective` in `solvers.cuda.vbd_kernels`.
+        The numbers are stored in `out` from `first` on; see `level` in `solvers.cuda.vbd_kernels`.
         """
         if asked == ASKED and not control[ASKED] > 0.0:
             return

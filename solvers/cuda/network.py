@@ -4,10 +4,10 @@
 
 Edges of the second kind, marked by nan in `rest`, are dashpots. Each vertex has one anchor stiffness and one centre,
 h c = inertia target + penalty pin, so that distant targets round as positions do. A form is represented by zero-length
-springs and anchors (`solvers.objective.spring_form`). Energies that couple vertices nonlinearly, or more than two of
+springs and anchors (`solvers.core.parts`). Energies that couple vertices nonlinearly, or more than two of
 them, are not supported; the error names them.
 
-Vertices are in rows: the free ones first, in patches of neighbours (`solvers.linalg.additive_schwarz`), then those with
+Vertices are in rows: the free ones first, in patches of neighbours (`solvers.linear.schwarz`), then those with
 exact pins. The entries of 32 rows, a warp, that are read together are contiguous.
 """
 
@@ -35,9 +35,9 @@ class Entries(NamedTuple):
     """Edges listed at both of their ends.
 
     Attributes:
-        warp_starts: (warps + 1,), first entry of each warp's rows.
-        neighbour_rows: row of the other end of each entry; the row itself for padding.
-        edge_indices: edge of each entry, ~edge at its second end.
+        first: (warps + 1,), first entry of each warp's rows.
+        other: row of the other end of each entry; the row itself for padding.
+        edge: edge of each entry, ~edge at its second end.
     """
 
     first: Any
@@ -69,12 +69,12 @@ class Edges(NamedTuple):
     """Edges on the device.
 
     Attributes:
-        warp_starts, neighbour_rows, edge_indices: see `EdgeEntries`.
-        entry_stiffness, entry_rest_length: of each entry [N/m, m].
+        first, other, edge: see `Entries`.
+        stiffness, rest: of each entry [N/m, m].
         ends: (m, 2), rows.
-        edge_stiffness, edge_rest_length: (m,) [N/m, m].
-        edge_direction: (m, 3), axis of a dashpot, or direction of a spring of zero length.
-        dashpot_offset: (m,) [m].
+        strength, length: (m,) [N/m, m].
+        axis: (m, 3), axis of a dashpot, or direction of a spring of zero length.
+        offset: (m,) [m].
     """
 
     first: Any
@@ -102,7 +102,7 @@ class Given(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """Edges of a system; `row_vertices` (n,) are the vertices of the rows, the first `num_free` rows move."""
+    """Edges of a system; `order` (n,) are the vertices of the rows, the first `free` rows move."""
 
     system: System
     parts: Parts
@@ -122,7 +122,7 @@ class Network:
         Args:
             solver: name of the solver, for messages.
             system: the system.
-            free_order: (f,), order of the free vertices, as indices among them.
+            order: (f,), order of the free vertices, as indices among them.
 
         Raises:
             Unsupported: with the names of energies other than springs, constant forms and dashpots.

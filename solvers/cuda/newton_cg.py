@@ -1,9 +1,9 @@
-"""Newton-CG on a device: the iterates of `solvers.methods.newton.newton_cg` with additive Schwarz.
+"""Newton-CG on a device: the iterates of `solvers.methods.newton_cg` with additive Schwarz.
 
 Positions and gradients are float64, directions `real`: p + t d retains the digits of positions, and the next gradient
 corrects the error of a direction. The host reads few numbers: those of each trial once, and after each TOGETHER
 iterations of conjugate gradients, which run on the device, whether they have ended. H d = -g to r'z <= limit
-(`solvers.linalg.krylov`):
+(`solvers.linear.krylov`):
 
     turn     p = z + r'z / (r'z before) p         multiply   y = H p, and p'y         curve    whether p'y > 0
     go       d += t p,   r -= t y                 apply      z = M^-1 r, and r'z      judge    whether r'z <= limit
@@ -58,8 +58,8 @@ def prepare(
         system: the system.
         preconditioner: of conjugate gradients; only schwarz is supported.
         real: floating-point type of the directions.
-        eta_bounds: upper and lower bound of eta.
-        max_cg_iterations: maximum number of conjugate gradient iterations.
+        forcing: upper and lower bound of eta.
+        most: maximum number of conjugate gradient iterations.
 
     Raises:
         NotPositiveDefinite: if the system leaves some positions undetermined.

@@ -2,7 +2,7 @@
 
     grad_i g = h_i (p_i - c_i) - f_i + sum over its edges of t n,      t = k (l - r), or k (n.v - o) of a dashpot
     (H x)_i  = h_i x_i + sum over its edges of b + a n (n.b),  b = s (x_i - x_j),  s = t/l,  a = (k - s)
-    g(q) - g(p): a sum of differences, as in `solvers.kernels.objective_kernels`
+    g(q) - g(p): a sum of differences, as in `solvers.kernels.objective`
 
 Each row gathers its own terms, in the order of its list, so no thread writes to another's row.
 """

@@ -3,7 +3,7 @@
     start: upload | launch, launch, ... | positions: download                       all in one stream, in their order
 
 Kernels are launched asynchronously. `positions` copies on access. The residual is evaluated after each
-ITERATIONS_PER_RESIDUAL iterations if it can end a solve. The iterates depend on neither.
+EVERY iterations if it can end a solve. The iterates depend on neither.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class DeviceIterating(Iterating):
 
     Attributes:
         row_vertices: (n,), the vertex of each row.
-        is_stalled: whether the last iteration moved nothing.
-        residual_of_positions: returns the residual [J^(1/2)] at positions; nan for a method that does not minimise.
+        stalled: whether the last iteration moved nothing.
+        gauge: returns the residual [J^(1/2)] at positions; nan for a method that does not minimise.
     """
 
     def __init__(self, stream: Stream, order: NDArray[np.int64]) -> None:

@@ -1,4 +1,4 @@
-"""Additive Schwarz preconditioner on a device: `solvers.linalg.additive_schwarz` of H+.
+"""Additive Schwarz preconditioner on a device: `solvers.linear.schwarz` of H+.
 
     z = sum over levels l of P_l diag(B_l^-1) P_l' r
     H+_ii = h_i + sum over its edges of b,   H+_ij = -b,   b = s I + (k - s) n n',   s no less than zero
@@ -34,11 +34,11 @@ class Level:
     """A level on the host.
 
     Attributes:
-        num_nodes: number of nodes.
-        edge_entries: edges between nodes, or to fixed rows, from both ends.
-        anchor_stiffness: (nodes,), sum of h over the parts [N/m].
-        num_edges: number of edges.
-        fine_edge_starts, fine_edges: (edges + 1,) and list of the finer edges of each edge; empty on the first level.
+        nodes: number of nodes.
+        entries: edges between nodes, or to fixed rows, from both ends.
+        held: (nodes,), sum of h over the parts [N/m].
+        edges: number of edges.
+        first, finer: (edges + 1,) and list of the finer edges of each edge; empty on the first level.
     """
 
     nodes: int
@@ -55,7 +55,7 @@ class Level:
 
 
 def levels(network: Network, held: NDArray[np.float64]) -> list[Level]:
-    """Build the levels of a network; `anchor_stiffness` (f,) is that of its rows [N/m]."""
+    """Build the levels of a network; `held` (f,) is that of its rows [N/m]."""
     none = np.zeros(1, np.int64)
     found = [Level(network.free, network.entries, held, len(network.ends), none, none)]
     ends = network.ends
@@ -74,7 +74,7 @@ def levels(network: Network, held: NDArray[np.float64]) -> list[Level]:
 
 
 def needed(of: list[Level], size: int) -> float:
-    """Return the bytes on the device, for numbers of `item_size` bytes."""
+    """Return the bytes on the device, for numbers of `size` bytes."""
     return sum(
         1.0 * size * packed(schwarz.PATCH) * one.patches
         + 48.0 * one.edges
@@ -110,7 +110,7 @@ class UploadedLevel(NamedTuple):
 
 
 class Schwarz:
-    """Packed inverses of the subdomains of all levels for one solve; `apply_preconditioner` acts on r (f, 3)."""
+    """Packed inverses of the subdomains of all levels for one solve; `apply` acts on r (f, 3)."""
 
     def __init__(self, of: list[Level], uploaded: list[UploadedLevel], stream: Stream, rows: int, real: Real) -> None:
         self._stream, self.r = stream, stream.zeros((rows, 3), real)

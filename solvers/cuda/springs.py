@@ -7,7 +7,7 @@
 No difference of large numbers occurs: each term is accurate to the last digits of w, so the error of float32 is
 relative to the change since the reference. The force at the reference itself is computed in float64.
 
-A thread processes one lane of `solvers.kernels.spring_local_step`'s packets, with rows as indices: eight adjacent
+A thread processes one lane of `solvers.kernels.springs`'s packets, with rows as indices: eight adjacent
 vertices read eight neighbours, eight spring vectors and one weight offset. Positions are in rows of four numbers, so
 that a neighbour is one memory sector.
 """
@@ -34,15 +34,15 @@ class Lanes(NamedTuple):
     """Spring packets on the device.
 
     Attributes:
-        lane_row: (L,), the row of each lane.
-        packet_start: (b + 1,).
-        neighbour_row: (8 e,).
-        weight_offset: (e,).
-        spring_weights: in the kernels' type.
-        float64_weights: in float64.
-        spring_index, rest_direction: (8 e,) and (m, 3), as in the host's packets.
-        spring_vectors: (3, 8 e), D [m] of the reference.
-        padding_row, padding_end_row: rows of padding lanes, and of the ends of padding springs.
+        own: (L,), the row of each lane.
+        start: (b + 1,).
+        neighbour: (8 e,).
+        kind: (e,).
+        weights: in the kernels' type.
+        exact: in float64.
+        spring, direction: (8 e,) and (m, 3), as in the host's packets.
+        arrows: (3, 8 e), D [m] of the reference.
+        nobody, far: rows of padding lanes, and of the ends of padding springs.
     """
 
     own: Any
@@ -61,7 +61,7 @@ class Lanes(NamedTuple):
     def of(cls, stream: Stream, bundles: Bundles, nobody: int, real: Any) -> Lanes:
         """Copy the packets to the device.
 
-        `padding_row` + 1 is the row of the ends of padding springs.
+        `nobody` + 1 is the row of the ends of padding springs.
         """
         entries = len(bundles.neighbour)
         direction = bundles.direction if len(bundles.direction) else np.zeros((1, 3))

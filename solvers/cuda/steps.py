@@ -3,7 +3,7 @@
     centre_i = (c m/dt^2 target + w pin) / (c m/dt^2 + w),     force_i = f_i - h_i centre_i        h: of forms
     n = v/|v| and n'(A origin) of dashpots, v = A p at the step's start
 
-Rows are those of `solvers.cuda.device_network`; the arrays of a step are by vertices, as on the host.
+Rows are those of `solvers.cuda.network`; the arrays of a step are by vertices, as on the host.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ class Step(NamedTuple):
     """A step on the device, by vertices.
 
     Attributes:
-        inertial_target, initial_guess: (n, 3) [m].
-        external_force: (n, 3) [N], including that of forms.
-        pin_targets: (q, 3) [m]; one row if there are none.
-        velocity_origin, lagged_positions: (n, 3) [m], of the stage's velocity and of the dashpots' directions;
+        target, guess: (n, 3) [m].
+        force: (n, 3) [N], including that of forms.
+        pins: (q, 3) [m]; one row if there are none.
+        origin, lagged: (n, 3) [m], of the stage's velocity and of the dashpots' directions;
             arbitrary without dashpots.
         positions, velocity: (n, 3) [m, m/s] at the start of the step; arbitrary for a minimising method without
             contact.
-        start_and_stage_time: [s].
-        normal_force_positions: (n, 3) [m], where friction evaluates normal forces; None for the start of the step.
+        times: [s].
+        pressed: (n, 3) [m], where friction evaluates normal forces; None for the start of the step.
     """
 
     target: Any
@@ -53,11 +53,11 @@ class Places(NamedTuple):
     """Data of each row (n,) on the device.
 
     Attributes:
-        row_vertices: the vertex.
-        pin_indices: index of its pin, -1 for none.
-        inertia_diagonal: c m/dt^2 [N/m].
-        pin_weight: weight of a penalty pin [N/m].
-        form_weight: h of all forms [N/m].
+        vertex: the vertex.
+        pin: index of its pin, -1 for none.
+        inertia: c m/dt^2 [N/m].
+        weight: weight of a penalty pin [N/m].
+        form: h of all forms [N/m].
     """
 
     vertex: Any
@@ -72,8 +72,8 @@ class Uploaded:
     """A network on a device.
 
     Attributes:
-        device_edges, row_data: of the network.
-        anchor_stiffness: (f,), sum of all anchors of a row [N/m].
+        edges, places: of the network.
+        hold: (f,), sum of all anchors of a row [N/m].
         axis: (m, 3), of the edges as prepared.
     """
 
@@ -129,8 +129,8 @@ class Begun:
     """Data of a solve for its step, in rows.
 
     Attributes:
-        device_edges: the edges, as in this step.
-        step_data: anchors of the free rows (f,) and (f, 3).
+        edges: the edges, as in this step.
+        given: anchors of the free rows (f,) and (f, 3).
     """
 
     def __init__(self, uploaded: Uploaded) -> None:
@@ -178,7 +178,7 @@ def give(places, target, force, pins, given):
 def place(places, free, guess, pins, rows):
     """Write an initial guess (n, 3) to rows.
 
-    Rows from `num_free` on are set to their pins' targets.
+    Rows from `free` on are set to their pins' targets.
     """
     i = cuda.grid(1)
     while i < places.vertex.shape[0]:
@@ -189,9 +189,9 @@ def place(places, free, guess, pins, rows):
 
 @cuda.jit
 def lag(first, vertex, origin, lagged, made, edges):
-    """Write directions and offsets of the dashpots, the edges from `first_dashpot` on.
+    """Write directions and offsets of the dashpots, the edges from `first` on.
 
-    `default_directions` are used at zero length.
+    `made` are used at zero length.
     """
     e = first + cuda.grid(1)
     while e < edges.ends.shape[0]:

@@ -3,8 +3,8 @@
 Threads loop over the terms with a stride, the threads of a block are summed by a tree, and one block sums the blocks by
 the same tree. The two stages are two kernels, so no block waits for another and atomics are unnecessary.
 
-`store_partial_sum` and `sum_partials` are inlined. Numba compiles a function once for each literal argument, including
-its callees, so the shared array of `sum_block` would be defined twice, which libNVVM rejects.
+`keep` and `of_all` are inlined. Numba compiles a function once for each literal argument, including
+its callees, so the shared array of `of_block` would be defined twice, which libNVVM rejects.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def of_block(value):
 
 @cuda.jit(device=True, inline="always")
 def keep(value, which, partials):
-    """First stage: store the sum of the block in a row of partials (k, MAX_BLOCKS)."""
+    """First stage: store the sum of the block in a row of partials (k, MOST_BLOCKS)."""
     total = of_block(value)
     if cuda.threadIdx.x == 0:
         partials[which, cuda.blockIdx.x] = total

@@ -1,7 +1,7 @@
-"""Vertex block descent on a device: the iterates of `solvers.methods.vertex_block.vbd`, one launch per colour.
+"""Vertex block descent on a device: the iterates of `solvers.methods.vbd`, one launch per colour.
 
 Colours, their order, packets and sums are those of the CPU. Springs, quadratic forms and vertex contact with obstacles
-are supported; elements of other energies and barrier contact are not. Every REBASE_INTERVAL iterations the displacement
+are supported; elements of other energies and barrier contact are not. Every REBASE iterations the displacement
 is added to the reference in float64, and the gradient is computed there. Hence float32 iterates converge to the minimum
 in float64 as well.
 """
@@ -41,9 +41,9 @@ def prepare(system: System, parts: Parts, made: VertexBlocks, radius: float, rea
 
     Args:
         system: the system.
-        spring_form: its springs and quadratic forms.
-        vertex_blocks: coloured packets.
-        spectral_radius: rho of the acceleration.
+        parts: its springs and quadratic forms.
+        made: coloured packets.
+        radius: rho of the acceleration.
         real: floating-point type of the kernels.
 
     Raises:

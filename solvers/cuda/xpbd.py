@@ -1,4 +1,4 @@
-"""XPBD on a device: the iterates of `solvers.methods.position_based.xpbd`, with one launch per colour.
+"""XPBD on a device: the iterates of `solvers.methods.xpbd`, with one launch per colour.
 
 Each thread processes one spring. No two springs of a colour share a vertex, so no thread writes what another reads.
 `solvers.cuda.xpbd_kernels` documents the precision of each quantity.
@@ -31,11 +31,11 @@ def prepare(
 
     Args:
         system: the system.
-        coloured_constraints: the springs by colour.
-        colour_starts: (colours + 1,), the first spring of each colour.
-        real_dtype: floating-point type of the kernels.
-        description: description of the solver.
-        small_steps: whether in small steps.
+        constraints: the springs by colour.
+        first: (colours + 1,), the first spring of each colour.
+        real: floating-point type of the kernels.
+        choice: description of the solver.
+        small: whether in small steps.
 
     Raises:
         Unsupported: if the device memory is too small.
@@ -57,10 +57,10 @@ class Springs(NamedTuple):
     Attributes:
         ends: (m, 2).
         stiffness: (m,) [N/m].
-        rest_length: r (m,) [m].
-        rest_direction: (m, 3), used at zero length.
-        reference_vectors: (4, m), D and |D| - r [m] of a solve.
-        spring_tensions: (m,) [N] of a solve.
+        rest: r (m,) [m].
+        direction: (m, 3), used at zero length.
+        arrows: (4, m), D and |D| - r [m] of a solve.
+        tension: (m,) [N] of a solve.
     """
 
     ends: Any
@@ -95,9 +95,9 @@ class Places(NamedTuple):
     """Data of each vertex (n,) on the device.
 
     Attributes:
-        pin_indices: index of its pin, -1 for none.
-        pin_weight: weight of the pin, 0 for none.
-        anchor_stiffness: c m/dt^2 + weight [N/m].
+        pin: index of its pin, -1 for none.
+        weight: weight of the pin, 0 for none.
+        held: c m/dt^2 + weight [N/m].
         mass: [kg].
     """
 
@@ -118,7 +118,7 @@ class Places(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PreparedXpbd(DeviceIterative):
-    """XPBD, prepared on a device; `colour_starts` (colours + 1,) are the first springs of the colours."""
+    """XPBD, prepared on a device; `first` (colours + 1,) are the first springs of the colours."""
 
     residual_of: ClassVar[ResidualOf] = "none"
 

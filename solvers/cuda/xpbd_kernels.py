@@ -121,9 +121,9 @@ def predict(h, left, places, start, pins, compliance, force, v, before, x, u):
 
     Args:
         h: substep [s].
-        remaining_fraction: part of the step after this substep.
-        start_positions: (n, 3) [m], where pins start.
-        pin_targets: (q, 3) [m], where pins end.
+        left: part of the step after this substep.
+        start: (n, 3) [m], where pins start.
+        pins: (q, 3) [m], where pins end.
     """
     i = cuda.grid(1)
     while i < x.shape[0]:

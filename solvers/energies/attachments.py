@@ -18,7 +18,7 @@ from solvers.problem import Positions, Start
 
 @dataclass(frozen=True, eq=False)
 class Attachments(Quadratic):
-    """Attachments of vertices; anchor_positions_at: anchor points (m, 3) [m] as a function of time [s]."""
+    """Attachments of vertices; points: anchor points (m, 3) [m] as a function of time [s]."""
 
     points: Callable[[float], Positions]
 
@@ -31,7 +31,7 @@ class Attachments(Quadratic):
         Args:
             vertices: (m,).
             stiffness: k (m,) [N/m].
-            anchor_positions_at: anchor points (m, 3) [m] as a function of time [s].
+            points: anchor points (m, 3) [m] as a function of time [s].
             n: number of vertices.
         """
         return cls(selection_matrix_sparse(vertices, n), stiffness, points(0.0), points)

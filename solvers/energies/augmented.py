@@ -94,9 +94,9 @@ def augmented(system: System, lengths: Lengths, stiffness: NDArray[np.float64], 
 
     Args:
         system: the system with constraints.
-        constraints: its constraints.
+        lengths: its constraints.
         stiffness: stiffnesses k (m,) [N/m].
-        tensions: tensions t (m,) [N].
+        tension: tensions t (m,) [N].
     """
     if not len(lengths.edges):
         return replace(system, lengths=()) if system.lengths else system

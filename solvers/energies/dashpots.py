@@ -2,9 +2,9 @@
 
 The direction n is that at the start of the step, so the force is linear. Integrators of order 2 evaluate n at positions
 that are extrapolated to the time of the stage, and preserve their order. Since the stage moves with the velocity
-velocity_rate (x - velocity_origin), the force is the gradient of
+rate (x - origin), the force is the gradient of
 
-    E(x) = sum_e c_e velocity_rate/2 (n_e'(A x - A velocity_origin)_e)^2
+    E(x) = sum_e c_e rate/2 (n_e'(A x - A origin)_e)^2
 
 This is a projective energy (Bouaziz et al. 2014): the vectors d_e without a velocity along n_e form a plane. Equal and
 opposite forces along the lagged edge conserve linear momentum and, for implicit Euler, angular momentum.
@@ -58,9 +58,9 @@ class Dashpots(Edges):
     """Dashpots along edges.
 
     Attributes:
-        stiffness: c (m,) [N s/m] initially, i.e. c velocity_rate [N/m] at a rate of 1/s; c velocity_rate in a step.
+        stiffness: c (m,) [N s/m] initially, i.e. c rate [N/m] at a rate of 1/s; c rate in a step.
         direction: n (m, 3), initially that of the rest shape.
-        offset: n'A velocity_origin (m,) [m], initially 0.
+        offset: n'A origin (m,) [m], initially 0.
     """
 
     direction: Positions
@@ -93,11 +93,11 @@ class Dashpots(Edges):
         return replace(self, stiffness=start.rate * self.stiffness, direction=n, offset=offset)
 
     def _closing(self, p: Positions) -> NDArray[np.float64]:
-        """Return n'(A p - A velocity_origin), (m,) [m]."""
+        """Return n'(A p - A origin), (m,) [m]."""
         return _dot(self.direction, self._along(p)) - self.offset
 
     def value(self, p: Positions) -> float:
-        """Return the energy [J] at p, shape (n, 3): half the energy dissipated in the time 1/velocity_rate."""
+        """Return the energy [J] at p, shape (n, 3): half the energy dissipated in the time 1/rate."""
         return 0.5 * float(self.stiffness @ self._closing(p) ** 2)
 
     def add_gradient(self, p: Positions, out: Positions) -> None:

@@ -51,11 +51,11 @@ class Law(NamedTuple):
     Attributes:
         value: function (elements, p) that returns the energy [J].
         add_gradient: function (elements, p, out) that adds the gradient [N] to `out`, (n, 3).
-        energy_change: function (elements, p, q) that returns the change from p to q [J].
-        evaluate_hessians: function (elements, p, out) that writes the second derivatives xx, xy, xz, yy, yz, zz of each
+        rise: function (elements, p, q) that returns the change from p to q [J].
+        curve: function (elements, p, out) that writes the second derivatives xx, xy, xz, yy, yz, zz of each
             element [N/m] to `out` (m, 6).
-        has_constant_hessian: whether the second derivatives do not depend on p.
-        element_functions: functions of a single element.
+        constant: whether the second derivatives do not depend on p.
+        one: functions of a single element.
     """
 
     value: Callable[..., float]
@@ -67,7 +67,7 @@ class Law(NamedTuple):
 
     @classmethod
     def of(cls, value: Any, gradient: Any, curvature: Any, rise: Any, *, constant: bool = False) -> Law:
-        """Build the passes from the functions of a single element (see `ElementFunctions`)."""
+        """Build the passes from the functions of a single element (see `One`)."""
 
         @kernel
         def values(elements, p):
@@ -136,7 +136,7 @@ class Joined(NamedTuple):
     """The rows of A of many energies.
 
     Attributes:
-        row_starts: index of the first entry of each row (m + 1,).
+        first: index of the first entry of each row (m + 1,).
         vertices, coefficients: of the entries.
     """
 
@@ -161,8 +161,8 @@ def add_blocks(elements, places, curvature, values):
 
     Args:
         elements: the elements.
-        block_indices: block of each pair of an element's vertices (m, k^2), -1 for none.
-        hessians: second derivatives (m, 6) [N/m].
+        places: block of each pair of an element's vertices (m, k^2), -1 for none.
+        curvature: second derivatives (m, 6) [N/m].
         values: blocks (b, 3, 3) [N/m].
     """
     width = elements.vertices.shape[1]

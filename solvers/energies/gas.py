@@ -31,8 +31,8 @@ class Gas:
 
     Attributes:
         triangles: (f, 3), oriented outwards.
-        rest_pressure: p0 [Pa] at the rest volume.
-        rest_volume: rest volume V0 [m^3].
+        pressure: p0 [Pa] at the rest volume.
+        volume: rest volume V0 [m^3].
     """
 
     triangles: NDArray[np.int64]

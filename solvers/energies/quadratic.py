@@ -2,8 +2,8 @@
 
     E(p) = sum_e w_e/2 |(A p)_e - d_e|^2,   grad E = A'W (A p - d)
 
-They include linear damping of A v: since the stage moves with the velocity velocity_rate (x - velocity_origin), the
-force -A'C A v is the gradient for W = C velocity_rate and d = A velocity_origin.
+They include linear damping of A v: since the stage moves with the velocity rate (x - origin), the
+force -A'C A v is the gradient for W = C rate and d = A origin.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Quadratic:
 class Viscous(Quadratic):
     """Linear damping of A v.
 
-    The weight is c (m,) [N s/m] initially, i.e. c velocity_rate [N/m] at a rate of 1/s, and c velocity_rate in a step.
+    The weight is c (m,) [N s/m] initially, i.e. c rate [N/m] at a rate of 1/s, and c rate in a step.
     """
 
     @classmethod

@@ -21,7 +21,7 @@ from solvers.problem import Positions, Start
 
 @dataclass(frozen=True, eq=False)
 class Sewing(StrainLimits):
-    """Threads; max_length_at: their maximum lengths (m,) [m] as a function of time [s]."""
+    """Threads; longest: their maximum lengths (m,) [m] as a function of time [s]."""
 
     longest: Callable[[float], NDArray[np.float64]]
 
@@ -39,7 +39,7 @@ class Sewing(StrainLimits):
             rest: rest positions (n, 3) [m].
             pairs: (m, 2).
             stiffness: k (m,) [N/m].
-            max_length_at: maximum lengths (m,) [m] as a function of time [s].
+            longest: maximum lengths (m,) [m] as a function of time [s].
         """
         return cls(pairs, stiffness, np.zeros(len(pairs)), longest(0.0), rest_directions(rest, pairs)[1], longest)
 

@@ -63,7 +63,7 @@ class Springs(Edges):
         return 0.5 * float(self.stiffness @ (self.lengths(p) - self.rest_length) ** 2)
 
     def hessian_at_rest(self, lateral: float, n: int) -> scipy.sparse.csr_array:
-        """Return the Hessian [N/m], (3n, 3n), of the rest shape with a transverse stiffness of `lateral_ratio` k."""
+        """Return the Hessian [N/m], (3n, 3n), of the rest shape with a transverse stiffness of `lateral` k."""
         across = np.where(self.rest_length == 0.0, 1.0, lateral)
         return self._blocks(across, self.rest_direction, n)
 

@@ -98,7 +98,7 @@ class StrainLimits(Edges):
     """Edges with limited lengths.
 
     Attributes:
-        min_length, max_length: minimum and maximum lengths (m,) [m], 0 <= low <= high.
+        low, high: minimum and maximum lengths (m,) [m], 0 <= low <= high.
         rest_direction: (m, 3), unit directions of edges of zero length.
     """
 

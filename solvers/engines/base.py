@@ -78,10 +78,10 @@ class Network:
 
     Attributes:
         mass: (n,) [kg].
-        free_vertices: (f,), the vertices that move.
-        pinned_vertices: (q,), the vertices with prescribed motion.
-        spring_dashpots: springs and dashpots with at least one free end.
-        vertex_drag: (n,) [N s/m].
+        free: (f,), the vertices that move.
+        pinned: (q,), the vertices with prescribed motion.
+        lines: springs and dashpots with at least one free end.
+        drag: (n,) [N s/m].
         time_step: [s].
     """
 
@@ -99,7 +99,7 @@ class Network:
         Args:
             system: the system.
             engine: name of the engine, for messages.
-            supports_damping: whether the engine supports dashpots and drag on vertices.
+            damps: whether the engine supports dashpots and drag on vertices.
 
         Raises:
             Unsupported: for other energies, integrators other than `own` and implicit Euler, and unpinned vertices
@@ -188,15 +188,15 @@ class Engine(ABC):
         """Return scripts that repeat a motion from a step's start with the engine only.
 
         Args:
-            file_stem: NAME of the files.
+            name: NAME of the files.
             network: the network.
             problem: the step problem with the start.
-            num_substeps: substeps per frame.
-            num_frames: number of frames.
+            substeps: substeps per frame.
+            frames: number of frames.
 
         Returns:
             Files by name: `NAME.py`, and the files that it reads except `NAME.npz`. The latter contains
-            `EngineNetwork.export_arrays` and the final positions, `end`.
+            `Network.arrays` and the final positions, `end`.
 
         Raises:
             Unsupported: for features that the script cannot express.
@@ -205,7 +205,7 @@ class Engine(ABC):
 
 @dataclass(frozen=True, eq=False)
 class PreparedEngine(Iterative):
-    """An engine, prepared for a system; `engine_stepper` has the network."""
+    """An engine, prepared for a system; `stepping` has the network."""
 
     residual_of: ClassVar[ResidualOf] = "none"
 
@@ -223,8 +223,8 @@ def evenly(begin: Positions, end: Positions, substeps: int) -> list[Positions] |
     """Interpolate the pins (q, 3) [m] linearly.
 
     Args:
-        start_targets: at the start of the step.
-        end_targets: at its end.
+        begin: at the start of the step.
+        end: at its end.
         substeps: number of substeps.
 
     Returns:

@@ -47,7 +47,7 @@ class Mujoco(Engine):
     """MuJoCo.
 
     Args:
-        mujoco_integrator: one of MuJoCo's four integrators, by its MuJoCo name.
+        integrator: one of MuJoCo's four integrators, by its MuJoCo name.
     """
 
     name: ClassVar[str] = "mujoco"

@@ -63,9 +63,9 @@ class NewtonPhysics(Engine, OnDevice):
     """Newton physics engine.
 
     Args:
-        newton_solver: one of Newton's solvers.
-        iterations_per_substep: number of iterations; unused by the explicit solver.
-        colouring_source: vertices that `vbd` moves simultaneously: by springs, or Newton's colouring.
+        method: one of Newton's solvers.
+        iterations: number of iterations; unused by the explicit solver.
+        colours: vertices that `vbd` moves simultaneously: by springs, or Newton's colouring.
         device: as for the other solvers.
     """
 

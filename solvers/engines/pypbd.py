@@ -50,7 +50,7 @@ class PyPbd(Engine):
     """PositionBasedDynamics.
 
     Args:
-        iterations_per_substep: iterations over all constraints in each substep.
+        iterations: iterations over all constraints in each substep.
     """
 
     name: ClassVar[str] = "pypbd"

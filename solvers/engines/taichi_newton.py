@@ -44,8 +44,8 @@ class TaichiNewton(Engine):
     """Newton's method with conjugate gradients in Taichi.
 
     Args:
-        iterations_per_substep: Newton iterations; one equals Baraff and Witkin's linearised step.
-        cg_rtol: tolerance of conjugate gradients, relative to the gradient.
+        iterations: Newton iterations; one equals Baraff and Witkin's linearised step.
+        tolerance: tolerance of conjugate gradients, relative to the gradient.
     """
 
     name: ClassVar[str] = "taichi"

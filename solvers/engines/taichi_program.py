@@ -23,7 +23,7 @@ def program(ti: Any, mass: Any, pinned: Any, ends: Any, stiffness: Any, rest_len
         ends: (m, 2).
         stiffness: (m,) [N/m].
         rest_length: (m,) [m].
-        cg_rtol: tolerance of conjugate gradients, relative to the gradient.
+        tolerance: tolerance of conjugate gradients, relative to the gradient.
 
     Returns:
         An object with `x`, `v`, `load` (n, 3) [m, m/s, N], `h` [s], `newton` (iterations) and `step()`.

@@ -29,9 +29,9 @@ __all__ = [
 Staged = RungeKutta | GeneralisedAlpha
 """The one-step integrators with one or more stages that evaluate all forces at the stage.
 
-Common attributes are order (of the error), num_stages (per step), inertia_factor (c), velocity_factor (velocity_rate
-times dt), needs_start_acceleration (whether the acceleration at the start of the step is needed), embedded_order (order
-of the embedded method for the error estimate, 0 for none) and iterate_stages (a generator of the stages).
+Common attributes are order (of the error), unknowns (per step), factor (c), speed (rate
+times dt), starts (whether the acceleration at the start of the step is needed), embedded (order
+of the embedded method for the error estimate, 0 for none) and step (a generator of the stages).
 """
 
 AnyIntegrator = Integrator | Staged

@@ -37,7 +37,7 @@ class GeneralisedAlpha:
 
     @classmethod
     def damping(cls, radius: float) -> GeneralisedAlpha:
-        """Return the method that multiplies the highest frequencies by `spectral_radius`, in [0, 1], per step."""
+        """Return the method that multiplies the highest frequencies by `radius`, in [0, 1], per step."""
         return cls((2.0 * radius - 1.0) / (radius + 1.0), radius / (radius + 1.0))
 
     @property

@@ -4,7 +4,7 @@ A stage x minimises energies(x) + c/(2 dt^2) |x - target|_M^2 - tr(x' f), like t
 c for all stages. So Q is factorised once, and every minimiser can be used. At the minimum M c/dt^2 (x - target) is the
 force, so
 
-    acceleration = c/dt^2 (x - target),     velocity = velocity_rate (x - velocity_origin)
+    acceleration = c/dt^2 (x - target),     velocity = rate (x - origin)
 
 and no further evaluation of the force is needed.
 """
@@ -28,9 +28,9 @@ class Unknown(NamedTuple):
     """A stage of a step.
 
     Attributes:
-        stage_fraction: time of x as a fraction of the step, 1 at its end.
-        inertial_target, velocity_origin: (n, 3) [m]; the caller may modify them.
-        predicted_acceleration: acceleration (n, 3) [m/s^2] at x predicted from the previous motion; None for none.
+        when: time of x as a fraction of the step, 1 at its end.
+        target, origin: (n, 3) [m]; the caller may modify them.
+        acceleration: acceleration (n, 3) [m/s^2] at x predicted from the previous motion; None for none.
     """
 
     when: float

@@ -5,7 +5,7 @@
 
 So P_i minimises energies + 1/(2 gamma^2 dt^2) |x - target|_M^2 with target = x^ + gamma dt v^. It moves with the
 velocity (x - x^)/(gamma dt), and the acceleration is (x - target)/(gamma dt)^2. This is a step problem with
-c = 1/gamma^2 and velocity_origin = x^. All of them are L-stable and stiffly accurate. Those with an explicit first
+c = 1/gamma^2 and origin = x^. All of them are L-stable and stiffly accurate. Those with an explicit first
 stage (a_11 = 0) have stage order 2, and their first acceleration is the last one of the previous step.
 
     SDIRK 2 and 3      Alexander 1977, "Diagonally implicit Runge-Kutta methods for stiff O.D.E.'s"
@@ -37,8 +37,8 @@ class RungeKutta:
     Attributes:
         order: order of the method.
         a: rows of the tableau, of lengths 1 to s.
-        embedded_weights: weights (s,) of the embedded method, if any.
-        embedded_order: order of the embedded method.
+        lower: weights (s,) of the embedded method, if any.
+        embedded: order of the embedded method.
     """
 
     order: int
@@ -83,7 +83,7 @@ class RungeKutta:
         The predicted acceleration of a stage is the known one that is nearest in time.
 
         Args:
-            motion: motion at the start of the step.
+            now: motion at the start of the step.
             acceleration: acceleration (n, 3) [m/s^2] at the start of the step, or None.
             dt: step size [s].
         """

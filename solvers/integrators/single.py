@@ -7,7 +7,7 @@
     BDF2             9/4   p^(t+dt)      (4 p - p')/3 + 2 dt/9 (4 v - v')          3/(2 dt) (x - (4 p - p')/3)
     midpoint         4     p^(t+dt/2)    p + dt/2 v                                2/dt (x - p)
 
-with p, v at the start of the step and p', v' one step earlier. The velocity is sqrt(c)/dt (x - velocity_origin) for all
+with p, v at the start of the step and p', v' one step earlier. The velocity is sqrt(c)/dt (x - origin) for all
 three. Implicit Euler has order 1 and numerical damping, the others have order 2; midpoint conserves quadratic energies
 (Hairer and Wanner, Solving Ordinary Differential Equations II, sections IV.12 and V.1; Hairer, Lubich and Wanner,
 Geometric Numerical Integration, section IV.2). Implicit Euler evaluates external forces at the start of the step, as
@@ -31,12 +31,12 @@ class Integrator:
     """An integrator with one stage per step.
 
     Attributes:
-        inertia_factor: c.
-        stage_fraction: time of the stage as a fraction of the step, 1 at its end.
-        extrapolation_fraction: time of the external forces, as such a fraction.
-        needs_history: whether the motion of the previous step is needed; implicit Euler then makes the first step.
-        predict_target: function of the motions now and one step earlier, and of dt [s], that returns target and
-            velocity_origin, each (n, 3) [m].
+        factor: c.
+        when: time of the stage as a fraction of the step, 1 at its end.
+        ahead: time of the external forces, as such a fraction.
+        history: whether the motion of the previous step is needed; implicit Euler then makes the first step.
+        predict: function of the motions now and one step earlier, and of dt [s], that returns target and
+            origin, each (n, 3) [m].
         order: order of the error.
     """
 

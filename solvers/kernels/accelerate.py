@@ -6,7 +6,7 @@
 
 A method is defined by its coefficients (see `acceleration_coefficients`), which it computes from inner products of the
 window's vectors. An iteration tries p + d, then shorter steps, then the plain correction with decreasing lengths, until
-one descends enough (`solvers.kernels.line_search_conditions`). For projective energies Q majorises the Hessian, so that
+one descends enough (`solvers.kernels.line_search`). For projective energies Q majorises the Hessian, so that
 the plain correction is accepted at full length. Vectors are flat and independent of the meaning of their entries;
 entries of vertices that do not move are zero.
 """
@@ -25,7 +25,7 @@ from solvers.vectors.dots import dot, dots
 
 _FLATTER = 0.1
 AGAIN, ACCEPTED, STALLED = 0, 1, 2
-"""The result of `judge_trial`: evaluate the next trial, accept it, or stop because round-off prevents descent."""
+"""The result of `judge`: evaluate the next trial, accept it, or stop because round-off prevents descent."""
 
 BLOCK = 512
 """Entries per block, so that the data of all pairs stay in the first-level cache."""
@@ -60,15 +60,15 @@ class Window(NamedTuple):
     """The state of a solve with m pairs in the history and N entries per vector.
 
     Attributes:
-        step_history, image_history: s and w (m N,).
-        position, trial_position: p and p + t d, N entries and possibly more that do not move.
-        descent, trial_descent: -grad g at p and at the trial.
+        steps, images: s and w (m N,).
+        position, trial: p and p + t d, N entries and possibly more that do not move.
+        descent, descent_there: -grad g at p and at the trial.
         correction, direction: c and d (N,).
-        block_scratch: scratch.
+        block: scratch.
         sy, wy: s_i y_j for i not younger than j, and w_i y_j (m, m).
         sg, wg: s_i grad g(p) and w_i grad g(p) (m,).
         a, b: coefficients (m,).
-        window_state: scalars of the iteration.
+        now: scalars of the iteration.
 
     The arrays s, w, c and d have the precision of the factor.
     """

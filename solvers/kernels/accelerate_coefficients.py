@@ -1,6 +1,6 @@
 """The coefficients of accelerated directions d = scale c - sum over j of (a_j s_j + b_j w_j), for each method.
 
-See `solvers.kernels.accelerated_descent` for the notation, and each method's own module for its source.
+See `solvers.kernels.accelerate` for the notation, and each method's own module for its source.
 """
 
 from __future__ import annotations

@@ -24,12 +24,12 @@ class Shares(NamedTuple):
     """The data of the objective in addition to those of the gradient.
 
     Attributes:
-        weight_offset: of each packet entry, the position in `energy_weights` of eight times 1/(4 k) [m/N], or 1/(2 k)
+        kind: of each packet entry, the position in `shares` of eight times 1/(4 k) [m/N], or 1/(2 k)
             if the other end is exactly pinned and so has no entry.
-        energy_weights: these numbers.
-        inverse_anchor: 1/(2 h) [m/N] of each lane (8 b,), 0 if h is 0.
-        massless_rows: offsets of the rows with h = 0, and of their x in the right-hand side (., 2).
-        energy_scale: sum of k r^2 [J].
+        shares: these numbers.
+        inverse: 1/(2 h) [m/N] of each lane (8 b,), 0 if h is 0.
+        massless: offsets of the rows with h = 0, and of their x in the right-hand side (., 2).
+        size: sum of k r^2 [J].
     """
 
     kind: NDArray[np.int32]

@@ -1,6 +1,6 @@
 """A whole accelerated step over a factor's own rows, without Python, for springs and spring-like energies.
 
-The plan is that of `solvers.kernels.local_global_iteration`, which corrects positions within the solve. Here a solve is
+The plan is that of `solvers.kernels.step`, which corrects positions within the solve. Here a solve is
 separate, because the acceptance of a trial depends on its objective.
 """
 
@@ -103,7 +103,7 @@ _iterate = compiled_over(_advance, _residual)
 
 @kernel
 def run(step: Step, edges, window: Window, limits, out):
-    """Run the iteration loop (see `solvers.kernels.iteration_loop`) and write the positions to `out` (n, 3)."""
+    """Run the iteration loop (see `solvers.kernels.loop`) and write the positions to `out` (n, 3)."""
     answer = _iterate((step, edges, window), limits)
     fetch(step.rows, window.position, out)
     return answer

@@ -20,15 +20,15 @@ class Duals(NamedTuple):
     """The dual variables and parameters of each edge (m,), updated after sweeps.
 
     Attributes:
-        min_length, max_length: minimum and maximum length in this step [m].
-        exact_mask: whether the edge has a tension; otherwise `max_stiffness` is its physical stiffness.
-        stiffness_ramp: increase of the stiffness [N/m] per metre of constraint violation.
-        max_stiffness: maximum stiffness [N/m].
-        max_tension: maximum tension [N].
+        low, high: minimum and maximum length in this step [m].
+        exact: whether the edge has a tension; otherwise `most` is its physical stiffness.
+        ramp: increase of the stiffness [N/m] per metre of constraint violation.
+        most: maximum stiffness [N/m].
+        firmest: maximum tension [N].
         stiffness: current stiffness [N/m].
         tension: current tension [N].
-        base_majorant: majorant of all other energies (rows,).
-        majorant_scratch: scratch for the majorant with the edges (rows,).
+        base: majorant of all other energies (rows,).
+        bound: scratch for the majorant with the edges (rows,).
     """
 
     low: NDArray[np.float64]
@@ -89,7 +89,7 @@ def _renew(hard, duals, p):
 
 @cache
 def augmenting(sweeps: Any) -> Any:
-    """Build the iteration over a kernel of sweeps, `vbd_sweeps.run_iterations` or one for elements."""
+    """Build the iteration over a kernel of sweeps, `vbd_sweeps.iterate` or one for elements."""
 
     @kernel
     def iterate(blocks, spaces, beside, right, work, p, iterations, hard, duals):

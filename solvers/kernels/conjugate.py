@@ -1,6 +1,6 @@
 """Compiled conjugate gradients on the exact Hessian, preconditioned by a factor of Q.
 
-H d = -g to |H d + g| <= limit,   |r|^2 = r' Q^-1 r           see `solvers.methods.newton.newton_cg`
+H d = -g to |H d + g| <= limit,   |r|^2 = r' Q^-1 r           see `solvers.methods.newton_cg`
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ class Newton(NamedTuple):
     """The state of the solve of a Newton equation H d = -g.
 
     Attributes:
-        hessian_arguments: arguments of `multiply_hessian`.
+        hessian: arguments of `multiply`.
         factor: factor of Q.
-        num_threads: threads of a solve with Q; None for one.
-        fixed_vertices: vertices that do not move.
-        inverse_scaling: vertices (c,) and blocks S^-1 (c, 3, 3) of the preconditioner (S Q S)^-1; None for Q^-1.
-        d, r, p, z, hessian_product: iterate, residual, direction, preconditioned residual, and Hessian times direction
+        threads: threads of a solve with Q; None for one.
+        held: vertices that do not move.
+        shrunk: vertices (c,) and blocks S^-1 (c, 3, 3) of the preconditioner (S Q S)^-1; None for Q^-1.
+        d, r, p, z, product: iterate, residual, direction, preconditioned residual, and Hessian times direction
             (n, 3).
     """
 

@@ -23,13 +23,13 @@ class Edges(NamedTuple):
     """Edges by the rows of their ends, strain limits first.
 
     Attributes:
-        end_rows: rows of each edge (m, 2).
-        row_starts: first entry of each row (rows + 1,).
-        other_row: of each entry, the row of the other end.
-        edge_index: of each entry, the edge, ~edge at its second end.
+        ends: rows of each edge (m, 2).
+        first: first entry of each row (rows + 1,).
+        other: of each entry, the row of the other end.
+        edge: of each entry, the edge, ~edge at its second end.
         stiffness: k (m,) [N/m].
-        min_length, max_length: minimum and maximum lengths [m] of the limits.
-        edge_axis: n of a dashpot, and the direction of a limit at zero length (m, 3).
+        low, high: minimum and maximum lengths [m] of the limits.
+        axis: n of a dashpot, and the direction of a limit at zero length (m, 3).
         offset: o (m,) [m].
     """
 

@@ -2,7 +2,7 @@
 
     p' = v,    v' = M^-1 (f - grad E(p)) - c v
 
-Positions, velocities and accelerations are in rows of four. `FrameForces` has the data that are constant in a frame.
+Positions, velocities and accelerations are in rows of four. `Forces` has the data that are constant in a frame.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ class Forces(NamedTuple):
     """The forces of a frame.
 
     Attributes:
-        spring_packets: packets of the springs at unpinned vertices.
-        right_hand_side: constant force [N], in the layout of `SpringPackets.build_right_hand_side`.
-        form_pairs, form_weight, form_vertex_weight: quadratic form as in `QuadraticForm`, (k, 2), (k,) and (n,), or
+        bundles: packets of the springs at unpinned vertices.
+        right: constant force [N], in the layout of `Bundles.right`.
+        pairs, weight, held: quadratic form as in `Form`, (k, 2), (k,) and (n,), or
             empty.
-        inverse_mass: 1/m [1/kg] in rows of four, 0 for pinned vertices.
-        drag_rate: c [1/s] in rows of four.
-        pinned_vertices: vertices (q,) that move uniformly from `pin_start` to `pin_end`.
-        pin_start, pin_end: positions of the pins (q, 3) [m].
+        inverse: 1/m [1/kg] in rows of four, 0 for pinned vertices.
+        drag: c [1/s] in rows of four.
+        pins: vertices (q,) that move uniformly from `begin` to `end`.
+        begin, end: positions of the pins (q, 3) [m].
     """
 
     bundles: Bundles
@@ -141,9 +141,9 @@ class Coefficients(NamedTuple):
 
     Attributes:
         a: rows of the tableau (s, s); the last one ends the step.
-        stage_times: c (s,).
-        error_weights: weights of the error (1 or 2, s); the second, of lower order, moderates the first.
-        error_exponent: exponent of h in the error; 0 fixes h.
+        times: c (s,).
+        errors: weights of the error (1 or 2, s); the second, of lower order, moderates the first.
+        power: exponent of h in the error; 0 fixes h.
     """
 
     a: Array
@@ -235,7 +235,7 @@ def integrate(forces, stages, steps, p, v, at, told):
         p: positions [m], overwritten with the result.
         v: velocities [m/s], overwritten with the result.
         at: scratch.
-        step_stats: output: accepted steps, rejected steps, last step size [s], time reached [s].
+        told: output: accepted steps, rejected steps, last step size [s], time reached [s].
     """
     free = 0
     for i in range(0, len(forces.inverse), 4):

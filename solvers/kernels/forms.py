@@ -21,7 +21,7 @@ _ROUND_OFF = 1e-13
 
 
 class Form(NamedTuple):
-    """A quadratic form: pairs (k, 2) of vertices; pair_weight: w (k,) [N/m]; vertex_weight: h (n,) [N/m]."""
+    """A quadratic form: pairs (k, 2) of vertices; weight: w (k,) [N/m]; held: h (n,) [N/m]."""
 
     pairs: NDArray[np.int64]
     weight: NDArray[np.float64]

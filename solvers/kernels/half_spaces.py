@@ -5,7 +5,7 @@
 The block and gradient of a vertex are those of its springs, of active half-spaces and of friction. Half-spaces that
 become active along the step are found by a few repetitions, each from the end of the last one. A step that increases
 the energy is replaced by one with a larger block, finally one that majorises all terms. Two functions provide all other
-energies of the vertices (see `solvers.methods.vertex_block.incident_elements`).
+energies of the vertices (see `solvers.kernels.stencils`).
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ class HalfSpaces(NamedTuple):
     """Half-spaces by the rows of their vertices.
 
     Attributes:
-        row_starts: first half-space of each row (rows + 1,).
-        has_half_space: whether a packet has a vertex with a half-space (b,).
-        normal, friction_anchor: n and a (k, 3).
+        first: first half-space of each row (rows + 1,).
+        near: whether a packet has a vertex with a half-space (b,).
+        normal, anchor: n and a (k, 3).
         offset: d [m] (k,).
         stiffness: k [N/m] (k,).
-        friction_limit: friction limit F [N] (k,).
-        smoothing_length: smoothing length [m] (k,).
-        is_two_sided: whether they act on both sides, as planes do.
+        grip: friction limit F [N] (k,).
+        slip: smoothing length [m] (k,).
+        both: whether they act on both sides, as planes do.
     """
 
     first: NDArray[np.int64]
@@ -224,7 +224,7 @@ def trying(risen: Any) -> Any:
     It tries increasingly large blocks; if none succeeds, the step is zero. A device compiles it separately.
 
     Args:
-        energy_change: function (d, where) that returns the change by a step of the other energies of the row; `where`
+        risen: function (d, where) that returns the change by a step of the other energies of the row; `where`
             is passed to it unchanged.
     """
 
@@ -254,8 +254,8 @@ def moving(felt: Any, risen: Any) -> Any:
     No two of them are coupled.
 
     Args:
-        add_gradient_block: function (beside, i, p, gradient, block) that adds the other energies of row i.
-        energy_change: function (beside, i, p, d) that returns their change by a step d.
+        felt: function (beside, i, p, gradient, block) that adds the other energies of row i.
+        risen: function (beside, i, p, d) that returns their change by a step d.
     """
 
     @inner_closure

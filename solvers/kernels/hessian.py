@@ -2,9 +2,9 @@
 
     H_e = k nn' + t/l (I - nn'),   t = k (l - r),   n the direction of a spring, l its length, t its tension
 
-A compressed spring (t < 0) has a negative transverse part. It is scaled by `negative_fraction`: 1 gives the exact
+A compressed spring (t < 0) has a negative transverse part. It is scaled by `keep`: 1 gives the exact
 Hessian, 0 makes it positive semidefinite spring by spring (Teran et al. 2005). The tensions are a separate argument,
-for methods that predict them (see `solvers.methods.newton.hybrid_newton`).
+for methods that predict them (see `solvers.methods.hybrid`).
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class Places(NamedTuple):
     """Block indices of vertices and springs in a matrix over the free vertices.
 
     Attributes:
-        free_vertices: free vertices (f,).
-        diagonal_block: diagonal block of each vertex (n,), -1 for a vertex that is not free.
-        off_diagonal: blocks of each spring from its first end to its second and back (m, 2), -1 if an end is not free.
+        free: free vertices (f,).
+        diagonal: diagonal block of each vertex (n,), -1 for a vertex that is not free.
+        across: blocks of each spring from its first end to its second and back (m, 2), -1 if an end is not free.
     """
 
     free: NDArray[np.int64]
@@ -86,7 +86,7 @@ def locate(number, starts, columns, vertices, out):
 def meetings(number, size, vertices, out):
     """Write each pair of different free vertices of each row (m, k) to `out`, as lower index times `size` plus higher.
 
-    Returns the number of pairs; `number` is that of `locate_blocks`.
+    Returns the number of pairs; `number` is that of `locate`.
     """
     count = 0
     for e in range(len(vertices)):
@@ -160,7 +160,7 @@ def assemble(terms, places, constant, p, tension, keep, values):
         constant: blocks of inertia, pins and other terms independent of p; None if there are no other terms.
         p: positions (n, 3) [m].
         tension: tension of each spring (m,) [N].
-        negative_fraction: factor of the springs' negative transverse parts.
+        keep: factor of the springs' negative transverse parts.
         values: output (b, 3, 3) [N/m].
     """
     if constant is None:
@@ -208,7 +208,7 @@ def multiply(terms, linear, form, joined, curvature, x, out):
 
     Args:
         terms: objective terms.
-        linear: output of `linearise_springs`.
+        linear: output of `linearise`.
         form, joined, curvature: quadratic form, elements and their Hessians, or None.
         x: (n, 3) [m].
         out: output (n, 3) [N].

@@ -1,4 +1,4 @@
-"""The compiled step of each vertex in JGS2, with its patch (`solvers.methods.vertex_block.jgs2`).
+"""The compiled step of each vertex in JGS2, with its patch (`solvers.methods.jgs2`).
 
 d_i = -R_i S^-1 sum over a of W_a' g_a,   S = sum over a, b of W_a' H_ab W_b,   W_a = R_a response_ia
 """
@@ -17,8 +17,8 @@ class Patches(NamedTuple):
     """The patch of each free vertex and its response.
 
     Attributes:
-        patch_starts: start of each patch (f + 1,).
-        patch_vertices: vertices of the patches, ascending, with the vertex itself (e,).
+        start: start of each patch (f + 1,).
+        near: vertices of the patches, ascending, with the vertex itself (e,).
         response: displacements per displacement of the vertex (e, 3, 3), dimensionless.
     """
 
@@ -55,7 +55,7 @@ def directions(patches, turn, pointers, columns, blocks, gradient, scratch, out)
 
     Args:
         patches: the patches.
-        rotations: rotation of each vertex (f, 3, 3).
+        turn: rotation of each vertex (f, 3, 3).
         pointers, columns, blocks: H by rows, with all columns.
         gradient: (f, 3) [N].
         scratch: scratch memory.

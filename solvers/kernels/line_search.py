@@ -1,7 +1,7 @@
 """Conditions of sufficient decrease of a line search, for Python and for kernels.
 
-    g(p + t d) - g(p) <= ARMIJO_FRACTION t (slope + t curvature/2)    Armijo (1966); curvature for steps from a saddle
-    grad g(p + t d) d <= (2 wolfe_fraction - 1) slope                 approximate Wolfe (Hager and Zhang 2005), if
+    g(p + t d) - g(p) <= DECREASE t (slope + t curvature/2)    Armijo (1966); curvature for steps from a saddle
+    grad g(p + t d) d <= (2 flatter - 1) slope                 approximate Wolfe (Hager and Zhang 2005), if
                                                                       round-off hides the decrease of g
 
 with slope = grad g(p) d. Each method chooses the next step size itself: half of it, or the minimum of a parabola.

@@ -2,7 +2,7 @@
 
     iterate until  residual <= limit  or  residual <= floor  or no step descends  or all iterations are done
 
-`build_loop` builds the loop from functions that advance and measure a state, `build_compiled_loop` that for kernels.
+`over` builds the loop from functions that advance and measure a state, `compiled_over` that for kernels.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ class Limits(NamedTuple):
     """The limits of a loop.
 
     Attributes:
-        max_iterations: maximum number of iterations.
-        residual_limit: residual [J^(1/2)] that ends the loop, if the residual is computed in each iteration.
-        residual_floor: residual [J^(1/2)] at which the loop ends for a check of round-off.
-        residual_mode: when residuals are computed.
+        iterations: maximum number of iterations.
+        limit: residual [J^(1/2)] that ends the loop, if the residual is computed in each iteration.
+        floor: residual [J^(1/2)] at which the loop ends for a check of round-off.
+        wanted: when residuals are computed.
     """
 
     iterations: int
@@ -61,7 +61,7 @@ def over(advance: Callable[..., Any], residual: Callable[..., Any]) -> Callable[
     """Build the iteration loop of a state.
 
     Args:
-        step_state: function of the state that does an iteration and returns whether it succeeded; a failed one does not
+        advance: function of the state that does an iteration and returns whether it succeeded; a failed one does not
             count.
         residual: function of the state that returns the residual [J^(1/2)].
 

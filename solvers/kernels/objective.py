@@ -93,7 +93,7 @@ def gradient(terms, given, p, out):
 def round_off(terms, given, p, out):
     """Write the bound (n,) [N] of the rounding error of `gradient` at p (n, 3) [m] to `out`.
 
-    It is that of `solvers.model.rounding_bound` for springs, inertia, force and penalty pins.
+    It is that of `solvers.round_off` for springs, inertia, force and penalty pins.
     """
     for v in range(len(p)):
         out[v] = terms.inertia[v] * (size(p, v) + size(given.target, v)) + size(given.force, v)

@@ -24,11 +24,11 @@ class Order(NamedTuple):
     """A factor in blocks, and their schedule.
 
     Attributes:
-        inverse_blocks, panels, row_slots, chunks, top_range, group_blocks, visit_schedule, visit_starts, row_shift: see
-            `solvers.kernels.local_global_iteration.IterationPlan`.
-        block_spans: columns of its block table without the packets (b, 5).
-        row_of_unknown: row of each unknown (n,).
-        num_rows: number of rows of a vector.
+        squares, panels, places, chunks, top, of_group, visits, visits_of, shift: see
+            `solvers.kernels.step.Plan`.
+        spans: columns of its block table without the packets (b, 5).
+        slot: row of each unknown (n,).
+        rows: number of rows of a vector.
     """
 
     squares: NDArray[Any]

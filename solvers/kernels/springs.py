@@ -32,12 +32,12 @@ class Bundles(NamedTuple):
     padding springs have zero stiffness and end at row `far`.
 
     Attributes:
-        row_offset: offset of each lane's vertex (8 b,), four times its row.
-        packet_start: first entry of each packet (b + 1,).
-        neighbour_offset: of each entry, eight offsets of the other ends.
-        weight_offset: of each entry, the position in `weights` of eight times k r [N] and eight times k [N/m].
+        own: offset of each lane's vertex (8 b,), four times its row.
+        start: first entry of each packet (b + 1,).
+        neighbour: of each entry, eight offsets of the other ends.
+        kind: of each entry, the position in `weights` of eight times k r [N] and eight times k [N/m].
         weights: these numbers, stored once for equal entries, which are nearly all in a regular mesh.
-        spring_index: of each entry, eight springs, ~spring at the second end.
+        spring: of each entry, eight springs, ~spring at the second end.
         rest_direction: unit directions at zero length (m, 3).
     """
 
@@ -124,7 +124,7 @@ class Bundles(NamedTuple):
         A packet has RIGHT numbers: eight x, y and z each, and eight stiffnesses. Rows in no packet follow at the end.
 
         Args:
-            anchor_stiffness: anchor stiffness of each row [N/m].
+            held: anchor stiffness of each row [N/m].
             y: in rows of four; zero, to be overwritten, if it is not given.
         """
         out = aligned(4 * len(self.own) + RIGHT)

@@ -2,7 +2,7 @@
 
     E = sum_e phi_e(z_e),   z = A p       gradient_i = sum_e a_ei phi'(z_e),   block_i = sum_e a_ei^2 phi''(z_e)
 
-with the element laws of `solvers.model.energies.element_energies`. If phi'' does not depend on z, a vertex's block B is
+with the element laws of `solvers.energies.elements`. If phi'' does not depend on z, a vertex's block B is
 constant in the step, and a step d of the vertex changes the energy by g'd + d'Bd/2, with its gradient g. Its elements
 are then evaluated once, and not again for the change. Positions have rows of four numbers.
 """
@@ -24,13 +24,13 @@ class Around(NamedTuple):
     Indices are unsigned, so that compiled code needs no check for negative ones.
 
     Attributes:
-        row_starts: first entry of each row (rows + 1,).
-        element_index, own_coefficient: of each entry, the element and the row's coefficient in it.
-        other_offsets, other_coefficients: offsets of the other vertices' rows, and their coefficients (entries, k - 1).
-        constant_block, last_gradient: for constant phi'', the sum of each row (rows, 6) and its last gradient (rows,
+        first: first entry of each row (rows + 1,).
+        element, own: of each entry, the element and the row's coefficient in it.
+        places, weights: offsets of the other vertices' rows, and their coefficients (entries, k - 1).
+        block, pull: for constant phi'', the sum of each row (rows, 6) and its last gradient (rows,
             3).
-        element_rows, coefficients: of the elements (m, k).
-        parameters: parameters of phi (m, q).
+        rows, coefficients: of the elements (m, k).
+        numbers: parameters of phi (m, q).
     """
 
     first: NDArray[np.uint32]
@@ -97,11 +97,11 @@ class Vertices(NamedTuple):
     """The functions of all kinds for kernels; `around` has incident elements for each kind.
 
     Attributes:
-        total_energy: function (around, p) that returns the energy [J].
-        add_gradient_block: function (around, i, p, gradient, block) that adds the elements of row i; the block is the
+        total: function (around, p) that returns the energy [J].
+        felt: function (around, i, p, gradient, block) that adds the elements of row i; the block is the
             upper triangle, row by row.
-        energy_change: function (around, i, p, d) that returns the energy change [J] by a step d of row i, from the
-            positions of the last call of `add_gradient_block`.
+        risen: function (around, i, p, d) that returns the energy change [J] by a step d of row i, from the
+            positions of the last call of `felt`.
     """
 
     total: Any

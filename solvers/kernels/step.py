@@ -37,20 +37,20 @@ class Plan(NamedTuple):
     """The order of the operations of an iteration and their data.
 
     Attributes:
-        inverse_blocks, panels, row_slots, chunks: arrays of a factor (see
-            `solvers.linalg.cholesky.supernodal_cholesky`).
-        top_range: first and last of the top's rows, and the number of groups (3,).
-        block_table: of each block its first and last slot, its first and last packet, its first chunk, and its last
+        squares, panels, places, chunks: arrays of a factor (see
+            `solvers.linear.supernodal`).
+        top: first and last of the top's rows, and the number of groups (3,).
+        blocks: of each block its first and last slot, its first and last packet, its first chunk, and its last
             chunk for forward and for back substitution (b, 7).
-        group_blocks: first block of each group and of the top (groups + 2,).
-        visit_schedule: operations of the groups in order; 2 b is back substitution of block b, 2 b + 1 its local step
+        of_group: first block of each group and of the top (groups + 2,).
+        visits: operations of the groups in order; 2 b is back substitution of block b, 2 b + 1 its local step
             and forward substitution.
-        visit_starts: first visit of each group (groups + 1,).
-        anchor_stiffness: m/dt^2 + w [N/m] of each row, plus the diagonal of quadratic forms.
-        norm_diagonal: diagonal part of |e|_Q^2 in each lane of the packets: `anchor_stiffness` without the pins, and
+        visits_of: first visit of each group (groups + 1,).
+        held: m/dt^2 + w [N/m] of each row, plus the diagonal of quadratic forms.
+        measure: diagonal part of |e|_Q^2 in each lane of the packets: `held` without the pins, and
             half of each spring to an exactly pinned vertex, because no packet of that vertex includes the other half.
-        unpinned_mask: 1 for the rows of unpinned vertices, else 0.
-        row_shift: number of rows from a vertex's position to its right-hand side.
+        loose: 1 for the rows of unpinned vertices, else 0.
+        shift: number of rows from a vertex's position to its right-hand side.
     """
 
     squares: NDArray[np.float64]
@@ -173,7 +173,7 @@ def _squared(plan, form, part, e):
 
 @kernel
 def length(plan, form, x, before, p, e):
-    """Return the residual [J^(1/2)] of an iteration from its vectors, as `run_iterations` defines it; e: scratch."""
+    """Return the residual [J^(1/2)] of an iteration from its vectors, as `iterate` defines it; e: scratch."""
     groups = plan.top[2]
     for part in range(groups + 1):
         _displace(plan, part, x, before, p, e)
@@ -260,9 +260,9 @@ def iterate(plan, bundles, edges, form, vectors, right, p, limits, threads, team
         edges: strain limits and dashpots, or None.
         form: packets of |e|_Q^2, with pairs for all energies that are not springs.
         vectors: three vectors that rotate, and one for scratch, of float64.
-        right: constant right-hand side (see `SpringPackets.build_right_hand_side`).
+        right: constant right-hand side (see `Bundles.right`).
         p: positions to correct, or None.
-        limits: see `solvers.kernels.iteration_loop`.
+        limits: see `solvers.kernels.loop`.
         threads: number of threads; None for one.
         team: the thread team.
 

@@ -18,14 +18,14 @@ class VertexRows(NamedTuple):
     """The rows of the vertices, and the constant data of their right-hand side.
 
     Attributes:
-        row_of_vertex: row of each vertex (n,).
-        right_hand_side_offset: offset of its x in the right-hand side (n,).
-        inertia_diagonal: m/dt^2 (n,) [N/m].
-        pin_weight: weight of each pin (q,) [N/m], infinite for an exact one.
-        pinned_vertices: vertex of each pin (q,).
-        pin_coupling: entries of Q [N/m] between free and exactly pinned vertices; empty if corrections are solved for.
-        coupled_vertices: the free vertex of each entry.
-        coupled_pins: the pin of each entry.
+        row: row of each vertex (n,).
+        right: offset of its x in the right-hand side (n,).
+        inertia: m/dt^2 (n,) [N/m].
+        weight: weight of each pin (q,) [N/m], infinite for an exact one.
+        pinned: vertex of each pin (q,).
+        coupling: entries of Q [N/m] between free and exactly pinned vertices; empty if corrections are solved for.
+        coupled: the free vertex of each entry.
+        pin: the pin of each entry.
     """
 
     row: NDArray[np.int64]
@@ -120,8 +120,8 @@ def solve(plan, bundles, edges, form, rows, vectors, right, p, given, limits, th
         vectors: vectors of the iterations.
         right: right-hand side, overwritten.
         p: positions to correct, or None.
-        step_arrays: target, force, targets of pins and initial guess.
-        limits: see `solvers.kernels.iteration_loop`.
+        given: target, force, targets of pins and initial guess.
+        limits: see `solvers.kernels.loop`.
         threads: number of threads; None for one.
         team: the thread team.
         out: output (n, 3) [m].

@@ -22,9 +22,9 @@ class Blocks(NamedTuple):
     Vectors have rows of four numbers, the unknowns first.
 
     Attributes:
-        spring_packets: packets of the free vertices, by colour.
-        objective_weights: weights of the objective.
-        num_free: number of free vertices.
+        bundles: packets of the free vertices, by colour.
+        shares: weights of the objective.
+        unknowns: number of free vertices.
         majorant: of each lane, stiffness of inertia, pins and springs [N/m]; 1 for padding.
     """
 
@@ -38,12 +38,12 @@ class SweepScratch(NamedTuple):
     """The arrays that the iterations of a step overwrite, except the positions.
 
     Attributes:
-        previous_positions, older_positions: previous positions.
-        descent_scratch: scratch.
-        spring_scratch: scratch for the springs of one packet.
-        packet_sums: scratch of nine numbers per vertex of a packet.
+        before, older: previous positions.
+        out: scratch.
+        near: scratch for the springs of one packet.
+        sums: scratch of nine numbers per vertex of a packet.
         omega: Chebyshev factor (1,), 0 at the start of a step.
-        objective_value: the objective (1,), nan if it is unknown.
+        level: the objective (1,), nan if it is unknown.
     """
 
     before: NDArray[np.float64]
@@ -120,7 +120,7 @@ def over(sweep: Any, level: Any) -> Any:
             blocks: packets of the vertices.
             spaces: half-spaces of the vertices, or None.
             beside: other element energies, or None.
-            right: see `SpringPackets.build_right_hand_side`.
+            right: see `Bundles.right`.
             radius: spectral radius of Chebyshev's extrapolation, 0 for none.
             work: scratch memory.
             p: positions in rows of four [m].

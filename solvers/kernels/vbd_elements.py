@@ -24,7 +24,7 @@ _D, _RISE = 3, 6
 
 @cache
 def iterating(*kinds: Kind) -> Any:
-    """Build the kernel `vbd_sweeps.run_iterations` for elements of these kinds."""
+    """Build the kernel `vbd_sweeps.iterate` for elements of these kinds."""
     total, felt, risen = Vertices.of(list(kinds))
     move = moving(felt, risen)
 

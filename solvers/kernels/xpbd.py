@@ -17,7 +17,7 @@ class Constraints(NamedTuple):
     """Springs in the order of their projection.
 
     Attributes:
-        end_vertices: (m, 2).
+        ends: (m, 2).
         stiffness: k (m,) [N/m].
         rest_length: r (m,) [m].
         rest_direction: direction at zero length (m, 3).
@@ -41,9 +41,9 @@ class Pinned(NamedTuple):
     """The motion of the pins in a step.
 
     Attributes:
-        pinned_vertices: (q,).
-        pin_weight: (q,) [N/m], infinite for an exact pin.
-        pin_start, pin_end: positions at the start and the end of the step (q, 3) [m].
+        vertices: (q,).
+        weight: (q,) [N/m], infinite for an exact pin.
+        begin, end: positions at the start and the end of the step (q, 3) [m].
     """
 
     vertices: NDArray[np.int64]
@@ -99,7 +99,7 @@ def substeps(constraints, ease, compliance, pinned, force, before, p, v, h, coun
     """Run `count` steps of size h, each with one pass; p and v are overwritten with the result.
 
     Args:
-        constraints, ease, compliance: as for `run_iterations`, for steps of size h.
+        constraints, ease, compliance: as for `iterate`, for steps of size h.
         pinned: motion of the pins.
         force: (n, 3) [N].
         before: scratch like p.

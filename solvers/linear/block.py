@@ -136,7 +136,7 @@ def _entered(
     heights: NDArray[np.int64],
     panel: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], ...]:
-    """Return `block_start`, `block_index`, `entry_offset` and `diagonal_block` of the fronts.
+    """Return `entered`, `block`, `entry` and `diagonal` of the fronts.
 
     A block (v, u), with u not eliminated before v, is stored in the column of v in its supernode's panel, in row u.
     """

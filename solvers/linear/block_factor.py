@@ -1,7 +1,7 @@
 """Multifrontal Cholesky factorisation of a matrix of 3 x 3 blocks (Duff and Reid 1983).
 
 A front is the dense matrix of a supernode's columns and of the rows below. Its columns become a panel of L; the
-remainder is an update of its parent (`solvers.linalg.cholesky.block_front`). Updates are stored on two stacks that
+remainder is an update of its parent (`solvers.linear.block_front`). Updates are stored on two stacks that
 alternate between the levels of the tree. Each update is thus computed in its place, while those of its children are
 read.
 
@@ -25,17 +25,17 @@ class Fronts(NamedTuple):
     """Structure of a factor with n vertices and s supernodes in postorder.
 
     Attributes:
-        member_start: first member of each supernode, (s + 1,).
-        member_vertices: vertices of each supernode's columns, followed by those of the rows below.
-        num_columns: number of columns in vertices, (s,).
-        parent_position: of each member below, its position among the parent's members.
+        start: first member of each supernode, (s + 1,).
+        members: vertices of each supernode's columns, followed by those of the rows below.
+        own: number of columns in vertices, (s,).
+        within: of each member below, its position among the parent's members.
         parent: (s,), -1 for a root.
-        stack_index: stack of each update, 0 or 1, (s,).
-        panel_start: first entry of each panel, (s + 1,).
-        block_start: first matrix block of each supernode, (s + 1,).
-        block_index: matrix blocks in the order of supernodes, (b,).
-        entry_offset: target of each of them in the panels, (b,).
-        diagonal_block: diagonal block of each vertex, (n,).
+        stack: stack of each update, 0 or 1, (s,).
+        panel: first entry of each panel, (s + 1,).
+        entered: first matrix block of each supernode, (s + 1,).
+        block: matrix blocks in the order of supernodes, (b,).
+        entry: target of each of them in the panels, (b,).
+        diagonal: diagonal block of each vertex, (n,).
     """
 
     start: NDArray[np.int64]
@@ -57,10 +57,10 @@ class Scratch(NamedTuple):
     Attributes:
         front: one vector longer than the largest front.
         stacks: updates, (2, size).
-        pending_supernodes: supernodes on each stack, preceded by their number, (2, s + 1).
-        stack_sizes: number of entries in use on each stack, (2,).
-        min_pivots: thresholds, (TILE_COLUMNS,).
-        triangles: factors of the tiles of a panel block, (., TILE_COLUMNS, TILE_COLUMNS).
+        waiting: supernodes on each stack, preceded by their number, (2, s + 1).
+        filled: number of entries in use on each stack, (2,).
+        least: thresholds, (TILE,).
+        triangles: factors of the tiles of a panel block, (., TILE, TILE).
         runs: (2, n + 1).
     """
 
@@ -191,7 +191,7 @@ def solve(fronts, panels, x, front, begun):
         panels: factor L.
         x: right-hand sides (n, 3), overwritten.
         front: scratch, one vector longer than the largest front.
-        forward_done: whether `factorise_blocks` has performed the forward substitution.
+        begun: whether `factorise` has performed the forward substitution.
     """
     if not begun:
         for s in range(len(fronts.own)):

@@ -3,7 +3,7 @@
     L_JJ L_JJ' = F_JJ,   L_BJ = F_BJ L_JJ^-T,   update: F_BB - L_BJ L_BJ'
 
 Columns are processed from left to right, one tile at a time. The product of the columns to the left is subtracted, then
-the tile is divided by its own triangle. Blocks of PANEL_DEPTH columns and ROW_BLOCK_HEIGHT rows keep the factors of the
+the tile is divided by its own triangle. Blocks of DEPTH columns and HEIGHT rows keep the factors of the
 products in cache. The products of an entry are subtracted in the order of columns, whatever these two sizes are.
 """
 
@@ -28,14 +28,14 @@ class Dense(NamedTuple):
     """Frontal matrix of a supernode.
 
     Attributes:
-        num_columns: number of columns in vertices.
-        below_offset: offset of the rows below in a panel column.
+        own: number of columns in vertices.
+        head: offset of the rows below in a panel column.
         stride: entries from one panel column to the next.
         panels: memory of the panels.
-        panel_offset: first entry of the panel.
-        update_buffer: memory of the parent's update.
-        update_offset: first entry of the update.
-        update_stride: entries from one update column to the next.
+        base: first entry of the panel.
+        update: memory of the parent's update.
+        begin: first entry of the update.
+        size: entries from one update column to the next.
     """
 
     own: int
@@ -62,11 +62,11 @@ def eliminate(fronts, s, values, panels, stride, least, triangles):
 
     Args:
         fronts: structure of the factor.
-        supernode: index of the supernode.
+        s: index of the supernode.
         values: matrix blocks (b, 3, 3), for the scale of the pivots.
         panels: panels, updated.
         stride: entries from one panel column to the next.
-        min_pivots, triangles: scratch.
+        least, triangles: scratch.
     """
     base, width = fronts.panel[s], 3 * fronts.own[s]
     for first in range(0, width, DEPTH):
@@ -130,7 +130,7 @@ def _product(panels, left, stride, depth, head, target, to, size, first, end):
 
 @inner
 def _subtract(panels, left, row, top, stride, depth, target, to, size, strips, columns):
-    """Call `subtract_tile_product` for six or three columns."""
+    """Call `subtract_product` for six or three columns."""
     if columns == 6:
         subtract_product(panels, left + row, left + top, stride, depth, target, to, size, strips, 6)
     else:

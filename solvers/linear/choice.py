@@ -1,6 +1,6 @@
 """Selection of the linear solver for Q, from exact operation counts before any factorisation.
 
-    inverse      n^2 entries, one product              up to MAX_DENSE_VERTICES vertices
+    inverse      n^2 entries, one product              up to SMALL vertices
     supernodal   2 x panels read per solve, flops once  while cheaper than the bytes that conjugate gradients read
     cg           iterations x (matrix and vectors)     beyond, and where the factor does not fit
 
@@ -66,9 +66,9 @@ class Estimate:
     """Estimated cost of a solver.
 
     Attributes:
-        memory_bytes: peak memory during setup.
-        traffic_bytes: bytes read by a solve, plus its share of the factorisation's flops converted to bytes.
-        description: the underlying counts.
+        memory: peak memory during setup.
+        traffic: bytes read by a solve, plus its share of the factorisation's flops converted to bytes.
+        words: the underlying counts.
     """
 
     memory: float
@@ -97,7 +97,7 @@ def factorise(
         Q: symmetric positive definite matrix (n, n).
         linear: name of the solver, or "auto".
         precision: precision of the factor.
-        memory_limit: bytes that the solver may allocate in addition to Q; default by `solvers.memory`.
+        memory: bytes that the solver may allocate in addition to Q; default by `solvers.memory`.
 
     Returns:
         The solver, and a description with the reason for its selection.
@@ -143,7 +143,7 @@ def choose(
         Q: symmetric positive definite matrix (n, n).
         linear: name of the solver, or "auto".
         precision: precision of the factor.
-        memory_limit: bytes that the solver may allocate; default by `solvers.memory`.
+        memory: bytes that the solver may allocate; default by `solvers.memory`.
 
     Raises:
         Unsupported: if the solver is unknown, does not support the precision, or does not fit in memory.

@@ -3,8 +3,8 @@
     z = V-cycle(r),  p = z + beta p,  x += alpha p,  r -= alpha Q p
 
 Three right-hand sides are solved in lockstep and share each pass over the matrices. z approximates the error of x
-itself, whatever the stiffness of a row. The iteration ends when no entry of z exceeds CG_RTOL times the largest one of
-x.
+itself, whatever the stiffness of a row. The iteration ends when no entry of z exceeds TOLERANCE times the largest one
+of x.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class ConjugateGradients:
 
     Attributes:
         nonzeros: entries of the matrices of all levels and of the coarsest level's factor.
-        num_iterations: of the last solve.
-        correction_ratios: largest entry of z before each iteration, relative to that of x, (iterations + 1, 3).
+        iterations: of the last solve.
+        changes: largest entry of z before each iteration, relative to that of x, (iterations + 1, 3).
     """
 
     def __init__(self, Q: csr_array) -> None:
@@ -92,7 +92,7 @@ class _Columns(Iteration):
 
     x, r, p and Q p are (n, 4) in float64, z in float32.
 
-    correction_ratios: largest entry of z before each iteration, relative to that of x; failing_vertex: the vertex with
+    changes: largest entry of z before each iteration, relative to that of x; at_fault: the vertex with
     the largest component where a curvature is negative.
     """
 

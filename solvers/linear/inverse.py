@@ -28,9 +28,9 @@ class Inverse:
 
     Attributes:
         nonzeros: entries of one triangle.
-        factor_bytes: bytes of the inverse that a solve reads.
+        panel_bytes: bytes of the inverse that a solve reads.
         flops: additions and multiplications of a solve, including padding.
-        inverse_matrix: padded with zeros.
+        inverse: padded with zeros.
     """
 
     def __init__(self, Q: csr_array, *, precision: Literal["float64", "float32"] = "float64") -> None:

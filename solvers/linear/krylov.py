@@ -2,8 +2,8 @@
 
     p = z + (r'z / previous r'z) p      x += t p,   r -= t A p,   t = r'z / p'Ap      z = M^-1 r
 
-`make_cg_loop` builds the iteration from operations on a state, which contains A and M^-1. `compile_cg_loop` builds it
-for kernels. `ConjugateGradientIteration` is a base class for states that are Python objects. Several right-hand sides
+`over` builds the iteration from operations on a state, which contains A and M^-1. `compiled_over` builds it
+for kernels. `Iteration` is a base class for states that are Python objects. Several right-hand sides
 are iterated in lockstep; the scalar products are then arrays.
 """
 
@@ -27,12 +27,12 @@ def over(
     """Build the iteration from operations on a state with known r and z.
 
     Args:
-        update_direction: (state, product, previous_product) -> p'Ap; sets p = z + product/previous_product p. At first
+        turn: (state, product, before) -> p'Ap; sets p = z + product/before p. At first
             the previous product is infinite, and p finite.
-        update_iterate: (state, product, curvature) -> r'z; changes x and r by product/curvature times p and A p,
+        go: (state, product, curvature) -> r'z; changes x and r by product/curvature times p and A p,
             then z.
-        is_convex: (state, curvature) -> whether the iteration may continue along p.
-        is_converged: (state, product) -> whether x is accurate enough.
+        convex: (state, curvature) -> whether the iteration may continue along p.
+        near: (state, product) -> whether x is accurate enough.
 
     Returns:
         Function (state, product, max_iterations) -> number of iterations and the reason for their end; product is r'z.
@@ -59,7 +59,7 @@ def compiled_over(*functions: Callable[..., Any]) -> Any:
 
 
 class Iteration(ABC):
-    """Base class of a state with known r and z (see `make_cg_loop`)."""
+    """Base class of a state with known r and z (see `over`)."""
 
     @abstractmethod
     def turn(self, product: Any, before: Any) -> Any:

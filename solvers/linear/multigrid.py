@@ -66,7 +66,7 @@ class Multigrid:
 
     Attributes:
         nonzeros: entries of all levels' matrices, including the coarsest level's factor.
-        level_sizes: vertices of each level.
+        sizes: vertices of each level.
     """
 
     def __init__(self, Q: csr_array) -> None:
@@ -97,7 +97,7 @@ class Multigrid:
 
     @property
     def right_hand_side(self) -> NDArray[np.float32]:
-        """Input r of `apply_cycle`, (n, 4), with a zero last column."""
+        """Input r of `apply`, (n, 4), with a zero last column."""
         return self._levels[0].b if self._levels else self._coarsest[0]
 
     def apply(self) -> NDArray[np.float32]:
@@ -176,7 +176,7 @@ def largest_eigenvalue(A: csr_array, diagonal: NDArray[np.float64]) -> float:
 
 
 def chebyshev_weights(largest: float) -> list[tuple[np.float32, np.float32]]:
-    """Return (momentum, scale) of each Chebyshev step, for eigenvalues from _SMOOTHED_FRACTION to 1 times `largest`."""
+    """Return (momentum, scale) of each Chebyshev step, for eigenvalues from _LOWEST to 1 times `largest`."""
     centre, half = 0.5 * (1.0 + _LOWEST) * largest, 0.5 * (1.0 - _LOWEST) * largest
     rho = half / centre
     weights = [(0.0, 1.0 / centre)]

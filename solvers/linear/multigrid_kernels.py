@@ -77,7 +77,7 @@ def smooth(pointers, columns, values, inverse_diagonal, keep, scale, b, step, x,
 
 @kept(parallel=True)
 def multiply_and_dot(pointers, columns, values, p, out, parts):
-    """Compute out = A p, and partial_sums[:, :3] = p'out of each block of rows."""
+    """Compute out = A p, and parts[:, :3] = p'out of each block of rows."""
     rows = len(out)
     for block in prange((rows + BLOCK - 1) // BLOCK):
         t0, t1, t2 = 0.0, 0.0, 0.0
@@ -99,7 +99,7 @@ def advance(alpha, p, image, x, r, rounded, parts):
         p, image: search direction and A p, (n, 4).
         x, r: iterate and residual, (n, 4), updated.
         rounded: r in float32, (n, 4), overwritten.
-        partial_sums: columns 0 to 2 get the largest |x| of each block.
+        parts: columns 0 to 2 get the largest |x| of each block.
     """
     rows = len(x)
     for block in prange((rows + BLOCK - 1) // BLOCK):
@@ -115,7 +115,7 @@ def advance(alpha, p, image, x, r, rounded, parts):
 
 @kept(parallel=True)
 def compare(r, z, parts):
-    """Write r'z of each block of rows, and its largest |z|, to partial_sums[:, :6], by column."""
+    """Write r'z of each block of rows, and its largest |z|, to parts[:, :6], by column."""
     rows = len(r)
     for block in prange((rows + BLOCK - 1) // BLOCK):
         for c in range(3):
@@ -233,7 +233,7 @@ def gauss_seidel(pointers, columns, values, x, sweeps):
     Args:
         pointers, columns, values: matrix in compressed rows.
         x: initial vectors (n, q), overwritten with the result.
-        num_sweeps: number of sweeps.
+        sweeps: number of sweeps.
     """
     n, count = x.shape
     for _ in range(sweeps):

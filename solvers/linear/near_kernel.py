@@ -5,8 +5,8 @@
     A_coarse = P'AP            z = V-cycle(r), a fixed symmetric operator near A^-1
 
 P is not smoothed, so that coarse matrices stay sparse. It depends on the pattern of A and on its slow-to-converge
-modes, which change little as A does. One `ProlongationHierarchy` therefore serves many matrices of one pattern, each
-with its own `VCycle`. The method helps if few modes converge slowly. Sums are taken in one order, whatever the number
+modes, which change little as A does. One `Prolongation` therefore serves many matrices of one pattern, each
+with its own `Cycle`. The method helps if few modes converge slowly. Sums are taken in one order, whatever the number
 of threads.
 """
 
@@ -44,8 +44,8 @@ def near_kernel(A: csr_array, components: int, sweeps: int) -> NDArray[np.float6
 
     Args:
         A: matrix (n, n).
-        num_components: number of vectors q.
-        num_sweeps: number of sweeps.
+        components: number of vectors q.
+        sweeps: number of sweeps.
 
     Returns:
         Vectors (n, q), each scaled to a largest entry of 1.
@@ -71,7 +71,7 @@ class Prolongation:
     """Prolongation matrices P of all levels, for A and for others with its pattern.
 
     Attributes:
-        prolongators: P (n, coarse unknowns) of each level, the finest first.
+        levels: P (n, coarse unknowns) of each level, the finest first.
     """
 
     def __init__(self, A: csr_array, B: NDArray[np.float64], smoothed: bool = False) -> None:
@@ -175,8 +175,8 @@ class Cycle:
     """V-cycle for A, with the prolongations of this or an earlier matrix.
 
     Attributes:
-        level_sizes: unknowns of each level.
-        matrix_bytes: bytes of the matrices that a cycle reads.
+        sizes: unknowns of each level.
+        bytes: bytes of the matrices that a cycle reads.
     """
 
     def __init__(self, A: csr_array, prolongation: Prolongation) -> None:
@@ -223,7 +223,7 @@ class Solving(Iteration):
         """Iterate; `x` contains the solution.
 
         Args:
-            max_iterations: maximum number of iterations.
+            most: maximum number of iterations.
 
         Returns:
             Number of iterations.

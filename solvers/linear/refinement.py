@@ -24,13 +24,13 @@ class _Cut(NamedTuple):
     Attributes:
         pointers, neighbours: graph in CSR form.
         piece: vertex of each local index.
-        local_index: local index of each vertex, -1 outside the piece.
+        local: local index of each vertex, -1 outside the piece.
         side: side of each vertex, 2 for the separator.
-        side_counts: number of vertices on each side, (3,).
-        pulled_neighbours: neighbours that a move of a separator vertex to a side pulls into the separator, (size, 2).
-        is_locked: whether a vertex has moved in this pass.
+        counts: number of vertices on each side, (3,).
+        pull: neighbours that a move of a separator vertex to a side pulls into the separator, (size, 2).
+        moved: whether a vertex has moved in this pass.
         separator: local indices; those that may move come first.
-        move_log: (local index, previous side) of each change.
+        trail: (local index, previous side) of each change.
     """
 
     pointers: NDArray[np.int64]

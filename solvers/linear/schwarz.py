@@ -1,10 +1,10 @@
 """Multilevel additive Schwarz preconditioner: dense inverses of small subdomains (Wu, Wang and Wang 2022).
 
-    S = sum over levels l of P_l diag(B_l^-1) P_l'        B_l: diagonal blocks of SUBDOMAIN_SIZE nodes of P_l'A P_l
+    S = sum over levels l of P_l diag(B_l^-1) P_l'        B_l: diagonal blocks of PATCH nodes of P_l'A P_l
 
 A consists of 3 x 3 blocks. The nodes of level 0 are its block rows, ordered so that neighbours form subdomains. A
 subdomain of one level moves rigidly and is a node of the next. Node i of a level therefore belongs to node
-i // SUBDOMAIN_SIZE of the next one, and no lists are needed. S is symmetric, and positive definite if A is; its
+i // PATCH of the next one, and no lists are needed. S is symmetric, and positive definite if A is; its
 application consists of products with dense matrices.
 """
 
@@ -22,7 +22,7 @@ PATCH = 32
 
 
 class Patches:
-    """Positions of the blocks of a matrix in subdomains; subdomain_order (f,): its rows, grouped by subdomain."""
+    """Positions of the blocks of a matrix in subdomains; order (f,): its rows, grouped by subdomain."""
 
     def __init__(self, graph: csr_array, order: NDArray[np.int64]) -> None:
         """Build the hierarchy.
@@ -61,7 +61,7 @@ class Patches:
 
 
 class Schwarz:
-    """Preconditioner S; subdomain_inverses: (subdomains, 3 SUBDOMAIN_SIZE, 3 SUBDOMAIN_SIZE) of each level.
+    """Preconditioner S; inverses: (subdomains, 3 PATCH, 3 PATCH) of each level.
 
     Rows and columns beyond a level's last node are zero.
     """
@@ -86,7 +86,7 @@ class Schwarz:
 def ordered(Q: csr_array) -> NDArray[np.int64]:
     """Return the vertices (f,) in an order that forms subdomains on all levels.
 
-    Each SUBDOMAIN_SIZE consecutive vertices are neighbours, and so are as many consecutive subdomains, and so on.
+    Each PATCH consecutive vertices are neighbours, and so are as many consecutive subdomains, and so on.
     """
     orders, graph = list[NDArray[np.int64]](), csr_array(Q)
     while (n := len(graph.indptr) - 1) > PATCH:

@@ -21,7 +21,7 @@ TOGETHER = 8
 
 
 def _fields() -> NDArray[np.int32]:
-    """Return the weights of the distance sums used as coordinates, (blocks, landmarks, FIELDS_PER_BLOCK).
+    """Return the weights of the distance sums used as coordinates, (blocks, landmarks, TOGETHER).
 
     The landmarks of a box are its eight corners. Of the 35 partitions into four and four of them, three correspond to
     its directions. The first block, for flat or long pieces, uses only the first four landmarks.
@@ -94,7 +94,7 @@ def separate(pointers, neighbours, owner, number, piece, dist, field, queue):
         owner: piece of each vertex (n,).
         number: number of this piece.
         piece: its vertices.
-        dist, field, queue: scratch, (n, NUM_LANDMARKS), (n, FIELDS_PER_BLOCK) and (n,).
+        dist, field, queue: scratch, (n, LANDMARKS), (n, TOGETHER) and (n,).
 
     Returns:
         Sides (len(piece),); empty if there is no suitable cut.

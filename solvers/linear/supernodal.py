@@ -39,18 +39,18 @@ _WORTH_THREADS = 4e6
 class Layout(NamedTuple):
     """Memory layout of the panels of a factor.
 
-    A supernode is divided into chunks of at most MAX_PANEL_WIDTH columns, with a panel each.
+    A supernode is divided into chunks of at most WIDTH columns, with a panel each.
 
     Attributes:
-        chunks: (c, 7), of each chunk the offsets of its S, of its W and of its rows in `row_slots`, its columns without
-            padding, its rows below with padding, its padded columns divided by COLUMN_LANES, and its first slot.
-        first_chunk: first chunk of each supernode, (s + 1,).
-        row_slots: of each supernode the slots of its columns and of the rows below, then copies of the last one for
+        chunks: (c, 7), of each chunk the offsets of its S, of its W and of its rows in `places`, its columns without
+            padding, its rows below with padding, its padded columns divided by LANES, and its first slot.
+        chunk_of: first chunk of each supernode, (s + 1,).
+        places: of each supernode the slots of its columns and of the rows below, then copies of the last one for
             rows that complete a tile; slots of the top refer to the group's own copy.
-        order_by_slot, order_by_vertex, group_spans: see `triangular_solve`; unsigned, so that indexing needs no test of
+        by_slot, by_vertex, spans: see `triangular_solve`; unsigned, so that indexing needs no test of
             the sign.
-        num_inverse_entries, num_panel_entries: entries of all S and of all W, stored as `panel_products` reads them.
-        num_work_rows: rows of four numbers in the work vector.
+        squares, panels: entries of all S and of all W, stored as `panel_products` reads them.
+        rows: rows of four numbers in the work vector.
     """
 
     chunks: NDArray[np.int64]
@@ -114,7 +114,7 @@ class Layout(NamedTuple):
 
 
 def _chunks(width: NDArray[np.int64], below: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
-    """Return `first_chunk`, and per chunk: supernode, preceding columns, own columns, rows below, column quads."""
+    """Return `chunk_of`, and per chunk: supernode, preceding columns, own columns, rows below, column quads."""
     many = -(-width // WIDTH)
     chunk_of = np.concatenate([[0], np.cumsum(many)])
     node = np.repeat(np.arange(len(width)), many)
@@ -147,11 +147,11 @@ class Supernodal:
 
     Attributes:
         nonzeros: entries of L including the diagonal, before padding of supernodes.
-        factor_bytes: bytes of all S and W.
+        panel_bytes: bytes of all S and W.
         flops: additions and multiplications of a solve, including padding.
-        work_shares: fraction of the entries in each group of subtrees, which threads process in parallel, and last in
+        shares: fraction of the entries in each group of subtrees, which threads process in parallel, and last in
             the top, which one thread processes.
-        inverse_blocks, panels, layout: all S, all W (float16 viewed as uint16), and their layout.
+        squares, panels, layout: all S, all W (float16 viewed as uint16), and their layout.
     """
 
     def __init__(self, Q: csr_array, *, precision: Precision = "float64", symbolic: Symbolic | None = None) -> None:
@@ -160,7 +160,7 @@ class Supernodal:
         Args:
             Q: symmetric positive definite matrix (n, n).
             precision: precision of the panels.
-            symbolic_factor: the symbolic factor, if it is known.
+            symbolic: the symbolic factor, if it is known.
 
         Raises:
             NotPositiveDefinite: with a vertex at fault.

@@ -33,11 +33,11 @@ def eliminate(front, size, start, own, below, vertex, matrix, into, k):
         front: frontal matrix and scratch.
         size: number of rows of the front.
         start: first column of the chunk.
-        num_columns: columns of the supernode.
+        own: columns of the supernode.
         below: rows below the supernode.
-        vertex: vertices of the columns (num_columns,).
+        vertex: vertices of the columns (own,).
         matrix: sparse matrix, for the scale of the pivots.
-        factor_panels: output.
+        into: output.
         k: index of the chunk.
 
     Returns:

@@ -1,7 +1,7 @@
 """Multifrontal Cholesky factorisation (Duff and Reid 1983), which produces the panels used by a solve.
 
 A front is the dense matrix of a supernode's columns and rows. It is stored in strips of four columns, each row by row.
-Its columns are eliminated in chunks (`solvers.linalg.cholesky.panel_factorisation`). The remainder is an update of its
+Its columns are eliminated in chunks (`solvers.linear.supernodal_chunk`). The remainder is an update of its
 parent's front, which is pushed on a stack.
 """
 
@@ -28,7 +28,7 @@ class Matrix(NamedTuple):
 class Panels(NamedTuple):
     """Output of the factorisation: all S and W, and their layout.
 
-    first_chunk (s + 1,) and chunks (c, 7): see `solvers.linalg.cholesky.supernodal_cholesky.PanelLayout`.
+    chunk_of (s + 1,) and chunks (c, 7): see `solvers.linear.supernodal.Layout`.
     """
 
     chunk_of: NDArray[np.int64]
@@ -42,12 +42,12 @@ class _Front(NamedTuple):
 
     Attributes:
         entries: strips of four columns.
-        slot_row: row of each slot in the front.
-        panel: columns of the chunk, then their Cholesky factor, (., MAX_PANEL_WIDTH).
-        inverse: L11^-1, (MAX_PANEL_WIDTH, MAX_PANEL_WIDTH).
+        place: row of each slot in the front.
+        panel: columns of the chunk, then their Cholesky factor, (., WIDTH).
+        inverse: L11^-1, (WIDTH, WIDTH).
         tiles: L21, by tiles of four rows.
-        row_scratch, block_scratch: one row and four rows, (MAX_PANEL_WIDTH,) and (4 MAX_PANEL_WIDTH,).
-        row_numbers: 0, 1, 2, ...
+        row, block: one row and four rows, (WIDTH,) and (4 WIDTH,).
+        numbers: 0, 1, 2, ...
     """
 
     entries: NDArray[np.float64]
@@ -66,8 +66,8 @@ def factorise(matrix, structure, into):
 
     Args:
         matrix: sparse matrix.
-        symbolic_factor: its symbolic factor.
-        factor_panels: output.
+        structure: its symbolic factor.
+        into: output.
 
     Returns:
         The vertex whose pivot is not positive, or -1.

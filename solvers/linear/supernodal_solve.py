@@ -7,8 +7,8 @@ The supernodes form groups of subtrees and a top above them. Each group has its 
 pass adds to this copy and the backward pass reads from it, so that groups can be processed in parallel. Copies are
 added in the order of the groups. The result is therefore bitwise independent of the number of threads.
 
-`group_spans` (groups + 1, 6) has for each group, and in its last row for the top, the first and last chunk, the first
-and last vertex in either order, and the first and last slot. `order_by_slot` and `order_by_vertex` (n, 2) list vertices
+`spans` (groups + 1, 6) has for each group, and in its last row for the top, the first and last chunk, the first
+and last vertex in either order, and the first and last slot. `by_slot` and `by_vertex` (n, 2) list vertices
 and their slots group by group, so that both input and output are written sequentially. `work` has 4 numbers per slot,
 followed by the groups' copies. Slots without a vertex remain zero. (Table entries are read one by one: unpacking a row
 would create an array first, which costs 20 ns.)
@@ -85,9 +85,9 @@ def backwards(squares, panels, index, chunks, begin, end, work):
 
 
 class Factor(NamedTuple):
-    """Arrays of a solve, with its work vector (see the module and `PanelLayout`).
+    """Arrays of a solve, with its work vector (see the module and `Layout`).
 
-    thread_team: shared state of the threads.
+    team: shared state of the threads.
     """
 
     squares: NDArray[Any]
@@ -193,7 +193,7 @@ def solve(factor, b, out, threads):
 
 @kernel
 def solve_by(squares, panels, places, chunks, spans, by_slot, by_vertex, work, team, b, out, threads):
-    """Solve Q out = b from Python with the fields of a `SupernodalFactor` as separate arguments.
+    """Solve Q out = b from Python with the fields of a `Factor` as separate arguments.
 
     Arrays are passed faster than a named tuple, which would take a seventh of a solve of 100 vertices.
     """

@@ -146,7 +146,7 @@ def _gain_most(s, child, sibling, width, rows):
 
 
 def groups(parent: NDArray[np.int32], cost: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Assign each node of a forest to a group of whole subtrees, NUM_SUBTREE_GROUPS for the top.
+    """Assign each node of a forest to a group of whole subtrees, GROUPS for the top.
 
     The heaviest subtree is split, with its root assigned to the top, until none exceeds a group's share. The lightest
     group then repeatedly gets the heaviest remaining subtree. The result depends on the tree alone, never on threads.

@@ -21,20 +21,20 @@ from solvers.linear.supernodes import GROUPS, LANES, amalgamate, groups
 class Symbolic(NamedTuple):
     """Structure of L over slots, the positions in the work vector.
 
-    Slots are padded so that each supernode starts at a multiple of COLUMN_LANES.
+    Slots are padded so that each supernode starts at a multiple of LANES.
 
     Supernodes are numbered group by group, followed by those above all groups, the top; children precede parents.
 
     Attributes:
-        slot_of_vertex: (n,).
-        vertex_of_slot: -1 for padding, (slots,).
+        slot: (n,).
+        vertex: -1 for padding, (slots,).
         parent: parent of each supernode, -1 for a root, (s,).
-        first_slot: first slot of each supernode, (s + 1,).
-        num_columns: columns of each supernode without padding, (s,).
+        first: first slot of each supernode, (s + 1,).
+        width: columns of each supernode without padding, (s,).
         row_start: first entry of each supernode in `rows`, (s + 1,).
         rows: sorted slots of the rows below each supernode.
-        postorder: the supernodes in a postorder of their tree, (s,).
-        group_start: first supernode of each group and of the top, (NUM_SUBTREE_GROUPS + 2,).
+        sequence: the supernodes in a postorder of their tree, (s,).
+        group_start: first supernode of each group and of the top, (GROUPS + 2,).
         nonzeros: entries of L before amalgamation, including the diagonal.
     """
 
@@ -57,7 +57,7 @@ _known: ContextVar[_Known | None] = ContextVar("_known", default=None)
 
 @contextmanager
 def analysed_once() -> Iterator[None]:
-    """Within this context, `analyse_graph` analyses each graph once, however many matrices share it."""
+    """Within this context, `structure` analyses each graph once, however many matrices share it."""
     token = _known.set([])
     try:
         yield

@@ -33,8 +33,8 @@ class Team(NamedTuple):
 
     Attributes:
         signals: the phase, the number of its completed tasks, and the last phase in which each task was claimed.
-        task_sums: results of the tasks.
-        results: final results of the step, (2,).
+        sums: results of the tasks.
+        found: final results of the step, (2,).
     """
 
     signals: NDArray[np.int64]

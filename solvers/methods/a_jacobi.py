@@ -9,7 +9,7 @@ dominant. Hence S and 2 S^-1 - Q are positive definite. As Q majorises the Hessi
 With bending terms the eigenvalues can exceed 2; D is then the diagonal times half of the largest eigenvalue.
 
 The iterations are accelerated by Chebyshev polynomials, as Wang (2015) accelerates Jacobi's method
-(`solvers.methods.quasi_newton.chebyshev`). They require nonnegative eigenvalues of I - S Q. For odd l, S is therefore
+(`solvers.methods.chebyshev`). They require nonnegative eigenvalues of I - S Q. For odd l, S is therefore
 divided by the largest possible eigenvalue of S Q, 1 + (m - 1)^l, where m is that of D^-1 Q. The factor of Q serves
 only to compute the residual.
 """
@@ -52,7 +52,7 @@ class AggregatedJacobi:
     """Projective dynamics whose global step is a fixed number of Jacobi sweeps.
 
     Args:
-        jacobi_sweeps: l, the number of Jacobi sweeps per iteration, 1 to 8.
+        sweeps: l, the number of Jacobi sweeps per iteration, 1 to 8.
     """
 
     minimises: ClassVar[bool] = True
@@ -101,7 +101,7 @@ class Aggregated:
     """Several Jacobi sweeps for Q x = b from x = 0, as one sparse matrix.
 
     Attributes:
-        num_nonzeros: number of stored entries of the matrix.
+        nonzeros: number of stored entries of the matrix.
     """
 
     def __init__(self, Q: csr_array, sweeps: int) -> None:
@@ -131,8 +131,8 @@ class PreparedAggregatedJacobi(Iterative):
     """A-Jacobi, prepared for a system.
 
     Attributes:
-        local_global: the local-global solver of Q, with S in place of its factor.
-        residual_solver: computes the residual at p by one local-global iteration; it has no other use.
+        base: the local-global solver of Q, with S in place of its factor.
+        measure: computes the residual at p by one local-global iteration; it has no other use.
     """
 
     def __init__(self, base: PreparedLocalGlobal, measure: Idle, objective: Objective) -> None:
@@ -168,5 +168,5 @@ class _Iterating(Interpreted):
         self._gauge = prepared.measure.gauge(problem)
 
     def residual(self) -> float:
-        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
+        """Return the residual [J^(1/2)] of the iterate that `residual_of` names."""
         return self._gauge(self.positions)

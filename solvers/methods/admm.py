@@ -94,7 +94,7 @@ class _Projected:
     Attributes:
         edges: (m, 2) vertex indices.
         stiffness: (m,) [N/m].
-        min_length, max_length: (m,) [m], bounds of the lengths at which an edge has no energy.
+        low, high: (m,) [m], bounds of the lengths at which an edge has no energy.
         direction: (m, 3), unit vectors for edges of zero length.
     """
 
@@ -121,8 +121,8 @@ class PreparedAdmm(Iterative):
     """ADMM, prepared for a system.
 
     Attributes:
-        local_global: the factorised ADMM matrix.
-        residual_metric: Q with its factor, for residuals.
+        base: the factorised ADMM matrix.
+        measure: Q with its factor, for residuals.
     """
 
     def __init__(

@@ -27,8 +27,8 @@ class Anderson(Windowed):
     """Anderson acceleration.
 
     Args:
-        history_size: number of differences of the most recent iterations to store.
-        linear_solver: solver of Q x = b.
+        pairs: number of differences of the most recent iterations to store.
+        linear: solver of Q x = b.
         precision: floating-point type of its stored entries.
     """
 

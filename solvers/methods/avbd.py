@@ -5,25 +5,25 @@ A constrained edge of length l has a tension t [N] and a stiffness k [N/m]:
     E_e = k/2 (l + t/k - clip(l + t/k, low, high))^2      in a sweep of `vertex_block.vbd` over all vertices
     t <- k (l + t/k - clip(l + t/k, low, high)),   k <- min(k + beta |l - clip(l, low, high)|, bound k_0)     after it
 
-so t converges to the Lagrange multipliers of the step (`solvers.model.energies.augmented_lagrangian`), and the lengths
+so t converges to the Lagrange multipliers of the step (`solvers.energies.augmented`), and the lengths
 to their feasible values, for any k. A solve converges when the gradient that the best multipliers leave is below the
-tolerance (`solvers.methods.vertex_block.lagrange_multipliers`), because the tensions t may cancel the gradient while
+tolerance (`solvers.core.multipliers`), because the tensions t may cancel the gradient while
 lengths are still wrong. Here beta = ramp k_0/high and k_0 = 1/(1/q_i + 1/q_j), the anchor stiffness of the two ends;
 the paper has a beta of 10 N/m^2 and starts at 1 N/m. The choice here does not depend on the units of mass, length and
 time. A larger ramp corrects lengths sooner, but leaves a larger gradient in the meantime.
 
 A step starts with gamma t and max(gamma k, k_0) of the previous step, which the solution stores for this warm start,
-gamma = `warm_start_decay`. `error_stabilisation` alpha widens the limits by alpha times the error at the start of the
+gamma = `decay`. `stabilisation` alpha widens the limits by alpha times the error at the start of the
 step, l - alpha (l^t - clip l^t): errors that few iterations left are corrected over several steps, not in one. With 0,
 the default, a solve converges to the minimum of the step; the paper uses .95, and multiplies t by it too. With
-`ramp_spring_stiffness`, springs are edges too; their stiffness starts low and grows by the same rule up to its own
+`softened`, springs are edges too; their stiffness starts low and grows by the same rule up to its own
 value (section 3.4), for large ratios of stiffness.
 
 Further differences from the paper: instead of a diagonal in which the length of each column represents the second
 derivatives across an edge, those of a tensile force are exact and those of a compressive force are dropped. A vertex
 whose step would raise the augmented energy uses the step of its majorant. Sweeps are not accelerated, because each has
 another energy; several accelerated sweeps before a dual step left larger length errors for the same work. Without
-constrained edges and without `ramp_spring_stiffness`, the method equals VBD.
+constrained edges and without `softened`, the method equals VBD.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ class AugmentedVertexBlockDescent:
     """Augmented vertex block descent for the energies of vertex block descent and length constraints.
 
     Args:
-        stiffness_ramp: growth of an edge's stiffness for a relative length error of 1, as a multiple of its initial
+        ramp: growth of an edge's stiffness for a relative length error of 1, as a multiple of its initial
             stiffness; not negative.
-        max_stiffness_ratio: largest stiffness as a multiple of the initial one, at least 1.
-        warm_start_decay: fraction of tensions and stiffnesses that the next step starts with, 0 to 1.
-        error_stabilisation: fraction of the initial length error that a step retains, 0 to 1.
-        ramp_spring_stiffness: whether the stiffness of springs starts low and grows.
+        bound: largest stiffness as a multiple of the initial one, at least 1.
+        decay: fraction of tensions and stiffnesses that the next step starts with, 0 to 1.
+        stabilisation: fraction of the initial length error that a step retains, 0 to 1.
+        softened: whether the stiffness of springs starts low and grows.
         spectral_radius: as in `VertexBlockDescent`, used if nothing is constrained or ramped.
     """
 
@@ -131,9 +131,9 @@ class PreparedAugmented(Iterative):
 
     Attributes:
         made: vertex block descent of the other energies, with the initial stiffness of the edges in its majorant.
-        augmented_edges: constrained edges, and springs with ramped stiffness.
-        min_stiffness, max_stiffness: (m,) [N/m], bounds of the edges' stiffness.
-        exact_mask: (m,), whether an edge is constrained.
+        edges: constrained edges, and springs with ramped stiffness.
+        least, most: (m,) [N/m], bounds of the edges' stiffness.
+        exact: (m,), whether an edge is constrained.
     """
 
     keeps_lengths: ClassVar[bool] = True
@@ -250,9 +250,9 @@ class Augmenting(Sweeps):
         return self._augmented.residual(self._problem, self.positions, tension)
 
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """Run iterations within the limits; the returned residual is `constrained_residual`.
+        """Run iterations within the limits; the returned residual is `residual_of_step`.
 
-        `constrained_residual` requires a factorisation. It is evaluated once the residual with the method's own
+        `residual_of_step` requires a factorisation. It is evaluated once the residual with the method's own
         tensions is small enough, and again each time the number of iterations has grown by half since.
         """
         count, residual, ended = super().iterate(limits)

@@ -35,7 +35,7 @@ class Chebyshev:
     """Chebyshev acceleration.
 
     Args:
-        linear_solver: solver of Q x = b.
+        linear: solver of Q x = b.
         precision: floating-point type of its stored entries.
     """
 

@@ -95,7 +95,7 @@ class _Fixed(Explicit):
     """Explicit solver with fixed substeps.
 
     Args:
-        refinement_factor: number of substeps as a multiple of the smallest stable number.
+        refine: number of substeps as a multiple of the smallest stable number.
     """
 
     refine: int = 1
@@ -117,7 +117,7 @@ class _Controlled(Explicit):
     """Explicit solver with adaptive substeps.
 
     Args:
-        error_tolerance: error of each substep, root mean square over the vertices, relative to the mean spring length.
+        error: error of each substep, root mean square over the vertices, relative to the mean spring length.
             An error of velocity counts by the displacement that it causes in a frame.
     """
 

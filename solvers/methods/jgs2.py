@@ -52,8 +52,8 @@ class Jgs2:
     """Jacobi's method with precomputed responses.
 
     Args:
-        neighbour_rings: rings of springs around a vertex that respond to it; 0 gives Jacobi's method.
-        lateral_stiffness_ratio: lateral stiffness of a spring at rest, relative to its stiffness, 0 to 1.
+        rings: rings of springs around a vertex that respond to it; 0 gives Jacobi's method.
+        lateral: lateral stiffness of a spring at rest, relative to its stiffness, 0 to 1.
     """
 
     minimises: ClassVar[bool] = True
@@ -108,7 +108,7 @@ def at_rest(system: System, springs: Springs, lateral: float) -> csr_array:
     Args:
         system: the system; its other projective energies contribute as in Q.
         springs: all springs of the system.
-        lateral_stiffness_ratio: lateral stiffness of a spring at rest, relative to its stiffness.
+        lateral: lateral stiffness of a spring at rest, relative to its stiffness.
 
     Returns:
         H0 [N/m] over the coordinates of the free vertices, (3f, 3f).
@@ -130,7 +130,7 @@ def answering(H: csr_array, graph: csr_array, rings: int) -> Patches:
     Args:
         H: Hessian of the rest shape (3f, 3f).
         graph: adjacency of the free vertices (f, f), with a full diagonal.
-        neighbour_rings: rings of springs in a patch.
+        rings: rings of springs in a patch.
 
     Raises:
         Unsupported: if the responses do not fit in memory.
@@ -168,7 +168,7 @@ class _Patch:
         self._inverse = np.empty((0, 0))
 
     def response(self, near: NDArray[np.int64], vertex: int) -> NDArray[np.float64]:
-        """Compute the response W (k, 3, 3) of a vertex; `patch_vertices` (k,) are those of its patch."""
+        """Compute the response W (k, 3, 3) of a vertex; `near` (k,) are those of its patch."""
         if not np.array_equal(near, self._near):
             self._near, self._factor = near, self._factorised(near)
         own, alone = int(np.searchsorted(near, vertex)), np.zeros((len(near), 3, 3))

@@ -11,7 +11,7 @@ positive and below Q, s y is at least y Q^-1 y, and H stays positive definite. A
 are not projective do not contribute to Q.
 
 `preconditioner: a-jacobi` replaces Q^-1 by S, the aggregate of several Jacobi sweeps
-(`solvers.methods.local_global.aggregated_jacobi`): a product with a sparse matrix, which suits a graphics processor.
+(`solvers.methods.a_jacobi`): a product with a sparse matrix, which suits a graphics processor.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class Lbfgs(Windowed):
     """L-BFGS, preconditioned.
 
     Args:
-        history_size: number of stored pairs, those of the most recent iterations.
-        linear_solver: solver of Q x = b.
+        pairs: number of stored pairs, those of the most recent iterations.
+        linear: solver of Q x = b.
         precision: floating-point type of its stored entries.
         preconditioner: initial metric, Q^-1 or its Jacobi approximation.
-        jacobi_sweeps: number of Jacobi sweeps of that approximation, 1 to 8.
+        sweeps: number of Jacobi sweeps of that approximation, 1 to 8.
     """
 
     unstated: ClassVar[frozenset[str]] = frozenset({"preconditioner", "sweeps"})
@@ -133,5 +133,5 @@ class _Iterating(Interpreted):
         self._metric = metric
 
     def residual(self) -> float:
-        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
+        """Return the residual [J^(1/2)] of the iterate that `residual_of` names."""
         return self._metric.residual(self.gradient())

@@ -6,7 +6,7 @@ This is the first Newton step on the objective g from the start of the frame: (H
 codes use it. It has the order of the integrator that defines the step, 1 with implicit Euler and 2 with BDF2 (Choi and
 Ko 2002) and midpoint. The accuracy of a step cannot be controlled: where springs rotate far in one step, x is far from
 the minimum. E is zero wherever H has a Cholesky factor. Where compressed springs leave it none, part of their negative
-lateral stiffness is removed, and if necessary all of it (`solvers.methods.newton.hessian_regularisation`); Choi and Ko
+lateral stiffness is removed, and if necessary all of it (`solvers.core.definite`); Choi and Ko
 always remove all of it.
 """
 
@@ -80,7 +80,7 @@ class BaraffWitkin:
 class PreparedLinearised(Iterative):
     """Linearised implicit Euler, prepared for a system.
 
-    `system_diagonal` is the diagonal of the free part of Q (3 f,) [N/m].
+    `diagonal` is the diagonal of the free part of Q (3 f,) [N/m].
     """
 
     residual_of: ClassVar[ResidualOf] = "none"

@@ -9,7 +9,7 @@ raises the energy, because A'KA - Hessian is positive semidefinite. Exact pins a
 from Q, and their columns contribute to the right-hand side.
 
 Backends differ only in the implementation of the two steps: `DenseLocalGlobal` uses NumPy matrices,
-`SparseLocalGlobal` SciPy matrices, and `solvers.methods.local_global.compiled_local_global` compiled code.
+`SparseLocalGlobal` SciPy matrices, and `solvers.methods.local_global_compiled` compiled code.
 """
 
 from __future__ import annotations

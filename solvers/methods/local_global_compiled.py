@@ -29,7 +29,7 @@ class CompiledLocalGlobal:
     """Compiled local-global with a linear solver that is selected by size, or given.
 
     Args:
-        linear_solver: solver of Q p = b.
+        linear: solver of Q p = b.
         precision: floating-point type of its stored entries.
     """
 

@@ -1,6 +1,6 @@
 """XPBD with a global dual solve by multigrid-preconditioned conjugate gradients (MGPBD: Li et al. 2025).
 
-It starts as XPBD does (`solvers.methods.position_based.xpbd`): at the positions without springs, with zero tensions. An
+It starts as XPBD does (`solvers.methods.xpbd`): at the positions without springs, with zero tensions. An
 iteration linearises all springs, solves for the increments of their tensions t, and moves the vertices accordingly:
 
     (J W J' + K^-1) dt = C(p) - K^-1 t,    p <- p - W J' dt,   t <- t + dt
@@ -54,10 +54,10 @@ class MultigridXpbd:
     """MGPBD; uses neither the initial guess nor a tolerance, and stops at round-off of the tensions.
 
     Args:
-        near_null_vectors: number of near-null-space vectors, each from sweeps on a random vector; 0 for constant
+        components: number of near-null-space vectors, each from sweeps on a random vector; 0 for constant
             tensions only.
-        setup_interval: iterations between constructions of the prolongations; each step starts with one.
-        smooth_prolongation: whether prolongations are smoothed.
+        setup: iterations between constructions of the prolongations; each step starts with one.
+        smoothed: whether prolongations are smoothed.
     """
 
     minimises: ClassVar[bool] = False
@@ -118,12 +118,12 @@ class PreparedMultigridXpbd(Iterative):
     """MGPBD, prepared for a system.
 
     Attributes:
-        incidence_matrix: A_s (m, n).
-        coupling_matrix: G (m, m).
-        root_stiffness: square roots of the stiffnesses (m,).
+        incidence: A_s (m, n).
+        coupling: G (m, m).
+        root: square roots of the stiffnesses (m,).
         rest_length: (m,) [m].
         rest_direction: (m, 3).
-        vertex_compliance: 1/q (n,) [m/N].
+        compliance: 1/q (n,) [m/N].
     """
 
     residual_of: ClassVar[ResidualOf] = "none"
@@ -170,9 +170,9 @@ class Dual(Iterating):
     """State of an MGPBD solve.
 
     Attributes:
-        scaled_tension: s = K^-1/2 t (m,) [J^(1/2)].
-        dual_residual: b, the error of s (m,).
-        num_cg_iterations: conjugate gradient iterations of the most recent iteration.
+        tension: s = K^-1/2 t (m,) [J^(1/2)].
+        misfit: b, the error of s (m,).
+        iterations: conjugate gradient iterations of the most recent iteration.
     """
 
     def __init__(self, prepared: PreparedMultigridXpbd, p: Positions) -> None:

@@ -5,12 +5,12 @@
 The Hessian of compressed springs may be indefinite. It remains exact wherever it has a Cholesky factor, which preserves
 quadratic convergence. Where it has none, an increasing part of the springs' negative lateral stiffness is removed, and
 finally a multiple of the diagonal of Q is added. Other rules modify the eigenvalues of elements (`indefinite`, see
-`solvers.methods.newton.hessian_regularisation`); clamping all of them (Teran et al. 2005) converges linearly. Where the
+`solvers.core.definite`); clamping all of them (Teran et al. 2005) converges linearly. Where the
 slope is small, none of these rules applies: the exact Hessian distinguishes a minimum from a saddle. From a stationary
-point whose exact Hessian has no factor, the method escapes (`solvers.methods.newton.negative_curvature`).
+point whose exact Hessian has no factor, the method escapes (`solvers.core.saddles`).
 
 With active contacts, an iteration converges friction and may consist of several steps
-(`solvers.methods.newton.friction_gauss_seidel`).
+(`solvers.contact.settling`).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Newton:
     """Newton's method; at convergence or stagnation, negative curvature is at the level of round-off.
 
     Args:
-        indefinite_strategy: modification of indefinite Hessians (`hessian_regularisation`).
+        indefinite: modification of indefinite Hessians (`hessian_regularisation`).
     """
 
     minimises: ClassVar[bool] = True
@@ -64,7 +64,7 @@ class Newton:
         Raises:
             NotPositiveDefinite: if the system leaves some positions undetermined.
             Unsupported: if Q does not fit in memory, and for energies without an element-wise form that
-                `indefinite_strategy` requires.
+                `indefinite` requires.
         """
         metric, objective = Metric(system), Objective(system)
         whole = {type(system.energies[k]).__name__ for k in objective.own if not is_bounded(system.energies[k])}

@@ -86,7 +86,7 @@ class NewtonCG(Precise):
 
 
 class TruncatedNewton:
-    """The iteration for one system; `compiled_cg` is the fused CG kernel, None if unavailable."""
+    """The iteration for one system; `compiled` is the fused CG kernel, None if unavailable."""
 
     def __init__(self, metric: Metric, objective: Objective, by: Preconditioning = "factor") -> None:
         self._metric, self._at = metric, preconditioning(by, metric, objective, "newton-cg")

@@ -144,7 +144,7 @@ class _Iterating(Iterating):
         return search(self._step, self._at, direction, first=-slope / curvature)
 
     def residual(self) -> float:
-        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
+        """Return the residual [J^(1/2)] of the iterate that `residual_of` names."""
         gradient = self._at.gradient
         if self._solve == self._metric.solve:
             return self._metric.norm(self._z.copy(), gradient)

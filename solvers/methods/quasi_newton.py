@@ -1,6 +1,6 @@
 """Accelerated first-order methods with one prefactored matrix: Anderson, Chebyshev and L-BFGS.
 
-They share the iteration (`solvers.kernels.accelerated_descent`) and differ in the coefficients of a direction. A step
+They share the iteration (`solvers.kernels.accelerate`) and differ in the coefficients of a direction. A step
 is fully compiled if the energies are springs, quadratic forms, strain limits and dashpots, and the factor's panels are
 supported by the kernels. Otherwise the kernels alternate with the energies' own values and gradients, and with the
 factor's own solve.
@@ -43,7 +43,7 @@ def prepare(system: System, scheme: Scheme, linear: Linear, precision: Precision
     Args:
         system: the system.
         scheme: coefficients of the acceleration.
-        linear_solver: solver of Q x = b.
+        linear: solver of Q x = b.
         precision: floating-point type of its stored entries.
 
     Raises:
@@ -73,8 +73,8 @@ class Windowed:
     """Base class of methods with a history of recent iterations.
 
     Args:
-        history_size: number of stored differences.
-        linear_solver: solver of Q x = b.
+        pairs: number of stored differences.
+        linear: solver of Q x = b.
         precision: floating-point type of its stored entries.
     """
 
@@ -92,7 +92,7 @@ class Windowed:
 
 @dataclass(frozen=True, eq=False)
 class PreparedAccelerated(Iterative):
-    """An accelerated method, prepared: `local_global` has the prefactored Q, `acceleration_engine` iterates."""
+    """An accelerated method, prepared: `base` has the prefactored Q, `engine` iterates."""
 
     base: PreparedLocalGlobal
     engine: Engine
@@ -149,7 +149,7 @@ _State = tuple[accelerate_step.Step, Window]
 
 
 class _CompiledAccelerating(Accelerating):
-    """State of a compiled solve; `free_states` receives its work arrays when it is deleted."""
+    """State of a compiled solve; `idle` receives its work arrays when it is deleted."""
 
     def __init__(
         self,
@@ -179,7 +179,7 @@ class _CompiledAccelerating(Accelerating):
         return self.iterate(ONE)[0] == 1
 
     def residual(self) -> float:
-        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
+        """Return the residual [J^(1/2)] of the iterate that `residual_of` names."""
         return self.iterate(at_most(0))[1]
 
     @property

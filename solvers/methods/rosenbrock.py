@@ -7,7 +7,7 @@ For p' = v, M v' = F(p) - D v and s = 1/(gamma h), a stage (u, w) of positions a
 with P = p + sum a u_j and V = v + sum a w_j. The velocities are eliminated, so the matrix is that of a step problem. It
 is factorised at the start of the step. K is the exact Hessian of the energies there, as the order conditions require.
 If the step is too long for compressed springs, it may have no Cholesky factor. Adaptive steps are then halved. Fixed
-steps reduce the springs' negative lateral stiffness (`solvers.methods.newton.hessian_regularisation`); only ROS2
+steps reduce the springs' negative lateral stiffness (`solvers.core.definite`); only ROS2
 retains its order in that case.
 """
 
@@ -50,8 +50,8 @@ class _Linear:
     """Base class of the Rosenbrock solvers.
 
     Args:
-        refinement_factor: number of fixed steps in a frame, used if `error_tolerance` is 0.
-        error_tolerance: error of each adaptive step, root mean square over the vertices, relative to the mean spring
+        refine: number of fixed steps in a frame, used if `error` is 0.
+        error: error of each adaptive step, root mean square over the vertices, relative to the mean spring
             length. An error of velocity counts by the displacement that it causes in a frame.
     """
 
@@ -171,11 +171,11 @@ class PreparedRosenbrock(Iterative):
     """A Rosenbrock method, prepared for a system.
 
     Attributes:
-        fixed_objective: of the energies without drag.
+        objective: of the energies without drag.
         drag: coefficients d (n,) [N s/m].
-        refinement_factor: number of fixed steps in a frame.
-        error_tolerance: error of each adaptive step [m], 0 for fixed steps.
-        num_factorisations: factorisations of an attempted step.
+        refine: number of fixed steps in a frame.
+        tolerance: error of each adaptive step [m], 0 for fixed steps.
+        factorisations: factorisations of an attempted step.
     """
 
     residual_of: ClassVar[ResidualOf] = "none"

@@ -24,7 +24,7 @@ class Rosenbrock:
     """Coefficients of a Rosenbrock method.
 
     Attributes:
-        order, embedded_order: orders of the method and of the embedded method.
+        order, embedded: orders of the method and of the embedded method.
         gamma: diagonal coefficient.
         a, c: rows of 0 to s - 1 entries.
         m, e: weights of the solution and of the error estimate (s,).

@@ -128,13 +128,13 @@ class PreparedVertexBlockDescent(Iterative):
     """Vertex block descent, prepared for a system.
 
     Attributes:
-        spring_form: the springs and quadratic forms.
-        vertex_elements: the elements of the other energies.
-        colour_packets: packets of the free vertices by colour.
-        row_of_vertex: (n,), row of each vertex in the packets.
-        anchor_stiffness: inertia and penalty pins of each row [N/m].
+        parts: the springs and quadratic forms.
+        beside: the elements of the other energies.
+        blocks: packets of the free vertices by colour.
+        row: (n,), row of each vertex in the packets.
+        held: inertia and penalty pins of each row [N/m].
         majorant: (n,) [N/m], of all energies except contact.
-        residual_solver: computes the residual at p by one local-global iteration; it has no other use.
+        measure: computes the residual at p by one local-global iteration; it has no other use.
     """
 
     system: System
@@ -219,7 +219,7 @@ class Sweeps(Iterating):
         return True
 
     def residual(self) -> float:
-        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
+        """Return the residual [J^(1/2)] of the iterate that `residual_of` names."""
         return self._gauge(self.positions)
 
     def alone(self, p: Positions) -> Positions:

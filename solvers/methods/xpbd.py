@@ -105,9 +105,9 @@ class PreparedXpbd(Iterative):
     """XPBD, prepared for a system.
 
     Attributes:
-        coloured_constraints: the springs by colour.
-        vertex_compliance: 1/q (n,) [m/N].
-        constraint_relaxation: (m,), documented with the kernels.
+        constraints: the springs by colour.
+        compliance: 1/q (n,) [m/N].
+        ease: (m,), documented with the kernels.
     """
 
     residual_of: ClassVar[ResidualOf] = "none"
@@ -125,7 +125,7 @@ class PreparedXpbd(Iterative):
 
 
 class Passes(Iterating):
-    """State of an XPBD solve; `spring_tensions` t (m,) [N] in the order of `coloured_constraints`."""
+    """State of an XPBD solve; `tension` t (m,) [N] in the order of `constraints`."""
 
     def __init__(self, prepared: PreparedXpbd, p: Positions) -> None:
         self._prepared, self.tension, self.positions = prepared, np.zeros_like(prepared.ease), p
@@ -144,7 +144,7 @@ class Passes(Iterating):
 
 @dataclass(frozen=True, eq=False)
 class PreparedSmallSteps(Iterative):
-    """XPBD with small steps, prepared; `coloured_constraints` are the springs by colour."""
+    """XPBD with small steps, prepared; `constraints` are the springs by colour."""
 
     residual_of: ClassVar[ResidualOf] = "none"
 

@@ -95,7 +95,7 @@ def _subtract_product(typingctx: Any, L: Any, at: Any, top: Any, stride: Any, de
 def _divide(typingctx: Any, L: Any, at: Any, stride: Any, triangle: Any, strips: Any, columns: Any) -> Any:
     """Replace the rows X of a tile, in strips of eight from `at` on, by X T^-T.
 
-    triangle (TILE_COLUMNS, TILE_COLUMNS): T with inverted diagonal.
+    triangle (TILE, TILE): T with inverted diagonal.
     """
     declared = signature(L, at, stride, triangle, strips, columns)
 
@@ -125,7 +125,7 @@ def _divide(typingctx: Any, L: Any, at: Any, stride: Any, triangle: Any, strips:
 def _factorise_corner(typingctx: Any, L: Any, at: Any, stride: Any, least: Any, triangle: Any, columns: Any) -> Any:
     """Write the Cholesky factor of a tile's diagonal block to `triangle`, with inverted diagonal.
 
-    triangle: (TILE_COLUMNS, TILE_COLUMNS). Returns whether each pivot exceeds its threshold.
+    triangle: (TILE, TILE). Returns whether each pivot exceeds its threshold.
     """
     declared = types.boolean(*signature(L, at, stride, least, triangle, columns).args)
 

@@ -1,6 +1,6 @@
 """Objective of eight vertices and their springs, and its negative gradient, in explicit LLVM vectors.
 
-See `solvers.kernels.accelerate_springs` for the formula, and `solvers.simd.spring_packets` for the lanes.
+See `solvers.kernels.accelerate_springs` for the formula, and `solvers.vectors.springs` for the lanes.
 """
 
 from __future__ import annotations

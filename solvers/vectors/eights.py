@@ -2,7 +2,7 @@
 
 `+`, `-`, `*` and comparisons act lane by lane on two packets, or on a packet and a float. Comparisons of packets give
 masks, which `&` and `|` combine. `where` replaces branches. No product is fused with a sum, so that each lane is
-bitwise identical to a scalar computation. `divide_packet` divides without a test for zero; `where` discards such
+bitwise identical to a scalar computation. `ratio` divides without a test for zero; `where` discards such
 results.
 """
 

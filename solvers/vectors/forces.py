@@ -1,4 +1,4 @@
-"""Forces of the springs of eight vertices, and their norm, in LLVM vectors (see `solvers.simd.spring_packets`)."""
+"""Forces of the springs of eight vertices, and their norm, in LLVM vectors (see `solvers.vectors.springs`)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from solvers.vectors.springs import LANES, MOST, WIDE, Bundle, Eights, constant
 def _over_bundle(correct: bool) -> Callable[..., Any]:
     """Return the code that adds a packet's forces to rows of `out`, or none if a spring is too short, which it returns.
 
-    subtract_position: whether to add the negative gradient; else the constant right-hand side and the spring
+    correct: whether to add the negative gradient; else the constant right-hand side and the spring
     projections.
     """
 

@@ -45,7 +45,7 @@ def _unpacked(context: Any, builder: Any, kind: Any, value: Any) -> Any:
 
 
 class Vectors:
-    """Builder of vector code; has_avx512: whether registers have 512 bits."""
+    """Builder of vector code; wide: whether registers have 512 bits."""
 
     def __init__(self, context: Any, builder: Any) -> None:
         self.builder = builder

@@ -166,7 +166,7 @@ class Eights(Vectors):
         self.store(self.builder.fadd(self.load(pointer, row.type), row), pointer)
 
     def clamped(self, s: Any) -> Any:
-        """Return s clamped to MIN_SQUARED_LENGTH and MAX_SQUARED_LENGTH."""
+        """Return s clamped to LEAST and MOST."""
         return self.least(self.least(s, constant(LEAST), ">="), constant(MOST))
 
     def least(self, a: Any, b: Any, order: str = "<=") -> Any:
@@ -179,7 +179,7 @@ class Eights(Vectors):
         return [self.load(self.builder.gep(at, [I64(LANES * k)]), WIDE) for k in range(4)]
 
     def ask_ahead(self, springs: Bundle, places: list[Any], right: Any, out: Any) -> None:
-        """Prefetch the data that a packet PREFETCH_ROWS rows ahead will read."""
+        """Prefetch the data that a packet AHEAD rows ahead will read."""
         b = self.builder
         first = b.mul(b.add(springs.number, I64(AHEAD // LANES)), I64(RIGHT))
         for k in range(4):
@@ -191,7 +191,7 @@ class Eights(Vectors):
             ask(b, b.gep(springs.neighbour, [b.add(first, I64(2 * LANES * k))]))
 
     def guess(self, s: Any) -> tuple[Any, Any]:
-        """Return y, an estimate of 1/sqrt(s), and 1 - s y^2, for clamped s; `inverse_sqrt_correction` completes it."""
+        """Return y, an estimate of 1/sqrt(s), and 1 - s y^2, for clamped s; `correction` completes it."""
         b = self.builder
         if self.wide:
             kind = ir.FunctionType(WIDE, [WIDE, WIDE, I8])
@@ -216,6 +216,6 @@ class Eights(Vectors):
         return first
 
     def inverse_root(self, s: Any) -> Any:
-        """Return 1/sqrt(s), for s between MIN_SQUARED_LENGTH and MAX_SQUARED_LENGTH."""
+        """Return 1/sqrt(s), for s between LEAST and MOST."""
         y, e = self.guess(s)
         return self.multiply_add(self.builder.fmul(y, e), self.correction(e), y)

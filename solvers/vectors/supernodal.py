@@ -29,7 +29,7 @@ _AHEAD = 4096
 
 
 class _Tiles(Vectors):
-    """Builder for tiles of 4 m columns in 512-bit vectors; `element_type` is the work vector's type."""
+    """Builder for tiles of 4 m columns in 512-bit vectors; `element` is the work vector's type."""
 
     def __init__(self, context: Any, builder: Any, element: types.Float, m: int) -> None:
         super().__init__(context, builder)
@@ -110,7 +110,7 @@ class _Tiles(Vectors):
         return self.add(self.mixed(xy, z0, (0, 1, 4, 5)), self.mixed(xy, z0, (2, 3, 6, 7)))
 
     def ask(self, tile: Any, kind: Any) -> None:
-        """Prefetch the cache lines _PREFETCH_BYTES before those of a tile."""
+        """Prefetch the cache lines _AHEAD before those of a tile."""
         for line in reversed(range(0, self.entries * kind.dtype.bitwidth // 8, 64)):
             ask(self.builder, tile, line - _AHEAD)
 

@@ -1,4 +1,4 @@
-"""Newton steps of eight vertices of one colour, in explicit LLVM vectors (see `solvers.simd.spring_packets`)."""
+"""Newton steps of eight vertices of one colour, in explicit LLVM vectors (see `solvers.vectors.springs`)."""
 
 from __future__ import annotations
 

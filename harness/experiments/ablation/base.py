@@ -24,7 +24,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class OfEffects(ABC):
-    """Unit that measures a scene's effects in a run (`harness.experiments.experiment_units.ExperimentUnit`)."""
+    """Unit that measures a scene's effects in a run (`harness.experiments.core.Unit`)."""
 
     run: RunSpec
     folder: Path

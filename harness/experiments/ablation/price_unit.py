@@ -87,10 +87,10 @@ def price_all(
         sweep: one scene with several solvers.
         folder: folder of the results.
         display: shows progress.
-        print_message: prints a remark.
-        rerun: whether to repeat all units.
-        rerun_stale: whether to repeat units measured by other source code.
-        isolated: see `harness.experiments.experiment_units.execute_units`.
+        say: prints a remark.
+        again: whether to repeat all units.
+        changed: whether to repeat units measured by other source code.
+        isolated: see `harness.experiments.core.do_all`.
 
     Returns: the files of rows.
 

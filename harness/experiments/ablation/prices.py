@@ -4,8 +4,8 @@
 
 The baseline scene has only the effects that are declared `plain`. Both scenes are simulated interleaved, step by step,
 to the requested tolerance, so that a drift of the machine affects both alike. Rounds end once the interval of the ratio
-is narrower than MAX_INTERVAL_WIDTH, or at the largest number of rounds. A round that has taken MAX_ROUND_SECONDS ends
-with the next counted step, and then MIN_ROUNDS rounds suffice. Where a single step takes that long, the number of
+is narrower than CLOSE, or at the largest number of rounds. A round that has taken ENOUGH ends
+with the next counted step, and then LEAST rounds suffice. Where a single step takes that long, the number of
 iterations per step is reduced. So the slowest solvers take minutes as well.
 
 No iteration can read the effect's own numbers faster than a dot product, nor multiply and add them faster than a matrix
@@ -54,13 +54,13 @@ class Price(NamedTuple):
     """Per-iteration overhead of an effect.
 
     Attributes:
-        effect_kind: kind of the effect.
-        ratio_interval: CPU time per iteration with the effect, divided by that without, with its interval.
+        effect: kind of the effect.
+        price: CPU time per iteration with the effect, divided by that without, with its interval.
         seconds: CPU time per iteration with the effect [s].
-        min_ratio: lower bound of the ratio, from the effect's own bytes and flops.
-        num_rounds: number of rounds.
-        max_iterations: iteration limit of a step.
-        unsupported_reason: why there is no measurement; empty if there is one.
+        bound: lower bound of the ratio, from the effect's own bytes and flops.
+        rounds: number of rounds.
+        iterations: iteration limit of a step.
+        refused: why there is no measurement; empty if there is one.
     """
 
     effect: str
@@ -76,7 +76,7 @@ class Price(NamedTuple):
 class _Run:
     """Running simulation of a scene by one solver.
 
-    `seconds` and `iterations` are those of the counted steps, `total_seconds` those of all steps [s].
+    `seconds` and `iterations` are those of the counted steps, `spent` those of all steps [s].
     """
 
     steps: Iterator[Step]
@@ -85,7 +85,7 @@ class _Run:
     spent: float = 0.0
 
     def step(self, *, counts: bool) -> None:
-        """Compute the next step; it is included in `seconds` and `iterations` if `is_counted`."""
+        """Compute the next step; it is included in `seconds` and `iterations` if `counts`."""
         began = thread_time()
         done = next(self.steps)
         took = thread_time() - began
@@ -101,7 +101,7 @@ class _Run:
 
 
 def priced(scene: SceneSpec) -> list[str]:
-    """Return the kinds of effects to measure, then ALL_EFFECTS. Raises InputError if there are none."""
+    """Return the kinds of effects to measure, then ALL. Raises InputError if there are none."""
     kinds = list(dict.fromkeys(effect.kind for effect in scene.effects if not _plain(effect)))
     if not kinds:
         listed = ", ".join(dict.fromkeys(effect.kind for effect in scene.effects))
@@ -110,7 +110,7 @@ def priced(scene: SceneSpec) -> list[str]:
 
 
 def only(scene: SceneSpec, *kinds: str) -> SceneSpec:
-    """Return the scene with these effects and the baseline effects only; ALL_EFFECTS selects all."""
+    """Return the scene with these effects and the baseline effects only; ALL selects all."""
     if ALL in kinds:
         return scene
     kept = [i for i, e in enumerate(scene.effects) if e.kind in kinds or _plain(e)]
@@ -129,9 +129,9 @@ def prices(scene: SceneSpec, size: int, solver: Solver, stop: Stop, *, frames: i
         scene: the scene.
         size: mesh size.
         solver: the solver.
-        stop_rule: stop rule of a step.
+        stop: stop rule of a step.
         frames: number of counted steps in a round.
-        max_rounds: largest number of rounds.
+        rounds: largest number of rounds.
     """
     plain = None
     for effect in priced(scene):
@@ -161,11 +161,11 @@ def price(effect: str, one: Ready, plain: Ready, stop: Stop, *, frames: int, rou
 
     Args:
         effect: kind of the effect.
-        with_effect: scene with the effect.
-        baseline: scene without it.
-        stop_rule: stop rule of a step.
+        one: scene with the effect.
+        plain: scene without it.
+        stop: stop rule of a step.
         frames: number of counted steps in a round.
-        max_rounds: largest number of rounds.
+        rounds: largest number of rounds.
     """
     pairs: list[tuple[float, float]] = []
     found = Interval(np.nan, np.nan, np.nan)
@@ -188,7 +188,7 @@ def price(effect: str, one: Ready, plain: Ready, stop: Stop, *, frames: int, rou
 
 
 def _affordable(plain: Ready, stop: Stop) -> Stop:
-    """Return the stop rule, with fewer iterations if a step takes longer than MAX_ROUND_SECONDS.
+    """Return the stop rule, with fewer iterations if a step takes longer than ENOUGH.
 
     The reduced number of iterations takes a quarter of that time.
     """

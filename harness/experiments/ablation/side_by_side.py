@@ -8,7 +8,7 @@ cost of an effect is a difference of times of the same frame in the same round:
 
     cost = mean over frames of the median over rounds of (full scene - scene without the effect)
 
-`harness.results.bootstrap_statistics` computes its 95 % interval.
+`harness.base.statistics` computes its 95 % interval.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class Contender:
         variant: the scene variant.
         scene: the scene; None if it could not be built.
         prepared: the prepared solver; None if preparation failed.
-        memory_bytes: memory of the scene and the prepared solver.
-        failure_reason: why there is no result; empty if there is one.
+        bytes: memory of the scene and the prepared solver.
+        failure: why there is no result; empty if there is one.
         seconds: CPU time of the steps, (rounds, frames) [s].
         positions: (frames, n, 3) [m].
         velocities: (frames, n, 3) [m/s].
@@ -151,13 +151,13 @@ def _steps(turn: Contender, settings: Settings) -> Iterator[Step]:
 
 
 def motion(scene: Scene, solver: Solver, settings: Settings, *, every: int = 1) -> tuple[Array, Array]:
-    """Simulate, and return positions and velocities (frames, n, 3) of every `stride`-th step.
+    """Simulate, and return positions and velocities (frames, n, 3) of every `every`-th step.
 
     Args:
         scene: the scene.
         solver: the solver.
         settings: settings, whose number of frames is that of the result.
-        stride: number of steps per frame of the result.
+        every: number of steps per frame of the result.
     """
     run = replace(settings, frames=settings.frames * every)
     kept = [s.state.now for s in steps(scene, prepare(scene, solver), run) if s.index % every == 0]

@@ -2,7 +2,7 @@
 
 Each comes with the evidence.
 
-The class of an effect defines the evidence for it (`harness.scenes.effects.effect_interface.Effect`).
+The class of an effect defines the evidence for it (`harness.scenes.effects.base.Effect`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def seen(scene: Scene, kinds: Collection[str], positions: NDArray[np.float64], v
 
     Args:
         scene: the scene.
-        effect_kinds: kinds of its effects.
+        kinds: kinds of its effects.
         positions: (frames, n, 3) [m].
         velocities: (frames, n, 3) [m/s].
     """
@@ -54,8 +54,8 @@ def suggestions(found: Seen, kinds: Collection[str]) -> list[Suggestion]:
     """Return the unlisted effects that the evidence indicates, in a fixed order.
 
     Args:
-        evidence: evidence from the motion.
-        effect_kinds: kinds of the effects that the scene lists.
+        found: evidence from the motion.
+        kinds: kinds of the effects that the scene lists.
     """
     absent = [kind for kind in EFFECTS if kind not in kinds and hasattr(_class(kind), "called_for")]
     told = (Suggestion(kind, _class(kind).called_for(found)) for kind in absent)

@@ -39,7 +39,7 @@ CONVERGED = StopRule(200, 1e-8)
 class Ablation(OfEffects):
     """Run of a scene, in full and without its effects, timed interleaved in one process.
 
-    `with_pairs` selects variants without each pair of effects, too.
+    `pairs` selects variants without each pair of effects, too.
     """
 
     pairs: bool
@@ -87,11 +87,11 @@ def run_ablation(
         sweep: sweep with one run.
         folder: folder of the results.
         display: shows progress.
-        print_message: prints a remark.
-        with_pairs: whether to leave out each pair of effects, too.
-        rerun: whether to repeat the ablation.
-        rerun_stale: whether to repeat it if it was measured by other source code.
-        isolated: see `harness.experiments.experiment_units.execute_units`.
+        say: prints a remark.
+        pairs: whether to leave out each pair of effects, too.
+        again: whether to repeat the ablation.
+        changed: whether to repeat it if it was measured by other source code.
+        isolated: see `harness.experiments.core.do_all`.
 
     Returns: the file of rows.
 

@@ -11,7 +11,7 @@ from harness.scenes.spec import SceneSpec
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Variant:
-    """Scene without the effects `omitted_effects`, by name; the full scene omits none."""
+    """Scene without the effects `left_out`, by name; the full scene omits none."""
 
     left_out: tuple[str, ...]
     scene: SceneSpec
@@ -23,7 +23,7 @@ class Variant:
 
 
 def variants(scene: SceneSpec, *, pairs: bool) -> list[Variant]:
-    """Build the full scene, then one variant without each effect in order; `with_pairs` adds pairs."""
+    """Build the full scene, then one variant without each effect in order; `pairs` adds pairs."""
     names = effect_names(scene)
     chosen: list[tuple[int, ...]] = [(), *((i,) for i in range(len(names)))]
     if pairs:

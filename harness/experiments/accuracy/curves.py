@@ -70,14 +70,14 @@ class GradedCurve:
     """Scored iterates of a solve.
 
     Attributes:
-        iterate_indices: (k,); 0 is the initial guess.
+        numbers: (k,); 0 is the initial guess.
         positions: (k, n, 3) [m].
         g: objective (k,) [J].
         stationarity: (k,).
         status: status of the curve as a whole.
         reason: reason of the status.
         seconds: time since the start of the solve, (k, rounds) [s].
-        preempted: whether any round was preempted.
+        interrupted: whether any round was preempted.
     """
 
     numbers: list[int]
@@ -105,11 +105,11 @@ def measure(
     Args:
         prepared: the prepared solver.
         problem: the problem of the step.
-        evaluator: reference evaluator that scores iterates.
-        lowest_energy: energy of the lowest known minimum [J]; None without one.
-        max_iterations: iteration limit.
+        oracle: reference evaluator that scores iterates.
+        lowest: energy of the lowest known minimum [J]; None without one.
+        iterations: iteration limit.
         time_limit: limit on the solver's own time [s].
-        num_rounds: number of timed passes.
+        rounds: number of timed passes.
 
     Raises:
         RunFailed: a timed pass ends at other positions, or another clock disagrees.
@@ -200,7 +200,7 @@ def _timed(
 ) -> tuple[NDArray[np.float64], bool]:
     """Return the wall seconds until each iterate, and whether the pass was preempted.
 
-    The times (num_iterates + 1,) begin with 0 for the initial guess.
+    The times (count + 1,) begin with 0 for the initial guess.
     """
     stamps, watch = np.zeros(count + 1), Watch(numba.get_num_threads())
     p, copied = problem.first_guess, None

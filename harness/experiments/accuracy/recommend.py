@@ -2,7 +2,7 @@
 
 It is selected from stored rows or new measurements.
 
-An error is that of a whole simulation up to a horizon (`harness.experiments.accuracy.work_precision`). A cost is the
+An error is that of a whole simulation up to a horizon (`harness.experiments.accuracy.work`). A cost is the
 wall time per simulated second. The result is the cheapest measured method that meets the error; one more simulation
 checks it.
 """
@@ -62,8 +62,7 @@ def candidates() -> list[dict[str, Any]]:
     """Return the grid that is measured where no rows exist.
 
     The first solver of each family runs with steps solved to a tolerance, or with 50 iterations or substeps. All
-    adaptive
-    solvers with their own integrator are included.
+    adaptive solvers with their own integrator are included.
     """
     made = {name: load(target) for name, target in SOLVERS.items()}
     told = {name: about(solver, name) for name, solver in made.items()}
@@ -83,11 +82,11 @@ class Recommended:
     """Method that was measured on the scene.
 
     Attributes:
-        work_spec: the simulation.
+        spec: the simulation.
         error: relative error.
-        seconds_per_simulated_second: wall time per simulated second.
-        reference_kind: kind of the reference solution for the error.
-        solver_description: what the solver selected automatically.
+        cost: wall time per simulated second.
+        truth: kind of the reference solution for the error.
+        choice: what the solver selected automatically.
         sweep: name of the study that measured it.
     """
 
@@ -124,9 +123,9 @@ class Recommendation:
     """Result of a recommendation.
 
     Attributes:
-        measured_methods: all measured methods, cheapest first.
-        best_method: cheapest of those that meet the error.
-        checked_method: a repeated measurement of it.
+        ways: all measured methods, cheapest first.
+        best: cheapest of those that meet the error.
+        checked: a repeated measurement of it.
     """
 
     ways: tuple[Recommended, ...]
@@ -163,19 +162,18 @@ def recommend(
     say: Callable[[str], None],
     budget: float = BUDGET,
 ) -> Recommendation:
-    """Return the cheapest method for a relative error at `t_end`.
+    """Return the cheapest method for a relative error at `horizon`.
 
     Args:
         path: file of the scene.
-        max_error: relative error to reach.
+        error: relative error to reach.
         size: mesh size; the scene's default if None.
-        t_end: simulated time [s]. If None, DEFAULT_T_END, or the longest time at which the error can be measured, if
-            that
-            is shorter.
+        horizon: simulated time [s]. If None, HORIZON, or the longest time at which the error can be measured, if
+            that is shorter.
         time_limit: wall-time limit of a simulation [s].
         results: folder that contains a folder for each config.
         display: shows progress.
-        print_message: prints a remark.
+        say: prints a remark.
         budget: limit for the wall time of all measurements together [s].
 
     Raises:

@@ -45,9 +45,9 @@ def record(
 
     Args:
         spec: the curves of the solver.
-        step: the step snapshot.
+        graded: the step snapshot.
         scene: the scene.
-        initial_guess: name of the initial guess.
+        first_guess: name of the initial guess.
         curve: the scored iterates.
         folder: folder of the results.
 

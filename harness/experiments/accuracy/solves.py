@@ -42,9 +42,9 @@ class GradedStep:
 
     Attributes:
         case: scene, size and integrator.
-        snapshot_name: name of the snapshot, as in the rows.
-        step_snapshot: the problem of the step.
-        reference_store: store of the reference solutions.
+        moment: name of the snapshot, as in the rows.
+        frozen: the problem of the step.
+        store: store of the reference solutions.
     """
 
     case: Case
@@ -58,8 +58,8 @@ class GradedStep:
 
         Args:
             case: scene, size and integrator.
-            snapshot_name: name of the snapshot, or number of the frame.
-            reference_store: store of the reference solutions.
+            moment: name of the snapshot, or number of the frame.
+            store: store of the reference solutions.
         """
         scene, size, integrator = case.scene, case.size, case.integrator
         if isinstance(moment, int):
@@ -154,8 +154,8 @@ def curve_rows(spec: CurveSpec, graded: GradedStep, folder: Path, tick: Callable
 
     Args:
         spec: the curves of the solver.
-        step: the step snapshot.
-        results_folder: folder of the config's results.
+        graded: the step snapshot.
+        folder: folder of the config's results.
         tick: called after each curve.
     """
     solver: Solver = load(EVERY[spec.solver.name])(**spec.solver.parameters)

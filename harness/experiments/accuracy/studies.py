@@ -29,7 +29,7 @@ from harness.reference.self_converged import told_once, touches
 
 @dataclass(frozen=True, slots=True)
 class _Planned:
-    """Unit and its completion status (`harness.experiments.completion_status.PlannedUnit`)."""
+    """Unit and its completion status (`harness.experiments.resume.Planned`)."""
 
     unit: CurveUnit | WorkUnit
     standing: Standing
@@ -57,10 +57,10 @@ def run_accuracy(
         accuracy: the accuracy config.
         folder: folder of its results; the reference solutions for all configs are stored next to it.
         display: shows progress.
-        print_message: prints a remark.
-        rerun: whether to repeat all units.
-        rerun_stale: whether to repeat units measured by other source code.
-        isolated: see `harness.experiments.experiment_units.execute_units`.
+        say: prints a remark.
+        again: whether to repeat all units.
+        changed: whether to repeat units measured by other source code.
+        isolated: see `harness.experiments.core.do_all`.
 
     Raises:
         InputError: the input is invalid.
@@ -87,7 +87,7 @@ def measuring(work: Sequence[WorkSpec], folder: Path, display: Display) -> Gener
 
     Args:
         work: the simulations that may be measured.
-        folder: folder of the results, as in `run_accuracy_study`.
+        folder: folder of the results, as in `run_accuracy`.
         display: shows progress.
 
     Raises:

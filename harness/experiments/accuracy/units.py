@@ -1,6 +1,6 @@
 """Step snapshots, curves and simulations as units of an accuracy config.
 
-Each is a `harness.experiments.experiment_units.ExperimentUnit`. It writes a Parquet file under `<folder>/accuracy` once
+Each is a `harness.experiments.core.Unit`. It writes a Parquet file under `<folder>/accuracy` once
 the whole unit is measured.
 """
 
@@ -131,7 +131,7 @@ def _write_step(path: Path, home: Home, found: Sequence[Row]) -> None:
 class CurveUnit:
     """Unit that measures the curves of one solver on one step.
 
-    `snapshot_row` is the first row of the step's file.
+    `step` is the first row of the step's file.
     """
 
     spec: CurveSpec
@@ -279,7 +279,7 @@ def trajectory_of(spec: WorkSpec, store: Store) -> Trajectory | Exception:
 
     Args:
         spec: the simulation.
-        reference_store: store of the reference solutions.
+        store: store of the reference solutions.
     """
     try:
         return store.trajectory(spec.case.scene, spec.case.size, [spec.horizon], error=1.0)

@@ -92,7 +92,7 @@ def _run(
 
     Return the last positions (n, 3) [m], the number of iterations and timing columns.
 
-    `time_limit` is in seconds; that of the spec if left out. Raises RunFailed where another clock disagrees.
+    `limit` is in seconds; that of the spec if left out. Raises RunFailed where another clock disagrees.
     """
     seconds, iterations, p, watch = 0.0, 0, scene.mesh.rest, Watch(spec.how.threads)
     clock = Clock(watch)

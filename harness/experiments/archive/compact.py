@@ -6,9 +6,8 @@ Readers get the same rows before and after.
 
 The packed file is written under a partial name, including the rows that were packed before. It is compared with the
 originals, which an independent reader reads file by file, and renamed. Then the units' own files are removed. Readers
-prefer a unit's own file to its packed rows (`harness.results.row_store`). An interruption therefore leaves, at any
-moment,
-all rows visible exactly once, and the next call completes the work.
+prefer a unit's own file to its packed rows (`harness.base.shelf`). An interruption therefore leaves, at any
+moment, all rows visible exactly once, and the next call completes the work.
 """
 
 from __future__ import annotations
@@ -42,8 +41,8 @@ def compact(results: Path, say: Callable[[str], None], *, days: float = 0.0) -> 
 
     Args:
         results: folder of results, or of one sweep.
-        print_message: called with a remark on each folder.
-        min_age_days: smallest age of a unit's file [days].
+        say: called with a remark on each folder.
+        days: smallest age of a unit's file [days].
 
     Raises:
         InputError: there are no rows, a sweep is running, or the schemas of rows do not match.

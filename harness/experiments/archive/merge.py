@@ -42,12 +42,12 @@ class Merged:
     """Result of a merge.
 
     Attributes:
-        num_written: units written.
-        num_existing: units that existed already.
+        written: units written.
+        known: units that existed already.
         conflicts: descriptions of runs with the same machine and source code that end at different positions.
-        cross_machine_differences: descriptions of such runs across machines or source codes, whose last bits may
+        others: descriptions of such runs across machines or source codes, whose last bits may
             differ.
-        machine_summary: all machines, and what may be compared across them.
+        machines: all machines, and what may be compared across them.
     """
 
     written: int
@@ -76,8 +76,8 @@ def merge(sources: Sequence[Path], into: Path, say: Callable[[str], None]) -> Me
 
     Args:
         sources: folders of results, or of sweeps.
-        target: folder for the merged results.
-        print_message: prints a remark.
+        into: folder for the merged results.
+        say: prints a remark.
 
     Raises:
         InputError: a folder has no rows, one contains another, sweeps and folders of several sweeps are mixed, rows are
@@ -216,7 +216,7 @@ def _conflicts(folders: Sequence[Path]) -> tuple[list[str], list[str], list[str]
 
 
 def _differing(units: Sequence[Path], read: pa.Table | None = None) -> tuple[list[str], list[str], list[str]]:
-    """Query the conflicts; DuckDB reads the units unless `table` has their rows. Raises SchemaMismatch."""
+    """Query the conflicts; DuckDB reads the units unless `read` has their rows. Raises Unfit."""
     asked = ", ".join(f'"{name}"' for name in ASKED)
     with union.connected() as connection:
         if read is None:

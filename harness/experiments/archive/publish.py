@@ -57,8 +57,8 @@ def publish(results: Path, archive: Path, say: Callable[[str], None], *, license
     Args:
         results: folder of results, or of one sweep.
         archive: archive to write.
-        print_message: prints a remark.
-        license_text: license of the results, a name or a URL.
+        say: prints a remark.
+        license: license of the results, a name or a URL.
 
     Raises:
         InputError: rows are damaged, or files lie outside of the folders.

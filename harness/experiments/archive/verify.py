@@ -2,10 +2,10 @@
 
 All checksums are compared, and the names and options of all runs with those of their configs. Then a random tenth of
 the runs is repeated here, each with another solver's run on the same scene and size. Positions after every step, and
-all columns except IRREPRODUCIBLE_COLUMNS, must be bitwise identical. A step's time must match the published one within
-a factor of MAX_SECONDS_RATIO. The ratio of the two solvers' times is compared step by step
-(`harness.results.bootstrap_statistics.estimate_slowdown`). It must match within MAX_RATIO_SAME_MACHINE on the published
-machine type, within MAX_RATIO_OTHER_MACHINE on others. With another machine, other libraries or other source code, a
+all columns except UNREPEATED, must be bitwise identical. A step's time must match the published one within
+a factor of SECONDS. The ratio of the two solvers' times is compared step by step
+(`harness.base.statistics.changed`). It must match within RATIO on the published
+machine type, within ELSEWHERE on others. With another machine, other libraries or other source code, a
 difference is inconclusive. So is a run that no config requests.
 """
 
@@ -187,8 +187,8 @@ def published(folder: Path, say: Callable[[str], None], *, own_code: bool) -> tu
 
     Args:
         folder: the unpacked archive.
-        print_message: prints a remark.
-        with_user_code: whether to include runs that need code from the archive.
+        say: prints a remark.
+        own_code: whether to include runs that need code from the archive.
 
     Returns: the runs, and failed or inconclusive claims on the names of runs.
     """
@@ -263,7 +263,7 @@ def _runs(config: Path, given: str, opens: bool) -> list[RunSpec]:
 
     The result is empty if they are invalid.
 
-    `imports_code` states whether code that the config names is imported.
+    `opens` states whether code that the config names is imported.
     """
     key = config, given, opens
     if key not in _LOADED:
@@ -297,7 +297,7 @@ def chosen(runs: Sequence[Published], seed: int, part: float = 0.1) -> list[Publ
     Args:
         runs: runs of the archive.
         seed: seed of the selection.
-        fraction: fraction of the runs.
+        part: fraction of the runs.
     """
     chance = random.Random(seed)
     taken = chance.sample(list(runs), max(1, math.ceil(part * len(runs)))) if runs else []
@@ -323,7 +323,7 @@ def compare(runs: Sequence[Published], new: Sequence[list[Row]]) -> list[Claim]:
 
     Args:
         runs: published runs.
-        rerun_rows: rows of the repetition of each.
+        new: rows of the repetition of each.
     """
     claims: list[Claim] = []
     for one, here in zip(runs, new, strict=True):

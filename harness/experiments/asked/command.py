@@ -56,16 +56,16 @@ def run_to_error(
 
     Args:
         config: file of the scene.
-        error: relative error at t_end.
+        error: relative error at horizon.
         results: folder of results.
-        print_message: prints a remark.
-        t_end: simulated time [s]; that of the scene if None.
+        say: prints a remark.
+        horizon: simulated time [s]; that of the scene if None.
         sizes: mesh sizes, at most one.
-        verify: whether to compare with the reference solution.
-        compare_third_party: whether to time third-party integrators too.
+        check: whether to compare with the reference solution.
+        peers: whether to time third-party integrators too.
         positions: where to store the positions of the frames; None for not at all.
-        rerun: whether to try all methods, even those that were expensive according to stored rows.
-        rejected_options: other options on the command line, which are not supported here.
+        again: whether to try all methods, even those that were expensive according to stored rows.
+        others: other options on the command line, which are not supported here.
 
     Returns: whether the verification passes; True without verification.
 

@@ -31,16 +31,16 @@ class Met:
     """Measured result of a performance target.
 
     Attributes:
-        target: the performance target.
+        asked: the performance target.
         size: size of the mesh.
         vertices: number of vertices.
-        method: name of the cheapest method.
-        error_estimated: its estimated error.
+        way: name of the cheapest method.
+        estimated: its estimated error.
         seconds: its CPU time [s].
-        baseline: name of the baseline.
-        baseline_error: error of the baseline.
-        baseline_seconds: CPU time of the baseline [s].
-        is_lower_bound: whether the baseline would take longer than baseline_seconds.
+        other: name of the baseline.
+        other_error: error of the baseline.
+        other_seconds: CPU time of the baseline [s].
+        bound: whether the baseline would take longer than other_seconds.
         error: error of the method against the reference solution; None where the target is not graded.
         note: why the method is much more accurate than requested; empty otherwise.
         reason: why there is no result; empty if there is one.
@@ -64,7 +64,7 @@ class Met:
     def ratio(self) -> float:
         """CPU time of the method divided by that of the baseline.
 
-        It is an upper bound if `is_lower_bound`.
+        It is an upper bound if `bound`.
         """
         return self.seconds / self.other_seconds
 
@@ -85,9 +85,9 @@ def met(goals: Goals, store: Store, say: Callable[[str], None]) -> Iterator[Met]
     """Measure the targets one after the other; a failure is reported as `reason`.
 
     Args:
-        targets: the performance targets.
-        reference_store: store of the reference solutions.
-        print_message: prints a remark.
+        goals: the performance targets.
+        store: store of the reference solutions.
+        say: prints a remark.
     """
     for one in goals.goals:
         say(f"{one.scene} {one.size or ''} to {one.error:g} after {one.goal.horizon:g} s:")

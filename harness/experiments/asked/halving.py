@@ -28,8 +28,8 @@ class Halved:
     """Step-doubling estimate.
 
     Attributes:
-        time_step: last step size that was halved [s].
-        relative_change: change of the end positions by that, relative to the displacement; None if time ran out first.
+        step: last step size that was halved [s].
+        moved: change of the end positions by that, relative to the displacement; None if time ran out first.
     """
 
     step: float
@@ -45,10 +45,10 @@ def halved(bound: Callable[[float, str], Scene], horizon: float, frames: int, *,
     """Halve the step size within a time budget, and return the last change.
 
     Args:
-        build_scene: returns the scene for a time step [s] and an integrator by name.
-        t_end: simulated time [s].
+        bound: returns the scene for a time step [s] and an integrator by name.
+        horizon: simulated time [s].
         frames: number of steps to start with.
-        time_budget: wall time [s].
+        seconds: wall time [s].
     """
     _end(bound(horizon / frames, "implicit-euler"), 1, inf)  # compiles
     began, before, found = perf_counter(), None, Halved(horizon / frames, None)

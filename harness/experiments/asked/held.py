@@ -4,7 +4,7 @@ A baseline is a third-party integrator, or the cheapest fixed step size for the 
 
 Step sizes are divided by sqrt(2) until the error at the end is at most the requested one, for each integrator, solver
 and tolerance. The best combination is thus known in hindsight. Where none reaches the error within
-`MAX_SIMULATION_SECONDS`, the baseline is a lower bound of the cost.
+`LONGEST`, the baseline is a lower bound of the cost.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class Held:
         name: name of the baseline.
         error: its relative error.
         seconds: its CPU time [s].
-        is_lower_bound: whether it misses the error, so that reaching it would take longer.
-        rerun_timed: repeats the simulation and returns its CPU seconds; None where that is not possible.
+        bound: whether it misses the error, so that reaching it would take longer.
+        again: repeats the simulation and returns its CPU seconds; None where that is not possible.
     """
 
     name: str
@@ -75,11 +75,11 @@ def held(one: OneGoal, asked: Asked, answer: Answer, error: Error, say: Callable
     """Measure the baseline of a performance target.
 
     Args:
-        performance_target: the target.
-        error_target: the scene and its end time.
-        search_result: result of the method search.
+        one: the target.
+        asked: the scene and its end time.
+        answer: result of the method search.
         error: returns the error of end positions.
-        print_message: prints a remark.
+        say: prints a remark.
 
     Raises:
         RunFailed: no baseline can be measured.

@@ -29,10 +29,10 @@ class Kept:
 
     Attributes:
         scene: the scene, built with the frame as its time step.
-        search_result: method, setting and error estimate.
-        error_requested: requested relative error.
-        timed_trajectories: the same motion, timed again in each round.
-        messages: remarks, stored in the rows.
+        answer: method, setting and error estimate.
+        asked: requested relative error.
+        rounds: the same motion, timed again in each round.
+        said: remarks, stored in the rows.
     """
 
     scene: Scene

@@ -47,7 +47,7 @@ def promising(found: Sequence[Row], error: float) -> tuple[float, list[tuple[str
     """Return the stored error nearest to `error`, and the methods cheap at it.
 
     Args:
-        stored_trials: rows of earlier trials.
+        found: rows of earlier trials.
         error: relative error to reach.
 
     Returns: the nearest error, and integrators with solvers; none where no stored error is similar.
@@ -67,8 +67,8 @@ def way_rows(answer: Answer, found: Iterable[Row], error: float) -> list[Row]:
     Stored trials of the same error are added.
 
     Args:
-        search_result: result of the search.
-        stored_trials: rows of earlier trials; methods that were run again are left out.
+        answer: result of the search.
+        found: rows of earlier trials; methods that were run again are left out.
         error: requested error.
     """
     made = [

@@ -30,12 +30,12 @@ class InitialValueProblem(NamedTuple):
     """Initial value problem y' = F(t, y), y = (positions, velocities).
 
     Attributes:
-        vector_field: the function F.
-        initial_state: y at time 0.
+        field: the function F.
+        start: y at time 0.
         scene: scene that the equations belong to.
-        t_end: end time [s].
-        rtol: relative tolerance of y.
-        atol: absolute tolerance of y [m, m/s].
+        until: end time [s].
+        relative: relative tolerance of y.
+        absolute: absolute tolerance of y [m, m/s].
     """
 
     field: Callable[[float, State], State]
@@ -52,10 +52,10 @@ class Library:
 
     Attributes:
         order: approximate order of its error.
-        integrate_to_end: returns the state at t_end; raises RunFailed.
-        uses_compiled_forces: whether the forces are compiled.
+        end: returns the state at until; raises RunFailed.
+        compiled: whether the forces are compiled.
         module: module that it needs; empty if it is always installed.
-        pip_extra: extra that installs the module.
+        extra: extra that installs the module.
     """
 
     order: int

@@ -32,11 +32,11 @@ class Peer:
 
     Attributes:
         name: name of the integrator.
-        error_estimated: estimated relative error.
-        wall_seconds: wall time [s].
-        cpu_time_ratio: CPU time divided by that of the search result, both including preparation.
+        estimated: estimated relative error.
+        seconds: wall time [s].
+        ratio: CPU time divided by that of the search result, both including preparation.
         reason: why there is no result; empty if there is one.
-        cpu_seconds: CPU time [s].
+        processor: CPU time [s].
     """
 
     name: str
@@ -52,10 +52,10 @@ def peers(asked: Asked, error: float, answer: Answer, names: Iterable[str] = LIB
     """Measure third-party integrators one after the other; a failure is reported as `reason`.
 
     Args:
-        error_target: the scene and its end time.
+        asked: the scene and its end time.
         error: relative error to reach.
-        search_result: result to compare with.
-        names: integrators in THIRD_PARTY_INTEGRATORS.
+        answer: result to compare with.
+        names: integrators in LIBRARIES.
 
     Raises:
         Unintegrable: the scene has no equations of motion.
@@ -71,7 +71,7 @@ def peers(asked: Asked, error: float, answer: Answer, names: Iterable[str] = LIB
 
 @dataclass(frozen=True, eq=False)
 class _Beside:
-    """Comparison of one search result; `own_cpu_seconds` is the CPU time of its best trial."""
+    """Comparison of one search result; `ours` is the CPU time of its best trial."""
 
     asked: Asked
     error: float

@@ -34,7 +34,7 @@ _AIM_EVEN = 0.85
 WIDE = 1 / 3
 """Smallest fraction of the target error that is accepted if a cheaper setting is stable.
 
-Estimated errors are compared with ESTIMATE_SAFETY times this fraction.
+Estimated errors are compared with DOUBT times this fraction.
 """
 CLOSER = 1 / 50
 """Local error of the reference trial, as a fraction of that of the trial."""
@@ -62,10 +62,10 @@ class Found:
     """Run of a method at one setting.
 
     Attributes:
-        method: the method.
+        way: the method.
         setting: setting of its stepper.
-        trajectory: the computed motion.
-        error_estimated: estimated relative error.
+        path: the computed motion.
+        estimated: estimated relative error.
         order: order at which the error decreases with the step size: that of the method, or less if two settings show
             it.
     """
@@ -103,11 +103,11 @@ class Answer:
     """Result of a search.
 
     Attributes:
-        best_trial: cheapest trial that meets the error.
-        trials: first trials of all methods with the CPU seconds predicted for the target error, cheapest first.
-        step_atol: tolerance of the first trials [m].
-        reference_trial: trial from which errors are estimated.
-        search_seconds: wall time of everything except the best trial.
+        best: cheapest trial that meets the error.
+        tried: first trials of all methods with the CPU seconds predicted for the target error, cheapest first.
+        tolerance: tolerance of the first trials [m].
+        closer: trial from which errors are estimated.
+        seconds: wall time of everything except the best trial.
         note: why the best trial is much more accurate than requested; empty otherwise.
     """
 
@@ -134,9 +134,9 @@ def foresee(asked: Asked, error: float, say: Callable[[str], None]) -> Growth:
     The smallest error that can be reached is printed.
 
     Args:
-        error_target: the scene and its end time.
-        max_error: relative error to reach.
-        print_message: prints a remark.
+        asked: the scene and its end time.
+        error: relative error to reach.
+        say: prints a remark.
 
     Raises:
         Unpredictable: the error cannot be reached at t_end (the message states one that can), or nothing moves.
@@ -157,14 +157,14 @@ def search(
     say: Callable[[str], None],
     pairs: Sequence[tuple[str, SolverSpec]] = (),
 ) -> Answer:
-    """Find the cheapest method whose relative error at t_end is at most `max_error`.
+    """Find the cheapest method whose relative error at t_end is at most `error`.
 
     Args:
-        error_target: the scene and its end time.
-        max_error: relative error to reach.
-        growth: growth of perturbations (`compute_predictability_horizon`).
-        print_message: prints a remark.
-        candidates: integrators and solvers to try; the default candidates if empty.
+        asked: the scene and its end time.
+        error: relative error to reach.
+        seen: growth of perturbations (`foresee`).
+        say: prints a remark.
+        pairs: integrators and solvers to try; the default candidates if empty.
 
     Raises:
         RunFailed: no method reaches the error.

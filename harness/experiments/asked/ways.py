@@ -39,8 +39,8 @@ class Asked:
     Attributes:
         scene: the scene.
         size: size of the mesh.
-        t_end: simulated time [s].
-        num_frames: number of frames of equal length up to t_end.
+        horizon: simulated time [s].
+        frames: number of frames of equal length up to horizon.
     """
 
     scene: SceneSpec
@@ -59,8 +59,8 @@ class Asked:
         Args:
             scene: the scene.
             size: size of the mesh; the scene's default if None.
-            t_end: simulated time [s]; that of the scene if None.
-            print_message: prints a remark.
+            horizon: simulated time [s]; that of the scene if None.
+            say: prints a remark.
 
         Raises:
             InputError: the size or the time step does not fit the scene.
@@ -111,10 +111,8 @@ def tried() -> list[tuple[str, SolverSpec]]:
     """Return the integrators (by name) and solvers that a search tries by default.
 
     Solvers with their own adaptive integrator come first. The others are solvers that minimise the step's objective.
-    They
-    are combined with the embedded Runge-Kutta integrator of the highest order, and among equals of the highest stage
-    order.
-    They are also combined with the one-step integrator of fixed step size that has the highest order.
+    They are combined with the embedded Runge-Kutta integrator of the highest order, and among equals of the highest
+    stage order. They are also combined with the one-step integrator of fixed step size that has the highest order.
     """
     pairs = {name: one for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded}
     best = max(pairs, key=lambda name: (pairs[name].order, pairs[name].starts))
@@ -144,9 +142,9 @@ def ways(asked: Asked, say: Callable[[str], None], pairs: Sequence[tuple[str, So
     """Return the methods that support the scene, warmed up so that timings exclude compilation.
 
     Args:
-        error_target: the scene and its end time.
-        print_message: prints the methods that do not support the scene, with the reason.
-        candidates: integrators and solvers; `list_candidate_methods` if empty.
+        asked: the scene and its end time.
+        say: prints the methods that do not support the scene, with the reason.
+        pairs: integrators and solvers; `tried` if empty.
 
     Raises:
         RunFailed: no method supports the scene.

@@ -5,7 +5,7 @@ detects any difference between two running programs. Two programs of the same co
 of their data (Mytkowicz et al. 2009). Between blocks the work of both is therefore rebuilt at other addresses, in an
 eighth of the time (after Curtsinger and Berger 2013). The effect of the layout becomes noise with many samples.
 Properties that a process has all its life, such as the addresses of its compiled code, become noise likewise: both
-programs are restarted every RESTART_SECONDS. A slowdown is reported only if a second benchmark, with restarted
+programs are restarted every PAIR. A slowdown is reported only if a second benchmark, with restarted
 programs, confirms it. The first benchmark alone excludes chance, so the second needs fewer blocks. The guarantee of the
 test is for the ratio of one pair of processes. For several pairs it is valid only as far as their ratios agree; the
 study measures the error rate for these.
@@ -58,7 +58,7 @@ class Racers:
     """Two programs after warm-up.
 
     a, b: perform the work once and return its time [s].
-    rebuild_work: rebuilds the work of both at other addresses and warms it up; None if that is impossible.
+    renew: rebuilds the work of both at other addresses and warms it up; None if that is impossible.
     """
 
     a: Timed
@@ -110,13 +110,13 @@ class Turn:
 class Result:
     """Result of a performance test.
 
-    verdict: decision of the sequential test.
-    sequential_test: the test, with its limit and error probability.
+    answer: decision of the sequential test.
+    rule: the test, with its limit and error probability.
     interval: estimated ratio of times, with its confidence interval.
-    blocks: all timed blocks.
-    elapsed_seconds: duration of the blocks [s].
-    load_average: load average of the machine at the end.
-    num_process_pairs: number of pairs of started programs, one every RESTART_SECONDS and those of the confirmation.
+    turns: all timed blocks.
+    elapsed: duration of the blocks [s].
+    load: load average of the machine at the end.
+    starts: number of pairs of started programs, one every PAIR and those of the confirmation.
     """
 
     answer: Verdict
@@ -155,11 +155,11 @@ def race(
     """Time both programs, after warm-up, until the test decides or the budget ends.
 
     Args:
-        programs: the two programs.
-        sequential_test: test on the ratio A / B.
-        time_budget: seconds.
-        rng: chooses the orders; by default the system's random source, which no other program can follow.
-        earlier_blocks: blocks of earlier processes of the same programs, which count too.
+        racers: the two programs.
+        rule: test on the ratio A / B.
+        budget: seconds.
+        coin: chooses the orders; by default the system's random source, which no other program can follow.
+        before: blocks of earlier processes of the same programs, which count too.
     """
     game = playing(racers.b, rule, budget=budget, coin=coin, renew=racers.renew, before=before)
     next(game)
@@ -185,11 +185,11 @@ def playing(
 
     Args:
         b: times one call of B.
-        sequential_test: test on the ratio A / B.
-        time_budget: seconds.
-        rng: chooses the orders.
-        rebuild_work: rebuilds the work of both programs.
-        earlier_blocks: blocks of earlier processes of the same programs, which count too.
+        rule: test on the ratio A / B.
+        budget: seconds.
+        coin: chooses the orders.
+        renew: rebuilds the work of both programs.
+        before: blocks of earlier processes of the same programs, which count too.
     """
     began, turns, renewing = perf_counter(), list(before), Renewing(renew)
     for order in orders(coin):
@@ -215,8 +215,8 @@ def result(rule: Rule, turns: list[Turn], elapsed: float) -> Result:
     """Build the result of at least one block.
 
     Args:
-        sequential_test: test on the ratio A / B.
-        blocks: all blocks so far.
+        rule: test on the ratio A / B.
+        turns: all blocks so far.
         elapsed: their duration [s].
     """
     x = [t.log_ratio for t in turns]
@@ -224,15 +224,15 @@ def result(rule: Rule, turns: list[Turn], elapsed: float) -> Result:
 
 
 def confirmed(start: Start, rule: Rule, *, budget: float = BUDGET) -> Result:
-    """Benchmark programs that are restarted every RESTART_SECONDS, and confirm a failure with other processes.
+    """Benchmark programs that are restarted every PAIR, and confirm a failure with other processes.
 
-    The confirmation has an error probability of its own, CONFIRMATION_ALPHA. If it disagrees, the result is
+    The confirmation has an error probability of its own, CONFIRMS. If it disagrees, the result is
     inconclusive.
 
     Args:
-        start_programs: starts both programs.
-        sequential_test: test on the ratio A / B.
-        time_budget: seconds of both benchmarks together, without the starts of programs.
+        start: starts both programs.
+        rule: test on the ratio A / B.
+        budget: seconds of both benchmarks together, without the starts of programs.
     """
     first = _raced(start, rule, budget)
     if first.answer is not Verdict.FAILS:

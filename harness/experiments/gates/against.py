@@ -31,7 +31,7 @@ class Request:
     """Work that both revisions prepare.
 
     title: description in messages.
-    command: request of `revision_worker.py`, with its arguments.
+    do: request of `revision_worker.py`, with its arguments.
     config: file of the run, in each revision's version; None for a performance test of the checkout.
     """
 
@@ -46,7 +46,7 @@ class Options:
     """Options of a comparison.
 
     budget: seconds per test.
-    max_ratio: ratio of times from which the checkout counts as slower.
+    limit: ratio of times from which the checkout counts as slower.
     alpha: error probability of all tests of a command together.
     clock: cpu or wall; None selects it by the work.
     """
@@ -63,9 +63,9 @@ def requests_of_config(sides: Sequence[Side], config: Path, asked: dict[str, Any
     Both revisions must list the same runs.
 
     Args:
-        revisions: the two revisions.
+        sides: the two revisions.
         config: file of the scene or sweep.
-        options: options of the runs.
+        asked: options of the runs.
     Raises:
         InputError: if a revision fails, or if the lists differ.
     """
@@ -83,7 +83,7 @@ def requests_of_gates(sides: Sequence[Side], name: str) -> list[Request]:
     """Build a request for each performance test of the checkout whose name contains `name`.
 
     Args:
-        revisions: the two revisions.
+        sides: the two revisions.
         name: part of the names.
     Raises:
         InputError: if no test matches, or if one revision lacks it.
@@ -105,10 +105,10 @@ def run_gates(
     """Benchmark this checkout against the revision, and print each result at once.
 
     Args:
-        revisions: this checkout, then the revision.
+        sides: this checkout, then the revision.
         requests: work to compare.
         options: limits of the comparison.
-        print_message: receives one line per result.
+        say: receives one line per result.
     Raises:
         InputError: if the work fails, or if the answers differ.
     """
@@ -136,10 +136,10 @@ def started(
     Each runs in its own process.
 
     Args:
-        revisions: this checkout, then the revision.
+        sides: this checkout, then the revision.
         request: work to prepare.
         options: limits of the comparison.
-        print_message: receives differences of deterministic counts.
+        say: receives differences of deterministic counts.
     Yields: the two programs.
     Raises:
         InputError: if the work fails, or if the answers differ.
@@ -163,7 +163,7 @@ def started(
 
 
 def _held(alive: Sequence[RevisionProcess], request: Request, frames: int) -> list[HeldWork]:
-    """Prepare the request's work in both processes; for a run it has num_frames steps."""
+    """Prepare the request's work in both processes; for a run it has frames steps."""
     held: list[HeldWork] = []
     for worker in alive:
         more: dict[str, Any] = {}

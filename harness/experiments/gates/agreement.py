@@ -17,7 +17,7 @@ def difference(new: ArrayLike, old: ArrayLike, tolerance: float = AGREEMENT) -> 
     Args:
         new: points (n, d), or an array of any other shape.
         old: baseline of the same shape.
-        rtol: tolerance relative to the size of `old`, its largest extent along an axis; 0 requires equal numbers.
+        tolerance: tolerance relative to the size of `old`, its largest extent along an axis; 0 requires equal numbers.
     """
     now, was = np.asarray(new, float), np.asarray(old, float)
     if now.shape != was.shape:

@@ -1,7 +1,7 @@
 """Hardware counter of retired instructions, which other programs do not affect.
 
 The counter is that of perf (`perf_event_open`, Linux). It counts the instructions of this thread in user mode. Many
-virtual machines hide it, and a kernel with `perf_event_paranoid` above 2 denies it; `explain_unavailable` describes the
+virtual machines hide it, and a kernel with `perf_event_paranoid` above 2 denies it; `reason` describes the
 cause. The module needs only the standard library, so that a worker can load it in any environment.
 """
 

@@ -83,7 +83,7 @@ def run_table(path: Path, budget: float, say: Callable[[str], None], alpha: floa
     Args:
         path: the table.
         budget: seconds of a test without a budget of its own.
-        print_message: receives one line per result.
+        say: receives one line per result.
         alpha: error probability of all tests together.
     Raises:
         InputError: for a mistake in the table, or if the answers differ.

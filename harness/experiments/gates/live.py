@@ -52,11 +52,11 @@ def hold(
         path: Parquet file of the results.
         checkout: folder of the checkout.
         requests: work to test.
-        background_load: "nothing", "busy" or "bursty".
+        condition: "nothing", "busy" or "bursty".
         options: limits of each test.
-        num_repeats: number of tests of each request.
-        injected_slowdown: extra work of the candidate, as a fraction of its iterations.
-        print_message: receives one line per result.
+        gates: number of tests of each request.
+        planted: extra work of the candidate, as a fraction of its iterations.
+        say: receives one line per result.
     """
     found = rows.read([path], SCHEMA).to_pylist() if path.exists() else []
     sides = Side("the one", checkout, extra=planted), Side("the other", checkout)

@@ -28,10 +28,10 @@ class Side:
     """A git revision that can be run.
 
     name: name in messages.
-    worktree: folder of its files.
-    interpreter: its Python interpreter.
+    tree: folder of its files.
+    python: its Python interpreter.
     checkout: folder that the revision belongs to.
-    injected_slowdown: artificial extra work, as a fraction of its own.
+    extra: artificial extra work, as a fraction of its own.
     """
 
     name: str
@@ -56,9 +56,9 @@ class HeldWork:
     """Work that a process has prepared.
 
     answer: result of the work.
-    stats: deterministic counts.
+    facts: deterministic counts.
     clock: clock that suits the work.
-    num_frames: number of steps, 0 if the work has none.
+    frames: number of steps, 0 if the work has none.
     """
 
     answer: NDArray[np.float64]
@@ -87,8 +87,8 @@ class RevisionProcess:
         """Send a request and return its answer.
 
         Args:
-            command: name of the request.
-            arguments: its arguments, which JSON can represent.
+            do: name of the request.
+            asked: its arguments, which JSON can represent.
         Raises:
             InputError: with the worker's message, or if its process has ended.
         """
@@ -122,7 +122,7 @@ class RevisionProcess:
         """Time calls of the work together.
 
         Args:
-            num_calls: number of calls.
+            calls: number of calls.
             clock: cpu or wall.
         Returns: seconds.
         """

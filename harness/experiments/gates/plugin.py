@@ -58,17 +58,17 @@ class Race:
     ) -> Result | None:
         """Fail the test if the candidate is too slow compared with the baseline.
 
-        It may take at most max_ratio times as long.
+        It may take at most limit times as long.
 
         Args:
             candidate: function without arguments.
-            baseline: function without arguments.
-            max_ratio: limit of the ratio of times.
+            yardstick: function without arguments.
+            limit: limit of the ratio of times.
             clock: "cpu" for the CPU time of the process, "wall" for elapsed time.
-            agreement_rtol: tolerance of the difference of the answers, relative to their size; None if there are none.
+            agree: tolerance of the difference of the answers, relative to their size; None if there are none.
             budget: seconds; --race-budget by default.
-            alpha: probability of a wrong verdict; 0.1 % by default.
-            extra_info: stored in the benchmark's JSON.
+            error: probability of a wrong verdict; 0.1 % by default.
+            told: stored in the benchmark's JSON.
         Returns: the result, or None if nothing is timed.
         """
         from harness.experiments.gates.abba import playing
@@ -128,9 +128,9 @@ class Race:
         Args:
             scene: file of the scene, relative to the test's file.
             solver: the candidate: a name, a mapping of name and parameters, or a solver object.
-            baseline: solver to compare with, in the same form.
-            max_ratio: limit of the ratio of times.
-            agreement_rtol: tolerance of the difference of the positions, relative to the scene's size.
+            against: solver to compare with, in the same form.
+            limit: limit of the ratio of times.
+            agree: tolerance of the difference of the positions, relative to the scene's size.
             clock: "cpu" or "wall".
             budget: seconds; --race-budget by default.
             size: mesh size; the scene's default if omitted.

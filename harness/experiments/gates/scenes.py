@@ -55,7 +55,7 @@ def pair(scene: Path, solver: Given, against: Given, *, size: int | None = None,
     Args:
         scene: file of the scene.
         solver: the candidate.
-        baseline: solver to compare with.
+        against: solver to compare with.
         size: mesh size; the scene's default if omitted.
         options: options of a run, such as iterations and tolerance.
     Raises: InputError, Unsupported, NotPositiveDefinite.
@@ -97,7 +97,7 @@ def timed(work: Work, calls: int, clock: Clock) -> Timed:
 
     Args:
         work: function to time.
-        num_calls: number of calls.
+        calls: number of calls.
         clock: "cpu" or "wall".
     """
     now = CLOCKS[clock]

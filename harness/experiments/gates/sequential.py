@@ -66,13 +66,13 @@ class RatioInterval:
 class Rule:
     """Sequential test of whether a ratio of times exceeds a limit.
 
-    It stops when the ratio lies entirely above `max_ratio` (fail) or below it (pass).
+    It stops when the ratio lies entirely above `limit` (fail) or below it (pass).
 
-    max_ratio: limit of the ratio of times.
+    limit: limit of the ratio of times.
     alpha: probability of a wrong decision.
 
     Raises:
-        ValueError: for an invalid max_ratio or alpha.
+        ValueError: for an invalid limit or alpha.
     """
 
     limit: float
@@ -95,7 +95,7 @@ class Rule:
     def first(self, log_ratios: ArrayLike) -> tuple[Verdict, int]:
         """Find the first decision when the test is evaluated after every block.
 
-        It equals `decide_verdict` block by block, but takes one pass, for a replay of many recorded samples.
+        It equals `judge` block by block, but takes one pass, for a replay of many recorded samples.
 
         Args:
             log_ratios: log ratios of the blocks (n,).

@@ -2,7 +2,7 @@
 
 A record has the four times of each block of two processes of the same code, for several process pairs. A replay draws
 stretches of successive blocks, so that bursts of load are preserved, and concatenates them up to the budget. It
-multiplies the candidate's times by the slowdown and evaluates the test after every block. Every RESTART_SECONDS it
+multiplies the candidate's times by the slowdown and evaluates the test after every block. Every PAIR it
 continues with the blocks of another process pair. It confirms failures with further blocks, as the test itself does.
 """
 
@@ -56,8 +56,8 @@ class PairTurns:
 
     log_ratios: (n,).
     a, b: times of A and of B (n, 2) [s].
-    wall_seconds: mean wall time of a block [s].
-    load_average: median load average of the machine.
+    wall: mean wall time of a block [s].
+    load: median load average of the machine.
     """
 
     log_ratios: Array
@@ -95,10 +95,10 @@ def record(
         path: Parquet file of the blocks.
         checkout: folder of the checkout, which both programs run.
         requests: work to record.
-        background_load: "nothing", "busy" or "bursty".
-        duration: total time [s].
-        num_process_pairs: number of starts of both processes.
-        injected_slowdown: extra work of A, as a fraction of its iterations.
+        condition: "nothing", "busy" or "bursty".
+        seconds: total time [s].
+        starts: number of starts of both processes.
+        planted: extra work of A, as a fraction of its iterations.
     """
     found = rows.read([path], SCHEMA).to_pylist() if path.exists() else []
     first = max((row["start"] for row in found), default=-1) + 1
@@ -183,11 +183,11 @@ def replay(starts: Sequence[PairTurns], slower: float, rule: Rule, budget: float
     """Replay tests with A slowed down by a factor.
 
     Args:
-        recorded_blocks: recorded process pairs.
-        slowdown: factor on A's times.
-        sequential_test: test to evaluate.
+        starts: recorded process pairs.
+        slower: factor on A's times.
+        rule: test to evaluate.
         budget: seconds of a test.
-        num_replays: number of replays.
+        replays: number of replays.
         seed: seed of the random generator.
     Returns: rates of the verdicts.
     """
@@ -208,7 +208,7 @@ def _race(
 ) -> tuple[Verdict, float]:
     """Replay one test, and return its verdict and its duration [s].
 
-    It draws another process pair every RESTART_SECONDS.
+    It draws another process pair every PAIR.
     """
     drawn, walls, left = list[Array](), list[Array](), budget
     while left > 0.0 or not drawn:
@@ -222,7 +222,7 @@ def _race(
 
 
 def _stretches(rng: np.random.Generator, length: int, turns: int) -> NDArray[np.int64]:
-    """Draw indices of stretches of successive blocks, num_blocks in total; a record is periodic."""
+    """Draw indices of stretches of successive blocks, turns in total; a record is periodic."""
     begins = rng.integers(length, size=max(1, -(-turns // STRETCH)))
     return ((begins[:, None] + np.arange(STRETCH)) % length).ravel()[:turns]
 
@@ -255,11 +255,11 @@ def replay_other(
     Each comparison has two sessions of equal duration, A's and then B's.
 
     Args:
-        is_slower: rule of the comparison, for the times of A and of B.
-        recorded_blocks: recorded process pairs.
-        slowdown: factor on A's times.
-        duration: seconds of one session.
-        num_replays: number of comparisons.
+        slower_than: rule of the comparison, for the times of A and of B.
+        starts: recorded process pairs.
+        slower: factor on A's times.
+        seconds: seconds of one session.
+        replays: number of comparisons.
     """
     rng, said = np.random.default_rng(0), 0
     for _ in range(replays):

@@ -53,10 +53,10 @@ class Worker:
 
         Args:
             config: file of the scene or sweep.
-            run_options: options of the runs.
+            asked: options of the runs.
             index: index of the run.
-            num_frames: maximum number of steps.
-            injected_slowdown: extra work, as a fraction of the run's iterations.
+            frames: maximum number of steps.
+            extra: extra work, as a fraction of the run's iterations.
             positions: path of the file.
         Returns: deterministic counts, suitable clock and number of steps.
         """
@@ -94,7 +94,7 @@ class Worker:
         """Time a number of calls together.
 
         Args:
-            num_calls: number of calls.
+            calls: number of calls.
             clock: cpu or wall.
         """
         now, work = CLOCKS[clock], self._work

@@ -202,7 +202,7 @@ class MachineCandidate:
 
 
 class Repeated:
-    """Timed repetition of a call; `preempted` states whether any repetition was preempted."""
+    """Timed repetition of a call; `interrupted` states whether any repetition was preempted."""
 
     def __init__(self, call: Callable[[], object]) -> None:
         self._call, self.interrupted = call, False
@@ -227,7 +227,7 @@ def reading(phase: str, call: Callable[[], object], columns: dict[str, Any], lea
         phase: name of the phase.
         call: what to time.
         columns: further columns of its row.
-        min_seconds: time for which to repeat the call [s].
+        least: time for which to repeat the call [s].
     """
     seconds = Repeated(call)
     return Reading(phase, average(seconds, least), columns | {"interrupted": seconds.interrupted})
@@ -236,7 +236,7 @@ def reading(phase: str, call: Callable[[], object], columns: dict[str, Any], lea
 def average(seconds: Callable[[int], float], least: float = LEAST) -> float:
     """Return the seconds per call.
 
-    This is one call, or the mean of enough calls to last `min_seconds` after a first one.
+    This is one call, or the mean of enough calls to last `least` after a first one.
     """
     once = seconds(1)
     number = _repeats(once, least)

@@ -45,12 +45,12 @@ PATIENCE = 3600.0
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Runs of one scene and size with their baselines (`harness.experiments.experiment_units.ExperimentUnit`).
+    """Runs of one scene and size with their baselines (`harness.experiments.core.Unit`).
 
     Attributes:
-        candidate_runs: the runs, and those of the baselines.
+        members: the runs, and those of the baselines.
         folder: folder of the results.
-        smaller_rows: name and file of rows of each candidate of a smaller size, smallest first.
+        smaller: name and file of rows of each candidate of a smaller size, smallest first.
         budget: time limit of a candidate, as predicted from its smaller sizes [s].
     """
 
@@ -128,11 +128,11 @@ def run_speed(
         sweep: the sweep.
         folder: folder of the results.
         display: shows progress.
-        print_message: prints a remark.
-        rerun: whether to repeat all sizes.
-        rerun_stale: whether to repeat sizes measured by other source code.
+        say: prints a remark.
+        again: whether to repeat all sizes.
+        changed: whether to repeat sizes measured by other source code.
         budget: time limit of a candidate at a size, as predicted from its smaller sizes [s].
-        isolated: see `harness.experiments.experiment_units.execute_units`.
+        isolated: see `harness.experiments.core.do_all`.
 
     Raises:
         InputError: an option is invalid.

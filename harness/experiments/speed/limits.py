@@ -41,8 +41,8 @@ class Probe:
 
     Attributes:
         name: name of the kernel.
-        working_set_bytes: size of the data that it traverses repeatedly [B].
-        bytes_moved: bytes that one call moves [B].
+        working_set: size of the data that it traverses repeatedly [B].
+        bytes: bytes that one call moves [B].
         flops: operations that one call computes.
         call: runs the kernel.
     """

@@ -63,7 +63,7 @@ def measure(
     Args:
         candidates: what to time.
         counts: columns that all rows share.
-        past_timings: timings at smaller sizes in ascending order, by `format_candidate_name` of a run.
+        past: timings at smaller sizes in ascending order, by `name` of a run.
         budget: time limit of a candidate [s].
         tick: called after each round with the phase.
     """
@@ -110,7 +110,7 @@ def predicted(past: Sequence[Past], vertices: int, run: RunSpec) -> float:
     A power law passes through the last two of them.
 
     Args:
-        past_timings: timings at other sizes, in ascending order.
+        past: timings at other sizes, in ascending order.
         vertices: number of vertices of the run.
         run: the run.
     """

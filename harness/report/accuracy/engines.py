@@ -44,7 +44,7 @@ class Standing(NamedTuple):
 
 
 def program(work: WorkPoint) -> str:
-    """Return the program of a simulation: an engine's name, or OWN_PROGRAM."""
+    """Return the program of a simulation: an engine's name, or OURS."""
     return work.solver if work.family == ENGINE else OURS
 
 

@@ -66,7 +66,7 @@ def write_findings(path: Path, title: str, chapters: Chapters, failed: list[dict
         path: target file.
         title: heading of the file.
         chapters: sentences by chapter title.
-        failed: failures, as `list_failures` returns them.
+        failed: failures, as `failures` returns them.
     """
     lines = [f"# {title}", ""]
     for chapter, sentences in chapters.items():

@@ -42,14 +42,14 @@ _FITTED, _COLUMNS, _ABREAST = 3, 4, 3  # sizes that a fit needs; scenes in a row
 
 
 class SizeGrowth(NamedTuple):
-    """A solver's times to GAP_TARGET on the sizes of a scene where it reached it.
+    """A solver's times to TARGET on the sizes of a scene where it reached it.
 
     Attributes:
         vertices: numbers of vertices (k,).
         seconds: median over the snapshots (k,) [s].
         exponent: exponent of the fitted power law; nan for too few sizes.
-        unsolved_sizes: numbers of vertices of the sizes on which the gap was not reached.
-        stale: which of the sizes (k,) involve measurements by other code than the current version.
+        lost: numbers of vertices of the sizes on which the gap was not reached.
+        older: which of the sizes (k,) involve measurements by other code than the current version.
     """
 
     scene: str
@@ -67,7 +67,7 @@ def growths(table: Measurements, other: Callable[[Curve], bool] = older) -> list
 
     Args:
         table: data of an accuracy measurement.
-        is_stale_curve: returns whether other code measured a curve.
+        other: returns whether other code measured a curve.
     """
     groups: dict[tuple[str, str, str], dict[int, list[Curve]]] = {}
     for curve in table.curves:

@@ -25,12 +25,12 @@ class Problem:
     Attributes:
         time_step: [s].
         mean_rest_length: [m].
-        objective_magnitude: magnitude of the objective's terms [J].
-        objective_initial: g0 [J].
+        magnitude: magnitude of the objective's terms [J].
+        g0: g0 [J].
         minima: objective values of the known minima, ascending [J].
-        minimum_ids: stable names of the minima, whose order may change.
-        uncertified_reason: why the lowest minimum is not certified; empty if it is.
-        is_liu2013: whether it belongs to the reproduction of Liu et al. 2013.
+        names: stable names of the minima, whose order may change.
+        doubt: why the lowest minimum is not certified; empty if it is.
+        paper: whether it belongs to the reproduction of Liu et al. 2013.
     """
 
     digest: str
@@ -93,15 +93,15 @@ class Curve:
     """The convergence of one solver to the minimum of one problem.
 
     Attributes:
-        family, citation: metadata of the solver.
+        family, reference: metadata of the solver.
         iterations, gap, stationarity: values (k,) of the recorded iterates.
-        max_vertex_error: (k,) [mean rest lengths].
+        largest: (k,) [mean rest lengths].
         seconds: (rounds, k) [s]; nan if not timed.
-        warm_seconds, cold_seconds: preparation time [s]; nan if unknown.
-        minimum_index: minimum that was reached.
+        warm, cold: preparation time [s]; nan if unknown.
+        branch: minimum that was reached.
         status, reason: values of the rows.
-        recording_path: relative to the folder of the results, or "".
-        source_fingerprint: code that the curve was measured by.
+        recording: relative to the folder of the results, or "".
+        code: code that the curve was measured by.
     """
 
     problem: Problem
@@ -128,15 +128,15 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class WorkPoint:
-    """One simulation up to `t_end` [s], with its error and its cost.
+    """One simulation up to `horizon` [s], with its error and its cost.
 
     Times are wall seconds per simulated second; nan if the simulation failed.
 
     Attributes:
-        family, citation, is_minimiser, is_substepping: metadata of the solver.
-        cpu_seconds_per_simulated_second: CPU time of the best round.
+        family, reference, minimises, own_steps: metadata of the solver.
+        cpu: CPU time of the best round.
         stiffness: k/m [1/s^2] of the median spring and the mean free vertex.
-        source_fingerprint: code that the simulation was measured by.
+        code: code that the simulation was measured by.
     """
 
     scene: str
@@ -190,8 +190,8 @@ class Measurements:
     """All data of the rows, in their order.
 
     Attributes:
-        machine_words: processor, threads and commit in words.
-        newest_fingerprint: source fingerprint of the latest rows.
+        machine: processor, threads and commit in words.
+        newest: source fingerprint of the latest rows.
     """
 
     problems: tuple[Problem, ...]
@@ -216,7 +216,7 @@ def by_other_code(measured: Iterable[Curve | WorkPoint], newest: str | None = No
 
     Args:
         measured: curves or simulations.
-        newest_fingerprint: source fingerprint to compare with; None for the current version.
+        newest: source fingerprint to compare with; None for the current version.
     """
     names = sorted({one.label for one in measured if (older(one) if newest is None else one.code != newest)})
     than = "today's" if newest is None else "that of the newest rows"

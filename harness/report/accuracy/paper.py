@@ -53,7 +53,7 @@ FIGURE_3 = {
     (21, 1200): (0.237, 0.100, 0.035, 0.0156),
     (21, 2400): (0.26, 0.132, 0.062, 0.035),
 }
-"""Vertices per side and stiffness [N/m]: mean relative error after each of LIU2013_ITERATIONS of local-global."""
+"""Vertices per side and stiffness [N/m]: mean relative error after each of ITERATIONS of local-global."""
 
 FAR = 2.0
 """Ratio to the paper's error beyond which a sentence reports the difference."""

@@ -1,4 +1,4 @@
-"""Reader of the rows of an accuracy measurement, as objects of `harness.report.accuracy.accuracy_data`."""
+"""Reader of the rows of an accuracy measurement, as objects of `harness.report.accuracy.measured`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def read(
     Args:
         folder: folder of the results.
         files: files of rows; None for all under `folder`/accuracy.
-        on_invalid: called for each invalid unit, see `harness.results.parquet_rows.read_rows`.
+        left_out: called for each invalid unit, see `harness.base.rows.read_rows`.
     Raises:
         InputError: if there are no rows.
     """

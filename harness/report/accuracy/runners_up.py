@@ -38,7 +38,7 @@ def draw_ways(stem: Path, title: str, facts: Sequence[str], points: Sequence[Run
         title: title of the picture.
         facts: phrases below the title.
         points: candidates, the cheapest first.
-        error_requested: relative error.
+        asked: relative error.
     """
     within = [point for point in points if point.error <= asked]
     words = [f"recommended: {_told(within[0])}"] if within else []

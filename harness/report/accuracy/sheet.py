@@ -58,7 +58,7 @@ def sheet(stem: Path, title: str, facts: Sequence[str]) -> Generator[Figure]:
 
 
 def files(stem: Path) -> list[Path]:
-    """Return the paths of the files that `plot_sheet` writes."""
+    """Return the paths of the files that `sheet` writes."""
     return [stem.with_suffix(".png"), stem.with_suffix(".svg")]
 
 
@@ -70,9 +70,9 @@ def line(
     Args:
         ax: axes.
         x, y: points (k,).
-        style: style of the line and its markers.
-        spaced_markers: whether markers keep a distance, for dense iterates.
-        stale: whether other code than the current version measured it, in total or per point (k,); such markers are
+        look: style of the line and its markers.
+        spaced: whether markers keep a distance, for dense iterates.
+        older: whether other code than the current version measured it, in total or per point (k,); such markers are
             hollow.
         **more: further keywords of `Axes.plot`.
     """
@@ -208,11 +208,11 @@ def iteration_axis(ax: Axes, last: float) -> None:
 
 
 def limits(values: Iterable[float], *, least: float = 0.0, margin: float = 1.3) -> tuple[float, float]:
-    """Return limits of a logarithmic axis around all positive finite values, at least `lower_bound`.
+    """Return limits of a logarithmic axis around all positive finite values, at least `least`.
 
     Args:
         values: values to include.
-        lower_bound: minimum of the smallest value.
+        least: minimum of the smallest value.
         margin: factor between the extreme values and the limits.
     """
     array = np.array([value for value in values if np.isfinite(value) and value > 0.0])

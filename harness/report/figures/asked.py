@@ -21,8 +21,8 @@ class Asked:
     """Options of a figure.
 
     Attributes:
-        width_mm: width [mm].
-        font_size: font size [points].
+        width: width [mm].
+        size: font size [points].
         selectors: parts of panel names; the parts of one selector are joined by colons on the command line.
     """
 
@@ -50,10 +50,10 @@ def asked(width: str, formats: str, size: float, panels: str, *, titled: bool, t
     Args:
         width: length with unit, such as 85mm.
         formats: formats separated by commas.
-        font_size: font size [points].
+        size: font size [points].
         panels: selectors separated by commas.
-        has_title: whether the figure has a title and a line on the machine.
-        is_transparent: whether the background is transparent.
+        titled: whether the figure has a title and a line on the machine.
+        transparent: whether the background is transparent.
     Raises:
         InputError: with all mistakes in the options.
     """

@@ -77,7 +77,7 @@ def compose(panels: Sequence[Panel], title: str, asked: Asked) -> Figure:
     Args:
         panels: panels of the figure.
         title: title; the panels' subject is appended if they share one.
-        options: options of the figure.
+        asked: options of the figure.
     """
     rc: Any = {**RC, "font.size": asked.size, "xtick.labelsize": asked.small, "ytick.labelsize": asked.small}
     with matplotlib.rc_context(rc):
@@ -101,7 +101,7 @@ def compose(panels: Sequence[Panel], title: str, asked: Asked) -> Figure:
 
 
 DPI = 100
-"""Resolution of the canvas that text is measured on; vector formats have none, and images use RASTER_DPI."""
+"""Resolution of the canvas that text is measured on; vector formats have none, and images use DOTS."""
 
 
 def _columns(panels: Sequence[Panel], asked: Asked) -> int:

@@ -30,7 +30,7 @@ def label_directly(axes: Sequence[Axes], panels: Sequence[Panel], asked: Asked) 
     Args:
         axes: axes of the panels.
         panels: panels of the figure; only a single one gets direct labels.
-        options: options of the figure.
+        asked: options of the figure.
     """
     panel = panels[0]
     if len(panels) > 1 or not isinstance(panel, Plot):
@@ -99,7 +99,7 @@ def apart(wanted: Sequence[float], gap: float, top: float) -> list[float]:
     """Spread sorted heights to be at least `gap` apart, with small displacements.
 
     Args:
-        targets: preferred heights, ascending.
+        wanted: preferred heights, ascending.
         gap: minimum distance.
         top: upper limit, exceeded only if the space from 0 is too small.
     """

@@ -36,7 +36,7 @@ def draw_plot(ax: Axes, panel: Plot, asked: Asked) -> None:
     Args:
         ax: axes.
         panel: panel to draw.
-        options: options of the figure.
+        asked: options of the figure.
     """
     set_scales(ax, panel)
     for band in panel.bands:
@@ -80,9 +80,9 @@ def mark(look: Mark, grown: float = 1.0, *, hollow: bool = False) -> dict[str, A
     """Return the style of a solver's marker.
 
     Args:
-        style: style of the solver.
-        marker_scale: size relative to other markers.
-        is_stale: whether other code measured it; such markers are hollow.
+        look: style of the solver.
+        grown: size relative to other markers.
+        hollow: whether other code measured it; such markers are hollow.
     """
     face = "white" if hollow else look.color
     edge, width = (look.color, 0.9) if hollow else ("white", 0.35)
@@ -118,7 +118,7 @@ def draw_grid(ax: Axes, panel: CellMap, asked: Asked) -> None:
     Args:
         ax: axes.
         panel: map to draw.
-        options: options of the figure.
+        asked: options of the figure.
     """
     rows, columns = names(panel)
     ax.set_xlim(0, len(columns))
@@ -168,7 +168,7 @@ def draw_picture(ax: Axes, panel: Picture, asked: Asked, width: float) -> None:
     Args:
         ax: axes.
         panel: picture to draw.
-        options: options of the figure.
+        asked: options of the figure.
         width: width of the place [inches].
     """
     ax.imshow(panel.render(round(width * DOTS), None if asked.transparent else "white"), interpolation="antialiased")

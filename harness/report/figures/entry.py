@@ -19,8 +19,8 @@ class Entry:
     """A panel that can be drawn.
 
     Attributes:
-        group, name: as in `panel.CurvePlot`.
-        build_panel: returns the panel.
+        of, name: as in `panel.Plot`.
+        make: returns the panel.
     """
 
     of: tuple[str, ...]

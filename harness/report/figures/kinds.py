@@ -30,10 +30,10 @@ class Kind(NamedTuple):
 
     Attributes:
         title: title of the figure.
-        required_rows: description of the rows that it is drawn from.
-        list_panels: returns the panels of a folder of results by name, given a function that finds stale runs.
-        default_panels: selectors that apply if the command line gives none.
-        prepare_panels: builds the panels from the selected entries.
+        wanted: description of the rows that it is drawn from.
+        panels: returns the panels of a folder of results by name, given a function that finds stale runs.
+        usual: selectors that apply if the command line gives none.
+        draw: builds the panels from the selected entries.
     """
 
     title: str

@@ -22,10 +22,10 @@ class Made(NamedTuple):
 
     Attributes:
         paths: files.
-        panel_names: names of its panels.
-        size_mm: width and height [mm].
-        other_panel_count: number of further panels in the results.
-        other_panel_example: name of one of them.
+        panels: names of its panels.
+        millimetres: width and height [mm].
+        others: number of further panels in the results.
+        example: name of one of them.
     """
 
     paths: list[Path]
@@ -42,9 +42,9 @@ def make(name: str, kind: Kind, results: Path, older: Older, folder: Path, asked
         name: name of the kind.
         kind: kind of figure.
         results: folder of the results.
-        find_stale: see `FigureKind.list_panels`.
+        older: see `Kind.panels`.
         folder: folder that the files are written to.
-        options: options of the figure.
+        asked: options of the figure.
     Raises:
         InputError: if the results contain nothing of the kind, if no panel matches a selector, if curves and maps are
             selected together, or if the text does not fit the width.

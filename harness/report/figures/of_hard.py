@@ -24,7 +24,7 @@ def hard(folder: Path, older: Older) -> list[Entry]:
 
     Args:
         folder: folder of a sweep's results.
-        find_stale: returns the ids of stale runs in a table of rows.
+        older: returns the ids of stale runs in a table of rows.
     """
     table = sweep_rows(folder)
     cells, other = read_cells(folder), older(table)

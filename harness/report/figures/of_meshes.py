@@ -47,7 +47,7 @@ class _Recorded(NamedTuple):
 
     Attributes:
         label: label that distinguishes it from other runs.
-        machine_words: provenance of the measurement.
+        told: provenance of the measurement.
     """
 
     run: RunTimes
@@ -159,13 +159,13 @@ def _subject(replay: Replay) -> str:
 
 
 class _Render(Renderer):
-    """Renders one frame with one camera (`panel.MeshRenderer`)."""
+    """Renders one frame with one camera (`panel.Renderer`)."""
 
     def __init__(self, replay: Replay, frame: int, view: View) -> None:
         self.replay, self.frame, self.view, self.aspect = replay, frame, view, 1.0
 
     def __call__(self, width: int, background: str | None) -> NDArray[np.uint8]:
-        """Render the frame, see `panel.MeshRenderer`."""
+        """Render the frame, see `panel.Renderer`."""
         with Studio(width, max(1, round(width / self.aspect)), background=background) as studio:
             return studio.draw(self.replay, self.frame, self.view)
 

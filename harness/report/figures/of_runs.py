@@ -45,7 +45,7 @@ def timing(folder: Path, older: Older) -> list[Entry]:
 
     Args:
         folder: folder of a sweep's results.
-        find_stale: returns the ids of stale runs in a table of rows.
+        older: returns the ids of stale runs in a table of rows.
     """
     table = sweep_rows(folder)
     found, other = runs(table), older(table)

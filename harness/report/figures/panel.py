@@ -22,10 +22,10 @@ class Scale(NamedTuple):
     """An axis.
 
     Attributes:
-        label: quantity with its unit.
-        division: scale of the axis; `sizes` is `log` with a tick at each value.
-        tick_format: format of the tick labels.
-        place_names: names of the positions 0, 1, ... if `division` is `names`.
+        words: quantity with its unit.
+        kind: scale of the axis; `sizes` is `log` with a tick at each value.
+        unit: format of the tick labels.
+        names: names of the positions 0, 1, ... if `kind` is `names`.
     """
 
     words: str
@@ -39,13 +39,13 @@ class Series:
     """One curve: ordered points x, y (k,); nan is a gap.
 
     Attributes:
-        lower, upper: interval (k,) of y, or of x if `is_horizontal`.
-        stale: which points (k,) other code measured; they are drawn hollow.
-        is_stepped: whether the curve is constant between points.
-        is_connected: whether a line connects the points.
-        labels_points: whether `label` is drawn at each point.
+        low, high: interval (k,) of y, or of x if `across`.
+        older: which points (k,) other code measured; they are drawn hollow.
+        steps: whether the curve is constant between points.
+        joined: whether a line connects the points.
+        named: whether `label` is drawn at each point.
         setting: distinguishes curves of the same label in the data.
-        marker_scale: marker size relative to other curves.
+        grown: marker size relative to other curves.
     """
 
     label: str
@@ -83,11 +83,11 @@ class Plot:
     """Curves in one frame.
 
     Attributes:
-        group: parts of the name that identify the measurement, such as scene and size.
+        of: parts of the name that identify the measurement, such as scene and size.
         name: parts of the name that identify the panel within the group; `--panels` selects by group and name.
         subject, title: the same in words.
         notes: sentences at the foot of the figure.
-        machine_words: provenance of the data.
+        machine: provenance of the data.
     """
 
     of: tuple[str, ...]
@@ -112,7 +112,7 @@ class Plot:
 class Cell(NamedTuple):
     """One cell of a map: row, column, outcome, colour and value.
 
-    `is_stale` states whether other code measured it.
+    `older` states whether other code measured it.
     """
 
     row: str
@@ -160,7 +160,7 @@ class Picture:
         springs: vertex indices (m, 2); drawn if there are no triangles.
         triangles: vertex indices (f, 3).
         strain: strain of each vertex (n,).
-        strain_limit: end of the strain scale.
+        limit: end of the strain scale.
         aspect: width / height of the picture.
         render: returns the pixels, given width [pixels] and background.
     """

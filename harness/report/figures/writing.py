@@ -32,7 +32,7 @@ def write(figure: Figure, panels: Sequence[Panel], stem: Path, title: str, asked
         panels: panels of the figure, all of one type.
         stem: path of the files without suffix.
         title: title of the figure.
-        options: options of the figure.
+        asked: options of the figure.
     Raises:
         CannotWrite: if a file cannot be written.
     """

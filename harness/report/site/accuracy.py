@@ -44,7 +44,7 @@ def charts(everything: Measurements, folder: Path) -> dict[str, Item]:
     """Build the charts with data in the rows, by their ids.
 
     Args:
-        all_data: data of an accuracy measurement.
+        everything: data of an accuracy measurement.
         folder: folder of the sweep's results.
     """
     table = without_short(everything)

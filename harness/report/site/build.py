@@ -33,10 +33,10 @@ def update(
 
     Args:
         results: folder of results, or the folder of one sweep.
-        changed_folders: folders of sweeps with new data; None for all.
-        with_recordings: whether recordings, and meshes drawn from them, are converted to scripts.
-        with_viewer: whether Rerun's viewer is added.
-        print_message: prints a remark.
+        only: folders of sweeps with new data; None for all.
+        recorded: whether recordings, and meshes drawn from them, are converted to scripts.
+        viewer: whether Rerun's viewer is added.
+        say: prints a remark.
     Raises:
         InputError: if there are no rows.
         CannotWrite: if a file cannot be written.
@@ -59,14 +59,14 @@ def update(
 def keep(results: Path, folder: Path, say: Callable[[str], None], *, quiet: bool = False) -> None:
     """Update the page of all results with the new data of a sweep.
 
-    It prints the path of the page unless `is_quiet`. If rows are damaged, it prints a remark instead of raising: the
+    It prints the path of the page unless `quiet`. If rows are damaged, it prints a remark instead of raising: the
     measured data is stored in any case.
 
     Args:
         results: folder of results.
         folder: folder of the sweep.
-        print_message: prints a remark.
-        is_quiet: whether to omit the path of the page.
+        say: prints a remark.
+        quiet: whether to omit the path of the page.
     """
     try:
         page = update(results, only=[folder])

@@ -27,7 +27,7 @@ class Folder(NamedTuple):
         path: path of the folder.
         name: name that the page shows.
         slug: name of its data that is valid in files and URLs.
-        relative_url: escaped URL of the folder relative to the page, with a trailing slash.
+        up: escaped URL of the folder relative to the page, with a trailing slash.
     """
 
     path: Path

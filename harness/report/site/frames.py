@@ -39,7 +39,7 @@ def write(folder: Folder, table: pa.Table, data: Path, wanted: Collection[str]) 
         folder: folder of the sweep's results.
         table: rows of the sweep.
         data: folder of the page's data of this sweep.
-        run_ids: runs to write.
+        wanted: runs to write.
     """
     if not wanted:
         return

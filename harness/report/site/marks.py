@@ -1,4 +1,4 @@
-"""Colours, markers and line styles of `harness.report.plot_style`, and axes, in Plotly's terms."""
+"""Colours, markers and line styles of `harness.report.style`, and axes, in Plotly's terms."""
 
 from __future__ import annotations
 

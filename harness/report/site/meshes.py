@@ -35,9 +35,9 @@ def write_last(folder: Folder, home: Path, units: Sequence[str], say: Say) -> se
 
     Args:
         folder: folder of the sweep's results.
-        data_folder: folder of the page's data of this sweep.
+        home: folder of the page's data of this sweep.
         units: units of rows, whose names are those of their recordings.
-        print_message: prints a remark.
+        say: prints a remark.
     Returns: the units with a script.
     """
     there: set[str] = set()
@@ -58,9 +58,9 @@ def write_solves(folder: Folder, home: Path, table: Measurements, say: Say) -> d
 
     Args:
         folder: folder of the sweep's results.
-        data_folder: folder of the page's data of this sweep.
+        home: folder of the page's data of this sweep.
         table: data of an accuracy measurement.
-        print_message: prints a remark.
+        say: prints a remark.
     Returns: the names of the scripts by their recordings.
     """
     written: dict[str, str] = {}
@@ -79,7 +79,7 @@ def write_recordings(folder: Folder, home: Path, recordings: Mapping[str, str]) 
 
     Args:
         folder: folder of the sweep's results.
-        data_folder: folder of the page's data of this sweep.
+        home: folder of the page's data of this sweep.
         recordings: titles by path of the recording.
     Returns: the names of the scripts by their recordings.
     """

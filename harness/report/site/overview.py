@@ -60,9 +60,9 @@ def overview(folder: Folder, home: Path, *, recorded: bool, say: Say) -> Overvie
 
     Args:
         folder: folder of the sweep's results.
-        data_folder: folder of the page's data, where scripts of single runs are written.
-        with_recordings: whether meshes and recordings are converted to scripts, which takes longer.
-        print_message: prints a remark.
+        home: folder of the page's data, where scripts of single runs are written.
+        recorded: whether meshes and recordings are converted to scripts, which takes longer.
+        say: prints a remark.
     """
     kinds = {"rows": _runs, "accuracy": _accuracy, "ablation": _ablation, "gates": _gates}
     there = [kind for kind in kinds if kind != "gates" and shelf.units(folder.path / kind)]
@@ -136,7 +136,7 @@ def _runs(folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
 def _add_recorded(folder: Folder, home: Path, found: Sequence[dict[str, Any]], anew: bool, say: Say) -> None:
     """Mark whether each run's last frame and recording are in the page's data.
 
-    With `include_missing`, missing ones are added.
+    With `anew`, missing ones are added.
     """
     there = {part: {path.stem for path in (home / part).glob("*.js")} for part in ("meshes", "recordings")}
     if anew and (recorded := {run["unit"]: title(run) for run in found if run["recording"]}):

@@ -49,7 +49,7 @@ def read(folder: Folder, left_out: Callable[[Mistake], None]) -> pa.Table:
 
     Args:
         folder: folder of the sweep's results.
-        on_invalid: called for each invalid unit.
+        left_out: called for each invalid unit.
     Raises:
         InputError: if rows are damaged.
     """
@@ -89,7 +89,7 @@ def as_script(folder: Folder, found: Sequence[Run], outcomes: Mapping[str, Any])
 
     Args:
         folder: folder of the sweep's results.
-        run_records: records of the runs.
+        found: records of the runs.
         outcomes: outcome and reason of verified runs by their ids.
     """
     columns = {name: [run[name] for run in found] for name in _SHOWN if found and name in found[0]}

@@ -68,7 +68,7 @@ def number(value: Any) -> float | int | None:
 
 
 def numbers(values: Iterable[Any]) -> list[float | int | None]:
-    """Round each value to five digits, see `round_number`."""
+    """Round each value to five digits, see `number`."""
     return [number(value) for value in values]
 
 

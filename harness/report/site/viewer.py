@@ -4,7 +4,7 @@ The viewer and the recordings are stored as scripts that a page can load from fi
 installed `rerun` serves to browsers: a script and its WebAssembly module. Both are packed into one `viewer.js`, the
 module as gzipped base64. A recording becomes a script of the same kind. `static/replay.js` loads them when a recording
 is opened. The start of the viewer from a page is undocumented: the code that depends on it is in this module and in
-that script, and is valid only for RERUN_VERSION.
+that script, and is valid only for VERSION.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ def count(facts: Mapping[str, float], vertices: int, springs: int, precision: st
     An iteration is both steps. Unknown counts are omitted.
 
     Args:
-        stats: `nnz_factor`, `panel_bytes` and `flops_per_solve` of a prepared solver, as far as known.
+        facts: `nnz_factor`, `panel_bytes` and `flops_per_solve` of a prepared solver, as far as known.
         vertices: number of vertices.
         springs: number of springs.
         precision: number format of the factor.

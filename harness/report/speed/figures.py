@@ -43,18 +43,18 @@ class Figures(NamedTuple):
     Times are medians over the rounds [ms]; None: not measured or unknown.
 
     Attributes:
-        step: time of STEP_ITERATIONS iterations.
-        factor_entries: number of entries of the factor L.
-        achieved_bandwidth: bytes per second of an iteration, by the size of the factor's panels.
-        binding_limit: resource that binds.
-        roofline_fraction: share of the binding limit that an iteration reaches, by those bytes and flops.
-        two_pass_fraction: share of the time that two passes over the entries of L would take, both from the location of
+        step: time of STEP iterations.
+        entries: number of entries of the factor L.
+        touched: bytes per second of an iteration, by the size of the factor's panels.
+        binds: resource that binds.
+        reached: share of the binding limit that an iteration reaches, by those bytes and flops.
+        passes: share of the time that two passes over the entries of L would take, both from the location of
             the working set; a program that uses entries twice while they are in the cache exceeds it.
-        speedup: of a step, over the C++ baseline.
-        speedup_over_cholmod: of a step, over carefully written C++.
-        solve_speedup_over_cholespy: of a global step.
-        precision_error: distance from the converged positions in float64, relative to the scene's size.
-        source_fingerprint, commit: code that the candidate was measured by.
+        faster: of a step, over the C++ baseline.
+        careful_faster: of a step, over carefully written C++.
+        solves_faster: of a global step.
+        apart: distance from the converged positions in float64, relative to the scene's size.
+        code, commit: code that the candidate was measured by.
         cpu, cores: machine of the measurement.
     """
 

@@ -16,7 +16,7 @@ from harness.report.style import OLDER
 class SpeedPicture:
     """One plot: file stem, title, and plotted value of a candidate.
 
-    `is_share` states whether that is a share.
+    `share` states whether that is a share.
     """
 
     stem: str
@@ -35,10 +35,10 @@ PICTURES = (
 
 
 def draw(found: Sequence[Figures], folder: Path) -> None:
-    """Draw all plots of each scene as PNG files of PAGE_WIDTH x PAGE_HEIGHT pixels.
+    """Draw all plots of each scene as PNG files of WIDTH x HEIGHT pixels.
 
     Args:
-        candidates: figures of all candidates.
+        found: figures of all candidates.
         folder: folder that the files are written to.
     """
     folder.mkdir(parents=True, exist_ok=True)

@@ -28,10 +28,10 @@ class CandidateLine(NamedTuple):
 
     Attributes:
         name: label of the candidate.
-        single_thread_name: label of the same candidate on one thread.
+        alone: label of the same candidate on one thread.
         solver: name of its solver.
         vertices, values: points (k,).
-        stale: which points (k,) were measured by other code than the current version.
+        older: which points (k,) were measured by other code than the current version.
     """
 
     name: str
@@ -43,7 +43,7 @@ class CandidateLine(NamedTuple):
 
 
 def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[CandidateLine], *, share: bool) -> None:
-    """Draw a plot as a PNG file of PAGE_WIDTH x PAGE_HEIGHT pixels.
+    """Draw a plot as a PNG file of WIDTH x HEIGHT pixels.
 
     Candidates have the colour and the marker of their solver, and a line style of their own. Multithreaded candidates
     have thinner lines, and stale points are hollow. A series without values is not drawn, but its line style stays
@@ -54,7 +54,7 @@ def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[
         title: title of the plot.
         facts: phrases below the title.
         series: lines of the candidates.
-        is_share: whether values are shares, drawn in percent.
+        share: whether values are shares, drawn in percent.
     """
     drawn = [line for line in series if line.values]
     marked = looks((line.alone, line.solver) for line in series)

@@ -127,9 +127,9 @@ def exponents(found: Sequence[Figures], figure: str = "global_", least: int = 10
     """Fit exponents of a figure's growth with size, by scene and label.
 
     Args:
-        candidates: figures of all candidates.
+        found: figures of all candidates.
         figure: field that is fitted; by default the time of a global step.
-        min_vertices: smallest size that is included.
+        least: smallest size that is included.
     """
     by_label: dict[tuple[str, str], list[tuple[int, float]]] = defaultdict(list)
     for f in found:

@@ -113,17 +113,17 @@ class Contribution:
 class Effect(Protocol):
     """A pydantic model with a literal `kind`.
 
-    Its class states `max_convergence_order`, a class variable: the order of the error in the step size up to which
+    Its class states `exact_to`, a class variable: the order of the error in the step size up to which
     integrators retain their own order with the effect. It is infinite if the effect is smooth and evaluated where it
-    acts; without it, no order is guaranteed. Optional class variables: `is_dissipative`, True if the effect removes
-    energy from any motion; `is_baseline_effect`, True if the baseline scenes of the effects' cost contain it, so it has
-    no cost of its own; and `find_evidence(observed: ObservedMotion) -> str`, a class method that returns the evidence
+    acts; without it, no order is guaranteed. Optional class variables: `damps`, True if the effect removes
+    energy from any motion; `plain`, True if the baseline scenes of the effects' cost contain it, so it has
+    no cost of its own; and `called_for(seen: Seen) -> str`, a class method that returns the evidence
     in the motion of a scene that the effect is missing, or "".
     """
 
     @property
     def kind(self) -> str:
-        """Name of the effect in `harness.scenes.effects.effect_table`."""
+        """Name of the effect in `harness.scenes.effects.effect_names`."""
         ...
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
@@ -146,11 +146,11 @@ class Seen:
 
     Attributes:
         springs: ends (m, 2) and rest lengths (m,) [m].
-        mean_spring_length: mean rest length, or the mesh's spacing [m].
+        length: mean rest length, or the mesh's spacing [m].
         mass: (n,) [kg].
-        has_pins: whether vertices are pinned.
-        is_driven: whether forces or obstacles maintain the motion.
-        is_damped: whether an effect dissipates energy.
+        held: whether vertices are pinned.
+        driven: whether forces or obstacles maintain the motion.
+        damped: whether an effect dissipates energy.
         positions: (frames, n, 3) [m].
         velocities: (frames, n, 3) [m/s].
     """
@@ -193,8 +193,8 @@ def kept(mesh: Mesh, springs: NDArray[np.int64], shortest: float, longest: float
     Args:
         mesh: the mesh.
         springs: (m,) indices of springs.
-        min_ratio: smallest length relative to the rest length.
-        max_ratio: largest length relative to the rest length.
+        shortest: smallest length relative to the rest length.
+        longest: largest length relative to the rest length.
 
     Raises:
         InputError: for a spring of zero length.

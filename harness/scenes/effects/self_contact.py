@@ -30,7 +30,7 @@ LOOKS = 30
 class SelfContact(Model):
     """Separates points from triangles and edges from edges of the mesh by a barrier that diverges as their gap closes.
 
-    Formulas: `solvers.contact.potentials.barrier`. All intermediate positions are intersection-free. Pairs that share a
+    Formulas: `solvers.contact.barrier`. All intermediate positions are intersection-free. Pairs that share a
     vertex are excluded. Pairs that are closer at rest than thickness plus range have both reduced in proportion to
     their rest distance, so the mesh may be arbitrarily fine. Vertices in no edge and no triangle do not collide.
     """

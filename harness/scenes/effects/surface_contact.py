@@ -29,7 +29,7 @@ _SAG = 0.1
 class SurfaceContact(Model):
     """Separates points, edges and triangles of the mesh from those of obstacles by a barrier.
 
-    The barrier acts on either side and diverges as the gap closes (formulas: `solvers.contact.potentials.barrier`). All
+    The barrier acts on either side and diverges as the gap closes (formulas: `solvers.contact.barrier`). All
     intermediate positions are intersection-free. Moving obstacles advance along their motion without passing through
     the mesh. Planes, spheres, capsules and boxes are represented by triangles too; those of round obstacles lie at most
     a tenth of the thickness inside.
@@ -60,7 +60,7 @@ class SurfaceContact(Model):
         return self.thickness if self.range is None else self.range
 
     def shapes(self, rest: Positions) -> list[Shape]:
-        """Build the surfaces of the obstacles in their declared poses; `rest_positions` (n, 3) [m] of the mesh."""
+        """Build the surfaces of the obstacles in their declared poses; `rest` (n, 3) [m] of the mesh."""
         return [shape(one, _SAG * self.thickness, rest) for one in self.obstacles]
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:

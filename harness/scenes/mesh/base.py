@@ -17,18 +17,18 @@ class Mesh:
     """A spring network at rest. All arrays are read-only.
 
     Attributes:
-        rest_positions: (n, 3) [m], also the initial positions.
+        rest: (n, 3) [m], also the initial positions.
         springs: (m, 2), vertex indices, in a fixed order.
-        spring_families: STRETCH, SHEAR and BEND -> indices of their springs, a partition of range(m).
+        families: STRETCH, SHEAR and BEND -> indices of their springs, a partition of range(m).
         triangles: (f, 3), for pictures and wind, empty for a chain.
-        mass_fractions: (n,), share of the total mass of each vertex, sums to 1.
+        shares: (n,), share of the total mass of each vertex, sums to 1.
         dimension: 1 chain and truss, 2 cloth, 3 solid.
         spacing: typical rest length h [m].
         resolution: mesh size, usually vertices per side; 0 for a mesh from a file.
         parts: named sets of vertices (`corners`, `top`, `left`, ...), each (q,), sorted.
         mass: (n,) [kg] if a file gives absolute masses, else None.
         attributes: vertex attributes from a file, each (n,).
-        vertex_areas: (n,) [m^2] at rest if they are not thirds of the triangles, else None.
+        areas: (n,) [m^2] at rest if they are not thirds of the triangles, else None.
         first_vertex: number of the first vertex in the mesh's file.
     """
 

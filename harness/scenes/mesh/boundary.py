@@ -22,7 +22,7 @@ class Loop(NamedTuple):
     Attributes:
         vertices: (k,), sorted.
         length: [m].
-        is_hole: whether the same connected surface has a longer loop.
+        hole: whether the same connected surface has a longer loop.
     """
 
     vertices: Indices

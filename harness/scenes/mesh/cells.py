@@ -56,11 +56,11 @@ class Cells:
     Attributes:
         points: (n, 3) [m].
         polygons: number of corners k >= 2 -> (f, k).
-        polygon_locations: k -> line of each polygon, (f,), or its number in the file.
-        location_unit: which of the two.
+        places: k -> line of each polygon, (f,), or its number in the file.
+        counted: which of the two.
         segments: (s, 2).
         tetrahedra: (t, 4).
-        vertex_groups: points of the groups named in the file.
+        groups: points of the groups named in the file.
         attributes: point attributes, each (n,).
         first_vertex: number of the first point in the file.
     """
@@ -82,7 +82,7 @@ class Cells:
 
 
 def check_file(path: Path, *, most: int = MAX_BYTES) -> None:
-    """Raise InputError unless `path` is a nonempty regular file of at most `max_bytes` and no placeholder."""
+    """Raise InputError unless `path` is a nonempty regular file of at most `most` and no placeholder."""
     try:
         size = path.stat().st_size
     except (OSError, ValueError) as error:
@@ -113,7 +113,7 @@ def network(cells: Cells, rule: SpringRule, path: Path) -> Mesh:
 
     Args:
         cells: the contents of the file.
-        spring_rule: springs along edges, or between all pairs of face corners.
+        rule: springs along edges, or between all pairs of face corners.
         path: the file, for messages.
 
     Raises:

@@ -2,7 +2,7 @@
 # meshio has no types.
 """Mesh file readers that run in a subprocess: meshio's formats, and own readers of PLY and .vtp.
 
-The subprocess is that of `harness.execution.sandbox`. meshio accepts some truncated files as complete. Hence the
+The subprocess is that of `harness.base.child`. meshio accepts some truncated files as complete. Hence the
 sections of a .msh must be closed, and a text STL must have its end marker.
 """
 
@@ -40,10 +40,10 @@ class Found(NamedTuple):
 
     Attributes:
         points: (n, 3).
-        vertex_groups: points by group name.
+        groups: points by group name.
         attributes: point data (n,); components of vectors have a number in their name, `normal.0`.
-        face_locations: line or number of each cell of a block.
-        unused_points: points that no cell uses, of formats that store others besides the mesh, (k, 3).
+        places: line or number of each cell of a block.
+        left_out: points that no cell uses, of formats that store others besides the mesh, (k, 3).
     """
 
     points: NDArray[np.float64]

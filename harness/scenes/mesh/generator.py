@@ -70,7 +70,7 @@ class Generator(Model):
 
     @abstractmethod
     def count(self, size: int) -> int:
-        """Return the number of vertices for a size from MIN_SIZE to MAX_VERTICES; nondecreasing in the size."""
+        """Return the number of vertices for a size from SMALLEST to MAX_VERTICES; nondecreasing in the size."""
 
     @abstractmethod
     def generate(self, size: int) -> Mesh:

@@ -31,7 +31,7 @@ _MOST_OF_HEAD = 2**20
 
 
 class Property(NamedTuple):
-    """A scalar property, or a list if `length_type` is set, the type of its length."""
+    """A scalar property, or a list if `length` is set, the type of its length."""
 
     name: str
     type: str
@@ -51,9 +51,9 @@ class Ply(NamedTuple):
 
     Attributes:
         points: (n, 3).
-        vertex_attributes: by name (n,).
+        numbers: by name (n,).
         faces: number of corners k -> faces (f, k), and their zero-based numbers in the file.
-        first_face_line: line of the first face if each face has its own line, else 0.
+        first_line: line of the first face if each face has its own line, else 0.
     """
 
     points: Array

@@ -42,8 +42,8 @@ class Surface(NamedTuple):
 
     Attributes:
         triangles: (f, k - 2, 3), in the orientation of the faces.
-        is_convex: (f,).
-        is_self_crossing: (f,), faces with a self-crossing boundary, whose triangles are invalid.
+        convex: (f,).
+        failed: (f,), faces with a self-crossing boundary, whose triangles are invalid.
     """
 
     triangles: Indices
@@ -138,7 +138,7 @@ def repeated_rows(cells: Indices) -> Indices:
 
 
 class Cover(NamedTuple):
-    """Faces of `corners` corners, rows (c,), and the faces of `larger_corners` corners that contain them, rows (c,)."""
+    """Faces of `corners` corners, rows (c,), and the faces of `larger` corners that contain them, rows (c,)."""
 
     corners: int
     rows: Indices

@@ -144,7 +144,7 @@ def assemble(
     """Assemble a mesh from springs by family, (k, 2) each: first all STRETCH, then all SHEAR, then all BEND.
 
     Args:
-        vertex_weights: proportional to the vertex masses; by default half the length of the springs of each.
+        weights: proportional to the vertex masses; by default half the length of the springs of each.
         spacing: by default the mean spring length.
 
     The other arguments are attributes of `Mesh`.

@@ -36,8 +36,8 @@ class Place:
     """A point of comparison.
 
     Attributes:
-      scene_terms: reference terms of the scene.
-      reference_step: the step as the reference implementation builds it.
+      side: reference terms of the scene.
+      stated: the step as the reference implementation builds it.
       problem: the step as the harness builds it.
       x: solution of the step (n, 3) [m].
       direction: direction of the derivatives (n, 3).

@@ -1,6 +1,6 @@
 """Reference terms of contact with Coulomb friction.
 
-Formulas: `solvers.contact.half_space.half_space_potential`, `solvers.contact.half_space.separating_planes`.
+Formulas: `solvers.contact.energy`, `solvers.contact.planes`.
 
     k_i/2 min(0, n.x_i - d)^2 + F_i h(|u_i|),   u_i = (I - nn')(x_i - a_i),   h(u) = u^2/(2 slip), beyond it u - slip/2
 
@@ -98,7 +98,7 @@ def _half_space(one: Any, a: Wide, b: Wide, R: float) -> tuple[Wide, Wide]:
 
 
 def radius(one: Any) -> float:
-    """Return the radius [m] around the shape whose distance `find_nearest` returns."""
+    """Return the radius [m] around the shape whose distance `nearest` returns."""
     return one.radius if one.kind in ("sphere", "capsule") else 0.0
 
 

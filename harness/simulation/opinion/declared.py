@@ -21,15 +21,15 @@ class Moment:
 
     Attributes:
       time_step: step size dt [s].
-      velocity_rate: factor [1/s] in the velocity at the solution x, rate (x - origin).
-      stage_fraction: fraction of the step at which x is evaluated.
+      rate: factor [1/s] in the velocity at the solution x, rate (x - origin).
+      when: fraction of the step at which x is evaluated.
       time: time of the step's start [s].
-      stage_time: time of x [s].
+      until: time of x [s].
       p: positions (n, 3) [m] at the start.
       v: filtered velocities (n, 3) [m/s] at the start.
-      lagged_positions: positions (n, 3) [m] at which lagged quantities are evaluated.
-      velocity_origin: origin (n, 3) [m] in the velocity.
-      normal_force_positions: positions (n, 3) [m] at which friction's normal forces are evaluated, None for the start.
+      expected: positions (n, 3) [m] at which lagged quantities are evaluated.
+      origin: origin (n, 3) [m] in the velocity.
+      pressed: positions (n, 3) [m] at which friction's normal forces are evaluated, None for the start.
     """
 
     time_step: float
@@ -53,7 +53,7 @@ class Declared:
       mass: masses (n,) [kg].
       time_step: step size [s].
       effects: models of all effects.
-      has_stages: whether the integrator evaluates forces at its stages, so that drag is a force.
+      staged: whether the integrator evaluates forces at its stages, so that drag is a force.
     """
 
     mesh: Mesh
@@ -83,8 +83,8 @@ class PinnedVertex(NamedTuple):
 
     Attributes:
       weight: penalty weight [N/m], infinite for an exact pin.
-      position: position (3,) [m] at a time [s].
-      velocity: velocity (3,) [m/s] at a time [s].
+      place: position (3,) [m] at a time [s].
+      speed: velocity (3,) [m/s] at a time [s].
     """
 
     weight: float
@@ -97,16 +97,16 @@ class Opinion:
     """Reference terms of one effect.
 
     Attributes:
-      build_energy: builds the energy of a step.
-      diagonal: share (n,) [N/m] of the diagonal of Q at the rate 1/dt, None for none.
-      build_from_diagonal: builds the energy where it depends on the diagonal of Q (n,) [N/m], the sum over all
+      begin: builds the energy of a step.
+      resists: share (n,) [N/m] of the diagonal of Q at the rate 1/dt, None for none.
+      needs: builds the energy where it depends on the diagonal of Q (n,) [N/m], the sum over all
         effects and inertia.
-      evaluate_force: evaluates the force.
-      filter_velocity: filters velocities (n, 3) before a step.
-      pinned_vertices: pins by vertex.
-      min_length: smallest length [m] that the energy depends on, apart from the springs'.
-      coordinate_scale: largest coordinate [m].
-      exact_lengths: shortest and longest length [m] allowed for each inextensible edge (i, j).
+      force: evaluates the force.
+      decay: filters velocities (n, 3) before a step.
+      pins: pins by vertex.
+      shortest: smallest length [m] that the energy depends on, apart from the springs'.
+      reach: largest coordinate [m].
+      exact: shortest and longest length [m] allowed for each inextensible edge (i, j).
     """
 
     begin: Begin | None = None

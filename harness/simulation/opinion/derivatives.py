@@ -64,8 +64,8 @@ def tell(values: Values, x: Wide, d: Wide, reach: float, shortest: float) -> Tol
       values: energies of the elements.
       x: positions (n, 3) [m].
       d: direction (n, 3).
-      coordinate_scale: X [m].
-      min_length: l [m].
+      reach: X [m].
+      shortest: l [m].
     """
 
     def slopes(at: Wide) -> Wide:

@@ -22,8 +22,8 @@ class Place(NamedTuple):
     """A rigid motion at one time.
 
     Attributes:
-      rotation: R (3, 3).
-      axis_point: a point on its axis (3,) [m].
+      turn: R (3, 3).
+      about: a point on its axis (3,) [m].
       offset: translation (3,) [m].
     """
 

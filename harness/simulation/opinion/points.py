@@ -58,7 +58,7 @@ def points(scene: Scene, declared: Declared, frames: int) -> Iterator[SamplePoin
     apart = declared.of_kind("self-contact")
     beside = [(effect, one) for effect in declared.of_kind("surface-contact") for one in against(effect, declared)]
     # Where there are obstacles, the displacement by forces in a step is limited
-    # (`margin` of `solvers.contact.half_space.half_space_potential`).
+    # (`margin` of `solvers.contact.energy`).
     limit = 0.05 * scene.mesh.size if touching else np.inf
     for k in range(POINTS):
         index = 0 if k % 5 == 0 else int(rng.integers(1, max(2, frames)))

@@ -59,7 +59,7 @@ class _Answer:
     """Substitute for a prepared solver, with a given solution.
 
     Its solution is x (n, 3) [m] as a function of the time [s]. It returns the velocity at the step's end if
-    `with_velocity`.
+    `moves`.
     """
 
     def __init__(self, x: Callable[[float], Array], *, moves: bool = False) -> None:

@@ -65,7 +65,7 @@ def barriers(effect: Any, parts: Sequence[Touching]) -> Opinion:
 class Touching:
     """Points, edges and triangles of a mesh.
 
-    `rest_positions` (n, 3) [m] are those from which rest lengths are computed.
+    `rest` (n, 3) [m] are those from which rest lengths are computed.
     """
 
     def __init__(self, declared: Declared) -> None:
@@ -197,7 +197,7 @@ def near(x: Array, one: Indices, two: Indices, reach: float) -> Indices:
       x: positions (N, 3) [m].
       one: vertices (a, i) of points or edges.
       two: vertices (b, j) of triangles or edges.
-      radius: distance [m].
+      reach: distance [m].
 
     Returns: vertices of the pairs (k, 4).
     """

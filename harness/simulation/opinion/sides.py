@@ -42,11 +42,11 @@ class Side:
     """A scene with a fixed step size, and its reference terms.
 
     Attributes:
-      declaration: declaration of the scene.
-      effect_terms: reference terms of each effect.
-      energy_builders: builder of the energy of each effect, None for none.
-      energy_indices: indices of the scene's energies that belong to each effect.
-      external_effects: effects without a reference implementation.
+      declared: declaration of the scene.
+      opinions: reference terms of each effect.
+      begins: builder of the energy of each effect, None for none.
+      owned: indices of the scene's energies that belong to each effect.
+      outside: effects without a reference implementation.
     """
 
     declared: Declared

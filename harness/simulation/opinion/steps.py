@@ -30,14 +30,14 @@ class Stated:
 
     Attributes:
       c: inertia factor.
-      inertial_target: target (n, 3) [m].
-      external_force: force (n, 3) [N].
+      target: target (n, 3) [m].
+      force: force (n, 3) [N].
       force_size: size [N] of its round-off, divided by eps.
       vertices: pinned vertices.
       weights: their weights [N/m].
-      pin_targets: their targets (q, 3) [m].
-      step_moment: data of the step.
-      start_motion: motion at the start, filtered.
+      held: their targets (q, 3) [m].
+      moment: data of the step.
+      now: motion at the start, filtered.
     """
 
     c: float

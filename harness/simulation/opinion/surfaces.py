@@ -4,7 +4,7 @@ bending   B/2 |K x|^2 / (A0 + A1) over each pair of triangles that share an edge
 x3,
           with K = (c03 + c04, c01 + c02, -c01 - c03, -c02 - c04), the cotangents c of the angles at the edge and the
           areas A at rest (Bergou et al. 2006, with 3/(A0 + A1) divided by 2 and by 3 as derived in
-          `solvers.model.energies.bending_energy`: a cylinder of curvature k stores B/2 k^2 per unit of area).
+          `solvers.energies.bending`: a cylinder of curvature k stores B/2 k^2 per unit of area).
           Rectangles count as cut by either diagonal, half each.
 gas       -p0 V0 ln(V/V0), V = sum of a.(b x c)/6 over outward triangles
 """
