@@ -31,7 +31,15 @@ SLOW_NAME_PARTS = (
     *("test_a_factor_in_single_precision", "test_compiled.py::test_no_iter", "test_compiled.py::test_all_vertices_may"),
     *("stability/test_hard_answers.py", "stability/test_properties", "contracts/test_backends_agree.py"),
 )
-"""Parts of their names."""
+"""Parts of names of slow tests that are not in the list."""
+
+LONG_NAME_PARTS = (
+    *("test_nobody_without_the_certificate", "test_each_run_is_done_by_one_of_two_commands"),
+    *("goes_on_where_it_was[without pictures]", "says_whose_it_is[entry-point]"),
+    *("[100000 brackets]", "[10001 keys]", "is_said_to_be[topology-degree-1000]", "never_passes_it[0.0-pncg]"),
+    "serves_all_steps_of_a_system[cloth large enough for threads",
+)
+"""Parts of names of tests that take 10 to 40 s; `pytest -m long` runs them."""
 
 
 def read_slow_names() -> frozenset[str]:
@@ -40,13 +48,15 @@ def read_slow_names() -> frozenset[str]:
 
 
 def mark_slow_tests(items: list[pytest.Item]) -> None:
-    """Mark the items that are named; those that are long already are in neither run."""
+    """Mark items `long` by LONG_NAME_PARTS and `slow` by the list, unless they are long already."""
     slow = read_slow_names()
     for item in items:
         if item.get_closest_marker("long"):
             continue
         name = item.nodeid
-        if name in slow or name.partition("::")[0] in slow or any(kind in name for kind in SLOW_NAME_PARTS):
+        if any(part in name for part in LONG_NAME_PARTS):
+            item.add_marker(pytest.mark.long)
+        elif name in slow or name.partition("::")[0] in slow or any(kind in name for kind in SLOW_NAME_PARTS):
             item.add_marker(pytest.mark.slow)
 
 

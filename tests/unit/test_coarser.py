@@ -71,7 +71,7 @@ def test_it_goes_on_from_step_to_step(tmp_path):
         ({"size": 16}, "smaller than 17"),
         ({"pins": "indices: [0]"}, "effects name vertices by `indices` or `every`"),
         ({"pins": "every: 7"}, "effects name vertices by `indices` or `every`"),
-        ({"integrator": "sdirk-2"}, "coarse is for integrators of one unknown a step"),
+        ({"integrator": "sdirk-2"}, "coarse is for integrators with one stage per step"),
         ({"pins": "box: {low: [0.02, -1, 0.02], high: [0.03, 1, 0.03]}", "size": 41}, "no vertex of the mesh lies in"),
     ],
     ids=["small", "indices", "every", "several unknowns", "an empty box"],
