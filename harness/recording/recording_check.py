@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from springbench.harness.errors import RunFailed
 from springbench.harness.recording.local_origin import MIN_DIAGONALS_PER_CELL, read_origin, store_relative
 from springbench.harness.recording.recorder_interface import RecordingInfo
-from springbench.harness.recording.recording_reader import open_recording, read_cell, read_properties
+from springbench.harness.recording.recording_reader import open_recording_source, read_cell, read_properties
 from springbench.harness.recording.strain_shading import NUM_LEVELS, build_palette
 from springbench.solvers.model.step_problem import Positions
 
@@ -89,7 +89,7 @@ class _ReadFrame(NamedTuple):
 def _read_frames(path: Path, wanted: Collection[int]) -> tuple[NDArray[np.float64], int, dict[int, _ReadFrame]]:
     """Read the origin, the last frame's number (-1 for none), and the selected frames."""
     end, found = -1, dict[int, _ReadFrame]()
-    with open_recording(path) as source:
+    with open_recording_source(path) as source:
         origin = read_origin(read_properties(source)[1])
         for positions, colours in _POSITION_COMPONENTS:
             for chunk in source.iterate_chunks(content="/scene/mesh", components=[positions, colours]):

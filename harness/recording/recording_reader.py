@@ -102,7 +102,7 @@ def read_replay(path: Path, frames: Collection[int] | None = None) -> RecordingR
     Raises:
       InputError: the file is not the recording of a run or lacks a selected frame.
     """
-    with open_recording(path) as source:
+    with open_recording_source(path) as source:
         springs = read_network(source)
         wanted = None
         if frames is not None:
@@ -138,7 +138,7 @@ def summarise_recording(path: Path) -> RecordingSummary:
     Raises:
       InputError: the file is not a Rerun recording.
     """
-    with open_recording(path) as source:
+    with open_recording_source(path) as source:
         entities: set[str] = set()
         times: dict[str, list[float]] = {}
         for chunk in source.iterate_chunks(content="/**"):
@@ -166,7 +166,7 @@ def summarise_recording(path: Path) -> RecordingSummary:
 def _try_reading(path: Path) -> None:
     """Read all of a recording; damage raises an exception or ends the process."""
     mark_verified(path, shared=False)
-    with open_recording(path) as source:
+    with open_recording_source(path) as source:
         for chunk in source.iterate_chunks(content="/**"):
             chunk.to_record_batch().validate(full=True)
     summarise_recording(path)
@@ -175,7 +175,7 @@ def _try_reading(path: Path) -> None:
 
 
 @contextmanager
-def open_recording(path: Path) -> Generator[RecordingSource]:
+def open_recording_source(path: Path) -> Generator[RecordingSource]:
     """Open the recording at `path` for the duration of the context.
 
     Raises:

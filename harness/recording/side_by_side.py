@@ -23,7 +23,7 @@ from springbench.harness.recording.partial_file import PartialFile
 from springbench.harness.recording.recording_reader import (
     RecordingSource,
     iterate_positions,
-    open_recording,
+    open_recording_source,
     read_convergence_frames,
     read_network,
     read_properties,
@@ -80,7 +80,7 @@ def write_side_by_side(out: Path, recordings: Mapping[str, Path], title: str, st
     file = PartialFile(out, f"springbench side by side {title}", title, title)
     try:
         with ExitStack() as opened:
-            sources = {name: opened.enter_context(open_recording(path)) for name, path in recordings.items()}
+            sources = {name: opened.enter_context(open_recording_source(path)) for name, path in recordings.items()}
             longest = max(float(read_network(source)["strain_range"][0]) for source in sources.values())
             box: ViewExtent | None = None  # of all of them, so that all are seen alike
             runs = list[_SourceRun]()

@@ -68,7 +68,7 @@ def mean_rest_length(replay: RecordingReplay) -> float:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CameraView:
+class FittedCamera:
     """A camera with y up.
 
     Attributes:
@@ -85,9 +85,9 @@ class CameraView:
     box_low: PointArray
     box_high: PointArray
 
-    def scale_view(self, factor: float) -> CameraView:
+    def scale_view(self, factor: float) -> FittedCamera:
         """Return the view of a scene whose coordinates are multiplied by `factor`."""
-        return CameraView(
+        return FittedCamera(
             factor * self.position,
             factor * self.target,
             factor * self.ground_height,
@@ -137,7 +137,7 @@ def _view_direction(azimuth: float, elevation: float) -> PointArray:
     return np.array([np.sin(azimuth) * level, np.sin(elevation), np.cos(azimuth) * level])
 
 
-def fit_camera(points: PointArray, *, aspect: float, angles: tuple[float, float]) -> CameraView:
+def fit_camera(points: PointArray, *, aspect: float, angles: tuple[float, float]) -> FittedCamera:
     """Compute the closest camera that sees all points.
 
     A point with camera coordinates (a, b, c), c towards the viewer, is visible from (ea, eb, ec) if
@@ -163,7 +163,7 @@ def fit_camera(points: PointArray, *, aspect: float, angles: tuple[float, float]
     middle = (c.min() + c.max()) / 2.0
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     eye[2] = max(distance, middle + 1e-3 * (float(np.linalg.norm(high - low)) or 1.0))
-    return CameraView(eye @ axes, np.array([eye[0], eye[1], middle]) @ axes, ground, low, high)
+    return FittedCamera(eye @ axes, np.array([eye[0], eye[1], middle]) @ axes, ground, low, high)
 
 
 def _camera_axes(angles: tuple[float, float]) -> PointArray:
@@ -267,7 +267,7 @@ class OffscreenRenderer:
         self,
         replay: RecordingReplay,
         frame: int,
-        view: CameraView,
+        view: FittedCamera,
         extra_solids: Sequence[pv.PolyData] = (),
         coloured_points: Sequence[ColouredPoints] = (),
     ) -> NDArray[np.uint8]:
@@ -371,7 +371,7 @@ class OffscreenRenderer:
             self._plotter.add_mesh(_make_spheres(at, radius), color=colour, smooth_shading=True, **_MATERIAL_OPTIONS)
 
     def _add_shadow(
-        self, replay: RecordingReplay, p: NDArray[np.float32], view: CameraView, sizes: _SceneSizes, background: str
+        self, replay: RecordingReplay, p: NDArray[np.float32], view: FittedCamera, sizes: _SceneSizes, background: str
     ) -> None:
         """Add a soft shadow on the ground.
 

@@ -23,7 +23,7 @@ from springbench.harness.errors import InputError, InputMistake, RunFailed
 from springbench.harness.recording.recorder_interface import RecordingReplay
 from springbench.harness.recording.recording_reader import (
     RecordingSummary,
-    open_recording,
+    open_recording_source,
     read_replay,
     summarise_recording,
 )
@@ -103,7 +103,7 @@ def view_recordings(paths: list[Path]) -> None:
     """
     paths = find_recordings(paths)
     for path in paths:
-        with open_recording(path):
+        with open_recording_source(path):
             pass
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise RunFailed(

@@ -43,7 +43,7 @@ _PIXELS_PER_VERTEX = 120
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class VertexSelection:
+class SelectedVertices:
     """Vertices (q,) that an effect selects, and their description."""
 
     name: str
@@ -53,7 +53,7 @@ class VertexSelection:
 
 def draw_scene_preview(
     replay: RecordingReplay,
-    selections: Sequence[VertexSelection],
+    selections: Sequence[SelectedVertices],
     facts: Sequence[str],
     notes: Sequence[tuple[str, str]],
     path: Path,

@@ -77,7 +77,7 @@ def build_levels(network: DeviceNetwork, anchor_stiffness: NDArray[np.float64]) 
     return found
 
 
-def compute_device_bytes(schwarz_levels: list[SchwarzLevel], item_size: int) -> float:
+def compute_schwarz_bytes(schwarz_levels: list[SchwarzLevel], item_size: int) -> float:
     """Return the bytes on the device, for numbers of `item_size` bytes."""
     return sum(
         1.0 * item_size * packed_length(additive_schwarz.SUBDOMAIN_SIZE) * one.num_subdomains

@@ -113,7 +113,7 @@ def _nonempty_array(array: NDArray[Any]) -> NDArray[Any]:
     return array if len(array) else np.zeros(1, array.dtype)
 
 
-def compute_device_bytes(bundles: SpringPackets, real: Any) -> int:
+def compute_spring_bytes(bundles: SpringPackets, real: Any) -> int:
     """Return the bytes of the lanes on the device."""
     size = np.dtype(real).itemsize
     return (

@@ -137,7 +137,7 @@ def assemble_diagonal_blocks(step: StepObjective, hessian: Hessian, p: Positions
     out = np.empty((len(whole.system.free_vertices), 3, 3))
     springs.assemble_hessian(terms, places, None, p, clamped.spring_tensions, clamped.negative_fraction, out)
     if form is not None:
-        quadratic_form_kernels.add_blocks(form, number, np.full((len(form.pair_weight), 2), -1), out)
+        quadratic_form_kernels.add_quadratic_blocks(form, number, np.full((len(form.pair_weight), 2), -1), out)
     for one, curvature in zip(step.element_energies, clamped.element_hessians, strict=True):
         add_blocks(one.elements, _diagonal_block_indices(number, one.elements.vertices), curvature, out)
     for pairs in clamped.pair_blocks:

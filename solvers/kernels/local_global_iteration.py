@@ -190,7 +190,7 @@ def compute_residual(plan, form, x, before, p, e):
 
 
 @jit_kernel
-def run_local_step(plan, bundles, edges, x, right, p, out):
+def run_blocked_local_step(plan, bundles, edges, x, right, p, out):
     """Do the local step of all blocks without a solve."""
     for k in range(len(out)):
         out[k] = 0.0

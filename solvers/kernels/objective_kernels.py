@@ -104,7 +104,7 @@ def gradient(terms, step_data, p, out):
 
 
 @jit_kernel
-def gradient_roundoff(terms, step_data, p, out):
+def bound_gradient_roundoff(terms, step_data, p, out):
     """Write the bound (n,) [N] of the rounding error of `gradient` at p (n, 3) [m] to `out`.
 
     It is that of `springbench.solvers.model.rounding_bound` for springs, inertia, force and penalty pins.

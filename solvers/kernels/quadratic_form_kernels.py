@@ -93,7 +93,7 @@ def energy_change(form, p, q):
 
 
 @jit_kernel
-def add_blocks(form, diagonal, off_diagonal, values):
+def add_quadratic_blocks(form, diagonal, off_diagonal, values):
     """Add L [N/m] to the blocks `values` (b, 3, 3).
 
     The indices are those of the diagonal (n,) and of the pairs in both directions (k, 2); -1 for none.

@@ -50,15 +50,17 @@ def gradient_roundoff(problem: StepProblem, p: Positions) -> FloatArray:
 
     It is zero at exactly pinned vertices and infinite where a term overflows. The positions p are (n, 3) [m].
     """
-    s, size = problem.system, row_norms(p)
+    s, size = problem.system, stable_row_norms(p)
     with np.errstate(over="ignore", invalid="ignore"):
-        out = s.inertia_diagonal * (size + row_norms(problem.inertial_target)) + row_norms(problem.external_force)
+        out = s.inertia_diagonal * (size + stable_row_norms(problem.inertial_target)) + row_norms(
+            problem.external_force
+        )
         for energy in problem.energies:
             (energy if isinstance(energy, RoundingBoundEnergy) else _HessianRoundingBound(energy)).add_absolute_terms(
                 p, out
             )
         soft, vertices, weight = s.penalty_pins
-        out[vertices] += weight * (size[vertices] + row_norms(problem.pin_targets[soft]))
+        out[vertices] += weight * (size[vertices] + stable_row_norms(problem.pin_targets[soft]))
         out *= EPS
     out[np.isnan(out)] = np.inf
     out[s.pins.vertices[s.pins.exact_mask]] = 0.0
@@ -72,7 +74,7 @@ def is_gradient_roundoff(problem: StepProblem, p: Positions, factor: float = ROU
     round-off of one part hide the gradient of another. Vertices with a penalty pin are included, because
     others depend on them.
     """
-    bound, size = gradient_roundoff(problem, p), row_norms(problem.gradient(p))
+    bound, size = gradient_roundoff(problem, p), stable_row_norms(problem.gradient(p))
     return bool(((size <= factor * bound) & np.isfinite(bound))[problem.system.free_vertices].all())
 
 
@@ -81,12 +83,12 @@ def clip_to_roundoff(gradient: Positions, bound: FloatArray) -> Positions:
 
     The remainder exceeds round-off. An infinite bound explains no part of the gradient.
     """
-    size = row_norms(gradient)
+    size = stable_row_norms(gradient)
     share = np.divide(np.minimum(size, bound), size, out=np.zeros_like(size), where=(size > 0.0) & np.isfinite(bound))
     return share[:, None] * gradient
 
 
-def row_norms(x: Positions) -> FloatArray:
+def stable_row_norms(x: Positions) -> FloatArray:
     """Return the norm of each row (n, 3), shape (n,), also for rows whose squares overflow."""
     return np.hypot(np.hypot(x[:, 0], x[:, 1]), x[:, 2])
 
@@ -100,4 +102,6 @@ class _HessianRoundingBound:
     def add_absolute_terms(self, p: Positions, out: FloatArray) -> None:
         own = np.zeros_like(p)
         self._energy.add_gradient(p, own)
-        out += (abs(self._energy.hessian(p)) @ np.repeat(row_norms(p), 3)).reshape(-1, 3).sum(axis=1) + row_norms(own)
+        out += (abs(self._energy.hessian(p)) @ np.repeat(stable_row_norms(p), 3)).reshape(-1, 3).sum(
+            axis=1
+        ) + row_norms(own)

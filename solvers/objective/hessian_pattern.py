@@ -133,5 +133,7 @@ class BlockMatrix:
         if self._quadratic_form is not None:
             i, j = self._quadratic_form.pairs.T
             across = np.column_stack([self._pair_block_indices(i, j), self._pair_block_indices(j, i)])
-            quadratic_form_kernels.add_blocks(self._quadratic_form, self.block_indices.diagonal_block, across, out)
+            quadratic_form_kernels.add_quadratic_blocks(
+                self._quadratic_form, self.block_indices.diagonal_block, across, out
+            )
         return out

@@ -1,4 +1,4 @@
-"""No reader meets two public classes of one name in one file."""
+"""A public name has one meaning, and no file uses two classes of one name."""
 
 import ast
 from collections import defaultdict
@@ -36,13 +36,38 @@ def _twice(module: str, tree: ast.Module, homes: dict[str, set[str]]) -> Iterabl
     return (name for name, modules in here.items() if len(modules) > 1 and not name.startswith("_"))
 
 
+PUBLISHED = {
+    "main": "the entry point of each program",
+    "load_scene": "`harness/api.py` publishes the loader of configs, and accepts a str for a path",
+}
+"""Names of functions that several modules define, and why."""
+
+
+def find_homonyms(trees: Trees) -> set[str]:
+    """Return public functions and classes that several modules define."""
+    homes: dict[str, set[str]] = defaultdict(set)
+    for module, tree in trees.items():
+        for node in tree.body:
+            if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
+                homes[node.name].add(module)
+    return {name for name, modules in homes.items() if len(modules) > 1}
+
+
 def parsed(texts: Iterable[tuple[str, str]]) -> Trees:
     return {module: ast.parse(text) for module, text in texts}
 
 
 def test_no_file_meets_two_classes_of_one_name() -> None:
-    modules = ((".".join(path.relative_to(ROOT).with_suffix("").parts), path.read_text()) for path in FILES)
+    modules = (
+        (".".join(("springbench", *path.relative_to(ROOT).with_suffix("").parts)), path.read_text()) for path in FILES
+    )
     assert met(parsed(modules)) == [], "give one of them a name of its own"
+
+
+def test_a_public_name_is_defined_once() -> None:
+    homonyms = find_homonyms(parsed((str(path), path.read_text()) for path in FILES))
+    assert homonyms - set(PUBLISHED) == set(), "give one of them a name of its own"
+    assert set(PUBLISHED) - homonyms == set(), "these are defined once now"
 
 
 def test_a_clash_is_found_under_another_name_too() -> None:

@@ -29,14 +29,14 @@ DIALECT = _split_words(
 SYMBOLS = _split_words(
     "solve step prepare residual iterates value gradient hessian stats description title order close main run "
     "positions velocity time elements energies factorise multiply matvec toarray dhat gamma beta state kind index "
-    "name weight vertices values targets blocks kernels"
+    "name weight vertices values targets blocks"
 )
 """Operations and quantities that papers and SciPy, optimistix and ipctk call by this one word."""
 PROPER = _split_words("Admm Xpbd Anderson Chebyshev Lbfgs Tsitouras5 Ros2 Rodas Jgs2 Multigrid Woodbury BVH Colouring")
 """Methods and data structures with a name of their own."""
 NOUNS = _split_words(
     "Mesh Scene System Solver Solution Energy Hessian Stage Motion Unsupported Simulation Trajectory Trial Method "
-    "Stepper Stopwatch Citation Elements Kernels Candidates Collisions Springs Dashpots Bending Gas Sewing Quadratic "
+    "Stepper Stopwatch Citation Elements Candidates Collisions Springs Dashpots Bending Gas Sewing Quadratic "
     "Attachments Triangulation"
 )
 """The classes that everything else is described by."""

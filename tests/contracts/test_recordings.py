@@ -14,7 +14,12 @@ from rerun.chunk import RrdReader
 from springbench.harness.atomic_files import WriteError
 from springbench.harness.errors import InputError
 from springbench.harness.recording.recorder_interface import LAYOUT_VERSION, RecordedFrame
-from springbench.harness.recording.recording_reader import open_recording, read_cell, read_replay, summarise_recording
+from springbench.harness.recording.recording_reader import (
+    open_recording_source,
+    read_cell,
+    read_replay,
+    summarise_recording,
+)
 from springbench.harness.recording.rerun_recorder import FLUSH_INTERVAL, RerunRecorder
 from springbench.harness.recording.side_by_side import LineStyle, read_residuals, write_side_by_side
 from springbench.harness.recording.strain_shading import NUM_LEVELS, build_palette
@@ -56,7 +61,7 @@ def test_positions_come_back_exactly_to_float32(mesh: str, tmp_path: Path):
 def test_each_frame_has_the_colours_of_its_own_strains(mesh: str, component: str, tmp_path: Path):
     of = build_recording_info(mesh)
     found: dict[Any, Any] = {}
-    with open_recording(write_recording(tmp_path / "a.rrd", of, frame_count=12)) as source:
+    with open_recording_source(write_recording(tmp_path / "a.rrd", of, frame_count=12)) as source:
         for chunk in source.iterate_chunks(content="/scene/mesh", components=[component]):
             batch = chunk.to_record_batch()
             found |= dict(zip(batch["frame"].to_pylist(), batch[component].to_pylist(), strict=True))
@@ -99,14 +104,14 @@ def test_a_mesh_without_springs_or_pins_is_recorded(tmp_path: Path):
 
 
 def test_topology_is_written_once(tmp_path: Path):
-    with open_recording(write_recording(tmp_path / "a.rrd", frame_count=30)) as source:
+    with open_recording_source(write_recording(tmp_path / "a.rrd", frame_count=30)) as source:
         found = list(source.iterate_chunks(content="/scene/mesh", components=["Mesh3D:triangle_indices"]))
     assert [(chunk.num_rows, chunk.is_static) for chunk in found] == [(1, True)]
 
 
 def test_scalars_come_in_bulk(tmp_path: Path):
     frames = 3 * FLUSH_INTERVAL + 2
-    with open_recording(write_recording(tmp_path / "a.rrd", frame_count=frames)) as source:
+    with open_recording_source(write_recording(tmp_path / "a.rrd", frame_count=frames)) as source:
         chunks = list(source.iterate_chunks(content="/strain/largest", components=["Scalars:scalars"]))
     assert [chunk.num_rows for chunk in chunks] == [FLUSH_INTERVAL + 1, FLUSH_INTERVAL, FLUSH_INTERVAL, 1]
 
@@ -183,7 +188,7 @@ def test_convergence_is_one_entity_by_iteration_with_a_value_for_each_frame(tmp_
         "/convergence",
         *(f"/convergence/{name}" for name in ("objective", "residual")),
     ]
-    with open_recording(tmp_path / "a.rrd") as source:
+    with open_recording_source(tmp_path / "a.rrd") as source:
         assert read_residuals(source) == {3: [1.0, 0.1, 0.0], 5: [3.0], 7: [2.0, 0.2]}
         curves = list(source.iterate_chunks(content="/curves/residual/lines"))
     assert [chunk.is_static for chunk in curves] == [True], "it is drawn on every timeline"
@@ -203,7 +208,7 @@ def test_forces_are_arrows_in_proportion_at_no_more_than_some_vertices(tmp_path:
         recorder.record_frame(replace(frame, forces={"external": np.full((400, 3), -1.0 - frame.index % 3)}))
     recorder.finish_recording({})
     found = []
-    with open_recording(tmp_path / "a.rrd") as source:
+    with open_recording_source(tmp_path / "a.rrd") as source:
         for chunk in source.iterate_chunks(content="/scene/forces/external", components=["Arrows3D:vectors"]):
             batch = chunk.to_record_batch()
             found += [read_cell(batch, "Arrows3D:vectors", k).reshape(-1, 3) for k in range(batch.num_rows)]
@@ -222,7 +227,7 @@ def test_an_arrow_begins_at_its_vertex_and_points_along_its_force(tmp_path: Path
     (frame,) = generate_waves(of, 1)
     recorder.record_frame(replace(frame, forces={"external": forces}))
     recorder.finish_recording({})
-    with open_recording(tmp_path / "a.rrd") as source:
+    with open_recording_source(tmp_path / "a.rrd") as source:
         found = [chunk.to_record_batch() for chunk in source.iterate_chunks(content="/scene/forces/external")]
     (batch,) = [one for one in found if "Arrows3D:vectors" in one.schema.names]
     vectors, origins = (read_cell(batch, f"Arrows3D:{name}").reshape(-1, 3) for name in ("vectors", "origins"))
@@ -247,7 +252,7 @@ def test_springs_of_a_large_mesh_do_not_stay_over_a_mesh_that_moves_on(tmp_path:
     mesh = GridMesh().build_mesh(20)
     of = replace(build_recording_info(), mesh=mesh, springs=mesh.springs, rest_lengths=mesh.rest_lengths)
     drawn, cleared = [], []
-    with open_recording(write_recording(tmp_path / "a.rrd", of, frame_count=100)) as source:
+    with open_recording_source(write_recording(tmp_path / "a.rrd", of, frame_count=100)) as source:
         for chunk in source.iterate_chunks(content="/scene/springs"):
             batch = chunk.to_record_batch()
             names = set(batch.schema.names)

@@ -16,7 +16,7 @@ import pyvista as pv
 from rich.console import Console
 from springbench.harness.errors import InputError, RunFailed
 from springbench.harness.recording.chunk_cells import read_cell
-from springbench.harness.recording.recording_reader import open_recording, read_replay
+from springbench.harness.recording.recording_reader import open_recording_source, read_replay
 from springbench.harness.recording.side_by_side import LineStyle, write_side_by_side
 from springbench.harness.report import recording_inspection as module
 from springbench.harness.report.recording_inspection import find_recordings, inspect_recordings, view_recordings
@@ -149,7 +149,7 @@ def test_recordings_side_by_side_have_the_longest_scale(tmp_path: Path):
     paths = {"a": write_recording(tmp_path / "a.rrd", short), "b": write_recording(tmp_path / "b.rrd", long)}
     write_side_by_side(tmp_path / "both.rrd", paths, "chain 9", dict.fromkeys(paths, LineStyle("#0072b2")))
     seen: dict[str, list[Any]] = {}
-    with open_recording(tmp_path / "both.rrd") as source:
+    with open_recording_source(tmp_path / "both.rrd") as source:
         for chunk in source.iterate_chunks(content="/**", components=["Points3D:colors", "LineStrips3D:colors"]):
             batch = chunk.to_record_batch()
             for name in {"Points3D:colors", "LineStrips3D:colors"} & set(batch.schema.names):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from springbench.harness.recording.recording_reader import open_recording, read_replay
+from springbench.harness.recording.recording_reader import open_recording_source, read_replay
 from springbench.harness.report.obstacle_meshes import build_obstacle_meshes, points_to_frame
 from springbench.harness.scenes.key_frames import KeyFrame, KeyFrameMotion
 from springbench.harness.scenes.primitive_obstacles import BoxObstacle, CapsuleObstacle, PlaneObstacle, SphereObstacle
@@ -32,7 +32,7 @@ OBSTACLES = (
 def rows(path: Path, entity: str) -> dict[str, Any]:
     """All that was logged at an entity: by component the values of its rows."""
     found: dict[str, Any] = {}
-    with open_recording(path) as source:
+    with open_recording_source(path) as source:
         for chunk in source.iterate_chunks(content=entity):
             batch = chunk.to_record_batch()
             for name in batch.schema.names:
@@ -104,7 +104,7 @@ def test_a_recording_without_obstacles_has_no_trace_of_any(tmp_path: Path):
     assert "obstacles" not in replay.properties
     assert build_obstacle_meshes(replay, 0) == []
     np.testing.assert_array_equal(points_to_frame(replay, [0]), replay.positions[0])
-    with open_recording(path) as source:
+    with open_recording_source(path) as source:
         assert list(source.iterate_chunks(content="/scene/obstacles/**")) == []
 
 

@@ -43,18 +43,20 @@ def _draw_preview(run: RunSpec, path: Path, tick: ProgressCallback) -> list[str]
     from springbench.harness.recording.obstacle_shapes import build_obstacles_property, list_obstacles
     from springbench.harness.recording.recorder_interface import RecordingReplay
     from springbench.harness.recording.strain_shading import DEFAULT_STRAIN_RANGE
-    from springbench.harness.report.scene_preview import VertexSelection, draw_scene_preview
+    from springbench.harness.report.scene_preview import SelectedVertices, draw_scene_preview
     from springbench.harness.scenes.scene_builder import build_scene
     from springbench.harness.scenes.vertex_selectors import find_selections
     from springbench.harness.simulation.time_loop import build_initial_state
 
     scene, told = run.scene.load_plugins(), list[str]()
     made = build_scene(scene, run.size)
-    mesh, choices = made.mesh, list[VertexSelection]()
+    mesh, choices = made.mesh, list[SelectedVertices]()
     for k, effect in enumerate(scene.effects):
         for key, selection in find_selections(effect):
             name = f"effects[{k}] {effect.kind}{f': {key}' if key else ''}"
-            choices.append(VertexSelection(name, selection.describe_selection(), selection.select_vertices(mesh, name)))
+            choices.append(
+                SelectedVertices(name, selection.describe_selection(), selection.select_vertices(mesh, name))
+            )
     notes = _list_selectors(mesh)
     for one in choices:
         some = ", ".join(map(str, one.vertices[:8].tolist())) + (", ..." if len(one.vertices) > 8 else "")

@@ -103,17 +103,17 @@ def draw_line(
     every: dict[str, Any] = {"markevery": 0.12} if spaced_markers and np.size(x) > 3 else {}
     more = (
         {"linewidth": 1.5, "markersize": 5 * marker_scale(style)}
-        | marker_style(style, is_stale=bool(hollow.all()))
+        | sheet_marker_style(style, is_stale=bool(hollow.all()))
         | every
         | line_options
     )
     ax.plot(x, y, color=style.color, linestyle=style.dash, marker=style.marker, **more)
     if hollow.any() and not hollow.all():
         at = np.asarray(x)[hollow], np.asarray(y)[hollow]
-        ax.plot(*at, style.marker, markersize=more["markersize"], **marker_style(style, is_stale=True))
+        ax.plot(*at, style.marker, markersize=more["markersize"], **sheet_marker_style(style, is_stale=True))
 
 
-def marker_style(style: SeriesStyle, *, is_stale: bool) -> dict[str, Any]:
+def sheet_marker_style(style: SeriesStyle, *, is_stale: bool) -> dict[str, Any]:
     """Return the fill and edge of a marker, hollow for stale results."""
     return (
         {"mfc": BACKGROUND_COLOUR, "mec": style.color, "mew": 1.3}

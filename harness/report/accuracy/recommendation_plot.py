@@ -17,7 +17,7 @@ from springbench.harness.report.accuracy.plot_sheet import (
     draw_notes,
     format_log_axis,
     log_limits,
-    marker_style,
+    sheet_marker_style,
     notes_top,
     sheet_paths,
 )
@@ -74,7 +74,7 @@ def draw_recommendation(
         ax.axhspan(down[0], error_requested, color=RULE_COLOUR, alpha=0.45, zorder=0, lw=0)
         for point in points:
             look = looks[point.solver]
-            style: dict[str, Any] = marker_style(look, is_stale=False) | {
+            style: dict[str, Any] = sheet_marker_style(look, is_stale=False) | {
                 "alpha": 1.0 if point.error <= error_requested else 0.35
             }
             style |= {"marker": look.marker, "ls": "", "color": look.color, "ms": 6.5 * sized(look)}

@@ -28,7 +28,7 @@ from springbench.harness.report.accuracy.plot_sheet import (
     draw_notes,
     format_log_axis,
     log_limits,
-    marker_style,
+    sheet_marker_style,
     notes_top,
     plot_sheet,
     sheet_paths,
@@ -187,7 +187,7 @@ def _draw_panel(
             ax.plot(x, y, "x", color=look.color, transform=ax.get_xaxis_transform(), markersize=6, markeredgewidth=1.8)
         if steps is None:
             warm = np.median([curve.warm_seconds for curve in curves])
-            ax.plot(-1, warm, look.marker, markersize=5, **marker_style(look, is_stale=hollow))
+            ax.plot(-1, warm, look.marker, markersize=5, **sheet_marker_style(look, is_stale=hollow))
     format_log_axis(ax.yaxis, *span, unit="time")
     first = -1 if steps is None else 0
     ax.set_xlim(first - 0.4, len(GAP_TARGETS) - 0.6)

@@ -22,7 +22,7 @@ from springbench.harness.report.figures.figure_panels import MeshPicture, MeshRe
 from springbench.harness.report.figures.panel_selection import PanelEntry
 from springbench.harness.report.figures.timing_panels import read_sweep_rows
 from springbench.harness.report.mesh_rendering import (
-    CameraView,
+    FittedCamera,
     OffscreenRenderer,
     choose_view_angles,
     compute_area_vectors,
@@ -166,7 +166,7 @@ def _subject_words(replay: RecordingReplay) -> str:
 class _FrameRenderer(MeshRenderer):
     """Renders one frame with one camera (`panel.MeshRenderer`)."""
 
-    def __init__(self, replay: RecordingReplay, frame: int, view: CameraView) -> None:
+    def __init__(self, replay: RecordingReplay, frame: int, view: FittedCamera) -> None:
         self.replay, self.frame, self.view, self.aspect = replay, frame, view, 1.0
 
     def __call__(self, width: int, background: str | None) -> NDArray[np.uint8]:

@@ -68,7 +68,7 @@ def build_benchmark_charts(stored: Sequence[StoredBenchmarks]) -> tuple[dict[str
     return {name: chart for name, chart in made.items() if chart["items"]}, [*_describe_changes(found)]
 
 
-def collect_provenance(stored: Sequence[StoredBenchmarks]) -> list[ChartItem]:
+def collect_benchmark_provenance(stored: Sequence[StoredBenchmarks]) -> list[ChartItem]:
     """Return commits and machines of the results, the newest first."""
     dates: dict[tuple[str, str | None, int], list[str]] = {}
     for one in stored:

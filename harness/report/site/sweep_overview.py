@@ -265,7 +265,7 @@ def _build_benchmark_section(
     scripts, found = benchmark_charts.build_benchmark_charts(known)
     plots = [(name, chart["title"]) for name, chart in scripts.items()]
     facts = {"gates": len({item["gate"] for chart in scripts.values() for item in chart["items"]})}
-    return _PageSection(scripts, plots, found, [], benchmark_charts.collect_provenance(known), facts)
+    return _PageSection(scripts, plots, found, [], benchmark_charts.collect_benchmark_provenance(known), facts)
 
 
 def _read_rows(folder: SweepFolder, kind: str, print_message: PrintMessage = lambda words: None) -> pa.Table:

@@ -38,7 +38,7 @@ def add_sparse_product(pointers, columns, values, x, out):
 
 
 @cached_njit(parallel=True)
-def compute_residual(pointers, columns, values, b, x, out):
+def compute_linear_residual(pointers, columns, values, b, x, out):
     """Compute out = b - A x; A in compressed rows, vectors (n, 4)."""
     rows = len(out)
     for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):

@@ -121,7 +121,7 @@ class Multigrid:
         for keep, scale in more:
             kernels.chebyshev_step(*level.A, level.inverse_diagonal, keep, scale, b, step, x, other)
             x, other = other, x
-        kernels.compute_residual(*level.A, b, x, other)
+        kernels.compute_linear_residual(*level.A, b, x, other)
         below = self._levels[depth + 1].b if depth + 1 < len(self._levels) else self._coarse_vectors[0]
         kernels.multiply_sparse(*level.R, other, below)
         kernels.add_sparse_product(*level.P, self._run_v_cycle(depth + 1), x)

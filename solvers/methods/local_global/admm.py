@@ -190,7 +190,7 @@ class _AdmmState(SolverState):
 
     def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents any further change."""
-        kernels.run_local_step(
+        kernels.run_admm_local_step(
             *self._edges, self.positions, self._constant_term, self._scaled_dual, self._right_hand_side
         )
         self._local_global.solve_correction(self._right_hand_side, self.positions)

@@ -8,7 +8,7 @@ from springbench.solvers.model.energies.edge_energy import ZERO_LENGTH
 
 
 @jit_kernel
-def run_local_step(edges, stiffness, low, high, rest_direction, weight, p, constant, u, out):
+def run_admm_local_step(edges, stiffness, low, high, rest_direction, weight, p, constant, u, out):
     """Write constant + W A'K (z - u) [N] to `out` and update u.
 
     Args:

@@ -263,7 +263,9 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
         edges = self.spring_form.update_edges(self.edges, problem)
 
         def local() -> NDArray[Any]:
-            local_global_iteration.run_local_step(self.iteration_plan, self.spring_packets, edges, a, right, p, b)
+            local_global_iteration.run_blocked_local_step(
+                self.iteration_plan, self.spring_packets, edges, a, right, p, b
+            )
             return b
 
         y, out = self.base.system.inertia_diagonal[:, None] * target + force, np.zeros_like(target)

@@ -28,7 +28,7 @@ from springbench.solvers.cuda.device_schwarz import (
     SchwarzLevel,
     UploadedLevel,
     build_levels,
-    compute_device_bytes,
+    compute_schwarz_bytes,
 )
 from springbench.solvers.cuda.device_solver import DeviceSolverState, MinimisingSolver
 from springbench.solvers.cuda.device_step import DeviceStep, LoadedStep, UploadedNetwork
@@ -87,7 +87,7 @@ def prepare_newton_cg(
     held = network.anchor_stiffness[: network.num_free] + MIN_DIAGONAL_FRACTION * metric.free_diagonal[order]
     of = build_levels(network, held)
     vectors = network.num_free * (3.0 * (12 * 8 + 8 * size) + 8.0 * 8)
-    solve = vectors + compute_device_bytes(of, size) + 4.0 * size * len(network.edge_entries.neighbour_rows)
+    solve = vectors + compute_schwarz_bytes(of, size) + 4.0 * size * len(network.edge_entries.neighbour_rows)
     cuda_device.require_memory("newton-cg", network.device_bytes + solve)
     with cuda_device.guard_device_errors():
         stream = DeviceStream()
@@ -157,7 +157,10 @@ class _NewtonCGState(DeviceSolverState):
         self._begun = LoadedStep(of)
         self._edges, self._given = self._begun.device_edges, self._begun.step_data
         self._p, self._q = (stream.allocate_zeros((len(network.row_vertices), 3), np.float64) for _ in range(2))
-        self._kernels, self._cg_kernels = objective_kernels.build_hessian_kernels(real), kernels(real)
+        self._kernels, self._cg_kernels = (
+            objective_kernels.build_hessian_kernels(real),
+            build_conjugate_gradient_kernels(real),
+        )
         self._preconditioner = DeviceAdditiveSchwarz(made.levels, made.on_device, stream, rows, real)
         self._linear = stream.allocate_zeros((4, len(network.edge_entries.neighbour_rows)), real)
         self._g = stream.allocate_zeros((rows, 3), np.float64)
@@ -312,7 +315,7 @@ def write_trial(p, d, t, q, g, sum_slot, partials):
     device_sums.store_partial_sum(total, sum_slot, partials)
 
 
-class Kernels(NamedTuple):
+class ConjugateGradientKernels(NamedTuple):
     """Conjugate gradient kernels for one precision."""
 
     update_direction: Any
@@ -320,7 +323,7 @@ class Kernels(NamedTuple):
 
 
 @cache
-def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
+def build_conjugate_gradient_kernels(real: type[np.float32] | type[np.float64]) -> ConjugateGradientKernels:
     """Build the kernels that compute in `real`."""
 
     @cuda.jit
@@ -349,7 +352,7 @@ def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
                 r[i, c] -= length * y[i, c]
             i += cuda.gridsize(1)
 
-    return Kernels(turn, go)
+    return ConjugateGradientKernels(turn, go)
 
 
 @cuda.jit

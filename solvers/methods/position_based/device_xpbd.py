@@ -20,7 +20,7 @@ from springbench.solvers.methods.position_based.device_xpbd_kernels import (
     build_xpbd_kernels,
     finish_substep,
     predict_step,
-    write_positions,
+    write_device_positions,
 )
 from springbench.solvers.methods.position_based.xpbd_projection import SpringConstraints
 from springbench.solvers.model.step_problem import Positions, ResidualIterate, StepProblem, System
@@ -200,7 +200,7 @@ class _DeviceXpbdState(DeviceSolverState):
     def position_rows(self) -> Any:
         """Return the current positions in rows (n, 3) [m], on the device."""
         self.launch_kernel(
-            write_positions, len(self.reference), self.reference, self.displacement, self.position_output
+            write_device_positions, len(self.reference), self.reference, self.displacement, self.position_output
         )
         return self.position_output
 

@@ -113,7 +113,7 @@ def build_xpbd_kernels(real: RealType) -> XpbdKernels:
 
 
 @cuda.jit
-def write_positions(x, u, out):
+def write_device_positions(x, u, out):
     """Write x + u to `out`, (n, 3) [m]."""
     i = cuda.grid(1)
     while i < x.shape[0]:

@@ -143,7 +143,7 @@ class XpbdState(SolverState):
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Run iterations within the limits; return their number, the residual and the reason of the end."""
         made = self._prepared
-        kernels.run_iterations(
+        kernels.run_projections(
             made.coloured_constraints,
             made.constraint_relaxation,
             made.vertex_compliance,

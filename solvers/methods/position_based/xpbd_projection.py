@@ -78,7 +78,7 @@ def _project_constraints(constraints, ease, compliance, tension, p):
 
 
 @jit_kernel
-def run_iterations(constraints, ease, compliance, tension, p, iterations):
+def run_projections(constraints, ease, compliance, tension, p, iterations):
     """Run n passes from p (n, 3) [m], which is overwritten with the result.
 
     Args:
@@ -98,7 +98,7 @@ def run_substeps(constraints, ease, compliance, pinned, force, before, p, v, h, 
     """Run `count` steps of size h, each with one pass; p and v are overwritten with the result.
 
     Args:
-        constraints, ease, compliance: as for `run_iterations`, for steps of size h.
+        constraints, ease, compliance: as for `run_projections`, for steps of size h.
         pinned: motion of the pins.
         force: (n, 3) [N].
         before: scratch like p.

@@ -171,7 +171,7 @@ def build_half_spaces(vertex, p, v, dt, when, square, frames, bodies, found, rou
         i += cuda.gridsize(1)
 
 
-class Kernels(NamedTuple):
+class HalfSpaceKernels(NamedTuple):
     """Kernels in one floating-point type."""
 
     push_with_model: Any
@@ -179,7 +179,7 @@ class Kernels(NamedTuple):
 
 
 @cache
-def kernels(real: Any) -> Kernels:
+def build_half_space_kernels(real: Any) -> HalfSpaceKernels:
     """Build the kernels for the floating-point type of the displacements."""
     of_springs = device_vbd_kernels.build_vbd_kernels(real)
     gathered, lowering = (
@@ -237,4 +237,4 @@ def kernels(real: Any) -> Kernels:
         if cuda.threadIdx.x == 0:
             out[first + cuda.blockIdx.x] = total
 
-    return Kernels(push, press)
+    return HalfSpaceKernels(push, press)

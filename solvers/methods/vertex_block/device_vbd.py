@@ -72,7 +72,7 @@ def prepare_vbd(
     obstacles = sum(len(energy.obstacles) for energy in system.energies if isinstance(energy, HalfSpaceContact))
     solve += 8 * device_half_spaces.FLOATS_PER_ROW * obstacles * vertex_blocks.num_free
     cuda_device.require_memory(
-        "vbd", device_springs.compute_device_bytes(vertex_blocks.spring_packets, real) + network.device_bytes + solve
+        "vbd", device_springs.compute_spring_bytes(vertex_blocks.spring_packets, real) + network.device_bytes + solve
     )
     with cuda_device.guard_device_errors():
         stream = DeviceStream()
@@ -161,7 +161,10 @@ class DeviceSweepState(DeviceSolverState):
         self._rows = stream.allocate_array((n, 3), np.float64)
         self._half_spaces = None
         if any(map(is_vertex_contact, made.system.energies)):
-            of, self._half_space_kernels = made.uploaded_network, device_half_spaces.kernels(made.real_dtype)
+            of, self._half_space_kernels = (
+                made.uploaded_network,
+                device_half_spaces.build_half_space_kernels(made.real_dtype),
+            )
             self._half_spaces = device_half_spaces.DeviceHalfSpaces(
                 stream,
                 made.system,

@@ -29,7 +29,7 @@ class EdgeEnergy:
 
     def edge_lengths(self, p: Positions) -> NDArray[np.float64]:
         """Return the length of each edge [m] at p (n, 3), shape (m,)."""
-        return row_norms(self._edge_vectors(p))
+        return _row_norms(self._edge_vectors(p))
 
     def stiffness_matrix(self, n: int) -> scipy.sparse.csr_array:
         """Return A'KA [N/m], shape (n, n), the contribution to Q."""
@@ -63,7 +63,7 @@ class EdgeEnergy:
 
     def _endpoint_norms(self, p: Positions) -> NDArray[np.float64]:
         """Return |p_i| + |p_j| of each edge (m,) [m], which scales the rounding error of its ends."""
-        size = row_norms(p)
+        size = _row_norms(p)
         return size[self.edges[:, 0]] + size[self.edges[:, 1]]
 
     def _block_hessian(
@@ -81,14 +81,14 @@ class EdgeEnergy:
         return drop_zeros(scipy.sparse.csr_array(scipy.sparse.coo_array(whole)))
 
 
-def row_norms(v: Positions) -> NDArray[np.float64]:
+def _row_norms(v: Positions) -> NDArray[np.float64]:
     """Return |v| of each row, (m,)."""
     return np.sqrt(np.einsum("ij,ij->i", v, v))
 
 
 def unit_directions(v: Positions, fallback: Positions) -> tuple[NDArray[np.float64], Positions]:
     """Return |v| (m,) and v/|v| (m, 3) of each row, with the fallback for a row of zero length."""
-    length = row_norms(v)
+    length = _row_norms(v)
     unit = v / np.maximum(length, ZERO_LENGTH)[:, None]
     zero = length <= ZERO_LENGTH
     unit[zero] = fallback[zero]
