@@ -52,7 +52,7 @@ def gradient_roundoff(problem: StepProblem, p: Positions) -> FloatArray:
     """
     s, size = problem.system, stable_row_norms(p)
     with np.errstate(over="ignore", invalid="ignore"):
-        out = s.inertia_diagonal * (size + stable_row_norms(problem.inertial_target)) + row_norms(
+        out = s.inertia_diagonal * (size + stable_row_norms(problem.inertial_target)) + stable_row_norms(
             problem.external_force
         )
         for energy in problem.energies:
@@ -104,4 +104,4 @@ class _HessianRoundingBound:
         self._energy.add_gradient(p, own)
         out += (abs(self._energy.hessian(p)) @ np.repeat(stable_row_norms(p), 3)).reshape(-1, 3).sum(
             axis=1
-        ) + row_norms(own)
+        ) + stable_row_norms(own)

@@ -17,8 +17,8 @@ from springbench.harness.report.accuracy.plot_sheet import (
     draw_notes,
     format_log_axis,
     log_limits,
-    sheet_marker_style,
     notes_top,
+    sheet_marker_style,
     sheet_paths,
 )
 from springbench.harness.report.accuracy.plot_sheet import marker_scale as sized

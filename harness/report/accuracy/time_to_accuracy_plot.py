@@ -28,9 +28,9 @@ from springbench.harness.report.accuracy.plot_sheet import (
     draw_notes,
     format_log_axis,
     log_limits,
-    sheet_marker_style,
     notes_top,
     plot_sheet,
+    sheet_marker_style,
     sheet_paths,
 )
 from springbench.harness.report.accuracy.time_to_accuracy import (
